@@ -1,0 +1,128 @@
+"""Read one point cloud, format by extension, as (N, 3) float32 [m] in the sensor frame."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchelev.io.errors import RecordingError
+
+KITTI_POINT_BYTES = 16  # x, y, z, intensity as float32
+
+
+def read_cloud(path: str | Path) -> NDArray[np.float32]:
+    """Read a cloud: `.bin` (KITTI), `.npy`, `.npz`, `.ply` or `.pcd` -> (N, 3) float32 [m].
+
+    Columns or fields beyond x, y, z are dropped; points with NaN are kept, the map ignores them. Raises
+    RecordingError for an unknown extension and for a file that is missing, cut short or not what its name says.
+    """
+    path = Path(path)
+    reader = CLOUD_READERS.get(path.suffix.lower())
+    if reader is None:
+        raise RecordingError(path, f"unknown format '{path.suffix}'", f"convert it to one of {known_formats()}")
+    if not path.is_file():
+        raise RecordingError(path, "no such file")
+    if path.stat().st_size == 0:
+        raise RecordingError(path, "the file is empty", "copy it again or remove it together with its pose")
+    return np.ascontiguousarray(reader(path), dtype=np.float32)
+
+
+def known_formats() -> str:
+    return " ".join(sorted(CLOUD_READERS))
+
+
+def _read_bin(path: Path) -> NDArray:
+    size = path.stat().st_size
+    if size % KITTI_POINT_BYTES:
+        problem = f"cut short: {size} bytes are no whole number of points of {KITTI_POINT_BYTES} bytes"
+        raise RecordingError(path, problem, "expected float32 x y z intensity; copy the file again")
+    return np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3]
+
+
+def _read_npy(path: Path) -> NDArray:
+    # numpy takes any junk for a pickle and says so: its message would mislead.
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise RecordingError(path, "cut short or no .npy file", "save it again with numpy.save") from error
+    return _columns(path, array)
+
+
+def _read_npz(path: Path) -> NDArray:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            keys = [name.removesuffix(".npy") for name in archive.namelist()]
+        key = _cloud_key(path, keys)
+        with np.load(path, allow_pickle=False) as arrays:
+            array = arrays[key]
+    except RecordingError:
+        raise
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
+        raise RecordingError(path, "cut short or no .npz file", "save it again with numpy.savez") from error
+    return _columns(path, array)
+
+
+def _cloud_key(path: Path, keys: list[str]) -> str:
+    for key in ("points", "xyz"):
+        if key in keys:
+            return key
+    if len(keys) != 1:
+        raise RecordingError(path, f"no array 'points' among {keys}", "name the (N, 3) array 'points'")
+    return keys[0]
+
+
+def _columns(path: Path, array: NDArray) -> NDArray:
+    """(..., C >= 3) or structured with x, y, z -> (N, 3)."""
+    if array.dtype.names:
+        return _fields(path, array)
+    if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":
+        problem = f"expected numbers (N, 3), got {array.dtype} {array.shape}"
+        raise RecordingError(path, problem, "save one row x y z per point")
+    return array[..., :3].reshape(-1, 3)
+
+
+def _fields(path: Path, array: NDArray) -> NDArray:
+    missing = {"x", "y", "z"} - set(array.dtype.names or ())
+    if missing:
+        raise RecordingError(path, f"no field {' '.join(sorted(missing))}", "the cloud needs fields x, y and z")
+    return np.stack([np.asarray(array[name]).ravel() for name in "xyz"], axis=-1)
+
+
+def _read_ply(path: Path) -> NDArray:
+    import plyfile
+
+    try:
+        data = plyfile.PlyData.read(path)
+    except (plyfile.PlyParseError, UnicodeDecodeError, ValueError) as error:
+        raise RecordingError(path, f"cut short or no .ply file ({error})", "export it again") from error
+    if "vertex" not in data:
+        raise RecordingError(path, "no element 'vertex'", "the cloud needs vertices with x, y and z")
+    return _fields(path, data["vertex"].data)
+
+
+def _read_pcd(path: Path) -> NDArray:
+    from pypcd4 import PointCloud
+
+    # pypcd4 leaves checking to numpy, pydantic and lzf: what a broken file raises depends on where it breaks.
+    try:
+        cloud = PointCloud.from_path(path)
+        count = cloud.metadata.points
+    except Exception as error:
+        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RecordingError(path, f"cut short or no .pcd file ({detail})", "export it again") from error
+    if len(cloud.pc_data) != count:
+        raise RecordingError(path, f"cut short: {len(cloud.pc_data)} of {count} points", "copy the file again")
+    return _fields(path, cloud.pc_data)
+
+
+CLOUD_READERS: dict[str, Callable[[Path], NDArray]] = {
+    ".bin": _read_bin,
+    ".npy": _read_npy,
+    ".npz": _read_npz,
+    ".pcd": _read_pcd,
+    ".ply": _read_ply,
+}
