@@ -1,0 +1,37 @@
+"""torchelev: batched, differentiable elevation mapping in PyTorch, for robots that learn."""
+
+from torchelev.aging import AgingConfig
+from torchelev.config import ElevationMapConfig
+from torchelev.drift import DriftConfig
+from torchelev.elevation_map import ElevationMap
+from torchelev.fusion import EdgeConfig, FusionConfig
+from torchelev.grid import GridConfig
+from torchelev.overlap import OverlapConfig
+from torchelev.raycast import RaycastConfig
+from torchelev.sensor import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
+from torchelev.state import MapState, Measurement, Statistics
+from torchelev.surface import SurfaceConfig
+from torchelev.traversability import TraversabilityConfig
+
+__version__ = "0.1.0"
+__all__ = [
+    "AgingConfig",
+    "BodyConfig",
+    "DriftConfig",
+    "EdgeConfig",
+    "ElevationMap",
+    "ElevationMapConfig",
+    "ExclusionConfig",
+    "FusionConfig",
+    "GridConfig",
+    "MapState",
+    "Measurement",
+    "OverlapConfig",
+    "RaycastConfig",
+    "SensorConfig",
+    "Statistics",
+    "SurfaceConfig",
+    "TraversabilityConfig",
+    "depth_to_points",
+    "voxel_filter",
+]

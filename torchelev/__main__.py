@@ -1,0 +1,16 @@
+"""`python -m torchelev`."""
+
+import sys
+
+
+def run() -> None:
+    """Start the command line, or say what to install for it."""
+    try:
+        from torchelev.cli import main
+    except ModuleNotFoundError as error:
+        sys.exit(f"Error: {error}; install the command line's packages with: pip install 'torchelev[io]'")
+    main(prog_name="python -m torchelev")
+
+
+if __name__ == "__main__":
+    run()

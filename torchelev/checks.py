@@ -1,0 +1,99 @@
+"""What the map refuses, before anything changed.
+
+Shapes, dtypes and devices are always checked. Checks that read values (rigid poses, a tensor `dt`, ids) would make the
+host wait for the device, so they run for CPU tensors and, on request, for others.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+
+
+def readable(value: Tensor, always: bool = False) -> bool:
+    """Tell whether a value may be read now: not while compiling, and not from tensors that hold no data."""
+    plain = type(value) in (Tensor, torch.nn.Parameter)
+    return plain and not torch.compiler.is_compiling() and (always or value.device.type == "cpu")
+
+
+def check_tensor(name: str, value: object, device: torch.device, dtypes: tuple[torch.dtype, ...]) -> Tensor:
+    """Refuse what is no tensor, or lies elsewhere, or has another dtype."""
+    require(isinstance(value, Tensor), name, "must be a torch.Tensor", type(value).__name__, "wrap it", TypeError)
+    assert isinstance(value, Tensor)
+    kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
+    require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, "convert it with .to(dtype)", TypeError)
+    same = value.device.type == device.type and (value.device.index or 0) == (device.index or 0)
+    came = f"{tuple(value.shape)} on {value.device}"
+    require(same, name, f"must be on {device}", came, "move it with .to(emap.device)")
+    return value
+
+
+def check_points(points: object, num_envs: int, device: torch.device) -> Tensor:
+    """Return the points as (B, S, N, 3)."""
+    value = check_tensor("points", points, device, FLOATS)
+    fits = value.ndim in (3, 4) and value.shape[0] == num_envs and value.shape[-1] == 3
+    rule = f"expected (B, N, 3) or (B, S, N, 3) with B = {num_envs} on {device}"
+    mend = "give one cloud per environment, padded with NaN"
+    require(fits, "points", rule, f"{tuple(value.shape)} on {value.device}", mend)
+    value = value if value.ndim == 4 else value[:, None]
+    require(value.shape[1] > 0, "points", "must have at least one sensor", tuple(value.shape), "give S >= 1")
+    return value
+
+
+def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.device, always: bool) -> Tensor:
+    """Return a rigid transform of this shape, which may lack the sensor dimension."""
+    value = check_tensor(name, pose, device, (torch.float32, torch.float64))
+    rule = f"expected {shape} on {device}"
+    require(tuple(value.shape) == shape, name, rule, tuple(value.shape), "give one 4 x 4 matrix for each")
+    if readable(value, always):
+        _check_rigid(name, value)
+    return value
+
+
+def _check_rigid(name: str, pose: Tensor) -> None:
+    mend = "use torchelev.frames.transform(position, quat_wxyz)"
+    require(bool(torch.isfinite(pose).all()), name, "must be finite", "NaN or inf", mend)
+    rotation = pose[..., :3, :3].double()
+    identity = torch.eye(3, dtype=torch.float64, device=pose.device)
+    error = (rotation @ rotation.transpose(-1, -2) - identity).abs().amax().item() if pose.numel() else 0.0
+    require(error < 1e-3, name, "must be rigid (R R^T = 1)", f"an error of {error:.3g}", mend)
+    require(bool((torch.linalg.det(rotation) > 0).all()), name, "must not mirror", "determinant -1", mend)
+    last = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
+    require(bool((pose[..., 3, :] == last).all()), name, "must have the last row 0 0 0 1", "another", mend)
+
+
+def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype, always: bool) -> Tensor:
+    """Return dt as (B,) [s]."""
+    if isinstance(dt, Tensor):
+        value = check_tensor("dt", dt, device, FLOATS)
+        fits = tuple(value.shape) in ((), (num_envs,))
+        require(fits, "dt", f"expected a number or ({num_envs},)", tuple(value.shape), "give one dt per environment")
+        if readable(value, always):
+            good = bool(torch.isfinite(value).all()) and bool((value >= 0).all())
+            require(good, "dt", "must not be negative", value.tolist(), "give seconds since the last update")
+        return value.to(dtype).expand(num_envs)
+    number = isinstance(dt, int | float) and not isinstance(dt, bool)
+    require(number, "dt", "must be a number or a tensor", type(dt).__name__, "give seconds", TypeError)
+    assert isinstance(dt, int | float)
+    good = math.isfinite(dt) and dt >= 0
+    require(good, "dt", "must not be negative", dt, "give seconds since the last update")
+    return torch.full((num_envs,), float(dt), device=device, dtype=dtype)
+
+
+def check_env_ids(env_ids: object, num_envs: int, device: torch.device, always: bool) -> Tensor:
+    """Return ids (K,) int64: each in range, none twice."""
+    value = check_tensor("env_ids", env_ids, device, (torch.int64,))
+    require(value.ndim == 1, "env_ids", "must be 1-D", tuple(value.shape), "flatten it, or pass mask=")
+    if readable(value, always) and value.numel():
+        low, high = int(value.min()), int(value.max())
+        inside = low >= 0 and high < num_envs
+        require(inside, "env_ids", f"must lie in [0, {num_envs})", f"{low}..{high}", "leave out the others")
+        unique = value.unique().numel() == value.numel()
+        require(unique, "env_ids", "must not repeat", value.tolist(), "use torch.unique or pass mask=")
+    return value

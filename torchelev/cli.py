@@ -1,0 +1,262 @@
+"""The command line: a recording in, a map out."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from torchelev.io import MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
+from torchelev.io.report import hints, summary, warnings
+
+if TYPE_CHECKING:
+    from torchelev.config import ElevationMapConfig
+    from torchelev.elevation_map import ElevationMap
+
+BAD_INPUT, INTERRUPTED = 2, 130
+RESOLUTION, SIZE = 0.1, 20.0  # [m]
+
+MAP_HELP = """Map RECORDING, a folder of scans with poses, and write the map.
+
+\b
+RECORDING holds one file per scan, in the order of their names:
+  .bin (KITTI: float32 x y z intensity)  .npy  .npz  .ply  .pcd
+or depth images (.png, uint16 millimetres) if --intrinsics is given.
+Points are in metres in the sensor's frame (x right, y down, z forward
+for depth images).
+
+\b
+The pose file has one line per scan: where the sensor was, in a map
+frame whose z axis points up. Either 12 numbers (KITTI: the upper 3x4 of
+the pose, row by row) or 8 (TUM: t x y z qx qy qz qw).
+
+\b
+Example: a folder drive/ with scans/000000.bin ... and poses.txt
+  python -m torchelev map drive
+  python -m torchelev map drive/scans --poses drive/poses.txt \\
+      --resolution 0.05 --size 30 --device cuda --out maps/drive
+
+\b
+It writes PREFIX.npz (every layer and the geometry, for numpy),
+PREFIX.png (a picture) and PREFIX.ply (a mesh for MeshLab, CloudCompare,
+Blender). The map is a window that follows the sensor; what leaves it is
+forgotten. --fixed with a larger --size keeps everything.
+"""
+
+
+class OneLineError(click.ClickException):
+    """Bad input: one line on stderr, exit code 2."""
+
+    exit_code = BAD_INPUT
+
+    def __init__(self, error: object) -> None:
+        super().__init__(" ".join(str(error).split()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """What the user asked of the map, checked."""
+
+    T_base_sensor: NDArray[np.float64] | None
+    sensor_height: float | None
+    fixed: bool
+
+    @property
+    def knows_base(self) -> bool:
+        """Whether the robot's own height is known, not only the sensor's."""
+        return self.T_base_sensor is not None or self.sensor_height is not None
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="torchelev")
+def main() -> None:
+    """Elevation maps from point clouds and depth images."""
+
+
+@main.command("map", help=MAP_HELP)
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option(
+    "--poses", type=click.Path(path_type=Path), help="Pose file.  [default: poses.txt in or beside RECORDING]"
+)
+@click.option(
+    "--intrinsics", type=click.Path(path_type=Path), help="Camera of depth images: text or YAML, fx fy cx cy."
+)
+@click.option(
+    "--out", type=str, default="map", show_default=True, metavar="PREFIX", help="Where to write; or a folder."
+)
+@click.option("--resolution", type=float, metavar="M", help="Size of a cell [m].  [default: 0.1, or the config's]")
+@click.option("--size", type=float, metavar="M", help="Edge of the square map [m].  [default: 20, or the config's]")
+@click.option("--fixed", is_flag=True, help="Do not follow the sensor: centre the map on the middle of its path.")
+@click.option("--device", default="cpu", show_default=True, help="Where to compute: cpu, cuda, cuda:1, ...")
+@click.option("--config", type=click.Path(path_type=Path), help="YAML with settings of ElevationMapConfig, by stage.")
+@click.option("--dt", type=float, metavar="S", help="Time between scans [s].  [default: the poses' times, or 0.1]")
+@click.option("--sensor-height", type=float, metavar="M", help="The sensor's height above the robot's base [m].")
+@click.option("--extrinsics", metavar="FILE|NUMBERS", help="T_base_sensor: file or quoted text, 12 numbers (3x4).")
+@click.option("--poses-of", type=click.Choice(["sensor", "base"]), default="sensor", show_default=True,
+              help="Whose poses the file has; 'base' needs --extrinsics.")  # fmt: skip
+def map_command(**options: Any) -> None:
+    try:
+        code = run_map(**options)
+    except ModuleNotFoundError as error:
+        raise OneLineError(f"{error}; install it with pip install 'torchelev[io]'") from error
+    except (RecordingError, ValueError, OSError) as error:
+        raise OneLineError(error) from error
+    sys.exit(code)
+
+
+@main.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("demo.png"), show_default=True, help="Picture.")
+def demo(out: Path) -> None:
+    """Simulate a walk of a robot with a depth camera, map it, and draw truth and map side by side."""
+    from torchelev.demo import run_demo
+
+    run_demo(out=out, progress=True)
+
+
+def run_map(
+    recording: Path, poses: Path | None, intrinsics: Path | None, out: str, resolution: float | None, size: float | None,
+    fixed: bool, device: str, config: Path | None, dt: float | None, sensor_height: float | None,
+    extrinsics: str | None, poses_of: str,
+) -> int:  # fmt: skip
+    """Do what `map` says; return the exit code. Raises ValueError for bad input."""
+    mount = None if extrinsics is None else read_transform(extrinsics)
+    if poses_of == "base" and mount is None:
+        raise ValueError("--poses-of base: where the sensor sits on the robot is not known; give --extrinsics")
+    if mount is not None and sensor_height is not None:
+        raise ValueError("--sensor-height: --extrinsics says this already; give one of them")
+    if dt is not None and not (math.isfinite(dt) and dt >= 0):
+        raise ValueError(f"--dt: must be a time in seconds of 0 or more, got {dt}")
+    options = MapOptions(T_base_sensor=mount, sensor_height=sensor_height, fixed=fixed)
+    scans = open_recording(recording, poses, intrinsics, dt)
+    scans = scans.moved(mount) if poses_of == "base" and mount is not None else scans
+    emap = new_map(load_config(config, resolution, size), device, options)
+    prefix, run = output_prefix(out), MappingRun(emap)
+    return finish(run, len(scans), prefix, fuse_all(run, scans, options), options)
+
+
+def load_config(path: Path | None, resolution: float | None, size: float | None) -> ElevationMapConfig:
+    """Settings of the YAML at `path`, with the command line's resolution and size [m] over them."""
+    from torchelev.config import ElevationMapConfig
+
+    values = {} if path is None else _read_yaml(path)
+    grid = values.get("grid") or {}
+    if not isinstance(grid, dict):
+        raise ValueError(f"{path}: config.grid must be a mapping; see ElevationMapConfig")
+    try:
+        return ElevationMapConfig.from_dict({**values, "grid": _grid(grid, resolution, size)})
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path or 'command line'}: {error}") from error
+
+
+def _grid(grid: dict, resolution: float | None, size: float | None) -> dict:
+    """The grid's settings, lengths rounded up to whole cells where they are not the config's own."""
+    cell = resolution if resolution is not None else grid.get("resolution", RESOLUTION)
+    lengths = {name: grid.get(name, SIZE) if size is None else size for name in ("length_x", "length_y")}
+    numbers = all(isinstance(v, int | float) and math.isfinite(v) and v > 0 for v in (cell, *lengths.values()))
+    if not numbers:
+        raise ValueError(f"resolution and size must be positive metres, got {cell} and {[*lengths.values()]}")
+    whole = {name: cell * math.ceil(length / cell - 1e-6) for name, length in lengths.items()}
+    own = {} if resolution is not None or size is not None else grid
+    return {**grid, "resolution": cell, **whole, **own}
+
+
+def _read_yaml(path: Path) -> dict:
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """YAML 1.1 takes 1e-4 for text, for want of a point."""
+
+    number = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
+    try:
+        values = yaml.load(path.read_text(encoding="utf-8"), Loader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: cannot be read as YAML ({error})") from error
+    if not isinstance(values, dict | None):
+        raise ValueError(f"{path}: expected settings by stage, such as 'grid: {{resolution: 0.1}}'")
+    return values or {}
+
+
+def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> ElevationMap:
+    """One map on `device`. What needs the robot's own height is off where only the sensor's is known."""
+    import torch
+
+    from torchelev.elevation_map import ElevationMap
+
+    if not options.knows_base:
+        config = replace(config, overlap=None, sensor=replace(config.sensor, body=None))
+    try:
+        torch.empty(1, device=device)
+        return ElevationMap(config, num_envs=1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"--device {device}: {reason}") from error
+
+
+def output_prefix(out: str) -> Path:
+    """PREFIX as given, or `map` in a folder; its folder exists afterwards, before hours of mapping."""
+    path = Path(out)
+    prefix = path / "map" if path.is_dir() or out.endswith(("/", "\\")) else path
+    prefix.parent.mkdir(parents=True, exist_ok=True)
+    return prefix
+
+
+def fuse_all(run: MappingRun, scans: Recording, options: MapOptions) -> BaseException | None:
+    """Fuse scan after scan; return what stopped it before the end, a Ctrl-C or a file that cannot be read."""
+    bases = base_poses(scans.T_map_sensor, options.T_base_sensor, options.sensor_height)
+    try:
+        if options.fixed:
+            sensors = scans.T_map_sensor[:, :3, 3]
+            run.center_on((sensors.min(axis=0) + sensors.max(axis=0)) / 2)
+        for k, frame in enumerate(_progress(scans)):
+            run.add(frame, None if options.fixed else bases[k])
+    except (KeyboardInterrupt, RecordingError) as reason:
+        return reason
+    return None
+
+
+def _progress(scans: Recording) -> Iterator:
+    """A progress bar on a terminal; nothing where stderr is a file, so that it holds errors only."""
+    from tqdm import tqdm
+
+    yield from tqdm(scans, desc="mapping", unit="scan", disable=None, leave=False)
+
+
+def finish(run: MappingRun, total: int, prefix: Path, stopped: BaseException | None, options: MapOptions) -> int:
+    """Write and report what there is; return the exit code."""
+    kept = f"kept the map of {run.num_scans} of {total} scans" if run.num_scans else "nothing was mapped yet"
+    if run.num_scans:
+        files = write_outputs(run, prefix)
+        click.echo("\n".join(summary(run, total) + hints(run, options.fixed, options.knows_base)))
+        click.echo("wrote     " + "  ".join(map(str, files)))
+    if isinstance(stopped, KeyboardInterrupt):
+        click.echo(f"interrupted: {kept}", err=True)
+        return INTERRUPTED
+    if stopped is not None:
+        raise OneLineError(f"{stopped}; {kept}")
+    for line in warnings(run):
+        click.echo(f"warning: {line}", err=True)
+    return 0
+
+
+def write_outputs(run: MappingRun, prefix: Path) -> list[Path]:
+    """Write the map's `.npz`, `.png` and `.ply`; return their paths."""
+    from torchelev import export
+    from torchelev.io.report import map_panels
+    from torchelev.plot import save_layers
+
+    npz, png, ply = (prefix.with_name(prefix.name + suffix) for suffix in (".npz", ".png", ".ply"))
+    export.save_npz(npz, run.emap)
+    saved = export.take(run.emap)
+    path_xy = np.array(run.sensor_xy)
+    save_layers(png, map_panels(saved.layers), extent=saved.extent, path_xy=path_xy, title=prefix.name)
+    export.save_mesh(ply, run.emap)
+    return [npz, png, ply]

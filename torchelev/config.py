@@ -1,0 +1,83 @@
+"""The whole configuration: one frozen dataclass per stage, each defined beside its stage."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any
+
+from torchelev.aging import AgingConfig
+from torchelev.drift import DriftConfig
+from torchelev.errors import require
+from torchelev.fusion import FusionConfig
+from torchelev.grid import GridConfig
+from torchelev.overlap import OverlapConfig
+from torchelev.raycast import RaycastConfig
+from torchelev.sensor import SensorConfig
+from torchelev.surface import SurfaceConfig
+from torchelev.traversability import TraversabilityConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ElevationMapConfig:
+    """All stages; None switches drift, raycast, overlap or traversability off (and `fusion.edges`)."""
+
+    grid: GridConfig = field(default_factory=GridConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    aging: AgingConfig = field(default_factory=AgingConfig)
+    drift: DriftConfig | None = field(default_factory=DriftConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    raycast: RaycastConfig | None = field(default_factory=RaycastConfig)
+    overlap: OverlapConfig | None = field(default_factory=OverlapConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    traversability: TraversabilityConfig | None = field(default_factory=TraversabilityConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return nested plain dicts, as written to YAML and to `state_dict`."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> ElevationMapConfig:
+        """Build a config from nested dicts; what is left out keeps its default.
+
+        Raises ValueError for an unknown key, naming it and what exists.
+        """
+        return _build(cls, values, "config")
+
+
+def _build(cls: type, values: object, where: str) -> Any:
+    require(isinstance(values, dict), where, "must be a mapping", type(values).__name__, "see ElevationMapConfig")
+    assert isinstance(values, dict)
+    hints = typing.get_type_hints(cls)
+    for name in values:
+        require(name in hints, f"{where}.{name}", "is not a setting", repr(name), f"there are {', '.join(hints)}")
+    return cls(**{name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()})
+
+
+def _value(hint: Any, value: object, where: str) -> Any:
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if value is None:
+        require(type(None) in options, where, "cannot be switched off", "None", "leave it out to keep its default")
+        return None
+    kind = next(option for option in options if option is not type(None))
+    if dataclasses.is_dataclass(kind):
+        return _build(typing.cast(type, kind), value, where)
+    if isinstance(value, list):
+        return tuple(value)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    require(number or kind is not float, where, "must be a number", repr(value), "give a number without quotes")
+    return float(value) if kind is float else value  # type: ignore[arg-type]
+
+
+def differing_fields(a: dict[str, Any], b: dict[str, Any], where: str = "") -> list[str]:
+    """List the dotted names of the settings in which two configs' dicts differ."""
+    names = []
+    for key in sorted(a.keys() | b.keys()):
+        left, right = a.get(key), b.get(key)
+        if isinstance(left, dict) and isinstance(right, dict):
+            names += differing_fields(left, right, f"{where}{key}.")
+        elif left != right:
+            names.append(f"{where}{key}")
+    return names

@@ -1,0 +1,54 @@
+"""Height drift: the estimated sensor height wanders, so the map is moved to meet the newest scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from torchelev.errors import require
+from torchelev.grid import GridConfig, lattice_offset, locate, pad_cells
+from torchelev.state import MapState, Measurement, count, tally
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriftConfig:
+    """Which points measure the drift, and how much of it is corrected."""
+
+    min_traversability: float = 0.5  # flat enough for a height error to mean drift
+    max_variance: float = 0.01  # [m^2] certain enough cells
+    max_error: float = 0.1  # [m] larger errors of single points are obstacles
+    min_points: int = 50
+    max_drift: float = 0.1  # [m] a larger mean error is not corrected
+    gain: float = 1.0  # the paper adds the whole mean error
+
+    def __post_init__(self) -> None:
+        require(0 < self.gain <= 1, "drift.gain", "must lie in (0, 1]", self.gain, "the paper's value is 1")
+        require(self.min_points >= 1, "drift.min_points", "must be at least 1", self.min_points, "give 50")
+
+
+def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig) -> MapState:
+    """Add the mean height error over certain, flat cells to elevation and upper bound (paper, Sec. II-D).
+
+    e = (1 / n) * sum (p_z - h) over points whose cell is known, traversable and certain, |p_z - h| <= max_error.
+    Corrected by gain * e where n >= min_points and |e| <= max_drift.
+    """
+    xy = m.points[..., :2]
+    cells = locate(xy, m.used, lattice_offset(state, m, grid), grid)
+    suits = state.validity & (state.traversability >= cfg.min_traversability) & (state.variance <= cfg.max_variance)
+    # On a slope the height within a cell depends on where in the cell the point lies.
+    from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
+    gradient = torch.stack([cells.take(pad_cells(g)) for g in (state.gradient_x, state.gradient_y)], -1)
+    ground = cells.take(pad_cells(state.elevation)) + (from_center * gradient.detach()).sum(-1)
+    error = m.points[..., 2] - ground
+    counts = cells.take(pad_cells(suits)) & (error.abs() <= cfg.max_error)
+    number = count(counts)
+    mean = torch.where(counts, error, 0.0).sum(1) / number.clamp(min=1)
+    applies = (number >= cfg.min_points) & (mean.abs() <= cfg.max_drift)
+    correction = torch.where(applies, cfg.gain * mean, 0.0)
+    shift = correction[:, None, None]
+    state = state._replace(
+        elevation=torch.where(state.validity, state.elevation + shift, state.elevation),
+        upper_bound=torch.where(state.bounded, state.upper_bound + shift, state.upper_bound),
+    )
+    return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

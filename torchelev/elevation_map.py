@@ -1,0 +1,330 @@
+"""The map: state and configuration, and the order of the stages."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from torchelev import checks
+from torchelev.aging import age
+from torchelev.config import ElevationMapConfig, differing_fields
+from torchelev.drift import compensate
+from torchelev.errors import require
+from torchelev.fusion import fuse
+from torchelev.grid import cell_centers, recenter
+from torchelev.initialize import METHODS, interpolate
+from torchelev.layers import LAYERS, Layer, sample_layer
+from torchelev.overlap import clear_other_floors
+from torchelev.raycast import clear_seen_through
+from torchelev.sensor import measure
+from torchelev.state import MapState, Measurement, Statistics, blank_state
+from torchelev.surface import normals
+from torchelev.traversability import traversability
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+
+def fuse_measurement(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+    """Run the stages in order (paper, Fig. 2). Pure: touches nothing but its arguments' values."""
+    grid = cfg.grid
+    state = recenter(state, m, grid)
+    state = age(state, m, cfg.aging)
+    if cfg.drift is not None:
+        state = compensate(state, m, grid, cfg.drift)
+    state = fuse(state, m, grid, cfg.fusion)
+    if cfg.raycast is not None:
+        state = clear_seen_through(state, m, grid, cfg.raycast)
+    if cfg.overlap is not None:
+        state = clear_other_floors(state, m, grid, cfg.overlap)
+    state = normals(state, grid, cfg.surface)
+    if cfg.traversability is not None:
+        state = traversability(state, grid, cfg.traversability)
+    return count_rejected(state, m)
+
+
+def count_rejected(state: MapState, m: Measurement) -> MapState:
+    """Carry the counts of the sensor's gates over to the statistics."""
+    gates = ("rejected_invalid", "rejected_range", "rejected_body", "rejected_overhang")
+    counts = {name: getattr(m, name) for name in gates}
+    return state._replace(statistics=state.statistics._replace(**counts))
+
+
+def _update(
+    state: MapState,
+    points: Tensor,
+    T_map_sensor: Tensor,
+    T_map_base: Tensor | None,
+    dt: Tensor,
+    variance: Tensor | None,
+    cfg: ElevationMapConfig,
+) -> MapState:
+    m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, state.elevation.dtype)
+    return fuse_measurement(state, m, cfg)
+
+
+@functools.cache
+def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
+    """Return the compiled update of a config; equal configs share one graph."""
+    return torch.compile(functools.partial(_update, cfg=cfg), fullgraph=True)
+
+
+def padded_size(num_points: int) -> int:
+    """Round a number of points up to one of a few sizes (at most 25 % more), so that new lengths do not recompile."""
+    if num_points <= 64:
+        return 64
+    step = 1 << ((num_points - 1).bit_length() - 3)
+    return -(-num_points // step) * step
+
+
+def pad_points(points: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Pad clouds with NaN, which every stage ignores, to a size that recurs."""
+    extra = padded_size(points.shape[2]) - points.shape[2]
+    points = nn.functional.pad(points, (0, 0, 0, extra), value=torch.nan)
+    return points, None if variance is None else nn.functional.pad(variance, (0, extra), value=torch.nan)
+
+
+class ElevationMap(nn.Module):
+    """B robot-centric elevation maps on one device.
+
+    Args:
+        cfg: the configuration, of every stage.
+        num_envs: B, how many maps.
+        device: where they live; `.to()` moves them.
+        check_values: also check pose matrices, tensor `dt` and ids on devices other than the CPU, which makes the host
+            wait for the device.
+
+    Raises ValueError or TypeError for bad arguments, naming the argument, the rule, what came and the mend.
+    """
+
+    corner: Tensor
+    base_height: Tensor
+    elevation: Tensor
+
+    def __init__(
+        self,
+        cfg: ElevationMapConfig | None = None,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        check_values: bool = False,
+    ) -> None:
+        super().__init__()
+        cfg = ElevationMapConfig() if cfg is None else cfg
+        config = isinstance(cfg, ElevationMapConfig)
+        require(config, "cfg", "must be an ElevationMapConfig", type(cfg).__name__, "wrap grid=GridConfig(...)", TypeError)
+        whole = isinstance(num_envs, int) and num_envs >= 1
+        require(whole, "num_envs", "must be a positive int", repr(num_envs), "give the number of maps")
+        self.cfg, self.num_envs, self.check_values = cfg, num_envs, check_values
+        self._compiled = False
+        state = blank_state(cfg.grid, num_envs, device, torch.float32)
+        for name, value in state._asdict().items():
+            if name != "statistics":
+                self.register_buffer(name, value)
+        for name, value in state.statistics._asdict().items():
+            self.register_buffer(f"last_{name}", value, persistent=False)
+
+    # The state ------------------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> torch.device:
+        """The device that holds the maps."""
+        return self.elevation.device
+
+    @property
+    def state(self) -> MapState:
+        """The maps' buffers as one value. They change with the next update; clone what you keep."""
+        layers = {name: getattr(self, name) for name in MapState._fields[:-1]}
+        return MapState(**layers, statistics=self.statistics)
+
+    @property
+    def statistics(self) -> Statistics:
+        """What the last update did, as (B,) tensors."""
+        return Statistics(*(getattr(self, f"last_{name}") for name in Statistics._fields))
+
+    def _store(self, state: MapState) -> None:
+        # Copied, not rebound: see the rules on deepcopy and inference mode in CONTRIBUTING.md.
+        with torch.no_grad():
+            for name in MapState._fields[:-1]:
+                getattr(self, name).copy_(getattr(state, name))
+            for name in Statistics._fields:
+                getattr(self, f"last_{name}").copy_(getattr(state.statistics, name))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the config as plain dicts, for `state_dict`."""
+        return {"config": self.cfg.to_dict()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another config, naming the settings that differ."""
+        fields = differing_fields(self.cfg.to_dict(), state["config"])
+        mend = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
+        require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", mend)
+
+    # Writing --------------------------------------------------------------------------------------------------------
+
+    def update(
+        self,
+        points: Float[Tensor, "B *S N 3"],
+        T_map_sensor: Float[Tensor, "B *S 4 4"],
+        T_map_base: Float[Tensor, "B 4 4"] | None = None,
+        dt: float | Float[Tensor, "B"] = 0.0,
+        *,
+        variance: Float[Tensor, "B *S N"] | None = None,
+    ) -> None:
+        """Fuse one cloud per environment into its map.
+
+        Args:
+            points: sensor-frame points [m]; NaN or inf points are ignored, so pad ragged clouds with NaN.
+            T_map_sensor: takes sensor-frame points into the map frame; float64 far from the origin.
+            T_map_base: the robot; the window follows it. None: the window stays, overlap and body box are skipped.
+            dt: time since that environment's last update [s]; 0 for a further sensor of the same instant.
+            variance: of each point's height [m^2], in place of the noise model.
+
+        Raises ValueError or TypeError before anything changed.
+        """
+        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
+        run = compiled_update(self.cfg) if self._compiled else functools.partial(_update, cfg=self.cfg)
+        if self._compiled:
+            inputs = (*pad_points(inputs[0], inputs[4]), *inputs[1:4])
+            inputs = (inputs[0], *inputs[2:], inputs[1])
+        with torch.no_grad():
+            self._store(run(self.state, *inputs))
+
+    def measure(
+        self,
+        points: Float[Tensor, "B *S N 3"],
+        T_map_sensor: Float[Tensor, "B *S 4 4"],
+        T_map_base: Float[Tensor, "B 4 4"] | None = None,
+        dt: float | Float[Tensor, "B"] = 0.0,
+        *,
+        variance: Float[Tensor, "B *S N"] | None = None,
+    ) -> Measurement:
+        """Turn points into a measurement; with `forward` this is the differentiable core of `update`."""
+        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
+        return measure(*inputs, self.cfg.grid, self.cfg.sensor, self.elevation.dtype)
+
+    def forward(self, state: MapState, measurement: Measurement) -> MapState:
+        """Fuse a measurement into a state and return the new one; touches no buffer (paper, Fig. 2)."""
+        return fuse_measurement(state, measurement, self.cfg)
+
+    def _check_inputs(self, points: Any, T_map_sensor: Any, T_map_base: Any, dt: Any, variance: Any) -> tuple:
+        B, device, always = self.num_envs, self.device, self.check_values
+        cloud = checks.check_points(points, B, device)
+        S = cloud.shape[1]
+        shape = (B, S, 4, 4) if points.ndim == 4 else (B, 4, 4)
+        T_map_sensor = checks.check_pose("T_map_sensor", T_map_sensor, shape, device, always).view(B, S, 4, 4)
+        if T_map_base is not None:
+            T_map_base = checks.check_pose("T_map_base", T_map_base, (B, 4, 4), device, always)
+        dt = checks.check_dt(dt, B, device, self.elevation.dtype, always)
+        if variance is not None:
+            variance = checks.check_tensor("variance", variance, device, checks.FLOATS)
+            fits = variance.shape == points.shape[:-1]
+            require(fits, "variance", f"expected {tuple(points.shape[:-1])}", tuple(variance.shape), "one per point")
+            variance = variance.view(cloud.shape[:-1])
+        return cloud, T_map_sensor, T_map_base, dt, variance
+
+    def compile(self, *args: Any, **kwargs: Any) -> None:
+        """Make `update` run compiled. Maps of equal configs share one graph; the first update pays for it."""
+        self._compiled = True
+
+    def reset(self, env_ids: Int[Tensor, "K"] | None = None, *, mask: Bool[Tensor, "B"] | None = None) -> None:
+        """Forget everything in some environments: all, those of `env_ids`, or those of `mask` (no host sync)."""
+        require(env_ids is None or mask is None, "env_ids, mask", "exclude each other", "both", "give one of them")
+        if mask is None:
+            mask = torch.full((self.num_envs,), env_ids is None, device=self.device, dtype=torch.bool)
+            if env_ids is not None:
+                ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
+                mask = mask.index_fill(0, ids, True)
+        mask = checks.check_tensor("mask", mask, self.device, (torch.bool,))
+        fits = tuple(mask.shape) == (self.num_envs,)
+        require(fits, "mask", f"expected ({self.num_envs},)", tuple(mask.shape), "give one bool per environment")
+        blank = blank_state(self.cfg.grid, 1, self.device, self.elevation.dtype)
+        self._store(_choose(mask, blank, self.state))
+
+    def initialize(self, feet: Float[Tensor, "B K 3"], method: str = "linear") -> None:
+        """Found the unknown cells on ground points such as the feet, map frame [m].
+
+        "linear": inside the feet's convex hull; "nearest": the whole window. The variance is the maximum, so that
+        the first measurement wins. Raises ValueError for another method or shape.
+        """
+        feet = checks.check_tensor("feet", feet, self.device, checks.FLOATS)
+        fits = feet.ndim == 3 and feet.shape[0] == self.num_envs and feet.shape[1] >= 1 and feet.shape[2] == 3
+        require(fits, "feet", f"expected ({self.num_envs}, K, 3) with K >= 1", tuple(feet.shape), "give ground points")
+        require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
+        if checks.readable(feet, self.check_values):
+            require(bool(torch.isfinite(feet).all()), "feet", "must be finite", "NaN or inf", "leave those feet out")
+        state, dtype = self.state, self.elevation.dtype
+        center = self.center[:, None]
+        xy = (self.cell_centers().flatten(1, 2) - center[..., :2]).to(dtype)
+        near = torch.cat([feet[..., :2].double() - center[..., :2], feet[..., 2:].double()], -1).to(dtype)
+        height, inside = interpolate(xy, near, method, self.cfg.grid.resolution)
+        found = inside.view_as(state.validity) & ~state.validity
+        elevation = torch.where(found, height.view_as(state.elevation), state.elevation)
+        variance = torch.where(found, self.cfg.aging.max_variance, state.variance)
+        state = state._replace(elevation=elevation, variance=variance, validity=state.validity | found)
+        state = state._replace(time=torch.where(found, 0.0, state.time), support=torch.where(found, 0.0, state.support))
+        state = normals(state, self.cfg.grid, self.cfg.surface)
+        if self.cfg.traversability is not None:
+            state = traversability(state, self.cfg.grid, self.cfg.traversability)
+        self._store(state)
+
+    # Reading --------------------------------------------------------------------------------------------------------
+
+    @property
+    def center(self) -> Float[Tensor, "B 3"]:
+        """The windows' centres [m], map frame, float64; z is the base's last height."""
+        size = torch.stack([self.corner.new_full((), n) for n in (self.cfg.grid.height, self.cfg.grid.width)])
+        xy = (self.corner.double() + size.double() / 2) * self.cfg.grid.resolution
+        return torch.cat([xy, self.base_height.double()[:, None]], -1)
+
+    def cell_centers(self) -> Float[Tensor, "B H W 2"]:
+        """Return the cell centres [m], map frame, float64."""
+        return cell_centers(self.corner, self.cfg.grid)
+
+    def layer(self, name: str, *, state: MapState | None = None) -> Float[Tensor, "B H W"]:
+        """Return a fresh tensor of one layer, NaN where unknown. Raises KeyError for an unknown name."""
+        values, known = self._read(name, state)
+        return torch.where(known, values, torch.nan)
+
+    def _read(self, name: str, state: MapState | None) -> Layer:
+        mend = f"there are {', '.join(LAYERS)}"
+        require(name in LAYERS, "layer", "must be a layer's name", repr(name), mend, KeyError)
+        return LAYERS[name](self.state if state is None else state)
+
+    def sample(
+        self,
+        xy: Float[Tensor, "B M 2"],
+        layer: str = "elevation",
+        mode: str = "bilinear",
+        *,
+        state: MapState | None = None,
+    ) -> tuple[Float[Tensor, "B M"], Bool[Tensor, "B M"]]:
+        """Read a layer at points (B, M, 2) [m], map frame. Returns values (B, M), 0 where not valid, and valid (B, M).
+
+        "bilinear" renormalises over known neighbours and is valid when their weight is at least one half; "nearest"
+        reads the cell that holds the point. Differentiable in the state and, if bilinear, in `xy`.
+
+        Raises KeyError for an unknown layer, ValueError for another mode or shape.
+        """
+        xy = checks.check_tensor("xy", xy, self.device, checks.FLOATS)
+        fits = xy.ndim == 3 and xy.shape[0] == self.num_envs and xy.shape[2] == 2
+        require(fits, "xy", f"expected ({self.num_envs}, M, 2)", tuple(xy.shape), "give points for each environment")
+        good = mode in ("bilinear", "nearest")
+        require(good, "mode", 'must be "bilinear" or "nearest"', repr(mode), "use bilinear")
+        state = self.state if state is None else state
+        uv = (xy.double() / self.cfg.grid.resolution - state.corner[:, None]).to(self.elevation.dtype)
+        return sample_layer(self._read(layer, state), uv, self.cfg.grid, mode)
+
+
+def _choose(mask: Tensor, new: MapState, old: MapState) -> MapState:
+    """Take `new` in the environments of the mask, `old` elsewhere."""
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(mask.view(-1, *[1] * (b.ndim - 1)), a, b)
+
+    statistics = Statistics(*map(pick, new.statistics, old.statistics))
+    layers = {name: pick(getattr(new, name), getattr(old, name)) for name in MapState._fields[:-1]}
+    return MapState(**layers, statistics=statistics)

@@ -1,0 +1,35 @@
+"""Poses are 4 x 4 matrices everywhere; this makes them from what simulators give."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+def transform(position: Float[Tensor, "B 3"], quat_wxyz: Float[Tensor, "B 4"]) -> Float[Tensor, "B 4 4"]:
+    """Return T_a_b (..., 4, 4) of a frame b at `position` [m], turned by the unit quaternion (w, x, y, z).
+
+    Raises ValueError for shapes that do not fit and, for CPU tensors, for a quaternion that is not normalised.
+    """
+    came = f"{tuple(position.shape)} and {tuple(quat_wxyz.shape)}"
+    fits = position.shape[-1:] == (3,) and quat_wxyz.shape == (*position.shape[:-1], 4)
+    require(fits, "position, quat_wxyz", "must be (..., 3) and (..., 4)", came, "give one quaternion per position")
+    if type(quat_wxyz) is Tensor and quat_wxyz.device.type == "cpu" and not torch.compiler.is_compiling():
+        norm = torch.linalg.vector_norm(quat_wxyz.double(), dim=-1)
+        worst = float((norm - 1).abs().max()) if norm.numel() else 0.0
+        require(worst < 1e-3, "quat_wxyz", "must have norm 1", f"a norm off by {worst:.3g}", "divide it by its norm")
+    w, x, y, z = quat_wxyz.unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), position[..., 0]],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), position[..., 1]],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), position[..., 2]],
+        [torch.zeros_like(w), torch.zeros_like(w), torch.zeros_like(w), torch.ones_like(w)],
+    ]
+    return torch.stack([torch.stack(torch.broadcast_tensors(*row), -1) for row in rows], -2)

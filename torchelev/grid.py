@@ -1,0 +1,138 @@
+"""Where cells are: the lattice, the window on it, and moving that window with the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.state import BLANK, MapState, Measurement
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridConfig:
+    """Size of the window and of its cells."""
+
+    resolution: float = 0.04  # [m]
+    length_x: float = 10.0  # [m]
+    length_y: float = 10.0  # [m]
+
+    def __post_init__(self) -> None:
+        require(self.resolution > 0, "grid.resolution", "must be positive", self.resolution, "give metres per cell")
+        for name in ("length_x", "length_y"):
+            cells = getattr(self, name) / self.resolution
+            whole = round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * max(1.0, cells)
+            mend = f"try {max(1, round(cells)) * self.resolution:.6g}"
+            require(whole, f"grid.{name}", "must be a whole number of cells", f"{cells:.6g} cells", mend)
+
+    @property
+    def height(self) -> int:
+        """Cells along x (H)."""
+        return round(self.length_x / self.resolution)
+
+    @property
+    def width(self) -> int:
+        """Cells along y (W)."""
+        return round(self.length_y / self.resolution)
+
+    @property
+    def num_cells(self) -> int:
+        """H * W."""
+        return self.height * self.width
+
+
+class PointCells(NamedTuple):
+    """Which cell each point falls into. Points outside go to an overflow slot that is dropped, so shapes stay fixed."""
+
+    index: Int[Tensor, "B M"]
+    num_cells: int
+
+    def sum(self, values: Float[Tensor, "B M"]) -> Float[Tensor, "B C+1"]:
+        """Sum the points' values per cell, overflow slot last."""
+        zeros = values.new_zeros(values.shape[0], self.num_cells + 1)
+        return zeros.scatter_add(1, self.index, values)
+
+    def take(self, cells: Tensor) -> Tensor:
+        """Give each point its cell's value: (B, C+1) -> (B, M)."""
+        return cells.gather(1, self.index)
+
+
+def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[Tensor, "B 2"]:
+    """Return where the measurement's horizontal origin lies, seen from the window's corner [m]."""
+    # A cell number fits float32 exactly only as a difference of near ones; far ones are clamped, they are outside.
+    cells = (m.anchor - state.corner).clamp(-(2**22), 2**22)
+    return cells.to(m.points.dtype) * grid.resolution
+
+
+def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[Tensor, Tensor]:
+    """Return x (B, H, 1) and y (B, 1, W) of the cell centres [m], counted from the measurement's horizontal origin."""
+    cells = (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
+    x = torch.arange(grid.height, device=cells.device) + cells[:, 0, None]
+    y = torch.arange(grid.width, device=cells.device) + cells[:, 1, None]
+    return x[:, :, None] * grid.resolution, y[:, None, :] * grid.resolution
+
+
+def locate(xy: Float[Tensor, "B M 2"], used: Bool[Tensor, "B M"], offset: Tensor, grid: GridConfig) -> PointCells:
+    """Find the cell of each point; `xy` counts from a lattice corner that lies at `offset` in the window."""
+    # Divide before adding whole cells: the result is then the same wherever the window is.
+    cell = torch.floor(xy / grid.resolution) + torch.round(offset / grid.resolution)[:, None]
+    i, j = cell.unbind(-1)
+    inside = used & (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
+    flat = torch.where(inside, i * grid.width + j, grid.num_cells)
+    return PointCells(flat.to(torch.int64), grid.num_cells)
+
+
+def pad_cells(layer: Tensor) -> Tensor:
+    """Flatten a layer and append the overflow slot: (B, H, W) -> (B, H*W + 1)."""
+    flat = layer.flatten(1)
+    return torch.cat([flat, flat.new_zeros(flat.shape[0], 1)], 1)
+
+
+def window_corner(base: Float[Tensor, "B 2"], anchor: Int[Tensor, "B 2"], grid: GridConfig) -> Int[Tensor, "B 2"]:
+    """Return the corner of the window that is centred on `base` to within half a cell."""
+    half = torch.stack([base.new_full((), size / 2) for size in (grid.height, grid.width)])
+    return anchor + torch.floor(base / grid.resolution - half + 0.5).to(torch.int64)
+
+
+def shift_layer(layer: Tensor, index: Tensor, entering: Tensor, blank: float) -> Tensor:
+    """Move a layer's content by gathering; cells that enter the window get the blank value."""
+    moved = layer.flatten(1).gather(1, index).view_as(layer)
+    return torch.where(entering, torch.full_like(moved, blank), moved)
+
+
+def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
+    """Move the window by whole cells so that it follows the robot (paper, Sec. II: a robot-centric map).
+
+    World-fixed cells keep their value to the bit, entering cells are blank. Environments move independently.
+    Without a base pose the window stays.
+    """
+    if m.base is None:
+        return state
+    corner = window_corner(m.base[:, :2], m.anchor, grid)
+    # A shift of a whole window blanks everything; the clamp keeps the index arithmetic small.
+    shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
+    device = state.corner.device
+    i = torch.arange(grid.height, device=device)[None, :, None] + shift[:, 0, None, None]
+    j = torch.arange(grid.width, device=device)[None, None, :] + shift[:, 1, None, None]
+    entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
+    index = (i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)).flatten(1)
+    layers = {
+        name: shift_layer(getattr(state, name), index, entering, BLANK.get(name, 0.0))
+        for name in MapState._fields[2:-1]
+    }
+    return state._replace(corner=corner, base_height=m.base[:, 2], **layers)
+
+
+def cell_centers(corner: Int[Tensor, "B 2"], grid: GridConfig) -> Float[Tensor, "B H W 2"]:
+    """Return the cell centres [m], map frame, float64: (k + 0.5) * resolution for cell number k."""
+    x = torch.arange(grid.height, device=corner.device) + corner[:, 0, None]
+    y = torch.arange(grid.width, device=corner.device) + corner[:, 1, None]
+    x, y = ((k.double() + 0.5) * grid.resolution for k in (x, y))
+    shape = (corner.shape[0], grid.height, grid.width)
+    return torch.stack([x[:, :, None].expand(shape), y[:, None, :].expand(shape)], -1)

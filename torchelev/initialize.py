@@ -1,0 +1,50 @@
+"""A first guess of the ground from the feet that stand on it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+METHODS = ("linear", "nearest")
+
+
+def interpolate(xy: Float[Tensor, "B C 2"], feet: Float[Tensor, "B K 3"], method: str, cell: float) -> tuple:
+    """Return heights (B, C) [m] at `xy` from ground points, and where they hold.
+
+    "nearest": the height of the nearest foot, everywhere. "linear": inside the feet's convex hull, widened by a cell of
+    size `cell` [m]: the least-squares plane of the feet plus its errors weighted by inverse squared distance, so that
+    feet on a plane give that plane and every foot its own height.
+    """
+    difference = xy[:, :, None] - feet[:, None, :, :2]
+    distance = difference.square().sum(-1)
+    if method == "nearest":
+        height = feet[..., 2].gather(1, distance.argmin(-1))
+        return height, torch.ones_like(height, dtype=torch.bool)
+    plane, level = _plane(feet)
+    mean = feet.mean(1, keepdim=True)
+    at_feet = level + ((feet - mean)[..., :2] * plane[:, None]).sum(-1)
+    weight = 1.0 / distance.clamp(min=1e-8)
+    error = (weight * (feet[..., 2] - at_feet)[:, None]).sum(-1) / weight.sum(-1)
+    height = level + ((xy - mean[..., :2]) * plane[:, None]).sum(-1) + error
+    return height, _inside_hull(xy, feet[..., :2], cell)
+
+
+def _plane(feet: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the gradient (B, 2) and mean height (B, 1); feet on one line give the gradient along it."""
+    centered = feet - feet.mean(1, keepdim=True)
+    gradient = torch.linalg.pinv(centered[..., :2], rtol=1e-4) @ centered[..., 2:]
+    return gradient[..., 0], feet[..., 2].mean(1, keepdim=True)
+
+
+def _inside_hull(xy: Tensor, corners: Tensor, margin: float, directions: int = 64) -> Bool[Tensor, "B C"]:
+    """Tell which points no direction separates from the corners' convex hull."""
+    angle = torch.arange(directions, device=xy.device, dtype=xy.dtype) * (2 * math.pi / directions)
+    direction = torch.stack([angle.cos(), angle.sin()])
+    extent = (corners @ direction).amax(1)
+    return (xy @ direction <= extent[:, None] + margin).all(-1)

@@ -1,0 +1,191 @@
+"""From a sensor's points to a measurement: transform, gates, noise. Depth images and voxel filtering too."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.grid import GridConfig
+from torchelev.state import Measurement, count
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExclusionConfig:
+    """The ramp of the paper's Fig. 3: points above it are overhangs, not ground."""
+
+    slope: float = 0.3  # tan(theta_a)
+    distance: float = 1.0  # [m] b: horizontal distance at which the ramp starts to rise
+    offset: float = 0.2  # [m] c: height above the sensor before b
+    height: float = 1.0  # [m] d: height above the sensor that is never exceeded
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyConfig:
+    """A box in the base frame that holds the robot; points inside are the robot's own."""
+
+    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  # [m]
+    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  # [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorConfig:
+    """Noise model and gates of the points."""
+
+    noise_factor: float = 1e-4  # alpha_d: sigma_p^2 = alpha_d * d^2 + noise_floor; 1 % of the distance
+    noise_floor: float = 2.5e-5  # [m^2] (5 mm)^2
+    min_distance: float = 0.1  # [m]
+    max_distance: float = 50.0  # [m]
+    exclusion: ExclusionConfig | None = ExclusionConfig()
+    body: BodyConfig | None = None
+
+    def __post_init__(self) -> None:
+        require(self.noise_factor >= 0, "sensor.noise_factor", "must not be negative", self.noise_factor, "give 1e-4")
+        require(self.noise_floor > 0, "sensor.noise_floor", "must be positive", self.noise_floor, "give 2.5e-5 m^2")
+        ordered = 0 <= self.min_distance < self.max_distance
+        came = (self.min_distance, self.max_distance)
+        require(ordered, "sensor.min_distance, max_distance", "must be ordered", came, "give 0 <= min < max in metres")
+
+
+def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[Tensor, "B M"]:
+    """Tell which points lie in the exclusion area (paper, Sec. II-C and Fig. 3).
+
+    z - z_s > min(max(r - b, 0) * tan(theta_a) + c, d), with r the horizontal distance from the sensor.
+    `relative` is the point less the sensor's position, in map axes [m].
+    """
+    r = torch.linalg.vector_norm(relative[..., :2], dim=-1)
+    limit = ((r - ramp.distance).clamp(min=0) * ramp.slope + ramp.offset).clamp(max=ramp.height)
+    return relative[..., 2] > limit
+
+
+def inside_body(points: Float[Tensor, "B M 3"], T_map_base: Tensor, base: Tensor, body: BodyConfig) -> Tensor:
+    """Tell which points lie in the robot's body box, which turns with the base."""
+    rotation = T_map_base[:, :3, :3].to(points.dtype)
+    in_base = (points - base[:, None]) @ rotation  # R^T p, written for row vectors
+    inside = torch.ones_like(in_base[..., 0], dtype=torch.bool)
+    for axis in range(3):
+        inside &= (in_base[..., axis] >= body.lower[axis]) & (in_base[..., axis] <= body.upper[axis])
+    return inside
+
+
+def anchor_of(position: Float[Tensor, "B 3"], resolution: float) -> Tensor:
+    """Return the cell number (B, 2) of a position; float64 first, or it is off by cells 100 km from the origin."""
+    return torch.floor(position[:, :2].double() / resolution).to(torch.int64)
+
+
+def relative_to(position: Float[Tensor, "B ... 3"], anchor: Tensor, resolution: float, dtype: torch.dtype) -> Tensor:
+    """Return positions with x and y counted from the anchor cell's corner, in the map's precision."""
+    corner = torch.nn.functional.pad(anchor.double() * resolution, (0, 1))
+    return (position.double() - corner.view(-1, *[1] * (position.ndim - 2), 3)).to(dtype)
+
+
+def measure(
+    points: Float[Tensor, "B S N 3"],
+    T_map_sensor: Float[Tensor, "B S 4 4"],
+    T_map_base: Float[Tensor, "B 4 4"] | None,
+    dt: Float[Tensor, "B"],
+    variance: Float[Tensor, "B S N"] | None,
+    grid: GridConfig,
+    cfg: SensorConfig,
+    dtype: torch.dtype,
+) -> Measurement:
+    """Turn sensor-frame points into a measurement (paper, Sec. II-A "transform" and II-C).
+
+    Noise: sigma_p^2 = alpha_d * d^2 + floor with d the distance from the sensor, or the caller's variances.
+    Gates: not finite, distance, body box, exclusion ramp. An ignored point has used = False.
+    """
+    position = T_map_sensor[..., :3, 3]
+    base_position = None if T_map_base is None else T_map_base[:, :3, 3]
+    anchor = anchor_of(position[:, 0] if base_position is None else base_position, grid.resolution)
+    origin = relative_to(position, anchor, grid.resolution, dtype)
+    base = None if base_position is None else relative_to(base_position, anchor, grid.resolution, dtype)
+
+    points = points.to(dtype)
+    distance = torch.linalg.vector_norm(torch.where(points == 0, 1e-12, points), dim=-1)
+    finite = torch.isfinite(points).all(-1)
+    in_range = finite & (distance >= cfg.min_distance) & (distance <= cfg.max_distance)
+    # Zeroed before any product: 0 * NaN would poison sums and gradients.
+    safe = torch.where(in_range[..., None], points, 0.0)
+    turned = safe @ T_map_sensor[..., :3, :3].to(dtype).transpose(-1, -2)
+    in_map = (turned + origin[:, :, None]).flatten(1, 2)
+    distance = torch.where(in_range, distance, 1.0)
+
+    if variance is None:
+        sigma2 = cfg.noise_factor * distance.square() + cfg.noise_floor
+    else:
+        sigma2 = torch.where(torch.isfinite(variance) & (variance > 0), variance.to(dtype), 1.0)
+    valid = in_range.flatten(1, 2)
+    body = torch.zeros_like(valid)
+    if cfg.body is not None and base is not None and T_map_base is not None:
+        body = valid & inside_body(in_map, T_map_base, base, cfg.body)
+    overhang = torch.zeros_like(valid)
+    if cfg.exclusion is not None:
+        overhang = valid & ~body & above_ramp(turned.flatten(1, 2), cfg.exclusion)
+    return Measurement(
+        anchor=anchor,
+        points=in_map,
+        variance=sigma2.flatten(1, 2),
+        used=valid & ~body & ~overhang,
+        casts=valid & ~body,
+        origin=origin,
+        base=base,
+        dt=dt.to(dtype),
+        rejected_invalid=count(~finite),
+        rejected_range=count(finite & ~in_range),
+        rejected_body=count(body),
+        rejected_overhang=count(overhang),
+    )
+
+
+def depth_to_points(depth: Tensor, intrinsics: Tensor, along: str = "z") -> Tensor:
+    """Turn depth images (..., h, w) [m] into points (..., h*w, 3) [m] of the optical frame: x right, y down, z forward.
+
+    `intrinsics` is (3, 3) or (..., 3, 3) in pixels. Depth is measured along z (pinhole cameras) or along the "ray".
+    Depth that is zero, negative or not finite becomes a NaN point, which the map ignores.
+
+    Raises ValueError for another `along` or shapes that do not fit.
+    """
+    require(along in ("z", "ray"), "along", 'must be "z" or "ray"', repr(along), 'pinhole depth images are "z"')
+    require(depth.ndim >= 2, "depth", "must be (..., h, w)", tuple(depth.shape), "add the image dimensions")
+    fits = intrinsics.shape[-2:] == (3, 3)
+    require(fits, "intrinsics", "must be (..., 3, 3)", tuple(intrinsics.shape), "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    intrinsics = intrinsics.to(depth)
+    v = torch.arange(depth.shape[-2], device=depth.device, dtype=depth.dtype)[:, None]
+    u = torch.arange(depth.shape[-1], device=depth.device, dtype=depth.dtype)
+    fx, fy, cx, cy = (intrinsics[..., i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    x, y = torch.broadcast_tensors((u - cx) / fx, (v - cy) / fy)
+    rays = torch.stack([x, y, torch.ones_like(x)], -1)
+    if along == "ray":
+        rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+    hit = torch.isfinite(depth) & (depth > 0)
+    return (rays * torch.where(hit, depth, math.nan)[..., None]).flatten(-3, -2)
+
+
+def voxel_filter(points: Float[Tensor, "B N 3"], size: float, max_points: int | None = None) -> Float[Tensor, "B K 3"]:
+    """Replace the points of each voxel of edge `size` [m] by their mean, padded with NaN (paper, Table II "filtered").
+
+    Batched and free of host synchronisation: K is `max_points`, by default N. Voxels beyond K are dropped.
+    Raises ValueError for a size that is not positive.
+    """
+    require(size > 0, "size", "must be positive", size, "give the voxel's edge in metres")
+    B, N, _ = points.shape
+    K = N if max_points is None else max_points
+    finite = torch.isfinite(points).all(-1) & (points.abs() < size * 2**20).all(-1)
+    safe = torch.where(finite[..., None], points, 0.0)
+    cell = torch.floor(safe / size).to(torch.int64) + 2**20
+    key = torch.where(finite, (cell[..., 0] << 42) | (cell[..., 1] << 21) | cell[..., 2], torch.iinfo(torch.int64).max)
+    key, order = key.sort(dim=1)
+    is_first = torch.cat([torch.ones_like(key[:, :1], dtype=torch.bool), key[:, 1:] != key[:, :-1]], 1)
+    voxel = torch.where(finite.gather(1, order), is_first.cumsum(1) - 1, K).clamp(max=K)
+    total = points.new_zeros(B, K + 1, 3)
+    total = total.scatter_add(1, voxel[..., None].expand(-1, -1, 3), safe.gather(1, order[..., None].expand(-1, -1, 3)))
+    number = points.new_zeros(B, K + 1).scatter_add(1, voxel, torch.ones_like(points[..., 0]))
+    mean = total / number.clamp(min=1)[..., None]
+    return torch.where((number > 0)[..., None], mean, math.nan)[:, :K]

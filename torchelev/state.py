@@ -1,0 +1,99 @@
+"""The two values that flow through the stages: what the map holds and what one scan says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+    from torchelev.grid import GridConfig
+
+
+class Statistics(NamedTuple):
+    """What the last update did, per environment. Counts are int64 (B,), heights are [m] (B,)."""
+
+    points_used: Int[Tensor, "B"]
+    rejected_invalid: Int[Tensor, "B"]  # NaN or inf
+    rejected_range: Int[Tensor, "B"]  # nearer or farther than the sensor measures
+    rejected_body: Int[Tensor, "B"]  # on the robot itself
+    rejected_overhang: Int[Tensor, "B"]  # above the exclusion ramp
+    rejected_outside: Int[Tensor, "B"]  # not over the window
+    rejected_outlier: Int[Tensor, "B"]  # outside the Mahalanobis gate
+    rejected_edge: Int[Tensor, "B"]  # on the wrong side of a step within their cell
+    drift_points: Int[Tensor, "B"]
+    drift_error: Float[Tensor, "B"]
+    drift_correction: Float[Tensor, "B"]
+    cleared_seen_through: Int[Tensor, "B"]
+    cleared_other_floors: Int[Tensor, "B"]
+    cells_bounded: Int[Tensor, "B"]  # unknown cells that have an upper bound
+
+
+class MapState(NamedTuple):
+    """B robot-centric maps. No NaN: a value counts only where its mask says so."""
+
+    corner: Int[Tensor, "B 2"]  # cell numbers of [..., 0, 0] on the map frame's lattice
+    base_height: Float[Tensor, "B"]  # [m] z of the last T_map_base
+    elevation: Float[Tensor, "B H W"]  # [m] map frame
+    variance: Float[Tensor, "B H W"]  # [m^2]
+    validity: Bool[Tensor, "B H W"]  # elevation is known
+    support: Float[Tensor, "B H W"]  # points that agree, less points that disagree
+    time: Float[Tensor, "B H W"]  # [s] since the last hit
+    upper_bound: Float[Tensor, "B H W"]  # [m] of cells that are not known
+    bounded: Bool[Tensor, "B H W"]  # upper_bound is known
+    gradient_x: Float[Tensor, "B H W"]  # dz/dx
+    gradient_y: Float[Tensor, "B H W"]  # dz/dy
+    traversability: Float[Tensor, "B H W"]  # in [0, 1]
+    statistics: Statistics
+
+
+class Measurement(NamedTuple):
+    """One instant's points of S sensors in the map frame, M = S * N. Made by `sensor.measure`.
+
+    Horizontal coordinates count from `anchor`, so that float32 keeps them exact far from the origin.
+    """
+
+    anchor: Int[Tensor, "B 2"]  # cell number that x = y = 0 below stands for
+    points: Float[Tensor, "B M 3"]  # [m] zero where ignored
+    variance: Float[Tensor, "B M"]  # [m^2] of each height
+    used: Bool[Tensor, "B M"]  # measures the ground
+    casts: Bool[Tensor, "B M"]  # its ray clears and bounds (points rejected as overhang do)
+    origin: Float[Tensor, "B S 3"]  # [m] the sensors
+    base: Float[Tensor, "B 3"] | None  # [m] the robot; None: the window stays
+    dt: Float[Tensor, "B"]  # [s]
+    rejected_invalid: Int[Tensor, "B"]
+    rejected_range: Int[Tensor, "B"]
+    rejected_body: Int[Tensor, "B"]
+    rejected_overhang: Int[Tensor, "B"]
+
+
+# What an unknown cell holds, by layer; everything else is zero.
+BLANK = {"variance": 1.0}
+
+
+def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dtype: torch.dtype) -> MapState:
+    """Return B maps of which nothing is known, centred on the map frame's origin."""
+    layer = torch.zeros(num_envs, grid.height, grid.width, device=device, dtype=dtype)
+    mask = torch.zeros_like(layer, dtype=torch.bool)
+    number = torch.zeros(num_envs, device=device, dtype=dtype)
+    count = torch.zeros(num_envs, device=device, dtype=torch.int64)
+    corner = torch.stack([count - grid.height // 2, count - grid.width // 2], -1)
+    heights = {"drift_error", "drift_correction"}
+    masks = {"validity", "bounded"}
+    layers = MapState._fields[2:-1]
+    values = {name: (mask if name in masks else layer + BLANK.get(name, 0.0)).clone() for name in layers}
+    statistics = Statistics(*(number.clone() if f in heights else count.clone() for f in Statistics._fields))
+    return MapState(corner=corner, base_height=number, statistics=statistics, **values)
+
+
+def tally(state: MapState, **counts: Tensor) -> MapState:
+    """Return the state with these statistics replaced."""
+    return state._replace(statistics=state.statistics._replace(**counts))
+
+
+def count(mask: Tensor) -> Tensor:
+    """Count what is true in each environment: (B, ...) bool -> (B,) int64."""
+    return mask.flatten(1).sum(1)

@@ -1,0 +1,97 @@
+"""Local planes: the slope of the ground at every known cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.grid import GridConfig
+from torchelev.state import MapState
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceConfig:
+    """How far the plane of a normal reaches."""
+
+    radius: int = 1  # [cells] 1: the 3 x 3 neighbours
+
+    def __post_init__(self) -> None:
+        require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
+
+
+class Plane(NamedTuple):
+    """Least-squares plane through the known cells of a window, for every cell."""
+
+    gradient_x: Float[Tensor, "B H W"]
+    gradient_y: Float[Tensor, "B H W"]
+    residual: Float[Tensor, "B H W"]  # [m^2] mean squared distance in z
+
+
+def shifted_sum(layer: Tensor, weights: list[float], dim: int) -> Tensor:
+    """Correlate along one dimension with a short odd kernel, zeros outside."""
+    radius = len(weights) // 2
+    pad = [radius, radius, 0, 0] if dim == -1 else [0, 0, radius, radius]
+    padded = F.pad(layer, pad)
+    terms = [w * padded.narrow(dim, k, layer.shape[dim]) for k, w in enumerate(weights) if w]
+    return torch.stack(terms).sum(0) if len(terms) > 8 else sum(terms[1:], terms[0])
+
+
+def window_moments(values: Tensor, radius: int, order: int) -> dict[tuple[int, int], Tensor]:
+    """Sum u^a v^b * values over a (2 * radius + 1)^2 window, a + b <= order; u, v count cells from the centre."""
+    offsets = [float(k) for k in range(-radius, radius + 1)]
+    along_x = [shifted_sum(values, [u**a for u in offsets], -2) for a in range(order + 1)]
+    return {
+        (a, b): shifted_sum(along_x[a], [v**b for v in offsets], -1)
+        for a in range(order + 1)
+        for b in range(order + 1 - a)
+    }
+
+
+def fit_plane(
+    elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], radius: int, resolution: float
+) -> Plane:
+    """Fit z = c + g_x x + g_y y by least squares to the known cells within `radius` cells of each cell.
+
+    Only known cells enter, so a plane comes out right at the border of the known area. Where they lie on one line, the
+    gradient along the line; a lone cell is level.
+    """
+    known = validity.to(elevation.dtype)
+    number = known.sum((1, 2), keepdim=True).clamp(min=1)
+    # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
+    datum = (torch.where(validity, elevation, 0.0).sum((1, 2), keepdim=True) / number).detach()
+    z = torch.where(validity, elevation - datum, 0.0)
+    n, h = window_moments(known, radius, 2), window_moments(z, radius, 1)
+    square = window_moments(z.square(), radius, 0)[0, 0]
+    total = n[0, 0].clamp(min=1)
+    mu, mv, mz = n[1, 0] / total, n[0, 1] / total, h[0, 0] / total
+    uu, vv, uv = n[2, 0] / total - mu * mu, n[0, 2] / total - mv * mv, n[1, 1] / total - mu * mv
+    uz, vz = h[1, 0] / total - mu * mz, h[0, 1] / total - mv * mz
+    det = uu * vv - uv * uv
+    spread = uu + vv
+    regular = det > 1e-4
+    safe_det = torch.where(regular, det, 1.0)
+    safe_spread = torch.where(spread > 1e-4, spread, 1.0)
+    gu = torch.where(regular, (vv * uz - uv * vz) / safe_det, uz / safe_spread)
+    gv = torch.where(regular, (uu * vz - uv * uz) / safe_det, vz / safe_spread)
+    residual = (square / total - mz * mz - gu * uz - gv * vz).clamp(min=0)
+    return Plane(gu / resolution, gv / resolution, residual)
+
+
+def normals(state: MapState, grid: GridConfig, cfg: SurfaceConfig) -> MapState:
+    """Store the gradient of every known cell, from the plane through its neighbours (paper, Sec. II-A).
+
+    The unit normal n = (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2) is made when it is read.
+    """
+    plane = fit_plane(state.elevation, state.validity, cfg.radius, grid.resolution)
+    return state._replace(
+        gradient_x=torch.where(state.validity, plane.gradient_x, 0.0),
+        gradient_y=torch.where(state.validity, plane.gradient_y, 0.0),
+    )

@@ -1,0 +1,57 @@
+"""Traversability: a head that looks at the map and says where a robot can stand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.grid import GridConfig
+from torchelev.state import MapState
+from torchelev.surface import fit_plane
+
+
+@dataclass(frozen=True, kw_only=True)
+class TraversabilityConfig:
+    """Critical values of the analytic head: at each of them traversability is zero."""
+
+    radius: float = 0.1  # [m] of the window that a foot or wheel needs
+    critical_slope: float = 0.7  # [rad]
+    critical_step: float = 0.2  # [m]
+    critical_roughness: float = 0.05  # [m] standard deviation around the local plane
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "critical_slope", "critical_step", "critical_roughness"):
+            value = getattr(self, name)
+            require(value > 0, f"traversability.{name}", "must be positive", value, "see its default")
+
+
+def height_range(elevation: Tensor, validity: Tensor, radius: int) -> Tensor:
+    """Return the difference between the highest and the lowest known cell of each window [m]."""
+    low, high = torch.where(validity, elevation, torch.inf), torch.where(validity, elevation, -torch.inf)
+    for dim, pad in ((-2, [0, 0, radius, radius]), (-1, [radius, radius, 0, 0])):
+        padded_low, padded_high = F.pad(low, pad, value=torch.inf), F.pad(high, pad, value=-torch.inf)
+        for k in range(2 * radius + 1):
+            low = torch.minimum(low, padded_low.narrow(dim, k, elevation.shape[dim]))
+            high = torch.maximum(high, padded_high.narrow(dim, k, elevation.shape[dim]))
+    return torch.where(validity, high - low, 0.0)
+
+
+def traversability(state: MapState, grid: GridConfig, cfg: TraversabilityConfig) -> MapState:
+    """Rate every known cell by the worst of slope, step and roughness (the seam for a learned head).
+
+    t = 1 - max(slope / critical, step / critical, roughness / critical), not below 0. The step is the height range of
+    the window less what its own plane explains.
+    """
+    radius = max(1, round(cfg.radius / grid.resolution))
+    plane = fit_plane(state.elevation, state.validity, radius, grid.resolution)
+    slope = torch.atan((plane.gradient_x.square() + plane.gradient_y.square()).clamp(min=1e-12).sqrt())
+    explained = 2 * radius * grid.resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())
+    step = (height_range(state.elevation, state.validity, radius) - explained).clamp(min=0)
+    roughness = plane.residual.clamp(min=1e-12).sqrt()
+    worst = torch.maximum(slope / cfg.critical_slope, step / cfg.critical_step)
+    worst = torch.maximum(worst, roughness / cfg.critical_roughness)
+    return state._replace(traversability=torch.where(state.validity, (1 - worst).clamp(min=0), 0.0))
