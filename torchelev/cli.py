@@ -122,24 +122,41 @@ def demo(out: Path) -> None:
 
 
 def run_map(
-    recording: Path, poses: Path | None, intrinsics: Path | None, out: str, resolution: float | None, size: float | None,
-    fixed: bool, device: str, config: Path | None, dt: float | None, sensor_height: float | None,
-    extrinsics: str | None, poses_of: str,
-) -> int:  # fmt: skip
+    recording: Path,
+    poses: Path | None,
+    intrinsics: Path | None,
+    out: str,
+    resolution: float | None,
+    size: float | None,
+    fixed: bool,
+    device: str,
+    config: Path | None,
+    dt: float | None,
+    sensor_height: float | None,
+    extrinsics: str | None,
+    poses_of: str,
+) -> int:
     """Do what `map` says; return the exit code. Raises ValueError for bad input."""
     mount = None if extrinsics is None else read_transform(extrinsics)
-    if poses_of == "base" and mount is None:
-        raise ValueError("--poses-of base: where the sensor sits on the robot is not known; give --extrinsics")
-    if mount is not None and sensor_height is not None:
-        raise ValueError("--sensor-height: --extrinsics says this already; give one of them")
-    if dt is not None and not (math.isfinite(dt) and dt >= 0):
-        raise ValueError(f"--dt: must be a time in seconds of 0 or more, got {dt}")
+    check_options(mount, sensor_height, poses_of, dt)
     options = MapOptions(T_base_sensor=mount, sensor_height=sensor_height, fixed=fixed)
     scans = open_recording(recording, poses, intrinsics, dt)
     scans = scans.moved(mount) if poses_of == "base" and mount is not None else scans
     emap = new_map(load_config(config, resolution, size), device, options)
     prefix, run = output_prefix(out), MappingRun(emap)
     return finish(run, len(scans), prefix, fuse_all(run, scans, options), options)
+
+
+def check_options(mount: NDArray | None, sensor_height: float | None, poses_of: str, dt: float | None) -> None:
+    """Refuse options that contradict each other or are no numbers."""
+    if poses_of == "base" and mount is None:
+        raise ValueError("--poses-of base: where the sensor sits on the robot is not known; give --extrinsics")
+    if mount is not None and sensor_height is not None:
+        raise ValueError("--sensor-height: --extrinsics says this already; give one of them")
+    if sensor_height is not None and not math.isfinite(sensor_height):
+        raise ValueError(f"--sensor-height: must be metres, got {sensor_height}")
+    if dt is not None and not (math.isfinite(dt) and dt >= 0):
+        raise ValueError(f"--dt: must be a time in seconds of 0 or more, got {dt}")
 
 
 def load_config(path: Path | None, resolution: float | None, size: float | None) -> ElevationMapConfig:

@@ -15,6 +15,8 @@ KITTI_COLUMNS, TUM_COLUMNS = 12, 8
 RIGID_TOLERANCE = 0.02
 FORMATS = "12 numbers a line (KITTI: the upper 3x4 of the pose) or 8 (TUM: t x y z qx qy qz qw)"
 
+TRANSFORM = "give 12 numbers (the upper 3x4 of T_base_sensor, row by row) or a file with them"
+
 
 class Poses(NamedTuple):
     """Poses of a sensor in the map frame and, where the file has them, their times."""
@@ -93,6 +95,49 @@ def _rigid(path: Path, numbers: list[int], rotations: NDArray, translations: NDA
     poses = np.tile(np.eye(4), (len(rotations), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = nearest, translations
     return poses
+
+
+def read_transform(text_or_path: str | Path) -> NDArray[np.float64]:
+    """One transform (4, 4): 12 or 16 numbers, given as text or as a file, or YAML with a key `T_base_sensor`.
+
+    Raises RecordingError if that is no rigid transform.
+    """
+    words = _words(str(text_or_path))
+    if words is None:
+        words = _file_words(Path(text_or_path))
+    if len(words) not in (12, 16):
+        raise RecordingError(text_or_path, f"holds {len(words)} numbers", TRANSFORM)
+    matrix = np.array(words[:12]).reshape(3, 4)
+    if np.abs(matrix[:, :3] - nearest_rotation(matrix[:, :3])).max() > RIGID_TOLERANCE:
+        raise RecordingError(text_or_path, "the 3x3 part is no rotation matrix (or a mirrored one)", TRANSFORM)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = nearest_rotation(matrix[:, :3]), matrix[:, 3]
+    return transform
+
+
+def _file_words(path: Path) -> list[float]:
+    import yaml
+
+    if not path.is_file():
+        raise RecordingError(path, "neither numbers nor a file", TRANSFORM)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise RecordingError(path, "is neither text nor YAML", TRANSFORM) from error
+    words = _words(data.get("T_base_sensor") if isinstance(data, dict) else data)
+    if words is None:
+        raise RecordingError(path, "holds no transform", TRANSFORM)
+    return words
+
+
+def _words(data: object) -> list[float] | None:
+    """Finite numbers in text or nested lists, or None if there is anything else."""
+    try:
+        split = data.replace(",", " ").split() if isinstance(data, str) else data
+        words = np.array(split, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return None
+    return words.tolist() if np.isfinite(words).all() else None
 
 
 def nearest_rotation(matrices: NDArray) -> NDArray[np.float64]:

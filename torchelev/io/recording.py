@@ -53,6 +53,10 @@ class Recording(Sequence[Frame]):
         path = self.files[index]
         return Frame(self._read(path), self.T_map_sensor[index], float(self.dt[index]), path.name)
 
+    def moved(self, T_base_sensor: NDArray[np.float64]) -> Recording:
+        """The same scans, for a pose file that has the poses of the robot's base: T_map_base T_base_sensor."""
+        return Recording(self.files, self.T_map_sensor @ T_base_sensor, self.dt, self._read)
+
 
 def open_recording(
     folder: str | Path,

@@ -1,0 +1,287 @@
+"""`python -m torchelev map` from end to end: a small recording in, a map out, and what is said when that fails."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import plyfile
+import pytest
+
+from torchelev.cli import main
+from torchelev.export import load_npz
+from torchelev.io import Recording
+
+NUM_SCANS = 4
+HEIGHT = 1.2  # [m] of the sensor above the ground
+
+
+def sensor_poses():
+    """A sensor that moves along x and turns to the left, (T, 4, 4)."""
+    poses = np.tile(np.eye(4), (NUM_SCANS, 1, 1))
+    for k, angle in enumerate(np.linspace(0, 0.5, NUM_SCANS)):
+        c, s = np.cos(angle), np.sin(angle)
+        poses[k, :3] = [[c, -s, 0, 0.25 * k], [s, c, 0, 0], [0, 0, 1, HEIGHT]]
+    return poses
+
+
+def world_points(seed):
+    """Ground at z = 0 within 4 m, and the top of a box 0.4 m high at x 2 to 3, y 1 to 2, in the map frame."""
+    xy = np.random.default_rng(seed).uniform(-4, 4, (20000, 2))
+    on_box = (np.abs(xy - [2.5, 1.5]) < 0.5).all(axis=1)
+    return np.column_stack([xy, 0.4 * on_box])
+
+
+def write_poses(path, poses):
+    np.savetxt(path, poses[:, :3].reshape(-1, 12))
+
+
+@pytest.fixture
+def recording(tmp_path):
+    folder = tmp_path / "drive"
+    (folder / "scans").mkdir(parents=True)
+    for k, pose in enumerate(sensor_poses()):
+        points = (world_points(k) - pose[:3, 3]) @ pose[:3, :3]
+        np.hstack([points, np.ones((len(points), 1))]).astype(np.float32).tofile(folder / "scans" / f"{k:06d}.bin")
+    write_poses(folder / "poses.txt", sensor_poses())
+    return folder
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Run the program in an empty folder -> exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*args):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as left:
+            main([str(arg) for arg in args], prog_name="torchelev")
+        return left.value.code, *capsys.readouterr()
+
+    return call
+
+
+def value_at(saved, x, y, layer="elevation"):
+    i, j = np.floor((np.array([x, y]) - saved.center[:2]) / saved.resolution + np.array(saved.layers[layer].shape) / 2)
+    return saved.layers[layer][int(i), int(j)]
+
+
+def test_recording_in_map_out(run, recording, tmp_path):
+    code, out, err = run("map", recording, "--size", 8, "--out", "maps/drive")
+    assert (code, err) == (0, "")
+    saved = load_npz(tmp_path / "maps" / "drive.npz")
+    assert value_at(saved, 2.5, 1.5) == pytest.approx(0.4, abs=0.01)
+    for x, y in [(-2.5, 1.5), (2.5, -1.5), (1.5, 2.5), (-2.5, -1.5)]:
+        assert value_at(saved, x, y) == pytest.approx(0.0, abs=0.01)
+    assert saved.center[:2] == pytest.approx([0.75, 0], abs=0.051), "the window follows the sensor"
+    assert (tmp_path / "maps" / "drive.png").read_bytes().startswith(b"\x89PNG")
+    assert len(plyfile.PlyData.read(tmp_path / "maps" / "drive.ply")["face"].data) > 1000
+    for word in (
+        "4 of 4",
+        "80,000 points",
+        "8 x 8 m",
+        "coverage",
+        "used",
+        "ms per scan",
+        "drive.npz",
+        "--sensor-height",
+    ):
+        assert word in out
+
+
+def test_defaults_write_map_here(run, recording, tmp_path):
+    assert run("map", recording / "scans", "--poses", recording / "poses.txt")[0] == 0
+    assert load_npz(tmp_path / "map.npz").layers["elevation"].shape == (200, 200)
+    (tmp_path / "folder").mkdir()
+    assert run("map", recording, "--size", 2, "--out", "folder")[0] == 0
+    assert (tmp_path / "folder" / "map.ply").exists()
+
+
+def test_size_is_rounded_up_to_whole_cells(run, recording, tmp_path):
+    assert run("map", recording, "--size", 5, "--resolution", 0.3)[0] == 0
+    assert load_npz(tmp_path / "map.npz").layers["elevation"].shape == (17, 17)
+
+
+def test_config_file_and_options_over_it(run, recording, tmp_path):
+    (tmp_path / "cfg.yaml").write_text(
+        "grid: {resolution: 0.2, length_x: 4, length_y: 6}\nsensor:\n  noise_factor: 2e-4\nraycast: null\n"
+    )
+    assert run("map", recording, "--config", "cfg.yaml")[0] == 0
+    saved = load_npz(tmp_path / "map.npz")
+    assert saved.layers["elevation"].shape == (20, 30) and saved.config["raycast"] is None
+    assert saved.config["sensor"]["noise_factor"] == 2e-4
+    assert run("map", recording, "--config", "cfg.yaml", "--resolution", 0.5)[0] == 0
+    assert load_npz(tmp_path / "map.npz").layers["elevation"].shape == (8, 12)
+
+
+def test_fixed_window_keeps_its_place(run, recording, tmp_path):
+    assert run("map", recording, "--fixed", "--size", 3)[0] == 0
+    assert load_npz(tmp_path / "map.npz").center[:2] == pytest.approx([0.375, 0], abs=0.051)
+    code, out, _ = run("map", recording, "--size", 0.5)
+    assert "--fixed --size 2 keeps all" in out
+
+
+def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
+    assert run("map", recording, "--size", 8)[0] == 0
+    assert load_npz(tmp_path / "map.npz").config["overlap"] is None
+    code, out, _ = run("map", recording, "--size", 8, "--sensor-height", HEIGHT)
+    saved = load_npz(tmp_path / "map.npz")
+    assert saved.config["overlap"] is not None and "overlap" not in out
+    assert saved.center[2] == pytest.approx(0, abs=1e-6)
+    # A base 4 m below the ground: everything near belongs to another floor.
+    code, _, err = run("map", recording, "--size", 4, "--sensor-height", HEIGHT + 4)
+    assert code == 0 and "every cell was cleared again: check --sensor-height" in err
+    assert not np.isfinite(load_npz(tmp_path / "map.npz").layers["elevation"]).any()
+
+
+def test_poses_of_the_base_with_extrinsics(run, recording, tmp_path):
+    mount = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, -0.1], [0, 0, 1, 0.5], [0, 0, 0, 1]])
+    assert run("map", recording, "--size", 8, "--out", "sensor")[0] == 0
+    write_poses(recording / "poses.txt", sensor_poses() @ np.linalg.inv(mount))
+    text = " ".join(map(str, mount[:3].ravel()))
+    args = ("map", recording, "--size", 8, "--poses-of", "base")
+    assert run(*args, "--out", "base", "--extrinsics", text)[0] == 0
+    (tmp_path / "mount.yaml").write_text(f"T_base_sensor: {mount.tolist()}")
+    assert run(*args, "--out", "yaml", "--extrinsics", "mount.yaml")[0] == 0
+    base, sensor = load_npz(tmp_path / "base.npz"), load_npz(tmp_path / "sensor.npz")
+    assert base.center[2] == pytest.approx(HEIGHT - 0.5)
+    assert value_at(base, 2.5, 1.5) == pytest.approx(value_at(sensor, 2.5, 1.5), abs=1e-3)
+    np.testing.assert_array_equal(base.layers["elevation"], load_npz(tmp_path / "yaml.npz").layers["elevation"])
+
+
+def test_depth_images(run, tmp_path):
+    folder = tmp_path / "camera"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "0.png"), np.full((60, 80), 2000, np.uint16))
+    # The optical axis straight down from 3 m: x to the right of the image is -y of the map.
+    pose = np.array([[0.0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
+    write_poses(folder / "poses.txt", pose[None])
+    (tmp_path / "camera.yaml").write_text("{fx: 60, fy: 60, cx: 39.5, cy: 29.5}")
+    code, out, err = run("map", folder, "--intrinsics", tmp_path / "camera.yaml", "--size", 4)
+    assert (code, err) == (0, "")
+    elevation = load_npz(tmp_path / "map.npz").layers["elevation"]
+    assert np.nanmedian(elevation) == pytest.approx(1.0, abs=1e-3)
+    i, j = np.nonzero(np.isfinite(elevation))
+    assert np.ptp(j) > np.ptp(i), "the image's width lies along y"
+
+
+def missing_pose(folder):
+    write_poses(folder / "poses.txt", sensor_poses()[:-1])
+    return "poses.txt: no pose for scan 000003.bin"
+
+
+def truncated_scan(folder):
+    (folder / "scans" / "000002.bin").write_bytes(b"cut")
+    return "000002.bin: cut short"
+
+
+def unknown_format(folder):
+    (folder / "scans" / "000001.bin").rename(folder / "scans" / "000001.xyz")
+    return "000001.xyz: unknown format"
+
+
+def empty_folder(folder):
+    for path in (folder / "scans").iterdir():
+        path.unlink()
+    return "drive: holds no scan"
+
+
+def skewed_pose(folder):
+    write_poses(folder / "poses.txt", sensor_poses() * [1, 1, 1.2, 1])
+    return "poses.txt: line 1"
+
+
+@pytest.mark.parametrize("spoil", [missing_pose, truncated_scan, unknown_format, empty_folder, skewed_pose])
+def test_a_bad_recording_is_one_line(run, recording, spoil):
+    problem = spoil(recording)
+    code, _, err = run("map", recording, "--size", 4)
+    assert code == 2
+    assert err.count("\n") == 1 and err.startswith("Error: ") and problem in err
+
+
+def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
+    truncated_scan(recording)
+    code, out, err = run("map", recording, "--size", 4)
+    assert code == 2 and "kept the map of 2 of 4 scans" in err
+    assert np.isfinite(load_npz(tmp_path / "map.npz").layers["elevation"]).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--poses", "gone.txt"], "gone.txt: no such pose file"),
+        (["--config", "gone.yaml"], "gone.yaml: cannot be read"),
+        (["--config", "unknown.yaml"], "unknown.yaml: config.sensor.rang"),
+        (["--config", "list.yaml"], "list.yaml: expected settings by stage"),
+        (["--config", "broken.yaml"], "broken.yaml: cannot be read as YAML"),
+        (["--resolution", "-1"], "resolution and size must be positive"),
+        (["--size", "nan"], "resolution and size must be positive"),
+        (["--device", "abacus"], "--device abacus"),
+        (["--dt", "-1"], "--dt: must be"),
+        (["--poses-of", "base"], "give --extrinsics"),
+        (["--extrinsics", "1 2 3"], "1 2 3: holds 3 numbers"),
+        (["--extrinsics", "gone.yaml"], "gone.yaml: neither numbers nor a file"),
+        (["--extrinsics", "2 0 0 0 0 2 0 0 0 0 2 0"], "no rotation matrix"),
+        (["--extrinsics", "1 0 0 0 0 1 0 0 0 0 1 0", "--sensor-height", "1"], "--sensor-height"),
+    ],
+)
+def test_bad_options_are_one_line(run, recording, tmp_path, options, problem):
+    (tmp_path / "unknown.yaml").write_text("sensor: {rang: 3}")
+    (tmp_path / "list.yaml").write_text("[1, 2]")
+    (tmp_path / "broken.yaml").write_text("{grid: [")
+    code, out, err = run("map", recording, *options)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1 and problem in err
+
+
+def interrupt_at(monkeypatch, index):
+    read = Recording.__getitem__
+
+    def get(self, k):
+        if k == index:
+            raise KeyboardInterrupt
+        return read(self, k)
+
+    monkeypatch.setattr(Recording, "__getitem__", get)
+
+
+def test_ctrl_c_keeps_what_was_mapped(run, recording, tmp_path, monkeypatch):
+    interrupt_at(monkeypatch, 2)
+    code, out, err = run("map", recording, "--size", 8)
+    assert code == 130
+    assert "interrupted: kept the map of 2 of 4 scans" in err and "map.npz" in out
+    saved = load_npz(tmp_path / "map.npz")
+    assert value_at(saved, 2.5, 1.5) == pytest.approx(0.4, abs=0.01)
+    assert saved.center[0] == pytest.approx(0.25, abs=0.051)
+
+
+def test_ctrl_c_before_the_first_scan(run, recording, tmp_path, monkeypatch):
+    interrupt_at(monkeypatch, 0)
+    code, out, err = run("map", recording)
+    assert (code, out) == (130, "") and "nothing was mapped yet" in err
+    assert not (tmp_path / "map.npz").exists()
+
+
+def test_a_wrong_frame_is_pointed_out(run, recording, tmp_path):
+    flat = np.zeros((3000, 4), np.float32)
+    flat[:, :3] = [0, 0, -HEIGHT] + np.random.default_rng(0).uniform(-3, 3, (3000, 3)) * [1, 1, 0]
+    for path in (recording / "scans").iterdir():
+        flat.tofile(path)
+    poses = sensor_poses()
+    poses[:, :3, :3] = poses[:, :3, :3] @ np.diag([1.0, -1, -1])  # upside down: the ground is above the sensor
+    write_poses(recording / "poses.txt", poses)
+    code, out, err = run("map", recording, "--size", 8)
+    assert code == 0 and "overhang 12,000" in out
+    assert "no point fell into the map: check that poses take sensor points into a z-up map frame" in err
+
+
+def test_help_tells_a_newcomer_what_to_give(run):
+    code, out, _ = run("map", "--help")
+    assert code == 0
+    for word in ("Example", "poses.txt", "KITTI", "TUM", "--intrinsics", "PREFIX.npz", "z axis points up"):
+        assert word in out
+
+
+def test_runs_as_a_module():
+    result = subprocess.run([sys.executable, "-m", "torchelev", "--help"], capture_output=True, text=True, check=True)
+    assert "map" in result.stdout and "demo" in result.stdout
