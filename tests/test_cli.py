@@ -1,5 +1,7 @@
 """`python -m torchelev map` from end to end: a small recording in, a map out, and what is said when that fails."""
 
+import os
+import signal
 import subprocess
 import sys
 
@@ -8,7 +10,7 @@ import numpy as np
 import plyfile
 import pytest
 
-from torchelev.cli import main
+from torchelev.cli import main, whole_scans
 from torchelev.export import load_npz
 from torchelev.io import Recording
 
@@ -216,6 +218,8 @@ def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
         (["--config", "broken.yaml"], "broken.yaml: cannot be read as YAML"),
         (["--resolution", "-1"], "resolution and size must be positive"),
         (["--size", "nan"], "resolution and size must be positive"),
+        (["--size", "2000"], "a map of 400,000,000 cells is too large"),
+        (["--out", "list.yaml/map"], "--out list.yaml/map: cannot make the folder list.yaml"),
         (["--device", "abacus"], "--device abacus"),
         (["--dt", "-1"], "--dt: must be"),
         (["--poses-of", "base"], "give --extrinsics"),
@@ -255,6 +259,14 @@ def test_ctrl_c_keeps_what_was_mapped(run, recording, tmp_path, monkeypatch):
     assert saved.center[0] == pytest.approx(0.25, abs=0.051)
 
 
+def test_ctrl_c_waits_for_the_scan_at_hand():
+    done = []
+    with pytest.raises(KeyboardInterrupt), whole_scans():
+        os.kill(os.getpid(), signal.SIGINT)
+        done.append("all of it")
+    assert done and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_ctrl_c_before_the_first_scan(run, recording, tmp_path, monkeypatch):
     interrupt_at(monkeypatch, 0)
     code, out, err = run("map", recording)
@@ -280,6 +292,14 @@ def test_help_tells_a_newcomer_what_to_give(run):
     assert code == 0
     for word in ("Example", "poses.txt", "KITTI", "TUM", "--intrinsics", "PREFIX.npz", "z axis points up"):
         assert word in out
+
+
+def test_demo_prints_what_it_measured(run, monkeypatch):
+    asked = {}
+    monkeypatch.setattr("torchelev.demo.run_demo", lambda **options: asked.update(options) or "RMSE 1 cm")
+    code, out, _ = run("demo", "--out", "picture.png")
+    assert (code, out) == (0, "RMSE 1 cm\nwrote picture.png\n")
+    assert str(asked["out"]) == "picture.png" and asked["progress"]
 
 
 def test_runs_as_a_module():

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import signal
 import sys
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +18,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev import __version__
 from torchelev.io import MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
 from torchelev.io.report import hints, summary, warnings
 
@@ -23,6 +28,7 @@ if TYPE_CHECKING:
 
 BAD_INPUT, INTERRUPTED = 2, 130
 RESOLUTION, SIZE = 0.1, 20.0  # [m]
+MAX_CELLS = 16_000_000  # an update takes about 350 bytes of memory per cell
 
 MAP_HELP = """Map RECORDING, a folder of scans with poses, and write the map.
 
@@ -76,7 +82,7 @@ class MapOptions:
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
-@click.version_option(package_name="torchelev")
+@click.version_option(__version__)
 def main() -> None:
     """Elevation maps from point clouds and depth images."""
 
@@ -118,7 +124,8 @@ def demo(out: Path) -> None:
     """Simulate a walk of a robot with a depth camera, map it, and draw truth and map side by side."""
     from torchelev.demo import run_demo
 
-    run_demo(out=out, progress=True)
+    click.echo(run_demo(out=out, progress=True))
+    click.echo(f"wrote {out}")
 
 
 def run_map(
@@ -180,6 +187,9 @@ def _grid(grid: dict, resolution: float | None, size: float | None) -> dict:
     numbers = all(isinstance(v, int | float) and math.isfinite(v) and v > 0 for v in (cell, *lengths.values()))
     if not numbers:
         raise ValueError(f"resolution and size must be positive metres, got {cell} and {[*lengths.values()]}")
+    cells = math.prod(length / cell for length in lengths.values())
+    if cells > MAX_CELLS:
+        raise ValueError(f"a map of {cells:,.0f} cells is too large; give a smaller --size or a coarser --resolution")
     whole = {name: cell * math.ceil(length / cell - 1e-6) for name, length in lengths.items()}
     own = {} if resolution is not None or size is not None else grid
     return {**grid, "resolution": cell, **whole, **own}
@@ -219,25 +229,48 @@ def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> Ele
 
 
 def output_prefix(out: str) -> Path:
-    """PREFIX as given, or `map` in a folder; its folder exists afterwards, before hours of mapping."""
+    """PREFIX as given, or `map` in a folder. Raises ValueError now, not after hours of mapping, if it cannot be."""
     path = Path(out)
     prefix = path / "map" if path.is_dir() or out.endswith(("/", "\\")) else path
-    prefix.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        prefix.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--out {out}: cannot make the folder {prefix.parent} ({error.strerror})") from error
+    if not os.access(prefix.parent, os.W_OK):
+        raise ValueError(f"--out {out}: may not write into {prefix.parent}")
     return prefix
 
 
 def fuse_all(run: MappingRun, scans: Recording, options: MapOptions) -> BaseException | None:
     """Fuse scan after scan; return what stopped it before the end, a Ctrl-C or a file that cannot be read."""
     bases = base_poses(scans.T_map_sensor, options.T_base_sensor, options.sensor_height)
+    sensors = scans.T_map_sensor[:, :3, 3]
+    middle = (sensors.min(axis=0) + sensors.max(axis=0)) / 2
     try:
-        if options.fixed:
-            sensors = scans.T_map_sensor[:, :3, 3]
-            run.center_on((sensors.min(axis=0) + sensors.max(axis=0)) / 2)
+        # An update without points also pays for what torch sets up on first use, which is no scan's time.
+        run.center_on(middle if options.fixed else bases[0, :3, 3])
         for k, frame in enumerate(_progress(scans)):
-            run.add(frame, None if options.fixed else bases[k])
+            with whole_scans():
+                run.add(frame, None if options.fixed else bases[k])
     except (KeyboardInterrupt, RecordingError) as reason:
         return reason
     return None
+
+
+@contextmanager
+def whole_scans() -> Iterator[None]:
+    """Hold a Ctrl-C back until the block is done: a map that is stored by half is no map."""
+    if threading.current_thread() is not threading.main_thread():  # signals reach the main thread alone
+        yield
+        return
+    held: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: held.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held:
+        raise KeyboardInterrupt
 
 
 def _progress(scans: Recording) -> Iterator:
