@@ -1,6 +1,6 @@
 """Map real recordings with the command line's code and measure the maps against points they never saw.
 
-    python benchmarks/real.py RECORDINGS_ROOT
+    python -m benchmarks.real RECORDINGS_ROOT
 
 RECORDINGS_ROOT holds `parked_car/` (two scans of one place) and `offroad/` (one scan, and `driven_path.txt`: poses of
 the same lidar along a path that the robot then drove). Prints a markdown table and writes `results/real.json`, which
@@ -13,15 +13,15 @@ coverage   share of held-out points in the window whose cell is known
 flat cell  at least 3 held-out points that span less than 10 cm in height: told by the held-out points alone, so that
            no method chooses where it is judged
 error      |height of the cell that holds the point - height of the point|, over held-out points on known flat cells
+driven     |height of the cell - (height of the lidar that passed over it - 0.48 m)|, over the known cells below the
+           straight lines between the poses of the path; traversable: share of these with a traversability above 0.5
 
-Beside the map: the per-cell mean of all points of the same scan (plain mean), and of those below the ramp (gated mean).
+Beside the map stand the per-cell mean of all points of the same scan, which knows no ceiling and no tree from the
+ground, and the per-cell mean of its points below the ramp.
 """
 
 from __future__ import annotations
 
-import json
-import platform
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-import torchelev
+from benchmarks.report import markdown_table, write_json
 from torchelev.cli import MapOptions, fuse_all, load_config, new_map
 from torchelev.export import SavedMap, take
 from torchelev.io import Frame, MappingRun, Recording, open_recording, read_poses
@@ -52,7 +52,7 @@ class Case:
     recording: Recording
     held_out: NDArray
     resolution: float
-    driven: NDArray | None = None  # (T, 3) [m] positions of the lidar
+    driven: NDArray | None = None  # (T, 3) [m] where the lidar went, inside the window
 
 
 class OneScan(Recording):
@@ -68,13 +68,20 @@ def main_cases(root: Path, seed: int) -> list[Case]:
     field = open_recording(root / "offroad")[0]
     chosen = np.random.default_rng(seed).random(len(field.points)) < 0.1
     mapped = OneScan(field._replace(points=field.points[~chosen]))
-    driven = read_poses(root / "offroad" / "driven_path.txt").T_map_sensor[:, :3, 3]
+    driven = along(read_poses(root / "offroad" / "driven_path.txt").T_map_sensor[:, :3, 3], step=0.02)
     second, tenth = below_ramp(car[1]), below_ramp(field._replace(points=field.points[chosen]))
     return [
         Case("parked_car", car[:1], second, 0.2),
         Case("parked_car", car[:1], second, 0.1),
         Case("offroad", mapped, tenth, 0.1, driven),
     ]
+
+
+def along(path: NDArray, step: float) -> NDArray:
+    """Points every `step` [m] on the straight lines between the poses of a path (T, 3) [m]."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = np.arange(0.0, way[-1], step)
+    return np.stack([np.interp(at, way, path[:, axis]) for axis in range(3)], axis=-1)
 
 
 def in_map(frame: Frame) -> NDArray:
@@ -149,9 +156,8 @@ def held_out_figures(elevation: NDArray, points: NDArray, saved: SavedMap) -> di
 
 def driven_figures(elevation: NDArray, driven: NDArray, saved: SavedMap) -> dict[str, float]:
     """|height - (lidar's height - 0.48 m)| [m] at the cells that the robot drove over, each counted once."""
-    cells, inside = cells_of(driven, saved)
-    cell, first = np.unique(cells[inside], return_index=True)
-    ground = driven[inside][first, 2] - LIDAR_HEIGHT
+    cell = np.unique(cells_of(driven, saved)[0])
+    ground = mean_map(driven, saved).ravel()[cell] - LIDAR_HEIGHT
     value = elevation.ravel()[cell]
     known = np.isfinite(value)
     error = np.abs(value - ground)[known]
@@ -165,8 +171,7 @@ def driven_figures(elevation: NDArray, driven: NDArray, saved: SavedMap) -> dict
 
 def traversable_share(saved: SavedMap, driven: NDArray) -> float:
     """Share of the driven cells with a known traversability for which it is above one half."""
-    cells, inside = cells_of(driven, saved)
-    value = saved.layers["traversability"].ravel()[np.unique(cells[inside])]
+    value = saved.layers["traversability"].ravel()[np.unique(cells_of(driven, saved)[0])]
     return float((value[np.isfinite(value)] > 0.5).mean())
 
 
@@ -176,8 +181,8 @@ def measure_case(case: Case) -> list[dict[str, Any]]:
     scans = list(case.recording)
     maps = {
         "torchelev": saved.layers["elevation"],
-        "plain mean": mean_map(np.concatenate([in_map(frame) for frame in scans]), saved),
-        "gated mean": mean_map(np.concatenate([below_ramp(frame) for frame in scans]), saved),
+        "mean of all points": mean_map(np.concatenate([in_map(frame) for frame in scans]), saved),
+        "mean below the ramp": mean_map(np.concatenate([below_ramp(frame) for frame in scans]), saved),
     }
     rows = []
     for method, elevation in maps.items():
@@ -197,13 +202,13 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     head = ["recording", "cell", "method", "flat: median", "p90", "all: median", "p90", "coverage", "driven: median",
             "p90", "traversable", "ms/scan"]  # fmt: skip
     keys = ("flat_median_m", "flat_p90_m", "all_median_m", "all_p90_m")
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for row in rows:
         first = [row["recording"], f"{100 * row['resolution_m']:.0f} cm", row["method"]]
         driven = [_cm(row, "driven_median_m"), _cm(row, "driven_p90_m"), _percent(row, "driven_traversable")]
         time = f"{row['ms_per_scan']:.1f}" if "ms_per_scan" in row else ""
         lines.append([*first, *(_cm(row, key) for key in keys), _percent(row, "coverage"), *driven, time])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(head, lines)
 
 
 def _cm(row: dict[str, Any], key: str) -> str:
@@ -212,24 +217,6 @@ def _cm(row: dict[str, Any], key: str) -> str:
 
 def _percent(row: dict[str, Any], key: str) -> str:
     return f"{100 * row[key]:.1f} %" if key in row else ""
-
-
-def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    info = Path("/proc/cpuinfo")
-    models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=RESULTS.parent, capture_output=True, text=True, check=False
-    )
-    return {
-        "cpu": models[0] if models else platform.processor(),
-        "threads": torch.get_num_threads(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "torchelev": torchelev.__version__,
-        "commit": commit.stdout.strip() or None,
-    }
 
 
 @click.command(help=__doc__.split("\n")[0])
@@ -242,8 +229,7 @@ def main(recordings_root: Path, threads: int, seed: int, out: Path) -> None:
     rows = [row for case in main_cases(recordings_root, seed) for row in measure_case(case)]
     print(markdown(rows))
     settings = {"size_m": SIZE, "seed": seed, "flat_span_m": FLAT_SPAN, "flat_points": FLAT_POINTS}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"machine": machine(), "settings": settings, "rows": rows}, indent=2) + "\n")
+    write_json(out, {"settings": settings, "rows": rows})
 
 
 if __name__ == "__main__":
