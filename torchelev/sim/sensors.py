@@ -106,7 +106,7 @@ def cast_terrain(scene: Scene, origin: Tensor, directions: Tensor, reach: Tensor
     With f the height over the terrain and s its steepness, no ray can meet the terrain within f / (s |d_xy| - d_z):
     that is how far each step goes. Once that is below 2 cm, steps of 2 cm find the crossing, which is then bisected.
     """
-    result = torch.full_like(reach, math.inf)
+    crossed = torch.full_like(reach, math.nan)
     sinking = scene.steepness * torch.linalg.vector_norm(directions[:, :2], dim=-1) - directions[:, 2]
     rays = torch.nonzero(sinking > 0)[:, 0]  # the others climb faster than the terrain can
     along = torch.zeros_like(rays, dtype=reach.dtype)
@@ -115,12 +115,14 @@ def cast_terrain(scene: Scene, origin: Tensor, directions: Tensor, reach: Tensor
             break
         over = _over_terrain(scene, origin, directions[rays], along)
         hit = over <= 0
-        if hit.any():
-            result[rays[hit]] = _bisect(scene, origin, directions[rays[hit]], along[hit])
+        crossed[rays[hit]] = along[hit]
         # Just short of the safe step, so that only a short last step can cross and the bracket stays short.
         along = along + (0.999 * over / sinking[rays]).clamp(min=FINEST)
         going = ~hit & (along < reach[rays] + FINEST)
         rays, along = rays[going], along[going]
+    hits = torch.nonzero(crossed.isfinite())[:, 0]
+    result = torch.full_like(reach, math.inf)
+    result[hits] = _bisect(scene, origin, directions[hits], crossed[hits])
     return result
 
 
