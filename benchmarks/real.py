@@ -14,7 +14,8 @@ flat cell  at least 3 held-out points that span less than 10 cm in height: told 
            no method chooses where it is judged
 error      |height of the cell that holds the point - height of the point|, over held-out points on known flat cells
 driven     |height of the cell - (height of the lidar that passed over it - 0.48 m)|, over the known cells below the
-           straight lines between the poses of the path; traversable: share of these with a traversability above 0.5
+           straight lines between the poses of the path, less those within 0.6 m of the lidar at the time of the scan,
+           where it saw the robot itself; traversable: share of these cells with a traversability above 0.5
 
 Beside the map stand the per-cell mean of all points of the same scan, which knows no ceiling and no tree from the
 ground, and the per-cell mean of its points below the ramp.
@@ -39,6 +40,7 @@ from torchelev.sensor import ExclusionConfig, above_ramp
 
 RESULTS = Path(__file__).parent / "results" / "real.json"
 LIDAR_HEIGHT = 0.48  # [m] of the lidar of `offroad` above the ground it drove over, from the recording's own notes
+ROBOT_RADIUS = 0.6  # [m] around the lidar of `offroad`
 SIZE = 20.0  # [m]
 FLAT_SPAN, FLAT_POINTS = 0.10, 3
 REPEATS = 7  # of a mapping, for its time
@@ -69,6 +71,7 @@ def main_cases(root: Path, seed: int) -> list[Case]:
     chosen = np.random.default_rng(seed).random(len(field.points)) < 0.1
     mapped = OneScan(field._replace(points=field.points[~chosen]))
     driven = along(read_poses(root / "offroad" / "driven_path.txt").T_map_sensor[:, :3, 3], step=0.02)
+    driven = driven[np.linalg.norm((driven - field.T_map_sensor[:3, 3])[:, :2], axis=1) > ROBOT_RADIUS]
     second, tenth = below_ramp(car[1]), below_ramp(field._replace(points=field.points[chosen]))
     return [
         Case("parked_car", car[:1], second, 0.2),

@@ -214,6 +214,7 @@ def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
         (["--poses", "gone.txt"], "gone.txt: no such pose file"),
         (["--config", "gone.yaml"], "gone.yaml: cannot be read"),
         (["--config", "unknown.yaml"], "unknown.yaml: config.sensor.rang"),
+        (["--config", "body.yaml", "--sensor-height", "1"], "config.sensor.body: the box turns"),
         (["--config", "list.yaml"], "list.yaml: expected settings by stage"),
         (["--config", "broken.yaml"], "broken.yaml: cannot be read as YAML"),
         (["--resolution", "-1"], "resolution and size must be positive"),
@@ -231,6 +232,7 @@ def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
 )
 def test_bad_options_are_one_line(run, recording, tmp_path, options, problem):
     (tmp_path / "unknown.yaml").write_text("sensor: {rang: 3}")
+    (tmp_path / "body.yaml").write_text("sensor: {body: {}}")
     (tmp_path / "list.yaml").write_text("[1, 2]")
     (tmp_path / "broken.yaml").write_text("{grid: [")
     code, out, err = run("map", recording, *options)

@@ -55,6 +55,11 @@ It writes PREFIX.npz (every layer and the geometry, for numpy),
 PREFIX.png (a picture) and PREFIX.ply (a mesh for MeshLab, CloudCompare,
 Blender). The map is a window that follows the sensor; what leaves it is
 forgotten. --fixed with a larger --size keeps everything.
+
+\b
+Settings beyond these options go into a YAML, by stage, for example
+  sensor: {min_distance: 0.8}    # [m] no points on the robot itself
+  drift: null                    # poses do not drift in height
 """
 
 
@@ -213,13 +218,15 @@ def _read_yaml(path: Path) -> dict:
 
 
 def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> ElevationMap:
-    """One map on `device`. What needs the robot's own height is off where only the sensor's is known."""
+    """One map on `device`. Overlap clearance, which needs the robot's own height, is off where that is not known."""
     import torch
 
     from torchelev.elevation_map import ElevationMap
 
+    if config.sensor.body is not None and options.T_base_sensor is None:
+        raise ValueError("config.sensor.body: the box turns with the robot's base, which needs --extrinsics")
     if not options.knows_base:
-        config = replace(config, overlap=None, sensor=replace(config.sensor, body=None))
+        config = replace(config, overlap=None)
     try:
         torch.empty(1, device=device)
         return ElevationMap(config, num_envs=1, device=device)

@@ -39,7 +39,7 @@ def hints(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]:
         size = math.ceil(reach + grid.length_x)
         lines.append(f"note      the path spans {reach:.0f} m; this is its last part, --fixed --size {size} keeps all")
     if not knows_base:
-        lines.append("note      overlap clearance and body box are off: they need --sensor-height or --extrinsics")
+        lines.append("note      overlap clearance is off: it needs --sensor-height or --extrinsics")
     return lines
 
 
