@@ -1,0 +1,219 @@
+"""The stages as slow NumPy loops over points and cells, written from the paper's equations.
+
+Nothing here comes from torchelev: plain numbers, lists, dicts and float64 arrays of one environment. A map is a dict of
+(H, W) arrays; `corner` holds the cell numbers of cell [0, 0] on the map frame's lattice. Points are absolute.
+"""
+
+import math
+
+import numpy as np
+
+# Where cells are ------------------------------------------------------------------------------------------------------
+
+
+def cell_of(x, y, corner, resolution, shape):
+    """The cell (i, j) that holds a map-frame position, or None outside the window."""
+    i = math.floor(x / resolution) - corner[0]
+    j = math.floor(y / resolution) - corner[1]
+    return (i, j) if 0 <= i < shape[0] and 0 <= j < shape[1] else None
+
+
+def center_of(i, j, corner, resolution):
+    """The centre of a cell [m]."""
+    return (corner[0] + i + 0.5) * resolution, (corner[1] + j + 0.5) * resolution
+
+
+def window_corner(x, y, resolution, shape):
+    """The corner of the window whose centre is nearest to a position, whole cells only."""
+    return tuple(math.floor(p / resolution - n / 2 + 0.5) for p, n in zip((x, y), shape, strict=True))
+
+
+def recenter(layer, old_corner, new_corner, blank):
+    """A layer after the window has moved: what was there stays on its place in the world, the rest is blank."""
+    moved = np.full_like(layer, blank)
+    H, W = layer.shape
+    for i in range(H):
+        for j in range(W):
+            old_i, old_j = i + new_corner[0] - old_corner[0], j + new_corner[1] - old_corner[1]
+            if 0 <= old_i < H and 0 <= old_j < W:
+                moved[i, j] = layer[old_i, old_j]
+    return moved
+
+
+# From points to a measurement -----------------------------------------------------------------------------------------
+
+
+def above_ramp(dx, dy, dz, slope, distance, offset, height):
+    """The exclusion area: z - z_s > min(max(r - b, 0) * tan(theta_a) + c, d)."""
+    r = math.hypot(dx, dy)
+    return dz > min(max(r - distance, 0.0) * slope + offset, height)
+
+
+def inside_box(point, T_map_base, lower, upper):
+    """Whether a map-frame point lies in a box of the base frame."""
+    in_base = np.linalg.inv(T_map_base) @ np.append(point, 1.0)
+    return all(lower[k] <= in_base[k] <= upper[k] for k in range(3))
+
+
+def measure(points, T_map_sensor, T_map_base, *, noise, limits, exclusion=None, body=None):
+    """Transform and gate the points (S, N, 3) of sensors with poses (S, 4, 4): a list of dicts, sensor after sensor.
+
+    Each has `gate`: "used", or the first gate that rejected it. sigma_p^2 = alpha_d * d^2 + floor, `noise` = (alpha_d,
+    floor). `limits` = (minimum, maximum distance); `exclusion` and `body` are dicts of their parameters.
+    """
+    measured = []
+    for s, cloud in enumerate(points):
+        for p in cloud:
+            out = {"sensor": s, "origin": T_map_sensor[s][:3, 3], "gate": "used"}
+            measured.append(out)
+            if not all(math.isfinite(c) for c in p):
+                out["gate"] = "invalid"
+                continue
+            d = math.sqrt(sum(c * c for c in p)) if max(abs(c) for c in p) < 1e100 else math.inf
+            if not limits[0] <= d <= limits[1]:
+                out["gate"] = "range"
+                continue
+            turned = T_map_sensor[s][:3, :3] @ p
+            out["point"] = turned + T_map_sensor[s][:3, 3]
+            out["variance"] = noise[0] * d * d + noise[1]
+            if body is not None and T_map_base is not None and inside_box(out["point"], T_map_base, **body):
+                out["gate"] = "body"
+            elif exclusion is not None and above_ramp(*turned, **exclusion):
+                out["gate"] = "overhang"
+    return measured
+
+
+def depth_to_points(depth, fx, fy, cx, cy, along):
+    """The points of a depth image (h, w), optical frame, row after row; NaN where there is no depth."""
+    points = []
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            ray = np.array([(u - cx) / fx, (v - cy) / fy, 1.0])
+            if along == "ray":
+                ray = ray / np.linalg.norm(ray)
+            d = depth[v, u]
+            points.append(ray * d if math.isfinite(d) and d > 0 else np.full(3, math.nan))
+    return np.array(points)
+
+
+def voxel_means(points, size):
+    """The mean of the points of each voxel, by voxel."""
+    voxels = {}
+    for p in points:
+        if np.isfinite(p).all():
+            voxels.setdefault(tuple(math.floor(c / size) for c in p), []).append(p)
+    return {key: np.mean(group, axis=0) for key, group in voxels.items()}
+
+
+# Time and drift -------------------------------------------------------------------------------------------------------
+
+
+def age(variance, time, dt, rate, max_variance):
+    """sigma_m^2 += sigma_t^2 * dt, not above the maximum; the time since the last hit grows."""
+    variance, time = variance.copy(), time.copy()
+    for cell in np.ndindex(variance.shape):
+        variance[cell] = min(variance[cell] + rate * dt, max_variance)
+        time[cell] += dt
+    return variance, time
+
+
+def drift(
+    layers, points, corner, resolution, *, min_traversability, max_variance, max_error, min_points, max_drift, gain
+):
+    """Number of points, mean error and correction: e = (1/n) sum (p_z - h) over certain, flat cells.
+
+    On a slope, h is the height of the cell's plane at the point.
+    """
+    errors = []
+    for x, y, z in points:
+        cell = cell_of(x, y, corner, resolution, layers["elevation"].shape)
+        if cell is None or not layers["validity"][cell]:
+            continue
+        if layers["traversability"][cell] < min_traversability or layers["variance"][cell] > max_variance:
+            continue
+        cx, cy = center_of(*cell, corner, resolution)
+        h = layers["elevation"][cell] + layers["gradient_x"][cell] * (x - cx) + layers["gradient_y"][cell] * (y - cy)
+        if abs(z - h) <= max_error:
+            errors.append(z - h)
+    mean = sum(errors) / len(errors) if errors else 0.0
+    applies = len(errors) >= min_points and abs(mean) <= max_drift
+    return len(errors), mean, gain * mean if applies else 0.0
+
+
+# Cells ----------------------------------------------------------------------------------------------------------------
+
+
+def clear_other_floors(layers, base, corner, resolution, radius, height):
+    """validity and bounded after cells near the robot and far from its height are cleared; and how many were."""
+    validity, bounded, cleared = layers["validity"].copy(), layers["bounded"].copy(), 0
+    for i, j in np.ndindex(validity.shape):
+        x, y = center_of(i, j, corner, resolution)
+        if math.hypot(x - base[0], y - base[1]) > radius:
+            continue
+        if validity[i, j] and abs(layers["elevation"][i, j] - base[2]) > height:
+            validity[i, j] = bounded[i, j] = False
+            cleared += 1
+        elif bounded[i, j] and abs(layers["upper_bound"][i, j] - base[2]) > height:
+            bounded[i, j] = False
+    return validity, bounded, cleared
+
+
+def window(validity, i, j, radius):
+    """The known cells within `radius` cells of a cell."""
+    H, W = validity.shape
+    rows, columns = range(max(0, i - radius), min(H, i + radius + 1)), range(max(0, j - radius), min(W, j + radius + 1))
+    return [(a, b) for a in rows for b in columns if validity[a, b]]
+
+
+def fit_plane(elevation, validity, i, j, radius, resolution):
+    """Least-squares plane through the known cells around a cell: gradient x, gradient y, mean squared residual.
+
+    Cells on one line leave the gradient across it open; the shortest gradient is taken.
+    """
+    cells = window(validity, i, j, radius)
+    if not cells:
+        return 0.0, 0.0, 0.0
+    xy = np.array([((a - i) * resolution, (b - j) * resolution) for a, b in cells])
+    z = np.array([elevation[c] for c in cells])
+    A, b = xy - xy.mean(0), z - z.mean()
+    gradient = np.linalg.lstsq(A, b, rcond=1e-6)[0]
+    return gradient[0], gradient[1], float(np.mean((b - A @ gradient) ** 2))
+
+
+def traversability(elevation, validity, i, j, resolution, *, radius, critical_slope, critical_step, critical_roughness):
+    """1 - max(slope / critical, step / critical, roughness / critical), not below 0; `radius` in metres."""
+    cells = max(1, round(radius / resolution))
+    gx, gy, residual = fit_plane(elevation, validity, i, j, cells, resolution)
+    heights = [elevation[c] for c in window(validity, i, j, cells)]
+    explained = 2 * cells * resolution * (abs(gx) + abs(gy))
+    slope, step = math.atan(math.hypot(gx, gy)), max(0.0, max(heights) - min(heights) - explained)
+    return max(0.0, 1 - max(slope / critical_slope, step / critical_step, math.sqrt(residual) / critical_roughness))
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def sample(values, known, x, y, corner, resolution, mode):
+    """The value of a layer at a position, and whether it is valid (then bilinear neighbours weigh at least a half)."""
+    if mode == "nearest":
+        cell = cell_of(x, y, corner, resolution, values.shape)
+        return (values[cell], True) if cell is not None and known[cell] else (0.0, False)
+    u, v = x / resolution - corner[0] - 0.5, y / resolution - corner[1] - 0.5
+    total = weighted = 0.0
+    for i in (math.floor(u), math.floor(u) + 1):
+        for j in (math.floor(v), math.floor(v) + 1):
+            if 0 <= i < values.shape[0] and 0 <= j < values.shape[1] and known[i, j]:
+                weight = (1 - abs(u - i)) * (1 - abs(v - j))
+                total, weighted = total + weight, weighted + weight * values[i, j]
+    return (weighted / total, True) if total >= 0.5 else (0.0, False)
+
+
+def nearest_foot(x, y, feet):
+    """The height of the foot nearest to a position."""
+    return min(feet, key=lambda f: math.hypot(f[0] - x, f[1] - y))[2]
+
+
+def feet_plane(x, y, feet):
+    """The height at a position of the least-squares plane through the feet."""
+    A = np.column_stack([feet[:, :2], np.ones(len(feet))])
+    return float(np.array([x, y, 1.0]) @ np.linalg.lstsq(A, feet[:, 2], rcond=None)[0])

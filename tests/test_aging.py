@@ -1,0 +1,44 @@
+"""Time passes."""
+
+import numpy as np
+import pytest
+import reference
+import torch
+from conftest import nans, pose, random_state, small_map
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchelev import AgingConfig
+from torchelev.aging import age
+
+
+@given(st.integers(0, 10_000), st.floats(0, 5), st.floats(1e-3, 2))
+def test_agrees_with_the_reference(seed, rate, max_variance):
+    rng = np.random.default_rng(seed)
+    emap = small_map(3, (5, 4), dtype=torch.float64)
+    state = random_state(rng, emap.cfg.grid, 3)
+    dt = torch.from_numpy(rng.uniform(0, 2, 3))
+    m = emap.measure(nans(3), pose(num_envs=3), None, dt)
+    after = age(state, m, AgingConfig(variance_rate=rate, max_variance=max_variance))
+    for b in range(3):
+        args = (state.variance[b].numpy(), state.time[b].numpy(), dt[b].item(), rate, max_variance)
+        variance, time = reference.age(*args)
+        np.testing.assert_allclose(after.variance[b], variance, rtol=1e-12)
+        np.testing.assert_allclose(after.time[b], time, rtol=1e-12)
+
+
+def test_each_environment_has_its_own_dt():
+    emap = small_map(2, aging=AgingConfig(variance_rate=0.01))
+    emap._store(random_state(np.random.default_rng(0), emap.cfg.grid, 2, known=1.0))
+    before = emap.layer("variance"), emap.layer("time")
+    emap.update(nans(2), pose(num_envs=2), None, torch.tensor([0.0, 2.0]))
+    grown, passed = emap.layer("variance") - before[0], emap.layer("time") - before[1]
+    assert torch.equal(grown[0], torch.zeros_like(grown[0])) and torch.equal(passed[0], torch.zeros_like(passed[0]))
+    torch.testing.assert_close(grown[1], torch.full_like(grown[1], 0.02))
+    torch.testing.assert_close(passed[1], torch.full_like(passed[1], 2.0))
+
+
+@pytest.mark.parametrize("bad", [dict(variance_rate=-1.0), dict(max_variance=0.0)])
+def test_refuses(bad):
+    with pytest.raises(ValueError, match=f"aging.{next(iter(bad))}"):
+        AgingConfig(**bad)

@@ -1,0 +1,144 @@
+"""The slow reference itself, on cases computed by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import reference
+
+EYE = np.eye(4)
+
+
+def test_cell_of_and_center_of():
+    assert reference.cell_of(0.05, -0.05, (-2, -1), 0.1, (4, 2)) == (2, 0)
+    assert reference.cell_of(0.25, 0.0, (-2, -1), 0.1, (4, 2)) is None
+    assert reference.cell_of(0.0, -0.11, (-2, -1), 0.1, (4, 2)) is None
+    assert reference.center_of(2, 0, (-2, -1), 0.1) == pytest.approx((0.05, -0.05))
+
+
+def test_window_corner_is_the_nearest():
+    assert reference.window_corner(0.0, 0.0, 0.1, (4, 3)) == (-2, -1)  # 3 cells: the centre is that of a cell
+    assert reference.window_corner(0.06, -0.06, 0.1, (4, 4)) == (-1, -3)
+
+
+def test_recenter_moves_against_the_window():
+    layer = np.array([[1.0, 2.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(reference.recenter(layer, (0, 0), (1, 0), 9.0), [[3, 4], [9, 9]])
+    np.testing.assert_array_equal(reference.recenter(layer, (0, 0), (0, -1), 9.0), [[9, 1], [9, 3]])
+
+
+def test_ramp():
+    ramp = dict(slope=0.5, distance=1.0, offset=0.2, height=0.6)
+    # At r = 1.4: min(0.4 * 0.5 + 0.2, 0.6) = 0.4. At r = 5: min(2.2, 0.6) = 0.6. At r = 0.5: 0.2.
+    assert reference.above_ramp(1.4, 0, 0.41, **ramp) and not reference.above_ramp(1.4, 0, 0.39, **ramp)
+    assert reference.above_ramp(3, 4, 0.61, **ramp) and not reference.above_ramp(3, 4, 0.59, **ramp)
+    assert reference.above_ramp(0.3, 0.4, 0.21, **ramp) and not reference.above_ramp(0.3, 0.4, 0.19, **ramp)
+
+
+def test_inside_box_turns_with_the_base():
+    T = EYE.copy()
+    T[:3, :3], T[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [5, 0, 0]  # +x of the base is +y of the map
+    box = dict(lower=(0, -0.1, -1), upper=(1, 0.1, 1))
+    assert reference.inside_box(np.array([5.0, 0.9, 0]), T, **box)
+    assert not reference.inside_box(np.array([5.9, 0.0, 0]), T, **box)
+
+
+def test_measure_gates_in_order():
+    T = EYE.copy()
+    T[2, 3] = 1.0
+    cloud = np.array([[1, 0, -1], [math.nan, 0, 0], [9, 0, 0], [0.01, 0, 0], [0.2, 0, -0.3], [1, 0, 2], [1e300, 0, 0]])
+    measured = reference.measure(
+        [cloud],
+        [T],
+        T,
+        noise=(0.01, 0.5),
+        limits=(0.1, 5.0),
+        exclusion=dict(slope=0, distance=0, offset=1.0, height=1.0),
+        body=dict(lower=(0, -1, -0.5), upper=(0.5, 1, 0)),
+    )
+    assert [m["gate"] for m in measured] == ["used", "invalid", "range", "range", "body", "overhang", "range"]
+    np.testing.assert_allclose(measured[0]["point"], [1, 0, 0])
+    assert measured[0]["variance"] == pytest.approx(0.01 * 2 + 0.5)
+
+
+def test_depth_to_points():
+    depth = np.array([[2.0, 0.0]])
+    points = reference.depth_to_points(depth, 1.0, 1.0, -1.0, 0.0, "z")
+    np.testing.assert_allclose(points[0], [2, 0, 2])
+    assert np.isnan(points[1]).all()
+    along_ray = reference.depth_to_points(depth, 1.0, 1.0, -1.0, 0.0, "ray")
+    np.testing.assert_allclose(along_ray[0], [math.sqrt(2), 0, math.sqrt(2)])
+
+
+def test_voxel_means():
+    means = reference.voxel_means(np.array([[0.1, 0, 0], [0.3, 0, 0], [-0.1, 0, 0], [math.nan, 0, 0]]), 1.0)
+    assert means.keys() == {(0, 0, 0), (-1, 0, 0)}
+    np.testing.assert_allclose(means[0, 0, 0], [0.2, 0, 0])
+
+
+def test_age():
+    variance, time = reference.age(np.array([[0.1, 0.95]]), np.array([[0.0, 2.0]]), 2.0, 0.1, 1.0)
+    np.testing.assert_allclose(variance, [[0.3, 1.0]])
+    np.testing.assert_allclose(time, [[2, 4]])
+
+
+def test_drift():
+    layers = {name: np.zeros((1, 3)) for name in ("elevation", "gradient_x", "gradient_y", "variance")}
+    layers |= {"validity": np.array([[True, True, False]]), "traversability": np.array([[1.0, 0.2, 1.0]])}
+    layers["gradient_x"][0, 0] = 1.0
+    settings = dict(min_traversability=0.5, max_variance=1.0, max_error=0.3, min_points=2, max_drift=0.2, gain=0.5)
+    # Cell 0 has its centre at (0.5, 0.5): the plane is 0.25 at x = 0.75. Cell 1 is not flat, cell 2 unknown.
+    points = [(0.5, 0.5, 0.1), (0.75, 0.5, 0.25 + 0.2), (0.5, 0.5, 0.31), (0.5, 1.5, 0.1), (0.5, 2.5, 0.1), (7, 7, 0.1)]
+    number, mean, correction = reference.drift(layers, points, (0, 0), 1.0, **settings)
+    assert number == 2 and mean == pytest.approx(0.15) and correction == pytest.approx(0.075)
+    assert reference.drift(layers, points[:1], (0, 0), 1.0, **settings)[2] == 0.0
+
+
+def test_clear_other_floors():
+    layers = dict(
+        elevation=np.array([[0.0, 3.0, 3.0]]),
+        upper_bound=np.array([[3.0, 0.0, 3.0]]),
+        validity=np.array([[True, True, True]]),
+        bounded=np.array([[True, True, True]]),
+    )
+    validity, bounded, cleared = reference.clear_other_floors(layers, (0.5, 0.5, 0.0), (0, 0), 1.0, 1.5, 2.0)
+    assert validity.tolist() == [[True, False, True]] and bounded.tolist() == [[False, False, True]] and cleared == 1
+
+
+def test_fit_plane():
+    known = np.ones((3, 3), bool)
+    i, j = np.indices((3, 3))
+    gx, gy, residual = reference.fit_plane(0.2 * i - 0.1 * j, known, 1, 1, 1, 0.1)
+    assert (gx, gy, residual) == pytest.approx((2.0, -1.0, 0.0))
+    # One line of cells along y: the gradient along it, none across.
+    assert reference.fit_plane(0.2 * i - 0.1 * j, i == 1, 1, 1, 1, 0.1) == pytest.approx((0.0, -1.0, 0.0))
+    # A lone peak in the middle: level; mean square of (8/9, -1/9 eight times) = 8/81.
+    peak = np.where((i == 1) & (j == 1), 1.0, 0.0)
+    assert reference.fit_plane(peak, known, 1, 1, 1, 0.1) == pytest.approx((0.0, 0.0, 8 / 81))
+
+
+def test_traversability():
+    critical = dict(radius=0.1, critical_slope=math.pi / 2, critical_step=0.5, critical_roughness=10.0)
+    i, j = np.indices((3, 3))
+    known = np.ones((3, 3), bool)
+    slope = reference.traversability(0.1 * i, known, 1, 1, 0.1, **critical)  # 45 degrees of 90; the plane explains 0.2
+    assert slope == pytest.approx(0.5)
+    peak = np.where((i == 1) & (j == 1), 0.1, 0.0)
+    assert reference.traversability(peak, known, 1, 1, 0.1, **critical) == pytest.approx(1 - 0.1 / 0.5)
+    assert reference.traversability(100 * peak, known, 1, 1, 0.1, **critical) == 0.0
+
+
+def test_sample():
+    values, known = np.array([[1.0, 2.0], [3.0, 99.0]]), np.array([[True, True], [True, False]])
+    # Weights at (0.75, 0.75): 0.5625, 0.1875, 0.1875 and 0.0625 of the unknown one.
+    expected = (0.5625 * 1 + 0.1875 * 2 + 0.1875 * 3) / 0.9375
+    assert reference.sample(values, known, 0.75, 0.75, (0, 0), 1.0, "bilinear") == (pytest.approx(expected), True)
+    assert reference.sample(values, known, 1.3, 1.3, (0, 0), 1.0, "bilinear")[1] is False
+    assert reference.sample(values, known, 1.3, 0.3, (0, 0), 1.0, "nearest") == (3.0, True)
+    assert reference.sample(values, known, 1.3, 1.3, (0, 0), 1.0, "nearest") == (0.0, False)
+
+
+def test_feet():
+    feet = np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, 2]])
+    assert reference.nearest_foot(0.9, 0.1, feet) == 1
+    assert reference.feet_plane(0.5, 0.5, feet) == pytest.approx(1.5)

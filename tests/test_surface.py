@@ -1,0 +1,82 @@
+"""Planes and normals."""
+
+import math
+
+import numpy as np
+import pytest
+import reference
+import torch
+from conftest import pose, random_state, small_map
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchelev import SurfaceConfig
+from torchelev.surface import fit_plane, normals
+
+SEEDS = st.integers(0, 10_000)
+
+
+@given(SEEDS, st.integers(1, 3), st.floats(0.1, 1.0), st.sampled_from([torch.float32, torch.float64]))
+def test_fit_plane_agrees_with_the_reference(seed, radius, known, dtype):
+    grid = small_map(1, (7, 6)).cfg.grid
+    state = random_state(np.random.default_rng(seed), grid, 2, known, dtype)
+    plane = fit_plane(state.elevation, state.validity, radius, grid.resolution)
+    tolerance = dict(rtol=1e-3, atol=2e-4) if dtype == torch.float32 else dict(rtol=1e-7, atol=1e-9)
+    for b, i, j in np.ndindex(2, 7, 6):
+        if state.validity[b, i, j]:
+            elevation, validity = state.elevation[b].double().numpy(), state.validity[b].numpy()
+            expected = reference.fit_plane(elevation, validity, i, j, radius, 0.1)
+            got = [float(value[b, i, j]) for value in plane]
+            np.testing.assert_allclose(got, expected, **tolerance)
+
+
+@pytest.mark.parametrize("altitude", [0.0, 3000.0])
+@pytest.mark.parametrize("gx, gy", [(0.5, 0.0), (0.0, -0.25), (-0.3, 0.7)])
+def test_normals_of_a_plane(gx, gy, altitude):
+    """n = (-gx, -gy, 1) / |.|, at the border of the known area too, and at any altitude in float32."""
+    emap = small_map(1, (20, 20))
+    x, y = emap.cell_centers()[0].unbind(-1)
+    z = gx * x + gy * y + altitude
+    state = emap.state._replace(elevation=z[None].float(), validity=(x < 0.35)[None])
+    emap._store(normals(state, emap.cfg.grid, emap.cfg.surface))
+    n = torch.stack([emap.layer(f"normal_{axis}") for axis in "xyz"], -1)
+    known = emap.validity
+    expected = torch.tensor([-gx, -gy, 1.0]) / math.sqrt(1 + gx * gx + gy * gy)
+    tolerance = 1e-5 if altitude == 0 else 3e-3  # float32 heights at 3 km are known to 0.2 mm
+    torch.testing.assert_close(n[known], expected.expand(int(known.sum()), 3), atol=tolerance, rtol=0)
+    assert n[~known].isnan().all() and known.sum() == 20 * 13
+
+
+@given(SEEDS)
+def test_normals_are_unit_vectors_that_point_up(seed):
+    emap = small_map(2)
+    state = normals(random_state(np.random.default_rng(seed), emap.cfg.grid, 2), emap.cfg.grid, SurfaceConfig())
+    n = torch.stack([emap.layer(f"normal_{axis}", state=state) for axis in "xyz"], -1)[state.validity]
+    torch.testing.assert_close(n.norm(dim=-1), torch.ones(len(n), dtype=n.dtype))
+    assert (n[:, 2] > 0).all()
+
+
+def test_lone_cell_is_level_and_a_line_slopes_along_itself():
+    validity = torch.zeros(1, 5, 5, dtype=torch.bool)
+    validity[0, 0, 4] = validity[0, 2:5, 0] = True
+    elevation = torch.zeros(1, 5, 5)
+    elevation[0, 0, 4], elevation[0, 2:5, 0] = 7.0, torch.tensor([0.0, 0.1, 0.2])
+    plane = fit_plane(elevation, validity, 1, 0.1)
+    assert plane.gradient_x[0, 0, 4] == 0 and plane.gradient_y[0, 0, 4] == 0
+    torch.testing.assert_close(plane.gradient_x[0, 3, 0], torch.tensor(1.0), atol=1e-4, rtol=0)
+    assert plane.gradient_y[0, 3, 0] == 0
+
+
+def test_a_slope_seen_by_a_sensor_has_its_normal():
+    emap = small_map(1, (10, 10))
+    x, y = np.meshgrid(np.arange(-0.49, 0.5, 0.02), np.arange(-0.49, 0.5, 0.02), indexing="ij")
+    cloud = np.column_stack([x.ravel(), y.ravel(), 0.5 * x.ravel() - 1.0])
+    emap.update(torch.from_numpy(cloud)[None], pose(), pose(), 0.1)
+    steep = torch.tensor(-0.5 / math.sqrt(1.25)).expand(1, 10, 10)
+    torch.testing.assert_close(emap.layer("normal_x"), steep, atol=0.02, rtol=0)
+    assert emap.layer("normal_y").abs().max() < 0.02
+
+
+def test_refuses():
+    with pytest.raises(ValueError, match="surface.radius"):
+        SurfaceConfig(radius=0)

@@ -1,0 +1,60 @@
+"""The analytic head."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import reference
+import torch
+from conftest import pose, random_state, small_map, terrain
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchelev import TraversabilityConfig
+from torchelev.traversability import height_range, traversability
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.05, 0.1, 0.2]), st.floats(0.2, 1.0), st.floats(1, 10))
+def test_agrees_with_the_reference(seed, radius, known, forgiving):
+    cfg = TraversabilityConfig(radius=radius, critical_step=0.2 * forgiving, critical_roughness=0.05 * forgiving)
+    grid = small_map(1, (7, 6)).cfg.grid
+    state = random_state(np.random.default_rng(seed), grid, 2, known)
+    got = traversability(state, grid, cfg).traversability
+    for b, i, j in np.ndindex(2, 7, 6):
+        expected = 0.0
+        if state.validity[b, i, j]:
+            elevation, validity = state.elevation[b].numpy(), state.validity[b].numpy()
+            expected = reference.traversability(elevation, validity, i, j, 0.1, **dataclasses.asdict(cfg))
+        assert float(got[b, i, j]) == pytest.approx(expected, abs=1e-4)  # the square roots are clamped
+
+
+def test_flat_is_traversable_and_a_step_is_not():
+    emap = small_map(1, (20, 10))
+    state = emap.state._replace(validity=torch.ones_like(emap.validity))
+    state.elevation[:, 12:] = 0.3
+    result = traversability(state, emap.cfg.grid, emap.cfg.traversability).traversability
+    assert result[0, :10].min() > 0.99 and result[0, 11:13].max() == 0 and result[0, 15:].min() > 0.99
+
+
+@given(st.integers(0, 10_000), st.integers(1, 3))
+def test_height_range(seed, radius):
+    state = random_state(np.random.default_rng(seed), small_map(1, (6, 5)).cfg.grid)
+    got = height_range(state.elevation, state.validity, radius)
+    for i, j in np.ndindex(6, 5):
+        cells = reference.window(state.validity[0].numpy(), i, j, radius)
+        heights = [float(state.elevation[0, a, b]) for a, b in cells]
+        assert float(got[0, i, j]) == (max(heights) - min(heights) if state.validity[0, i, j] else 0.0)
+
+
+@pytest.mark.xfail(strict=True, reason="the layer is 0; the contract says NaN where the head has no answer")
+def test_a_map_without_the_head_knows_no_traversability():
+    emap = small_map(1, traversability=None)
+    emap.update(torch.from_numpy(terrain(np.random.default_rng(0), 200))[None] - torch.tensor([0, 0, 1]), pose())
+    assert emap.layer("elevation").isfinite().any()
+    assert emap.layer("traversability").isnan().all()
+
+
+@pytest.mark.parametrize("name", ["radius", "critical_slope", "critical_step", "critical_roughness"])
+def test_refuses(name):
+    with pytest.raises(ValueError, match=f"traversability.{name}"):
+        TraversabilityConfig(**{name: 0.0})
