@@ -87,11 +87,16 @@ def test_drift():
     layers |= {"validity": np.array([[True, True, False]]), "traversability": np.array([[1.0, 0.2, 1.0]])}
     layers["gradient_x"][0, 0] = 1.0
     settings = dict(min_traversability=0.5, max_variance=1.0, max_error=0.3, min_points=2, max_drift=0.2, gain=0.5)
+    settings |= dict(sigma2=9.0, gate=1.0, relief=4.0)
     # Cell 0 has its centre at (0.5, 0.5): the plane is 0.25 at x = 0.75. Cell 1 is not flat, cell 2 unknown.
     points = [(0.5, 0.5, 0.1), (0.75, 0.5, 0.25 + 0.2), (0.5, 0.5, 0.31), (0.5, 1.5, 0.1), (0.5, 2.5, 0.1), (7, 7, 0.1)]
     number, mean, correction = reference.drift(layers, points, (0, 0), 1.0, **settings)
     assert number == 2 and mean == pytest.approx(0.15) and correction == pytest.approx(0.075)
     assert reference.drift(layers, points[:1], (0, 0), 1.0, **settings)[2] == 0.0
+    # Around the mean of 0.1, 0.1 and 0.25 (0.15), only the first two lie within sqrt(0.06^2 + 0.08^2) = 0.1 * 0.6.
+    settings |= dict(sigma2=0.06**2, gate=0.6, relief=0.08)
+    points = [(0.5, 0.5, 0.1), (0.5, 0.6, 0.1), (0.5, 0.5, 0.25)]
+    assert reference.drift(layers, points, (0, 0), 1.0, **settings)[:2] == (2, pytest.approx(0.1))
 
 
 def test_clear_other_floors():

@@ -1,0 +1,87 @@
+"""The whole configuration."""
+
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchelev import BodyConfig, DriftConfig, ElevationMapConfig, FusionConfig, GridConfig, RaycastConfig, SensorConfig
+from torchelev.config import differing_fields
+
+SOME = [
+    ElevationMapConfig(),
+    ElevationMapConfig(drift=None, raycast=None, overlap=None, traversability=None),
+    ElevationMapConfig(sensor=SensorConfig(body=BodyConfig(), exclusion=None), fusion=FusionConfig(edges=None)),
+    ElevationMapConfig(grid=GridConfig(resolution=0.1, length_x=3.0), raycast=RaycastConfig(max_range=4.0)),
+]
+
+
+@pytest.mark.parametrize("cfg", SOME)
+def test_dict_round_trip(cfg):
+    assert ElevationMapConfig.from_dict(cfg.to_dict()) == cfg
+    assert hash(ElevationMapConfig.from_dict(cfg.to_dict())) == hash(cfg)
+
+
+def test_left_out_keeps_its_default():
+    cfg = ElevationMapConfig.from_dict({"drift": {"gain": 0.5}, "raycast": None})
+    assert cfg == ElevationMapConfig(drift=DriftConfig(gain=0.5), raycast=None)
+
+
+def test_yaml_numbers_become_floats_and_lists_tuples():
+    cfg = ElevationMapConfig.from_dict({"grid": {"length_x": 8}, "sensor": {"body": {"lower": [-1.0, -1.0, -1.0]}}})
+    assert isinstance(cfg.grid.length_x, float) and cfg.sensor.body.lower == (-1.0, -1.0, -1.0)
+
+
+@pytest.mark.parametrize(
+    "values, named",
+    [
+        ({"grit": {}}, "config.grit"),
+        ({"grid": {"size": 3}}, "config.grid.size"),
+        ({"grid": 3}, "config.grid"),
+        ({"grid": None}, "config.grid"),
+        ({"grid": {"resolution": "4 cm"}}, "config.grid.resolution"),
+        ({"grid": {"resolution": -1}}, "grid.resolution"),
+        ({"fusion": {"edges": {"sharp": 1}}}, "config.fusion.edges.sharp"),
+        ([], "config"),
+    ],
+)
+def test_refuses_and_names_the_field(values, named):
+    with pytest.raises(ValueError, match=named.replace(".", r"\.")):
+        ElevationMapConfig.from_dict(values)
+
+
+def test_configs_are_frozen_and_keyword_only():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        ElevationMapConfig().grid.resolution = 1.0
+    with pytest.raises(TypeError):
+        GridConfig(0.1)
+
+
+@pytest.mark.parametrize("name", ["gate", "scan_variance_floor", "max_variance"])
+def test_fusion_refuses(name):
+    with pytest.raises(ValueError, match=f"fusion.{name}"):
+        FusionConfig(**{name: 0.0})
+
+
+@pytest.mark.parametrize("bad", [dict(min_time=-1.0), dict(min_incidence=1.0), dict(min_incidence=-0.1)])
+def test_raycast_refuses(bad):
+    with pytest.raises(ValueError, match=f"raycast.{next(iter(bad))}"):
+        RaycastConfig(**bad)
+
+
+@pytest.mark.xfail(strict=True, reason="not checked: a negative range fails inside the first update")
+def test_raycast_refuses_a_negative_range():
+    with pytest.raises(ValueError, match="raycast.max_range"):
+        RaycastConfig(max_range=-1.0)
+
+
+@given(st.floats(0.1, 0.9), st.booleans())
+def test_differing_fields(gain, body):
+    a = ElevationMapConfig()
+    b = dataclasses.replace(a, drift=DriftConfig(gain=gain))
+    names = ["drift.gain"]
+    if body:
+        b, names = dataclasses.replace(b, sensor=SensorConfig(body=BodyConfig())), [*names, "sensor.body"]
+    assert differing_fields(a.to_dict(), b.to_dict()) == names
+    assert differing_fields(a.to_dict(), a.to_dict()) == []

@@ -1,0 +1,52 @@
+"""Window sums and running minima, operators of their own."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchelev.windows import moment_orders, running_minimum, window_moments
+
+SIZES = st.tuples(st.integers(1, 2), st.integers(1, 7), st.integers(1, 6))
+
+
+@given(st.integers(0, 10_000), SIZES, st.integers(1, 4), st.integers(0, 2))
+def test_window_moments_are_sums_over_the_window(seed, shape, radius, order):
+    values = np.random.default_rng(seed).normal(size=shape)
+    moments = window_moments(torch.from_numpy(values), radius, order)
+    offsets = range(-radius, radius + 1)
+    for k, (a, b) in enumerate(moment_orders(order)):
+        for env, i, j in np.ndindex(*shape):
+            near = [
+                u**a * v**b * values[env, i + u, j + v]
+                for u in offsets
+                for v in offsets
+                if 0 <= i + u < shape[1] and 0 <= j + v < shape[2]
+            ]
+            assert float(moments[k, env, i, j]) == pytest.approx(sum(near), abs=1e-9)
+
+
+@given(st.integers(0, 10_000), SIZES, st.booleans())
+def test_running_minimum(seed, shape, from_end):
+    table = np.random.default_rng(seed).normal(size=shape)
+    passed = torch.from_numpy(table.copy())
+    expected = np.empty_like(table)
+    for k in range(shape[1]):
+        expected[:, k] = (table[:, k:] if from_end else table[:, : k + 1]).min(1)
+    np.testing.assert_array_equal(running_minimum(passed, from_end), expected)
+    np.testing.assert_array_equal(passed, table)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_gradient_of_window_moments(order):
+    values = torch.randn(2, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: window_moments(v, 2, order), (values,))
+
+
+@pytest.mark.parametrize(
+    "operator, settings", [("window_moments", (1, 2)), ("running_minimum", (True,)), ("running_minimum", (False,))]
+)
+def test_operators_are_registered_right(operator, settings):
+    """Fake shapes, aliasing and compilation, as torch checks them."""
+    torch.library.opcheck(getattr(torch.ops.torchelev, operator).default, (torch.randn(2, 5, 4), *settings))
