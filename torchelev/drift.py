@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, lattice_offset, locate, pad_cells
@@ -18,6 +19,8 @@ class DriftConfig:
     min_traversability: float = 0.5  # flat enough for a height error to mean drift
     max_variance: float = 0.01  # [m^2] certain enough cells
     max_error: float = 0.1  # [m] larger errors of single points are obstacles
+    gate: float = 2.0  # standard deviations around the mean error that still count
+    relief: float = 0.003  # [m] standard deviation of height within a flat cell
     min_points: int = 50
     max_drift: float = 0.1  # [m] a larger mean error is not corrected
     gain: float = 1.0  # the paper adds the whole mean error
@@ -25,6 +28,11 @@ class DriftConfig:
     def __post_init__(self) -> None:
         require(0 < self.gain <= 1, "drift.gain", "must lie in (0, 1]", self.gain, "the paper's value is 1")
         require(self.min_points >= 1, "drift.min_points", "must be at least 1", self.min_points, "give 50")
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Average (B, M) over what the mask keeps; 0 where it keeps nothing."""
+    return torch.where(mask, values, 0.0).sum(1) / count(mask).clamp(min=1)
 
 
 def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig) -> MapState:
@@ -42,8 +50,10 @@ def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConf
     ground = cells.take(pad_cells(state.elevation)) + (from_center * gradient.detach()).sum(-1)
     error = m.points[..., 2] - ground
     counts = cells.take(pad_cells(suits)) & (error.abs() <= cfg.max_error)
-    number = count(counts)
-    mean = torch.where(counts, error, 0.0).sum(1) / number.clamp(min=1)
+    mean = masked_mean(error, counts)
+    # Once more around the mean: the foot of a wall that nobody saw yet stands on ground that looks flat.
+    counts = counts & ((error - mean[:, None]).square() <= cfg.gate**2 * (m.variance + cfg.relief**2))
+    number, mean = count(counts), masked_mean(error, counts)
     applies = (number >= cfg.min_points) & (mean.abs() <= cfg.max_drift)
     correction = torch.where(applies, cfg.gain * mean, 0.0)
     shift = correction[:, None, None]

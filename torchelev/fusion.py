@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class EdgeConfig:
     """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
 
-    min_points: int = 4
+    min_points: int = 6
     min_share: float = 0.25  # of the cell's points outside the gate around its estimate
     refinements: int = 4  # each halves the distance to the top of a wall's face
 
@@ -31,10 +31,10 @@ class FusionConfig:
 
     gate: float = 3.0  # Mahalanobis distance beyond which a point is an outlier
     max_gate_std: float = 0.05  # [m] an uncertain cell's gate grows no wider, or an outlier would slip in
-    relief: float = 0.3  # [cells] standard deviation of height within a cell of rough or sloped ground
+    relief: float = 0.25  # [cells] standard deviation of height within a cell of rough or sloped ground
     scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
-    outlier_variance: float = 2.5e-5  # [m^2] added by a scan that mostly disagrees
-    max_support: float = 30.0  # points; how many must disagree until a settled cell is founded anew
+    outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
+    max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
     max_variance: float = 1.0  # [m^2]
     edges: EdgeConfig | None = EdgeConfig()
 
@@ -125,9 +125,19 @@ def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionCo
         spread=m.variance + (cfg.relief * grid.resolution) ** 2,
         weight=torch.where(used, 1.0 / m.variance, 0.0),
         used=used,
-        beyond=(from_center * ray).sum(-1) > 0,
+        beyond=passed_center(from_center, ray),
         cells=cells,
     )
+
+
+def passed_center(from_center: Tensor, ray: Tensor) -> Tensor:
+    """Tell which rays passed over the middle of the cell before they hit: within 45 degrees of straight behind it.
+
+    A wall that the ray meets at an angle also has points farther along the ray; those passed the centre by.
+    """
+    along = (from_center * ray).sum(-1)
+    across = from_center[..., 0] * ray[..., 1] - from_center[..., 1] * ray[..., 0]
+    return along > across.abs()
 
 
 def gather_prior(state: MapState, cfg: FusionConfig) -> Prior:

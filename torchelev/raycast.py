@@ -17,6 +17,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate, pad_cells
 from torchelev.state import MapState, Measurement, count, tally
+from torchelev.windows import running_minimum
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -28,7 +29,7 @@ NO_RAY = 1e4  # a slope above every ray's
 class RaycastConfig:
     """When a ray removes a cell, and which rays are believed."""
 
-    min_time: float = 0.5  # [s] cells hit within it stay
+    min_time: float = 1.0  # [s] cells hit within it stay
     min_incidence: float = 0.1  # alpha_n: |r . n| below it is a grazing ray
     max_range: float | None = None  # [m] rays count up to here; None: 1.1 half-diagonals of the window
     min_support: float = 2.0  # points that agree with a ray's end, or a neighbouring cell, for the ray to be believed
@@ -113,7 +114,36 @@ def believed(state: MapState, m: Measurement, s: int, grid: GridConfig, cfg: Ray
     supported = cells.take(pad_cells(well_supported(state, cfg, grid.resolution)))
     spread = cells.take(pad_cells(state.variance)) + (0.5 * grid.resolution) ** 2
     below = height < cells.take(pad_cells(state.elevation)) - cfg.gate * spread.sqrt()
-    return casts & (cells.index < cells.num_cells) & (~known | (supported & ~below))
+    ends_well = (cells.index < cells.num_cells) & (~known | (supported & ~below))
+    return casts & ends_well & ~under_horizon(state, m, s, grid, cfg)
+
+
+def under_horizon(state: MapState, m: Measurement, s: int, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
+    """Tell which rays pass below ground that was hit within `min_time`: they contradict it, and are wrong returns.
+
+    The horizon at a range is the steepest slope under which the sensor sees recently hit ground up to there. It is kept
+    in a polar table of half the resolution, filled by gathering from the map.
+    """
+    step = 2 * grid.resolution
+    polar = PolarGrid.of(grid, cfg)
+    ranges, azimuths = polar.ranges // 2 + 1, polar.azimuths // 2
+    points, device = sensor_points(m, s)[0], m.points.device
+    rho = (torch.arange(ranges, device=device, dtype=points.dtype) + 0.5) * step
+    angle = (torch.arange(azimuths, device=device, dtype=points.dtype) + 0.5) * (2 * math.pi / azimuths)
+    circle = torch.stack([angle.cos(), angle.sin()], -1)
+    xy = m.origin[:, s, None, :2] + (rho[:, None, None] * circle).flatten(0, 1)
+    cells = locate(xy, torch.ones_like(xy[..., 0], dtype=torch.bool), lattice_offset(state, m, grid), grid)
+    margin = cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
+    recent = state.validity & (state.time <= cfg.min_time) & (state.support >= cfg.min_support)
+    below_sensor = pad_cells(torch.where(recent, m.origin[:, s, 2, None, None] - state.elevation + margin, NO_RAY))
+    fall = cells.take(below_sensor).unflatten(1, (ranges, azimuths)) / rho[:, None]
+    horizon = running_minimum(torch.where(cells.index.view_as(fall) < grid.num_cells, fall, NO_RAY), from_end=False)
+    ray = points - m.origin[:, s, None]
+    r = (ray[..., 0].square() + ray[..., 1].square()).clamp(min=1e-12).sqrt()
+    k = (torch.floor(r / step) - 1).clamp(max=ranges - 1)
+    a = torch.floor(turn(ray[..., 0], ray[..., 1]) * azimuths).clamp(max=azimuths - 1)
+    limit = horizon.flatten(1).gather(1, (k.clamp(min=0) * azimuths + a).to(torch.int64))
+    return (k >= 0) & (-ray[..., 2] / r > limit)
 
 
 def sensor_points(m: Measurement, s: int) -> tuple[Tensor, Tensor]:
@@ -127,17 +157,12 @@ def lowest_slopes(m: Measurement, s: int, casts: Tensor, polar: PolarGrid, grid:
     ray = sensor_points(m, s)[0] - m.origin[:, s, None]
     r = torch.linalg.vector_norm(torch.where(ray[..., :2] == 0, 1e-12, ray[..., :2]), dim=-1)
     slope = ray[..., 2] / r.clamp(min=1e-6)
-    last = torch.floor(r / grid.resolution).clamp(max=polar.ranges) - 1
+    last = torch.floor(r / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(turn(ray[..., 0], ray[..., 1]) * polar.azimuths).clamp(max=polar.azimuths - 1)
     size = polar.ranges * polar.azimuths
     index = torch.where(casts & (last >= 0), last * polar.azimuths + a, size).to(torch.int64)
     table = slope.new_full((slope.shape[0], size + 1), NO_RAY).scatter_reduce(1, index, slope, "amin")
-    table = table[:, :-1].reshape(-1, polar.ranges, polar.azimuths)
-    step = 1
-    while step < polar.ranges:  # reversed running minimum by doubling
-        table = torch.cat([torch.minimum(table[:, :-step], table[:, step:]), table[:, -step:]], 1)
-        step *= 2
-    return table
+    return running_minimum(table[:, :-1].reshape(-1, polar.ranges, polar.azimuths), from_end=True)
 
 
 def pyramid(table: Float[Tensor, "B R A"], levels: int) -> Float[Tensor, "B R P"]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.state import MapState
+from torchelev.windows import window_moments
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -35,26 +35,6 @@ class Plane(NamedTuple):
     residual: Float[Tensor, "B H W"]  # [m^2] mean squared distance in z
 
 
-def shifted_sum(layer: Tensor, weights: list[float], dim: int) -> Tensor:
-    """Correlate along one dimension with a short odd kernel, zeros outside."""
-    radius = len(weights) // 2
-    pad = [radius, radius, 0, 0] if dim == -1 else [0, 0, radius, radius]
-    padded = F.pad(layer, pad)
-    terms = [w * padded.narrow(dim, k, layer.shape[dim]) for k, w in enumerate(weights) if w]
-    return torch.stack(terms).sum(0) if len(terms) > 8 else sum(terms[1:], terms[0])
-
-
-def window_moments(values: Tensor, radius: int, order: int) -> dict[tuple[int, int], Tensor]:
-    """Sum u^a v^b * values over a (2 * radius + 1)^2 window, a + b <= order; u, v count cells from the centre."""
-    offsets = [float(k) for k in range(-radius, radius + 1)]
-    along_x = [shifted_sum(values, [u**a for u in offsets], -2) for a in range(order + 1)]
-    return {
-        (a, b): shifted_sum(along_x[a], [v**b for v in offsets], -1)
-        for a in range(order + 1)
-        for b in range(order + 1 - a)
-    }
-
-
 def fit_plane(
     elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], radius: int, resolution: float
 ) -> Plane:
@@ -68,12 +48,12 @@ def fit_plane(
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
     datum = (torch.where(validity, elevation, 0.0).sum((1, 2), keepdim=True) / number).detach()
     z = torch.where(validity, elevation - datum, 0.0)
-    n, h = window_moments(known, radius, 2), window_moments(z, radius, 1)
-    square = window_moments(z.square(), radius, 0)[0, 0]
-    total = n[0, 0].clamp(min=1)
-    mu, mv, mz = n[1, 0] / total, n[0, 1] / total, h[0, 0] / total
-    uu, vv, uv = n[2, 0] / total - mu * mu, n[0, 2] / total - mv * mv, n[1, 1] / total - mu * mv
-    uz, vz = h[1, 0] / total - mu * mz, h[0, 1] / total - mv * mz
+    (n, n_v, n_vv, n_u, n_uv, n_uu), (s_z, s_vz, s_uz) = window_moments(known, radius, 2), window_moments(z, radius, 1)
+    (s_zz,) = window_moments(z.square(), radius, 0)
+    share = 1 / n.clamp(min=1)
+    mu, mv, mz = n_u * share, n_v * share, s_z * share
+    uu, vv, uv = n_uu * share - mu * mu, n_vv * share - mv * mv, n_uv * share - mu * mv
+    uz, vz = s_uz * share - mu * mz, s_vz * share - mv * mz
     det = uu * vv - uv * uv
     spread = uu + vv
     regular = det > 1e-4
@@ -81,7 +61,7 @@ def fit_plane(
     safe_spread = torch.where(spread > 1e-4, spread, 1.0)
     gu = torch.where(regular, (vv * uz - uv * vz) / safe_det, uz / safe_spread)
     gv = torch.where(regular, (uu * vz - uv * uz) / safe_det, vz / safe_spread)
-    residual = (square / total - mz * mz - gu * uz - gv * vz).clamp(min=0)
+    residual = (s_zz * share - mz * mz - gu * uz - gv * vz).clamp(min=0)
     return Plane(gu / resolution, gv / resolution, residual)
 
 
