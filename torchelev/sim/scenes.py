@@ -151,20 +151,21 @@ def stairs(rise: float = 0.17, run: float = 0.29, count: int = 8) -> Scene:
 
 def boxes(seed: int = 0, count: int = 24) -> Scene:
     """Make boxes of 10 to 50 cm height on flat ground, within 4 m, none nearer than 0.7 m to the origin."""
-    return Scene(name="boxes", boxes=tuple(_crates(seed, count, (-4.0, 4.0, -4.0, 4.0), keep_off=0.7)))
+    return Scene(name="boxes", boxes=tuple(crates(seed, count, (-4.0, 4.0, -4.0, 4.0), keep_off=0.7)))
 
 
-def _crates(seed: int, count: int, area: tuple[float, float, float, float], keep_off: float = 0.0) -> list[Box]:
+def crates(seed: int, count: int, area: tuple[float, float, float, float], keep_off: float = 0.0) -> list[Box]:
+    """Make `count` boxes of 10 to 50 cm within area (x0, x1, y0, y1) [m], `keep_off` [m] or more from the origin."""
     generator = torch.Generator().manual_seed(seed)
-    crates: list[Box] = []
-    while len(crates) < count:
+    made: list[Box] = []
+    while len(made) < count:
         u = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
         x = area[0] + u[0] * (area[1] - area[0])
         y = area[2] + u[1] * (area[3] - area[2])
         half_x, half_y, top = 0.1 + 0.25 * u[2], 0.1 + 0.25 * u[3], 0.1 + 0.4 * u[4]
         if math.hypot(max(abs(x) - half_x, 0.0), max(abs(y) - half_y, 0.0)) > keep_off:
-            crates.append(block(x - half_x, x + half_x, y - half_y, y + half_y, top))
-    return crates
+            made.append(block(x - half_x, x + half_x, y - half_y, y + half_y, top))
+    return made
 
 
 def mixed(seed: int = 0) -> Scene:
@@ -178,9 +179,9 @@ def mixed(seed: int = 0) -> Scene:
 
     climb = steps(1.217, -0.787, 0.913, count=6, rise=0.17, run=0.29)
     landing = block(1.217 + 6 * 0.29, 4.5, -0.787, 0.913, 6 * 0.17)
-    crates = _crates(seed + 1, 9, (-0.8, 3.6, -3.7, -1.4))
+    aside = crates(seed + 1, 9, (-0.8, 3.6, -3.7, -1.4))
     # The relief is faded in over 1 m, which adds its height to its slope.
-    return Scene(name="mixed", terrain=terrain, steepness=gradient + steepness + 0.1, boxes=(*climb, landing, *crates))
+    return Scene(name="mixed", terrain=terrain, steepness=gradient + steepness + 0.1, boxes=(*climb, landing, *aside))
 
 
 def wall() -> Scene:
