@@ -170,7 +170,8 @@ def overhang_cells(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figur
 
     Overhang cells: hit by exact returns of bar or ceiling that lay above the default ramp, by none that lay below it.
     `overhang [%]`: share of them more than 10 cm above the ground in the map after any frame.
-    `all under it at the end [%]`: cells under bar or ceiling, known, more than 10 cm too high in the last map.
+    `bar at the end [%]`, `ceiling at the end [%]`: of the known cells under it, those more than 10 cm too high in the
+    last map, whether or not it was below the ramp from somewhere (the bar was, from afar).
     `obstacle mapped [%]`: of the cells wholly on the low obstacle's top that an exact return had hit, those within 3 cm
     of it, in the last map before the robot is under the bar or at the end, whichever has fewer.
     """
@@ -192,10 +193,12 @@ def overhang_cells(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figur
 
     emap = fuse(recording, cfg, watch)
     cells = cells_of(emap, recording)
-    under = recording.scene.covered(cells.xy) & cells.error.isfinite()
+    high, known = cells.error > 0.1, cells.error.isfinite()
+    under = [box.covers(cells.xy[..., 0], cells.xy[..., 1]) & known for box in recording.scene.boxes[:2]]
     return {
         "overhang [%]": 100 * share(ever, within),
-        "all under it at the end [%]": 100 * share(cells.error > 0.1, under),
+        "bar at the end [%]": 100 * share(high, under[0]),
+        "ceiling at the end [%]": 100 * share(high, under[1]),
         "obstacle mapped [%]": min(mapped),
         "cells": float(within.sum()),
     }, emap

@@ -52,7 +52,7 @@ LEFT = {"left [%]": ("<=", 1.0)}
 REMOVED = {"removed [%]": ("<=", 0.5)}
 OVERHANG = {"overhang [%]": ("<=", 0.2), "obstacle mapped [%]": (">=", 90.0)}
 SEAM = {"seam [cm]": ("<=", 1.0), "seam mean [cm]": ("<=", 1.0)}
-WALLS = {name: ("<=", 2.0) for name in ("wall top [cm]", "tall wall top [cm]", "top cells [cm]")}
+WALLS = {name: ("<=", 2.0) for name in ("top cells [cm]", "wall top [cm]", "tall wall top [cm]")}
 FLOOR = {"other floor [%]": ("<=", 1.0)}
 BOUNDS = {"bounded [%]": (">=", 60.0), "below truth [%]": ("<=", 1.0)}
 WRONG = 0.01  # share of returns that are too long
@@ -137,7 +137,7 @@ def draw(outcomes: list[Outcome], path: Path) -> None:
     from matplotlib.figure import Figure
 
     outcomes = [outcome for outcome in outcomes if outcome.feature.name in PICTURED]
-    figure = Figure(figsize=(12.5, 2.9 * len(outcomes)), layout="compressed")
+    figure = Figure(figsize=(12.5, 2.15 * len(outcomes)), layout="compressed")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(outcomes), 4, squeeze=False)
     for row, outcome in zip(axes, outcomes, strict=True):
@@ -147,12 +147,18 @@ def draw(outcomes: list[Outcome], path: Path) -> None:
     figure.savefig(path, dpi=80)
 
 
+def limits(*layers: torch.Tensor) -> tuple[float, float]:
+    """Return heights [m] that leave 1 in 1000 cells of any layer off the colour scale at either end."""
+    known = [layer[layer.isfinite()] for layer in layers]
+    return min(float(z.quantile(0.001)) for z in known) - 0.02, max(float(z.quantile(0.999)) for z in known) + 0.02
+
+
 def draw_row(figure, row, outcome: Outcome) -> None:
     """Draw truth, on, off and baseline of one feature."""
     xy = outcome.maps["on"].cell_centers()[0]
     truth = outcome.recording.truth(xy)
     layer = "upper_bound" if outcome.feature.measure is metrics.bounds else "elevation"
-    low, high = float(truth.quantile(0.001)) - 0.05, float(truth.quantile(0.999)) + 0.15
+    low, high = limits(truth, outcome.maps["on"].layer("elevation")[0].double())
     layers = {"truth": truth, **{name: emap.layer(layer)[0] for name, emap in outcome.maps.items()}}
     corner, end = xy[0, 0] - GRID.resolution / 2, xy[-1, -1] + GRID.resolution / 2
     extent = (float(corner[0]), float(end[0]), float(corner[1]), float(end[1]))
