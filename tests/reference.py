@@ -108,11 +108,11 @@ def voxel_means(points, size):
 # Time and drift -------------------------------------------------------------------------------------------------------
 
 
-def age(variance, time, dt, rate, max_variance):
-    """sigma_m^2 += sigma_t^2 * dt, not above the maximum; the time since the last hit grows."""
+def age(variance, time, dt, rate):
+    """sigma_m^2 += sigma_t^2 * dt; the time since the last hit grows."""
     variance, time = variance.copy(), time.copy()
     for cell in np.ndindex(variance.shape):
-        variance[cell] = min(variance[cell] + rate * dt, max_variance)
+        variance[cell] += rate * dt
         time[cell] += dt
     return variance, time
 

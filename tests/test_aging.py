@@ -8,20 +8,20 @@ from conftest import nans, pose, random_state, small_map
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev import AgingConfig
+from torchelev import AgingConfig, FusionConfig
 from torchelev.aging import age
 
 
-@given(st.integers(0, 10_000), st.floats(0, 5), st.floats(1e-3, 2))
-def test_agrees_with_the_reference(seed, rate, max_variance):
+@given(st.integers(0, 10_000), st.floats(0, 5))
+def test_agrees_with_the_reference(seed, rate):
     rng = np.random.default_rng(seed)
     emap = small_map(3, (5, 4), dtype=torch.float64)
     state = random_state(rng, emap.cfg.grid, 3)
     dt = torch.from_numpy(rng.uniform(0, 2, 3))
     m = emap.measure(nans(3), pose(num_envs=3), None, dt)
-    after = age(state, m, AgingConfig(variance_rate=rate, max_variance=max_variance))
+    after = age(state, m, AgingConfig(variance_rate=rate))
     for b in range(3):
-        args = (state.variance[b].numpy(), state.time[b].numpy(), dt[b].item(), rate, max_variance)
+        args = (state.variance[b].numpy(), state.time[b].numpy(), dt[b].item(), rate)
         variance, time = reference.age(*args)
         np.testing.assert_allclose(after.variance[b], variance, rtol=1e-12)
         np.testing.assert_allclose(after.time[b], time, rtol=1e-12)
@@ -38,7 +38,14 @@ def test_each_environment_has_its_own_dt():
     torch.testing.assert_close(passed[1], torch.full_like(passed[1], 2.0))
 
 
-@pytest.mark.parametrize("bad", [dict(variance_rate=-1.0), dict(max_variance=0.0)])
-def test_refuses(bad):
-    with pytest.raises(ValueError, match=f"aging.{next(iter(bad))}"):
-        AgingConfig(**bad)
+def test_the_variance_grows_to_its_maximum():
+    emap = small_map(1, aging=AgingConfig(variance_rate=0.4), fusion=FusionConfig(max_variance=0.5))
+    emap._store(random_state(np.random.default_rng(0), emap.cfg.grid, known=1.0))
+    for _ in range(2):
+        emap.update(nans(1), pose(), None, 1.0)
+    assert (emap.layer("variance") == 0.5).all()
+
+
+def test_refuses():
+    with pytest.raises(ValueError, match="aging.variance_rate"):
+        AgingConfig(variance_rate=-1.0)

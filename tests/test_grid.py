@@ -111,8 +111,8 @@ def test_point_cells_sum_and_take():
     grid = small_config((2, 2), 1.0).grid
     xy = torch.tensor([[[0.5, 0.5], [0.6, 0.1], [1.5, 0.5], [9.0, 0.0]]])
     cells = locate(xy, torch.ones(1, 4, dtype=torch.bool), torch.zeros(1, 2), grid)
-    totals = cells.sum(torch.tensor([[1.0, 2.0, 4.0, 8.0]]))
-    assert totals.tolist() == [[3, 0, 4, 0, 8]]
+    totals, number = cells.sums(torch.tensor([[1.0, 2.0, 4.0, 8.0]]), torch.ones(1, 4))
+    assert totals.tolist() == [[3, 0, 4, 0, 8]] and number.tolist() == [[2, 0, 1, 0, 1]]
     assert cells.take(totals).tolist() == [[3, 3, 4, 8]]
 
 

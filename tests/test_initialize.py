@@ -68,7 +68,7 @@ def test_only_unknown_cells_are_founded():
     emap.elevation[:, :6] = 9.0
     emap.initialize(FEET[None], method="nearest")
     assert (emap.elevation[:, :6] == 9.0).all() and emap.elevation[:, 6:].abs().max() <= 0.3
-    assert (emap.variance[:, 6:] == emap.cfg.aging.max_variance).all()
+    assert (emap.variance[:, 6:] == emap.cfg.fusion.max_variance).all()
 
 
 def test_the_first_measurement_wins():

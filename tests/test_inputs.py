@@ -255,7 +255,7 @@ def test_random_garbage_never_poisons_the_map(seed, dtype):
         T = random_poses(rng, 2, tilt=3.0, reach=1.0)
         emap.update(torch.from_numpy(cloud).to(dtype), T, T if rng.random() < 0.7 else None, float(rng.random()))
         assert floats_finite(emap.state) == []
-        assert (emap.variance > 0).all() and (emap.variance <= emap.cfg.aging.max_variance).all()
+        assert (emap.variance > 0).all() and (emap.variance <= emap.cfg.fusion.max_variance).all()
 
 
 @given(st.integers(0, 10_000))

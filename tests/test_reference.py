@@ -77,8 +77,8 @@ def test_voxel_means():
 
 
 def test_age():
-    variance, time = reference.age(np.array([[0.1, 0.95]]), np.array([[0.0, 2.0]]), 2.0, 0.1, 1.0)
-    np.testing.assert_allclose(variance, [[0.3, 1.0]])
+    variance, time = reference.age(np.array([[0.1, 0.95]]), np.array([[0.0, 2.0]]), 2.0, 0.1)
+    np.testing.assert_allclose(variance, [[0.3, 1.15]])
     np.testing.assert_allclose(time, [[2, 4]])
 
 

@@ -1,4 +1,4 @@
-"""Window sums and running minima, operators of their own."""
+"""Sums per cell and window, running minima and pyramids: operators of their own."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.windows import moment_orders, running_minimum, window_moments
+from torchelev.operators import azimuth_pyramid, cell_sums, moment_orders, running_minimum, window_moments
 
 SIZES = st.tuples(st.integers(1, 2), st.integers(1, 7), st.integers(1, 6))
 
@@ -38,15 +38,47 @@ def test_running_minimum(seed, shape, from_end):
     np.testing.assert_array_equal(passed, table)
 
 
+@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 3), st.integers(0, 20))
+def test_cell_sums(seed, columns, num_envs, num_points):
+    rng = np.random.default_rng(seed)
+    index, values = rng.integers(0, 5, (num_envs, num_points)), rng.normal(size=(columns, num_envs, num_points))
+    expected = np.zeros((columns, num_envs, 5))
+    for k, b, n in np.ndindex(*values.shape):
+        expected[k, b, index[b, n]] += values[k, b, n]
+    np.testing.assert_allclose(cell_sums(torch.from_numpy(index), torch.from_numpy(values), 5), expected)
+
+
+def test_azimuth_pyramid():
+    table = torch.tensor([[[5.0, 3.0, 4.0, 1.0, 7.0, 8.0, 9.0, 6.0]]])
+    assert azimuth_pyramid(table, 2).tolist() == [[table[0, 0].tolist() + [3, 1, 7, 6] + [1, 6]]]
+
+
+def test_gradient_of_cell_sums():
+    index = torch.tensor([[0, 2, 2, 1], [1, 1, 1, 3]])
+    values = torch.randn(3, 2, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: cell_sums(index, v, 4), (values,))
+
+
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_gradient_of_window_moments(order):
     values = torch.randn(2, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
     assert torch.autograd.gradcheck(lambda v: window_moments(v, 2, order), (values,))
 
 
+TABLE = torch.linspace(0, 1, 40).view(2, 5, 4)
+
+
 @pytest.mark.parametrize(
-    "operator, settings", [("window_moments", (1, 2)), ("running_minimum", (True,)), ("running_minimum", (False,))]
+    "operator, arguments",
+    [
+        ("window_moments", (TABLE, 1, 2)),
+        ("running_minimum", (TABLE, True)),
+        ("running_minimum", (TABLE, False)),
+        ("azimuth_pyramid", (TABLE, 2)),
+        ("azimuth_pyramid", (TABLE, 0)),
+        ("cell_sums", (torch.tensor([[0, 1], [1, 1]]), torch.ones(3, 2, 2), 2)),
+    ],
 )
-def test_operators_are_registered_right(operator, settings):
+def test_operators_are_registered_right(operator, arguments):
     """Fake shapes, aliasing and compilation, as torch checks them."""
-    torch.library.opcheck(getattr(torch.ops.torchelev, operator).default, (torch.randn(2, 5, 4), *settings))
+    torch.library.opcheck(getattr(torch.ops.torchelev, operator).default, arguments)
