@@ -2,10 +2,10 @@
 
     python -m benchmarks.accuracy            # benchmarks/results/accuracy.json, accuracy.png and a table
 
-Closed-form scenes; a 160 x 120 depth camera (86 x 58 degrees, pitched 35 degrees down) at 0.8 m turning on the spot, the
-same camera on a walk with roll, pitch and bob, and a 32-ring lidar; each without and with noise, and with 8 % of the
-points at wrong ranges along their ray. Scored are the cells within 2.5 m of the robot's last place, against the true
-height at the cell's centre.
+Closed-form scenes; a 160 x 120 depth camera (86 x 58 degrees, pitched 35 degrees down) at 0.8 m turning on the spot,
+the same camera on a walk with roll, pitch and bob, and a 32-ring lidar; each without and with noise, and with 8 % of
+the points at wrong ranges along their ray. Scored are the cells within 2.5 m of the robot's last place, against the
+true height at the cell's centre.
 """
 
 from __future__ import annotations
@@ -91,7 +91,9 @@ class Cells(NamedTuple):
 
 def plain_cells(emap: ElevationMap, recording: Recording, scans: list[Tensor]) -> Cells:
     """Bin every point of the recording into the map's window: the plain baseline."""
-    in_map = torch.cat([p.double() @ T[:3, :3].T + T[:3, 3] for p, T in zip(scans, recording.T_map_sensor, strict=True)])
+    in_map = torch.cat(
+        [p.double() @ T[:3, :3].T + T[:3, 3] for p, T in zip(scans, recording.T_map_sensor, strict=True)]
+    )
     wrong = torch.cat([(p - q).norm(dim=-1) > 0.1 for p, q in zip(scans, recording.clean, strict=True)])
     index, inside = cell_of(emap, in_map)
     index, z, wrong = index[inside], in_map[inside, 2], wrong[inside]
@@ -153,11 +155,22 @@ def score(name: str, motion: str, kind: str, cfg: ElevationMapConfig | None = No
     both = touched & elevation.isfinite()
     error, mean, top = ((h - truth)[both] * 1e3 for h in (elevation, plain.mean, plain.maximum))
     low, high = true_range(recording.scene, xy)
-    wrong, wrong_mean = (((h - high).clamp(min=0) + (low - h).clamp(min=0))[both] > 0.05 for h in (elevation, plain.mean))
+    wrong, wrong_mean = (
+        ((h - high).clamp(min=0) + (low - h).clamp(min=0))[both] > 0.05 for h in (elevation, plain.mean)
+    )
     rmse, rmse_mean, rmse_max = (e.square().mean().sqrt().item() for e in (error, mean, top))
     return Score(
-        name, motion, kind, rmse, rmse_mean, rmse_max, max(rmse, 1.0) / max(rmse_mean, 1.0), error.mean().item(),
-        (both.sum() / touched.sum()).item(), wrong.double().mean().item(), wrong_mean.double().mean().item(),
+        name,
+        motion,
+        kind,
+        rmse,
+        rmse_mean,
+        rmse_max,
+        max(rmse, 1.0) / max(rmse_mean, 1.0),
+        error.mean().item(),
+        (both.sum() / touched.sum()).item(),
+        wrong.double().mean().item(),
+        wrong_mean.double().mean().item(),
     )
 
 
@@ -185,8 +198,19 @@ def table(rows: Iterable[Score]) -> str:
     """Format the rows as markdown."""
     head = ["scene", "motion", "noise", "map", "mean", "max", "map / mean", "bias", "coverage", "> 5 cm", "holds"]
     body = [
-        [r.scene, r.motion, r.noise, f"{r.rmse:.1f}", f"{r.rmse_mean:.1f}", f"{r.rmse_max:.1f}", f"{r.ratio:.2f}",
-         f"{r.bias:+.1f}", f"{r.coverage:.1%}", f"{r.wrong_5cm:.2%}", "yes" if meets(r) else "no"]
+        [
+            r.scene,
+            r.motion,
+            r.noise,
+            f"{r.rmse:.1f}",
+            f"{r.rmse_mean:.1f}",
+            f"{r.rmse_max:.1f}",
+            f"{r.ratio:.2f}",
+            f"{r.bias:+.1f}",
+            f"{r.coverage:.1%}",
+            f"{r.wrong_5cm:.2%}",
+            "yes" if meets(r) else "no",
+        ]
         for r in rows
     ]
     return markdown_table(head, body)

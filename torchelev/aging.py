@@ -13,17 +13,13 @@ class AgingConfig:
     """How fast an estimate loses certainty while it is not measured."""
 
     variance_rate: float = 1e-7  # [m^2/s] sigma_t^2 per second: 1 cm after 17 minutes
-    max_variance: float = 1.0  # [m^2] of every cell, also after outliers
 
     def __post_init__(self) -> None:
-        require(self.variance_rate >= 0, "aging.variance_rate", "must not be negative", self.variance_rate, "give m^2/s")
-        require(self.max_variance > 0, "aging.max_variance", "must be positive", self.max_variance, "give m^2")
+        rate = self.variance_rate
+        require(rate >= 0, "aging.variance_rate", "must not be negative", rate, "give m^2/s")
 
 
 def age(state: MapState, m: Measurement, cfg: AgingConfig) -> MapState:
-    """Add the time variance, sigma_m^2 += sigma_t^2 * dt up to the maximum (paper, Sec. II-C)."""
+    """Add the time variance, sigma_m^2 += sigma_t^2 * dt (paper, Sec. II-C); `fuse` keeps it below its maximum."""
     dt = m.dt[:, None, None]
-    return state._replace(
-        time=state.time + dt,
-        variance=(state.variance + cfg.variance_rate * dt).clamp(max=cfg.max_variance),
-    )
+    return state._replace(time=state.time + dt, variance=state.variance + cfg.variance_rate * dt)

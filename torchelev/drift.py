@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.grid import GridConfig, lattice_offset, locate, pad_cells
+from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate, pad_cells
 from torchelev.state import MapState, Measurement, count, tally
 
 
@@ -45,10 +45,11 @@ def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConf
     cells = locate(xy, m.used, lattice_offset(state, m, grid), grid)
     suits = state.validity & (state.traversability >= cfg.min_traversability) & (state.variance <= cfg.max_variance)
     # On a slope the height within a cell depends on where in the cell the point lies.
-    from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
-    gradient = torch.stack([cells.take(pad_cells(g)) for g in (state.gradient_x, state.gradient_y)], -1)
-    ground = cells.take(pad_cells(state.elevation)) + (from_center * gradient.detach()).sum(-1)
-    error = m.points[..., 2] - ground
+    x, y = center_offsets(state, m, grid)
+    gx, gy = state.gradient_x.detach(), state.gradient_y.detach()
+    at_origin = state.elevation - gx * x - gy * y
+    ground, gx, gy = (cells.take(pad_cells(layer)) for layer in (at_origin, gx, gy))
+    error = m.points[..., 2] - (ground + gx * xy[..., 0] + gy * xy[..., 1])
     counts = cells.take(pad_cells(suits)) & (error.abs() <= cfg.max_error)
     mean = masked_mean(error, counts)
     # Once more around the mean: the foot of a wall that nobody saw yet stands on ground that looks flat.

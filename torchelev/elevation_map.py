@@ -115,7 +115,9 @@ class ElevationMap(nn.Module):
         super().__init__()
         cfg = ElevationMapConfig() if cfg is None else cfg
         config = isinstance(cfg, ElevationMapConfig)
-        require(config, "cfg", "must be an ElevationMapConfig", type(cfg).__name__, "wrap grid=GridConfig(...)", TypeError)
+        require(
+            config, "cfg", "must be an ElevationMapConfig", type(cfg).__name__, "wrap grid=GridConfig(...)", TypeError
+        )
         whole = isinstance(num_envs, int) and num_envs >= 1
         require(whole, "num_envs", "must be a positive int", repr(num_envs), "give the number of maps")
         self.cfg, self.num_envs, self.check_values = cfg, num_envs, check_values
@@ -188,8 +190,8 @@ class ElevationMap(nn.Module):
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
         run = compiled_update(self.cfg) if self._compiled else functools.partial(_update, cfg=self.cfg)
         if self._compiled:
-            inputs = (*pad_points(inputs[0], inputs[4]), *inputs[1:4])
-            inputs = (inputs[0], *inputs[2:], inputs[1])
+            cloud, variance = pad_points(inputs[0], inputs[4])
+            inputs = (cloud, *inputs[1:4], variance)
         with torch.no_grad():
             self._store(run(self.state, *inputs))
 
@@ -210,7 +212,9 @@ class ElevationMap(nn.Module):
         """Fuse a measurement into a state and return the new one; touches no buffer (paper, Fig. 2)."""
         return fuse_measurement(state, measurement, self.cfg)
 
-    def _check_inputs(self, points: Any, T_map_sensor: Any, T_map_base: Any, dt: Any, variance: Any) -> tuple:
+    def _check_inputs(
+        self, points: Any, T_map_sensor: Any, T_map_base: Any, dt: Any, variance: Any
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor | None]:
         B, device, always = self.num_envs, self.device, self.check_values
         cloud = checks.check_points(points, B, device)
         S = cloud.shape[1]
@@ -263,7 +267,7 @@ class ElevationMap(nn.Module):
         height, inside = interpolate(xy, near, method, self.cfg.grid.resolution)
         found = inside.view_as(state.validity) & ~state.validity
         elevation = torch.where(found, height.view_as(state.elevation), state.elevation)
-        variance = torch.where(found, self.cfg.aging.max_variance, state.variance)
+        variance = torch.where(found, self.cfg.fusion.max_variance, state.variance)
         state = state._replace(elevation=elevation, variance=variance, validity=state.validity | found)
         state = state._replace(time=torch.where(found, 0.0, state.time), support=torch.where(found, 0.0, state.support))
         state = normals(state, self.cfg.grid, self.cfg.surface)

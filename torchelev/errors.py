@@ -8,7 +8,9 @@ def message(argument: str, rule: str, came: object, mend: str) -> str:
     return f"{argument}: {rule}, got {came}; {mend}"
 
 
-def require(holds: bool, argument: str, rule: str, came: object, mend: str, error: type[Exception] = ValueError) -> None:
+def require(
+    holds: bool, argument: str, rule: str, came: object, mend: str, error: type[Exception] = ValueError
+) -> None:
     """Raise `error` with a full message unless the rule holds."""
     if not holds:
         raise error(message(argument, rule, came, mend))

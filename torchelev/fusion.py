@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, lattice_offset, locate, pad_cells
-from torchelev.state import MapState, Measurement, count, tally
+from torchelev.state import BLANK, MapState, Measurement, count, tally
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -22,7 +22,7 @@ class EdgeConfig:
 
     min_points: int = 6
     min_share: float = 0.25  # of the cell's points outside the gate around its estimate
-    refinements: int = 4  # each halves the distance to the top of a wall's face
+    refinements: int = 3  # each halves the distance to the top of a wall's face
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,9 @@ class FusionConfig:
 
     def __post_init__(self) -> None:
         for name in ("gate", "max_gate_std", "scan_variance_floor", "max_variance"):
-            require(getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default")
+            require(
+                getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
+            )
 
 
 class Scan(NamedTuple):
@@ -53,9 +55,9 @@ class Scan(NamedTuple):
     beyond: Bool[Tensor, "B M"]  # the ray passed over the cell's centre before it hit
     cells: PointCells
 
-    def number(self, mask: Tensor) -> Tensor:
-        """Count the points of each cell for which `mask` holds."""
-        return self.cells.sum(mask.to(self.z.dtype))
+    def sums(self, *columns: Tensor) -> tuple[Tensor, ...]:
+        """Sum numbers, or count what is true, over the points of each cell."""
+        return self.cells.sums(*(column.to(self.z.dtype) for column in columns))
 
 
 class Prior(NamedTuple):
@@ -71,11 +73,11 @@ class Prior(NamedTuple):
 def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -> MapState:
     """Fuse the scan into the map (paper, Sec. II-C).
 
-    Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of the
-    cell's elevation where most agree with it, else those around the scan's own robust mean. In cells that hold a step,
-    `side_of_step` drops the points of the wrong side. The points kept have the information sum 1 / R = sum 1 / sigma_p^2
-    with a floor on R, because the points of one scan share the error of its pose. Equations (1) and (2), in
-    information form and so in no order:
+    Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of
+    the cell's elevation where most agree with it, else those around the scan's own robust mean. In cells that hold a
+    step, `side_of_step` drops the points of the wrong side. The points kept have the information sum
+    1 / R = sum 1 / sigma_p^2 with a floor on R, because the points of one scan share the error of its pose.
+    Equations (1) and (2), in information form and so in no order:
 
         1 / sigma^2 = 1 / sigma_m^2 + 1 / R,    h = sigma^2 * (h / sigma_m^2 + z_s / R).
 
@@ -84,31 +86,36 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     variance, as in the paper, and founds the cell anew once the votes are used up.
     """
     scan, prior = gather_scan(state, m, grid, cfg), gather_prior(state, cfg)
-    near = agrees(scan, prior.elevation, prior.gate_variance, cfg) & scan.cells.take(prior.known)
-    number, agreeing = scan.number(scan.used), scan.number(near)
+    take = scan.cells.take
+    near = agrees(scan, take(prior.elevation), take(prior.gate_variance), cfg)
+    number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
     trusted = prior.known & (2 * agreeing >= number)
-    guess = torch.where(trusted, prior.elevation, consensus(scan).detach())
-    kept = agrees(scan, guess, torch.zeros_like(guess), cfg)
-    kept = torch.where(scan.cells.take(trusted), near, kept)
-    ignored = torch.zeros_like(kept)
+    mean = ratio(moment, weight).detach()
+    guess = torch.where(trusted, prior.elevation, consensus(scan, mean)).detach()
+    gate = torch.where(trusted, prior.gate_variance, 0.0)
+    side = torch.zeros_like(guess)
     if cfg.edges is not None:
-        guess, kept, ignored = side_of_step(scan, guess, kept, cfg, cfg.edges)
+        side, guess = side_of_step(scan, guess, gate, mean, number, cfg, cfg.edges)
+    kept, ignored = on_side(scan, take(guess), take(gate), take(side), cfg)
 
     weight = torch.where(kept, scan.weight, 0.0)
-    information, support = scan.cells.sum(weight), scan.number(kept)
-    hit = support > 0
     # Around the guess, so that float32 keeps millimetres at any altitude.
-    height = guess + scan.cells.sum(weight * (scan.z - scan.cells.take(guess))) / torch.where(hit, information, 1.0)
-    variance = (1.0 / torch.where(hit, information, 1.0)).clamp(min=cfg.scan_variance_floor)
-    dissent = scan.number(scan.used & ~kept & ~ignored)
-    state, agreed = merge(state, prior, hit, height, variance, support, dissent, agreeing, cfg)
-    used = kept & scan.cells.take(agreed)
+    information, moment, support, edge = scan.sums(weight, weight * (scan.z - take(guess)), kept, ignored)
+    scanned = ScanOfCells(
+        height=guess + ratio(moment, information),
+        variance=(1.0 / torch.where(support > 0, information, 1.0)).clamp(min=cfg.scan_variance_floor),
+        number=number - edge,
+        kept=support,
+        agreeing=agreeing,
+    )
+    state, taken = merge(state, prior, scanned, grid, cfg)
+    points_used = torch.where(taken, support, 0.0)[:, :-1].sum(1).to(torch.int64)
     return tally(
         state,
-        points_used=count(used),
+        points_used=points_used,
         rejected_outside=count(m.used & ~scan.used),
         rejected_edge=count(ignored),
-        rejected_outlier=count(scan.used & ~ignored & ~used),
+        rejected_outlier=count(scan.used) - count(ignored) - points_used,
     )
 
 
@@ -116,7 +123,7 @@ def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionCo
     """Find each point's cell, and whether its ray passed over the cell's centre."""
     xy, z = m.points[..., :2], m.points[..., 2]
     cells = locate(xy, m.used, lattice_offset(state, m, grid), grid)
-    used = cells.index < grid.num_cells
+    used = cells.slot < grid.num_cells
     from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
     sensors = m.origin.shape[1]
     ray = (xy.unflatten(1, (sensors, -1)) - m.origin[:, :, None, :2]).flatten(1, 2)
@@ -147,7 +154,8 @@ def gather_prior(state: MapState, cfg: FusionConfig) -> Prior:
     return Prior(
         elevation=pad_cells(state.elevation),
         variance=torch.where(known, variance, 1.0),
-        gate_variance=variance.clamp(max=cfg.max_gate_std**2).detach(),
+        # Nothing agrees with an unknown cell.
+        gate_variance=torch.where(known, variance.clamp(max=cfg.max_gate_std**2), -1e3).detach(),
         known=known,
         support=pad_cells(state.support),
     )
@@ -155,100 +163,93 @@ def gather_prior(state: MapState, cfg: FusionConfig) -> Prior:
 
 def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
     """Tell which points lie within the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
-    residual = scan.z - scan.cells.take(height)
-    limit = cfg.gate**2 * (scan.spread + scan.cells.take(variance))
-    return scan.used & (residual.square() <= limit)
+    return scan.used & ((scan.z - height).square() <= cfg.gate**2 * (scan.spread + variance))
 
 
-def consensus(scan: Scan, rounds: int = 3) -> Tensor:
-    """Return the robust mean height of each cell's points: weights w / (1 + r^2 / sigma_p^2)^2, iterated from the mean."""
-    height = mean_height(scan, scan.weight)
+def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """Divide; zero where there is nothing to divide by."""
+    return numerator / torch.where(denominator > 0, denominator, 1.0)
+
+
+def consensus(scan: Scan, height: Tensor, rounds: int = 2) -> Tensor:
+    """Refine each cell's mean height to a robust one, by weights w / (1 + r^2 / sigma_p^2)^2 of the residuals r."""
     for _ in range(rounds):
         residual = scan.z - scan.cells.take(height)
-        height = height + mean_of(scan, residual, scan.weight / (1.0 + residual.square() / scan.spread).square())
+        weight = scan.weight / (1.0 + residual.square() / scan.spread).square()
+        total, moment = scan.sums(weight, weight * residual)
+        height = height + ratio(moment, total)
     return height
 
 
-def mean_of(scan: Scan, values: Tensor, weight: Tensor) -> Tensor:
-    """Average the points' values per cell; zero where the weights vanish."""
-    total = scan.cells.sum(weight)
-    return scan.cells.sum(weight * values) / torch.where(total > 0, total, 1.0)
-
-
-def mean_height(scan: Scan, weight: Tensor) -> Tensor:
-    """Average the heights of each cell's points."""
-    return mean_of(scan, scan.z, weight)
-
-
 def side_of_step(
-    scan: Scan, guess: Tensor, kept: Tensor, cfg: FusionConfig, edges: EdgeConfig
-) -> tuple[Tensor, Tensor, Tensor]:
+    scan: Scan, guess: Tensor, gate: Tensor, mean: Tensor, number: Tensor, cfg: FusionConfig, edges: EdgeConfig
+) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
-    where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is what
-    lies at the centre, and points above are ignored. Returns the guess, the points kept and the points ignored.
+    where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
+    what lies at the centre, and points above are ignored. Returns the side (B, C+1), +1 top, -1 ground and 0 no step,
+    and the guess, moved to that side.
     """
-    number, far = scan.number(scan.used), scan.number(scan.used & ~kept)
+    take = scan.cells.take
+    far = scan.used & ~agrees(scan, take(guess), take(gate), cfg)
+    far, passed_low = scan.sums(far, scan.used & scan.beyond & (scan.z < take(mean)))
     step = (number >= edges.min_points) & (far >= edges.min_share * number)
-    mean = mean_height(scan, scan.weight)
-    passed_low = scan.number(scan.used & scan.beyond & (scan.z < scan.cells.take(mean)))
     up = torch.where(passed_low >= torch.clamp(0.15 * number, min=2.0), -1.0, 1.0)
-    level = mean
-    side = scan.cells.take(up)
+    level, direction = mean, take(up)
     for _ in range(edges.refinements):
-        inside = scan.used & (side * (scan.z - scan.cells.take(level)) >= 0)
-        enough = scan.number(inside) >= 0.5 * edges.min_points
-        level = torch.where(enough, mean_height(scan, torch.where(inside, scan.weight, 0.0)), level)
-    at_step = scan.cells.take(step) & scan.used
-    residual = side * (scan.z - scan.cells.take(level))
-    on_side = scan.used & (residual >= -scan.spread.sqrt())
-    outlier = residual > cfg.gate * scan.spread.sqrt()
-    guess = torch.where(step, level, guess)
-    ignored = at_step & ~on_side
-    return guess.detach(), torch.where(at_step, on_side & ~outlier, kept), ignored
+        above = scan.z - take(level)
+        weight = torch.where(direction * above >= 0, scan.weight, 0.0)
+        total, moment = scan.sums(weight, weight * above)
+        level = level + ratio(moment, total)
+    return torch.where(step, up, 0.0), torch.where(step, level, guess)
+
+
+def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
+    """Return the points kept and, in cells with a step, the points ignored as being of its other side."""
+    residual = side * (scan.z - guess)
+    ignored = scan.used & (residual < -scan.spread.sqrt())
+    return agrees(scan, guess, gate, cfg) & ~ignored, ignored
+
+
+class ScanOfCells(NamedTuple):
+    """What the scan says of each cell; heights in [m], the others count points."""
+
+    height: Float[Tensor, "B C+1"]
+    variance: Float[Tensor, "B C+1"]
+    number: Float[Tensor, "B C+1"]  # not ignored
+    kept: Float[Tensor, "B C+1"]  # that make up the height
+    agreeing: Float[Tensor, "B C+1"]  # with the cell's elevation
 
 
 def merge(
-    state: MapState,
-    prior: Prior,
-    hit: Tensor,
-    height: Tensor,
-    variance: Tensor,
-    number: Tensor,
-    dissent: Tensor,
-    agreeing: Tensor,
-    cfg: FusionConfig,
+    state: MapState, prior: Prior, scan: ScanOfCells, grid: GridConfig, cfg: FusionConfig
 ) -> tuple[MapState, Tensor]:
     """Take the scan's heights into the cells, or count them as votes against. Returns also where they were taken."""
-    distance = (height - prior.elevation).square()
-    agree = prior.known & hit & (distance <= cfg.gate**2 * (prior.gate_variance + variance + cfg.max_gate_std**2 * 0.1))
-    against = prior.known & hit & ~agree
-    votes = prior.support + torch.where(agree, number - dissent, agreeing - number)
-    found = hit & (~prior.known | (against & (votes < 0)))
-    outvoted = against & ~found
-
-    information = torch.where(agree, 1.0 / prior.variance, 0.0) + 1.0 / variance
-    fused = prior.elevation + torch.where(agree | found, (height - prior.elevation) / (information * variance), 0.0)
-    raised = prior.variance + cfg.outlier_variance * number
-    posterior = torch.where(agree | found, 1.0 / information, torch.where(outvoted, raised, prior.variance))
-    posterior = posterior.clamp(max=cfg.max_variance)
-    support = torch.where(found, torch.where(prior.known, -votes, number - dissent), votes.clamp(min=0))
-    support = torch.where(hit, support.clamp(min=0, max=cfg.max_support), prior.support)
-    shape = state.elevation.shape
+    hit, innovation = scan.kept > 0, scan.height - prior.elevation
+    limit = prior.gate_variance + scan.variance + (cfg.relief * grid.resolution) ** 2
+    agree = prior.known & hit & (innovation.square() <= cfg.gate**2 * limit)
+    votes = torch.where(agree, 2 * scan.kept - scan.number, scan.agreeing - scan.kept)
+    support = prior.support + votes
+    found = hit & ~agree & (~prior.known | (support < 0))
     taken = agree | found
 
+    information = torch.where(agree, 1.0 / prior.variance, 0.0) + 1.0 / scan.variance
+    fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
+    outvoted = torch.where(hit, prior.variance + cfg.outlier_variance * scan.kept, prior.variance)
+    posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)
+    fresh = torch.where(prior.known, -support, 2 * scan.kept - scan.number)
+    support = torch.where(hit, torch.where(found, fresh, support).clamp(0, cfg.max_support), prior.support)
+
     def store(cells: Tensor) -> Tensor:
-        return cells[:, :-1].reshape(shape)
+        return cells[:, :-1].reshape(state.elevation.shape)
 
     hit_now = store(taken)
-    return (
-        state._replace(
-            elevation=torch.where(hit_now, store(fused), state.elevation),
-            variance=torch.where(store(hit), store(posterior), state.variance),
-            support=store(support),
-            validity=state.validity | hit_now,
-            time=torch.where(hit_now, 0.0, state.time),
-        ),
-        taken,
+    stored = state._replace(
+        elevation=torch.where(hit_now, store(fused), state.elevation),
+        variance=torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
+        support=store(support),
+        validity=state.validity | hit_now,
+        time=torch.where(hit_now, 0.0, state.time),
     )
+    return stored, taken

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.operators import cell_sums, realize
 from torchelev.state import BLANK, MapState, Measurement
 
 if TYPE_CHECKING:
@@ -50,24 +51,23 @@ class GridConfig:
 class PointCells(NamedTuple):
     """Which cell each point falls into. Points outside go to an overflow slot that is dropped, so shapes stay fixed."""
 
-    index: Int[Tensor, "B M"]
+    slot: Int[Tensor, "B M"]
     num_cells: int
 
-    def sum(self, values: Float[Tensor, "B M"]) -> Float[Tensor, "B C+1"]:
-        """Sum the points' values per cell, overflow slot last."""
-        zeros = values.new_zeros(values.shape[0], self.num_cells + 1)
-        return zeros.scatter_add(1, self.index, values)
+    def sums(self, *columns: Float[Tensor, "B M"]) -> tuple[Float[Tensor, "B C+1"], ...]:
+        """Sum columns of the points' values per cell, overflow slot last."""
+        return cell_sums(self.slot, torch.stack(columns), self.num_cells + 1).unbind(0)
 
     def take(self, cells: Tensor) -> Tensor:
         """Give each point its cell's value: (B, C+1) -> (B, M)."""
-        return cells.gather(1, self.index)
+        return cells.gather(1, self.slot)
 
 
 def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[Tensor, "B 2"]:
     """Return where the measurement's horizontal origin lies, seen from the window's corner [m]."""
     # A cell number fits float32 exactly only as a difference of near ones; far ones are clamped, they are outside.
     cells = (m.anchor - state.corner).clamp(-(2**22), 2**22)
-    return cells.to(m.points.dtype) * grid.resolution
+    return realize(cells.to(m.points.dtype) * grid.resolution)
 
 
 def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[Tensor, Tensor]:
@@ -75,7 +75,7 @@ def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[T
     cells = (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
     x = torch.arange(grid.height, device=cells.device) + cells[:, 0, None]
     y = torch.arange(grid.width, device=cells.device) + cells[:, 1, None]
-    return x[:, :, None] * grid.resolution, y[:, None, :] * grid.resolution
+    return realize(x * grid.resolution)[:, :, None], realize(y * grid.resolution)[:, None, :]
 
 
 def locate(xy: Float[Tensor, "B M 2"], used: Bool[Tensor, "B M"], offset: Tensor, grid: GridConfig) -> PointCells:
@@ -103,7 +103,7 @@ def window_corner(base: Float[Tensor, "B 2"], anchor: Int[Tensor, "B 2"], grid: 
 def shift_layer(layer: Tensor, index: Tensor, entering: Tensor, blank: float) -> Tensor:
     """Move a layer's content by gathering; cells that enter the window get the blank value."""
     moved = layer.flatten(1).gather(1, index).view_as(layer)
-    return torch.where(entering, torch.full_like(moved, blank), moved)
+    return realize(torch.where(entering, torch.full_like(moved, blank), moved))
 
 
 def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
@@ -114,15 +114,15 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     """
     if m.base is None:
         return state
-    corner = window_corner(m.base[:, :2], m.anchor, grid)
+    corner = realize(window_corner(m.base[:, :2], m.anchor, grid))
     # A shift of a whole window blanks everything; the clamp keeps the index arithmetic small.
-    shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
+    shift = realize((corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width)))
     device = state.corner.device
     i = torch.arange(grid.height, device=device)[None, :, None] + shift[:, 0, None, None]
     j = torch.arange(grid.width, device=device)[None, None, :] + shift[:, 1, None, None]
     entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
     index = (i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)).flatten(1)
-    layers = {
+    layers: dict[str, Any] = {
         name: shift_layer(getattr(state, name), index, entering, BLANK.get(name, 0.0))
         for name in MapState._fields[2:-1]
     }

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate, pad_cells
+from torchelev.operators import azimuth_pyramid, realize, running_minimum
 from torchelev.state import MapState, Measurement, count, tally
-from torchelev.windows import running_minimum
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -29,16 +29,18 @@ NO_RAY = 1e4  # a slope above every ray's
 class RaycastConfig:
     """When a ray removes a cell, and which rays are believed."""
 
-    min_time: float = 1.0  # [s] cells hit within it stay
+    min_time: float = 1.0  # [s] cells hit within it stay, and contradict rays that pass below them
     min_incidence: float = 0.1  # alpha_n: |r . n| below it is a grazing ray
     max_range: float | None = None  # [m] rays count up to here; None: 1.1 half-diagonals of the window
     min_support: float = 2.0  # points that agree with a ray's end, or a neighbouring cell, for the ray to be believed
-    gate: float = 3.0  # a ray that ends so many standard deviations below the known ground is a wrong return
+    gate: float = 3.0  # a ray so many standard deviations below ground that is known is a wrong return
 
     def __post_init__(self) -> None:
         require(self.min_time >= 0, "raycast.min_time", "must not be negative", self.min_time, "give seconds")
         cosine = 0 <= self.min_incidence < 1
         require(cosine, "raycast.min_incidence", "must lie in [0, 1)", self.min_incidence, "give a cosine such as 0.1")
+        reach = self.max_range is None or self.max_range > 0
+        require(reach, "raycast.max_range", "must be positive", self.max_range, "give metres, or None")
 
 
 class PolarGrid(NamedTuple):
@@ -73,52 +75,71 @@ def turn(x: Tensor, y: Tensor) -> Tensor:
     return torch.where(y < 0, 1 - half, half)
 
 
-def end_of_ray(state: MapState, m: Measurement, sensor: Tensor, points: Tensor, casts: Tensor, grid: GridConfig) -> tuple:
-    """Return the cells and heights where rays end, or where they leave the window."""
+class Rays(NamedTuple):
+    """The rays of one sensor."""
+
+    origin: Float[Tensor, "B 3"]  # [m] counted from the measurement's horizontal origin
+    xy: Float[Tensor, "B N 2"]  # [m] from the sensor to the hit
+    r: Float[Tensor, "B N"]  # [m] horizontal length
+    slope: Float[Tensor, "B N"]  # dz / dr
+    azimuth: Float[Tensor, "B N"]  # in turns
+    casts: Bool[Tensor, "B N"]
+
+
+def rays_of(m: Measurement, s: int) -> Rays:
+    """Return the rays of sensor s."""
+    sensors = m.origin.shape[1]
+    ray = m.points.unflatten(1, (sensors, -1))[:, s] - m.origin[:, s, None]
+    x, y, z = ray.unbind(-1)
+    r = (x.square() + y.square()).clamp(min=1e-12).sqrt()
+    casts = m.casts.unflatten(1, (sensors, -1))[:, s]
+    return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), casts)
+
+
+# Which rays are believed ----------------------------------------------------------------------------------------------
+# The lowest ray decides, so that one return that is too long would clear a radial line of ground.
+
+
+def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
+    """Tell which rays may clear and bound: their end is credible, and they pass below no ground hit of late."""
+    return rays.casts & ends_well(state, m, rays, grid, cfg) & ~under_horizon(state, m, rays, grid, cfg)
+
+
+def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
+    """Tell which rays end, or leave the window, in an unknown cell or not below a well supported one."""
     offset = lattice_offset(state, m, grid)[:, None]
-    start, along = sensor[:, None, :2] + offset, points[..., :2] - sensor[:, None, :2]
+    start = rays.origin[:, None, :2] + offset
     size = torch.stack([start.new_full((), n * grid.resolution) for n in (grid.height, grid.width)])
     inner = 0.5 * grid.resolution  # half a cell inside, so that rounding leaves no ray outside
-    room = torch.where(along > 0, size - inner - start, inner - start)
-    share = room / torch.where(along.abs() > 1e-9, along, torch.where(along > 0, 1e-9, -1e-9))
-    share = share.amin(-1).clamp(0, 1)
-    xy = sensor[:, None, :2] + share[..., None] * along
-    height = sensor[:, None, 2] + share * (points[..., 2] - sensor[:, None, 2])
-    return locate(xy, casts, offset[:, 0], grid), height
+    room = torch.where(rays.xy > 0, size - inner - start, inner - start)
+    along = torch.where(rays.xy.abs() > 1e-9, rays.xy, torch.where(rays.xy > 0, 1e-9, -1e-9))
+    share = (room / along).amin(-1).clamp(0, 1)
+    xy = rays.origin[:, None, :2] + share[..., None] * rays.xy
+    cells = locate(xy, rays.casts, offset[:, 0], grid)
+    sigma = (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
+    floor = torch.where(well_supported(state, cfg, grid.resolution), state.elevation - cfg.gate * sigma, 1e6)
+    floor = cells.take(pad_cells(torch.where(state.validity, floor, -1e6)))
+    height = rays.origin[:, None, 2] + share * rays.r * rays.slope
+    return (cells.slot < cells.num_cells) & (height >= floor)
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
     """Tell which known cells are believed: enough points agree, or a neighbouring cell has a like height."""
-    supported = state.validity & (state.support >= cfg.min_support)
+    supported = state.support >= cfg.min_support
     for dim in (-1, -2):
-        size = state.validity.shape[dim] - 1
-        if size < 1:
-            continue
-        step = (state.elevation.narrow(dim, 1, size) - state.elevation.narrow(dim, 0, size)).abs()
-        like = state.validity.narrow(dim, 1, size) & state.validity.narrow(dim, 0, size) & (step <= resolution)
-        end = torch.zeros_like(state.validity.narrow(dim, 0, 1))
+        near = torch.zeros_like(supported)
+        size = supported.shape[dim] - 1
+        first, second = state.elevation.narrow(dim, 0, size), state.elevation.narrow(dim, 1, size)
+        both = state.validity.narrow(dim, 0, size) & state.validity.narrow(dim, 1, size)
+        like = both & ((first - second).abs() <= resolution)
+        end = near.narrow(dim, 0, 1)
         supported = supported | torch.cat([like, end], dim) | torch.cat([end, like], dim)
     return supported & state.validity
 
 
-def believed(state: MapState, m: Measurement, s: int, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
-    """Tell which rays may clear and bound.
-
-    The lowest ray decides, so one return that is too long would clear a radial line of ground. A ray is believed only
-    if it does not end below the known ground, and its end is no lone point. A ray that leaves the window is judged
-    where it leaves.
-    """
-    points, casts = sensor_points(m, s)
-    cells, height = end_of_ray(state, m, m.origin[:, s], points, casts, grid)
-    known = cells.take(pad_cells(state.validity))
-    supported = cells.take(pad_cells(well_supported(state, cfg, grid.resolution)))
-    spread = cells.take(pad_cells(state.variance)) + (0.5 * grid.resolution) ** 2
-    below = height < cells.take(pad_cells(state.elevation)) - cfg.gate * spread.sqrt()
-    ends_well = (cells.index < cells.num_cells) & (~known | (supported & ~below))
-    return casts & ends_well & ~under_horizon(state, m, s, grid, cfg)
-
-
-def under_horizon(state: MapState, m: Measurement, s: int, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
+def under_horizon(
+    state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig
+) -> Bool[Tensor, "B N"]:
     """Tell which rays pass below ground that was hit within `min_time`: they contradict it, and are wrong returns.
 
     The horizon at a range is the steepest slope under which the sensor sees recently hit ground up to there. It is kept
@@ -127,50 +148,58 @@ def under_horizon(state: MapState, m: Measurement, s: int, grid: GridConfig, cfg
     step = 2 * grid.resolution
     polar = PolarGrid.of(grid, cfg)
     ranges, azimuths = polar.ranges // 2 + 1, polar.azimuths // 2
-    points, device = sensor_points(m, s)[0], m.points.device
-    rho = (torch.arange(ranges, device=device, dtype=points.dtype) + 0.5) * step
-    angle = (torch.arange(azimuths, device=device, dtype=points.dtype) + 0.5) * (2 * math.pi / azimuths)
+    device, dtype = rays.r.device, rays.r.dtype
+    rho = (torch.arange(ranges, device=device, dtype=dtype) + 0.5) * step
+    angle = (torch.arange(azimuths, device=device, dtype=dtype) + 0.5) * (2 * math.pi / azimuths)
     circle = torch.stack([angle.cos(), angle.sin()], -1)
-    xy = m.origin[:, s, None, :2] + (rho[:, None, None] * circle).flatten(0, 1)
+    xy = rays.origin[:, None, :2] + realize(rho[:, None, None] * circle).flatten(0, 1)
     cells = locate(xy, torch.ones_like(xy[..., 0], dtype=torch.bool), lattice_offset(state, m, grid), grid)
     margin = cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
     recent = state.validity & (state.time <= cfg.min_time) & (state.support >= cfg.min_support)
-    below_sensor = pad_cells(torch.where(recent, m.origin[:, s, 2, None, None] - state.elevation + margin, NO_RAY))
-    fall = cells.take(below_sensor).unflatten(1, (ranges, azimuths)) / rho[:, None]
-    horizon = running_minimum(torch.where(cells.index.view_as(fall) < grid.num_cells, fall, NO_RAY), from_end=False)
-    ray = points - m.origin[:, s, None]
-    r = (ray[..., 0].square() + ray[..., 1].square()).clamp(min=1e-12).sqrt()
-    k = (torch.floor(r / step) - 1).clamp(max=ranges - 1)
-    a = torch.floor(turn(ray[..., 0], ray[..., 1]) * azimuths).clamp(max=azimuths - 1)
+    below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - state.elevation + margin, NO_RAY)
+    fall = torch.where(cells.slot < grid.num_cells, cells.take(pad_cells(below_sensor)), NO_RAY * step)
+    fall = realize(fall).unflatten(1, (ranges, azimuths)) / rho[:, None]
+    horizon = running_minimum(fall, from_end=False)
+    k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
+    a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = horizon.flatten(1).gather(1, (k.clamp(min=0) * azimuths + a).to(torch.int64))
-    return (k >= 0) & (-ray[..., 2] / r > limit)
+    return (k >= 0) & (-rays.slope > limit)
 
 
-def sensor_points(m: Measurement, s: int) -> tuple[Tensor, Tensor]:
-    """Return the points (B, N, 3) of sensor s and whether they cast."""
-    sensors = m.origin.shape[1]
-    return m.points.unflatten(1, (sensors, -1))[:, s], m.casts.unflatten(1, (sensors, -1))[:, s]
+# The polar table ------------------------------------------------------------------------------------------------------
 
 
-def lowest_slopes(m: Measurement, s: int, casts: Tensor, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R A"]:
-    """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least one bin farther."""
-    ray = sensor_points(m, s)[0] - m.origin[:, s, None]
-    r = torch.linalg.vector_norm(torch.where(ray[..., :2] == 0, 1e-12, ray[..., :2]), dim=-1)
-    slope = ray[..., 2] / r.clamp(min=1e-6)
-    last = torch.floor(r / grid.resolution).clamp(max=polar.ranges + 1) - 2
-    a = torch.floor(turn(ray[..., 0], ray[..., 1]) * polar.azimuths).clamp(max=polar.azimuths - 1)
+def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
+    """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least a cell farther.
+
+    Azimuths come as a pyramid: single bins, then minima over 2, 4, ...
+    """
+    last = torch.floor(rays.r / grid.resolution).clamp(max=polar.ranges + 1) - 2
+    a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
     size = polar.ranges * polar.azimuths
     index = torch.where(casts & (last >= 0), last * polar.azimuths + a, size).to(torch.int64)
-    table = slope.new_full((slope.shape[0], size + 1), NO_RAY).scatter_reduce(1, index, slope, "amin")
-    return running_minimum(table[:, :-1].reshape(-1, polar.ranges, polar.azimuths), from_end=True)
+    table = rays.slope.new_full((rays.slope.shape[0], size + 1), NO_RAY)
+    table = table.scatter_reduce(1, index, rays.slope.detach(), "amin")[:, :-1]
+    table = running_minimum(table.reshape(-1, polar.ranges, polar.azimuths), from_end=True)
+    return azimuth_pyramid(table, polar.levels)
 
 
-def pyramid(table: Float[Tensor, "B R A"], levels: int) -> Float[Tensor, "B R P"]:
-    """Append to the azimuths their minima over 2, 4, ... bins."""
-    stack = [table]
-    for _ in range(levels):
-        stack.append(stack[-1].unflatten(-1, (-1, 2)).amin(-1))
-    return torch.cat(stack, -1)
+def cell_widths(polar: PolarGrid, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return half the width of a cell's inner half in azimuth bins, and where the pyramid has bins as wide, by range.
+
+    The latter as the scale 2^-l of the level l and its begin in the flat table.
+    """
+    k = torch.arange(polar.ranges, device=like.device, dtype=like.dtype)
+    half_width = realize(0.25 * polar.azimuths / (2 * math.pi * k.clamp(min=0.5)))
+    scale = realize(torch.exp2(-torch.ceil(torch.log2(2 * half_width)).clamp(0, polar.levels)))
+    total = sum(polar.azimuths >> level for level in range(polar.levels + 1))
+    return half_width, scale, realize(k * total + 2 * polar.azimuths * (1 - scale))
+
+
+def read(values: Float[Tensor, "B K"], index: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
+    """Give each cell the value at its index."""
+    # Realized while it has two dimensions: flattened first, the compiler would divide to find row and column.
+    return values.gather(1, realize(index.to(torch.int64)).flatten(1)).view_as(index)
 
 
 class RayOverCell(NamedTuple):
@@ -181,24 +210,21 @@ class RayOverCell(NamedTuple):
     incidence: Float[Tensor, "B H W"]  # |r . n|
 
 
-def look_up(state: MapState, m: Measurement, s: int, table: Tensor, polar: PolarGrid, grid: GridConfig) -> RayOverCell:
+def look_up(
+    state: MapState, m: Measurement, origin: Tensor, table: Tensor, polar: PolarGrid, grid: GridConfig
+) -> RayOverCell:
     """Gather the lowest ray over the inner half of each cell from the pyramid of azimuths."""
     x, y = center_offsets(state, m, grid)
-    x, y, z_s = x - m.origin[:, s, 0, None, None], y - m.origin[:, s, 1, None, None], m.origin[:, s, 2, None, None]
+    x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
     rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
     k = torch.floor(rho / grid.resolution)
     azimuth = turn(*torch.broadcast_tensors(x, y)) * polar.azimuths
-    half_width = 0.25 * grid.resolution / rho / (2 * math.pi) * polar.azimuths
-    level = torch.ceil(torch.log2(2 * half_width)).clamp(0, polar.levels)
-    scale = torch.exp2(-level)
-    start = 2 * polar.azimuths * (1 - scale)  # of the level within the pyramid
-    total = table.shape[-1]
+    bins = k.clamp(max=polar.ranges - 1)
+    half_width, scale, start = (read(values.expand(len(rho), -1), bins) for values in cell_widths(polar, rho))
     slope = torch.full_like(rho, NO_RAY)
     for side in (-half_width, half_width):
         a = torch.floor(torch.remainder(azimuth + side, polar.azimuths) * scale)
-        a = start + torch.minimum(a, polar.azimuths * scale - 1)
-        index = (k.clamp(max=polar.ranges - 1) * total + a).to(torch.int64).flatten(1)
-        slope = torch.minimum(slope, table.flatten(1).gather(1, index).view_as(rho))
+        slope = torch.minimum(slope, read(table.flatten(1), start + torch.minimum(a, polar.azimuths * scale - 1)))
     found = (slope < NO_RAY) & (k < polar.ranges)
     slope = torch.where(found, slope, 0.0)
     gx, gy = state.gradient_x, state.gradient_y
@@ -214,20 +240,24 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     (eq. 3 and 4), with n the cell's normal and r the direction of the lowest ray, the only one that the table keeps.
     The upper bound of an unknown cell is the lowest ray height over it so far.
     """
-    polar = PolarGrid.of(grid, cfg)
-    cleared = torch.zeros_like(state.validity)
+    polar, known = PolarGrid.of(grid, cfg), state.validity
     for s in range(m.origin.shape[1]):
-        casts = believed(state, m, s, grid, cfg)
-        table = pyramid(lowest_slopes(m, s, casts, polar, grid), polar.levels)
-        ray = look_up(state, m, s, table, polar, grid)
-        below = ray.height < state.elevation - state.variance.sqrt()
-        gone = state.validity & ray.found & below & (state.time > cfg.min_time) & (ray.incidence > cfg.min_incidence)
-        bounds = ray.found & ~(state.validity & ~gone)
-        lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
-        cleared = cleared | gone
-        state = state._replace(
-            validity=state.validity & ~gone,
-            bounded=(state.bounded & ~state.validity) | bounds,
-            upper_bound=torch.where(bounds, lower, state.upper_bound),
-        )
-    return tally(state, cleared_seen_through=count(cleared), cells_bounded=count(state.bounded & ~state.validity))
+        rays = rays_of(m, s)
+        table = lowest_slopes(rays, believed(state, m, rays, grid, cfg), polar, grid)
+        state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), cfg)
+    cleared = count(known & ~state.validity)
+    return tally(state, cleared_seen_through=cleared, cells_bounded=count(state.bounded))
+
+
+def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> MapState:
+    """Apply the lowest ray of one sensor to every cell."""
+    below = ray.height < state.elevation - state.variance.sqrt()
+    gone = state.validity & ray.found & below & (state.time > cfg.min_time) & (ray.incidence > cfg.min_incidence)
+    validity = state.validity & ~gone
+    bounds = ray.found & ~validity
+    lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
+    return state._replace(
+        validity=validity,
+        bounded=(state.bounded & ~state.validity) | bounds,
+        upper_bound=torch.where(bounds, lower, state.upper_bound),
+    )

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.operators import realize
 from torchelev.state import Measurement, count
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[
     z - z_s > min(max(r - b, 0) * tan(theta_a) + c, d), with r the horizontal distance from the sensor.
     `relative` is the point less the sensor's position, in map axes [m].
     """
-    r = torch.linalg.vector_norm(relative[..., :2], dim=-1)
+    r = (relative[..., 0].square() + relative[..., 1].square()).clamp(min=1e-12).sqrt()
     limit = ((r - ramp.distance).clamp(min=0) * ramp.slope + ramp.offset).clamp(max=ramp.height)
     return relative[..., 2] > limit
 
@@ -77,13 +78,21 @@ def inside_body(points: Float[Tensor, "B M 3"], T_map_base: Tensor, base: Tensor
 
 def anchor_of(position: Float[Tensor, "B 3"], resolution: float) -> Tensor:
     """Return the cell number (B, 2) of a position; float64 first, or it is off by cells 100 km from the origin."""
-    return torch.floor(position[:, :2].double() / resolution).to(torch.int64)
+    return realize(torch.floor(position[:, :2].double() / resolution).to(torch.int64))
 
 
 def relative_to(position: Float[Tensor, "B ... 3"], anchor: Tensor, resolution: float, dtype: torch.dtype) -> Tensor:
     """Return positions with x and y counted from the anchor cell's corner, in the map's precision."""
     corner = torch.nn.functional.pad(anchor.double() * resolution, (0, 1))
-    return (position.double() - corner.view(-1, *[1] * (position.ndim - 2), 3)).to(dtype)
+    return realize((position.double() - corner.view(-1, *[1] * (position.ndim - 2), 3)).to(dtype))
+
+
+def rotate(rotation: Float[Tensor, "B S 3 3"], points: Float[Tensor, "B 3 M"], each: int) -> Float[Tensor, "B 3 M"]:
+    """Turn the points of each sensor, `each` of them per sensor, into map axes."""
+    # Written out: a matrix product may round otherwise for another batch size.
+    r = rotation.flatten(2).repeat_interleave(each, 1)
+    x, y, z = points.unbind(1)
+    return realize(torch.stack([r[..., k] * x + r[..., k + 1] * y + r[..., k + 2] * z for k in (0, 3, 6)], 1))
 
 
 def measure(
@@ -107,38 +116,40 @@ def measure(
     origin = relative_to(position, anchor, grid.resolution, dtype)
     base = None if base_position is None else relative_to(base_position, anchor, grid.resolution, dtype)
 
-    points = points.to(dtype)
-    distance = torch.linalg.vector_norm(torch.where(points == 0, 1e-12, points), dim=-1)
-    finite = torch.isfinite(points).all(-1)
-    in_range = finite & (distance >= cfg.min_distance) & (distance <= cfg.max_distance)
-    # Zeroed before any product: 0 * NaN would poison sums and gradients.
-    safe = torch.where(in_range[..., None], points, 0.0)
-    turned = safe @ T_map_sensor[..., :3, :3].to(dtype).transpose(-1, -2)
-    in_map = (turned + origin[:, :, None]).flatten(1, 2)
-    distance = torch.where(in_range, distance, 1.0)
+    x, y, z = points.to(dtype).flatten(1, 2).unbind(-1)
+    finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
+    # Zeroed before any product: 0 * NaN would poison sums and gradients, and so would the square of 1e30.
+    small = finite & (torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= cfg.max_distance)
+    x, y, z = (torch.where(small, c, 0.0) for c in (x, y, z))
+    square = x * x + y * y + z * z
+    valid = realize(small & (square >= cfg.min_distance**2) & (square <= cfg.max_distance**2))
+    relative = rotate(T_map_sensor[..., :3, :3].to(dtype), torch.stack([x, y, z], 1), points.shape[2])
+    # Coordinates outermost in memory: the stages read x, y and z apart.
+    in_map = (relative + origin.transpose(1, 2).repeat_interleave(points.shape[2], 2)).transpose(1, 2)
+    relative = relative.transpose(1, 2)
 
     if variance is None:
-        sigma2 = cfg.noise_factor * distance.square() + cfg.noise_floor
+        sigma2 = cfg.noise_factor * square + cfg.noise_floor
     else:
-        sigma2 = torch.where(torch.isfinite(variance) & (variance > 0), variance.to(dtype), 1.0)
-    valid = in_range.flatten(1, 2)
+        given = variance.to(dtype).flatten(1)
+        sigma2 = torch.where(torch.isfinite(given) & (given > 0), given, 1.0)
     body = torch.zeros_like(valid)
     if cfg.body is not None and base is not None and T_map_base is not None:
         body = valid & inside_body(in_map, T_map_base, base, cfg.body)
     overhang = torch.zeros_like(valid)
     if cfg.exclusion is not None:
-        overhang = valid & ~body & above_ramp(turned.flatten(1, 2), cfg.exclusion)
+        overhang = valid & ~body & above_ramp(relative, cfg.exclusion)
     return Measurement(
         anchor=anchor,
         points=in_map,
-        variance=sigma2.flatten(1, 2),
-        used=valid & ~body & ~overhang,
+        variance=realize(sigma2),
+        used=realize(valid & ~body & ~overhang),
         casts=valid & ~body,
         origin=origin,
         base=base,
         dt=dt.to(dtype),
         rejected_invalid=count(~finite),
-        rejected_range=count(finite & ~in_range),
+        rejected_range=count(finite & ~valid),
         rejected_body=count(body),
         rejected_overhang=count(overhang),
     )
@@ -155,7 +166,9 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, along: str = "z") -> Tens
     require(along in ("z", "ray"), "along", 'must be "z" or "ray"', repr(along), 'pinhole depth images are "z"')
     require(depth.ndim >= 2, "depth", "must be (..., h, w)", tuple(depth.shape), "add the image dimensions")
     fits = intrinsics.shape[-2:] == (3, 3)
-    require(fits, "intrinsics", "must be (..., 3, 3)", tuple(intrinsics.shape), "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    require(
+        fits, "intrinsics", "must be (..., 3, 3)", tuple(intrinsics.shape), "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+    )
     intrinsics = intrinsics.to(depth)
     v = torch.arange(depth.shape[-2], device=depth.device, dtype=depth.dtype)[:, None]
     u = torch.arange(depth.shape[-1], device=depth.device, dtype=depth.dtype)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.operators import window_moments
 from torchelev.state import MapState
-from torchelev.windows import window_moments
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
