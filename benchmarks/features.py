@@ -30,7 +30,7 @@ from benchmarks import feature_metrics as metrics
 from benchmarks import feature_recordings as rec
 from benchmarks.feature_metrics import GRID, Figures
 from benchmarks.feature_recordings import Recording
-from benchmarks.report import markdown_table, write_json
+from benchmarks.report import machine, markdown_table, write_json
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 
@@ -181,6 +181,7 @@ def draw_row(figure, row, outcome: Outcome) -> None:
 @click.option("--only", default="", help="Measure the features whose name contains this, and write nothing.")
 def main(out: Path, only: str) -> None:
     """Measure every feature on, off, and against the plain baseline."""
+    measured_on = machine()  # read now: the checkout may move on while this runs
     outcomes = [examine(feature) for feature in FEATURES if only in feature.name]
     rows = table_rows(outcomes)
     click.echo(markdown_table(HEAD, rows))
@@ -189,7 +190,7 @@ def main(out: Path, only: str) -> None:
     if not only:
         settings = {name: cfg.to_dict() for name, cfg in configurations("raycast").items()}
         named = [dict(zip(HEAD, row, strict=True)) for row in rows]
-        write_json(out / "features.json", {"rows": named, "configs": settings})
+        write_json(out / "features.json", {"machine": measured_on, "rows": named, "configs": settings})
         draw(outcomes, out / "features.png")
 
 
