@@ -105,6 +105,118 @@ def voxel_means(points, size):
     return {key: np.mean(group, axis=0) for key, group in voxels.items()}
 
 
+# The height update --------------------------------------------------------------------------------------------------
+
+
+def kalman(h, variance, points):
+    """The paper's equations (1) and (2), point (p_z, sigma_p^2) after point."""
+    for z, point_variance in points:
+        h = (point_variance * h + variance * z) / (variance + point_variance)
+        variance = variance * point_variance / (variance + point_variance)
+    return h, variance
+
+
+def passed_center(x, y, origin, corner, resolution, shape):
+    """Whether a point's ray passed over its cell's middle: the point lies within 45 degrees of straight behind it."""
+    cx, cy = center_of(*cell_of(x, y, corner, resolution, shape), corner, resolution)
+    dx, dy, rx, ry = x - cx, y - cy, x - origin[0], y - origin[1]
+    return dx * rx + dy * ry > abs(dx * ry - dy * rx)
+
+
+def agrees(p, height, variance, relief, gate):
+    """|z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2 + relief^2)."""
+    return abs(p["z"] - height) <= gate * math.sqrt(variance + p["variance"] + relief**2)
+
+
+def weighted_mean(points, value=lambda p: p["z"], weight=lambda p: 1.0):
+    """The mean over points of weight 1 / sigma_p^2, times `weight`."""
+    weights = [weight(p) / p["variance"] for p in points]
+    return sum(w * value(p) for w, p in zip(weights, points, strict=True)) / sum(weights)
+
+
+def consensus(points, relief, rounds=2):
+    """A robust mean: weights 1 / (1 + r^2 / sigma^2)^2 of the residuals r, from the mean on."""
+    height = weighted_mean(points)
+    for _ in range(rounds):
+        height = weighted_mean(
+            points,
+            weight=lambda p, h=height: (1 + (p["z"] - h) ** 2 / (p["variance"] + relief**2)) ** -2,
+        )
+    return height
+
+
+def side_of_step(points, edges):
+    """+1 and the top's height, or -1 and the ground's, of a cell that holds a step."""
+    mean = weighted_mean(points)
+    low = [p for p in points if p["z"] < mean]
+    side, level = -1 if sum(p["beyond"] for p in low) > edges["min_passed"] * len(low) else 1, mean
+    for _ in range(edges["refinements"]):
+        inside = [p for p in points if side * (p["z"] - level) >= 0]
+        level = weighted_mean(inside) if inside else level
+    return side, level
+
+
+def scan_height(cell, points, relief, *, gate, max_gate_std, edges):
+    """What a scan says of a cell: the points kept and ignored, and the number that agree with the cell's elevation."""
+    gate_variance = min(cell["variance"], max_gate_std**2) if cell["known"] else 0.0
+    agreeing = sum(cell["known"] and agrees(p, cell["elevation"], gate_variance, relief, gate) for p in points)
+    if cell["known"] and 2 * agreeing >= len(points):
+        guess = cell["elevation"]
+    else:
+        guess, gate_variance = consensus(points, relief), 0.0
+    side = 0
+    if edges is not None:
+        far = sum(not agrees(p, guess, gate_variance, relief, gate) for p in points)
+        if len(points) >= edges["min_points"] and far >= edges["min_share"] * len(points):
+            side, guess = side_of_step(points, edges)
+    wrong = [side * (p["z"] - guess) < -math.sqrt(p["variance"] + relief**2) for p in points]
+    kept = [p for p, w in zip(points, wrong, strict=True) if not w and agrees(p, guess, gate_variance, relief, gate)]
+    return kept, sum(wrong), agreeing
+
+
+def fuse_cell(
+    cell,
+    points,
+    resolution,
+    *,
+    gate,
+    max_gate_std,
+    relief,
+    scan_variance_floor,
+    outlier_variance,
+    max_support,
+    max_variance,
+    edges,
+):
+    """One cell and the points of one scan: the cell after it, and the numbers of points used and ignored at a step.
+
+    `cell` has elevation, variance, known, support, time; each point z, variance, beyond. `relief` counts cells.
+    """
+    after, relief = dict(cell), relief * resolution
+    after["variance"] = min(cell["variance"], max_variance) if cell["known"] else 1.0
+    if not points:
+        return after, 0, 0
+    kept, ignored, agreeing = scan_height(cell, points, relief, gate=gate, max_gate_std=max_gate_std, edges=edges)
+    if not kept:
+        return after, 0, ignored
+    height, R = weighted_mean(kept), max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor)
+    gate_variance = min(cell["variance"], max_gate_std**2)
+    distance = abs(height - cell["elevation"])
+    agree = cell["known"] and distance <= gate * math.sqrt(gate_variance + R + relief**2)
+    margin = 2 * len(kept) - (len(points) - ignored)  # points for the height, less points against it
+    support = cell["support"] + (margin if agree else agreeing - len(kept))
+    if agree:
+        h, variance = kalman(cell["elevation"], cell["variance"], [(height, R)])
+        after |= dict(elevation=h, variance=min(variance, max_variance), time=0.0)
+    elif not cell["known"] or support < 0:
+        after |= dict(elevation=height, variance=min(R, max_variance), known=True, time=0.0)
+        support = -support if cell["known"] else margin
+    else:
+        after["variance"] = min(cell["variance"] + outlier_variance * len(kept), max_variance)
+        return after | dict(support=min(max(support, 0), max_support)), 0, ignored
+    return after | dict(support=min(max(support, 0), max_support)), len(kept), ignored
+
+
 # Time and drift -------------------------------------------------------------------------------------------------------
 
 
@@ -191,6 +303,53 @@ def traversability(elevation, validity, i, j, resolution, *, radius, critical_sl
     explained = 2 * cells * resolution * (abs(gx) + abs(gy))
     slope, step = math.atan(math.hypot(gx, gy)), max(0.0, max(heights) - min(heights) - explained)
     return max(0.0, 1 - max(slope / critical_slope, step / critical_step, math.sqrt(residual) / critical_roughness))
+
+
+# Rays -----------------------------------------------------------------------------------------------------------------
+
+
+def march(rays, corner, resolution, shape, steps_per_cell=4):
+    """The lowest ray over each cell, by marching along every ray: heights (H, W), inf where none, and its direction.
+
+    `rays` are (origin, hit) pairs. A ray counts up to one cell before its hit.
+    """
+    lowest, direction = np.full(shape, math.inf), np.zeros((*shape, 3))
+    for origin, hit in rays:
+        horizontal = math.hypot(hit[0] - origin[0], hit[1] - origin[1])
+        unit = (hit - origin) / np.linalg.norm(hit - origin)
+        for k in range(int((horizontal - resolution) / resolution * steps_per_cell)):
+            x, y, z = origin + (k + 0.5) / steps_per_cell * resolution / horizontal * (hit - origin)
+            cell = cell_of(x, y, corner, resolution, shape)
+            if cell is not None and z < lowest[cell]:
+                lowest[cell], direction[cell] = z, unit
+    return lowest, direction
+
+
+def over_centers(lowest, direction, origin, corner, resolution):
+    """The heights over the cells' centres of the rays that are lowest in them."""
+    height = lowest.copy()
+    for i, j in zip(*np.nonzero(np.isfinite(lowest)), strict=True):
+        x, y = center_of(i, j, corner, resolution)
+        slope = direction[i, j][2] / math.hypot(direction[i, j][0], direction[i, j][1])
+        height[i, j] = origin[2] + slope * math.hypot(x - origin[0], y - origin[1])
+    return height
+
+
+def clear_seen_through(layers, lowest, direction, min_time, min_incidence):
+    """validity, bounded and upper bound after rays: remove if p_z < h - sigma, not hit of late, |r . n| > alpha_n."""
+    validity, bounded, bound = (layers[n].copy() for n in ("validity", "bounded", "upper_bound"))
+    for c in np.ndindex(validity.shape):
+        if not math.isfinite(lowest[c]):
+            continue
+        normal = np.array([-layers["gradient_x"][c], -layers["gradient_y"][c], 1.0])
+        incidence = abs(direction[c] @ normal) / np.linalg.norm(normal)
+        below = lowest[c] < layers["elevation"][c] - math.sqrt(layers["variance"][c])
+        if validity[c] and below and layers["time"][c] > min_time and incidence > min_incidence:
+            validity[c] = bounded[c] = False
+        if not validity[c]:
+            bound[c] = min(bound[c], lowest[c]) if bounded[c] else lowest[c]
+            bounded[c] = True
+    return validity, bounded & ~validity, bound
 
 
 # Reading --------------------------------------------------------------------------------------------------------------

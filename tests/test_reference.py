@@ -99,6 +99,97 @@ def test_drift():
     assert reference.drift(layers, points, (0, 0), 1.0, **settings)[:2] == (2, pytest.approx(0.1))
 
 
+FUSION = dict(gate=3.0, max_gate_std=1.0, relief=0.0, scan_variance_floor=1e-9, outlier_variance=0.5, max_support=9)
+FUSION |= dict(max_variance=100.0, edges=None)
+EDGES = dict(min_points=4, min_share=0.5, min_passed=0.5, refinements=2)
+
+
+def cell(**values):
+    return dict(elevation=0.0, variance=1.0, known=True, support=2, time=5.0) | values
+
+
+def points(*heights, variance=1.0, beyond=False):
+    return [dict(z=z, variance=variance, beyond=beyond) for z in heights]
+
+
+def test_kalman():
+    assert reference.kalman(0.0, 1.0, [(1.0, 1.0)]) == (0.5, 0.5)
+    assert reference.kalman(0.0, 1.0, [(1.0, 1.0), (2.0, 0.5)]) == (1.25, 0.25)
+
+
+def test_fuse_cell_founds_an_unknown_cell():
+    after, used, _ = reference.fuse_cell(cell(known=False, variance=7.0), points(1.0, 3.0), 0.1, **FUSION)
+    assert (after["elevation"], after["variance"], after["support"]) == (2.0, 0.5, 2)
+    assert after["known"] and after["time"] == 0 and used == 2
+
+
+def test_fuse_cell_takes_what_agrees():
+    after, used, _ = reference.fuse_cell(cell(), points(1.0, 1.0, 9.0), 0.1, **FUSION)
+    # 9 is outside 3 * sqrt(2). z_s = 1, R = 1/2: h = (0 / 1 + 1 / 0.5) / 3; support 2 + 2 for - 1 against.
+    assert after["elevation"] == pytest.approx(2 / 3) and after["variance"] == pytest.approx(1 / 3)
+    assert after["support"] == 3 and used == 2
+
+
+def test_fuse_cell_outvotes_or_founds_anew():
+    after, used, _ = reference.fuse_cell(cell(), points(9.0, 9.0), 0.1, **FUSION)
+    assert (after["elevation"], after["variance"], after["support"], used) == (0.0, 2.0, 0, 0)
+    after, used, _ = reference.fuse_cell(cell(), points(9.0, 9.0, 9.0), 0.1, **FUSION)
+    assert after["elevation"] == pytest.approx(9) and after["variance"] == pytest.approx(1 / 3)
+    assert (after["support"], used) == (1, 3)
+
+
+def test_fuse_cell_keeps_one_side_of_a_step():
+    low_high = points(0.0, 0.0, 10.0, 10.0, variance=0.01)
+    unknown, settings = cell(known=False), FUSION | dict(edges=EDGES)
+    after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings)
+    assert (after["elevation"], used, ignored) == (pytest.approx(10.0), 2, 2)
+    for p in low_high[:2]:
+        p["beyond"] = True
+    after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings)
+    assert (after["elevation"], used, ignored) == (pytest.approx(0.0), 2, 2)
+
+
+def test_consensus_leaves_the_outlier():
+    assert reference.consensus(points(1.0, 1.0), 0.0) == 1.0
+    robust = reference.consensus(points(0.0, 0.0, 0.0, 0.0, 8.0), 0.0)
+    # From the mean 1.6: weights (1 + 1.6^2)^-2 = 0.0789 and (1 + 6.4^2)^-2 = 0.000568; then from 0.0144.
+    assert robust == pytest.approx(8 * (1 + 7.9856**2) ** -2 / (4 * (1 + 0.0144**2) ** -2), rel=1e-2)
+
+
+def test_passed_center():
+    args = ((-9.0, 0.5), (0, 0), 1.0, (1, 1))
+    assert reference.passed_center(0.9, 0.5, *args) and not reference.passed_center(0.1, 0.5, *args)
+    assert not reference.passed_center(0.6, 0.9, *args)
+
+
+def test_march():
+    ray = (np.array([0.5, 0.5, 4.0]), np.array([4.5, 0.5, 0.0]))
+    lowest, direction = reference.march([ray], (0, 0), 1.0, (6, 1))
+    # Height 4 - (x - 0.5), a quarter of a cell a step, up to x = 3.5.
+    np.testing.assert_allclose(lowest[:4, 0], [3.5 + 1 / 8, 2.5 + 1 / 8, 1.5 + 1 / 8, 1 + 1 / 8])
+    assert np.isinf(lowest[4:]).all()
+    np.testing.assert_allclose(direction[0, 0], [0.5**0.5, 0, -(0.5**0.5)])
+    height = reference.over_centers(lowest, direction, ray[0], (0, 0), 1.0)
+    np.testing.assert_allclose(height[:4, 0], [4, 3, 2, 1])
+
+
+def test_clear_seen_through():
+    names = ("elevation", "variance", "time", "gradient_x", "gradient_y", "upper_bound")
+    layers = {n: np.zeros((1, 5)) for n in names}
+    layers["elevation"][:] = 2.0
+    layers["time"][0] = [9, 0, 9, 9, 9]
+    layers["variance"][0, 2] = 4.0  # h - sigma = 0 is not above the ray
+    layers["validity"] = np.array([[True, True, True, False, True]])
+    layers["bounded"] = np.array([[False, False, False, True, True]])
+    layers["upper_bound"][0, 3] = 0.5
+    lowest, down = np.array([[1.0, 1.0, 1.0, 1.0, math.inf]]), np.tile([0.6, 0.0, -0.8], (1, 5, 1))
+    validity, bounded, bound = reference.clear_seen_through(layers, lowest, down, 1.0, 0.7)
+    assert validity.tolist() == [[False, True, True, False, True]]
+    assert bounded.tolist() == [[True, False, False, True, False]]
+    assert bound[0, 0] == 1.0 and bound[0, 3] == 0.5
+    assert reference.clear_seen_through(layers, lowest, down, 1.0, 0.9)[0][0, 0], "a grazing ray"
+
+
 def test_clear_other_floors():
     layers = dict(
         elevation=np.array([[0.0, 3.0, 3.0]]),
