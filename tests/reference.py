@@ -145,33 +145,53 @@ def consensus(points, relief, rounds=2):
     return height
 
 
-def side_of_step(points, edges):
-    """+1 and the top's height, or -1 and the ground's, of a cell that holds a step."""
-    mean = weighted_mean(points)
-    low = [p for p in points if p["z"] < mean]
-    side, level = -1 if sum(p["beyond"] for p in low) > edges["min_passed"] * len(low) else 1, mean
+def extreme(points, side, edges, relief):
+    """The top (+1) or bottom (-1) of the points: the mean of those beyond the mean, give or take a margin, repeated."""
+    level = weighted_mean(points)
     for _ in range(edges["refinements"]):
-        inside = [p for p in points if side * (p["z"] - level) >= 0]
-        level = weighted_mean(inside) if inside else level
-    return side, level
+        margins = [edges["margin"] * math.sqrt(p["variance"] + relief**2) for p in points]
+        beyond = [p for p, margin in zip(points, margins, strict=True) if side * (p["z"] - level) >= -margin]
+        level = weighted_mean(beyond) if beyond else level
+    return level
 
 
-def scan_height(cell, points, relief, *, gate, max_gate_std, edges):
-    """What a scan says of a cell: the points kept and ignored, and the number that agree with the cell's elevation."""
-    gate_variance = min(cell["variance"], max_gate_std**2) if cell["known"] else 0.0
-    agreeing = sum(cell["known"] and agrees(p, cell["elevation"], gate_variance, relief, gate) for p in points)
-    if cell["known"] and 2 * agreeing >= len(points):
+def side_of_step(points, edges, relief, neighbour_top):
+    """+1 and the top's height, or -1 and the ground's, of a cell that holds a step.
+
+    The ground wins where rays passed the centre and hit low, if a neighbouring cell's mean height shows the top.
+    """
+    mean, top = weighted_mean(points), extreme(points, 1, edges, relief)
+    low = [p for p in points if p["z"] < mean]
+    passed = sum(p["beyond"] for p in low) > edges["min_passed"] * len(low)
+    if passed and neighbour_top >= (mean + top) / 2:
+        return -1, extreme(points, -1, edges, relief)
+    return 1, top
+
+
+def scan_height(cell, points, relief, neighbour_top, *, gate, max_gate_std, edges):
+    """What a scan says of a cell: its height, the points kept, how many were ignored, and how many speak for the cell.
+
+    Points on the face of a wall speak for its top; whoever sees less of a face has nothing against the top.
+    """
+    gate_variance = min(cell["variance"], max_gate_std**2)
+    near = [cell["known"] and agrees(p, cell["elevation"], gate_variance, relief, gate) for p in points]
+    if 2 * sum(near) >= len(points):
         guess = cell["elevation"]
     else:
         guess, gate_variance = consensus(points, relief), 0.0
-    side = 0
+    side = margin = 0
     if edges is not None:
+        margin = edges["margin"]
         far = sum(not agrees(p, guess, gate_variance, relief, gate) for p in points)
         if len(points) >= edges["min_points"] and far >= edges["min_share"] * len(points):
-            side, guess = side_of_step(points, edges)
-    wrong = [side * (p["z"] - guess) < -math.sqrt(p["variance"] + relief**2) for p in points]
+            side, guess = side_of_step(points, edges, relief, neighbour_top)
+    wrong = [side * (p["z"] - guess) < -margin * math.sqrt(p["variance"] + relief**2) for p in points]
     kept = [p for p, w in zip(points, wrong, strict=True) if not w and agrees(p, guess, gate_variance, relief, gate)]
-    return kept, sum(wrong), agreeing
+    height = weighted_mean(kept) if kept else guess
+    for_cell = sum(n and not w for n, w in zip(near, wrong, strict=True))
+    if side > 0 and height < cell["elevation"]:
+        for_cell = len(kept) + sum(wrong)
+    return height, kept, sum(wrong), for_cell
 
 
 def fuse_cell(
@@ -187,24 +207,28 @@ def fuse_cell(
     max_support,
     max_variance,
     edges,
+    neighbour_top=-math.inf,
 ):
     """One cell and the points of one scan: the cell after it, and the numbers of points used and ignored at a step.
 
-    `cell` has elevation, variance, known, support, time; each point z, variance, beyond. `relief` counts cells.
+    `cell` has elevation, variance, known, support, time; each point z, variance, beyond. `relief` counts cells,
+    `neighbour_top` is the highest mean height of the points in the eight cells around.
     """
     after, relief = dict(cell), relief * resolution
     after["variance"] = min(cell["variance"], max_variance) if cell["known"] else 1.0
     if not points:
         return after, 0, 0
-    kept, ignored, agreeing = scan_height(cell, points, relief, gate=gate, max_gate_std=max_gate_std, edges=edges)
+    settings = dict(gate=gate, max_gate_std=max_gate_std, edges=edges)
+    height, kept, ignored, for_cell = scan_height(cell, points, relief, neighbour_top, **settings)
     if not kept:
         return after, 0, ignored
-    height, R = weighted_mean(kept), max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor)
+    R = max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor)
     gate_variance = min(cell["variance"], max_gate_std**2)
     distance = abs(height - cell["elevation"])
     agree = cell["known"] and distance <= gate * math.sqrt(gate_variance + R + relief**2)
-    margin = 2 * len(kept) - (len(points) - ignored)  # points for the height, less points against it
-    support = cell["support"] + (margin if agree else agreeing - len(kept))
+    votes = len(kept) + ignored
+    margin = 2 * votes - len(points)  # votes for the height, less votes against it
+    support = cell["support"] + (margin if agree else for_cell - votes)
     if agree:
         h, variance = kalman(cell["elevation"], cell["variance"], [(height, R)])
         after |= dict(elevation=h, variance=min(variance, max_variance), time=0.0)

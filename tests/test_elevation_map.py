@@ -249,10 +249,22 @@ def test_inference_mode_then_reset_outside():
         emap.sample(torch.zeros(2, 3, 2))
         emap.reset(mask=torch.tensor([True, False]))
         emap.initialize(torch.zeros(2, 4, 3), method="nearest")
+    assert not any(b.is_inference() for b in emap.buffers())
     emap.reset(torch.tensor([0]))
     emap.update(cloud, T, T, 0.1)
     emap.elevation.add_(0.0)
-    assert not emap.elevation.is_inference() and emap.validity.any()
+    assert emap.validity.any()
+
+
+def test_buffers_keep_their_place_in_memory():
+    """Whoever holds a buffer, such as a CUDA graph, sees the map change."""
+    emap = small_map(2)
+    places = {name: b.data_ptr() for name, b in emap.named_buffers()}
+    cloud, T = scan(0)
+    emap.update(cloud, T, T, 0.1)
+    emap.reset(mask=torch.tensor([True, False]))
+    emap.initialize(torch.zeros(2, 4, 3), method="nearest")
+    assert {name: b.data_ptr() for name, b in emap.named_buffers()} == places
 
 
 # Copies and checkpoints -----------------------------------------------------------------------------------------------

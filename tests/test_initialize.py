@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from torchelev.initialize import interpolate
 
-FEET = torch.tensor([[0.4, 0.3, 0.0], [0.4, -0.3, 0.1], [-0.4, 0.3, 0.2], [-0.4, -0.3, 0.3]])
+FEET = torch.tensor([[0.4, 0.3, 0.0], [0.4, -0.3, 0.1], [-0.4, 0.3, 0.2], [-0.4, -0.3, 0.1]])  # on no plane
 
 
 def random_feet(seed, num_envs=2, number=4):

@@ -101,7 +101,7 @@ def test_drift():
 
 FUSION = dict(gate=3.0, max_gate_std=1.0, relief=0.0, scan_variance_floor=1e-9, outlier_variance=0.5, max_support=9)
 FUSION |= dict(max_variance=100.0, edges=None)
-EDGES = dict(min_points=4, min_share=0.5, min_passed=0.5, refinements=2)
+EDGES = dict(min_points=4, min_share=0.5, min_passed=0.5, refinements=2, margin=0.5)
 
 
 def cell(**values):
@@ -145,8 +145,9 @@ def test_fuse_cell_keeps_one_side_of_a_step():
     assert (after["elevation"], used, ignored) == (pytest.approx(10.0), 2, 2)
     for p in low_high[:2]:
         p["beyond"] = True
-    after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings)
-    assert (after["elevation"], used, ignored) == (pytest.approx(0.0), 2, 2)
+    for neighbour_top, height in ((7.4, 10.0), (7.6, 0.0)):  # halfway between the mean of 5 and the top of 10
+        after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings, neighbour_top=neighbour_top)
+        assert (after["elevation"], used, ignored) == (pytest.approx(height), 2, 2)
 
 
 def test_consensus_leaves_the_outlier():
