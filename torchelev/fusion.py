@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, lattice_offset, locate, pad_cells
+from torchelev.operators import realize
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 
 if TYPE_CHECKING:
@@ -22,7 +24,9 @@ class EdgeConfig:
 
     min_points: int = 6
     min_share: float = 0.25  # of the cell's points outside the gate around its estimate
-    refinements: int = 3  # each halves the distance to the top of a wall's face
+    min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
+    refinements: int = 5  # each halves the distance to the top of a wall's face
+    margin: float = 0.25  # standard deviations below the top that still belong to it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,18 +99,23 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     gate = torch.where(trusted, prior.gate_variance, 0.0)
     side = torch.zeros_like(guess)
     if cfg.edges is not None:
-        side, guess = side_of_step(scan, guess, gate, mean, number, cfg, cfg.edges)
+        side, guess = side_of_step(scan, guess, gate, mean, number, grid, cfg)
     kept, ignored = on_side(scan, take(guess), take(gate), take(side), cfg)
 
     weight = torch.where(kept, scan.weight, 0.0)
     # Around the guess, so that float32 keeps millimetres at any altitude.
-    information, moment, support, edge = scan.sums(weight, weight * (scan.z - take(guess)), kept, ignored)
+    columns = (weight, weight * (scan.z - take(guess)), kept, ignored, near & ~ignored)
+    information, moment, support, edge, agreeing = scan.sums(*columns)
+    height = guess + ratio(moment, information)
     scanned = ScanOfCells(
-        height=guess + ratio(moment, information),
+        height=height,
         variance=(1.0 / torch.where(support > 0, information, 1.0)).clamp(min=cfg.scan_variance_floor),
-        number=number - edge,
         kept=support,
-        agreeing=agreeing,
+        # Points on the face of a wall speak for its top.
+        votes=support + edge,
+        dissent=number - support - edge,
+        # The paper ignores the points below a wall's top: who sees less of its face has nothing against it.
+        agreeing=torch.where((side > 0) & (height < prior.elevation), support + edge, agreeing),
     )
     state, taken = merge(state, prior, scanned, grid, cfg)
     points_used = torch.where(taken, support, 0.0)[:, :-1].sum(1).to(torch.int64)
@@ -182,7 +191,7 @@ def consensus(scan: Scan, height: Tensor, rounds: int = 2) -> Tensor:
 
 
 def side_of_step(
-    scan: Scan, guess: Tensor, gate: Tensor, mean: Tensor, number: Tensor, cfg: FusionConfig, edges: EdgeConfig
+    scan: Scan, guess: Tensor, gate: Tensor, mean: Tensor, number: Tensor, grid: GridConfig, cfg: FusionConfig
 ) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
@@ -191,24 +200,45 @@ def side_of_step(
     what lies at the centre, and points above are ignored. Returns the side (B, C+1), +1 top, -1 ground and 0 no step,
     and the guess, moved to that side.
     """
-    take = scan.cells.take
-    far = scan.used & ~agrees(scan, take(guess), take(gate), cfg)
-    far, passed_low = scan.sums(far, scan.used & scan.beyond & (scan.z < take(mean)))
+    take, edges = scan.cells.take, cfg.edges
+    assert edges is not None
+    far, low = scan.used & ~agrees(scan, take(guess), take(gate), cfg), scan.used & (scan.z < take(mean))
+    far, low, passed_low = scan.sums(far, low, low & scan.beyond)
     step = (number >= edges.min_points) & (far >= edges.min_share * number)
-    up = torch.where(passed_low >= torch.clamp(0.15 * number, min=2.0), -1.0, 1.0)
-    level, direction = mean, take(up)
+    top = extreme(scan, mean, 1.0, edges)
+    # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
+    elsewhere = neighbour_maximum(torch.where(number > 0, mean, -1e6), grid) >= 0.5 * (mean + top)
+    ground = step & elsewhere & (passed_low > edges.min_passed * low)
+    guess = torch.where(step, torch.where(ground, extreme(scan, mean, -1.0, edges), top), guess)
+    return torch.where(step, torch.where(ground, -1.0, 1.0), 0.0), guess.detach()
+
+
+def extreme(scan: Scan, mean: Tensor, side: float, edges: EdgeConfig) -> Tensor:
+    """Return the top (side 1) or bottom (side -1) of each cell: the mean of the points beyond the mean, repeated."""
+    level = mean
     for _ in range(edges.refinements):
-        above = scan.z - take(level)
-        weight = torch.where(direction * above >= 0, scan.weight, 0.0)
-        total, moment = scan.sums(weight, weight * above)
+        residual = scan.z - scan.cells.take(level)
+        beyond = side * residual >= -edges.margin * scan.spread.sqrt()
+        weight = torch.where(beyond, scan.weight, 0.0)
+        total, moment = scan.sums(weight, weight * residual)
         level = level + ratio(moment, total)
-    return torch.where(step, up, 0.0), torch.where(step, level, guess)
+    return level
+
+
+def neighbour_maximum(cells: Float[Tensor, "B C+1"], grid: GridConfig) -> Float[Tensor, "B C+1"]:
+    """Return the highest value of the eight neighbours of each cell."""
+    H, W = grid.height, grid.width
+    layer = F.pad(cells[:, :-1].unflatten(1, (H, W)), (1, 1, 1, 1), value=-1e6)
+    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    highest = torch.stack([layer[:, i : i + H, j : j + W] for i, j in shifts]).amax(0)
+    return F.pad(realize(highest).flatten(1), (0, 1))
 
 
 def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
     """Return the points kept and, in cells with a step, the points ignored as being of its other side."""
     residual = side * (scan.z - guess)
-    ignored = scan.used & (residual < -scan.spread.sqrt())
+    margin = cfg.edges.margin if cfg.edges is not None else 0.0
+    ignored = scan.used & (residual < -margin * scan.spread.sqrt())
     return agrees(scan, guess, gate, cfg) & ~ignored, ignored
 
 
@@ -217,9 +247,10 @@ class ScanOfCells(NamedTuple):
 
     height: Float[Tensor, "B C+1"]
     variance: Float[Tensor, "B C+1"]
-    number: Float[Tensor, "B C+1"]  # not ignored
-    kept: Float[Tensor, "B C+1"]  # that make up the height
-    agreeing: Float[Tensor, "B C+1"]  # with the cell's elevation
+    kept: Float[Tensor, "B C+1"]  # make up the height
+    votes: Float[Tensor, "B C+1"]  # speak for the height
+    dissent: Float[Tensor, "B C+1"]  # speak against it
+    agreeing: Float[Tensor, "B C+1"]  # speak for the cell's elevation
 
 
 def merge(
@@ -229,7 +260,7 @@ def merge(
     hit, innovation = scan.kept > 0, scan.height - prior.elevation
     limit = prior.gate_variance + scan.variance + (cfg.relief * grid.resolution) ** 2
     agree = prior.known & hit & (innovation.square() <= cfg.gate**2 * limit)
-    votes = torch.where(agree, 2 * scan.kept - scan.number, scan.agreeing - scan.kept)
+    votes = torch.where(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
     found = hit & ~agree & (~prior.known | (support < 0))
     taken = agree | found
@@ -238,7 +269,7 @@ def merge(
     fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
     outvoted = torch.where(hit, prior.variance + cfg.outlier_variance * scan.kept, prior.variance)
     posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)
-    fresh = torch.where(prior.known, -support, 2 * scan.kept - scan.number)
+    fresh = torch.where(prior.known, -support, scan.votes - scan.dissent)
     support = torch.where(hit, torch.where(found, fresh, support).clamp(0, cfg.max_support), prior.support)
 
     def store(cells: Tensor) -> Tensor:
