@@ -104,7 +104,7 @@ def test_locate_agrees_with_the_reference(seed, cells):
     for n in range(50):
         cell = reference.cell_of(*xy[0, n], corner, 0.1, cells)
         expected = grid.num_cells if cell is None or not used[0, n] else cell[0] * cells[1] + cell[1]
-        assert found.index[0, n] == expected
+        assert found.slot[0, n] == expected
 
 
 def test_point_cells_sum_and_take():
