@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from torchelev import checks
-from torchelev.aging import age
 from torchelev.config import ElevationMapConfig, differing_fields
-from torchelev.drift import compensate
 from torchelev.errors import require
-from torchelev.fusion import fuse
-from torchelev.grid import cell_centers, recenter
+from torchelev.grid import cell_centers
 from torchelev.initialize import METHODS, interpolate
 from torchelev.layers import LAYERS, Layer, sample_layer
-from torchelev.overlap import clear_other_floors
-from torchelev.raycast import clear_seen_through
+from torchelev.pipeline import compiled_update, fuse_measurement, update
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state
 from torchelev.surface import normals
@@ -27,65 +22,6 @@ from torchelev.traversability import traversability
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
-
-
-def fuse_measurement(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
-    """Run the stages in order (paper, Fig. 2). Pure: touches nothing but its arguments' values."""
-    grid = cfg.grid
-    state = recenter(state, m, grid)
-    state = age(state, m, cfg.aging)
-    if cfg.drift is not None:
-        state = compensate(state, m, grid, cfg.drift)
-    state = fuse(state, m, grid, cfg.fusion)
-    if cfg.raycast is not None:
-        state = clear_seen_through(state, m, grid, cfg.raycast)
-    if cfg.overlap is not None:
-        state = clear_other_floors(state, m, grid, cfg.overlap)
-    state = normals(state, grid, cfg.surface)
-    if cfg.traversability is not None:
-        state = traversability(state, grid, cfg.traversability)
-    return count_rejected(state, m)
-
-
-def count_rejected(state: MapState, m: Measurement) -> MapState:
-    """Carry the counts of the sensor's gates over to the statistics."""
-    gates = ("rejected_invalid", "rejected_range", "rejected_body", "rejected_overhang")
-    counts = {name: getattr(m, name) for name in gates}
-    return state._replace(statistics=state.statistics._replace(**counts))
-
-
-def _update(
-    state: MapState,
-    points: Tensor,
-    T_map_sensor: Tensor,
-    T_map_base: Tensor | None,
-    dt: Tensor,
-    variance: Tensor | None,
-    cfg: ElevationMapConfig,
-) -> MapState:
-    m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, state.elevation.dtype)
-    return fuse_measurement(state, m, cfg)
-
-
-@functools.cache
-def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
-    """Return the compiled update of a config; equal configs share one graph."""
-    return torch.compile(functools.partial(_update, cfg=cfg), fullgraph=True)
-
-
-def padded_size(num_points: int) -> int:
-    """Round a number of points up to one of a few sizes (at most 25 % more), so that new lengths do not recompile."""
-    if num_points <= 64:
-        return 64
-    step = 1 << ((num_points - 1).bit_length() - 3)
-    return -(-num_points // step) * step
-
-
-def pad_points(points: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Pad clouds with NaN, which every stage ignores, to a size that recurs."""
-    extra = padded_size(points.shape[2]) - points.shape[2]
-    points = nn.functional.pad(points, (0, 0, 0, extra), value=torch.nan)
-    return points, None if variance is None else nn.functional.pad(variance, (0, extra), value=torch.nan)
 
 
 class ElevationMap(nn.Module):
@@ -160,10 +96,15 @@ class ElevationMap(nn.Module):
         return {"config": self.cfg.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another config, naming the settings that differ."""
-        fields = differing_fields(self.cfg.to_dict(), state["config"])
+        """Do nothing: the config was compared before anything was loaded."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Refuse a checkpoint of another config, naming the settings that differ, before anything changed."""
+        extra = state_dict.get(f"{prefix}_extra_state")
+        fields = differing_fields(self.cfg.to_dict(), extra["config"]) if extra else []
         mend = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", mend)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     # Writing --------------------------------------------------------------------------------------------------------
 
@@ -188,10 +129,7 @@ class ElevationMap(nn.Module):
         Raises ValueError or TypeError before anything changed.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
-        run = compiled_update(self.cfg) if self._compiled else functools.partial(_update, cfg=self.cfg)
-        if self._compiled:
-            cloud, variance = pad_points(inputs[0], inputs[4])
-            inputs = (cloud, *inputs[1:4], variance)
+        run = compiled_update(self.cfg) if self._compiled else functools.partial(update, cfg=self.cfg)
         with torch.no_grad():
             self._store(run(self.state, *inputs))
 
@@ -296,7 +234,9 @@ class ElevationMap(nn.Module):
     def _read(self, name: str, state: MapState | None) -> Layer:
         mend = f"there are {', '.join(LAYERS)}"
         require(name in LAYERS, "layer", "must be a layer's name", repr(name), mend, KeyError)
-        return LAYERS[name](self.state if state is None else state)
+        values, known = LAYERS[name](self.state if state is None else state)
+        has_answer = name != "traversability" or self.cfg.traversability is not None
+        return values, known & has_answer
 
     def sample(
         self,

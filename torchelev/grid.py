@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,8 +29,8 @@ class GridConfig:
         require(self.resolution > 0, "grid.resolution", "must be positive", self.resolution, "give metres per cell")
         for name in ("length_x", "length_y"):
             cells = getattr(self, name) / self.resolution
-            whole = round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * max(1.0, cells)
-            mend = f"try {max(1, round(cells)) * self.resolution:.6g}"
+            whole = math.isfinite(cells) and round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * max(1.0, cells)
+            mend = f"try {max(1, round(cells)) * self.resolution:.6g}" if math.isfinite(cells) else "give metres"
             require(whole, f"grid.{name}", "must be a whole number of cells", f"{cells:.6g} cells", mend)
 
     @property

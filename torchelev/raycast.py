@@ -32,7 +32,7 @@ class RaycastConfig:
     min_time: float = 1.0  # [s] cells hit within it stay, and contradict rays that pass below them
     min_incidence: float = 0.1  # alpha_n: |r . n| below it is a grazing ray
     max_range: float | None = None  # [m] rays count up to here; None: 1.1 half-diagonals of the window
-    min_support: float = 2.0  # points that agree with a ray's end, or a neighbouring cell, for the ray to be believed
+    min_support: float = 3.0  # points that agree with a ray's end, or a neighbouring cell, for the ray to be believed
     gate: float = 3.0  # a ray so many standard deviations below ground that is known is a wrong return
 
     def __post_init__(self) -> None:
@@ -84,6 +84,7 @@ class Rays(NamedTuple):
     slope: Float[Tensor, "B N"]  # dz / dr
     azimuth: Float[Tensor, "B N"]  # in turns
     casts: Bool[Tensor, "B N"]
+    overhang: Bool[Tensor, "B N"]  # the point lies above the exclusion ramp
 
 
 def rays_of(m: Measurement, s: int) -> Rays:
@@ -92,8 +93,8 @@ def rays_of(m: Measurement, s: int) -> Rays:
     ray = m.points.unflatten(1, (sensors, -1))[:, s] - m.origin[:, s, None]
     x, y, z = ray.unbind(-1)
     r = (x.square() + y.square()).clamp(min=1e-12).sqrt()
-    casts = m.casts.unflatten(1, (sensors, -1))[:, s]
-    return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), casts)
+    casts, used = (mask.unflatten(1, (sensors, -1))[:, s] for mask in (m.casts, m.used))
+    return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), casts, casts & ~used)
 
 
 # Which rays are believed ----------------------------------------------------------------------------------------------
@@ -102,11 +103,16 @@ def rays_of(m: Measurement, s: int) -> Rays:
 
 def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
     """Tell which rays may clear and bound: their end is credible, and they pass below no ground hit of late."""
-    return rays.casts & ends_well(state, m, rays, grid, cfg) & ~under_horizon(state, m, rays, grid, cfg)
+    clearance = horizon(state, m, rays, grid, cfg) + rays.slope
+    return rays.casts & ends_well(state, m, rays, grid, cfg) & (clearance >= 0)
 
 
 def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
-    """Tell which rays end, or leave the window, in an unknown cell or not below a well supported one."""
+    """Tell which rays end, or leave the window, in a well supported cell and not below it.
+
+    Where nothing is known nobody vouches for a ray, unless its point is above the exclusion ramp: too long a return
+    lies below the ground, not up there.
+    """
     offset = lattice_offset(state, m, grid)[:, None]
     start = rays.origin[:, None, :2] + offset
     size = torch.stack([start.new_full((), n * grid.resolution) for n in (grid.height, grid.width)])
@@ -118,32 +124,30 @@ def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg
     cells = locate(xy, rays.casts, offset[:, 0], grid)
     sigma = (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
     floor = torch.where(well_supported(state, cfg, grid.resolution), state.elevation - cfg.gate * sigma, 1e6)
-    floor = cells.take(pad_cells(torch.where(state.validity, floor, -1e6)))
+    floor = cells.take(pad_cells(torch.where(state.validity, floor, 1e6)))
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
-    return (cells.slot < cells.num_cells) & (height >= floor)
+    return (cells.slot < cells.num_cells) & (height >= floor) | rays.overhang
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
-    """Tell which known cells are believed: enough points agree, or a neighbouring cell has a like height."""
-    supported = state.support >= cfg.min_support
+    """Tell which known cells are believed: enough points agree, or on a neighbouring cell of like height."""
+    enough = supported = state.validity & (state.support >= cfg.min_support)
     for dim in (-1, -2):
-        near = torch.zeros_like(supported)
         size = supported.shape[dim] - 1
         first, second = state.elevation.narrow(dim, 0, size), state.elevation.narrow(dim, 1, size)
         both = state.validity.narrow(dim, 0, size) & state.validity.narrow(dim, 1, size)
         like = both & ((first - second).abs() <= resolution)
-        end = near.narrow(dim, 0, 1)
-        supported = supported | torch.cat([like, end], dim) | torch.cat([end, like], dim)
+        end = torch.zeros_like(enough.narrow(dim, 0, 1))
+        by_second, by_first = like & enough.narrow(dim, 1, size), like & enough.narrow(dim, 0, size)
+        supported = supported | torch.cat([by_second, end], dim) | torch.cat([end, by_first], dim)
     return supported & state.validity
 
 
-def under_horizon(
-    state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig
-) -> Bool[Tensor, "B N"]:
-    """Tell which rays pass below ground that was hit within `min_time`: they contradict it, and are wrong returns.
+def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B N"]:
+    """Return the steepest fall -dz/dr that a ray may have before it passes below ground hit within `min_time`.
 
-    The horizon at a range is the steepest slope under which the sensor sees recently hit ground up to there. It is kept
-    in a polar table of half the resolution, filled by gathering from the map.
+    Rays that pass below it contradict it, and are wrong returns. Kept in a polar table of half the resolution, filled
+    by gathering from the map: the running minimum, from the sensor outwards, of the fall to each bin's ground.
     """
     step = 2 * grid.resolution
     polar = PolarGrid.of(grid, cfg)
@@ -155,15 +159,15 @@ def under_horizon(
     xy = rays.origin[:, None, :2] + realize(rho[:, None, None] * circle).flatten(0, 1)
     cells = locate(xy, torch.ones_like(xy[..., 0], dtype=torch.bool), lattice_offset(state, m, grid), grid)
     margin = cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
-    recent = state.validity & (state.time <= cfg.min_time) & (state.support >= cfg.min_support)
+    recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - state.elevation + margin, NO_RAY)
     fall = torch.where(cells.slot < grid.num_cells, cells.take(pad_cells(below_sensor)), NO_RAY * step)
     fall = realize(fall).unflatten(1, (ranges, azimuths)) / rho[:, None]
-    horizon = running_minimum(fall, from_end=False)
+    lowest = running_minimum(fall, from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
-    limit = horizon.flatten(1).gather(1, (k.clamp(min=0) * azimuths + a).to(torch.int64))
-    return (k >= 0) & (-rays.slope > limit)
+    limit = lowest.flatten(1).gather(1, (k.clamp(min=0) * azimuths + a).to(torch.int64))
+    return torch.where(k >= 0, limit, NO_RAY)
 
 
 # The polar table ------------------------------------------------------------------------------------------------------
@@ -245,8 +249,7 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
         rays = rays_of(m, s)
         table = lowest_slopes(rays, believed(state, m, rays, grid, cfg), polar, grid)
         state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), cfg)
-    cleared = count(known & ~state.validity)
-    return tally(state, cleared_seen_through=cleared, cells_bounded=count(state.bounded))
+    return tally(state, cleared_seen_through=count(known & ~state.validity))
 
 
 def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> MapState:

@@ -40,6 +40,11 @@ def height_range(elevation: Tensor, validity: Tensor, radius: int) -> Tensor:
     return torch.where(validity, high - low, 0.0)
 
 
+def rate_all(state: MapState) -> MapState:
+    """Rate every cell as traversable: without a head, all known cells count in drift compensation."""
+    return state._replace(traversability=torch.ones_like(state.traversability))
+
+
 def traversability(state: MapState, grid: GridConfig, cfg: TraversabilityConfig) -> MapState:
     """Rate every known cell by the worst of slope, step and roughness (the seam for a learned head).
 

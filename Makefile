@@ -1,0 +1,36 @@
+# `make demo` and `make test` set up their own environment; nothing but python3 and make is needed.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: help demo test lint types setup bench clean
+
+help:  ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
+
+$(BIN)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[io,dev]'
+	touch $@
+
+setup: $(BIN)/.ready  ## make the environment .venv
+
+demo: setup  ## simulate a walk, map it, write demo.png
+	$(BIN)/python -m torchelev demo --out demo.png
+
+test: setup  ## run all tests
+	$(BIN)/python -m pytest
+
+lint: setup  ## check style
+	$(BIN)/ruff check .
+
+types: setup  ## check types
+	$(BIN)/mypy
+
+bench: setup  ## measure: accuracy, features, the paper's tables
+	$(BIN)/python -m benchmarks.accuracy
+	$(BIN)/python -m benchmarks.features
+	$(BIN)/python -m benchmarks.paper_tables
+
+clean:  ## remove what the targets made
+	rm -rf $(VENV) demo.png

@@ -1,0 +1,78 @@
+"""The paper's overview figure: the stages in their order."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchelev.aging import age
+from torchelev.config import ElevationMapConfig
+from torchelev.drift import compensate
+from torchelev.fusion import fuse
+from torchelev.grid import recenter
+from torchelev.overlap import clear_other_floors
+from torchelev.raycast import clear_seen_through
+from torchelev.sensor import measure
+from torchelev.state import MapState, Measurement, count, tally
+from torchelev.surface import normals
+from torchelev.traversability import rate_all, traversability
+
+
+def fuse_measurement(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+    """Run the stages in order (paper, Fig. 2). Pure: touches nothing but its arguments' values."""
+    grid = cfg.grid
+    state = start_tally(state, m)
+    state = recenter(state, m, grid)
+    state = age(state, m, cfg.aging)
+    if cfg.drift is not None:
+        state = compensate(state, m, grid, cfg.drift)
+    state = fuse(state, m, grid, cfg.fusion)
+    if cfg.raycast is not None:
+        state = clear_seen_through(state, m, grid, cfg.raycast)
+    if cfg.overlap is not None:
+        state = clear_other_floors(state, m, grid, cfg.overlap)
+    state = normals(state, grid, cfg.surface)
+    state = traversability(state, grid, cfg.traversability) if cfg.traversability is not None else rate_all(state)
+    return tally(state, cells_bounded=count(state.bounded & ~state.validity))
+
+
+def start_tally(state: MapState, m: Measurement) -> MapState:
+    """Set the statistics to zero, and to what the sensor's gates rejected."""
+    gates = ("rejected_invalid", "rejected_range", "rejected_body", "rejected_overhang")
+    zeros = {name: torch.zeros_like(value) for name, value in state.statistics._asdict().items()}
+    return tally(state, **(zeros | {name: getattr(m, name) for name in gates}))
+
+
+def update(
+    state: MapState,
+    points: Tensor,
+    T_map_sensor: Tensor,
+    T_map_base: Tensor | None,
+    dt: Tensor,
+    variance: Tensor | None,
+    cfg: ElevationMapConfig,
+) -> MapState:
+    """Measure and fuse; points come as (B, S, N, 3)."""
+    m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, state.elevation.dtype)
+    return fuse_measurement(state, m, cfg)
+
+
+@functools.cache
+def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
+    """Return the compiled update of a config; equal configs share one graph, whatever the number of points."""
+    plain = functools.partial(update, cfg=cfg)
+    graph = torch.compile(plain, fullgraph=True)
+
+    def run(state: MapState, points: Tensor, *others: Any) -> MapState:
+        if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
+            return plain(state, points, *others)
+        for values in (points, others[-1]):
+            if values is not None:
+                torch._dynamo.maybe_mark_dynamic(values, 2)
+        return graph(state, points, *others)
+
+    return run
