@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, lattice_offset, locate, pad_cells
-from torchelev.operators import realize
+from torchelev.operators import realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 
 if TYPE_CHECKING:
@@ -205,20 +205,20 @@ def side_of_step(
     far, low = scan.used & ~agrees(scan, take(guess), take(gate), cfg), scan.used & (scan.z < take(mean))
     far, low, passed_low = scan.sums(far, low, low & scan.beyond)
     step = (number >= edges.min_points) & (far >= edges.min_share * number)
-    top = extreme(scan, mean, 1.0, edges)
+    top = extreme(scan, mean, 1.0, edges.refinements, edges.margin)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
     elsewhere = neighbour_maximum(torch.where(number > 0, mean, -1e6), grid) >= 0.5 * (mean + top)
     ground = step & elsewhere & (passed_low > edges.min_passed * low)
-    guess = torch.where(step, torch.where(ground, extreme(scan, mean, -1.0, edges), top), guess)
+    guess = torch.where(step, torch.where(ground, extreme(scan, mean, -1.0, 2, edges.margin), top), guess)
     return torch.where(step, torch.where(ground, -1.0, 1.0), 0.0), guess.detach()
 
 
-def extreme(scan: Scan, mean: Tensor, side: float, edges: EdgeConfig) -> Tensor:
+def extreme(scan: Scan, mean: Tensor, side: float, rounds: int, margin: float) -> Tensor:
     """Return the top (side 1) or bottom (side -1) of each cell: the mean of the points beyond the mean, repeated."""
     level = mean
-    for _ in range(edges.refinements):
+    for _ in range(rounds):
         residual = scan.z - scan.cells.take(level)
-        beyond = side * residual >= -edges.margin * scan.spread.sqrt()
+        beyond = side * residual >= -margin * scan.spread.sqrt()
         weight = torch.where(beyond, scan.weight, 0.0)
         total, moment = scan.sums(weight, weight * residual)
         level = level + ratio(moment, total)
@@ -276,11 +276,12 @@ def merge(
         return cells[:, :-1].reshape(state.elevation.shape)
 
     hit_now = store(taken)
-    stored = state._replace(
-        elevation=torch.where(hit_now, store(fused), state.elevation),
-        variance=torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
-        support=store(support),
-        validity=state.validity | hit_now,
-        time=torch.where(hit_now, 0.0, state.time),
+    elevation, variance, support, validity, time = realize_all(
+        torch.where(hit_now, store(fused), state.elevation),
+        torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
+        store(support),
+        state.validity | hit_now,
+        torch.where(hit_now, 0.0, state.time),
     )
+    stored = state._replace(elevation=elevation, variance=variance, support=support, validity=validity, time=time)
     return stored, taken

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.operators import cell_sums, realize
+from torchelev.operators import cell_sums, realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement
 
 if TYPE_CHECKING:
@@ -76,7 +76,8 @@ def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[T
     cells = (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
     x = torch.arange(grid.height, device=cells.device) + cells[:, 0, None]
     y = torch.arange(grid.width, device=cells.device) + cells[:, 1, None]
-    return realize(x * grid.resolution)[:, :, None], realize(y * grid.resolution)[:, None, :]
+    x, y = realize_all(x * grid.resolution, y * grid.resolution)
+    return x[:, :, None], y[:, None, :]
 
 
 def locate(xy: Float[Tensor, "B M 2"], used: Bool[Tensor, "B M"], offset: Tensor, grid: GridConfig) -> PointCells:
@@ -104,7 +105,7 @@ def window_corner(base: Float[Tensor, "B 2"], anchor: Int[Tensor, "B 2"], grid: 
 def shift_layer(layer: Tensor, index: Tensor, entering: Tensor, blank: float) -> Tensor:
     """Move a layer's content by gathering; cells that enter the window get the blank value."""
     moved = layer.flatten(1).gather(1, index).view_as(layer)
-    return realize(torch.where(entering, torch.full_like(moved, blank), moved))
+    return torch.where(entering, torch.full_like(moved, blank), moved)
 
 
 def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
@@ -115,18 +116,18 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     """
     if m.base is None:
         return state
-    corner = realize(window_corner(m.base[:, :2], m.anchor, grid))
+    corner = window_corner(m.base[:, :2], m.anchor, grid)
     # A shift of a whole window blanks everything; the clamp keeps the index arithmetic small.
-    shift = realize((corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width)))
+    shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
+    corner, shift = realize_all(corner, shift)
     device = state.corner.device
     i = torch.arange(grid.height, device=device)[None, :, None] + shift[:, 0, None, None]
     j = torch.arange(grid.width, device=device)[None, None, :] + shift[:, 1, None, None]
     entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
     index = (i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)).flatten(1)
-    layers: dict[str, Any] = {
-        name: shift_layer(getattr(state, name), index, entering, BLANK.get(name, 0.0))
-        for name in MapState._fields[2:-1]
-    }
+    names = MapState._fields[2:-1]
+    moved = [shift_layer(getattr(state, name), index, entering, BLANK.get(name, 0.0)) for name in names]
+    layers: dict[str, Any] = dict(zip(names, realize_all(*moved), strict=True))
     return state._replace(corner=corner, base_height=m.base[:, 2], **layers)
 
 

@@ -12,17 +12,29 @@ from torch import Tensor
 
 
 @torch.library.custom_op("torchelev::realize", mutates_args=())
-def realize(values: Tensor) -> Tensor:
+def _realize(values: list[Tensor]) -> list[Tensor]:
+    return [value.clone() for value in values]
+
+
+@_realize.register_fake
+def _(values: list[Tensor]) -> list[Tensor]:
+    return [torch.empty_like(value) for value in values]
+
+
+_realize.register_autograd(lambda ctx, grads: (grads,))
+
+
+def realize(value: Tensor) -> Tensor:
     """Return a copy. The compiler would otherwise compute the values anew wherever they are read."""
-    return values.clone()
+    return realize_all(value)[0]
 
 
-@realize.register_fake
-def _(values: Tensor) -> Tensor:
-    return torch.empty_like(values)
+def realize_all(*values: Tensor) -> list[Tensor]:
+    """Return copies; one call for many, because each call costs the host some 30 microseconds.
 
-
-realize.register_autograd(lambda ctx, grad: grad)
+    Eager code computes each value once anyway, and keeps it.
+    """
+    return _realize(list(values)) if torch.compiler.is_compiling() else list(values)
 
 
 @torch.library.custom_op("torchelev::cell_sums", mutates_args=())

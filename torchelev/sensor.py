@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.operators import realize
+from torchelev.operators import realize, realize_all
 from torchelev.state import Measurement, count
 
 if TYPE_CHECKING:
@@ -68,11 +68,11 @@ def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[
 
 def inside_body(points: Float[Tensor, "B M 3"], T_map_base: Tensor, base: Tensor, body: BodyConfig) -> Tensor:
     """Tell which points lie in the robot's body box, which turns with the base."""
-    rotation = T_map_base[:, :3, :3].to(points.dtype)
-    in_base = (points - base[:, None]) @ rotation  # R^T p, written for row vectors
-    inside = torch.ones_like(in_base[..., 0], dtype=torch.bool)
-    for axis in range(3):
-        inside &= (in_base[..., axis] >= body.lower[axis]) & (in_base[..., axis] <= body.upper[axis])
+    to_base = T_map_base[:, :3, :3].to(points.dtype).transpose(1, 2)
+    in_base = turned(to_base, *(points - base[:, None]).unbind(-1))
+    inside = torch.ones_like(in_base[0], dtype=torch.bool)
+    for axis, coordinate in enumerate(in_base):
+        inside = inside & (coordinate >= body.lower[axis]) & (coordinate <= body.upper[axis])
     return inside
 
 
@@ -87,12 +87,11 @@ def relative_to(position: Float[Tensor, "B ... 3"], anchor: Tensor, resolution: 
     return realize((position.double() - corner.view(-1, *[1] * (position.ndim - 2), 3)).to(dtype))
 
 
-def rotate(rotation: Float[Tensor, "B S 3 3"], points: Float[Tensor, "B 3 M"], each: int) -> Float[Tensor, "B 3 M"]:
-    """Turn the points of each sensor, `each` of them per sensor, into map axes."""
-    # Written out: a matrix product may round otherwise for another batch size.
-    r = rotation.flatten(2).repeat_interleave(each, 1)
-    x, y, z = points.unbind(1)
-    return realize(torch.stack([r[..., k] * x + r[..., k + 1] * y + r[..., k + 2] * z for k in (0, 3, 6)], 1))
+def turned(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    """Return the rows of R p. Written out: a matrix product may round otherwise for another batch size."""
+    return [
+        rotation[..., k, 0, None] * x + rotation[..., k, 1, None] * y + rotation[..., k, 2, None] * z for k in range(3)
+    ]
 
 
 def measure(
@@ -116,20 +115,21 @@ def measure(
     origin = relative_to(position, anchor, grid.resolution, dtype)
     base = None if base_position is None else relative_to(base_position, anchor, grid.resolution, dtype)
 
-    x, y, z = points.to(dtype).flatten(1, 2).unbind(-1)
+    x, y, z = points.to(dtype).unbind(-1)
     finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
     # Zeroed before any product: 0 * NaN would poison sums and gradients, and so would the square of 1e30.
     small = finite & (torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= cfg.max_distance)
     x, y, z = (torch.where(small, c, 0.0) for c in (x, y, z))
     square = x * x + y * y + z * z
-    valid = realize(small & (square >= cfg.min_distance**2) & (square <= cfg.max_distance**2))
-    relative = rotate(T_map_sensor[..., :3, :3].to(dtype), torch.stack([x, y, z], 1), points.shape[2])
+    valid = small & (square >= cfg.min_distance**2) & (square <= cfg.max_distance**2)
     # Coordinates outermost in memory: the stages read x, y and z apart.
-    in_map = (relative + origin.transpose(1, 2).repeat_interleave(points.shape[2], 2)).transpose(1, 2)
-    relative = relative.transpose(1, 2)
+    relative = torch.stack(turned(T_map_sensor[..., :3, :3].to(dtype), x, y, z), 1)
+    in_map = relative + origin.transpose(1, 2)[..., None]
+    valid, relative, in_map = (t.flatten(-2) for t in realize_all(valid, relative, in_map))
+    relative, in_map = relative.transpose(1, 2), in_map.transpose(1, 2)
 
     if variance is None:
-        sigma2 = cfg.noise_factor * square + cfg.noise_floor
+        sigma2 = (cfg.noise_factor * square + cfg.noise_floor).flatten(1)
     else:
         given = variance.to(dtype).flatten(1)
         sigma2 = torch.where(torch.isfinite(given) & (given > 0), given, 1.0)
@@ -139,12 +139,13 @@ def measure(
     overhang = torch.zeros_like(valid)
     if cfg.exclusion is not None:
         overhang = valid & ~body & above_ramp(relative, cfg.exclusion)
+    sigma2, used, casts = realize_all(sigma2, valid & ~body & ~overhang, valid & ~body)
     return Measurement(
         anchor=anchor,
         points=in_map,
-        variance=realize(sigma2),
-        used=realize(valid & ~body & ~overhang),
-        casts=valid & ~body,
+        variance=sigma2,
+        used=used,
+        casts=casts,
         origin=origin,
         base=base,
         dt=dt.to(dtype),
