@@ -50,7 +50,6 @@ def test_without_a_base_nothing_is_cleared():
     assert not emap.layer("elevation").isnan().any() and emap.statistics.cleared_other_floors.item() == 0
 
 
-@pytest.mark.xfail(strict=True, reason="the count of the last update that had a base stays")
 def test_the_count_is_that_of_the_last_update():
     emap, T = upstairs_map()
     emap.update(nans(1), T, T, 0.1)
@@ -58,7 +57,6 @@ def test_the_count_is_that_of_the_last_update():
     assert emap.statistics.cleared_other_floors.item() == 0
 
 
-@pytest.mark.xfail(strict=True, reason="counted before the overlap clearance takes bounds away")
 def test_bounds_that_were_cleared_do_not_count():
     emap, T = upstairs_map()
     emap.validity.fill_(False)

@@ -46,7 +46,6 @@ def test_height_range(seed, radius):
         assert float(got[0, i, j]) == (max(heights) - min(heights) if state.validity[0, i, j] else 0.0)
 
 
-@pytest.mark.xfail(strict=True, reason="the layer is 0; the contract says NaN where the head has no answer")
 def test_a_map_without_the_head_knows_no_traversability():
     emap = small_map(1, traversability=None)
     emap.update(torch.from_numpy(terrain(np.random.default_rng(0), 200))[None] - torch.tensor([0, 0, 1]), pose())
