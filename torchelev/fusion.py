@@ -38,6 +38,7 @@ class FusionConfig:
     relief: float = 0.25  # [cells] standard deviation of height within a cell of rough or sloped ground
     scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
     outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
+    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
     max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
     max_variance: float = 1.0  # [m^2]
     edges: EdgeConfig | None = EdgeConfig()
@@ -99,7 +100,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     gate = torch.where(trusted, prior.gate_variance, 0.0)
     side = torch.zeros_like(guess)
     if cfg.edges is not None:
-        side, guess = side_of_step(scan, guess, gate, mean, number, grid, cfg)
+        side, guess = side_of_step(scan, prior, guess, gate, mean, number, grid, cfg)
     kept, ignored = on_side(scan, take(guess), take(gate), take(side), cfg)
 
     weight = torch.where(kept, scan.weight, 0.0)
@@ -107,6 +108,8 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     columns = (weight, weight * (scan.z - take(guess)), kept, ignored, near & ~ignored)
     information, moment, support, edge, agreeing = scan.sums(*columns)
     height = guess + ratio(moment, information)
+    # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
+    lower_part = (side > 0) & (height < prior.elevation) & (prior.support >= cfg.min_settled)
     scanned = ScanOfCells(
         height=height,
         variance=(1.0 / torch.where(support > 0, information, 1.0)).clamp(min=cfg.scan_variance_floor),
@@ -114,8 +117,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
         # Points on the face of a wall speak for its top.
         votes=support + edge,
         dissent=number - support - edge,
-        # The paper ignores the points below a wall's top: who sees less of its face has nothing against it.
-        agreeing=torch.where((side > 0) & (height < prior.elevation), support + edge, agreeing),
+        agreeing=torch.where(lower_part, support + edge, agreeing),
     )
     state, taken = merge(state, prior, scanned, grid, cfg)
     points_used = torch.where(taken, support, 0.0)[:, :-1].sum(1).to(torch.int64)
@@ -191,7 +193,14 @@ def consensus(scan: Scan, height: Tensor, rounds: int = 2) -> Tensor:
 
 
 def side_of_step(
-    scan: Scan, guess: Tensor, gate: Tensor, mean: Tensor, number: Tensor, grid: GridConfig, cfg: FusionConfig
+    scan: Scan,
+    prior: Prior,
+    guess: Tensor,
+    gate: Tensor,
+    mean: Tensor,
+    number: Tensor,
+    grid: GridConfig,
+    cfg: FusionConfig,
 ) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
@@ -207,7 +216,9 @@ def side_of_step(
     step = (number >= edges.min_points) & (far >= edges.min_share * number)
     top = extreme(scan, mean, 1.0, edges.refinements, edges.margin)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
-    elsewhere = neighbour_maximum(torch.where(number > 0, mean, -1e6), grid) >= 0.5 * (mean + top)
+    scanned, mapped = torch.where(number > 0, mean, -1e6), torch.where(prior.known, prior.elevation, -1e6)
+    elsewhere = neighbour_maximum(scanned, grid) >= 0.5 * (mean + top)
+    elsewhere = elsewhere | (neighbour_maximum(mapped.detach(), grid) >= top - grid.resolution)
     ground = step & elsewhere & (passed_low > edges.min_passed * low)
     guess = torch.where(step, torch.where(ground, extreme(scan, mean, -1.0, 2, edges.margin), top), guess)
     return torch.where(step, torch.where(ground, -1.0, 1.0), 0.0), guess.detach()
