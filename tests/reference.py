@@ -145,33 +145,34 @@ def consensus(points, relief, rounds=2):
     return height
 
 
-def extreme(points, side, edges, relief):
+def extreme(points, side, edges, relief, rounds):
     """The top (+1) or bottom (-1) of the points: the mean of those beyond the mean, give or take a margin, repeated."""
     level = weighted_mean(points)
-    for _ in range(edges["refinements"]):
+    for _ in range(rounds):
         margins = [edges["margin"] * math.sqrt(p["variance"] + relief**2) for p in points]
         beyond = [p for p, margin in zip(points, margins, strict=True) if side * (p["z"] - level) >= -margin]
         level = weighted_mean(beyond) if beyond else level
     return level
 
 
-def side_of_step(points, edges, relief, neighbour_top):
+def side_of_step(points, edges, relief, shown, resolution):
     """+1 and the top's height, or -1 and the ground's, of a cell that holds a step.
 
-    The ground wins where rays passed the centre and hit low, if a neighbouring cell's mean height shows the top.
+    The ground wins where rays passed the centre and hit low, if a neighbouring cell shows the top: by the mean height
+    of its points, `shown[0]`, or by its height in the map, `shown[1]`.
     """
-    mean, top = weighted_mean(points), extreme(points, 1, edges, relief)
+    mean, top = weighted_mean(points), extreme(points, 1, edges, relief, edges["refinements"])
     low = [p for p in points if p["z"] < mean]
     passed = sum(p["beyond"] for p in low) > edges["min_passed"] * len(low)
-    if passed and neighbour_top >= (mean + top) / 2:
-        return -1, extreme(points, -1, edges, relief)
+    if passed and (shown[0] >= (mean + top) / 2 or shown[1] >= top - resolution):
+        return -1, extreme(points, -1, edges, relief, rounds=2)
     return 1, top
 
 
-def scan_height(cell, points, relief, neighbour_top, *, gate, max_gate_std, edges):
+def scan_height(cell, points, relief, shown, resolution, *, gate, max_gate_std, min_settled, edges):
     """What a scan says of a cell: its height, the points kept, how many were ignored, and how many speak for the cell.
 
-    Points on the face of a wall speak for its top; whoever sees less of a face has nothing against the top.
+    Points on the face of a wall speak for its top; whoever sees less of a face has nothing against a settled top.
     """
     gate_variance = min(cell["variance"], max_gate_std**2)
     near = [cell["known"] and agrees(p, cell["elevation"], gate_variance, relief, gate) for p in points]
@@ -184,12 +185,12 @@ def scan_height(cell, points, relief, neighbour_top, *, gate, max_gate_std, edge
         margin = edges["margin"]
         far = sum(not agrees(p, guess, gate_variance, relief, gate) for p in points)
         if len(points) >= edges["min_points"] and far >= edges["min_share"] * len(points):
-            side, guess = side_of_step(points, edges, relief, neighbour_top)
+            side, guess = side_of_step(points, edges, relief, shown, resolution)
     wrong = [side * (p["z"] - guess) < -margin * math.sqrt(p["variance"] + relief**2) for p in points]
     kept = [p for p, w in zip(points, wrong, strict=True) if not w and agrees(p, guess, gate_variance, relief, gate)]
     height = weighted_mean(kept) if kept else guess
     for_cell = sum(n and not w for n, w in zip(near, wrong, strict=True))
-    if side > 0 and height < cell["elevation"]:
+    if side > 0 and height < cell["elevation"] and cell["support"] >= min_settled:
         for_cell = len(kept) + sum(wrong)
     return height, kept, sum(wrong), for_cell
 
@@ -205,21 +206,22 @@ def fuse_cell(
     scan_variance_floor,
     outlier_variance,
     max_support,
+    min_settled,
     max_variance,
     edges,
-    neighbour_top=-math.inf,
+    shown=(-math.inf, -math.inf),
 ):
     """One cell and the points of one scan: the cell after it, and the numbers of points used and ignored at a step.
 
     `cell` has elevation, variance, known, support, time; each point z, variance, beyond. `relief` counts cells,
-    `neighbour_top` is the highest mean height of the points in the eight cells around.
+    `shown` are the highest mean height of the points in the eight cells around, and the highest of those cells.
     """
     after, relief = dict(cell), relief * resolution
     after["variance"] = min(cell["variance"], max_variance) if cell["known"] else 1.0
     if not points:
         return after, 0, 0
-    settings = dict(gate=gate, max_gate_std=max_gate_std, edges=edges)
-    height, kept, ignored, for_cell = scan_height(cell, points, relief, neighbour_top, **settings)
+    settings = dict(gate=gate, max_gate_std=max_gate_std, min_settled=min_settled, edges=edges)
+    height, kept, ignored, for_cell = scan_height(cell, points, relief, shown, resolution, **settings)
     if not kept:
         return after, 0, ignored
     R = max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor)
@@ -357,6 +359,47 @@ def over_centers(lowest, direction, origin, corner, resolution):
         slope = direction[i, j][2] / math.hypot(direction[i, j][0], direction[i, j][1])
         height[i, j] = origin[2] + slope * math.hypot(x - origin[0], y - origin[1])
     return height
+
+
+def well_supported(c, layers, resolution, min_support):
+    """Whether enough points agree with a known cell, or with a known neighbour at a side, less than a cell higher."""
+
+    def enough(a):
+        return layers["validity"][a] and layers["support"][a] >= min_support
+
+    H, W = layers["validity"].shape
+    around = [(c[0] - 1, c[1]), (c[0] + 1, c[1]), (c[0], c[1] - 1), (c[0], c[1] + 1)]
+    around = [a for a in around if 0 <= a[0] < H and 0 <= a[1] < W]
+    like = [a for a in around if abs(layers["elevation"][a] - layers["elevation"][c]) <= resolution]
+    return bool(layers["validity"][c]) and any(enough(a) for a in [c, *like])
+
+
+def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate):
+    """Whether a ray ends in a well supported cell and not below it, or passes the window's last half cell so."""
+    shape, share = layers["validity"].shape, 1.0
+    for k in range(2):
+        low, high = corner[k] * resolution, (corner[k] + shape[k]) * resolution
+        border = high - resolution / 2 if hit[k] > origin[k] else low + resolution / 2
+        if hit[k] != origin[k]:
+            share = min(share, (border - origin[k]) / (hit[k] - origin[k]))
+    x, y, z = origin + max(share, 0.0) * (hit - origin)
+    c = cell_of(x, y, corner, resolution, shape)
+    if c is None or not well_supported(c, layers, resolution, min_support):
+        return False
+    return z >= layers["elevation"][c] - gate * math.sqrt(layers["variance"][c] + (resolution / 2) ** 2)
+
+
+def stays_above_recent(origin, hit, layers, corner, resolution, *, min_time, gate):
+    """Whether a ray passes over all ground hit of late, sampled every two cells up to two cells before its hit."""
+    horizontal, step = math.hypot(hit[0] - origin[0], hit[1] - origin[1]), 2 * resolution
+    for k in range(math.floor(horizontal / step)):
+        x, y, z = origin + (k + 0.5) * step / horizontal * (hit - origin)
+        c = cell_of(x, y, corner, resolution, layers["validity"].shape)
+        if c is None or not layers["validity"][c] or layers["time"][c] > min_time:
+            continue
+        if z < layers["elevation"][c] - gate * math.sqrt(layers["variance"][c] + (resolution / 2) ** 2):
+            return False
+    return True
 
 
 def clear_seen_through(layers, lowest, direction, min_time, min_incidence):

@@ -38,10 +38,13 @@ def reference_fuse(state, points, variances, used, origins, b, cfg):
             by_cell.setdefault(c, []).append(dict(z=p[2], variance=variance, beyond=beyond))
     results, means = {}, {c: reference.weighted_mean(points) for c, points in by_cell.items()}
     for c in np.ndindex(*shape):
-        around = [means.get((c[0] + i, c[1] + j), -np.inf) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+        around = [(c[0] + i, c[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+        inside = [a for a in around if 0 <= a[0] < shape[0] and 0 <= a[1] < shape[1]]
+        known = [float(state.elevation[b][a]) for a in inside if state.validity[b][a]]
+        shown = max(means.get(a, -np.inf) for a in inside), max(known, default=-np.inf)
         cell = {n: float(getattr(state, n)[b][c]) for n in ("elevation", "variance", "support", "time")}
         cell["known"] = bool(state.validity[b][c])
-        settings = dict(dataclasses.asdict(cfg), neighbour_top=max(around))
+        settings = dict(dataclasses.asdict(cfg), shown=shown)
         results[c] = reference.fuse_cell(cell, by_cell.get(c, []), 0.1, **settings)
     return results
 

@@ -100,7 +100,7 @@ def test_drift():
 
 
 FUSION = dict(gate=3.0, max_gate_std=1.0, relief=0.0, scan_variance_floor=1e-9, outlier_variance=0.5, max_support=9)
-FUSION |= dict(max_variance=100.0, edges=None)
+FUSION |= dict(max_variance=100.0, min_settled=1, edges=None)
 EDGES = dict(min_points=4, min_share=0.5, min_passed=0.5, refinements=2, margin=0.5)
 
 
@@ -145,9 +145,18 @@ def test_fuse_cell_keeps_one_side_of_a_step():
     assert (after["elevation"], used, ignored) == (pytest.approx(10.0), 2, 2)
     for p in low_high[:2]:
         p["beyond"] = True
-    for neighbour_top, height in ((7.4, 10.0), (7.6, 0.0)):  # halfway between the mean of 5 and the top of 10
-        after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings, neighbour_top=neighbour_top)
+    # The scan shows the top halfway between the mean of 5 and the top of 10, the map a cell's edge below the top.
+    for shown, height in (((7.4, -9), 10.0), ((7.6, -9), 0.0), ((-9, 9.8), 10.0), ((-9, 9.95), 0.0)):
+        after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings, shown=shown)
         assert (after["elevation"], used, ignored) == (pytest.approx(height), 2, 2)
+
+
+@pytest.mark.parametrize("settled, support", [(5, 5), (6, 1)])
+def test_a_settled_top_stands_though_a_scan_sees_less_of_the_face(settled, support):
+    """Of 4 points, two on the face of a wall of 20 and two at its foot: none is against the top, or all are."""
+    seen, top = points(0.0, 0.0, 10.0, 10.0, variance=0.01), cell(elevation=20.0, support=5)
+    after, used, _ = reference.fuse_cell(top, seen, 0.1, **(FUSION | dict(edges=EDGES, min_settled=settled)))
+    assert (after["elevation"], after["support"], used) == (20.0, support, 0)
 
 
 def test_consensus_leaves_the_outlier():
@@ -172,6 +181,31 @@ def test_march():
     np.testing.assert_allclose(direction[0, 0], [0.5**0.5, 0, -(0.5**0.5)])
     height = reference.over_centers(lowest, direction, ray[0], (0, 0), 1.0)
     np.testing.assert_allclose(height[:4, 0], [4, 3, 2, 1])
+
+
+def test_believed_rays():
+    layers = {n: np.zeros((4, 1)) for n in ("elevation", "variance", "support", "time")}
+    layers["validity"] = np.array([[True], [True], [True], [False]])
+    layers["support"][:, 0] = [0, 0, 3, 9]
+    layers["elevation"][1] = 0.9
+    origin, limits = np.array([-4.0, 0.5, 2.0]), dict(min_support=3, gate=2.0)  # 2 * sqrt(0 + 0.5^2) = 1 m below
+
+    def ends_well(x, z):
+        return reference.ends_well(origin, np.array([x, 0.5, z]), layers, (0, 0), 1.0, **limits)
+
+    assert ends_well(2.5, 0.0) and ends_well(2.5, -0.9) and not ends_well(2.5, -1.1)
+    assert ends_well(1.5, 0.0), "less than a cell's edge above its neighbour"
+    assert not ends_well(0.5, 0.0), "its neighbour has no support either"
+    assert not ends_well(3.4, 0.0) and not ends_well(9.0, 0.0), "unknown, and left the window over it"
+    layers["validity"][3] = True
+    assert ends_well(11.0, -1.9), "it leaves the last half cell, at x = 3.5, at 0.05"
+    assert not ends_well(11.0, -4.1), "-1.05 there"
+    over = dict(min_time=1.0, gate=2.0)
+    layers["elevation"][:] = 1.5  # ground hit of late, believed within 1 m: sampled last at x = 3, 7/9 of the way
+    for z, time, above in ((0.2, 0, True), (0.0, 0, False), (0.0, 2, True)):
+        layers["time"][:] = time
+        hit = np.array([5.0, 0.5, z])
+        assert reference.stays_above_recent(origin, hit, layers, (0, 0), 1.0, **over) == above
 
 
 def test_clear_seen_through():
