@@ -216,6 +216,27 @@ def table(rows: Iterable[Score]) -> str:
     return markdown_table(head, body)
 
 
+def plot(path: str, rows: list[Score]) -> None:
+    """Draw the map's error beside the mean's, a panel for each motion."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, 3, figsize=(11, 4.2), sharex=True, layout="constrained")
+    for panel, motion in zip(panels, ("turn", "walk", "lidar"), strict=True):
+        part = [r for r in rows if r.motion == motion][::-1]
+        places = range(len(part))
+        panel.barh([k + 0.2 for k in places], [max(r.rmse, 0.1) for r in part], 0.4, label="torchelev")
+        panel.barh([k - 0.2 for k in places], [max(r.rmse_mean, 0.1) for r in part], 0.4, label="per-cell mean")
+        panel.set(xscale="log", xlim=(0.1, 100), xlabel="RMSE [mm]", title=motion)
+        panel.set_yticks(list(places), [f"{r.scene}, {r.noise}" for r in part], fontsize=7)
+        panel.grid(alpha=0.3, axis="x")
+    panels[0].legend(fontsize=7)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
 def main() -> None:
     """Run every row, write JSON and plot, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -228,6 +249,7 @@ def main() -> None:
     if not args.only:
         values = [asdict(r) | {"holds": meets(r)} for r in rows]
         write_json(f"{args.out}/accuracy.json", {"config": ElevationMapConfig(grid=GRID).to_dict(), "rows": values})
+        plot(f"{args.out}/accuracy.png", rows)
 
 
 if __name__ == "__main__":
