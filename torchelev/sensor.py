@@ -127,6 +127,7 @@ def measure(
     in_map = relative + origin.transpose(1, 2)[..., None]
     valid, relative, in_map = (t.flatten(-2) for t in realize_all(valid, relative, in_map))
     relative, in_map = relative.transpose(1, 2), in_map.transpose(1, 2)
+    finite = finite.flatten(1)
 
     if variance is None:
         sigma2 = (cfg.noise_factor * square + cfg.noise_floor).flatten(1)
