@@ -107,3 +107,9 @@ def test_reads_organised_and_structured_arrays(tmp_path):
     assert read_cloud(tmp_path / "image.npy").tolist()[1] == [4, 5, 6]
     np.save(tmp_path / "rows.npy", np.array([(1, 2, 3)], dtype=[("z", "f4"), ("y", "f4"), ("x", "f4")]))
     assert read_cloud(tmp_path / "rows.npy").tolist() == [[3, 2, 1]]
+
+
+def test_a_transposed_cloud_is_refused(tmp_path):
+    np.save(tmp_path / "0.npy", np.zeros((3, 500), np.float32))
+    with pytest.raises(RecordingError, match="transposed"):
+        read_cloud(tmp_path / "0.npy")

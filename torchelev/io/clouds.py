@@ -82,6 +82,8 @@ def _columns(path: Path, array: NDArray) -> NDArray:
     if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":
         problem = f"expected numbers (N, 3), got {array.dtype} {array.shape}"
         raise RecordingError(path, problem, "save one row x y z per point")
+    if array.ndim == 2 and array.shape[0] in (3, 4) and array.shape[1] > 16:
+        raise RecordingError(path, f"expected (N, 3), got {array.shape}", "save it transposed, one row per point")
     return array[..., :3].reshape(-1, 3)
 
 
