@@ -122,9 +122,8 @@ def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg
     share = (room / along).amin(-1).clamp(0, 1)
     xy = rays.origin[:, None, :2] + share[..., None] * rays.xy
     cells = locate(xy, rays.casts, offset[:, 0], grid)
-    sigma = (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
-    floor = torch.where(well_supported(state, cfg, grid.resolution), state.elevation - cfg.gate * sigma, 1e6)
-    floor = cells.take(pad_cells(torch.where(state.validity, floor, 1e6)))
+    lowest = state.elevation - height_margin(state, grid, cfg)
+    floor = cells.take(pad_cells(torch.where(well_supported(state, cfg, grid.resolution), lowest, 1e6)))
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
     return (cells.slot < cells.num_cells) & (height >= floor) | rays.overhang
 
@@ -140,7 +139,12 @@ def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bo
         end = torch.zeros_like(enough.narrow(dim, 0, 1))
         by_second, by_first = like & enough.narrow(dim, 1, size), like & enough.narrow(dim, 0, size)
         supported = supported | torch.cat([by_second, end], dim) | torch.cat([end, by_first], dim)
-    return supported & state.validity
+    return supported
+
+
+def height_margin(state: MapState, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B H W"]:
+    """Return how far below a cell's elevation a ray must pass to contradict it [m]; half a cell allows for relief."""
+    return cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
 
 
 def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B N"]:
@@ -158,9 +162,9 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
     circle = torch.stack([angle.cos(), angle.sin()], -1)
     xy = rays.origin[:, None, :2] + realize(rho[:, None, None] * circle).flatten(0, 1)
     cells = locate(xy, torch.ones_like(xy[..., 0], dtype=torch.bool), lattice_offset(state, m, grid), grid)
-    margin = cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
     recent = state.validity & (state.time <= cfg.min_time)
-    below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - state.elevation + margin, NO_RAY)
+    depth = rays.origin[:, 2, None, None] - state.elevation + height_margin(state, grid, cfg)
+    below_sensor = torch.where(recent, depth, NO_RAY)
     fall = torch.where(cells.slot < grid.num_cells, cells.take(pad_cells(below_sensor)), NO_RAY * step)
     fall = realize(fall).unflatten(1, (ranges, azimuths)) / rho[:, None]
     lowest = running_minimum(fall, from_end=False)
