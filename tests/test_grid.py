@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev import GridConfig
-from torchelev.grid import cell_centers, center_offsets, lattice_offset, locate, recenter, window_corner
+from torchelev.grid import PointCells, cell_centers, center_offsets, lattice_offset, locate, recenter, window_corner
 from torchelev.state import BLANK, MapState, blank_state
 
 SEEDS = st.integers(0, 10_000)
@@ -98,22 +98,22 @@ def test_locate_agrees_with_the_reference(seed, cells):
     rng = np.random.default_rng(seed)
     grid = small_config(cells).grid
     xy = rng.uniform(-1, 1, (1, 50, 2))
-    used = torch.from_numpy(rng.random((1, 50)) < 0.8)
     corner = rng.integers(-8, 3, 2)
-    found = locate(torch.from_numpy(xy), used, torch.from_numpy(-corner[None] * 0.1), grid)
+    slot, inside = locate(*torch.from_numpy(xy).unbind(-1), torch.from_numpy(-corner[None] * 0.1), grid)
     for n in range(50):
         cell = reference.cell_of(*xy[0, n], corner, 0.1, cells)
-        expected = grid.num_cells if cell is None or not used[0, n] else cell[0] * cells[1] + cell[1]
-        assert found.slot[0, n] == expected
+        assert bool(inside[0, n]) == (cell is not None)
+        assert slot[0, n] == (0 if cell is None else cell[0] * cells[1] + cell[1])
 
 
 def test_point_cells_sum_and_take():
     grid = small_config((2, 2), 1.0).grid
     xy = torch.tensor([[[0.5, 0.5], [0.6, 0.1], [1.5, 0.5], [9.0, 0.0]]])
-    cells = locate(xy, torch.ones(1, 4, dtype=torch.bool), torch.zeros(1, 2), grid)
-    totals, number = cells.sums(torch.tensor([[1.0, 2.0, 4.0, 8.0]]), torch.ones(1, 4))
-    assert totals.tolist() == [[3, 0, 4, 0, 8]] and number.tolist() == [[2, 0, 1, 0, 1]]
-    assert cells.take(totals).tolist() == [[3, 3, 4, 8]]
+    cells = PointCells(*locate(*xy.unbind(-1), torch.zeros(1, 2), grid), grid.num_cells)
+    totals, number = cells.sums(torch.tensor([[1.0, 2.0, 4.0, 0.0]]), cells.inside.float())
+    assert totals.tolist() == [[3, 0, 4, 0]] and number.tolist() == [[2, 0, 1, 0]]
+    (at_points,) = cells.take(totals)
+    assert at_points[:, :3].tolist() == [[3, 3, 4]]
 
 
 @given(st.floats(-50, 50), st.floats(-50, 50), SIZES)

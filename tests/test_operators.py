@@ -1,4 +1,4 @@
-"""Sums per cell and window, running minima and pyramids: operators of their own."""
+"""Sums per cell, borders, running minima and polar tables: operators of their own."""
 
 import numpy as np
 import pytest
@@ -6,36 +6,34 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.operators import azimuth_pyramid, cell_sums, moment_orders, running_minimum, window_moments
-
-SIZES = st.tuples(st.integers(1, 2), st.integers(1, 7), st.integers(1, 6))
+from torchelev.operators import cell_sums, padded, polar_minimum, running_minimum
 
 
-@given(st.integers(0, 10_000), SIZES, st.integers(1, 4), st.integers(0, 2))
-def test_window_moments_are_sums_over_the_window(seed, shape, radius, order):
-    values = np.random.default_rng(seed).normal(size=shape)
-    moments = window_moments(torch.from_numpy(values), radius, order)
-    offsets = range(-radius, radius + 1)
-    for k, (a, b) in enumerate(moment_orders(order)):
-        for env, i, j in np.ndindex(*shape):
-            near = [
-                u**a * v**b * values[env, i + u, j + v]
-                for u in offsets
-                for v in offsets
-                if 0 <= i + u < shape[1] and 0 <= j + v < shape[2]
-            ]
-            assert float(moments[k, env, i, j]) == pytest.approx(sum(near), abs=1e-9)
-
-
-@given(st.integers(0, 10_000), SIZES, st.booleans())
-def test_running_minimum(seed, shape, from_end):
-    table = np.random.default_rng(seed).normal(size=shape)
+@given(st.integers(0, 10_000), st.integers(1, 2), st.integers(1, 4), st.integers(1, 6), st.booleans())
+def test_running_minimum(seed, num_envs, blocks, columns, from_end):
+    table = np.random.default_rng(seed).normal(size=(num_envs, 8 * blocks, columns))
     passed = torch.from_numpy(table.copy())
     expected = np.empty_like(table)
-    for k in range(shape[1]):
+    for k in range(table.shape[1]):
         expected[:, k] = (table[:, k:] if from_end else table[:, : k + 1]).min(1)
     np.testing.assert_array_equal(running_minimum(passed, from_end), expected)
     np.testing.assert_array_equal(passed, table)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 2), st.integers(0, 40))
+def test_polar_minimum(seed, num_envs, num_values):
+    """Range bins 0 and 1 look at 4 azimuths, 2 and 3 at two, the others at one; out of reach there is nothing."""
+    rng, ranges, azimuths, blank = np.random.default_rng(seed), 8, 6, 9.0
+    near, index = [4, 4, 2, 2, 1, 1, 1, 1], rng.integers(0, (ranges + 1) * azimuths, (num_envs, num_values))
+    values = rng.normal(size=(num_envs, num_values))
+    expected = np.full((num_envs, 2 * ranges, azimuths), blank)
+    for b, k, a in np.ndindex(num_envs, ranges, azimuths):
+        for n in range(num_values):
+            reach, azimuth = divmod(index[b, n], azimuths)
+            if k <= reach < ranges and (azimuth - a) % azimuths < near[k]:
+                expected[b, k, a] = min(expected[b, k, a], values[b, n])
+    table = polar_minimum(torch.from_numpy(index), torch.from_numpy(values), azimuths, [4, 2], ranges, blank)
+    np.testing.assert_array_equal(table, expected)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 3), st.integers(0, 20))
@@ -48,34 +46,27 @@ def test_cell_sums(seed, columns, num_envs, num_points):
     np.testing.assert_allclose(cell_sums(torch.from_numpy(index), torch.from_numpy(values), 5), expected)
 
 
-def test_azimuth_pyramid():
-    table = torch.tensor([[[5.0, 3.0, 4.0, 1.0, 7.0, 8.0, 9.0, 6.0]]])
-    assert azimuth_pyramid(table, 2).tolist() == [[table[0, 0].tolist() + [3, 1, 7, 6] + [1, 6]]]
-
-
 def test_gradient_of_cell_sums():
     index = torch.tensor([[0, 2, 2, 1], [1, 1, 1, 3]])
     values = torch.randn(3, 2, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
     assert torch.autograd.gradcheck(lambda v: cell_sums(index, v, 4), (values,))
 
 
-@pytest.mark.parametrize("order", [0, 1, 2])
-def test_gradient_of_window_moments(order):
+def test_gradient_of_padded():
     values = torch.randn(2, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda v: window_moments(v, 2, order), (values,))
+    assert torch.autograd.gradcheck(lambda v: padded(v, 2, 1.0), (values,))
 
 
-TABLE = torch.linspace(0, 1, 40).view(2, 5, 4)
+TABLE = torch.linspace(0, 1, 64).view(2, 8, 4)
 
 
 @pytest.mark.parametrize(
     "operator, arguments",
     [
-        ("window_moments", (TABLE, 1, 2)),
+        ("padded", (TABLE, 1, 2.0)),
         ("running_minimum", (TABLE, True)),
         ("running_minimum", (TABLE, False)),
-        ("azimuth_pyramid", (TABLE, 2)),
-        ("azimuth_pyramid", (TABLE, 0)),
+        ("polar_minimum", (torch.tensor([[0, 11]]), torch.ones(1, 2), 4, [3, 1], 8, 9.0)),
         ("cell_sums", (torch.tensor([[0, 1], [1, 1]]), torch.ones(3, 2, 2), 2)),
     ],
 )

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate, pad_cells
+from torchelev.grid import GridConfig, cells_of, center_offsets, lattice_offset
 from torchelev.state import MapState, Measurement, count, tally
+
+NOWHERE = 1e6  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,16 +43,17 @@ def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConf
     e = (1 / n) * sum (p_z - h) over points whose cell is known, traversable and certain, |p_z - h| <= max_error.
     Corrected by gain * e where n >= min_points and |e| <= max_drift.
     """
-    xy = m.points[..., :2]
-    cells = locate(xy, m.used, lattice_offset(state, m, grid), grid)
+    px, py, pz = m.points.unbind(-1)
+    cells = cells_of(m, lattice_offset(state, m, grid), grid)
     suits = state.validity & (state.traversability >= cfg.min_traversability) & (state.variance <= cfg.max_variance)
     # On a slope the height within a cell depends on where in the cell the point lies.
     x, y = center_offsets(state, m, grid)
     gx, gy = state.gradient_x.detach(), state.gradient_y.detach()
     at_origin = state.elevation - gx * x - gy * y
-    ground, gx, gy = (cells.take(pad_cells(layer)) for layer in (at_origin, gx, gy))
-    error = m.points[..., 2] - (ground + gx * xy[..., 0] + gy * xy[..., 1])
-    counts = cells.take(pad_cells(suits)) & (error.abs() <= cfg.max_error)
+    # Cells that do not suit get a height that no point is near.
+    ground, gx, gy = cells.take(torch.where(suits, at_origin, NOWHERE), gx, gy)
+    error = pz - (ground + gx * px + gy * py)
+    counts = cells.inside & (error.abs() <= cfg.max_error)
     mean = masked_mean(error, counts)
     # Once more around the mean: the foot of a wall that nobody saw yet stands on ground that looks flat.
     counts = counts & ((error - mean[:, None]).square() <= cfg.gate**2 * (m.variance + cfg.relief**2))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.disputed import robust_mean, step_heights
 from torchelev.errors import require
-from torchelev.grid import GridConfig, PointCells, lattice_offset, locate, pad_cells
-from torchelev.operators import realize, realize_all
+from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
+from torchelev.operators import as_bytes, realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement, count, tally
+from torchelev.windows import neighbours
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -64,15 +66,19 @@ class Scan(NamedTuple):
         """Sum numbers, or count what is true, over the points of each cell."""
         return self.cells.sums(*(column.to(self.z.dtype) for column in columns))
 
+    def columns(self) -> tuple[Tensor, ...]:
+        """Return what `disputed` needs of every point."""
+        return self.cells.slot, self.z.detach(), self.spread.detach(), self.weight.detach()
+
 
 class Prior(NamedTuple):
-    """The cells before the scan, flat, overflow slot last."""
+    """The cells before the scan, flat."""
 
-    elevation: Float[Tensor, "B C+1"]
-    variance: Float[Tensor, "B C+1"]
-    gate_variance: Float[Tensor, "B C+1"]
-    known: Bool[Tensor, "B C+1"]
-    support: Float[Tensor, "B C+1"]
+    elevation: Float[Tensor, "B C"]
+    variance: Float[Tensor, "B C"]
+    gate_variance: Float[Tensor, "B C"]
+    known: Bool[Tensor, "B C"]
+    support: Float[Tensor, "B C"]
 
 
 def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -> MapState:
@@ -91,21 +97,24 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     variance, as in the paper, and founds the cell anew once the votes are used up.
     """
     scan, prior = gather_scan(state, m, grid, cfg), gather_prior(state, cfg)
-    take = scan.cells.take
-    near = agrees(scan, take(prior.elevation), take(prior.gate_variance), cfg)
+    near = agrees(scan, *scan.cells.take(prior.elevation, prior.gate_variance), cfg)
     number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
-    trusted = prior.known & (2 * agreeing >= number)
     mean = ratio(moment, weight).detach()
-    guess = torch.where(trusted, prior.elevation, consensus(scan, mean)).detach()
+    trusted = prior.known & (2 * agreeing >= number)
+    robust, robustly = robust_mean(as_bytes(~trusted & (number > 0)), *scan.columns(), mean, cfg.gate)
+    guess = torch.where(trusted, prior.elevation, robust).detach()
     gate = torch.where(trusted, prior.gate_variance, 0.0)
     side = torch.zeros_like(guess)
     if cfg.edges is not None:
-        side, guess = side_of_step(scan, prior, guess, gate, mean, number, grid, cfg)
-    kept, ignored = on_side(scan, take(guess), take(gate), take(side), cfg)
+        far = number - torch.where(trusted, agreeing, robustly)
+        step = (number >= cfg.edges.min_points) & (far >= cfg.edges.min_share * number)
+        side, guess = side_of_step(scan, prior, step, guess, mean, number, grid, cfg.edges)
+    guess_at, gate_at, side_at = scan.cells.take(guess, gate, side)
+    kept, ignored = on_side(scan, guess_at, gate_at, side_at, cfg)
 
     weight = torch.where(kept, scan.weight, 0.0)
     # Around the guess, so that float32 keeps millimetres at any altitude.
-    columns = (weight, weight * (scan.z - take(guess)), kept, ignored, near & ~ignored)
+    columns = (weight, weight * (scan.z - guess_at), kept, ignored, near & ~ignored)
     information, moment, support, edge, agreeing = scan.sums(*columns)
     height = guess + ratio(moment, information)
     # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
@@ -120,7 +129,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
         agreeing=torch.where(lower_part, support + edge, agreeing),
     )
     state, taken = merge(state, prior, scanned, grid, cfg)
-    points_used = torch.where(taken, support, 0.0)[:, :-1].sum(1).to(torch.int64)
+    points_used = torch.where(taken, support, 0.0).sum(1).to(torch.int64)
     return tally(
         state,
         points_used=points_used,
@@ -133,8 +142,8 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
 def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -> Scan:
     """Find each point's cell, and whether its ray passed over the cell's centre."""
     xy, z = m.points[..., :2], m.points[..., 2]
-    cells = locate(xy, m.used, lattice_offset(state, m, grid), grid)
-    used = cells.slot < grid.num_cells
+    cells = cells_of(m, lattice_offset(state, m, grid), grid)
+    used = cells.inside
     from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
     sensors = m.origin.shape[1]
     ray = (xy.unflatten(1, (sensors, -1)) - m.origin[:, :, None, :2]).flatten(1, 2)
@@ -160,15 +169,14 @@ def passed_center(from_center: Tensor, ray: Tensor) -> Tensor:
 
 def gather_prior(state: MapState, cfg: FusionConfig) -> Prior:
     """Flatten what the update reads of the map."""
-    known = pad_cells(state.validity)
-    variance = pad_cells(state.variance)
+    known, variance = state.validity.flatten(1), state.variance.flatten(1)
     return Prior(
-        elevation=pad_cells(state.elevation),
+        elevation=state.elevation.flatten(1),
         variance=torch.where(known, variance, 1.0),
         # Nothing agrees with an unknown cell.
         gate_variance=torch.where(known, variance.clamp(max=cfg.max_gate_std**2), -1e3).detach(),
         known=known,
-        support=pad_cells(state.support),
+        support=state.support.flatten(1),
     )
 
 
@@ -182,67 +190,38 @@ def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
     return numerator / torch.where(denominator > 0, denominator, 1.0)
 
 
-def consensus(scan: Scan, height: Tensor, rounds: int = 2) -> Tensor:
-    """Refine each cell's mean height to a robust one, by weights w / (1 + r^2 / sigma_p^2)^2 of the residuals r."""
-    for _ in range(rounds):
-        residual = scan.z - scan.cells.take(height)
-        weight = scan.weight / (1.0 + residual.square() / scan.spread).square()
-        total, moment = scan.sums(weight, weight * residual)
-        height = height + ratio(moment, total)
-    return height
-
-
 def side_of_step(
     scan: Scan,
     prior: Prior,
+    step: Tensor,
     guess: Tensor,
-    gate: Tensor,
     mean: Tensor,
     number: Tensor,
     grid: GridConfig,
-    cfg: FusionConfig,
+    edges: EdgeConfig,
 ) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
     where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
-    what lies at the centre, and points above are ignored. Returns the side (B, C+1), +1 top, -1 ground and 0 no step,
+    what lies at the centre, and points above are ignored. Returns the side (B, C), +1 top, -1 ground and 0 no step,
     and the guess, moved to that side.
     """
-    take, edges = scan.cells.take, cfg.edges
-    assert edges is not None
-    far, low = scan.used & ~agrees(scan, take(guess), take(gate), cfg), scan.used & (scan.z < take(mean))
-    far, low, passed_low = scan.sums(far, low, low & scan.beyond)
-    step = (number >= edges.min_points) & (far >= edges.min_share * number)
-    top = extreme(scan, mean, 1.0, edges.refinements, edges.margin)
+    columns = (*scan.columns(), as_bytes(scan.beyond))
+    top, bottom, passed_low = step_heights(as_bytes(step), *columns, mean, edges.refinements, edges.margin)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
     scanned, mapped = torch.where(number > 0, mean, -1e6), torch.where(prior.known, prior.elevation, -1e6)
     elsewhere = neighbour_maximum(scanned, grid) >= 0.5 * (mean + top)
-    elsewhere = elsewhere | (neighbour_maximum(mapped.detach(), grid) >= top - grid.resolution)
-    ground = step & elsewhere & (passed_low > edges.min_passed * low)
-    guess = torch.where(step, torch.where(ground, extreme(scan, mean, -1.0, 2, edges.margin), top), guess)
+    elsewhere = elsewhere | (neighbour_maximum(mapped, grid) >= top - grid.resolution)
+    ground = step & elsewhere & (passed_low > edges.min_passed)
+    guess = torch.where(step, torch.where(ground, bottom, top), guess)
     return torch.where(step, torch.where(ground, -1.0, 1.0), 0.0), guess.detach()
 
 
-def extreme(scan: Scan, mean: Tensor, side: float, rounds: int, margin: float) -> Tensor:
-    """Return the top (side 1) or bottom (side -1) of each cell: the mean of the points beyond the mean, repeated."""
-    level = mean
-    for _ in range(rounds):
-        residual = scan.z - scan.cells.take(level)
-        beyond = side * residual >= -margin * scan.spread.sqrt()
-        weight = torch.where(beyond, scan.weight, 0.0)
-        total, moment = scan.sums(weight, weight * residual)
-        level = level + ratio(moment, total)
-    return level
-
-
-def neighbour_maximum(cells: Float[Tensor, "B C+1"], grid: GridConfig) -> Float[Tensor, "B C+1"]:
+def neighbour_maximum(cells: Float[Tensor, "B C"], grid: GridConfig) -> Float[Tensor, "B C"]:
     """Return the highest value of the eight neighbours of each cell."""
-    H, W = grid.height, grid.width
-    layer = F.pad(cells[:, :-1].unflatten(1, (H, W)), (1, 1, 1, 1), value=-1e6)
-    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    highest = torch.stack([layer[:, i : i + H, j : j + W] for i, j in shifts]).amax(0)
-    return F.pad(realize(highest).flatten(1), (0, 1))
+    layer = cells.detach().unflatten(1, (grid.height, grid.width))
+    return realize(functools.reduce(torch.maximum, neighbours(layer, -1e6))).flatten(1)
 
 
 def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
@@ -256,12 +235,12 @@ def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionCo
 class ScanOfCells(NamedTuple):
     """What the scan says of each cell; heights in [m], the others count points."""
 
-    height: Float[Tensor, "B C+1"]
-    variance: Float[Tensor, "B C+1"]
-    kept: Float[Tensor, "B C+1"]  # make up the height
-    votes: Float[Tensor, "B C+1"]  # speak for the height
-    dissent: Float[Tensor, "B C+1"]  # speak against it
-    agreeing: Float[Tensor, "B C+1"]  # speak for the cell's elevation
+    height: Float[Tensor, "B C"]
+    variance: Float[Tensor, "B C"]
+    kept: Float[Tensor, "B C"]  # make up the height
+    votes: Float[Tensor, "B C"]  # speak for the height
+    dissent: Float[Tensor, "B C"]  # speak against it
+    agreeing: Float[Tensor, "B C"]  # speak for the cell's elevation
 
 
 def merge(
@@ -274,7 +253,7 @@ def merge(
     votes = torch.where(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
     found = hit & ~agree & (~prior.known | (support < 0))
-    taken = agree | found
+    agree, taken = realize_all(agree, agree | found)
 
     information = torch.where(agree, 1.0 / prior.variance, 0.0) + 1.0 / scan.variance
     fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
@@ -284,7 +263,7 @@ def merge(
     support = torch.where(hit, torch.where(found, fresh, support).clamp(0, cfg.max_support), prior.support)
 
     def store(cells: Tensor) -> Tensor:
-        return cells[:, :-1].reshape(state.elevation.shape)
+        return cells.view(state.elevation.shape)
 
     hit_now = store(taken)
     elevation, variance, support, validity, time = realize_all(

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.operators import cell_sums, realize, realize_all
+from torchelev.operators import as_bytes, cell_sums, realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,18 +50,19 @@ class GridConfig:
 
 
 class PointCells(NamedTuple):
-    """Which cell each point falls into. Points outside go to an overflow slot that is dropped, so shapes stay fixed."""
+    """Which cell each point falls into. Points outside point to some cell, so mask what is summed by `inside`."""
 
     slot: Int[Tensor, "B M"]
+    inside: Bool[Tensor, "B M"]
     num_cells: int
 
-    def sums(self, *columns: Float[Tensor, "B M"]) -> tuple[Float[Tensor, "B C+1"], ...]:
-        """Sum columns of the points' values per cell, overflow slot last."""
-        return cell_sums(self.slot, torch.stack(columns), self.num_cells + 1).unbind(0)
+    def sums(self, *columns: Float[Tensor, "B M"]) -> tuple[Float[Tensor, "B C"], ...]:
+        """Sum columns of the points' values per cell; they must be zero outside."""
+        return cell_sums(self.slot, torch.stack(columns), self.num_cells).unbind(0)
 
-    def take(self, cells: Tensor) -> Tensor:
-        """Give each point its cell's value: (B, C+1) -> (B, M)."""
-        return cells.gather(1, self.slot)
+    def take(self, *layers: Tensor) -> list[Tensor]:
+        """Give each point its cell's value of each layer: (B, H, W) or (B, C) -> (B, M)."""
+        return [cells.flatten(1).gather(1, self.slot) for cells in realize_all(*layers)]
 
 
 def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[Tensor, "B 2"]:
@@ -80,20 +81,23 @@ def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[T
     return x[:, :, None], y[:, None, :]
 
 
-def locate(xy: Float[Tensor, "B M 2"], used: Bool[Tensor, "B M"], offset: Tensor, grid: GridConfig) -> PointCells:
-    """Find the cell of each point; `xy` counts from a lattice corner that lies at `offset` in the window."""
+def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig) -> tuple[Tensor, Tensor]:
+    """Return the flat cell number, int64, of each place (x, y), both (B, ...), and whether it lies in the window.
+
+    x and y count from a lattice corner that lies at `offset` in the window. Outside, the number is 0.
+    """
+    first = torch.round(offset / grid.resolution).view(2 * offset.shape[0], *[1] * (x.ndim - 1)).unflatten(0, (-1, 2))
     # Divide before adding whole cells: the result is then the same wherever the window is.
-    cell = torch.floor(xy / grid.resolution) + torch.round(offset / grid.resolution)[:, None]
-    i, j = cell.unbind(-1)
-    inside = used & (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
-    flat = torch.where(inside, i * grid.width + j, grid.num_cells)
-    return PointCells(flat.to(torch.int64), grid.num_cells)
+    i = torch.floor(x / grid.resolution) + first[:, 0]
+    j = torch.floor(y / grid.resolution) + first[:, 1]
+    inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
+    return torch.where(inside, i * grid.width + j, 0.0).to(torch.int64), inside
 
 
-def pad_cells(layer: Tensor) -> Tensor:
-    """Flatten a layer and append the overflow slot: (B, H, W) -> (B, H*W + 1)."""
-    flat = layer.flatten(1)
-    return torch.cat([flat, flat.new_zeros(flat.shape[0], 1)], 1)
+def cells_of(m: Measurement, offset: Float[Tensor, "B 2"], grid: GridConfig) -> PointCells:
+    """Find the cell of each point that measures the ground."""
+    slot, inside = locate(m.points[..., 0], m.points[..., 1], offset, grid)
+    return PointCells(*realize_all(slot, inside & m.used), grid.num_cells)
 
 
 def window_corner(base: Float[Tensor, "B 2"], anchor: Int[Tensor, "B 2"], grid: GridConfig) -> Int[Tensor, "B 2"]:
@@ -104,8 +108,11 @@ def window_corner(base: Float[Tensor, "B 2"], anchor: Int[Tensor, "B 2"], grid: 
 
 def shift_layer(layer: Tensor, index: Tensor, entering: Tensor, blank: float) -> Tensor:
     """Move a layer's content by gathering; cells that enter the window get the blank value."""
-    moved = layer.flatten(1).gather(1, index).view_as(layer)
-    return torch.where(entering, torch.full_like(moved, blank), moved)
+    mask = layer.dtype == torch.bool
+    values = realize(as_bytes(layer) if mask else layer)
+    moved = values.flatten(1).gather(1, index).view_as(layer)
+    moved = torch.where(entering, torch.full_like(moved, blank), moved)
+    return moved != 0 if mask else moved
 
 
 def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:

@@ -1,14 +1,18 @@
-"""The few operations that the compiler makes slower: sums per cell, sums over windows, running minima.
+"""The few operations that the compiler makes slower: sums per cell, borders, running minima.
 
-It would turn the first into atomic additions and fuse the others' shifted reads into kernels that compute every term
-again for every reader, 10 to 30 times slower on a CPU. As custom operators they stay plain in eager and compiled code.
+It would turn the first into atomic additions, test at every read whether it lies outside, and compute every term of a
+running minimum again for every reader, 5 to 30 times slower on a CPU. As custom operators they stay plain in eager and
+compiled code.
 """
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch._inductor import inductor_prims
 
 
 @torch.library.custom_op("torchelev::realize", mutates_args=())
@@ -25,16 +29,33 @@ _realize.register_autograd(lambda ctx, grads: (grads,))
 
 
 def realize(value: Tensor) -> Tensor:
-    """Return a copy. The compiler would otherwise compute the values anew wherever they are read."""
+    """Make the compiler store the values. It would otherwise compute them anew wherever they are read."""
     return realize_all(value)[0]
 
 
 def realize_all(*values: Tensor) -> list[Tensor]:
-    """Return copies; one call for many, because each call costs the host some 30 microseconds.
+    """Make the compiler store these values, masks as bytes; eager code does so anyway.
 
-    Eager code computes each value once anyway, and keeps it.
+    A demand for a memory layout does it at no cost but has no gradient; where one is wanted, the values are copied.
     """
-    return _realize(list(values)) if torch.compiler.is_compiling() else list(values)
+    if not torch.compiler.is_compiling():
+        return list(values)
+    masks = [value.dtype == torch.bool for value in values]
+    plain = [as_bytes(value) if mask else value for value, mask in zip(values, masks, strict=True)]
+    stored = _realize(plain) if torch.is_grad_enabled() else [_in_memory(value) for value in plain]
+    return [value != 0 if mask else value for value, mask in zip(stored, masks, strict=True)]
+
+
+def _in_memory(value: Tensor) -> Tensor:
+    strides = [1]
+    for size in reversed(value.shape[1:]):
+        strides.insert(0, strides[0] * size)
+    return inductor_prims.force_stride_order(value, strides[-value.ndim :])
+
+
+def as_bytes(mask: Tensor) -> Tensor:
+    """Return a mask as 0 and 1 in uint8. Compiled code stores bytes eight times as fast as booleans on a CPU."""
+    return torch.where(mask, 1, 0).to(torch.uint8)
 
 
 @torch.library.custom_op("torchelev::cell_sums", mutates_args=())
@@ -62,68 +83,55 @@ def _keep_index(ctx, inputs: tuple, output: Tensor) -> None:
 cell_sums.register_autograd(_cell_sums_backward, setup_context=_keep_index)
 
 
-def moment_orders(order: int) -> list[tuple[int, int]]:
-    """List the exponents (a, b) of u^a v^b with a + b <= order <= 2, in the order of `window_moments`."""
-    return [(a, b) for a in range(order + 1) for b in range(order + 1 - a)]
+@torch.library.custom_op("torchelev::padded", mutates_args=())
+def padded(values: Tensor, radius: int, fill: float) -> Tensor:
+    """Put a rim of `radius` cells around (..., H, W)."""
+    return F.pad(values, [radius] * 4, value=fill)
 
 
-def _line_moments(values: Tensor, radius: int, orders: int, dim: int) -> list[Tensor]:
-    """Sum u^a * values for a = 0..orders along one dimension that is padded by `radius`."""
-    size = values.shape[dim] - 2 * radius
-    center = values.narrow(dim, radius, size)
-    sums = [center.clone(), torch.zeros_like(center), torch.zeros_like(center)][: orders + 1]
-    for k in range(1, radius + 1):
-        after, before = values.narrow(dim, radius + k, size), values.narrow(dim, radius - k, size)
-        pair = after + before
-        sums[0] += pair
-        if orders >= 1:
-            sums[1].add_(after, alpha=k).sub_(before, alpha=k)
-        if orders >= 2:
-            sums[2].add_(pair, alpha=k * k)
-    return sums
+@padded.register_fake
+def _(values: Tensor, radius: int, fill: float) -> Tensor:
+    return values.new_empty(*values.shape[:-2], values.shape[-2] + 2 * radius, values.shape[-1] + 2 * radius)
 
 
-@torch.library.custom_op("torchelev::window_moments", mutates_args=())
-def window_moments(values: Tensor, radius: int, order: int) -> Tensor:
-    """Sum u^a v^b * values over the (2 * radius + 1)^2 window around each cell, zeros outside the layer.
+def _padded_backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
+    r = ctx.radius
+    return grad[..., r:-r, r:-r].contiguous(), None, None
 
-    u and v count cells from the window's centre along H and W. (B, H, W) -> (K, B, H, W), K as in `moment_orders`.
+
+def _keep_radius(ctx, inputs: tuple, output: Tensor) -> None:
+    ctx.radius = inputs[1]
+
+
+padded.register_autograd(_padded_backward, setup_context=_keep_radius)
+
+
+def _scan_rows(rows: list[Tensor]) -> None:
+    """Turn each row into the minimum of itself and all before it, in place."""
+    for before, row in itertools.pairwise(rows):
+        torch.minimum(before, row, out=row)
+
+
+def _scan(table: Tensor, from_end: bool) -> None:
+    """Turn a table (B, R, P), R a multiple of 8, into its running minimum along R, in place.
+
+    In blocks of eight rows, then over the blocks: each entry is touched twice, where doubling touches it log R times.
     """
-    padded = F.pad(values, [radius] * 4)
-    along_x = _line_moments(padded, radius, order, -2)
-    return torch.stack([s for a in range(order + 1) for s in _line_moments(along_x[a], radius, order - a, -1)])
-
-
-@window_moments.register_fake
-def _(values: Tensor, radius: int, order: int) -> Tensor:
-    return values.new_empty(len(moment_orders(order)), *values.shape)
-
-
-def _moments_backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
-    # The operator is linear; its transpose has the same kernels, mirrored: (-1)^(a + b).
-    total = torch.zeros_like(grad[0])
-    for k, (a, b) in enumerate(moment_orders(ctx.order)):
-        moments = window_moments(grad[k].contiguous(), ctx.radius, a + b)
-        total = total + (-1) ** (a + b) * moments[moment_orders(a + b).index((a, b))]
-    return total, None, None
-
-
-def _keep_settings(ctx, inputs: tuple, output: Tensor) -> None:
-    _, ctx.radius, ctx.order = inputs
-
-
-window_moments.register_autograd(_moments_backward, setup_context=_keep_settings)
+    blocks = table.unflatten(1, (-1, 8))
+    steps = [blocks[:, :, k] for k in range(8)]
+    last = blocks[:, :, 0 if from_end else -1]
+    ends = [last[:, k] for k in range(blocks.shape[1])]
+    _scan_rows(steps[::-1] if from_end else steps)
+    _scan_rows(ends[::-1] if from_end else ends)
+    inner, before = (blocks[:, :-1], last[:, 1:]) if from_end else (blocks[:, 1:], last[:, :-1])
+    torch.minimum(inner, before.unsqueeze(2).clone(), out=inner)
 
 
 @torch.library.custom_op("torchelev::running_minimum", mutates_args=())
 def running_minimum(table: Tensor, from_end: bool) -> Tensor:
-    """Return the running minimum along dimension 1 by doubling: over j <= k, or over j >= k from the end."""
-    table, other, step, size = table.clone(), torch.empty_like(table), 1, table.shape[1]
-    while step < size:
-        kept, reduced = (slice(-step, None), slice(-step)) if from_end else (slice(step), slice(step, None))
-        torch.minimum(table[:, :-step], table[:, step:], out=other[:, reduced])
-        other[:, kept] = table[:, kept]
-        table, other, step = other, table, 2 * step
+    """Return the running minimum along dimension 1, a multiple of 8: over j <= k, or over j >= k from the end."""
+    table = table.clone()
+    _scan(table, from_end)
     return table
 
 
@@ -132,15 +140,30 @@ def _(table: Tensor, from_end: bool) -> Tensor:
     return torch.empty_like(table)
 
 
-@torch.library.custom_op("torchelev::azimuth_pyramid", mutates_args=())
-def azimuth_pyramid(table: Tensor, levels: int) -> Tensor:
-    """Append to the last dimension its minima over 2, 4, ... 2^levels neighbours."""
-    stack = [table]
-    for _ in range(levels):
-        stack.append(torch.minimum(stack[-1][..., ::2], stack[-1][..., 1::2]))
-    return torch.cat(stack, -1)
+@torch.library.custom_op("torchelev::polar_minimum", mutates_args=())
+def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
+    """Return the table (B, R, azimuths) of the lowest value at or beyond each range and near each azimuth.
+
+    `index` (B, N) is range * azimuths + azimuth of each value (B, N); range = `ranges` drops it. Every level w of
+    `widen` makes an entry of the first widen[w] ranges the minimum of twice as many azimuths, itself the first of
+    them. Row `ranges` and what follows it, R being a multiple of 8, are blank, for what lies out of reach.
+    """
+    rows = _table_rows(ranges)
+    table = values.new_full((index.shape[0], rows * azimuths), blank)
+    table.scatter_reduce_(1, index, values, "amin")
+    table = table.unflatten(1, (rows, azimuths))
+    table[:, ranges] = blank
+    _scan(table, from_end=True)
+    for level, rows in enumerate(widen):
+        near = table[:, :rows]
+        torch.minimum(near, near.roll(-(2**level), 2), out=near)
+    return table
 
 
-@azimuth_pyramid.register_fake
-def _(table: Tensor, levels: int) -> Tensor:
-    return table.new_empty(*table.shape[:-1], sum(table.shape[-1] >> k for k in range(levels + 1)))
+def _table_rows(ranges: int) -> int:
+    return 8 * (ranges // 8 + 1)
+
+
+@polar_minimum.register_fake
+def _(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
+    return values.new_empty(index.shape[0], _table_rows(ranges), azimuths)

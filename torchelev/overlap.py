@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets
+from torchelev.operators import realize_all
 from torchelev.state import MapState, Measurement, count, tally
 
 
@@ -34,5 +35,6 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     height = m.base[:, 2, None, None]
     other = near & state.validity & ((state.elevation - height).abs() > cfg.height)
     other_bound = near & state.bounded & ((state.upper_bound - height).abs() > cfg.height)
-    state = state._replace(validity=state.validity & ~other, bounded=state.bounded & ~(other | other_bound))
+    validity, bounded = realize_all(state.validity & ~other, state.bounded & ~(other | other_bound))
+    state = state._replace(validity=validity, bounded=bounded)
     return tally(state, cleared_other_floors=count(other))

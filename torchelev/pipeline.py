@@ -14,6 +14,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.drift import compensate
 from torchelev.fusion import fuse
 from torchelev.grid import recenter
+from torchelev.operators import as_bytes
 from torchelev.overlap import clear_other_floors
 from torchelev.raycast import clear_seen_through
 from torchelev.sensor import measure
@@ -61,18 +62,28 @@ def update(
     return fuse_measurement(state, m, cfg)
 
 
+def with_masks(state: MapState, convert: Callable[[Tensor], Tensor]) -> MapState:
+    """Return the state with its masks converted."""
+    return state._replace(validity=convert(state.validity), bounded=convert(state.bounded))
+
+
 @functools.cache
 def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
     """Return the compiled update of a config; equal configs share one graph, whatever the number of points."""
-    plain = functools.partial(update, cfg=cfg)
-    graph = torch.compile(plain, fullgraph=True)
+
+    def bytewise(state: MapState, *others: Any) -> MapState:
+        """Update; masks come and go as bytes, see `as_bytes`."""
+        return with_masks(update(with_masks(state, lambda mask: mask != 0), *others, cfg=cfg), as_bytes)
+
+    graph = torch.compile(bytewise, fullgraph=True)
 
     def run(state: MapState, points: Tensor, *others: Any) -> MapState:
         if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
-            return plain(state, points, *others)
+            return update(state, points, *others, cfg=cfg)
         for values in (points, others[-1]):
             if values is not None:
                 torch._dynamo.maybe_mark_dynamic(values, 2)
-        return graph(state, points, *others)
+        state = graph(with_masks(state, lambda mask: mask.view(torch.uint8)), points, *others)
+        return with_masks(state, lambda mask: mask.view(torch.bool))
 
     return run

@@ -7,6 +7,7 @@ looks its own entry up. Cost: points + table + cells, whatever the length of the
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,12 +16,13 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate, pad_cells
-from torchelev.operators import azimuth_pyramid, realize, running_minimum
+from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate
+from torchelev.operators import polar_minimum, realize, realize_all, running_minimum
 from torchelev.state import MapState, Measurement, count, tally
+from torchelev.windows import neighbours
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 NO_RAY = 1e4  # a slope above every ray's
 
@@ -48,17 +50,17 @@ class PolarGrid(NamedTuple):
 
     ranges: int
     azimuths: int
-    levels: int  # of the azimuth pyramid, each twice as wide as the one before
+    widen: tuple[int, ...]  # up to which range 3/4 of a cell are wider than 1, 2, 4, ... azimuth bins
 
     @classmethod
     def of(cls, grid: GridConfig, cfg: RaycastConfig) -> PolarGrid:
         """Choose the table's size for a window."""
-        reach = cfg.max_range or 0.55 * math.hypot(grid.length_x, grid.length_y)
-        ranges = math.ceil(reach / grid.resolution)
+        reach = math.ceil((cfg.max_range or 0.55 * math.hypot(grid.length_x, grid.length_y)) / grid.resolution)
         # The approximated azimuth below stretches some bins by 8 %.
-        wanted = max(16.0, 1.08 * 2 * math.pi * ranges)
-        levels = max(1, int(math.log2(wanted)) - 3)
-        return cls(ranges, 2**levels * math.ceil(wanted / 2**levels), levels)
+        azimuths = 2 * math.ceil(max(16.0, 1.08 * 2 * math.pi * reach) / 2)
+        width = 0.75 * azimuths / (2 * math.pi)  # in azimuth bins, of 3/4 of a cell at a range of one cell
+        levels = math.ceil(math.log2(2 * width))  # the sensor's own cell has a range of half a cell
+        return cls(reach, azimuths, tuple(math.ceil(width / 2**k) for k in range(levels)))
 
 
 def turn(x: Tensor, y: Tensor) -> Tensor:
@@ -120,26 +122,20 @@ def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg
     room = torch.where(rays.xy > 0, size - inner - start, inner - start)
     along = torch.where(rays.xy.abs() > 1e-9, rays.xy, torch.where(rays.xy > 0, 1e-9, -1e-9))
     share = (room / along).amin(-1).clamp(0, 1)
-    xy = rays.origin[:, None, :2] + share[..., None] * rays.xy
-    cells = locate(xy, rays.casts, offset[:, 0], grid)
+    x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
+    slot, inside = locate(x, y, offset[:, 0], grid)
     lowest = state.elevation - height_margin(state, grid, cfg)
-    floor = cells.take(pad_cells(torch.where(well_supported(state, cfg, grid.resolution), lowest, 1e6)))
+    floor = realize(torch.where(well_supported(state, cfg, grid.resolution), lowest, 1e6)).flatten(1).gather(1, slot)
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
-    return (cells.slot < cells.num_cells) & (height >= floor) | rays.overhang
+    return (rays.casts & inside) & (height >= floor) | rays.overhang
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
     """Tell which known cells are believed: enough points agree, or on a neighbouring cell of like height."""
-    enough = supported = state.validity & (state.support >= cfg.min_support)
-    for dim in (-1, -2):
-        size = supported.shape[dim] - 1
-        first, second = state.elevation.narrow(dim, 0, size), state.elevation.narrow(dim, 1, size)
-        both = state.validity.narrow(dim, 0, size) & state.validity.narrow(dim, 1, size)
-        like = both & ((first - second).abs() <= resolution)
-        end = torch.zeros_like(enough.narrow(dim, 0, 1))
-        by_second, by_first = like & enough.narrow(dim, 1, size), like & enough.narrow(dim, 0, size)
-        supported = supported | torch.cat([by_second, end], dim) | torch.cat([end, by_first], dim)
-    return supported
+    enough = state.validity & (state.support >= cfg.min_support)
+    _, above, _, left, right, _, below, _ = neighbours(torch.where(enough, state.elevation, torch.inf), torch.inf)
+    unlike = functools.reduce(torch.minimum, [(h - state.elevation).abs() for h in (above, left, right, below)])
+    return enough | (state.validity & (unlike <= resolution))
 
 
 def height_margin(state: MapState, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B H W"]:
@@ -155,18 +151,16 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
     """
     step = 2 * grid.resolution
     polar = PolarGrid.of(grid, cfg)
-    ranges, azimuths = polar.ranges // 2 + 1, polar.azimuths // 2
+    ranges, azimuths = 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
     device, dtype = rays.r.device, rays.r.dtype
-    rho = (torch.arange(ranges, device=device, dtype=dtype) + 0.5) * step
+    rho = (torch.arange(ranges, device=device, dtype=dtype) + 0.5)[:, None] * step
     angle = (torch.arange(azimuths, device=device, dtype=dtype) + 0.5) * (2 * math.pi / azimuths)
-    circle = torch.stack([angle.cos(), angle.sin()], -1)
-    xy = rays.origin[:, None, :2] + realize(rho[:, None, None] * circle).flatten(0, 1)
-    cells = locate(xy, torch.ones_like(xy[..., 0], dtype=torch.bool), lattice_offset(state, m, grid), grid)
+    x, y = (rays.origin[:, axis, None, None] + rho * part for axis, part in enumerate((angle.cos(), angle.sin())))
+    slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     recent = state.validity & (state.time <= cfg.min_time)
     depth = rays.origin[:, 2, None, None] - state.elevation + height_margin(state, grid, cfg)
     below_sensor = torch.where(recent, depth, NO_RAY)
-    fall = torch.where(cells.slot < grid.num_cells, cells.take(pad_cells(below_sensor)), NO_RAY * step)
-    fall = realize(fall).unflatten(1, (ranges, azimuths)) / rho[:, None]
+    fall = torch.where(inside, read(realize(below_sensor).flatten(1), slot), NO_RAY * step) / rho
     lowest = running_minimum(fall, from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
@@ -180,34 +174,19 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
 def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
     """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least a cell farther.
 
-    Azimuths come as a pyramid: single bins, then minima over 2, 4, ...
+    At short range, where a cell spans several azimuth bins, an entry is the minimum over 2, 4, ... of them.
     """
     last = torch.floor(rays.r / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
-    size = polar.ranges * polar.azimuths
-    index = torch.where(casts & (last >= 0), last * polar.azimuths + a, size).to(torch.int64)
-    table = rays.slope.new_full((rays.slope.shape[0], size + 1), NO_RAY)
-    table = table.scatter_reduce(1, index, rays.slope.detach(), "amin")[:, :-1]
-    table = running_minimum(table.reshape(-1, polar.ranges, polar.azimuths), from_end=True)
-    return azimuth_pyramid(table, polar.levels)
+    index = torch.where(casts & (last >= 0), last * polar.azimuths + a, polar.ranges * polar.azimuths)
+    slope, size = rays.slope.detach(), polar.ranges
+    return polar_minimum(index.to(torch.int64), slope, polar.azimuths, list(polar.widen), size, NO_RAY)
 
 
-def cell_widths(polar: PolarGrid, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return half the width of a cell's inner half in azimuth bins, and where the pyramid has bins as wide, by range.
-
-    The latter as the scale 2^-l of the level l and its begin in the flat table.
-    """
-    k = torch.arange(polar.ranges, device=like.device, dtype=like.dtype)
-    half_width = realize(0.25 * polar.azimuths / (2 * math.pi * k.clamp(min=0.5)))
-    scale = realize(torch.exp2(-torch.ceil(torch.log2(2 * half_width)).clamp(0, polar.levels)))
-    total = sum(polar.azimuths >> level for level in range(polar.levels + 1))
-    return half_width, scale, realize(k * total + 2 * polar.azimuths * (1 - scale))
-
-
-def read(values: Float[Tensor, "B K"], index: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
-    """Give each cell the value at its index."""
+def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
+    """Give each entry the value at its index."""
     # Realized while it has two dimensions: flattened first, the compiler would divide to find row and column.
-    return values.gather(1, realize(index.to(torch.int64)).flatten(1)).view_as(index)
+    return values.gather(1, realize(index).flatten(1)).view_as(index)
 
 
 class RayOverCell(NamedTuple):
@@ -221,19 +200,16 @@ class RayOverCell(NamedTuple):
 def look_up(
     state: MapState, m: Measurement, origin: Tensor, table: Tensor, polar: PolarGrid, grid: GridConfig
 ) -> RayOverCell:
-    """Gather the lowest ray over the inner half of each cell from the pyramid of azimuths."""
+    """Gather the lowest ray over the middle of each cell, three quarters of it or more."""
     x, y = center_offsets(state, m, grid)
     x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
     rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
-    k = torch.floor(rho / grid.resolution)
-    azimuth = turn(*torch.broadcast_tensors(x, y)) * polar.azimuths
-    bins = k.clamp(max=polar.ranges - 1)
-    half_width, scale, start = (read(values.expand(len(rho), -1), bins) for values in cell_widths(polar, rho))
-    slope = torch.full_like(rho, NO_RAY)
-    for side in (-half_width, half_width):
-        a = torch.floor(torch.remainder(azimuth + side, polar.azimuths) * scale)
-        slope = torch.minimum(slope, read(table.flatten(1), start + torch.minimum(a, polar.azimuths * scale - 1)))
-    found = (slope < NO_RAY) & (k < polar.ranges)
+    k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
+    width = 1.0 + sum((k < rows) * 2.0**level for level, rows in enumerate(polar.widen))
+    a = torch.floor(turn(*torch.broadcast_tensors(x, y)) * polar.azimuths - 0.5 * (width - 1))
+    a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
+    slope = read(table.flatten(1), (k * polar.azimuths + a).to(torch.int64))
+    found = slope < NO_RAY
     slope = torch.where(found, slope, 0.0)
     gx, gy = state.gradient_x, state.gradient_y
     along = (slope - gx * x / rho - gy * y / rho).abs()
@@ -263,8 +239,6 @@ def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> Ma
     validity = state.validity & ~gone
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
-    return state._replace(
-        validity=validity,
-        bounded=(state.bounded & ~state.validity) | bounds,
-        upper_bound=torch.where(bounds, lower, state.upper_bound),
-    )
+    upper_bound = torch.where(bounds, lower, state.upper_bound)
+    validity, bounded, upper_bound = realize_all(validity, (state.bounded & ~state.validity) | bounds, upper_bound)
+    return state._replace(validity=validity, bounded=bounded, upper_bound=upper_bound)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.operators import realize
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
@@ -96,4 +98,4 @@ def tally(state: MapState, **counts: Tensor) -> MapState:
 
 def count(mask: Tensor) -> Tensor:
     """Count what is true in each environment: (B, ...) bool -> (B,) int64."""
-    return mask.flatten(1).sum(1)
+    return realize(mask).flatten(1).sum(1)

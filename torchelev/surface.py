@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.operators import window_moments
 from torchelev.state import MapState
+from torchelev.windows import window_moments
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -48,8 +48,8 @@ def fit_plane(
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
     datum = (torch.where(validity, elevation, 0.0).sum((1, 2), keepdim=True) / number).detach()
     z = torch.where(validity, elevation - datum, 0.0)
-    (n, n_v, n_vv, n_u, n_uv, n_uu), (s_z, s_vz, s_uz) = window_moments(known, radius, 2), window_moments(z, radius, 1)
-    (s_zz,) = window_moments(z.square(), radius, 0)
+    moments = window_moments([(known, 2), (z, 1), (z.square(), 0)], radius)
+    n, n_v, n_vv, n_u, n_uv, n_uu, s_z, s_vz, s_uz, s_zz = moments
     share = 1 / n.clamp(min=1)
     mu, mv, mz = n_u * share, n_v * share, s_z * share
     uu, vv, uv = n_uu * share - mu * mu, n_vv * share - mv * mv, n_uv * share - mu * mv

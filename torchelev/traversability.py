@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.state import MapState
 from torchelev.surface import fit_plane
+from torchelev.windows import window_maximum
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,13 +31,9 @@ class TraversabilityConfig:
 
 def height_range(elevation: Tensor, validity: Tensor, radius: int) -> Tensor:
     """Return the difference between the highest and the lowest known cell of each window [m]."""
-    low, high = torch.where(validity, elevation, torch.inf), torch.where(validity, elevation, -torch.inf)
-    for dim, pad in ((-2, [0, 0, radius, radius]), (-1, [radius, radius, 0, 0])):
-        padded_low, padded_high = F.pad(low, pad, value=torch.inf), F.pad(high, pad, value=-torch.inf)
-        for k in range(2 * radius + 1):
-            low = torch.minimum(low, padded_low.narrow(dim, k, elevation.shape[dim]))
-            high = torch.maximum(high, padded_high.narrow(dim, k, elevation.shape[dim]))
-    return torch.where(validity, high - low, 0.0)
+    high, low = torch.where(validity, elevation, -torch.inf), torch.where(validity, -elevation, -torch.inf)
+    highest, lowest = window_maximum(torch.stack([high, low]), radius).unbind(0)
+    return torch.where(validity, highest + lowest, 0.0)
 
 
 def rate_all(state: MapState) -> MapState:

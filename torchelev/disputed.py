@@ -1,0 +1,114 @@
+"""Cells whose points disagree: their robust mean, and the top and the bottom of the step that they hold.
+
+Few cells are disputed, but each costs several rounds over its points. So a CPU picks their points out; a GPU, which
+would have to wait for the host to learn how many there are, goes through all. Nothing here has a gradient: a height is
+a guess around which `fusion` averages.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class _Points:
+    """The points (P,) of the disputed cells, which are numbered across environments."""
+
+    def __init__(self, cells: Tensor, slot: Tensor, *columns: Tensor) -> None:
+        """Pick the points of `cells` (B, C) out of slots and columns (B, M); on a GPU take all."""
+        first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
+        values = [(slot + first).flatten(), *(column.flatten() for column in columns)]
+        if cells.device.type == "cpu":
+            chosen = cells.flatten().index_select(0, values[0]).nonzero().squeeze(1)
+            values = [value.index_select(0, chosen) for value in values]
+        self.slot, self.z, self.spread, self.weight, *self.others = values
+        self.used = self.weight > 0
+        self._sums = self.z.new_zeros(cells.numel())
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Give each point the sum over its cell."""
+        self._sums.index_fill_(0, self.slot, 0.0).scatter_add_(0, self.slot, values)
+        return self._sums.index_select(0, self.slot)
+
+    def moved(self, height: Tensor, weight: Tensor) -> Tensor:
+        """Move the points' heights to their cells' means under other weights; where there are none, nowhere."""
+        total, moment = self.sum(weight), self.sum(weight * (self.z - height))
+        return height + moment / torch.where(total > 0, total, 1.0)
+
+    def of_cells(self, values: Tensor, like: Tensor) -> Tensor:
+        """Give each cell (B, C) its points' common value, other cells zero."""
+        return torch.zeros_like(like).flatten().scatter_(0, self.slot, values).view_as(like)
+
+
+@torch.library.custom_op("torchelev::robust_mean", mutates_args=())
+def robust_mean(
+    cells: Tensor, slot: Tensor, z: Tensor, spread: Tensor, weight: Tensor, mean: Tensor, gate: float
+) -> tuple[Tensor, Tensor]:
+    """Return the robust mean of each disputed cell and how many points lie within the gate around it.
+
+    From the mean on, twice: the mean under the weights w / (1 + r^2 / sigma^2)^2 of the residuals r, which leave an
+    outlier out. `cells` (B, C) uint8 names the disputed cells, `mean` (B, C) holds their means; the points' columns
+    are (B, M), with weight zero where a point is not used. Elsewhere the results are zero, or mean nothing.
+    """
+    points = _Points(cells, slot, z, spread, weight)
+    height = mean.flatten().index_select(0, points.slot)
+    for _ in range(2):
+        square = (points.z - height).square()
+        height = points.moved(height, points.weight / (1.0 + square / points.spread).square())
+    near = points.used & ((points.z - height).square() <= gate**2 * points.spread)
+    return points.of_cells(height, mean), points.of_cells(points.sum(near.to(mean.dtype)), mean)
+
+
+@robust_mean.register_fake
+def _(
+    cells: Tensor, slot: Tensor, z: Tensor, spread: Tensor, weight: Tensor, mean: Tensor, gate: float
+) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(mean), torch.empty_like(mean)
+
+
+@torch.library.custom_op("torchelev::step_heights", mutates_args=())
+def step_heights(
+    cells: Tensor,
+    slot: Tensor,
+    z: Tensor,
+    spread: Tensor,
+    weight: Tensor,
+    beyond: Tensor,
+    mean: Tensor,
+    refinements: int,
+    margin: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the top and the bottom of each disputed cell, and which part of its low points passed the centre.
+
+    The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
+    top of a wall's face. The bottom takes two. Points up to `margin` standard deviations beyond the level count.
+    """
+    points = _Points(cells, slot, z, spread, weight, beyond)
+    middle = mean.flatten().index_select(0, points.slot)
+    slack = margin * points.spread.sqrt()
+
+    def level(side: float, rounds: int) -> Tensor:
+        height = middle
+        for _ in range(rounds):
+            counts = side * (points.z - height) >= -slack
+            height = points.moved(height, torch.where(counts, points.weight, 0.0))
+        return points.of_cells(height, mean)
+
+    low = (points.used & (points.z < middle)).to(mean.dtype)
+    passed_low = points.sum(low * points.others[0]) / points.sum(low).clamp(min=1)
+    return level(1.0, refinements), level(-1.0, 2), points.of_cells(passed_low, mean)
+
+
+@step_heights.register_fake
+def _(
+    cells: Tensor,
+    slot: Tensor,
+    z: Tensor,
+    spread: Tensor,
+    weight: Tensor,
+    beyond: Tensor,
+    mean: Tensor,
+    refinements: int,
+    margin: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.empty_like(mean), torch.empty_like(mean), torch.empty_like(mean)
