@@ -155,21 +155,24 @@ def extreme(points, side, edges, relief, rounds):
     return level
 
 
-def side_of_step(points, edges, relief, shown, resolution):
+def side_of_step(points, edges, relief, shown):
     """+1 and the top's height, or -1 and the ground's, of a cell that holds a step.
 
     The ground wins where rays passed the centre and hit low, if a neighbouring cell shows the top: by the mean height
-    of its points, `shown[0]`, or by its height in the map, `shown[1]`.
+    of its points, of which `shown[0]` is the highest, or behind it by its height in the map, `shown[1]` by (i, j).
     """
     mean, top = weighted_mean(points), extreme(points, 1, edges, relief, edges["refinements"])
     low = [p for p in points if p["z"] < mean]
     passed = sum(p["beyond"] for p in low) > edges["min_passed"] * len(low)
-    if passed and (shown[0] >= (mean + top) / 2 or shown[1] >= top - resolution):
+    rx, ry = (sum(p["ray"][axis] for p in points) for axis in (0, 1))
+    angles = {(i, j): math.degrees(math.atan2(i * ry - j * rx, i * rx + j * ry)) for i, j in shown[1]}
+    behind = [height for place, height in shown[1].items() if abs(angles[place]) < 50]
+    if passed and (shown[0] >= (mean + top) / 2 or max(behind, default=-math.inf) >= top - relief):
         return -1, extreme(points, -1, edges, relief, rounds=2)
     return 1, top
 
 
-def scan_height(cell, points, relief, shown, resolution, *, gate, max_gate_std, min_settled, edges):
+def scan_height(cell, points, relief, shown, *, gate, max_gate_std, min_settled, edges):
     """What a scan says of a cell: its height, the points kept, how many were ignored, and how many speak for the cell.
 
     Points on the face of a wall speak for its top; whoever sees less of a face has nothing against a settled top.
@@ -185,7 +188,7 @@ def scan_height(cell, points, relief, shown, resolution, *, gate, max_gate_std, 
         margin = edges["margin"]
         far = sum(not agrees(p, guess, gate_variance, relief, gate) for p in points)
         if len(points) >= edges["min_points"] and far >= edges["min_share"] * len(points):
-            side, guess = side_of_step(points, edges, relief, shown, resolution)
+            side, guess = side_of_step(points, edges, relief, shown)
     wrong = [side * (p["z"] - guess) < -margin * math.sqrt(p["variance"] + relief**2) for p in points]
     kept = [p for p, w in zip(points, wrong, strict=True) if not w and agrees(p, guess, gate_variance, relief, gate)]
     height = weighted_mean(kept) if kept else guess
@@ -209,19 +212,19 @@ def fuse_cell(
     min_settled,
     max_variance,
     edges,
-    shown=(-math.inf, -math.inf),
+    shown=(-math.inf, {}),
 ):
     """One cell and the points of one scan: the cell after it, and the numbers of points used and ignored at a step.
 
-    `cell` has elevation, variance, known, support, time; each point z, variance, beyond. `relief` counts cells,
-    `shown` are the highest mean height of the points in the eight cells around, and the highest of those cells.
+    `cell` has elevation, variance, known, support, time; each point z, variance, ray, beyond. `relief` counts cells,
+    `shown` are the highest mean height of the points in the eight cells around, and the heights of those cells.
     """
     after, relief = dict(cell), relief * resolution
     after["variance"] = min(cell["variance"], max_variance) if cell["known"] else 1.0
     if not points:
         return after, 0, 0
     settings = dict(gate=gate, max_gate_std=max_gate_std, min_settled=min_settled, edges=edges)
-    height, kept, ignored, for_cell = scan_height(cell, points, relief, shown, resolution, **settings)
+    height, kept, ignored, for_cell = scan_height(cell, points, relief, shown, **settings)
     if not kept:
         return after, 0, ignored
     R = max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor)

@@ -35,13 +35,14 @@ def reference_fuse(state, points, variances, used, origins, b, cfg):
         c = reference.cell_of(p[0], p[1], corner, 0.1, shape)
         if u and c is not None:
             beyond = reference.passed_center(p[0], p[1], origin, corner, 0.1, shape)
-            by_cell.setdefault(c, []).append(dict(z=p[2], variance=variance, beyond=beyond))
+            ray = (p[0] - origin[0], p[1] - origin[1])
+            by_cell.setdefault(c, []).append(dict(z=p[2], variance=variance, ray=ray, beyond=beyond))
     results, means = {}, {c: reference.weighted_mean(points) for c, points in by_cell.items()}
     for c in np.ndindex(*shape):
         around = [(c[0] + i, c[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
         inside = [a for a in around if 0 <= a[0] < shape[0] and 0 <= a[1] < shape[1]]
-        known = [float(state.elevation[b][a]) for a in inside if state.validity[b][a]]
-        shown = max(means.get(a, -np.inf) for a in inside), max(known, default=-np.inf)
+        known = {(a[0] - c[0], a[1] - c[1]): float(state.elevation[b][a]) for a in inside if state.validity[b][a]}
+        shown = max(means.get(a, -np.inf) for a in inside), known
         cell = {n: float(getattr(state, n)[b][c]) for n in ("elevation", "variance", "support", "time")}
         cell["known"] = bool(state.validity[b][c])
         settings = dict(dataclasses.asdict(cfg), shown=shown)

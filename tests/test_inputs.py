@@ -52,6 +52,7 @@ BAD_POSES = {
     "sheared": (broken(r01=0.1), ValueError, "rigid"),
     "mirrored": (broken(r22=-1.0), ValueError, "mirror"),
     "zero": (torch.zeros(B, 4, 4), ValueError, "rigid"),
+    "far": (broken(r03=1e30), ValueError, "within 1e\\+09 m"),
     "last row": (broken(r30=0.5), ValueError, "last row"),
     "nan": (broken(r03=float("nan")), ValueError, "finite"),
     "inf": (broken(r13=float("inf")), ValueError, "finite"),

@@ -109,7 +109,7 @@ def cell(**values):
 
 
 def points(*heights, variance=1.0, beyond=False):
-    return [dict(z=z, variance=variance, beyond=beyond) for z in heights]
+    return [dict(z=z, variance=variance, ray=(1.0, 0.2), beyond=beyond) for z in heights]
 
 
 def test_kalman():
@@ -140,13 +140,18 @@ def test_fuse_cell_outvotes_or_founds_anew():
 
 def test_fuse_cell_keeps_one_side_of_a_step():
     low_high = points(0.0, 0.0, 10.0, 10.0, variance=0.01)
-    unknown, settings = cell(known=False), FUSION | dict(edges=EDGES)
+    unknown, settings = cell(known=False), FUSION | dict(edges=EDGES, relief=1.0)
     after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings)
     assert (after["elevation"], used, ignored) == (pytest.approx(10.0), 2, 2)
     for p in low_high[:2]:
         p["beyond"] = True
-    # The scan shows the top halfway between the mean of 5 and the top of 10, the map a cell's edge below the top.
-    for shown, height in (((7.4, -9), 10.0), ((7.6, -9), 0.0), ((-9, 9.8), 10.0), ((-9, 9.95), 0.0)):
+    # The scan shows the top halfway between the mean of 5 and the top of 10, the map a cell's edge below the top, but
+    # only within 50 degrees of the rays, which go by 11 degrees to the left.
+    behind, beside = [(1, 0), (1, 1), (1, -1)], [(0, 1), (0, -1), (-1, 1), (-1, 0)]
+    cases = [((7.4, {}), 10.0), ((7.6, {}), 0.0)]
+    cases += [((-9, {place: 9.8}), 10.0) for place in behind] + [((-9, {place: 9.95}), 10.0) for place in beside]
+    cases += [((-9, {place: 9.95}), 0.0) for place in behind[:2]] + [((-9, {behind[2]: 9.95}), 10.0)]
+    for shown, height in cases:
         after, used, ignored = reference.fuse_cell(unknown, low_high, 0.1, **settings, shown=shown)
         assert (after["elevation"], used, ignored) == (pytest.approx(height), 2, 2)
 

@@ -35,16 +35,17 @@ class _Points:
         total, moment = self.sum(weight), self.sum(weight * (self.z - height))
         return height + moment / torch.where(total > 0, total, 1.0)
 
-    def of_cells(self, values: Tensor, like: Tensor) -> Tensor:
-        """Give each cell (B, C) its points' common value, other cells zero."""
-        return torch.zeros_like(like).flatten().scatter_(0, self.slot, values).view_as(like)
+    def of_cells(self, *values: Tensor, like: Tensor) -> Tensor:
+        """Give each cell its points' common values, other cells zero: K times (P,) -> (K, B, C)."""
+        cells = like.new_zeros(len(values), like.numel())
+        return cells.scatter_(1, self.slot.expand(len(values), -1), torch.stack(values)).unflatten(1, like.shape)
 
 
 @torch.library.custom_op("torchelev::robust_mean", mutates_args=())
 def robust_mean(
     cells: Tensor, slot: Tensor, z: Tensor, spread: Tensor, weight: Tensor, mean: Tensor, gate: float
-) -> tuple[Tensor, Tensor]:
-    """Return the robust mean of each disputed cell and how many points lie within the gate around it.
+) -> Tensor:
+    """Return the robust mean of each disputed cell and how many points lie within the gate around it, (2, B, C).
 
     From the mean on, twice: the mean under the weights w / (1 + r^2 / sigma^2)^2 of the residuals r, which leave an
     outlier out. `cells` (B, C) uint8 names the disputed cells, `mean` (B, C) holds their means; the points' columns
@@ -56,14 +57,12 @@ def robust_mean(
         square = (points.z - height).square()
         height = points.moved(height, points.weight / (1.0 + square / points.spread).square())
     near = points.used & ((points.z - height).square() <= gate**2 * points.spread)
-    return points.of_cells(height, mean), points.of_cells(points.sum(near.to(mean.dtype)), mean)
+    return points.of_cells(height, points.sum(near.to(mean.dtype)), like=mean)
 
 
 @robust_mean.register_fake
-def _(
-    cells: Tensor, slot: Tensor, z: Tensor, spread: Tensor, weight: Tensor, mean: Tensor, gate: float
-) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(mean), torch.empty_like(mean)
+def _(cells: Tensor, slot: Tensor, z: Tensor, spread: Tensor, weight: Tensor, mean: Tensor, gate: float) -> Tensor:
+    return mean.new_empty(2, *mean.shape)
 
 
 @torch.library.custom_op("torchelev::step_heights", mutates_args=())
@@ -73,17 +72,20 @@ def step_heights(
     z: Tensor,
     spread: Tensor,
     weight: Tensor,
+    ray: list[Tensor],
     beyond: Tensor,
     mean: Tensor,
     refinements: int,
     margin: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the top and the bottom of each disputed cell, and which part of its low points passed the centre.
+) -> Tensor:
+    """Return, as (5, B, C), what tells the ground from the top in each disputed cell.
 
+    Its top and its bottom; which part of its low points lies `beyond` the centre; x and y of where its rays go.
     The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
     top of a wall's face. The bottom takes two. Points up to `margin` standard deviations beyond the level count.
     """
-    points = _Points(cells, slot, z, spread, weight, beyond)
+    points = _Points(cells, slot, z, spread, weight, beyond, *ray)
+    passed, *ray = points.others
     middle = mean.flatten().index_select(0, points.slot)
     slack = margin * points.spread.sqrt()
 
@@ -92,11 +94,12 @@ def step_heights(
         for _ in range(rounds):
             counts = side * (points.z - height) >= -slack
             height = points.moved(height, torch.where(counts, points.weight, 0.0))
-        return points.of_cells(height, mean)
+        return height
 
     low = (points.used & (points.z < middle)).to(mean.dtype)
-    passed_low = points.sum(low * points.others[0]) / points.sum(low).clamp(min=1)
-    return level(1.0, refinements), level(-1.0, 2), points.of_cells(passed_low, mean)
+    passed_low = points.sum(low * passed) / points.sum(low).clamp(min=1)
+    x, y = (points.sum(torch.where(points.used, part, 0.0)) for part in ray)
+    return points.of_cells(level(1.0, refinements), level(-1.0, 2), passed_low, x, y, like=mean)
 
 
 @step_heights.register_fake
@@ -106,9 +109,10 @@ def _(
     z: Tensor,
     spread: Tensor,
     weight: Tensor,
+    ray: list[Tensor],
     beyond: Tensor,
     mean: Tensor,
     refinements: int,
     margin: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.empty_like(mean), torch.empty_like(mean), torch.empty_like(mean)
+) -> Tensor:
+    return mean.new_empty(5, *mean.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +15,7 @@ from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
 from torchelev.operators import as_bytes, realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement, count, tally
-from torchelev.windows import neighbours
+from torchelev.windows import AROUND, neighbours
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -27,7 +28,7 @@ class EdgeConfig:
     min_points: int = 6
     min_share: float = 0.25  # of the cell's points outside the gate around its estimate
     min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
-    refinements: int = 5  # each halves the distance to the top of a wall's face
+    refinements: int = 7  # each halves the distance to the top of a wall's face
     margin: float = 0.25  # standard deviations below the top that still belong to it
 
 
@@ -59,6 +60,7 @@ class Scan(NamedTuple):
     spread: Float[Tensor, "B M"]  # [m^2] variance of z around its cell's height
     weight: Float[Tensor, "B M"]  # 1 / sigma_p^2, zero where not used
     used: Bool[Tensor, "B M"]
+    ray: list[Float[Tensor, "B M"]]  # [m] x and y from the sensor to the point
     beyond: Bool[Tensor, "B M"]  # the ray passed over the cell's centre before it hit
     cells: PointCells
 
@@ -97,18 +99,20 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     variance, as in the paper, and founds the cell anew once the votes are used up.
     """
     scan, prior = gather_scan(state, m, grid, cfg), gather_prior(state, cfg)
-    near = agrees(scan, *scan.cells.take(prior.elevation, prior.gate_variance), cfg)
+    elevation_at, variance_at = scan.cells.take(prior.elevation, prior.gate_variance)
+    near = agrees(scan, elevation_at, variance_at, cfg)
     number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
     mean = ratio(moment, weight).detach()
     trusted = prior.known & (2 * agreeing >= number)
-    robust, robustly = robust_mean(as_bytes(~trusted & (number > 0)), *scan.columns(), mean, cfg.gate)
+    untrusted = as_bytes(~trusted & (number > 0))
+    robust, robustly = robust_mean(untrusted, *scan.columns(), mean, cfg.gate).unbind(0)
     guess = torch.where(trusted, prior.elevation, robust).detach()
     gate = torch.where(trusted, prior.gate_variance, 0.0)
     side = torch.zeros_like(guess)
     if cfg.edges is not None:
         far = number - torch.where(trusted, agreeing, robustly)
         step = (number >= cfg.edges.min_points) & (far >= cfg.edges.min_share * number)
-        side, guess = side_of_step(scan, prior, step, guess, mean, number, grid, cfg.edges)
+        side, guess = side_of_step(scan, prior, step, guess, mean, number, grid, cfg)
     guess_at, gate_at, side_at = scan.cells.take(guess, gate, side)
     kept, ignored = on_side(scan, guess_at, gate_at, side_at, cfg)
 
@@ -152,6 +156,7 @@ def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionCo
         spread=m.variance + (cfg.relief * grid.resolution) ** 2,
         weight=torch.where(used, 1.0 / m.variance, 0.0),
         used=used,
+        ray=list(ray.unbind(-1)),
         beyond=passed_center(from_center, ray),
         cells=cells,
     )
@@ -198,7 +203,7 @@ def side_of_step(
     mean: Tensor,
     number: Tensor,
     grid: GridConfig,
-    edges: EdgeConfig,
+    cfg: FusionConfig,
 ) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
@@ -207,21 +212,35 @@ def side_of_step(
     what lies at the centre, and points above are ignored. Returns the side (B, C), +1 top, -1 ground and 0 no step,
     and the guess, moved to that side.
     """
-    columns = (*scan.columns(), as_bytes(scan.beyond))
-    top, bottom, passed_low = step_heights(as_bytes(step), *columns, mean, edges.refinements, edges.margin)
+    edges = cfg.edges
+    assert edges is not None
+    columns = (*scan.columns(), [part.detach() for part in scan.ray], as_bytes(scan.beyond))
+    found = step_heights(as_bytes(step), *columns, mean, edges.refinements, edges.margin)
+    top, bottom, passed_low, *ray = found.unbind(0)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
-    scanned, mapped = torch.where(number > 0, mean, -1e6), torch.where(prior.known, prior.elevation, -1e6)
-    elsewhere = neighbour_maximum(scanned, grid) >= 0.5 * (mean + top)
-    elsewhere = elsewhere | (neighbour_maximum(mapped, grid) >= top - grid.resolution)
+    scanned = neighbour_maximum(torch.where(number > 0, mean, -1e6), None, grid)
+    mapped = neighbour_maximum(torch.where(prior.known, prior.elevation, -1e6), ray, grid)
+    elsewhere = (scanned >= 0.5 * (mean + top)) | (mapped >= top - cfg.relief * grid.resolution)
     ground = step & elsewhere & (passed_low > edges.min_passed)
     guess = torch.where(step, torch.where(ground, bottom, top), guess)
     return torch.where(step, torch.where(ground, -1.0, 1.0), 0.0), guess.detach()
 
 
-def neighbour_maximum(cells: Float[Tensor, "B C"], grid: GridConfig) -> Float[Tensor, "B C"]:
-    """Return the highest value of the eight neighbours of each cell."""
-    layer = cells.detach().unflatten(1, (grid.height, grid.width))
-    return realize(functools.reduce(torch.maximum, neighbours(layer, -1e6))).flatten(1)
+def neighbour_maximum(
+    cells: Float[Tensor, "B C"], ray: list[Float[Tensor, "B C"]] | None, grid: GridConfig
+) -> Float[Tensor, "B C"]:
+    """Return the highest value of the neighbours of each cell; given rays, of those within 50 degrees behind it.
+
+    Beside it along a wall lie cells that show the wall's face too, and the wall would end as every other cell's.
+    """
+    shape = (grid.height, grid.width)
+    heights = neighbours(cells.detach().unflatten(1, shape), -1e6)
+    if ray is not None:
+        x, y = (part.unflatten(1, shape) for part in ray)
+        limit = math.cos(math.radians(50)) * (x.square() + y.square()).sqrt()
+        behind = [i * x + j * y > math.hypot(i, j) * limit for i, j in AROUND]
+        heights = [torch.where(mask, height, -1e6) for mask, height in zip(behind, heights, strict=True)]
+    return realize(functools.reduce(torch.maximum, heights)).flatten(1)
 
 
 def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.operators import as_bytes, cell_sums, realize, realize_all
+from torchelev.operators import as_bytes, cell_sums, moved, realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +97,8 @@ def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig)
 def cells_of(m: Measurement, offset: Float[Tensor, "B 2"], grid: GridConfig) -> PointCells:
     """Find the cell of each point that measures the ground."""
     slot, inside = locate(m.points[..., 0], m.points[..., 1], offset, grid)
-    return PointCells(*realize_all(slot, inside & m.used), grid.num_cells)
+    slot, inside = realize_all(slot, inside & m.used)
+    return PointCells(slot, inside, grid.num_cells)
 
 
 def window_corner(base: Float[Tensor, "B 2"], anchor: Int[Tensor, "B 2"], grid: GridConfig) -> Int[Tensor, "B 2"]:
@@ -106,13 +107,14 @@ def window_corner(base: Float[Tensor, "B 2"], anchor: Int[Tensor, "B 2"], grid: 
     return anchor + torch.floor(base / grid.resolution - half + 0.5).to(torch.int64)
 
 
-def shift_layer(layer: Tensor, index: Tensor, entering: Tensor, blank: float) -> Tensor:
-    """Move a layer's content by gathering; cells that enter the window get the blank value."""
-    mask = layer.dtype == torch.bool
-    values = realize(as_bytes(layer) if mask else layer)
-    moved = values.flatten(1).gather(1, index).view_as(layer)
-    moved = torch.where(entering, torch.full_like(moved, blank), moved)
-    return moved != 0 if mask else moved
+def gathered(layers: list[Tensor], shift: Int[Tensor, "B 2"], blanks: list[float], grid: GridConfig) -> list[Tensor]:
+    """Shift layers by gathering; cells that enter the window get the layer's blank value."""
+    i = torch.arange(grid.height, device=shift.device)[None, :, None] + shift[:, 0, None, None]
+    j = torch.arange(grid.width, device=shift.device)[None, None, :] + shift[:, 1, None, None]
+    entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
+    index = (i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)).flatten(1)
+    values = [layer.flatten(1).gather(1, index).view_as(layer) for layer in realize_all(*layers)]
+    return realize_all(*(torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)))
 
 
 def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
@@ -127,15 +129,16 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     # A shift of a whole window blanks everything; the clamp keeps the index arithmetic small.
     shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
     corner, shift = realize_all(corner, shift)
-    device = state.corner.device
-    i = torch.arange(grid.height, device=device)[None, :, None] + shift[:, 0, None, None]
-    j = torch.arange(grid.width, device=device)[None, None, :] + shift[:, 1, None, None]
-    entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
-    index = (i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)).flatten(1)
     names = MapState._fields[2:-1]
-    moved = [shift_layer(getattr(state, name), index, entering, BLANK.get(name, 0.0)) for name in names]
-    layers: dict[str, Any] = dict(zip(names, realize_all(*moved), strict=True))
-    return state._replace(corner=corner, base_height=m.base[:, 2], **layers)
+    layers, blanks = [getattr(state, name) for name in names], [BLANK.get(name, 0.0) for name in names]
+    masks = [layer.dtype == torch.bool for layer in layers]
+    layers = [as_bytes(layer) if mask else layer for layer, mask in zip(layers, masks, strict=True)]
+    # Copying has no gradient, and the host must know the shifts; gathering takes 8 times as long on a CPU.
+    few = shift.shape[0] <= 4 and shift.device.type == "cpu" and not torch.is_grad_enabled()
+    values = moved(layers, shift, blanks) if few else gathered(layers, shift, blanks, grid)
+    values = [value != 0 if mask else value for value, mask in zip(values, masks, strict=True)]
+    fields: dict[str, Any] = dict(zip(names, values, strict=True))
+    return state._replace(corner=corner, base_height=m.base[:, 2], **fields)
 
 
 def cell_centers(corner: Int[Tensor, "B 2"], grid: GridConfig) -> Float[Tensor, "B H W 2"]:

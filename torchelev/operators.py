@@ -55,7 +55,26 @@ def _in_memory(value: Tensor) -> Tensor:
 
 def as_bytes(mask: Tensor) -> Tensor:
     """Return a mask as 0 and 1 in uint8. Compiled code stores bytes eight times as fast as booleans on a CPU."""
-    return torch.where(mask, 1, 0).to(torch.uint8)
+    return torch.where(mask, 1, 0).to(torch.uint8) if torch.compiler.is_compiling() else mask.view(torch.uint8)
+
+
+@torch.library.custom_op("torchelev::moved", mutates_args=())
+def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
+    """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
+    results = [torch.full_like(layer, blank) for layer, blank in zip(layers, blanks, strict=True)]
+    H, W = layers[0].shape[1:]
+    for env, (i, j) in enumerate(shift.tolist()):
+        if abs(i) < H and abs(j) < W:
+            to = (env, slice(max(0, -i), H - max(0, i)), slice(max(0, -j), W - max(0, j)))
+            source = (env, slice(max(0, i), H - max(0, -i)), slice(max(0, j), W - max(0, -j)))
+            for result, layer in zip(results, layers, strict=True):
+                result[to].copy_(layer[source])
+    return results
+
+
+@moved.register_fake
+def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
+    return [torch.empty_like(layer) for layer in layers]
 
 
 @torch.library.custom_op("torchelev::cell_sums", mutates_args=())

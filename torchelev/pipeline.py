@@ -70,16 +70,17 @@ def with_masks(state: MapState, convert: Callable[[Tensor], Tensor]) -> MapState
 @functools.cache
 def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
     """Return the compiled update of a config; equal configs share one graph, whatever the number of points."""
+    plain: Callable[..., MapState] = functools.partial(update, cfg=cfg)
 
     def bytewise(state: MapState, *others: Any) -> MapState:
         """Update; masks come and go as bytes, see `as_bytes`."""
-        return with_masks(update(with_masks(state, lambda mask: mask != 0), *others, cfg=cfg), as_bytes)
+        return with_masks(plain(with_masks(state, lambda mask: mask != 0), *others), as_bytes)
 
     graph = torch.compile(bytewise, fullgraph=True)
 
     def run(state: MapState, points: Tensor, *others: Any) -> MapState:
         if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
-            return update(state, points, *others, cfg=cfg)
+            return plain(state, points, *others)
         for values in (points, others[-1]):
             if values is not None:
                 torch._dynamo.maybe_mark_dynamic(values, 2)

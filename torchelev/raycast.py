@@ -85,6 +85,7 @@ class Rays(NamedTuple):
     r: Float[Tensor, "B N"]  # [m] horizontal length
     slope: Float[Tensor, "B N"]  # dz / dr
     azimuth: Float[Tensor, "B N"]  # in turns
+    noise: Float[Tensor, "B N"]  # [m] standard deviation of its end
     casts: Bool[Tensor, "B N"]
     overhang: Bool[Tensor, "B N"]  # the point lies above the exclusion ramp
 
@@ -95,8 +96,8 @@ def rays_of(m: Measurement, s: int) -> Rays:
     ray = m.points.unflatten(1, (sensors, -1))[:, s] - m.origin[:, s, None]
     x, y, z = ray.unbind(-1)
     r = (x.square() + y.square()).clamp(min=1e-12).sqrt()
-    casts, used = (mask.unflatten(1, (sensors, -1))[:, s] for mask in (m.casts, m.used))
-    return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), casts, casts & ~used)
+    casts, used, variance = (values.unflatten(1, (sensors, -1))[:, s] for values in (m.casts, m.used, m.variance))
+    return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), variance.sqrt(), casts, casts & ~used)
 
 
 # Which rays are believed ----------------------------------------------------------------------------------------------
@@ -176,7 +177,8 @@ def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig)
 
     At short range, where a cell spans several azimuth bins, an entry is the minimum over 2, 4, ... of them.
     """
-    last = torch.floor(rays.r / grid.resolution).clamp(max=polar.ranges + 1) - 2
+    # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
+    last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
     index = torch.where(casts & (last >= 0), last * polar.azimuths + a, polar.ranges * polar.azimuths)
     slope, size = rays.slope.detach(), polar.ranges

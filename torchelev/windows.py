@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torchelev.operators import padded, realize_all
 
+AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+
 
 def _line(values: Tensor, radius: int, dim: int, k: int) -> Tensor:
     """Return what lies k entries on, along a dimension that is padded by `radius`."""
@@ -49,7 +51,7 @@ def window_maximum(values: Tensor, radius: int) -> Tensor:
 
 
 def neighbours(values: Tensor, fill: float) -> list[Tensor]:
-    """Return the eight neighbours of each cell of (..., H, W), `fill` outside the layer."""
+    """Return the eight neighbours of each cell of (..., H, W) in the order of AROUND, `fill` outside the layer."""
     around = padded(values, 1, fill)
     rows = [_line(around, 1, -2, i) for i in (-1, 0, 1)]
-    return [_line(rows[1 + i], 1, -1, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    return [_line(rows[1 + i], 1, -1, j) for i, j in AROUND]
