@@ -146,12 +146,15 @@ def consensus(points, relief, rounds=2):
 
 
 def extreme(points, side, edges, relief, rounds):
-    """The top (+1) or bottom (-1) of the points: the mean of those beyond the mean, give or take a margin, repeated."""
+    """The top (+1) or bottom (-1) of the points: the mean of those beyond the mean, repeated while enough are there."""
     level = weighted_mean(points)
     for _ in range(rounds):
-        margins = [edges["margin"] * math.sqrt(p["variance"] + relief**2) for p in points]
-        beyond = [p for p, margin in zip(points, margins, strict=True) if side * (p["z"] - level) >= -margin]
-        level = weighted_mean(beyond) if beyond else level
+        noises = [math.sqrt(p["variance"] + relief**2) for p in points]
+        beyond = [p for p, n in zip(points, noises, strict=True) if side * (p["z"] - level) >= -edges["margin"] * n]
+        further = weighted_mean(beyond)
+        if sum(side * (p["z"] - further) >= -n for p, n in zip(points, noises, strict=True)) < edges["min_extreme"]:
+            break
+        level = further
     return level
 
 
@@ -172,7 +175,7 @@ def side_of_step(points, edges, relief, shown):
     return 1, top
 
 
-def scan_height(cell, points, relief, shown, *, gate, max_gate_std, min_settled, edges):
+def scan_height(cell, points, relief, shown, *, gate, max_gate_std, edges):
     """What a scan says of a cell: its height, the points kept, how many were ignored, and how many speak for the cell.
 
     Points on the face of a wall speak for its top; whoever sees less of a face has nothing against a settled top.
@@ -193,7 +196,7 @@ def scan_height(cell, points, relief, shown, *, gate, max_gate_std, min_settled,
     kept = [p for p, w in zip(points, wrong, strict=True) if not w and agrees(p, guess, gate_variance, relief, gate)]
     height = weighted_mean(kept) if kept else guess
     for_cell = sum(n and not w for n, w in zip(near, wrong, strict=True))
-    if side > 0 and height < cell["elevation"] and cell["support"] >= min_settled:
+    if side > 0 and height < cell["elevation"] and cell["support"] >= edges["min_settled"]:
         for_cell = len(kept) + sum(wrong)
     return height, kept, sum(wrong), for_cell
 
@@ -209,7 +212,6 @@ def fuse_cell(
     scan_variance_floor,
     outlier_variance,
     max_support,
-    min_settled,
     max_variance,
     edges,
     shown=(-math.inf, {}),
@@ -223,7 +225,7 @@ def fuse_cell(
     after["variance"] = min(cell["variance"], max_variance) if cell["known"] else 1.0
     if not points:
         return after, 0, 0
-    settings = dict(gate=gate, max_gate_std=max_gate_std, min_settled=min_settled, edges=edges)
+    settings = dict(gate=gate, max_gate_std=max_gate_std, edges=edges)
     height, kept, ignored, for_cell = scan_height(cell, points, relief, shown, **settings)
     if not kept:
         return after, 0, ignored

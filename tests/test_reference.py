@@ -100,8 +100,8 @@ def test_drift():
 
 
 FUSION = dict(gate=3.0, max_gate_std=1.0, relief=0.0, scan_variance_floor=1e-9, outlier_variance=0.5, max_support=9)
-FUSION |= dict(max_variance=100.0, min_settled=1, edges=None)
-EDGES = dict(min_points=4, min_share=0.5, min_passed=0.5, refinements=2, margin=0.5)
+FUSION |= dict(max_variance=100.0, edges=None)
+EDGES = dict(min_points=4, min_share=0.5, min_passed=0.5, refinements=2, margin=0.5, min_extreme=2, min_settled=1)
 
 
 def cell(**values):
@@ -160,7 +160,7 @@ def test_fuse_cell_keeps_one_side_of_a_step():
 def test_a_settled_top_stands_though_a_scan_sees_less_of_the_face(settled, support):
     """Of 4 points, two on the face of a wall of 20 and two at its foot: none is against the top, or all are."""
     seen, top = points(0.0, 0.0, 10.0, 10.0, variance=0.01), cell(elevation=20.0, support=5)
-    after, used, _ = reference.fuse_cell(top, seen, 0.1, **(FUSION | dict(edges=EDGES, min_settled=settled)))
+    after, used, _ = reference.fuse_cell(top, seen, 0.1, **(FUSION | dict(edges=EDGES | dict(min_settled=settled))))
     assert (after["elevation"], after["support"], used) == (20.0, support, 0)
 
 

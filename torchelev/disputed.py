@@ -77,23 +77,27 @@ def step_heights(
     mean: Tensor,
     refinements: int,
     margin: float,
+    min_points: int,
 ) -> Tensor:
     """Return, as (5, B, C), what tells the ground from the top in each disputed cell.
 
     Its top and its bottom; which part of its low points lies `beyond` the centre; x and y of where its rays go.
     The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
-    top of a wall's face. The bottom takes two. Points up to `margin` standard deviations beyond the level count.
+    top of a wall's face. The bottom takes two. Up to `margin` standard deviations short of a level is beyond it.
+    A level that fewer than `min_points` reach, give or take a standard deviation, is an outlier's.
     """
     points = _Points(cells, slot, z, spread, weight, beyond, *ray)
     passed, *ray = points.others
     middle = mean.flatten().index_select(0, points.slot)
-    slack = margin * points.spread.sqrt()
+    noise = points.spread.sqrt()
 
     def level(side: float, rounds: int) -> Tensor:
         height = middle
         for _ in range(rounds):
-            counts = side * (points.z - height) >= -slack
-            height = points.moved(height, torch.where(counts, points.weight, 0.0))
+            beyond = side * (points.z - height) >= -margin * noise
+            further = points.moved(height, torch.where(beyond, points.weight, 0.0))
+            there = points.used & (side * (points.z - further) >= -noise)
+            height = torch.where(points.sum(there.to(height.dtype)) >= min_points, further, height)
         return height
 
     low = (points.used & (points.z < middle)).to(mean.dtype)
@@ -114,5 +118,6 @@ def _(
     mean: Tensor,
     refinements: int,
     margin: float,
+    min_points: int,
 ) -> Tensor:
     return mean.new_empty(5, *mean.shape)

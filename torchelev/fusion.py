@@ -28,8 +28,10 @@ class EdgeConfig:
     min_points: int = 6
     min_share: float = 0.25  # of the cell's points outside the gate around its estimate
     min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
+    min_extreme: int = 2  # points within a standard deviation of the top or bottom, or beyond; fewer are outliers
     refinements: int = 7  # each halves the distance to the top of a wall's face
     margin: float = 0.25  # standard deviations below the top that still belong to it
+    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +43,6 @@ class FusionConfig:
     relief: float = 0.25  # [cells] standard deviation of height within a cell of rough or sloped ground
     scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
     outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
-    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
     max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
     max_variance: float = 1.0  # [m^2]
     edges: EdgeConfig | None = EdgeConfig()
@@ -122,7 +123,8 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     information, moment, support, edge, agreeing = scan.sums(*columns)
     height = guess + ratio(moment, information)
     # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
-    lower_part = (side > 0) & (height < prior.elevation) & (prior.support >= cfg.min_settled)
+    settled = prior.support >= (cfg.edges.min_settled if cfg.edges is not None else 0.0)
+    lower_part = (side > 0) & (height < prior.elevation) & settled
     scanned = ScanOfCells(
         height=height,
         variance=(1.0 / torch.where(support > 0, information, 1.0)).clamp(min=cfg.scan_variance_floor),
@@ -215,7 +217,7 @@ def side_of_step(
     edges = cfg.edges
     assert edges is not None
     columns = (*scan.columns(), [part.detach() for part in scan.ray], as_bytes(scan.beyond))
-    found = step_heights(as_bytes(step), *columns, mean, edges.refinements, edges.margin)
+    found = step_heights(as_bytes(step), *columns, mean, edges.refinements, edges.margin, edges.min_extreme)
     top, bottom, passed_low, *ray = found.unbind(0)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
     scanned = neighbour_maximum(torch.where(number > 0, mean, -1e6), None, grid)
