@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import functools
 import io
 import pickle
 
@@ -426,7 +425,9 @@ def compile_with(monkeypatch):
     compiler = torch.compile
 
     def use(backend):
-        monkeypatch.setattr(torch, "compile", functools.partial(compiler, backend=backend))
+        monkeypatch.setattr(
+            torch, "compile", lambda f, fullgraph, options: compiler(f, fullgraph=fullgraph, backend=backend)
+        )
         compiled_update.cache_clear()
         torch._dynamo.reset()
 

@@ -16,8 +16,8 @@ PLACES = [(0.0, 0.0), (0.55, -0.33), (-1.93, 0.04), (-2.6, 0.3)]  # in the middl
 EVERY = RaycastConfig(min_time=0.5, min_incidence=0.0)  # no ray is too flat to clear
 
 
-def wide_map():
-    sensor = SensorConfig(exclusion=None, min_distance=0.0)
+def wide_map(noise=1e-6):
+    sensor = SensorConfig(exclusion=None, min_distance=0.0, noise_factor=0.0, noise_floor=noise**2)
     return small_map(1, CELLS, RESOLUTION, torch.float64, sensor=sensor, raycast=EVERY, overlap=None, drift=None)
 
 
@@ -181,6 +181,18 @@ def test_incidence_is_that_of_the_paper(slope, gradient):
     for threshold, number in ((incidence * 0.99, 1), (min(0.999, incidence * 1.01), 0)):
         after = cast(emap, state, hits, T, RaycastConfig(min_time=0.5, min_incidence=threshold))
         assert cleared(state, after) == number
+
+
+@pytest.mark.parametrize("noise, number", [(0.01, 1), (0.2, 0)])
+def test_a_ray_clears_no_farther_than_its_noise_allows(noise, number):
+    """Rays that pass below a cell and end two cells behind it: within their noise they may end in it."""
+    emap = wide_map(noise)
+    state = ghosts(emap)
+    height = torch.zeros_like(state.elevation)
+    height[0, 20, 15] = 3.0
+    T = pose((-1.95, 0.05, 1.0))
+    after = cast(emap, state._replace(elevation=height), np.repeat([[0.28, 0.05, 0.0]], 3, 0), T)
+    assert cleared(state._replace(elevation=height), after) == number
 
 
 def test_no_returns_change_nothing():

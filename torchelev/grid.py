@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.operators import as_bytes, cell_sums, moved, realize, realize_all
+from torchelev.operators import as_bytes, as_mask, cell_sums, moved, realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement
 
 if TYPE_CHECKING:
@@ -114,7 +114,10 @@ def gathered(layers: list[Tensor], shift: Int[Tensor, "B 2"], blanks: list[float
     entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
     index = (i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)).flatten(1)
     values = [layer.flatten(1).gather(1, index).view_as(layer) for layer in realize_all(*layers)]
-    return realize_all(*(torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)))
+    blanked = (
+        torch.where(entering, torch.full_like(value, blank), value) for value, blank in zip(values, blanks, strict=True)
+    )
+    return realize_all(*blanked)
 
 
 def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
@@ -136,7 +139,7 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     # Copying has no gradient, and the host must know the shifts; gathering takes 8 times as long on a CPU.
     few = shift.shape[0] <= 4 and shift.device.type == "cpu" and not torch.is_grad_enabled()
     values = moved(layers, shift, blanks) if few else gathered(layers, shift, blanks, grid)
-    values = [value != 0 if mask else value for value, mask in zip(values, masks, strict=True)]
+    values = [as_mask(value) if mask else value for value, mask in zip(values, masks, strict=True)]
     fields: dict[str, Any] = dict(zip(names, values, strict=True))
     return state._replace(corner=corner, base_height=m.base[:, 2], **fields)
 

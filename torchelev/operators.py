@@ -43,7 +43,7 @@ def realize_all(*values: Tensor) -> list[Tensor]:
     masks = [value.dtype == torch.bool for value in values]
     plain = [as_bytes(value) if mask else value for value, mask in zip(values, masks, strict=True)]
     stored = _realize(plain) if torch.is_grad_enabled() else [_in_memory(value) for value in plain]
-    return [value != 0 if mask else value for value, mask in zip(stored, masks, strict=True)]
+    return [as_mask(value) if mask else value for value, mask in zip(stored, masks, strict=True)]
 
 
 def _in_memory(value: Tensor) -> Tensor:
@@ -56,6 +56,11 @@ def _in_memory(value: Tensor) -> Tensor:
 def as_bytes(mask: Tensor) -> Tensor:
     """Return a mask as 0 and 1 in uint8. Compiled code stores bytes eight times as fast as booleans on a CPU."""
     return torch.where(mask, 1, 0).to(torch.uint8) if torch.compiler.is_compiling() else mask.view(torch.uint8)
+
+
+def as_mask(stored: Tensor) -> Tensor:
+    """Return what `as_bytes` stored. Compiled code compares integers eight times as fast as bytes."""
+    return stored.to(torch.int32) > 0 if torch.compiler.is_compiling() else stored.view(torch.bool)
 
 
 @torch.library.custom_op("torchelev::moved", mutates_args=())

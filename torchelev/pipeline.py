@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+import torch._inductor.config
 from torch import Tensor
 
 from torchelev.aging import age
@@ -14,7 +15,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.drift import compensate
 from torchelev.fusion import fuse
 from torchelev.grid import recenter
-from torchelev.operators import as_bytes
+from torchelev.operators import as_bytes, as_mask
 from torchelev.overlap import clear_other_floors
 from torchelev.raycast import clear_seen_through
 from torchelev.sensor import measure
@@ -67,6 +68,12 @@ def with_masks(state: MapState, convert: Callable[[Tensor], Tensor]) -> MapState
     return state._replace(validity=convert(state.validity), bounded=convert(state.bounded))
 
 
+def compiled_options() -> dict[str, Any]:
+    """Return what keeps the loops over points vectorised: the compiler gives up on many gathers, which pay off here."""
+    heuristics = hasattr(torch._inductor.config.cpp, "enable_tiling_heuristics")  # later torch
+    return {"cpp.enable_tiling_heuristics": False} if heuristics else {}
+
+
 @functools.cache
 def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
     """Return the compiled update of a config; equal configs share one graph, whatever the number of points."""
@@ -74,9 +81,9 @@ def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
 
     def bytewise(state: MapState, *others: Any) -> MapState:
         """Update; masks come and go as bytes, see `as_bytes`."""
-        return with_masks(plain(with_masks(state, lambda mask: mask != 0), *others), as_bytes)
+        return with_masks(plain(with_masks(state, as_mask), *others), as_bytes)
 
-    graph = torch.compile(bytewise, fullgraph=True)
+    graph = torch.compile(bytewise, fullgraph=True, options=compiled_options())
 
     def run(state: MapState, points: Tensor, *others: Any) -> MapState:
         if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
@@ -84,7 +91,7 @@ def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
         for values in (points, others[-1]):
             if values is not None:
                 torch._dynamo.maybe_mark_dynamic(values, 2)
-        state = graph(with_masks(state, lambda mask: mask.view(torch.uint8)), points, *others)
-        return with_masks(state, lambda mask: mask.view(torch.bool))
+        state = graph(with_masks(state, as_bytes), points, *others)
+        return with_masks(state, as_mask)
 
     return run
