@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import signal
 import sys
 import threading
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from torchelev import __version__
 from torchelev.io import MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
+from torchelev.io.config_file import load_config
 from torchelev.io.report import hints, summary, warnings
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
 BAD_INPUT, INTERRUPTED = 2, 130
-RESOLUTION, SIZE = 0.1, 20.0  # [m]
-MAX_CELLS = 16_000_000  # an update takes about 350 bytes of memory per cell
 
 MAP_HELP = """Map RECORDING, a folder of scans with poses, and write the map.
 
@@ -114,6 +112,7 @@ def main() -> None:
 @click.option("--poses-of", type=click.Choice(["sensor", "base"]), default="sensor", show_default=True,
               help="Whose poses the file has; 'base' needs --extrinsics.")  # fmt: skip
 def map_command(**options: Any) -> None:
+    """Map, and turn what went wrong into one line and an exit code."""
     try:
         code = run_map(**options)
     except ModuleNotFoundError as error:
@@ -169,52 +168,6 @@ def check_options(mount: NDArray | None, sensor_height: float | None, poses_of: 
         raise ValueError(f"--sensor-height: must be metres, got {sensor_height}")
     if dt is not None and not (math.isfinite(dt) and dt >= 0):
         raise ValueError(f"--dt: must be a time in seconds of 0 or more, got {dt}")
-
-
-def load_config(path: Path | None, resolution: float | None, size: float | None) -> ElevationMapConfig:
-    """Settings of the YAML at `path`, with the command line's resolution and size [m] over them."""
-    from torchelev.config import ElevationMapConfig
-
-    values = {} if path is None else _read_yaml(path)
-    grid = values.get("grid") or {}
-    if not isinstance(grid, dict):
-        raise ValueError(f"{path}: config.grid must be a mapping; see ElevationMapConfig")
-    try:
-        return ElevationMapConfig.from_dict({**values, "grid": _grid(grid, resolution, size)})
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path or 'command line'}: {error}") from error
-
-
-def _grid(grid: dict, resolution: float | None, size: float | None) -> dict:
-    """The grid's settings, lengths rounded up to whole cells where they are not the config's own."""
-    cell = resolution if resolution is not None else grid.get("resolution", RESOLUTION)
-    lengths = {name: grid.get(name, SIZE) if size is None else size for name in ("length_x", "length_y")}
-    numbers = all(isinstance(v, int | float) and math.isfinite(v) and v > 0 for v in (cell, *lengths.values()))
-    if not numbers:
-        raise ValueError(f"resolution and size must be positive metres, got {cell} and {[*lengths.values()]}")
-    cells = math.prod(length / cell for length in lengths.values())
-    if cells > MAX_CELLS:
-        raise ValueError(f"a map of {cells:,.0f} cells is too large; give a smaller --size or a coarser --resolution")
-    whole = {name: cell * math.ceil(length / cell - 1e-6) for name, length in lengths.items()}
-    own = {} if resolution is not None or size is not None else grid
-    return {**grid, "resolution": cell, **whole, **own}
-
-
-def _read_yaml(path: Path) -> dict:
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """YAML 1.1 takes 1e-4 for text, for want of a point."""
-
-    number = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
-    try:
-        values = yaml.load(path.read_text(encoding="utf-8"), Loader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: cannot be read as YAML ({error})") from error
-    if not isinstance(values, dict | None):
-        raise ValueError(f"{path}: expected settings by stage, such as 'grid: {{resolution: 0.1}}'")
-    return values or {}
 
 
 def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> ElevationMap:

@@ -32,6 +32,7 @@ def read_cloud(path: str | Path) -> NDArray[np.float32]:
 
 
 def known_formats() -> str:
+    """Name the suffixes of the clouds that can be read."""
     return " ".join(sorted(CLOUD_READERS))
 
 

@@ -94,7 +94,9 @@ def find_scans(folder: Path, depth: bool = False) -> list[Path]:
         if place == folder:
             _refuse_unreadable(files, depth)
     wanted = "depth .png" if depth else known_formats()
-    raise RecordingError(folder, "holds no scan", f"expected files of one format among {wanted}")
+    found = sorted({path.suffix or path.name for path in folder.rglob("*") if path.is_file()})
+    problem = f"holds no scan, only {' '.join(found[:8])}" if found else "holds no scan"
+    raise RecordingError(folder, problem, f"expected files of one format among {wanted}")
 
 
 def _subfolders(folder: Path, depth: bool) -> list[Path]:

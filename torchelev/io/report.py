@@ -49,8 +49,11 @@ def warnings(run: MappingRun) -> list[str]:
     if used < 0.01 * run.num_points or used == 0:
         few = "no point" if used == 0 else f"only {used:,} of {run.num_points:,} points"
         return [f"{few} fell into the map: check that poses take sensor points into a z-up map frame"]
-    if not bool(run.emap.layer("validity")[0].any()):
+    coverage = float(run.emap.layer("validity")[0].mean())
+    if coverage == 0:
         return ["every cell was cleared again: check --sensor-height or --extrinsics, and overlap in the config"]
+    if coverage < 1e-3:
+        return [f"only {100 * coverage:.2g} % of the window is known: check the poses, and --size and --resolution"]
     return []
 
 
