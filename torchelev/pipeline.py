@@ -68,7 +68,7 @@ def with_masks(state: MapState, convert: Callable[[Tensor], Tensor]) -> MapState
     return state._replace(validity=convert(state.validity), bounded=convert(state.bounded))
 
 
-def compiled_options() -> dict[str, Any]:
+def compiler_options() -> dict[str, Any]:
     """Return what keeps the loops over points vectorised: the compiler gives up on many gathers, which pay off here."""
     heuristics = hasattr(torch._inductor.config.cpp, "enable_tiling_heuristics")  # later torch
     return {"cpp.enable_tiling_heuristics": False} if heuristics else {}
@@ -83,7 +83,7 @@ def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
         """Update; masks come and go as bytes, see `as_bytes`."""
         return with_masks(plain(with_masks(state, as_mask), *others), as_bytes)
 
-    graph = torch.compile(bytewise, fullgraph=True, options=compiled_options())
+    graph = torch.compile(bytewise, fullgraph=True, options=compiler_options())
 
     def run(state: MapState, points: Tensor, *others: Any) -> MapState:
         if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
