@@ -31,6 +31,7 @@ bench: setup  ## measure: accuracy, features, the paper's tables
 	$(BIN)/python -m benchmarks.accuracy
 	$(BIN)/python -m benchmarks.features
 	$(BIN)/python -m benchmarks.paper_tables
+	$(BIN)/python -m benchmarks.readme
 
 clean:  ## remove what the targets made
 	rm -rf $(VENV) demo.png

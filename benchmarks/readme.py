@@ -1,0 +1,84 @@
+"""Write the README's tables from the results, so that no number stands there without its run.
+
+    python -m benchmarks.readme
+
+Each table stands between <!-- name --> and <!-- end -->.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from benchmarks.paper_tables import SENSORS
+from benchmarks.report import markdown_table
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
+
+
+def load(name: str) -> dict[str, Any]:
+    """Read a result."""
+    return json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def accuracy() -> str:
+    """Tabulate map / mean [mm] by scene, and count the cases that hold."""
+    rows = load("accuracy")["rows"]
+    cells = {(r["scene"], f"{r['motion']} {r['noise']}"): f"{r['rmse']:.1f} / {r['rmse_mean']:.1f}" for r in rows}
+    scenes = list(dict.fromkeys(r["scene"] for r in rows))
+    table = markdown_table(["scene", *SHOWN], [[scene, *(cells[scene, case] for case in SHOWN)] for scene in scenes])
+    failed = [f"*{r['scene']} {r['motion']} {r['noise']}*" for r in rows if not r["holds"]]
+    verdict = f"not {', '.join(failed)}" if failed else "all of them"
+    return f"{table}\n\n{len(rows) - len(failed)} of {len(rows)} cases hold their bars: {verdict}."
+
+
+def features() -> str:
+    """Tabulate the figures that have a bar."""
+    rows = [list(r.values()) for r in load("features")["rows"] if r["bar"]]
+    return markdown_table(["feature", "figure", "on", "off", "baseline", "bar", ""], rows)
+
+
+def real() -> str:
+    """Tabulate held-out errors on flat cells."""
+    head = ["recording", "cell", "method", "median", "p90", "coverage", "ms / scan"]
+    rows = []
+    for r in load("real")["rows"]:
+        errors = [f"{100 * r[name]:.1f} cm" for name in ("flat_median_m", "flat_p90_m")]
+        time = f"{r['ms_per_scan']:.0f}" if r.get("ms_per_scan") else ""
+        cell = f"{100 * r['resolution_m']:.0f} cm"
+        rows.append([r["recording"], cell, r["method"], *errors, f"{100 * r['coverage']:.1f} %", time])
+    return markdown_table(head, rows)
+
+
+def speed() -> str:
+    """Tabulate times by sensor, and say whether they meet their targets."""
+    result = load("paper_tables")
+    times = {kind: {r["points"]: r["median"] for r in result[kind]} for kind in ("all_stages", "plain_baseline")}
+    rows = []
+    for name, points, paper, _ in SENSORS:
+        full, plain = times["all_stages"][points], times["plain_baseline"][points]
+        rows.append([name, f"{points:,}", f"{full:.1f} ms", f"{plain:.1f} ms", f"{1000 / full:.0f}", str(paper)])
+    head = ["the paper's sensor", "points", "all stages", "plain baseline", "Hz here", "Hz there, Jetson Xavier GPU"]
+    eager = f"Eager: {result['eager_43074']['median']:.0f} ms at 43,074 points."
+    return f"{markdown_table(head, rows)}\n\n{eager}"
+
+
+TABLES = {"accuracy": accuracy, "features": features, "real": real, "speed": speed}
+
+
+def with_tables(text: str) -> str:
+    """Return the README with its tables made anew."""
+    for name, table in TABLES.items():
+        pattern = rf"(<!-- {name} -->\n).*?(\n<!-- end -->)"
+        text, count = re.subn(pattern, lambda m, t=table: m[1] + t() + m[2], text, flags=re.DOTALL)
+        assert count == 1, f"README.md must hold <!-- {name} --> ... <!-- end --> once"
+    return text
+
+
+if __name__ == "__main__":
+    readme = ROOT / "README.md"
+    readme.write_text(with_tables(readme.read_text()))
