@@ -22,9 +22,9 @@ from torch.utils._pytree import tree_map
 
 from benchmarks.report import markdown_table, write_json
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig
-from torchelev.operators import as_bytes, as_mask
 from torchelev.pipeline import compiler_options
 from torchelev.state import MapState, Measurement
+from torchelev.storage import as_bytes, as_mask
 
 # The paper's Table II: sensor, points, its map update rate on a Jetson Xavier [Hz], the sensor's rate [Hz].
 SENSORS = [

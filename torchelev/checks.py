@@ -82,13 +82,13 @@ def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype
         require(fits, "dt", f"expected a number or ({num_envs},)", tuple(value.shape), "give one dt per environment")
         if readable(value, always):
             good = bool(torch.isfinite(value).all()) and bool((value >= 0).all())
-            require(good, "dt", "must not be negative", value.tolist(), "give seconds since the last update")
+            require(good, "dt", "must be finite and not negative", value.tolist(), "give seconds since the last update")
         return value.to(dtype).expand(num_envs)
     number = isinstance(dt, int | float) and not isinstance(dt, bool)
     require(number, "dt", "must be a number or a tensor", type(dt).__name__, "give seconds", TypeError)
     assert isinstance(dt, int | float)
     good = math.isfinite(dt) and dt >= 0
-    require(good, "dt", "must not be negative", dt, "give seconds since the last update")
+    require(good, "dt", "must be finite and not negative", dt, "give seconds since the last update")
     return torch.full((num_envs,), float(dt), device=device, dtype=dtype)
 
 

@@ -30,8 +30,8 @@ class _Points:
         self._sums.index_fill_(0, self.slot, 0.0).scatter_add_(0, self.slot, values)
         return self._sums.index_select(0, self.slot)
 
-    def moved(self, height: Tensor, weight: Tensor) -> Tensor:
-        """Move the points' heights to their cells' means under other weights; where there are none, nowhere."""
+    def at_mean(self, height: Tensor, weight: Tensor) -> Tensor:
+        """Move the points' heights to their cells' means under these weights; where there are none, nowhere."""
         total, moment = self.sum(weight), self.sum(weight * (self.z - height))
         return height + moment / torch.where(total > 0, total, 1.0)
 
@@ -55,7 +55,7 @@ def robust_mean(
     height = mean.flatten().index_select(0, points.slot)
     for _ in range(2):
         square = (points.z - height).square()
-        height = points.moved(height, points.weight / (1.0 + square / points.spread).square())
+        height = points.at_mean(height, points.weight / (1.0 + square / points.spread).square())
     near = points.used & ((points.z - height).square() <= gate**2 * points.spread)
     return points.of_cells(height, points.sum(near.to(mean.dtype)), like=mean)
 
@@ -65,7 +65,12 @@ def _(cells: Tensor, slot: Tensor, z: Tensor, spread: Tensor, weight: Tensor, me
     return mean.new_empty(2, *mean.shape)
 
 
-@torch.library.custom_op("torchelev::step_heights", mutates_args=())
+@torch.library.custom_op(
+    "torchelev::step_heights",
+    mutates_args=(),
+    schema="(Tensor cells, Tensor slot, Tensor z, Tensor spread, Tensor weight, Tensor[] ray, Tensor passed, "
+    "Tensor mean, SymInt refinements, float margin, SymInt min_points) -> Tensor",
+)
 def step_heights(
     cells: Tensor,
     slot: Tensor,
@@ -73,7 +78,7 @@ def step_heights(
     spread: Tensor,
     weight: Tensor,
     ray: list[Tensor],
-    beyond: Tensor,
+    passed: Tensor,
     mean: Tensor,
     refinements: int,
     margin: float,
@@ -81,12 +86,12 @@ def step_heights(
 ) -> Tensor:
     """Return, as (5, B, C), what tells the ground from the top in each disputed cell.
 
-    Its top and its bottom; which part of its low points lies `beyond` the centre; x and y of where its rays go.
+    Its top and its bottom; which part of its low points has `passed` the centre; x and y of where its rays go.
     The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
-    top of a wall's face. The bottom takes two. Up to `margin` standard deviations short of a level is beyond it.
+    top of a wall's face. The bottom takes two. Up to `margin` standard deviations short of a level lies past it.
     A level that fewer than `min_points` reach, give or take a standard deviation, is an outlier's.
     """
-    points = _Points(cells, slot, z, spread, weight, beyond, *ray)
+    points = _Points(cells, slot, z, spread, weight, passed, *ray)
     passed, *ray = points.others
     middle = mean.flatten().index_select(0, points.slot)
     noise = points.spread.sqrt()
@@ -94,8 +99,8 @@ def step_heights(
     def level(side: float, rounds: int) -> Tensor:
         height = middle
         for _ in range(rounds):
-            beyond = side * (points.z - height) >= -margin * noise
-            further = points.moved(height, torch.where(beyond, points.weight, 0.0))
+            outer = side * (points.z - height) >= -margin * noise
+            further = points.at_mean(height, torch.where(outer, points.weight, 0.0))
             there = points.used & (side * (points.z - further) >= -noise)
             height = torch.where(points.sum(there.to(height.dtype)) >= min_points, further, height)
         return height
@@ -114,7 +119,7 @@ def _(
     spread: Tensor,
     weight: Tensor,
     ray: list[Tensor],
-    beyond: Tensor,
+    passed: Tensor,
     mean: Tensor,
     refinements: int,
     margin: float,

@@ -40,7 +40,8 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig) -> MapState:
     """Add the mean height error over certain, flat cells to elevation and upper bound (paper, Sec. II-D).
 
-    e = (1 / n) * sum (p_z - h) over points whose cell is known, traversable and certain, |p_z - h| <= max_error.
+    e = (1 / n) * sum (p_z - h), h the height at the point of its cell's plane, over points whose cell is known,
+    traversable and certain, with |p_z - h| <= max_error and then within `gate` standard deviations of their mean.
     Corrected by gain * e where n >= min_points and |e| <= max_drift.
     """
     px, py, pz = m.points.unbind(-1)

@@ -2,36 +2,21 @@
 
 from __future__ import annotations
 
-import functools
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.disputed import robust_mean, step_heights
+from torchelev.disputed import robust_mean
+from torchelev.edges import EdgeConfig, side_of_step
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
-from torchelev.operators import as_bytes, realize, realize_all
 from torchelev.state import BLANK, MapState, Measurement, count, tally
-from torchelev.windows import AROUND, neighbours
+from torchelev.storage import as_bytes, realize_all
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-
-@dataclass(frozen=True, kw_only=True)
-class EdgeConfig:
-    """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
-
-    min_points: int = 6
-    min_share: float = 0.25  # of the cell's points outside the gate around its estimate
-    min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
-    min_extreme: int = 2  # points within a standard deviation of the top or bottom, or beyond; fewer are outliers
-    refinements: int = 7  # each halves the distance to the top of a wall's face
-    margin: float = 0.25  # standard deviations below the top that still belong to it
-    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +47,7 @@ class Scan(NamedTuple):
     weight: Float[Tensor, "B M"]  # 1 / sigma_p^2, zero where not used
     used: Bool[Tensor, "B M"]
     ray: list[Float[Tensor, "B M"]]  # [m] x and y from the sensor to the point
-    beyond: Bool[Tensor, "B M"]  # the ray passed over the cell's centre before it hit
+    passed: Bool[Tensor, "B M"]  # the ray passed over the cell's centre before it hit
     cells: PointCells
 
     def sums(self, *columns: Tensor) -> tuple[Tensor, ...]:
@@ -89,7 +74,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
 
     Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of
     the cell's elevation where most agree with it, else those around the scan's own robust mean. In cells that hold a
-    step, `side_of_step` drops the points of the wrong side. The points kept have the information sum
+    step, `edges.side_of_step` drops the points of the wrong side. The points kept have the information sum
     1 / R = sum 1 / sigma_p^2 with a floor on R, because the points of one scan share the error of its pose.
     Equations (1) and (2), in information form and so in no order:
 
@@ -100,42 +85,10 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     variance, as in the paper, and founds the cell anew once the votes are used up.
     """
     scan, prior = gather_scan(state, m, grid, cfg), gather_prior(state, cfg)
-    elevation_at, variance_at = scan.cells.take(prior.elevation, prior.gate_variance)
-    near = agrees(scan, elevation_at, variance_at, cfg)
-    number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
-    mean = ratio(moment, weight).detach()
-    trusted = prior.known & (2 * agreeing >= number)
-    untrusted = as_bytes(~trusted & (number > 0))
-    robust, robustly = robust_mean(untrusted, *scan.columns(), mean, cfg.gate).unbind(0)
-    guess = torch.where(trusted, prior.elevation, robust).detach()
-    gate = torch.where(trusted, prior.gate_variance, 0.0)
-    side = torch.zeros_like(guess)
-    if cfg.edges is not None:
-        far = number - torch.where(trusted, agreeing, robustly)
-        step = (number >= cfg.edges.min_points) & (far >= cfg.edges.min_share * number)
-        side, guess = side_of_step(scan, prior, step, guess, mean, number, grid, cfg)
-    guess_at, gate_at, side_at = scan.cells.take(guess, gate, side)
-    kept, ignored = on_side(scan, guess_at, gate_at, side_at, cfg)
-
-    weight = torch.where(kept, scan.weight, 0.0)
-    # Around the guess, so that float32 keeps millimetres at any altitude.
-    columns = (weight, weight * (scan.z - guess_at), kept, ignored, near & ~ignored)
-    information, moment, support, edge, agreeing = scan.sums(*columns)
-    height = guess + ratio(moment, information)
-    # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
-    settled = prior.support >= (cfg.edges.min_settled if cfg.edges is not None else 0.0)
-    lower_part = (side > 0) & (height < prior.elevation) & settled
-    scanned = ScanOfCells(
-        height=height,
-        variance=(1.0 / torch.where(support > 0, information, 1.0)).clamp(min=cfg.scan_variance_floor),
-        kept=support,
-        # Points on the face of a wall speak for its top.
-        votes=support + edge,
-        dissent=number - support - edge,
-        agreeing=torch.where(lower_part, support + edge, agreeing),
-    )
+    guess = guess_heights(scan, prior, grid, cfg)
+    scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
     state, taken = merge(state, prior, scanned, grid, cfg)
-    points_used = torch.where(taken, support, 0.0).sum(1).to(torch.int64)
+    points_used = torch.where(taken, scanned.kept, 0.0).sum(1).to(torch.int64)
     return tally(
         state,
         points_used=points_used,
@@ -143,6 +96,61 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
         rejected_edge=count(ignored),
         rejected_outlier=count(scan.used) - count(ignored) - points_used,
     )
+
+
+class Guess(NamedTuple):
+    """What a cell's height is about, before the points that count are chosen. Without a gradient."""
+
+    height: Float[Tensor, "B C"]  # [m]
+    gate_variance: Float[Tensor, "B C"]  # [m^2] of the height; zero where the scan's own points give it
+    side: Float[Tensor, "B C"]  # of a step: +1 top, -1 ground, 0 no step
+    number: Float[Tensor, "B C"]  # of the scan's points
+    near: Bool[Tensor, "B M"]  # points that agree with the cell's elevation
+
+
+def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Guess:
+    """Trust a cell's elevation where most points agree with it, else the robust mean, and at a step one of its ends."""
+    elevation_at, variance_at = scan.cells.take(prior.elevation, prior.gate_variance)
+    near = agrees(scan, elevation_at, variance_at, cfg)
+    number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
+    mean = ratio(moment, weight).detach()
+    trusted = prior.known & (2 * agreeing >= number)
+    untrusted = as_bytes(~trusted & (number > 0))
+    robust, robustly = robust_mean(untrusted, *scan.columns(), mean, cfg.gate).unbind(0)
+    height = torch.where(trusted, prior.elevation, robust).detach()
+    gate_variance = torch.where(trusted, prior.gate_variance, 0.0)
+    side = torch.zeros_like(height)
+    if cfg.edges is not None:
+        far = number - torch.where(trusted, agreeing, robustly)
+        step = (number >= cfg.edges.min_points) & (far >= cfg.edges.min_share * number)
+        side, end = side_of_step(scan, prior, step, mean, number, grid, cfg)
+        height = torch.where(step, end, height)
+    return Guess(height, gate_variance, side, number, near)
+
+
+def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> tuple[ScanOfCells, Tensor]:
+    """Average the points that lie within the gate around the guess and on its side; tell which the side ignores."""
+    height_at, gate_at, side_at = scan.cells.take(guess.height, guess.gate_variance, guess.side)
+    kept, ignored = on_side(scan, height_at, gate_at, side_at, cfg)
+    weight = torch.where(kept, scan.weight, 0.0)
+    # Around the guess, so that float32 keeps millimetres at any altitude.
+    columns = (weight, weight * (scan.z - height_at), kept, ignored, guess.near & ~ignored)
+    information, moment, kept_number, edge, agreeing = scan.sums(*columns)
+    height = guess.height + ratio(moment, information)
+    # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
+    settled = prior.support >= (cfg.edges.min_settled if cfg.edges is not None else 0.0)
+    lower_part = (guess.side > 0) & (height < prior.elevation) & settled
+    # Points on the face of a wall speak for its top.
+    votes = kept_number + edge
+    cells = ScanOfCells(
+        height=height,
+        variance=(1.0 / torch.where(kept_number > 0, information, 1.0)).clamp(min=cfg.scan_variance_floor),
+        kept=kept_number,
+        votes=votes,
+        dissent=guess.number - votes,
+        agreeing=torch.where(lower_part, votes, agreeing),
+    )
+    return cells, ignored
 
 
 def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -> Scan:
@@ -159,7 +167,7 @@ def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionCo
         weight=torch.where(used, 1.0 / m.variance, 0.0),
         used=used,
         ray=list(ray.unbind(-1)),
-        beyond=passed_center(from_center, ray),
+        passed=passed_center(from_center, ray),
         cells=cells,
     )
 
@@ -180,8 +188,7 @@ def gather_prior(state: MapState, cfg: FusionConfig) -> Prior:
     return Prior(
         elevation=state.elevation.flatten(1),
         variance=torch.where(known, variance, 1.0),
-        # Nothing agrees with an unknown cell.
-        gate_variance=torch.where(known, variance.clamp(max=cfg.max_gate_std**2), -1e3).detach(),
+        gate_variance=variance.clamp(max=cfg.max_gate_std**2).detach(),
         known=known,
         support=state.support.flatten(1),
     )
@@ -195,54 +202,6 @@ def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> T
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
     """Divide; zero where there is nothing to divide by."""
     return numerator / torch.where(denominator > 0, denominator, 1.0)
-
-
-def side_of_step(
-    scan: Scan,
-    prior: Prior,
-    step: Tensor,
-    guess: Tensor,
-    mean: Tensor,
-    number: Tensor,
-    grid: GridConfig,
-    cfg: FusionConfig,
-) -> tuple[Tensor, Tensor]:
-    """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
-
-    The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
-    where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
-    what lies at the centre, and points above are ignored. Returns the side (B, C), +1 top, -1 ground and 0 no step,
-    and the guess, moved to that side.
-    """
-    edges = cfg.edges
-    assert edges is not None
-    columns = (*scan.columns(), [part.detach() for part in scan.ray], as_bytes(scan.beyond))
-    found = step_heights(as_bytes(step), *columns, mean, edges.refinements, edges.margin, edges.min_extreme)
-    top, bottom, passed_low, *ray = found.unbind(0)
-    # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
-    scanned = neighbour_maximum(torch.where(number > 0, mean, -1e6), None, grid)
-    mapped = neighbour_maximum(torch.where(prior.known, prior.elevation, -1e6), ray, grid)
-    elsewhere = (scanned >= 0.5 * (mean + top)) | (mapped >= top - cfg.relief * grid.resolution)
-    ground = step & elsewhere & (passed_low > edges.min_passed)
-    guess = torch.where(step, torch.where(ground, bottom, top), guess)
-    return torch.where(step, torch.where(ground, -1.0, 1.0), 0.0), guess.detach()
-
-
-def neighbour_maximum(
-    cells: Float[Tensor, "B C"], ray: list[Float[Tensor, "B C"]] | None, grid: GridConfig
-) -> Float[Tensor, "B C"]:
-    """Return the highest value of the neighbours of each cell; given rays, of those within 50 degrees behind it.
-
-    Beside it along a wall lie cells that show the wall's face too, and the wall would end as every other cell's.
-    """
-    shape = (grid.height, grid.width)
-    heights = neighbours(cells.detach().unflatten(1, shape), -1e6)
-    if ray is not None:
-        x, y = (part.unflatten(1, shape) for part in ray)
-        limit = math.cos(math.radians(50)) * (x.square() + y.square()).sqrt()
-        behind = [i * x + j * y > math.hypot(i, j) * limit for i, j in AROUND]
-        heights = [torch.where(mask, height, -1e6) for mask, height in zip(behind, heights, strict=True)]
-    return realize(functools.reduce(torch.maximum, heights)).flatten(1)
 
 
 def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.operators import as_bytes, as_mask, cell_sums, moved, realize, realize_all
+from torchelev.operators import cell_sums, moved
 from torchelev.state import BLANK, MapState, Measurement
+from torchelev.storage import as_bytes, as_mask, realize, realize_all
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -86,12 +87,14 @@ def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig)
 
     x and y count from a lattice corner that lies at `offset` in the window. Outside, the number is 0.
     """
-    first = torch.round(offset / grid.resolution).view(2 * offset.shape[0], *[1] * (x.ndim - 1)).unflatten(0, (-1, 2))
+    first = torch.round(offset / grid.resolution).view(-1, 2, *[1] * (x.ndim - 1))
     # Divide before adding whole cells: the result is then the same wherever the window is.
     i = torch.floor(x / grid.resolution) + first[:, 0]
     j = torch.floor(y / grid.resolution) + first[:, 1]
     inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
-    return torch.where(inside, i * grid.width + j, 0.0).to(torch.int64), inside
+    # In integers: float32 counts no farther than 2^24 cells.
+    i, j = (torch.where(inside, k, 0.0).to(torch.int32) for k in (i, j))
+    return (i * grid.width + j).to(torch.int64), inside
 
 
 def cells_of(m: Measurement, offset: Float[Tensor, "B 2"], grid: GridConfig) -> PointCells:

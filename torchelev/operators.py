@@ -1,8 +1,7 @@
-"""The few operations that the compiler makes slower: sums per cell, borders, running minima.
+"""Operations that the compiler makes 5 to 30 times slower on a CPU: as custom operators they stay as they are.
 
-It would turn the first into atomic additions, test at every read whether it lies outside, and compute every term of a
-running minimum again for every reader, 5 to 30 times slower on a CPU. As custom operators they stay plain in eager and
-compiled code.
+It would turn sums per cell into atomic additions, test at every read of a border whether it lies outside, gather where
+a window could be copied, and compute every term of a running minimum again for every reader.
 """
 
 from __future__ import annotations
@@ -12,58 +11,11 @@ import itertools
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch._inductor import inductor_prims
 
 
-@torch.library.custom_op("torchelev::realize", mutates_args=())
-def _realize(values: list[Tensor]) -> list[Tensor]:
-    return [value.clone() for value in values]
-
-
-@_realize.register_fake
-def _(values: list[Tensor]) -> list[Tensor]:
-    return [torch.empty_like(value) for value in values]
-
-
-_realize.register_autograd(lambda ctx, grads: (grads,))
-
-
-def realize(value: Tensor) -> Tensor:
-    """Make the compiler store the values. It would otherwise compute them anew wherever they are read."""
-    return realize_all(value)[0]
-
-
-def realize_all(*values: Tensor) -> list[Tensor]:
-    """Make the compiler store these values, masks as bytes; eager code does so anyway.
-
-    A demand for a memory layout does it at no cost but has no gradient; where one is wanted, the values are copied.
-    """
-    if not torch.compiler.is_compiling():
-        return list(values)
-    masks = [value.dtype == torch.bool for value in values]
-    plain = [as_bytes(value) if mask else value for value, mask in zip(values, masks, strict=True)]
-    stored = _realize(plain) if torch.is_grad_enabled() else [_in_memory(value) for value in plain]
-    return [as_mask(value) if mask else value for value, mask in zip(stored, masks, strict=True)]
-
-
-def _in_memory(value: Tensor) -> Tensor:
-    strides = [1]
-    for size in reversed(value.shape[1:]):
-        strides.insert(0, strides[0] * size)
-    return inductor_prims.force_stride_order(value, strides[-value.ndim :])
-
-
-def as_bytes(mask: Tensor) -> Tensor:
-    """Return a mask as 0 and 1 in uint8. Compiled code stores bytes eight times as fast as booleans on a CPU."""
-    return torch.where(mask, 1, 0).to(torch.uint8) if torch.compiler.is_compiling() else mask.view(torch.uint8)
-
-
-def as_mask(stored: Tensor) -> Tensor:
-    """Return what `as_bytes` stored. Compiled code compares integers eight times as fast as bytes."""
-    return stored.to(torch.int32) > 0 if torch.compiler.is_compiling() else stored.view(torch.bool)
-
-
-@torch.library.custom_op("torchelev::moved", mutates_args=())
+@torch.library.custom_op(
+    "torchelev::moved", mutates_args=(), schema="(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]"
+)
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
     results = [torch.full_like(layer, blank) for layer, blank in zip(layers, blanks, strict=True)]
@@ -164,7 +116,11 @@ def _(table: Tensor, from_end: bool) -> Tensor:
     return torch.empty_like(table)
 
 
-@torch.library.custom_op("torchelev::polar_minimum", mutates_args=())
+@torch.library.custom_op(
+    "torchelev::polar_minimum",
+    mutates_args=(),
+    schema="(Tensor index, Tensor values, SymInt azimuths, SymInt[] widen, SymInt ranges, float blank) -> Tensor",
+)
 def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
     """Return the table (B, R, azimuths) of the lowest value at or beyond each range and near each azimuth.
 
@@ -172,10 +128,10 @@ def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int]
     `widen` makes an entry of the first widen[w] ranges the minimum of twice as many azimuths, itself the first of
     them. Row `ranges` and what follows it, R being a multiple of 8, are blank, for what lies out of reach.
     """
-    rows = _table_rows(ranges)
-    table = values.new_full((index.shape[0], rows * azimuths), blank)
+    size = _table_rows(ranges)
+    table = values.new_full((index.shape[0], size * azimuths), blank)
     table.scatter_reduce_(1, index, values, "amin")
-    table = table.unflatten(1, (rows, azimuths))
+    table = table.unflatten(1, (size, azimuths))
     table[:, ranges] = blank
     _scan(table, from_end=True)
     for level, rows in enumerate(widen):

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets
-from torchelev.operators import realize_all
 from torchelev.state import MapState, Measurement, count, tally
+from torchelev.storage import realize_all
 
 
 @dataclass(frozen=True, kw_only=True)

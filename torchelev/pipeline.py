@@ -15,17 +15,17 @@ from torchelev.config import ElevationMapConfig
 from torchelev.drift import compensate
 from torchelev.fusion import fuse
 from torchelev.grid import recenter
-from torchelev.operators import as_bytes, as_mask
 from torchelev.overlap import clear_other_floors
 from torchelev.raycast import clear_seen_through
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, count, tally
+from torchelev.storage import as_bytes, as_mask
 from torchelev.surface import normals
 from torchelev.traversability import rate_all, traversability
 
 
 def fuse_measurement(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
-    """Run the stages in order (paper, Fig. 2). Pure: touches nothing but its arguments' values."""
+    """Run the stages in order (paper, Fig. 2). Pure: it changes none of its arguments."""
     grid = cfg.grid
     state = start_tally(state, m)
     state = recenter(state, m, grid)
@@ -76,7 +76,7 @@ def compiler_options() -> dict[str, Any]:
 
 @functools.cache
 def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
-    """Return the compiled update of a config; equal configs share one graph, whatever the number of points."""
+    """Return the compiled update of a config; equal configs share it, and any number of points one graph."""
     plain: Callable[..., MapState] = functools.partial(update, cfg=cfg)
 
     def bytewise(state: MapState, *others: Any) -> MapState:

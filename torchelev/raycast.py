@@ -17,8 +17,9 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate
-from torchelev.operators import polar_minimum, realize, realize_all, running_minimum
+from torchelev.operators import polar_minimum, running_minimum
 from torchelev.state import MapState, Measurement, count, tally
+from torchelev.storage import realize, realize_all
 from torchelev.windows import neighbours
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class PolarGrid(NamedTuple):
     def of(cls, grid: GridConfig, cfg: RaycastConfig) -> PolarGrid:
         """Choose the table's size for a window."""
         reach = math.ceil((cfg.max_range or 0.55 * math.hypot(grid.length_x, grid.length_y)) / grid.resolution)
-        # The approximated azimuth below stretches some bins by 8 %.
+        # 8 % to spare, of which the approximated azimuth below takes 3: it widens some bins.
         azimuths = 2 * math.ceil(max(16.0, 1.08 * 2 * math.pi * reach) / 2)
         width = 0.75 * azimuths / (2 * math.pi)  # in azimuth bins, of 3/4 of a cell at a range of one cell
         levels = math.ceil(math.log2(2 * width))  # the sensor's own cell has a range of half a cell
@@ -64,7 +65,7 @@ class PolarGrid(NamedTuple):
 
 
 def turn(x: Tensor, y: Tensor) -> Tensor:
-    """Return the azimuth as a fraction of a turn in [0, 1), within 0.1 % of atan2 and without its cost.
+    """Return the azimuth as a fraction of a turn in [0, 1], within 0.001 turns of atan2 and without its cost.
 
     Rays and cells use the same function, so that only its monotony matters.
     """
@@ -128,7 +129,7 @@ def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg
     lowest = state.elevation - height_margin(state, grid, cfg)
     floor = realize(torch.where(well_supported(state, cfg, grid.resolution), lowest, 1e6)).flatten(1).gather(1, slot)
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
-    return (rays.casts & inside) & (height >= floor) | rays.overhang
+    return inside & (height >= floor) | rays.overhang
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
@@ -165,7 +166,7 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
     lowest = running_minimum(fall, from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
-    limit = lowest.flatten(1).gather(1, (k.clamp(min=0) * azimuths + a).to(torch.int64))
+    limit = lowest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths))
     return torch.where(k >= 0, limit, NO_RAY)
 
 
@@ -180,9 +181,13 @@ def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig)
     # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
-    index = torch.where(casts & (last >= 0), last * polar.azimuths + a, polar.ranges * polar.azimuths)
-    slope, size = rays.slope.detach(), polar.ranges
-    return polar_minimum(index.to(torch.int64), slope, polar.azimuths, list(polar.widen), size, NO_RAY)
+    index = flat(torch.where(casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
+    return polar_minimum(index, rays.slope.detach(), polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
+
+
+def flat(row: Tensor, column: Tensor, width: int) -> Tensor:
+    """Return the flat index of whole numbers, in integers: float32 counts no farther than 2^24."""
+    return (row.to(torch.int32) * width + column.to(torch.int32)).to(torch.int64)
 
 
 def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
@@ -210,7 +215,7 @@ def look_up(
     width = 1.0 + sum((k < rows) * 2.0**level for level, rows in enumerate(polar.widen))
     a = torch.floor(turn(*torch.broadcast_tensors(x, y)) * polar.azimuths - 0.5 * (width - 1))
     a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
-    slope = read(table.flatten(1), (k * polar.azimuths + a).to(torch.int64))
+    slope = read(table.flatten(1), flat(k, a, polar.azimuths))
     found = slope < NO_RAY
     slope = torch.where(found, slope, 0.0)
     gx, gy = state.gradient_x, state.gradient_y

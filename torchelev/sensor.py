@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.operators import realize, realize_all
 from torchelev.state import Measurement, count
+from torchelev.storage import realize, realize_all
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

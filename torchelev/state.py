@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.operators import realize
+from torchelev.storage import realize
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -81,13 +81,13 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
     layer = torch.zeros(num_envs, grid.height, grid.width, device=device, dtype=dtype)
     mask = torch.zeros_like(layer, dtype=torch.bool)
     number = torch.zeros(num_envs, device=device, dtype=dtype)
-    count = torch.zeros(num_envs, device=device, dtype=torch.int64)
-    corner = torch.stack([count - grid.height // 2, count - grid.width // 2], -1)
+    zero = torch.zeros(num_envs, device=device, dtype=torch.int64)
+    corner = torch.stack([zero - grid.height // 2, zero - grid.width // 2], -1)
     heights = {"drift_error", "drift_correction"}
     masks = {"validity", "bounded"}
     layers = MapState._fields[2:-1]
     values = {name: (mask if name in masks else layer + BLANK.get(name, 0.0)).clone() for name in layers}
-    statistics = Statistics(*(number.clone() if f in heights else count.clone() for f in Statistics._fields))
+    statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))
     return MapState(corner=corner, base_height=number, statistics=statistics, **values)
 
 

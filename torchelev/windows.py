@@ -7,7 +7,8 @@ import functools
 import torch
 from torch import Tensor
 
-from torchelev.operators import padded, realize_all
+from torchelev.operators import padded
+from torchelev.storage import realize_all
 
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 

@@ -1,0 +1,56 @@
+"""What the compiler is to store, and how. Eager code stores every value, and none of this changes it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch._inductor import inductor_prims
+
+
+@torch.library.custom_op("torchelev::realize", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
+def _realize(values: list[Tensor]) -> list[Tensor]:
+    return [value.clone() for value in values]
+
+
+@_realize.register_fake
+def _(values: list[Tensor]) -> list[Tensor]:
+    return [torch.empty_like(value) for value in values]
+
+
+_realize.register_autograd(lambda ctx, grads: (grads,))
+
+
+def realize(value: Tensor) -> Tensor:
+    """Make the compiler store the values. It would otherwise compute them anew wherever they are read."""
+    return realize_all(value)[0]
+
+
+def realize_all(*values: Tensor) -> list[Tensor]:
+    """Make the compiler store these values, masks as bytes; eager code does so anyway.
+
+    A demand for a memory layout does it at no cost but has no gradient; where one is wanted, the values are copied.
+    """
+    if not torch.compiler.is_compiling():
+        return list(values)
+    masks = [value.dtype == torch.bool for value in values]
+    plain = [as_bytes(value) if mask else value for value, mask in zip(values, masks, strict=True)]
+    stored = _realize(plain) if torch.is_grad_enabled() else [_in_memory(value) for value in plain]
+    return [as_mask(value) if mask else value for value, mask in zip(stored, masks, strict=True)]
+
+
+def _in_memory(value: Tensor) -> Tensor:
+    """Demand a contiguous layout, which the compiler can only meet in memory."""
+    strides = [1] * value.ndim
+    for dim in range(value.ndim - 2, -1, -1):
+        strides[dim] = strides[dim + 1] * value.shape[dim + 1]
+    return inductor_prims.force_stride_order(value, strides)
+
+
+def as_bytes(mask: Tensor) -> Tensor:
+    """Return a mask as 0 and 1 in uint8. Compiled code stores bytes eight times as fast as booleans on a CPU."""
+    return torch.where(mask, 1, 0).to(torch.uint8) if torch.compiler.is_compiling() else mask.view(torch.uint8)
+
+
+def as_mask(stored: Tensor) -> Tensor:
+    """Return what `as_bytes` stored. Compiled code compares integers eight times as fast as bytes."""
+    return stored.to(torch.int32) > 0 if torch.compiler.is_compiling() else stored.view(torch.bool)
