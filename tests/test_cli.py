@@ -205,7 +205,17 @@ def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
     truncated_scan(recording)
     code, out, err = run("map", recording, "--size", 4)
     assert code == 2 and "kept the map of 2 of 4 scans" in err
-    assert np.isfinite(load_npz(tmp_path / "map.npz").layers["elevation"]).any()
+    assert np.isfinite(load_npz(tmp_path / "map.partial.npz").layers["elevation"]).any()
+    assert not (tmp_path / "map.npz").exists()  # which may hold an earlier, whole map
+
+
+def test_poses_that_contradict_each_other_are_warned_of(run, recording):
+    """Every other scan is a metre higher than its pose says."""
+    poses = np.loadtxt(recording / "poses.txt")
+    poses[1::2, 11 if poses.shape[1] == 12 else 3] += 1.0
+    np.savetxt(recording / "poses.txt", poses)
+    code, _, err = run("map", recording, "--size", 4)
+    assert code == 0 and "of the points contradict the map: check that the map's z points up" in err
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ BAD_RESETS = {
     "2-D": (dict(env_ids=torch.tensor([[0]])), ValueError, "env_ids: must be 1-D"),
     "list": (dict(env_ids=[0]), TypeError, "env_ids: .*got list"),
     "floats": (dict(env_ids=torch.tensor([0.0])), TypeError, "env_ids: must be int64.*float32"),
-    "mask as ids": (dict(env_ids=torch.tensor([True, False])), TypeError, "env_ids: must be int64.*bool"),
+    "mask as ids": (dict(env_ids=torch.tensor([True, False])), TypeError, "env_ids: must be int64.*bool.*mask="),
     "device": (dict(env_ids=torch.zeros(1, dtype=torch.int64, device=META)), ValueError, "env_ids: .*cpu.*meta"),
     "mask of floats": (dict(mask=torch.ones(B)), TypeError, "mask: must be bool.*float32"),
     "mask shape": (dict(mask=torch.ones(3, dtype=torch.bool)), ValueError, r"mask: expected \(2,\).*\(3,\)"),

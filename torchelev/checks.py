@@ -24,12 +24,19 @@ def readable(value: Tensor, always: bool = False) -> bool:
     return plain and not torch.compiler.is_compiling() and (always or value.device.type == "cpu")
 
 
-def check_tensor(name: str, value: object, device: torch.device, dtypes: tuple[torch.dtype, ...]) -> Tensor:
-    """Refuse what is no tensor, or lies elsewhere, or has another dtype."""
-    require(isinstance(value, Tensor), name, "must be a torch.Tensor", type(value).__name__, "wrap it", TypeError)
+def check_tensor(
+    name: str,
+    value: object,
+    device: torch.device,
+    dtypes: tuple[torch.dtype, ...],
+    convert: str = "convert it with .to(dtype)",
+) -> Tensor:
+    """Refuse what is no tensor, or lies elsewhere, or has another dtype, which `convert` says how to mend."""
+    came = type(value).__name__
+    require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
     assert isinstance(value, Tensor)
     kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
-    require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, "convert it with .to(dtype)", TypeError)
+    require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, convert, TypeError)
     same = value.device.type == device.type and (value.device.index or 0) == (device.index or 0)
     came = f"{tuple(value.shape)} on {value.device}"
     require(same, name, f"must be on {device}", came, "move it with .to(emap.device)")
@@ -42,6 +49,8 @@ def check_points(points: object, num_envs: int, device: torch.device) -> Tensor:
     fits = value.ndim in (3, 4) and value.shape[0] == num_envs and value.shape[-1] == 3
     rule = f"expected (B, N, 3) or (B, S, N, 3) with B = {num_envs} on {device}"
     mend = "give one cloud per environment, padded with NaN"
+    if value.ndim in (3, 4) and value.shape[-1] != 3:
+        mend = "transpose the last two dimensions" if value.shape[-2] == 3 else "keep x, y and z alone: points[..., :3]"
     require(fits, "points", rule, f"{tuple(value.shape)} on {value.device}", mend)
     value = value if value.ndim == 4 else value[:, None]
     require(value.shape[1] > 0, "points", "must have at least one sensor", tuple(value.shape), "give S >= 1")
@@ -94,7 +103,9 @@ def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype
 
 def check_env_ids(env_ids: object, num_envs: int, device: torch.device, always: bool) -> Tensor:
     """Return ids (K,) int64: each in range, none twice."""
-    value = check_tensor("env_ids", env_ids, device, (torch.int64,))
+    is_mask = isinstance(env_ids, Tensor) and env_ids.dtype == torch.bool
+    convert = "pass it as mask=" if is_mask else "convert it with .to(torch.int64)"
+    value = check_tensor("env_ids", env_ids, device, (torch.int64,), convert)
     require(value.ndim == 1, "env_ids", "must be 1-D", tuple(value.shape), "flatten it, or pass mask=")
     if readable(value, always) and value.numel():
         low, high = int(value.min()), int(value.max())

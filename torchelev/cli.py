@@ -40,7 +40,9 @@ for depth images).
 \b
 The pose file has one line per scan: where the sensor was, in a map
 frame whose z axis points up. Either 12 numbers (KITTI: the upper 3x4 of
-the pose, row by row) or 8 (TUM: t x y z qx qy qz qw).
+the pose, row by row) or 8 (TUM: t x y z qx qy qz qw). The poses that come
+with KITTI odometry are the camera's, whose z axis points forward:
+convert them with its calibration first.
 
 \b
 Example: a folder drive/ with scans/000000.bin ... and poses.txt
@@ -185,7 +187,7 @@ def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> Ele
         return ElevationMap(config, num_envs=1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"--device {device}: {reason}") from error
+        raise ValueError(f"--device {device}: {reason}; use cpu, or a torch built for that device") from error
 
 
 def output_prefix(out: str) -> Path:
@@ -243,6 +245,8 @@ def _progress(scans: Recording) -> Iterator:
 def finish(run: MappingRun, total: int, prefix: Path, stopped: BaseException | None, options: MapOptions) -> int:
     """Write and report what there is; return the exit code."""
     kept = f"kept the map of {run.num_scans} of {total} scans" if run.num_scans else "nothing was mapped yet"
+    if isinstance(stopped, RecordingError):
+        prefix = prefix.with_name(f"{prefix.name}.partial")  # an earlier, whole map stays
     if run.num_scans:
         files = write_outputs(run, prefix)
         click.echo("\n".join(summary(run, total) + hints(run, options.fixed, options.knows_base)))

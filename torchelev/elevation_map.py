@@ -123,7 +123,7 @@ class ElevationMap(nn.Module):
             points: sensor-frame points [m]; NaN or inf points are ignored, so pad ragged clouds with NaN.
             T_map_sensor: takes sensor-frame points into the map frame; float64 far from the origin.
             T_map_base: the robot; the window follows it. None: the window stays, overlap and body box are skipped.
-            dt: time since that environment's last update [s]; 0 for a further sensor of the same instant.
+            dt: time since that environment's last update [s]; 0, the default, for a further sensor of the same instant.
             variance: of each point's height [m^2], in place of the noise model.
 
         Raises ValueError or TypeError before anything changed.
@@ -168,9 +168,19 @@ class ElevationMap(nn.Module):
             variance = variance.view(cloud.shape[:-1])
         return cloud, T_map_sensor, T_map_base, dt, variance
 
-    def compile(self, *args: Any, **kwargs: Any) -> None:
-        """Make `update` run compiled. Maps of equal configs share one graph; the first update pays for it."""
+    def compile(self) -> None:  # type: ignore[override]
+        """Make `update` run compiled. The first update compiles for about a minute, which needs a C++ compiler.
+
+        Maps of equal configs share one graph, and so do scans of any length. Another number of environments or
+        sensors, or a base pose that comes or goes, makes another.
+        """
         self._compiled = True
+
+    def extra_repr(self) -> str:
+        """Say how many maps there are, and how large."""
+        grid = self.cfg.grid
+        size = f"{grid.length_x:g} x {grid.length_y:g} m, resolution={grid.resolution:g} m"
+        return f"num_envs={self.num_envs}, {size}, device={self.device}"
 
     def reset(self, env_ids: Int[Tensor, "K"] | None = None, *, mask: Bool[Tensor, "B"] | None = None) -> None:
         """Forget everything in some environments: all, those of `env_ids`, or those of `mask` (no host sync)."""
@@ -227,7 +237,13 @@ class ElevationMap(nn.Module):
         return cell_centers(self.corner, self.cfg.grid)
 
     def layer(self, name: str, *, state: MapState | None = None) -> Float[Tensor, "B H W"]:
-        """Return a fresh tensor of one layer, NaN where unknown. Raises KeyError for an unknown name."""
+        """Return a fresh tensor of one layer, NaN where unknown.
+
+        elevation, upper_bound [m]; variance [m^2]; time [s] since the last hit; traversability, 0 to 1, the better;
+        normal_x, normal_y, normal_z of unit length; validity, 1 where the elevation is known, else 0. The upper bound
+        equals the elevation where that is known; elsewhere the ground lies no higher, as rays passed above it.
+        Raises KeyError for an unknown name.
+        """
         values, known = self._read(name, state)
         return torch.where(known, values, torch.nan)
 

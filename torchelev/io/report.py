@@ -49,6 +49,12 @@ def warnings(run: MappingRun) -> list[str]:
     if used < 0.01 * run.num_points or used == 0:
         few = "no point" if used == 0 else f"only {used:,} of {run.num_points:,} points"
         return [f"{few} fell into the map: check that poses take sensor points into a z-up map frame"]
+    against = run.counts["rejected_outlier"] / (used + run.counts["rejected_outlier"])
+    if against > 0.15:
+        advice = "check that the map's z points up (KITTI odometry's own does not), and quaternions, x y z w"
+            "check that map z points up, and that quaternions are x y z w (KITTI odometry's own poses are a camera's)"
+        )
+        return [f"{100 * against:.0f} % of the points contradict the map: {advice}"]
     coverage = float(run.emap.layer("validity")[0].mean())
     if coverage == 0:
         return ["every cell was cleared again: check --sensor-height or --extrinsics, and overlap in the config"]
