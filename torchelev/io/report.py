@@ -44,7 +44,7 @@ def hints(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]:
 
 
 def warnings(run: MappingRun) -> list[str]:
-    """Say what most likely went wrong, where hardly anything was mapped."""
+    """Say what most likely went wrong, where little was mapped or much contradicts it."""
     used = run.counts["points_used"]
     if used < 0.01 * run.num_points or used == 0:
         few = "no point" if used == 0 else f"only {used:,} of {run.num_points:,} points"
@@ -52,8 +52,6 @@ def warnings(run: MappingRun) -> list[str]:
     against = run.counts["rejected_outlier"] / (used + run.counts["rejected_outlier"])
     if against > 0.15:
         advice = "check that the map's z points up (KITTI odometry's own does not), and quaternions, x y z w"
-            "check that map z points up, and that quaternions are x y z w (KITTI odometry's own poses are a camera's)"
-        )
         return [f"{100 * against:.0f} % of the points contradict the map: {advice}"]
     coverage = float(run.emap.layer("validity")[0].mean())
     if coverage == 0:
