@@ -161,7 +161,11 @@ def stage_times(num_points: int, seconds: float) -> dict[str, float]:
     times = {}
     with torch.no_grad():
         for name, stage in stages.items():
-            compiled, inputs = torch.compile(bytewise(stage), options=compiler_options()), mask_bytes((state, m))
+            torch._dynamo.reset()  # the stages share a function, of which the compiler keeps no more than 8 versions
+            compiled, inputs = (
+                torch.compile(bytewise(stage), fullgraph=True, options=compiler_options()),
+                mask_bytes((state, m)),
+            )
             compiled(inputs)
             times[name] = milliseconds(lambda run=compiled, inputs=inputs: run(inputs), seconds)["median"]
     return times
