@@ -4,6 +4,8 @@ import copy
 import dataclasses
 import io
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -546,3 +548,12 @@ def test_every_stage_can_be_switched_off():
     off |= dict(fusion=dataclasses.replace(ElevationMapConfig().fusion, edges=None))
     for chosen in ({}, off, *({name: value} for name, value in off.items())):
         assert mapped(1, **chosen).layer("elevation").isfinite().any()
+
+
+def test_importing_does_not_load_the_compiler():
+    """Which takes a second; only compiled maps need it."""
+    code = (
+        "import sys, torch; before = 'torch._inductor' in sys.modules; import torchelev; "
+        "assert before or 'torch._inductor' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-import torch._inductor.config
 from torch import Tensor
 
 from torchelev.aging import age
@@ -70,7 +69,9 @@ def with_masks(state: MapState, convert: Callable[[Tensor], Tensor]) -> MapState
 
 def compiler_options() -> dict[str, Any]:
     """Return what keeps the loops over points vectorised: the compiler gives up on many gathers, which pay off here."""
-    heuristics = hasattr(torch._inductor.config.cpp, "enable_tiling_heuristics")  # later torch
+    from torch._inductor import config  # takes a second to import, which only compiling needs
+
+    heuristics = hasattr(config.cpp, "enable_tiling_heuristics")  # later torch
     return {"cpp.enable_tiling_heuristics": False} if heuristics else {}
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch._inductor import inductor_prims
 
 
 @torch.library.custom_op("torchelev::realize", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
@@ -40,6 +39,8 @@ def realize_all(*values: Tensor) -> list[Tensor]:
 
 def _in_memory(value: Tensor) -> Tensor:
     """Demand a contiguous layout, which the compiler can only meet in memory."""
+    from torch._inductor import inductor_prims  # takes a second to import, which only compiling needs
+
     strides = [1] * value.ndim
     for dim in range(value.ndim - 2, -1, -1):
         strides[dim] = strides[dim + 1] * value.shape[dim + 1]
