@@ -162,10 +162,8 @@ def stage_times(num_points: int, seconds: float) -> dict[str, float]:
     with torch.no_grad():
         for name, stage in stages.items():
             torch._dynamo.reset()  # the stages share a function, of which the compiler keeps no more than 8 versions
-            compiled, inputs = (
-                torch.compile(bytewise(stage), fullgraph=True, options=compiler_options()),
-                mask_bytes((state, m)),
-            )
+            compiled = torch.compile(bytewise(stage), fullgraph=True, options=compiler_options())
+            inputs = mask_bytes((state, m))
             compiled(inputs)
             times[name] = milliseconds(lambda run=compiled, inputs=inputs: run(inputs), seconds)["median"]
     return times
