@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,7 +13,7 @@ from torchelev.errors import require
 from torchelev.grid import cell_centers
 from torchelev.initialize import METHODS, interpolate
 from torchelev.layers import LAYERS, Layer, sample_layer
-from torchelev.pipeline import compiled_update, fuse_measurement, update
+from torchelev.pipeline import compiled_update, fuse_measurement, update, write
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state
 from torchelev.surface import normals
@@ -86,10 +85,7 @@ class ElevationMap(nn.Module):
     def _store(self, state: MapState) -> None:
         # Copied, not rebound: see the rules on deepcopy and inference mode in CONTRIBUTING.md.
         with torch.no_grad():
-            for name in MapState._fields[:-1]:
-                getattr(self, name).copy_(getattr(state, name))
-            for name in Statistics._fields:
-                getattr(self, f"last_{name}").copy_(getattr(state.statistics, name))
+            write(self.state, state)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the config as plain dicts, for `state_dict`."""
@@ -129,9 +125,11 @@ class ElevationMap(nn.Module):
         Raises ValueError or TypeError before anything changed.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
-        run = compiled_update(self.cfg) if self._compiled else functools.partial(update, cfg=self.cfg)
         with torch.no_grad():
-            self._store(run(self.state, *inputs))
+            if self._compiled:
+                compiled_update(self.cfg)(self.state, *inputs)
+            else:
+                write(self.state, update(self.state, *inputs, self.cfg))
 
     def measure(
         self,

@@ -76,23 +76,32 @@ def compiler_options() -> dict[str, Any]:
 
 
 @functools.cache
-def compiled_update(cfg: ElevationMapConfig) -> Callable[..., MapState]:
-    """Return the compiled update of a config; equal configs share it, and any number of points one graph."""
+def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
+    """Return the compiled update of a config, which writes into the state that it is given.
+
+    Equal configs share it, and any number of points one graph.
+    """
     plain: Callable[..., MapState] = functools.partial(update, cfg=cfg)
 
-    def bytewise(state: MapState, *others: Any) -> MapState:
-        """Update; masks come and go as bytes, see `as_bytes`."""
-        return with_masks(plain(with_masks(state, as_mask), *others), as_bytes)
+    def in_place(stored: MapState, *others: Any) -> None:
+        """Update; masks come as bytes, see `as_bytes`. Writing within the graph saves a copy of every layer."""
+        write(stored, with_masks(plain(with_masks(stored, as_mask), *others), as_bytes))
 
-    graph = torch.compile(bytewise, fullgraph=True, options=compiler_options())
+    graph = torch.compile(in_place, fullgraph=True, options=compiler_options())
 
-    def run(state: MapState, points: Tensor, *others: Any) -> MapState:
+    def run(state: MapState, points: Tensor, *others: Any) -> None:
         if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
-            return plain(state, points, *others)
+            write(state, plain(state, points, *others))
+            return
         for values in (points, others[-1]):
             if values is not None:
                 torch._dynamo.maybe_mark_dynamic(values, 2)
-        state = graph(with_masks(state, as_bytes), points, *others)
-        return with_masks(state, as_mask)
+        graph(with_masks(state, as_bytes), points, *others)
 
     return run
+
+
+def write(state: MapState, new: MapState) -> None:
+    """Copy the new values into the state's own tensors."""
+    for old, value in zip(state[:-1] + state.statistics, new[:-1] + new.statistics, strict=True):
+        old.copy_(value)

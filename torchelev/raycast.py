@@ -157,7 +157,8 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
     device, dtype = rays.r.device, rays.r.dtype
     rho = (torch.arange(ranges, device=device, dtype=dtype) + 0.5)[:, None] * step
     angle = (torch.arange(azimuths, device=device, dtype=dtype) + 0.5) * (2 * math.pi / azimuths)
-    x, y = (rays.origin[:, axis, None, None] + rho * part for axis, part in enumerate((angle.cos(), angle.sin())))
+    # Realized, or the compiler computes them anew for every bin of every environment.
+    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(realize_all(angle.cos(), angle.sin())))
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     recent = state.validity & (state.time <= cfg.min_time)
     depth = rays.origin[:, 2, None, None] - state.elevation + height_margin(state, grid, cfg)
@@ -215,7 +216,8 @@ def look_up(
     width = 1.0 + sum((k < rows) * 2.0**level for level, rows in enumerate(polar.widen))
     a = torch.floor(turn(*torch.broadcast_tensors(x, y)) * polar.azimuths - 0.5 * (width - 1))
     a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
-    slope = read(table.flatten(1), flat(k, a, polar.azimuths))
+    # Realized, or the compiler would gather twice, for the masks and for the heights.
+    slope = realize(read(table.flatten(1), flat(k, a, polar.azimuths)))
     found = slope < NO_RAY
     slope = torch.where(found, slope, 0.0)
     gx, gy = state.gradient_x, state.gradient_y
