@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from torchelev.disputed import step_heights
+from torchelev.disputed import Disputed, moved_by
 from torchelev.grid import GridConfig
-from torchelev.storage import as_bytes, realize
-from torchelev.windows import AROUND, neighbours
+from torchelev.storage import as_bytes
+from torchelev.windows import AROUND
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-
     from torchelev.fusion import FusionConfig, Prior, Scan
 
 
@@ -46,29 +43,105 @@ def side_of_step(
     """
     edges = cfg.edges
     assert edges is not None
-    columns = (*scan.columns(), [part.detach() for part in scan.ray], as_bytes(scan.passed))
-    found = step_heights(as_bytes(step), *columns, mean, edges.refinements, edges.margin, edges.min_extreme)
-    top, bottom, passed_low, *ray = found.unbind(0)
+    points = (*scan.columns(), [part.detach() for part in scan.ray], as_bytes(scan.passed))
+    shown = [torch.where(number > 0, mean, UNSEEN), torch.where(prior.known, prior.elevation, UNSEEN).detach()]
+    limits = (edges.refinements, edges.margin, edges.min_extreme, edges.min_passed, cfg.relief * grid.resolution)
+    side, height = step_side(as_bytes(step), *points, mean, shown, grid.width, *limits).unbind(0)
+    return side, height
+
+
+UNSEEN = -1e6  # [m] below every height
+
+
+@torch.library.custom_op(
+    "torchelev::step_side",
+    mutates_args=(),
+    schema="(Tensor cells, Tensor slot, Tensor z, Tensor spread, Tensor weight, Tensor[] ray, Tensor passed, "
+    "Tensor mean, Tensor[] shown, SymInt width, SymInt refinements, float margin, SymInt min_extreme, "
+    "float min_passed, float relief) -> Tensor",
+)
+def step_side(
+    cells: Tensor,
+    slot: Tensor,
+    z: Tensor,
+    spread: Tensor,
+    weight: Tensor,
+    ray: list[Tensor],
+    passed: Tensor,
+    mean: Tensor,
+    shown: list[Tensor],
+    width: int,
+    refinements: int,
+    margin: float,
+    min_extreme: int,
+    min_passed: float,
+    relief: float,
+) -> Tensor:
+    """Return the side and its height of each cell marked as a step, (2, B, C); zero elsewhere.
+
+    `shown` holds the heights (B, C) that the scan and the map show, `width` counts cells along y, `relief` is in [m].
+    """
+    points = Disputed(cells, slot, z, spread, weight, passed, *ray)
+    passed, *ray = points.others
+    middle = points.of(mean)
+    top, bottom = ends_of_step(points, middle, refinements, margin, min_extreme)
+    low = ((points.weight > 0) & (points.z < points.at_points(middle))).to(mean.dtype)
+    ground = points.sum(low * passed) > min_passed * points.sum(low)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
-    scanned = neighbour_maximum(torch.where(number > 0, mean, -1e6), None, grid)
-    mapped = neighbour_maximum(torch.where(prior.known, prior.elevation, -1e6), ray, grid)
-    elsewhere = (scanned >= 0.5 * (mean + top)) | (mapped >= top - cfg.relief * grid.resolution)
-    ground = step & elsewhere & (passed_low > edges.min_passed)
-    return torch.where(step, torch.where(ground, -1.0, 1.0), 0.0), torch.where(ground, bottom, top)
+    scanned, mapped = (heights_around(layer, points.cells, width) for layer in shown)
+    x, y = (points.sum(torch.where(points.weight > 0, part, 0.0)) for part in ray)
+    mapped = torch.where(lie_behind(x, y), mapped, UNSEEN)
+    elsewhere = (scanned.amax(1) >= 0.5 * (middle + top)) | (mapped.amax(1) >= top - relief)
+    ground = ground & elsewhere
+    return points.spread_out(torch.where(ground, -1.0, 1.0).to(mean.dtype), torch.where(ground, bottom, top))
 
 
-def neighbour_maximum(
-    cells: Float[Tensor, "B C"], ray: list[Float[Tensor, "B C"]] | None, grid: GridConfig
-) -> Float[Tensor, "B C"]:
-    """Return the highest value of the neighbours of each cell; given rays, of those within 50 degrees behind it.
+@step_side.register_fake
+def _(cells: Tensor, slot: Tensor, z: Tensor, *others: Any) -> Tensor:
+    return z.new_empty(2, *cells.shape)
+
+
+def ends_of_step(
+    points: Disputed, middle: Tensor, refinements: int, margin: float, min_extreme: int
+) -> tuple[Tensor, Tensor]:
+    """Return the heights (K,) of the step's top and bottom.
+
+    The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
+    top of a wall's face. The bottom takes two. Up to `margin` standard deviations short of a level lies past it.
+    A level that fewer than `min_extreme` reach, give or take a standard deviation, is an outlier's.
+    """
+    noise = points.spread.sqrt()
+    used = points.weight > 0
+
+    def level(side: float, rounds: int) -> Tensor:
+        height = middle
+        for _ in range(rounds):
+            residual = points.z - points.at_points(height)
+            outer = torch.where(side * residual >= -margin * noise, points.weight, 0.0)
+            further = moved_by(height, points.sum(outer * residual), points.sum(outer))
+            there = used & (side * (points.z - points.at_points(further)) >= -noise)
+            height = torch.where(points.sum(there.to(height.dtype)) >= min_extreme, further, height)
+        return height
+
+    return level(1.0, refinements), level(-1.0, 2)
+
+
+def heights_around(layer: Tensor, cells: Tensor, width: int) -> Tensor:
+    """Read a layer (B, C) at the eight neighbours of cells (K,) numbered across environments: -> (K, 8)."""
+    i, j = cells % layer.shape[1] // width, cells % width
+    di, dj = torch.tensor(AROUND, device=cells.device).unbind(1)
+    i, j = i[:, None] + di, j[:, None] + dj
+    exists = (i >= 0) & (i < layer.shape[1] // width) & (j >= 0) & (j < width)
+    place = torch.where(exists, cells[:, None] + di * width + dj, 0)
+    return torch.where(exists, layer.flatten()[place], UNSEEN)
+
+
+def lie_behind(x: Tensor, y: Tensor) -> Tensor:
+    """Tell which neighbours (K, 8) of a cell lie behind it, within 50 degrees of where its rays (K,) go.
 
     Beside it along a wall lie cells that show the wall's face too, and the wall would end as every other cell's.
     """
-    shape = (grid.height, grid.width)
-    heights = neighbours(cells.detach().unflatten(1, shape), -1e6)
-    if ray is not None:
-        x, y = (part.unflatten(1, shape) for part in ray)
-        limit = math.cos(math.radians(50)) * (x.square() + y.square()).sqrt()
-        behind = [i * x + j * y > math.hypot(i, j) * limit for i, j in AROUND]
-        heights = [torch.where(mask, height, -1e6) for mask, height in zip(behind, heights, strict=True)]
-    return realize(functools.reduce(torch.maximum, heights)).flatten(1)
+    around = torch.tensor(AROUND, device=x.device, dtype=x.dtype)
+    limit = math.cos(math.radians(50)) * torch.linalg.vector_norm(around, dim=1)
+    along = x[:, None] * around[:, 0] + y[:, None] * around[:, 1]
+    return along > limit * (x.square() + y.square()).sqrt()[:, None]
