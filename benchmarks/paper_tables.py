@@ -133,7 +133,7 @@ def measure_points(cfg: ElevationMapConfig, num_points: int, seconds: float, all
 
 def stage_times(num_points: int, seconds: float) -> dict[str, float]:
     """Time each stage compiled on its own (paper, Table I). Their sum exceeds the whole, which the compiler fuses."""
-    from torchelev import aging, drift, fusion, grid, overlap, raycast, sensor, surface, traversability
+    from torchelev import aging, drift, fusion, grid, overlap, pipeline, raycast, sensor
 
     cfg = full_config()
     drive = Drive(cfg, num_points, compiled=False)
@@ -154,8 +154,7 @@ def stage_times(num_points: int, seconds: float) -> dict[str, float]:
         "height update": lambda state, m: fusion.fuse(state, m, g, cfg.fusion),
         "ray casting": lambda state, m: raycast.clear_seen_through(state, m, g, cfg.raycast),
         "overlap clearance": lambda state, m: overlap.clear_other_floors(state, m, g, cfg.overlap),
-        "normals": lambda state, m: surface.normals(state, g, cfg.surface),
-        "traversability": lambda state, m: traversability.traversability(state, g, cfg.traversability),
+        "normals and traversability": lambda state, m: pipeline.rate_surface(state, cfg),
     }
     state, m = drive.emap.state, transform(drive.emap.state, None)  # type: ignore[arg-type]
     times = {}

@@ -5,8 +5,7 @@ import pytest
 import torch
 from conftest import off_borders, pose, random_state, small_map
 
-from torchelev.surface import normals
-from torchelev.traversability import traversability
+from torchelev.pipeline import rate_surface
 
 CELLS = (6, 5)
 
@@ -185,9 +184,7 @@ def test_gradients_of_flat_ground_are_finite(stage):
     validity[1, 2, 2] = True
     elevation = torch.zeros_like(state.elevation, requires_grad=True)
     state = state._replace(elevation=elevation, validity=validity)
-    if stage == "normals":
-        after = normals(state, emap.cfg.grid, emap.cfg.surface)
-        (after.gradient_x + after.gradient_y).sum().backward()
-    else:
-        traversability(state, emap.cfg.grid, emap.cfg.traversability).traversability.sum().backward()
+    after = rate_surface(state, emap.cfg)
+    read = after.gradient_x + after.gradient_y if stage == "normals" else after.traversability
+    read.sum().backward()
     assert elevation.grad.isfinite().all()

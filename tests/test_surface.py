@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev import SurfaceConfig
-from torchelev.surface import fit_plane, normals
+from torchelev.pipeline import rate_surface
+from torchelev.surface import fit_plane, known_ground
 
 SEEDS = st.integers(0, 10_000)
 
@@ -20,7 +21,7 @@ SEEDS = st.integers(0, 10_000)
 def test_fit_plane_agrees_with_the_reference(seed, radius, known, dtype):
     grid = small_map(1, (7, 6)).cfg.grid
     state = random_state(np.random.default_rng(seed), grid, 2, known, dtype)
-    plane = fit_plane(state.elevation, state.validity, radius, grid.resolution)
+    plane = fit_plane(known_ground(state.elevation, state.validity, radius), radius, grid.resolution)
     tolerance = dict(rtol=1e-3, atol=2e-4) if dtype == torch.float32 else dict(rtol=1e-7, atol=1e-9)
     for b, i, j in np.ndindex(2, 7, 6):
         if state.validity[b, i, j]:
@@ -38,7 +39,7 @@ def test_normals_of_a_plane(gx, gy, altitude):
     x, y = emap.cell_centers()[0].unbind(-1)
     z = gx * x + gy * y + altitude
     state = emap.state._replace(elevation=z[None].float(), validity=(x < 0.35)[None])
-    emap._store(normals(state, emap.cfg.grid, emap.cfg.surface))
+    emap._store(rate_surface(state, emap.cfg))
     n = torch.stack([emap.layer(f"normal_{axis}") for axis in "xyz"], -1)
     known = emap.validity
     expected = torch.tensor([-gx, -gy, 1.0]) / math.sqrt(1 + gx * gx + gy * gy)
@@ -50,7 +51,7 @@ def test_normals_of_a_plane(gx, gy, altitude):
 @given(SEEDS)
 def test_normals_are_unit_vectors_that_point_up(seed):
     emap = small_map(2)
-    state = normals(random_state(np.random.default_rng(seed), emap.cfg.grid, 2), emap.cfg.grid, SurfaceConfig())
+    state = rate_surface(random_state(np.random.default_rng(seed), emap.cfg.grid, 2), emap.cfg)
     n = torch.stack([emap.layer(f"normal_{axis}", state=state) for axis in "xyz"], -1)[state.validity]
     torch.testing.assert_close(n.norm(dim=-1), torch.ones(len(n), dtype=n.dtype))
     assert (n[:, 2] > 0).all()
@@ -61,7 +62,7 @@ def test_lone_cell_is_level_and_a_line_slopes_along_itself():
     validity[0, 0, 4] = validity[0, 2:5, 0] = True
     elevation = torch.zeros(1, 5, 5)
     elevation[0, 0, 4], elevation[0, 2:5, 0] = 7.0, torch.tensor([0.0, 0.1, 0.2])
-    plane = fit_plane(elevation, validity, 1, 0.1)
+    plane = fit_plane(known_ground(elevation, validity, 2), 1, 0.1)
     assert plane.gradient_x[0, 0, 4] == 0 and plane.gradient_y[0, 0, 4] == 0
     torch.testing.assert_close(plane.gradient_x[0, 3, 0], torch.tensor(1.0), atol=1e-4, rtol=0)
     assert plane.gradient_y[0, 3, 0] == 0

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import reference
 import torch
-from conftest import pose, random_state, small_map, terrain
+from conftest import pose, random_state, small_config, small_map, terrain
 from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev import TraversabilityConfig
-from torchelev.traversability import height_range, traversability
+from torchelev.pipeline import rate_surface
+from torchelev.surface import known_ground
+from torchelev.traversability import height_range
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.05, 0.1, 0.2]), st.floats(0.2, 1.0), st.floats(1, 10))
@@ -19,7 +21,7 @@ def test_agrees_with_the_reference(seed, radius, known, forgiving):
     cfg = TraversabilityConfig(radius=radius, critical_step=0.2 * forgiving, critical_roughness=0.05 * forgiving)
     grid = small_map(1, (7, 6)).cfg.grid
     state = random_state(np.random.default_rng(seed), grid, 2, known)
-    got = traversability(state, grid, cfg).traversability
+    got = rate_surface(state, small_config((7, 6), traversability=cfg)).traversability
     for b, i, j in np.ndindex(2, 7, 6):
         expected = 0.0
         if state.validity[b, i, j]:
@@ -32,18 +34,20 @@ def test_flat_is_traversable_and_a_step_is_not():
     emap = small_map(1, (20, 10))
     state = emap.state._replace(validity=torch.ones_like(emap.validity))
     state.elevation[:, 12:] = 0.3
-    result = traversability(state, emap.cfg.grid, emap.cfg.traversability).traversability
+    result = rate_surface(state, emap.cfg).traversability
     assert result[0, :10].min() > 0.99 and result[0, 11:13].max() == 0 and result[0, 15:].min() > 0.99
 
 
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_height_range(seed, radius):
     state = random_state(np.random.default_rng(seed), small_map(1, (6, 5)).cfg.grid)
-    got = height_range(state.elevation, state.validity, radius)
+    ground = known_ground(state.elevation, state.validity, radius)
+    got = height_range(ground, radius)
     for i, j in np.ndindex(6, 5):
         cells = reference.window(state.validity[0].numpy(), i, j, radius)
         heights = [float(state.elevation[0, a, b]) for a, b in cells]
-        assert float(got[0, i, j]) == (max(heights) - min(heights) if state.validity[0, i, j] else 0.0)
+        if heights:
+            assert float(got[0, i, j]) == pytest.approx(max(heights) - min(heights), abs=1e-6)
 
 
 def test_a_map_without_the_head_knows_no_traversability():

@@ -6,6 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchelev.operators import padded
 from torchelev.windows import neighbours, window_maximum, window_moments
 
 SIZES = st.tuples(st.integers(1, 2), st.integers(1, 7), st.integers(1, 6))
@@ -21,8 +22,9 @@ def around(values, radius, b, i, j):
 @given(st.integers(0, 10_000), SIZES, st.integers(1, 4))
 def test_window_moments_are_sums_over_the_window(seed, shape, radius):
     values = np.random.default_rng(seed).normal(size=shape)
-    layer = torch.from_numpy(values)
-    moments = window_moments([(layer, 2), (layer, 0), (layer, 1)], radius)
+    rim = radius + seed % 2
+    layer = padded(torch.from_numpy(values), rim, 0.0)
+    moments = window_moments([(layer, 2), (layer, 0), (layer, 1)], rim, radius)
     powers = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0)] + [(0, 0)] + [(0, 0), (0, 1), (1, 0)]
     assert len(moments) == len(powers)
     for moment, (a, b) in zip(moments, powers, strict=True):
@@ -34,9 +36,12 @@ def test_window_moments_are_sums_over_the_window(seed, shape, radius):
 @given(st.integers(0, 10_000), SIZES, st.integers(1, 4))
 def test_window_maximum(seed, shape, radius):
     values = np.random.default_rng(seed).normal(size=shape)
-    highest = window_maximum(torch.from_numpy(values), radius)
+    rim = radius + seed % 2
+    layers = [padded(torch.from_numpy(v), rim, -torch.inf) for v in (values, -values)]
+    highest, minus_lowest = window_maximum(layers, rim, radius)
     for cell in np.ndindex(*shape):
-        assert highest[cell] == max(value for _, _, value in around(values, radius, *cell))
+        window = [value for _, _, value in around(values, radius, *cell)]
+        assert highest[cell] == max(window) and -minus_lowest[cell] == min(window)
 
 
 def test_neighbours():
@@ -46,7 +51,7 @@ def test_neighbours():
     assert around[0, 1, 2].tolist() == [1, 2, 9, 4, 9, 9, 9, 9]
 
 
-@pytest.mark.parametrize("function", [lambda v: window_moments([(v, 2)], 2), lambda v: window_maximum(v, 2)])
+@pytest.mark.parametrize("function", [lambda v: window_moments([(v, 2)], 1, 1), lambda v: window_maximum([v], 1, 1)])
 def test_gradients(function):
     values = torch.randn(2, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
     assert torch.autograd.gradcheck(function, (values,))

@@ -13,11 +13,9 @@ from torchelev.errors import require
 from torchelev.grid import cell_centers
 from torchelev.initialize import METHODS, interpolate
 from torchelev.layers import LAYERS, Layer, sample_layer
-from torchelev.pipeline import compiled_update, fuse_measurement, update, write
+from torchelev.pipeline import compiled_update, fuse_measurement, rate_surface, update, write
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state
-from torchelev.surface import normals
-from torchelev.traversability import traversability
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -216,10 +214,7 @@ class ElevationMap(nn.Module):
         variance = torch.where(found, self.cfg.fusion.max_variance, state.variance)
         state = state._replace(elevation=elevation, variance=variance, validity=state.validity | found)
         state = state._replace(time=torch.where(found, 0.0, state.time), support=torch.where(found, 0.0, state.support))
-        state = normals(state, self.cfg.grid, self.cfg.surface)
-        if self.cfg.traversability is not None:
-            state = traversability(state, self.cfg.grid, self.cfg.traversability)
-        self._store(state)
+        self._store(rate_surface(state, self.cfg))
 
     # Reading --------------------------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from torchelev.raycast import clear_seen_through
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, as_mask
-from torchelev.surface import normals
+from torchelev.surface import known_ground, normals
 from torchelev.traversability import rate_all, traversability
 
 
@@ -36,9 +36,17 @@ def fuse_measurement(state: MapState, m: Measurement, cfg: ElevationMapConfig) -
         state = clear_seen_through(state, m, grid, cfg.raycast)
     if cfg.overlap is not None:
         state = clear_other_floors(state, m, grid, cfg.overlap)
-    state = normals(state, grid, cfg.surface)
-    state = traversability(state, grid, cfg.traversability) if cfg.traversability is not None else rate_all(state)
+    state = rate_surface(state, cfg)
     return tally(state, cells_bounded=count(state.bounded & ~state.validity))
+
+
+def rate_surface(state: MapState, cfg: ElevationMapConfig) -> MapState:
+    """Compute normals and traversability from the elevation."""
+    head = cfg.traversability
+    rim = max(cfg.surface.radius, head.cells(cfg.grid) if head is not None else 0)
+    ground = known_ground(state.elevation, state.validity, rim)
+    state = normals(state, ground, cfg.grid, cfg.surface)
+    return traversability(state, ground, cfg.grid, head) if head is not None else rate_all(state)
 
 
 def start_tally(state: MapState, m: Measurement) -> MapState:

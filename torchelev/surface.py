@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.operators import padded
 from torchelev.state import MapState
 from torchelev.windows import window_moments
 
@@ -27,6 +28,24 @@ class SurfaceConfig:
         require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
 
 
+class Ground(NamedTuple):
+    """The known heights, with a rim around the map that windows may reach into; nothing is known there."""
+
+    known: Float[Tensor, "B H+2*rim W+2*rim"]  # 1 or 0
+    height: Float[Tensor, "B H+2*rim W+2*rim"]  # [m] from the map's mean; 0 where unknown
+    rim: int  # [cells]
+
+
+def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], rim: int) -> Ground:
+    """Put a rim around the known heights, once for all the windows."""
+    known = validity.to(elevation.dtype)
+    number = known.sum((1, 2), keepdim=True).clamp(min=1)
+    # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
+    datum = (torch.where(validity, elevation, 0.0).sum((1, 2), keepdim=True) / number).detach()
+    layers = padded(torch.stack([known, torch.where(validity, elevation - datum, 0.0)]), rim, 0.0)
+    return Ground(layers[0], layers[1], rim)
+
+
 class Plane(NamedTuple):
     """Least-squares plane through the known cells of a window, for every cell."""
 
@@ -35,20 +54,14 @@ class Plane(NamedTuple):
     residual: Float[Tensor, "B H W"]  # [m^2] mean squared distance in z
 
 
-def fit_plane(
-    elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], radius: int, resolution: float
-) -> Plane:
+def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     """Fit z = c + g_x x + g_y y by least squares to the known cells within `radius` cells of each cell.
 
     Only known cells enter, so a plane comes out right at the border of the known area. Where they lie on one line, the
     gradient along the line; a lone cell is level.
     """
-    known = validity.to(elevation.dtype)
-    number = known.sum((1, 2), keepdim=True).clamp(min=1)
-    # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
-    datum = (torch.where(validity, elevation, 0.0).sum((1, 2), keepdim=True) / number).detach()
-    z = torch.where(validity, elevation - datum, 0.0)
-    moments = window_moments([(known, 2), (z, 1), (z.square(), 0)], radius)
+    z = ground.height
+    moments = window_moments([(ground.known, 2), (z, 1), (z.square(), 0)], ground.rim, radius)
     n, n_v, n_vv, n_u, n_uv, n_uu, s_z, s_vz, s_uz, s_zz = moments
     share = 1 / n.clamp(min=1)
     mu, mv, mz = n_u * share, n_v * share, s_z * share
@@ -65,12 +78,12 @@ def fit_plane(
     return Plane(gu / resolution, gv / resolution, residual)
 
 
-def normals(state: MapState, grid: GridConfig, cfg: SurfaceConfig) -> MapState:
+def normals(state: MapState, ground: Ground, grid: GridConfig, cfg: SurfaceConfig) -> MapState:
     """Store the gradient of every known cell, from the plane through its neighbours (paper, Sec. II-A).
 
     The unit normal n = (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2) is made when it is read.
     """
-    plane = fit_plane(state.elevation, state.validity, cfg.radius, grid.resolution)
+    plane = fit_plane(ground, cfg.radius, grid.resolution)
     return state._replace(
         gradient_x=torch.where(state.validity, plane.gradient_x, 0.0),
         gradient_y=torch.where(state.validity, plane.gradient_y, 0.0),

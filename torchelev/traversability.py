@@ -10,7 +10,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.state import MapState
-from torchelev.surface import fit_plane
+from torchelev.surface import Ground, fit_plane
 from torchelev.windows import window_maximum
 
 
@@ -29,11 +29,16 @@ class TraversabilityConfig:
             require(value > 0, f"traversability.{name}", "must be positive", value, "see its default")
 
 
-def height_range(elevation: Tensor, validity: Tensor, radius: int) -> Tensor:
-    """Return the difference between the highest and the lowest known cell of each window [m]."""
-    high, low = torch.where(validity, elevation, -torch.inf), torch.where(validity, -elevation, -torch.inf)
-    highest, lowest = window_maximum(torch.stack([high, low]), radius).unbind(0)
-    return torch.where(validity, highest + lowest, 0.0)
+    def cells(self, grid: GridConfig) -> int:
+        """Return the window's radius in cells."""
+        return max(1, round(self.radius / grid.resolution))
+
+
+def height_range(ground: Ground, radius: int) -> Tensor:
+    """Return the height difference of the highest and the lowest known cell of each window [m]; -inf without any."""
+    signed = (torch.where(ground.known > 0, z, -torch.inf) for z in (ground.height, -ground.height))
+    highest, minus_lowest = window_maximum(list(signed), ground.rim, radius)
+    return highest + minus_lowest
 
 
 def rate_all(state: MapState) -> MapState:
@@ -41,17 +46,18 @@ def rate_all(state: MapState) -> MapState:
     return state._replace(traversability=torch.ones_like(state.traversability))
 
 
-def traversability(state: MapState, grid: GridConfig, cfg: TraversabilityConfig) -> MapState:
+def traversability(state: MapState, ground: Ground, grid: GridConfig, cfg: TraversabilityConfig) -> MapState:
     """Rate every known cell by the worst of slope, step and roughness (the seam for a learned head).
 
     t = 1 - max(slope / critical, step / critical, roughness / critical), not below 0. The step is the height range of
     the window less what its own plane explains.
     """
-    radius = max(1, round(cfg.radius / grid.resolution))
-    plane = fit_plane(state.elevation, state.validity, radius, grid.resolution)
+    radius = cfg.cells(grid)
+    plane = fit_plane(ground, radius, grid.resolution)
     slope = torch.atan((plane.gradient_x.square() + plane.gradient_y.square()).clamp(min=1e-12).sqrt())
     explained = 2 * radius * grid.resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())
-    step = (height_range(state.elevation, state.validity, radius) - explained).clamp(min=0)
+    heights = torch.where(state.validity, height_range(ground, radius), 0.0)
+    step = (heights - explained).clamp(min=0)
     roughness = plane.residual.clamp(min=1e-12).sqrt()
     worst = torch.maximum(slope / cfg.critical_slope, step / cfg.critical_step)
     worst = torch.maximum(worst, roughness / cfg.critical_roughness)

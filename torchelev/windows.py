@@ -13,42 +13,39 @@ from torchelev.storage import realize_all
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 
 
-def _line(values: Tensor, radius: int, dim: int, k: int) -> Tensor:
-    """Return what lies k entries on, along a dimension that is padded by `radius`."""
-    return values.narrow(dim, radius + k, values.shape[dim] - 2 * radius)
+def _line(values: Tensor, rim: int, dim: int, k: int) -> Tensor:
+    """Return what lies k entries on, along a dimension that has a rim."""
+    return values.narrow(dim, rim + k, values.shape[dim] - 2 * rim)
 
 
-def _line_sum(values: Tensor, radius: int, dim: int, power: int) -> Tensor:
+def _line_sum(values: Tensor, rim: int, radius: int, dim: int, power: int) -> Tensor:
     """Sum k^power * values over k = -radius .. radius along one dimension."""
-    total = torch.zeros_like(_line(values, radius, dim, 0))
+    total = torch.zeros_like(_line(values, rim, dim, 0))
     for k in range(-radius, radius + 1):
         if power == 0 or k != 0:
-            total = total + float(k) ** power * _line(values, radius, dim, k)
+            total = total + float(k) ** power * _line(values, rim, dim, k)
     return total
 
 
-def window_moments(layers: list[tuple[Tensor, int]], radius: int) -> list[Tensor]:
-    """Sum u^a v^b * values over the (2 * radius + 1)^2 window around each cell, zeros outside the layer.
+def window_moments(layers: list[tuple[Tensor, int]], rim: int, radius: int) -> list[Tensor]:
+    """Sum u^a v^b * values over the (2 * radius + 1)^2 window around each cell.
 
-    u and v count cells from the window's centre along H and W. For each layer (B, H, W) with its order, all moments
-    with a + b <= order: (0, 0), (0, 1), ... (1, 0), ...
+    u and v count cells from the window's centre along H and W. For each layer (B, H + 2 * rim, W + 2 * rim) with its
+    order, all moments (B, H, W) with a + b <= order: (0, 0), (0, 1), ... (1, 0), ... The rim is at least the radius.
     """
-    values = padded(torch.stack([layer for layer, _ in layers]), radius, 0.0)
-    lines = [
-        _line_sum(v, radius, -2, a) for v, (_, order) in zip(values, layers, strict=True) for a in range(order + 1)
-    ]
+    lines = realize_all(*(_line_sum(v, rim, radius, -2, a) for v, order in layers for a in range(order + 1)))
     orders = [order - a for _, order in layers for a in range(order + 1)]
-    lines = realize_all(*lines)
-    return [_line_sum(line, radius, -1, b) for line, order in zip(lines, orders, strict=True) for b in range(order + 1)]
+    return [
+        _line_sum(line, rim, radius, -1, b) for line, order in zip(lines, orders, strict=True) for b in range(order + 1)
+    ]
 
 
-def window_maximum(values: Tensor, radius: int) -> Tensor:
-    """Return the maximum over the (2 * radius + 1)^2 window around each cell of (..., H, W)."""
-    highest = padded(values, radius, -torch.inf)
+def window_maximum(values: list[Tensor], rim: int, radius: int) -> list[Tensor]:
+    """Return each layer's maxima over the (2 * radius + 1)^2 window around each cell; shapes as in `window_moments`."""
     for dim in (-2, -1):
-        lines = [_line(highest, radius, dim, k) for k in range(-radius, radius + 1)]
-        (highest,) = realize_all(functools.reduce(torch.maximum, lines))
-    return highest
+        lines = ([_line(v, rim, dim, k) for k in range(-radius, radius + 1)] for v in values)
+        values = realize_all(*(functools.reduce(torch.maximum, line) for line in lines))
+    return values
 
 
 def neighbours(values: Tensor, fill: float) -> list[Tensor]:
