@@ -13,7 +13,7 @@ from torchelev.edges import EdgeConfig, side_of_step
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
 from torchelev.state import BLANK, MapState, Measurement, count, tally
-from torchelev.storage import as_bytes, realize_all
+from torchelev.storage import as_bytes, realize, realize_all
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -111,7 +111,7 @@ class Guess(NamedTuple):
 def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Guess:
     """Trust a cell's elevation where most points agree with it, else the robust mean, and at a step one of its ends."""
     elevation_at, variance_at = scan.cells.take(prior.elevation, prior.gate_variance)
-    near = agrees(scan, elevation_at, variance_at, cfg)
+    near = realize(agrees(scan, elevation_at, variance_at, cfg))
     number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
     mean = ratio(moment, weight).detach()
     trusted = prior.known & (2 * agreeing >= number)
@@ -209,7 +209,8 @@ def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionCo
     residual = side * (scan.z - guess)
     margin = cfg.edges.margin if cfg.edges is not None else 0.0
     ignored = scan.used & (residual < -margin * scan.spread.sqrt())
-    return agrees(scan, guess, gate, cfg) & ~ignored, ignored
+    kept, ignored = realize_all(agrees(scan, guess, gate, cfg) & ~ignored, ignored)
+    return kept, ignored
 
 
 class ScanOfCells(NamedTuple):
@@ -229,11 +230,11 @@ def merge(
     """Take the scan's heights into the cells, or count them as votes against. Returns also where they were taken."""
     hit, innovation = scan.kept > 0, scan.height - prior.elevation
     limit = prior.gate_variance + scan.variance + (cfg.relief * grid.resolution) ** 2
-    agree = prior.known & hit & (innovation.square() <= cfg.gate**2 * limit)
+    agree = realize(prior.known & hit & (innovation.square() <= cfg.gate**2 * limit))
     votes = torch.where(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
     found = hit & ~agree & (~prior.known | (support < 0))
-    agree, taken = realize_all(agree, agree | found)
+    taken = realize(agree | found)
 
     information = torch.where(agree, 1.0 / prior.variance, 0.0) + 1.0 / scan.variance
     fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
