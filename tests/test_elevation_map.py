@@ -421,6 +421,63 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
     assert graphs() == before + 1
 
 
+@pytest.mark.parametrize("chunk", [1, 2, 3, 5])
+def test_chunks_change_nothing(chunk):
+    whole, parts = small_map(5), ElevationMap(small_config(), num_envs=5, chunk=chunk)
+    for k in range(3):
+        cloud, T = scan(k, 5)
+        for emap in (whole, parts):
+            emap.update(cloud, T, T, torch.arange(5.0), variance=torch.full(cloud.shape[:2], 1e-4))
+    assert differences(whole.state, parts.state) == []
+
+
+def test_many_maps_are_updated_in_equal_parts():
+    assert [(c.start, c.stop) for c in ElevationMap(small_config(), 10, chunk=4)._chunks()] == [(0, 4), (4, 8), (8, 12)]
+    assert len(ElevationMap(small_config((256, 256)), 8)._chunks()) == 2
+    assert len(ElevationMap(small_config(), 8, device="meta")._chunks()) == 1
+
+
+def test_the_first_compiled_update_says_what_it_costs(compile_with, capsys):
+    compile_with("eager")
+    emap = small_map(2)
+    emap.compile()
+    for k in range(2):
+        cloud, T = scan(k, 2)
+        emap.update(cloud, T, T, 0.1)
+    assert capsys.readouterr().err.count("compiling the update") == 1
+
+
+def test_same_clouds_same_map_to_the_bit():
+    """On a CPU, with several threads; sums do not depend on which thread was first."""
+    torch.set_num_threads(2)
+    runs = []
+    for _ in range(2):
+        emap = small_map(3, (60, 50))
+        for k in range(3):
+            cloud, T = scan(k, 3, 20_000)
+            emap.update(cloud, T, T, 0.1)
+        runs.append(emap.state)
+    assert differences(*runs) == []
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float16, 2e-3), (torch.bfloat16, 2e-2)])
+def test_points_of_half_the_bytes(dtype, tolerance):
+    """Points of half precision are the same points, rounded: within 2 m, by 1 mm, or by 8 mm in bfloat16."""
+    maps = [small_map(2), small_map(2)]
+    for k in range(3):
+        cloud, T = scan(k, 2)
+        maps[0].update(cloud.to(dtype).float(), T, T, 0.1)
+        maps[1].update(cloud.to(dtype), T, T, 0.1)
+    assert differences(maps[0].state, maps[1].state) == []
+    exact = small_map(2)
+    for k in range(3):
+        cloud, T = scan(k, 2)
+        exact.update(cloud, T, T, 0.1)
+    both = exact.validity & maps[1].validity
+    error = (exact.elevation - maps[1].elevation)[both].abs()
+    assert both.float().mean() > 0.9 * exact.validity.float().mean() and error.median() < tolerance
+
+
 @pytest.fixture
 def compile_with(monkeypatch):
     """Let emap.compile() use another backend of the compiler."""

@@ -55,20 +55,15 @@ def sample_layer(
     finite = torch.isfinite(uv).all(-1, keepdim=True)
     uv = torch.where(finite, uv.clamp(-1e6, 1e6), -1e6)
     if mode == "nearest":
-        corners = [(torch.floor(uv), torch.ones_like(uv[..., 0]))]
-    else:
-        low = torch.floor(uv - 0.5)
-        fraction = uv - 0.5 - low
-        corners = []
-        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            offset = torch.stack([torch.full_like(low[..., 0], float(d)) for d in step], -1)
-            weight = torch.where(offset > 0, fraction, 1 - fraction).prod(-1)
-            corners.append((low + offset, weight))
-    total = weighted = torch.zeros_like(uv[..., 0])
-    for cell, weight in corners:
-        value, known = _read_cells(layer, cell, grid)
-        weight = torch.where(known, weight, 0.0)
-        total, weighted = total + weight, weighted + weight * value
+        return _read_cells(layer, torch.floor(uv), grid)
+    low = torch.floor(uv - 0.5)
+    (u, v), (i, j) = (uv - 0.5 - low).unbind(-1), low.unbind(-1)
+    # All four corners at once: (B, M, 4).
+    weight = torch.stack([(1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v], -1)
+    cell = torch.stack([torch.stack([i, i, i + 1, i + 1], -1), torch.stack([j, j + 1, j, j + 1], -1)], -1)
+    value, known = (corners.view_as(weight) for corners in _read_cells(layer, cell.flatten(1, 2), grid))
+    weight = torch.where(known, weight, 0.0)
+    total, weighted = weight.sum(-1), (weight * value).sum(-1)
     valid = total >= 0.5
     return torch.where(valid, weighted / torch.where(valid, total, 1.0), 0.0), valid
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -17,7 +20,7 @@ from torchelev.grid import recenter
 from torchelev.overlap import clear_other_floors
 from torchelev.raycast import clear_seen_through
 from torchelev.sensor import measure
-from torchelev.state import MapState, Measurement, count, tally
+from torchelev.state import MapState, Measurement, count, map_layers, tally
 from torchelev.storage import as_bytes, as_mask
 from torchelev.surface import known_ground, normals
 from torchelev.traversability import rate_all, traversability
@@ -63,11 +66,22 @@ def update(
     T_map_base: Tensor | None,
     dt: Tensor,
     variance: Tensor | None,
+    *,
     cfg: ElevationMapConfig,
 ) -> MapState:
     """Measure and fuse; points come as (B, S, N, 3)."""
     m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, state.elevation.dtype)
     return fuse_measurement(state, m, cfg)
+
+
+def update_in_place(stored: MapState, *inputs: Any, cfg: ElevationMapConfig) -> None:
+    """Measure, fuse, and write the new values into the stored state's own tensors."""
+    write(stored, update(stored, *inputs, cfg=cfg))
+
+
+def write(stored: MapState, new: MapState) -> None:
+    """Copy the new values into the stored state's own tensors."""
+    map_layers(Tensor.copy_, stored, new)
 
 
 def with_masks(state: MapState, convert: Callable[[Tensor], Tensor]) -> MapState:
@@ -96,6 +110,16 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
     return [not guard.is_global and "plain" not in guard.name and "__dict__" not in guard.name for guard in guards]
 
 
+@contextlib.contextmanager
+def announced_compilation() -> Iterator[None]:
+    """Say on stderr what is going on for a minute, and what it cost."""
+    print("torchelev: compiling the update, for up to a minute ...", end=" ", file=sys.stderr, flush=True)
+    start = time.perf_counter()
+    yield
+    took = time.perf_counter() - start
+    print(f"done in {took:.0f} s. Later processes find it in the compiler's cache.", file=sys.stderr, flush=True)
+
+
 @functools.cache
 def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
     """Return the compiled update of a config, which writes into the state that it is given.
@@ -109,20 +133,18 @@ def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
         write(stored, with_masks(plain(with_masks(stored, as_mask), *others), as_bytes))
 
     graph = torch.compile(in_place, fullgraph=True, options=compiler_options())
+    first = True
 
     def run(state: MapState, points: Tensor, *others: Any) -> None:
         if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
-            write(state, plain(state, points, *others))
+            update_in_place(state, points, *others, cfg=cfg)
             return
+        nonlocal first
         for values in (points, others[-1]):
             if values is not None:
                 torch._dynamo.maybe_mark_dynamic(values, 2)
-        graph(with_masks(state, as_bytes), points, *others)
+        with announced_compilation() if first else contextlib.nullcontext():
+            graph(with_masks(state, as_bytes), points, *others)
+        first = False
 
     return run
-
-
-def write(state: MapState, new: MapState) -> None:
-    """Copy the new values into the state's own tensors."""
-    for old, value in zip(state[:-1] + state.statistics, new[:-1] + new.statistics, strict=True):
-        old.copy_(value)

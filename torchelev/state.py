@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -89,6 +90,13 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
     values = {name: (mask if name in masks else layer + BLANK.get(name, 0.0)).clone() for name in layers}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))
     return MapState(corner=corner, base_height=number, statistics=statistics, **values)
+
+
+def map_layers(function: Callable[..., Tensor], *states: MapState) -> MapState:
+    """Apply a function to each tensor of a state, or to the same tensor of several states."""
+    layers = {n: function(*(getattr(state, n) for state in states)) for n in MapState._fields[:-1]}
+    counts = {n: function(*(getattr(state.statistics, n) for state in states)) for n in Statistics._fields}
+    return MapState(statistics=Statistics(**counts), **layers)
 
 
 def tally(state: MapState, **counts: Tensor) -> MapState:
