@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test lint types setup bench clean
+.PHONY: help demo test lint types setup bench quality clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
@@ -27,10 +27,13 @@ lint: setup  ## check style
 types: setup  ## check types
 	$(BIN)/mypy
 
-bench: setup  ## measure: accuracy, features, the paper's tables
+bench: setup  ## measure speed and scale, under ten minutes
+	$(BIN)/python -m benchmarks.run
+	$(BIN)/python -m benchmarks.readme
+
+quality: setup  ## measure accuracy and features, five minutes
 	$(BIN)/python -m benchmarks.accuracy
 	$(BIN)/python -m benchmarks.features
-	$(BIN)/python -m benchmarks.paper_tables
 	$(BIN)/python -m benchmarks.readme
 
 clean:  ## remove what the targets made

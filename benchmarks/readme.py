@@ -12,11 +12,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-from benchmarks.paper_tables import SENSORS
+from benchmarks import speed_tables
 from benchmarks.report import markdown_table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
+SPEED = "speed-2-x-amd-epyc-2-threads"
 SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
 
 
@@ -55,16 +56,9 @@ def real() -> str:
 
 
 def speed() -> str:
-    """Tabulate times by sensor, and say whether they meet their targets."""
-    result = load("paper_tables")
-    times = {kind: {r["points"]: r["median"] for r in result[kind]} for kind in ("all_stages", "plain_baseline")}
-    rows = []
-    for name, points, paper, _ in SENSORS:
-        full, plain = times["all_stages"][points], times["plain_baseline"][points]
-        rows.append([name, f"{points:,}", f"{full:.1f} ms", f"{plain:.1f} ms", f"{1000 / full:.0f}", str(paper)])
-    head = ["the paper's sensor", "points", "all stages", "plain baseline", "Hz here", "Hz there, Jetson Xavier GPU"]
-    eager = f"Eager: {result['eager_43074']['median']:.0f} ms at 43,074 points."
-    return f"{markdown_table(head, rows)}\n\n{eager}"
+    """Tabulate the sensors, the stages, the robots, and the targets."""
+    picture = f"![Time against points, robots, cells and ray length](benchmarks/results/{SPEED}.png)"
+    return f"{speed_tables.report(load(SPEED))}\n\n{picture}"
 
 
 TABLES = {"accuracy": accuracy, "features": features, "real": real, "speed": speed}

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import io
 import pickle
 import subprocess
@@ -32,9 +33,10 @@ from torchelev import (
     ElevationMapConfig,
     GridConfig,
     SensorConfig,
+    pipeline,
 )
 from torchelev.layers import LAYERS
-from torchelev.pipeline import compiled_update
+from torchelev.pipeline import compiled_update, guards_on_arguments
 from torchelev.state import Statistics
 
 
@@ -407,7 +409,7 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
     maps = {name: small_map(2) for name in ("eager", "compiled", "twin")}
     maps["compiled"].compile()
     maps["twin"].compile()
-    for k, number in enumerate((300, 290, 310)):
+    for k, number in enumerate((300, 290, 5000)):
         cloud, T = scan(k, 2, number)
         for emap in maps.values():
             emap.update(cloud, T, T, 0.3)
@@ -419,6 +421,22 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
             rounded = floats | {"drift_error", "drift_correction"}
             assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
     assert graphs() == before + 1
+
+
+def test_configs_of_one_shape_have_their_own_graphs(monkeypatch):
+    """Nine: of one code object the compiler keeps eight graphs, and refuses the next."""
+    guards = {"guard_filter_fn": guards_on_arguments}
+    monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
+    stages = {"drift": None, "raycast": None, "overlap": None, "traversability": None}
+    cloud, T = scan(0, 2, 60)
+    for k in range(9):
+        maps = [small_map(2, **stages, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
+        maps[1].compile()
+        for emap in maps:
+            emap.update(cloud, T, T, 0.3)
+        assert_close(maps[0].state, maps[1].state)
+    compiled_update.cache_clear()
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 5])

@@ -34,7 +34,9 @@ class DriftConfig:
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Average (B, M) over what the mask keeps; 0 where it keeps nothing."""
-    return torch.where(mask, values, 0.0).sum(1) / count(mask).clamp(min=1)
+    # In float64: a float32 sum of more than 4096 points the compiler writes in another way, in another graph.
+    total = torch.where(mask, values, 0.0).sum(1, dtype=torch.float64)
+    return (total / count(mask).clamp(min=1)).to(values.dtype)
 
 
 def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig) -> MapState:

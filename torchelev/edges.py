@@ -12,7 +12,7 @@ from torch import Tensor
 from torchelev.disputed import Disputed, moved_by
 from torchelev.grid import GridConfig
 from torchelev.storage import as_bytes
-from torchelev.windows import AROUND
+from torchelev.windows import around
 
 if TYPE_CHECKING:
     from torchelev.fusion import FusionConfig, Prior, Scan
@@ -129,7 +129,7 @@ def ends_of_step(
 def heights_around(layer: Tensor, cells: Tensor, width: int) -> Tensor:
     """Read a layer (B, C) at the eight neighbours of cells (K,) numbered across environments: -> (K, 8)."""
     i, j = cells % layer.shape[1] // width, cells % width
-    di, dj = torch.tensor(AROUND, device=cells.device).unbind(1)
+    di, dj = around(cells.device)
     i, j = i[:, None] + di, j[:, None] + dj
     exists = (i >= 0) & (i < layer.shape[1] // width) & (j >= 0) & (j < width)
     place = torch.where(exists, cells[:, None] + di * width + dj, 0)
@@ -141,7 +141,7 @@ def lie_behind(x: Tensor, y: Tensor) -> Tensor:
 
     Beside it along a wall lie cells that show the wall's face too, and the wall would end as every other cell's.
     """
-    around = torch.tensor(AROUND, device=x.device, dtype=x.dtype)
-    limit = math.cos(math.radians(50)) * torch.linalg.vector_norm(around, dim=1)
-    along = x[:, None] * around[:, 0] + y[:, None] * around[:, 1]
+    di, dj = (steps.to(x.dtype) for steps in around(x.device))
+    limit = math.cos(math.radians(50)) * (di.square() + dj.square()).sqrt()
+    along = x[:, None] * di + y[:, None] * dj
     return along > limit * (x.square() + y.square()).sqrt()[:, None]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from types import FunctionType
 from typing import Any
 
 import torch
@@ -120,6 +122,20 @@ def announced_compilation() -> Iterator[None]:
     print(f"done in {took:.0f} s. Later processes find it in the compiler's cache.", file=sys.stderr, flush=True)
 
 
+def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function with a code object of its own.
+
+    The compiler finds its graphs by code object and guards. Functions that differ by what they enclose alone, which no
+    guard looks at here, would be given each other's graphs; and of one code object it keeps no more than eight.
+    """
+    assert isinstance(function, FunctionType)
+    code = function.__code__.replace(co_name=f"{function.__name__}_{next(_number)}")
+    return FunctionType(code, function.__globals__, code.co_name, function.__defaults__, function.__closure__)
+
+
+_number = itertools.count()
+
+
 @functools.cache
 def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
     """Return the compiled update of a config, which writes into the state that it is given.
@@ -132,7 +148,7 @@ def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
         """Update; masks come as bytes, see `as_bytes`. Writing within the graph saves a copy of every layer."""
         write(stored, with_masks(plain(with_masks(stored, as_mask), *others), as_bytes))
 
-    graph = torch.compile(in_place, fullgraph=True, options=compiler_options())
+    graph = torch.compile(own_code(in_place), fullgraph=True, options=compiler_options())
     first = True
 
     def run(state: MapState, points: Tensor, *others: Any) -> None:

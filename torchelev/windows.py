@@ -13,6 +13,13 @@ from torchelev.storage import realize_all
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 
 
+def around(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return AROUND's rows and columns, (8,) int64; computed, as a copy to a GPU would make the host wait."""
+    k = torch.arange(8, device=device)
+    k = k + (k >= 4)
+    return k // 3 - 1, k % 3 - 1
+
+
 def _line(values: Tensor, rim: int, dim: int, k: int) -> Tensor:
     """Return what lies k entries on, along a dimension that has a rim."""
     return values.narrow(dim, rim + k, values.shape[dim] - 2 * rim)
@@ -50,6 +57,6 @@ def window_maximum(values: list[Tensor], rim: int, radius: int) -> list[Tensor]:
 
 def neighbours(values: Tensor, fill: float) -> list[Tensor]:
     """Return the eight neighbours of each cell of (..., H, W) in the order of AROUND, `fill` outside the layer."""
-    around = padded(values, 1, fill)
-    rows = [_line(around, 1, -2, i) for i in (-1, 0, 1)]
+    rimmed = padded(values, 1, fill)
+    rows = [_line(rimmed, 1, -2, i) for i in (-1, 0, 1)]
     return [_line(rows[1 + i], 1, -1, j) for i, j in AROUND]

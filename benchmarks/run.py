@@ -1,0 +1,118 @@
+"""Speed and scale on this machine: time, memory and growth of an update, start-up, and whether the targets are met.
+
+    python -m benchmarks.run                      # all sections, under ten minutes: JSON, plots, tables
+    python -m benchmarks.run points robots        # these sections alone; the others stay as they were
+    python -m benchmarks.run --against old.json   # measure, and flag what became slower
+    python -m benchmarks.run --compare new.json --against old.json    # compare two files without measuring
+
+Each finished section is written at once; --resume goes on with the sections missing from this commit's file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from benchmarks import meter, speed_plots, speed_tables
+from benchmarks.report import commit, machine, write_json
+from benchmarks.speed_sections import SECTIONS, fresh_compiler
+from benchmarks.workload import full_config
+
+SLOWER = 1.3  # a ratio of times above it is a regression, if medians and minima agree on it
+
+
+def default_path(folder: str) -> Path:
+    """Return where this machine's result lies: one file per processor and number of threads."""
+    words = re.findall(r"[a-z0-9]+", machine()["processor"].lower())
+    return Path(folder) / f"speed-{'-'.join(words)}-{torch.get_num_threads()}-threads.json"
+
+
+def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[str, Any]:
+    """Run sections, writing the file after each."""
+    result = json.loads(path.read_text()) if path.exists() else {"commits": {}}
+    for name in names:
+        if resume and result["commits"].get(name) == commit():
+            continue
+
+        def track(values: Iterable, name: str = name) -> Iterator:
+            yield from tqdm(list(values), desc=name, disable=None, leave=False)
+
+        fresh_compiler()
+        result[name] = SECTIONS[name](seconds, track)
+        result["commits"][name] = commit()
+        result["copy_gigabytes_per_second"] = meter.copy_bandwidth() / 1e9
+        result["config"] = full_config().to_dict()
+        result["machine"] = machine()
+        write_json(path, result)
+    return result
+
+
+def timings(values: Any, path: str = "") -> Iterator[tuple[str, dict[str, float]]]:
+    """Find every time in a result, with its place."""
+    if isinstance(values, dict):
+        if {"median", "min"} <= values.keys():
+            yield path, values
+        for name, value in values.items():
+            yield from timings(value, f"{path}/{name}")
+    elif isinstance(values, list):
+        for value in (v for v in values if isinstance(v, dict)):
+            key = next((f"{k} {value[k]}" for k in ("points", "robots", "cells", "metres") if k in value), "?")
+            yield from timings(value, f"{path}/{key}")
+
+
+def regressions(new: dict[str, Any], old: dict[str, Any], limit: float = SLOWER) -> list[str]:
+    """List what takes more than `limit` times as long as before, by median and by minimum: one alone is noise."""
+    before = dict(timings(old))
+    slower = []
+    for place, time in timings(new):
+        if place in before:
+            ratios = [time[kind] / before[place][kind] for kind in ("median", "min")]
+            if min(ratios) > limit:
+                change = f"{before[place]['median']:.3f} -> {time['median']:.3f} ms"
+                slower.append(f"{place}: {change}, {min(ratios):.2f} times as long")
+    return slower
+
+
+def main() -> int:
+    """Measure, write JSON, plots and tables; with --against, fail if something became slower."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}; default: all")
+    parser.add_argument("--out", default="benchmarks/results", help="folder for the results (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=2.0, help="time for each figure [s] (default: %(default)s)")
+    parser.add_argument("--resume", action="store_true", help="skip the sections measured at this commit")
+    parser.add_argument("--against", type=Path, metavar="OLD.json", help="flag what became slower than there")
+    parser.add_argument("--compare", type=Path, metavar="NEW.json", help="measure nothing, compare this with --against")
+    args = parser.parse_args()
+    unknown = [name for name in args.sections if name not in SECTIONS]
+    if unknown:
+        parser.error(f"unknown section {', '.join(unknown)}: there are {', '.join(SECTIONS)}")
+    if args.compare and not args.against:
+        parser.error("--compare needs --against OLD.json")
+    old = json.loads(args.against.read_text()) if args.against else None
+    if args.compare:
+        result = json.loads(args.compare.read_text())
+    else:
+        torch.set_num_threads(args.threads)
+        path = default_path(args.out)
+        result = measure(path, args.sections or list(SECTIONS), args.seconds, args.resume)
+        speed_plots.draw(result, path.with_suffix(".png"))
+        print(speed_tables.report(result))
+        print(f"\nwrote {path} and {path.with_suffix('.png')}")
+    if old is not None:
+        slower = regressions(result, old)
+        print("\n".join([f"\nMore than {SLOWER} times as slow as in {args.against}: {len(slower)}", *slower]))
+        return 1 if slower else 0
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

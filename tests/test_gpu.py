@@ -1,0 +1,120 @@
+"""A GPU's host neither waits nor reads back; where there is a GPU: equal to the CPU, deterministic, and captured."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import pose, random_poses, small_config
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from torchelev import BodyConfig, ElevationMap, SensorConfig, disputed, edges, operators
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+OPERATORS = [
+    operators.cell_sums,
+    operators.padded,
+    operators.running_minimum,
+    operators.polar_minimum,
+    disputed.robust_mean,
+    edges.step_side,
+]
+
+
+class OneDevice(TorchDispatchMode):
+    """Refuses operations between devices, for which the host waits."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        tensors = [t for t in tree_leaves((args, kwargs, result)) if isinstance(t, torch.Tensor)]
+        devices = {t.device.type for t in tensors if t.ndim > 0}
+        assert len(devices) <= 1, f"{function} mixes {devices}"
+        return result
+
+
+def test_host_reads_nothing_back(monkeypatch):
+    # Tensors on "meta" have no values, so that reading one raises; all but the CPU takes the GPU's paths.
+    for operator in OPERATORS:
+        monkeypatch.setattr(operator, "_abstract_fn", operator._init_fn)
+    emap = ElevationMap(small_config(sensor=SensorConfig(body=BodyConfig())), 5, "meta")
+    cloud, T = torch.empty(5, 2, 100, 3, device="meta"), torch.empty(5, 2, 4, 4, device="meta")
+    for constructor in ("tensor", "as_tensor", "from_numpy"):  # copies a constant, while the host waits
+        monkeypatch.setattr(torch, constructor, None)
+    with OneDevice():
+        emap.update(cloud, T, T[:, 0], 0.1)
+        emap.update(cloud, T, T[:, 0], torch.empty(5, device="meta"), variance=cloud[..., 0])
+        emap.sample(torch.empty(5, 7, 2, device="meta"), "upper_bound")
+        emap.layer("normal_z")
+        emap.initialize(torch.empty(5, 4, 3, device="meta"))
+        emap.reset(mask=torch.empty(5, device="meta", dtype=torch.bool))
+        emap.reset(torch.empty(3, device="meta", dtype=torch.int64))
+        emap.reset()
+
+
+def drive(emap, updates=4, seed=0):
+    """Fuse a few random scans, made on the CPU so that every device gets the same."""
+    generator = torch.Generator().manual_seed(seed)
+    for k in range(updates):
+        cloud = torch.rand(emap.num_envs, 300, 3, generator=generator) * torch.tensor([2.0, 2.0, 0.3]) - 1
+        T = pose((0.05 * k, 0.0, 1.0), num_envs=emap.num_envs)
+        emap.update(cloud.to(emap.device), T.to(emap.device), T.to(emap.device), 0.6)
+    return emap
+
+
+@needs_gpu
+@pytest.mark.parametrize("compiled", [False, True])
+def test_gpu_gives_the_same_map(compiled):
+    on_cpu, on_gpu = (ElevationMap(small_config((40, 40), 0.05), 3, device) for device in ("cpu", "cuda"))
+    if compiled:
+        on_gpu.compile()
+    drive(on_cpu), drive(on_gpu)
+    assert (on_gpu.validity.cpu() == on_cpu.validity).float().mean() > 0.999
+    both = on_gpu.validity.cpu() & on_cpu.validity
+    difference = (on_gpu.elevation.cpu() - on_cpu.elevation)[both].abs()
+    assert difference.median() < 1e-6 and difference.quantile(0.999) < 1e-4
+
+
+@needs_gpu
+def test_gpu_repeats_to_the_bit_when_told_to():
+    torch.use_deterministic_algorithms(True)
+    try:
+        first, second = (drive(ElevationMap(small_config((40, 40), 0.05), 3, "cuda")) for _ in range(2))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for name, value in first.state_dict().items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, second.state_dict()[name]), name
+
+
+@needs_gpu
+def test_host_never_waits():
+    emap = drive(ElevationMap(small_config(), 3, "cuda"))
+    cloud, T = torch.rand(3, 50, 3, device="cuda"), pose(num_envs=3).cuda()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        emap.update(cloud, T, T, 0.1)
+        emap.sample(cloud[..., :2])
+        emap.reset(mask=torch.ones(3, dtype=torch.bool, device="cuda"))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@needs_gpu
+@pytest.mark.parametrize("compiled", [False, True])
+def test_captured_update_equals_plain(compiled):
+    plain, captured = (ElevationMap(small_config((40, 40), 0.05), 3, "cuda") for _ in range(2))
+    if compiled:
+        captured.compile()
+    cloud, T = torch.rand(3, 300, 3, device="cuda") - 0.5, pose(num_envs=3).cuda()
+    drive(captured)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured.update(cloud, T, T, 0.1)
+    captured.reset()
+    for seed in range(3):
+        cloud.copy_(torch.rand(cloud.shape, generator=torch.Generator().manual_seed(seed)) - 0.5)
+        T.copy_(random_poses(np.random.default_rng(seed), 3))
+        graph.replay()
+        plain.update(cloud, T, T, 0.1)
+    both = plain.validity & captured.validity
+    assert (plain.validity == captured.validity).float().mean() > 0.999
+    assert (plain.elevation - captured.elevation)[both].abs().quantile(0.999) < 1e-4
