@@ -20,7 +20,7 @@ def test_neighbours_behind_a_cell_lie_within_50_degrees_of_its_rays(degrees):
 def test_heights_around():
     """Of two maps of 3 x 2 cells; outside a map nothing is seen, the other map's cells least of all."""
     layer = torch.arange(12.0).view(2, 6)
-    got = heights_around(layer, torch.tensor([3, 4, 6]), width=2)
+    (got,) = heights_around([layer], torch.tensor([3, 4, 6]), width=2)
     none = UNSEEN
     assert got[0].tolist() == [0, 1, none, 2, none, 4, 5, none]
     assert got[1].tolist() == [none, 2, 3, none, 5, none, none, none]

@@ -85,11 +85,12 @@ def step_side(
     passed, *ray = points.others
     middle = points.of(mean)
     top, bottom = ends_of_step(points, middle, refinements, margin, min_extreme)
-    low = ((points.weight > 0) & (points.z < points.at_points(middle))).to(mean.dtype)
+    used = (points.weight > 0).to(mean.dtype)
+    low = used * (points.z < points.at_points(middle))
     ground = points.sum(low * passed) > min_passed * points.sum(low)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
-    scanned, mapped = (heights_around(layer, points.cells, width) for layer in shown)
-    x, y = (points.sum(torch.where(points.weight > 0, part, 0.0)) for part in ray)
+    scanned, mapped = heights_around(shown, points.cells, width)
+    x, y = (points.sum(used * part) for part in ray)
     mapped = torch.where(lie_behind(x, y), mapped, UNSEEN)
     elsewhere = (scanned.amax(1) >= 0.5 * (middle + top)) | (mapped.amax(1) >= top - relief)
     ground = ground & elsewhere
@@ -104,36 +105,37 @@ def _(cells: Tensor, slot: Tensor, z: Tensor, *others: Any) -> Tensor:
 def ends_of_step(
     points: Disputed, middle: Tensor, refinements: int, margin: float, min_extreme: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the heights (K,) of the step's top and bottom.
+    """Return the heights (K,) of the step's top and bottom: the bottom is the top of the step upside down.
 
     The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
     top of a wall's face. The bottom takes two. Up to `margin` standard deviations short of a level lies past it.
     A level that fewer than `min_extreme` reach, give or take a standard deviation, is an outlier's.
     """
     noise = points.spread.sqrt()
-    used = points.weight > 0
+    widest = torch.where(points.weight > 0, noise, -torch.inf)
 
-    def level(side: float, rounds: int) -> Tensor:
-        height = middle
+    def level(z: Tensor, height: Tensor, rounds: int) -> Tensor:
+        past, reached = z + margin * noise, z + widest
         for _ in range(rounds):
-            residual = points.z - points.at_points(height)
-            outer = torch.where(side * residual >= -margin * noise, points.weight, 0.0)
-            further = moved_by(height, points.sum(outer * residual), points.sum(outer))
-            there = used & (side * (points.z - points.at_points(further)) >= -noise)
-            height = torch.where(points.sum(there.to(height.dtype)) >= min_extreme, further, height)
+            start = points.at_points(height)
+            outer = points.weight * (past >= start)
+            further = moved_by(height, points.sum(outer * (z - start)), points.sum(outer))
+            there = (reached >= points.at_points(further)).to(height.dtype)
+            height = torch.where(points.sum(there) >= min_extreme, further, height)
         return height
 
-    return level(1.0, refinements), level(-1.0, 2)
+    return level(points.z, middle, refinements), -level(-points.z, -middle, 2)
 
 
-def heights_around(layer: Tensor, cells: Tensor, width: int) -> Tensor:
-    """Read a layer (B, C) at the eight neighbours of cells (K,) numbered across environments: -> (K, 8)."""
-    i, j = cells % layer.shape[1] // width, cells % width
+def heights_around(layers: list[Tensor], cells: Tensor, width: int) -> list[Tensor]:
+    """Read layers (B, C) at the eight neighbours of cells (K,) numbered across environments: each -> (K, 8)."""
+    num_cells = layers[0].shape[1]
+    i, j = cells % num_cells // width, cells % width
     di, dj = around(cells.device)
     i, j = i[:, None] + di, j[:, None] + dj
-    exists = (i >= 0) & (i < layer.shape[1] // width) & (j >= 0) & (j < width)
+    exists = (i >= 0) & (i < num_cells // width) & (j >= 0) & (j < width)
     place = torch.where(exists, cells[:, None] + di * width + dj, 0)
-    return torch.where(exists, layer.flatten()[place], UNSEEN)
+    return [torch.where(exists, layer.take(place), UNSEEN) for layer in layers]
 
 
 def lie_behind(x: Tensor, y: Tensor) -> Tensor:

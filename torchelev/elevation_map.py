@@ -134,7 +134,10 @@ class ElevationMap(nn.Module):
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
         run = compiled_update(self.cfg) if self._compiled else functools.partial(update_in_place, cfg=self.cfg)
         with torch.no_grad():
-            for envs in self._chunks():
+            chunks = self._chunks()
+            if len(chunks) == 1:
+                return run(self.state, *inputs)
+            for envs in chunks:
                 state = map_layers(lambda layer, envs=envs: layer[envs], self.state)
                 values: list[Any] = [None if value is None else value[envs] for value in inputs]
                 run(state, *values)
