@@ -156,11 +156,17 @@ def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
             update_in_place(state, points, *others, cfg=cfg)
             return
         nonlocal first
-        for values in (points, others[-1]):
+        inputs = [None if value is None else packed(value) for value in (points, *others)]
+        for values in (inputs[0], inputs[-1]):
             if values is not None:
                 torch._dynamo.maybe_mark_dynamic(values, 2)
         with announced_compilation() if first else contextlib.nullcontext():
-            graph(with_masks(state, as_bytes), points, *others)
+            graph(with_masks(state, as_bytes), *inputs)
         first = False
 
     return run
+
+
+def packed(value: Tensor) -> Tensor:
+    """Return the values with the strides of a new tensor; for a slice's or an expansion's there would be other graphs."""
+    return value.reshape(-1).view(value.shape)

@@ -1,0 +1,142 @@
+"""Long runs: does an update's time, the process's memory or the number of compiled graphs grow?
+
+    python -m benchmarks.long_run        # 100,000 updates of one robot, 10,000 of 256: about 20 minutes
+
+The robots drive on and on, and no two scans of a round have the same number of points. The result is written after
+each hundredth of a run, so that Ctrl-C loses nothing; growth within a process cannot be resumed in another.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.utils.benchmark as bench
+from torch._dynamo.utils import counters
+from tqdm import tqdm
+
+from benchmarks.report import markdown_table, write_json
+from benchmarks.speed_sections import fresh_compiler
+from benchmarks.workload import BPEARL, MANY_POINTS, Drive, full_config
+
+CASES = {"one robot": (1, 250, BPEARL, 100_000), "256 robots": (256, 64, MANY_POINTS, 10_000)}
+BLOCKS = 100
+GROWTH = 1.05  # of the last quarter over the first
+
+
+def resident_bytes() -> int:
+    """Return what the process holds in memory now."""
+    pages = Path("/proc/self/statm").read_text().split()[1]
+    return int(pages) * 4096
+
+
+def onward(drive: Drive) -> None:
+    """Let the robots drive on for ever, and give each scan its own number of points."""
+    drive.clouds = [cloud[:, k * cloud.shape[1] // 40 :].contiguous() for k, cloud in enumerate(drive.clouds)]
+    plain = drive.next_scan
+
+    def next_scan() -> tuple[torch.Tensor, torch.Tensor]:
+        cloud, T = plain()
+        T = T.clone()
+        T[:, 0, 3] = 0.04 * drive.step
+        return cloud, T
+
+    drive.next_scan = next_scan  # type: ignore[method-assign]
+
+
+def run_case(name: str, updates: int, save: Any) -> dict[str, Any]:
+    """Run in blocks; note each block's time per update, and memory and graphs after it."""
+    robots, side, points, _ = CASES[name]
+    fresh_compiler()
+    counters.clear()
+    drive = Drive(full_config(side), points, robots=robots, scans=8 if robots == 1 else 4)
+    onward(drive)
+    drive.watch(8)
+    size = max(1, updates // BLOCKS)
+    timer = bench.Timer("drive()", globals={"drive": drive}, num_threads=torch.get_num_threads())
+    values: dict[str, Any] = {"robots": robots, "points": points, "cells": side**2, "block": size}
+    values |= {"ms": [], "resident_bytes": [], "graphs": []}
+    for _ in tqdm(range(math.ceil(updates / size)), desc=name, disable=None):
+        values["ms"].append(1e3 * timer.timeit(size).mean)
+        values["resident_bytes"].append(resident_bytes())
+        values["graphs"].append(counters["stats"]["unique_graphs"])
+        values["updates"] = drive.step
+        values["known_share"] = float(drive.emap.validity.float().mean())
+        save(values)
+    return values
+
+
+def growth(series: list[float]) -> float:
+    """Return the last quarter's median over the first's, of which the very first entries warm up."""
+    part = max(1, len(series) // 4)
+    return statistics.median(series[-part:]) / statistics.median(series[:part])
+
+
+def verdicts(result: dict[str, Any]) -> list[list[str]]:
+    """Tabulate growth of time and memory, and the graphs compiled."""
+    rows = []
+    for name, values in result.items():
+        time, memory = growth(values["ms"]), growth(values["resident_bytes"])
+        part = max(1, len(values["ms"]) // 4)
+        fastest = [min(values["ms"][:part]), min(values["ms"][-part:])]
+        graphs = values["graphs"][-1]
+        holds = fastest[1] / fastest[0] <= GROWTH and memory <= GROWTH and graphs == values["graphs"][0]
+        figures = [f"{time:.2f}", f"{fastest[1] / fastest[0]:.2f}", f"{memory:.3f}", f"{graphs}"]
+        rows.append([name, f"{values['updates']:,}", *figures, "none grows" if holds else "GROWS"])
+    return rows
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Draw time per update and memory over the updates."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(result), figsize=(9, 3.2), layout="constrained", squeeze=False)
+    for ax, (name, values) in zip(axes.flat, result.items(), strict=True):
+        updates = [values["block"] * (k + 1) for k in range(len(values["ms"]))]
+        ax.plot(updates, values["ms"], label="time")
+        ax.set(xlabel="updates", ylabel="time per update [ms]", title=name)
+        ax.set_ylim(bottom=0)
+        memory = ax.twinx()
+        memory.plot(updates, [b / 1e6 for b in values["resident_bytes"]], color="C1", label="memory")
+        memory.set_ylabel("memory of the process [MB]")
+        memory.set_ylim(bottom=0)
+        ax.legend(handles=[ax.lines[0], memory.lines[0]], fontsize=8, loc="lower right")
+    figure.savefig(path, dpi=90)
+
+
+def main() -> int:
+    """Run the cases, write JSON and plot, and fail if something grows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(map(repr, CASES))}; default: all")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
+    parser.add_argument("--share", type=float, default=1.0, help="of the updates to run (default: %(default)s)")
+    args = parser.parse_args()
+    if unknown := [name for name in args.cases if name not in CASES]:
+        parser.error(f"unknown case {', '.join(unknown)}: there are {', '.join(CASES)}")
+    torch.set_num_threads(args.threads)
+    result: dict[str, Any] = {}
+    for name in args.cases or CASES:
+
+        def save(values: dict[str, Any], name: str = name) -> None:
+            result[name] = values
+            write_json(args.out / "long_run.json", result)
+
+        run_case(name, int(args.share * CASES[name][3]), save)
+    plot(result, args.out / "long_run.png")
+    rows = verdicts(result)
+    head = ["case", "updates", "time", "fastest block", "memory", "graphs", "last quarter / first"]
+    print(markdown_table(head, rows))
+    return int(any(row[-1] == "GROWS" for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
