@@ -91,6 +91,11 @@ def verdicts(result: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
+def table(result: dict[str, Any]) -> str:
+    """Tabulate the cases."""
+    return markdown_table(["case", "updates", "time", "fastest block", "memory", "graphs", ""], verdicts(result))
+
+
 def plot(result: dict[str, Any], path: Path) -> None:
     """Draw time per update and memory over the updates."""
     import matplotlib
@@ -107,7 +112,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
         memory = ax.twinx()
         memory.plot(updates, [b / 1e6 for b in values["resident_bytes"]], color="C1", label="memory")
         memory.set_ylabel("memory of the process [MB]")
-        memory.set_ylim(bottom=0)
+        memory.set_ylim(0, 1.3e-6 * max(values["resident_bytes"]))
         ax.legend(handles=[ax.lines[0], memory.lines[0]], fontsize=8, loc="lower right")
     figure.savefig(path, dpi=90)
 
@@ -132,10 +137,8 @@ def main() -> int:
 
         run_case(name, int(args.share * CASES[name][3]), save)
     plot(result, args.out / "long_run.png")
-    rows = verdicts(result)
-    head = ["case", "updates", "time", "fastest block", "memory", "graphs", "last quarter / first"]
-    print(markdown_table(head, rows))
-    return int(any(row[-1] == "GROWS" for row in rows))
+    print(table(result))
+    return int(any(row[-1] == "GROWS" for row in verdicts(result)))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from benchmarks import long_run as long_runs
 from benchmarks import speed_tables
 from benchmarks.report import markdown_table
 
@@ -61,14 +62,20 @@ def speed() -> str:
     return f"{speed_tables.report(load(SPEED))}\n\n{picture}"
 
 
-TABLES = {"accuracy": accuracy, "features": features, "real": real, "speed": speed}
+def long_run() -> str:
+    """Tabulate growth over long runs."""
+    cases = {name: values for name, values in load("long_run").items() if name in long_runs.CASES}
+    return long_runs.table(cases)
+
+
+TABLES = {"accuracy": accuracy, "features": features, "real": real, "speed": speed, "long_run": long_run}
 
 
 def with_tables(text: str) -> str:
     """Return the README with its tables made anew."""
     for name, table in TABLES.items():
-        pattern = rf"(<!-- {name} -->\n).*?(\n<!-- end -->)"
-        text, count = re.subn(pattern, lambda m, t=table: m[1] + t() + m[2], text, flags=re.DOTALL)
+        pattern = rf"(<!-- {name} -->\n).*?(<!-- end -->)"
+        text, count = re.subn(pattern, lambda m, t=table: m[1] + t() + "\n" + m[2], text, flags=re.DOTALL)
         assert count == 1, f"README.md must hold <!-- {name} --> ... <!-- end --> once"
     return text
 

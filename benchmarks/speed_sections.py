@@ -58,7 +58,8 @@ def points(seconds: float, track: Track) -> dict[str, Any]:
     rows = results["full"]
     sizes, times = [row["points"] for row in rows], [row["median"] for row in rows]
     results["exponent"] = meter.exponent(sizes, times)
-    results["exponent_from_43074"] = meter.exponent(sizes[4:], times[4:])
+    many = sizes.index(BPEARL)
+    results["exponent_from_43074"] = meter.exponent(sizes[many:], times[many:])
     return results
 
 

@@ -1,5 +1,6 @@
 """The speed benchmarks: what they count, fit and compare."""
 
+import copy
 import json
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from benchmarks import meter, speed_plots, speed_tables
+from benchmarks import gpu, long_run, meter, speed_plots, speed_sections, speed_tables
 from benchmarks.readme import ROOT, SPEED, load
 from benchmarks.run import regressions, timings
 from benchmarks.workload import Drive, full_config
@@ -68,6 +69,60 @@ def test_committed_result_has_its_table_and_picture(tmp_path):
     assert "| case | measured | target |" in speed_tables.report(result)
     speed_plots.draw(result, tmp_path / "speed.png")
     assert (tmp_path / "speed.png").stat().st_size > 10_000
+
+
+@pytest.fixture
+def eager(monkeypatch):
+    """Skip compiling, which takes half a minute."""
+    monkeypatch.setattr(ElevationMap, "compile", lambda self: None)
+
+
+def test_long_run_writes_every_block(tmp_path, monkeypatch, capsys, eager):
+    monkeypatch.setattr(long_run, "CASES", {"two robots": (2, 64, 400, 4)})
+    monkeypatch.setattr(sys, "argv", ["long_run", "--out", str(tmp_path), "--threads", "1"])
+    long_run.main()
+    values = json.loads((tmp_path / "long_run.json").read_text())["two robots"]
+    assert len(values["ms"]) == len(values["resident_bytes"]) == len(values["graphs"]) == 4
+    assert values["updates"] >= 12 and values["known_share"] > 0.05
+    assert (tmp_path / "long_run.png").exists() and "| two robots |" in capsys.readouterr().out
+
+
+def test_long_run_sees_growth():
+    steady = {"updates": 400, "ms": [9.0, 3.0, 3.1, 3.0] * 3, "resident_bytes": [10**8] * 12, "graphs": [1] * 12}
+    slower = steady | {"ms": [3.0 + 0.1 * k for k in range(12)]}
+    larger = steady | {"resident_bytes": [10**8 + 10**6 * k for k in range(12)]}
+    again = steady | {"graphs": [1] * 6 + [2] * 6}
+    rows = long_run.verdicts({"steady": steady, "slower": slower, "larger": larger, "again": again})
+    assert [row[-1] for row in rows] == ["none grows", "GROWS", "GROWS", "GROWS"]
+
+
+def test_drives_of_a_long_run_vary_in_length_and_place():
+    drive = Drive(full_config(64), 400, compiled=False, scans=4)
+    long_run.onward(drive)
+    scans = [drive.next_scan() for _ in range(50)]
+    assert {cloud.shape[1] for cloud, _ in scans} == {400, 390, 380, 370}
+    torch.testing.assert_close(scans[49][1][0, 0, 3].item(), 0.04 * 50)
+
+
+@pytest.mark.parametrize("section", ["rays", "points", "robots", "cells"])
+def test_sections_measure_at_small_sizes(section, monkeypatch, eager):
+    small = {"RAYS": [1.2, 4.8], "POINTS": [6276, 43074, 50000], "ROBOTS": [1, 2, 3], "CELLS": [50, 60, 70]}
+    for name, values in small.items():
+        monkeypatch.setattr(speed_sections, name, values)
+    monkeypatch.setattr(speed_sections, "SENSORS", [("none", 6276, 1, 1)])
+    result = {section: speed_sections.SECTIONS[section](0.001, lambda values: values)}
+    assert len(list(timings(result))) >= 2
+
+
+def test_gpu_comparison():
+    first = gpu.driven("cpu", compiled=False, robots=1, updates=2)
+    assert set(gpu.compare(first, first).values()) == {0.0}
+    other = copy.deepcopy(first)
+    other.elevation += 0.5
+    other.validity[:, 0] = ~other.validity[:, 0]
+    result = gpu.compare(first, other)
+    assert result["median_difference_m"] == pytest.approx(0.5)
+    assert result["cells_known_by_one_alone"] == pytest.approx(1 / 64)
 
 
 def run_compare(new, old):

@@ -403,7 +403,7 @@ def graphs():
 
 
 def test_compiled_update_equals_eager_and_shares_its_graph():
-    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, a new N or a slice."""
+    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice."""
     torch._dynamo.reset()
     before = graphs()
     maps = {name: small_map(2) for name in ("eager", "compiled", "twin")}

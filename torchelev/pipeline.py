@@ -168,5 +168,5 @@ def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
 
 
 def packed(value: Tensor) -> Tensor:
-    """Return the values with the strides of a new tensor; for a slice's or an expansion's there would be other graphs."""
+    """Return the values with the strides of a new tensor; a slice or an expansion would get other graphs."""
     return value.reshape(-1).view(value.shape)
