@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,9 +21,24 @@ from torchelev.state import blank_state
 
 def milliseconds(run: Callable[[], Any], seconds: float) -> dict[str, float]:
     """Time a callable by torch's benchmark tool: median, minimum and interquartile range [ms]."""
-    timer = bench.Timer("run()", globals={"run": run}, num_threads=torch.get_num_threads())
-    m = timer.blocked_autorange(min_run_time=seconds)
-    return {"median": m.median * 1e3, "min": min(m.times) * 1e3, "iqr": m.iqr * 1e3}
+    return interleaved({"": run}, seconds, rounds=1)[""]
+
+
+def interleaved(runs: dict[str, Callable[[], Any]], seconds: float, rounds: int = 5) -> dict[str, dict[str, float]]:
+    """Time several callables in turn, `seconds` each in all, so that a shared machine's bad minutes hit them alike."""
+    threads = torch.get_num_threads()
+    timers = {name: bench.Timer("run()", globals={"run": run}, num_threads=threads) for name, run in runs.items()}
+    parts: dict[str, list[bench.Measurement]] = {name: [] for name in runs}
+    for _ in range(rounds):
+        for name, timer in timers.items():
+            parts[name].append(timer.blocked_autorange(min_run_time=seconds / rounds))
+    return {name: summary([t for part in measured for t in part.times]) for name, measured in parts.items()}
+
+
+def summary(times: list[float]) -> dict[str, float]:
+    """Return median, minimum and interquartile range [ms] of times [s]."""
+    quarters = statistics.quantiles(times, n=4) if len(times) > 1 else [times[0]] * 3
+    return {"median": 1e3 * quarters[1], "min": 1e3 * min(times), "iqr": 1e3 * (quarters[2] - quarters[0])}
 
 
 def peak_bytes(run: Callable[[], Any], device: str = "cpu") -> int:

@@ -87,7 +87,7 @@ def main() -> int:
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}; default: all")
     parser.add_argument("--out", default="benchmarks/results", help="folder for the results (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=2.0, help="time for each figure [s] (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="time for each figure [s] (default: %(default)s)")
     parser.add_argument("--resume", action="store_true", help="skip the sections measured at this commit")
     parser.add_argument("--against", type=Path, metavar="OLD.json", help="flag what became slower than there")
     parser.add_argument("--compare", type=Path, metavar="NEW.json", help="measure nothing, compare this with --against")

@@ -66,7 +66,7 @@ def draw_robots(ax: Any, result: dict[str, Any]) -> None:
 def draw_stages(ax: Any, result: dict[str, Any]) -> None:
     """Draw each stage's time."""
     times = result["stages"]["stages"]
-    names = list(times)[::-1]
+    names = [name for name in times if name != "the whole update"][::-1]
     ax.barh(names, [times[name]["median"] for name in names])
     ax.set(xlabel="time [ms], each compiled alone", title=f"stages, {result['stages']['points']:,} points")
     ax.grid(alpha=0.3, axis="x")

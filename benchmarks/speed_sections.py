@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import statistics
 import subprocess
@@ -36,30 +37,24 @@ def fresh_compiler() -> None:
 
 def points(seconds: float, track: Track) -> dict[str, Any]:
     """Time one robot's update against the number of points: all stages, the paper's plain baseline, eager."""
-    results: dict[str, Any] = {}
-    for kind, cfg in (("full", full_config()), ("baseline", baseline_config())):
-        fresh_compiler()
-        counters.clear()
-        results[kind] = []
-        for n in track(POINTS):
-            drive = Drive(cfg, n)
-            drive.warm_up() if kind == "full" else drive.watch(8)
-            moved = meter.needed_traffic(cfg, n)
-            time = meter.milliseconds(drive, seconds)
-            rate = moved / time["median"] / 1e6
-            row = {"points": n} | time | {"necessary_bytes": moved, "gigabytes_per_second": rate}
-            results[kind].append(row | {"largest_statistics": drive.seen} if kind == "full" else row)
-        results[f"{kind}_graphs"] = counters["stats"]["unique_graphs"]
-    results["eager"] = []
-    for _, n, _, _ in track(SENSORS):
-        drive = Drive(full_config(), n, compiled=False)
-        drive.warm_up()
-        results["eager"].append({"points": n} | meter.milliseconds(drive, seconds))
-    rows = results["full"]
-    sizes, times = [row["points"] for row in rows], [row["median"] for row in rows]
-    results["exponent"] = meter.exponent(sizes, times)
+    counters.clear()
+    drives = {("full", n): Drive(full_config(), n) for n in POINTS}
+    drives |= {("baseline", n): Drive(baseline_config(), n) for n in POINTS}
+    drives |= {("eager", n): Drive(full_config(), n, compiled=False) for n in sorted(row[1] for row in SENSORS)}
+    for (kind, _), drive in track(drives.items()):
+        drive.watch(8) if kind == "baseline" else drive.warm_up()
+    times = meter.interleaved(drives, seconds)
+    results: dict[str, Any] = {"full": [], "baseline": [], "eager": []}
+    for (kind, n), drive in drives.items():
+        moved = meter.needed_traffic(drive.emap.cfg, n)
+        row = {"points": n} | times[kind, n] | {"necessary_bytes": moved}
+        row["gigabytes_per_second"] = moved / row["median"] / 1e6
+        results[kind].append(row | {"largest_statistics": drive.seen})
+    sizes, medians = [row["points"] for row in results["full"]], [row["median"] for row in results["full"]]
+    results["graphs"] = counters["stats"]["unique_graphs"] - 1  # one is the baseline's
+    results["exponent"] = meter.exponent(sizes, medians)
     many = sizes.index(BPEARL)
-    results["exponent_from_43074"] = meter.exponent(sizes[many:], times[many:])
+    results["exponent_from_43074"] = meter.exponent(sizes[many:], medians[many:])
     return results
 
 
@@ -79,34 +74,37 @@ def stages(seconds: float, track: Track) -> dict[str, Any]:
         "point transform, gates, noise": transform,
         "recenter": lambda state, m: grid.recenter(state, m, g),
         "age": lambda state, m: aging.age(state, m, cfg.aging),
-        "drift compensation": lambda state, m: drift_stage(state, m),
+        "drift compensation": lambda state, m: drift.compensate(state, m, g, cfg.drift),
         "height update": lambda state, m: fusion.fuse(state, m, g, cfg.fusion),
         "ray casting": lambda state, m: raycast.clear_seen_through(state, m, g, cfg.raycast),
         "overlap clearance": lambda state, m: overlap.clear_other_floors(state, m, g, cfg.overlap),
         "normals and traversability": lambda state, m: pipeline.rate_surface(state, cfg),
     }
 
-    def drift_stage(state: MapState, m: Measurement) -> MapState:
-        return drift.compensate(state, m, g, cfg.drift)
-
     inputs = (drive.emap.state, transform(drive.emap.state, None))  # type: ignore[arg-type]
-    times = {name: stage_time(all_stages[name], inputs, seconds) for name in track(all_stages)}
-    return {"points": BPEARL, "stages": times}
+    runs = {name: compiled_alone(all_stages[name], [inputs]) for name in track(all_stages)}
+    whole = Drive(cfg, BPEARL)
+    whole.warm_up()
+    return {"points": BPEARL, "stages": meter.interleaved(runs | {"the whole update": whole}, seconds)}
 
 
-def stage_time(stage: Callable[[MapState, Measurement], Any], inputs: Any, seconds: float) -> dict[str, float]:
-    """Compile a stage on its own and time it; masks come and go as bytes, as in the whole update."""
+def compiled_alone(stage: Callable[[MapState, Measurement], Any], inputs: list[Any]) -> Callable[[], None]:
+    """Compile a stage on its own, for one input after the other; masks come and go as bytes, as in the whole update."""
 
-    def run(values: Any) -> Any:
+    def on_bytes(values: Any) -> Any:
         masks = tree_map(lambda t: as_mask(t) if isinstance(t, Tensor) and t.dtype == torch.uint8 else t, values)
         return mask_bytes(stage(*masks))
 
-    fresh_compiler()
-    compiled = torch.compile(run, fullgraph=True, options=pipeline.compiler_options())
-    values = mask_bytes(inputs)
-    with torch.no_grad():
-        compiled(values)
-        return meter.milliseconds(lambda: compiled(values), seconds)
+    compiled = torch.compile(pipeline.own_code(on_bytes), fullgraph=True, options=pipeline.compiler_options())
+    values = [mask_bytes(value) for value in inputs]
+
+    def run() -> None:
+        with torch.no_grad():
+            for value in values:
+                compiled(value)
+
+    run()
+    return run
 
 
 def mask_bytes(values: Any) -> Any:
@@ -135,79 +133,66 @@ def robots(seconds: float, track: Track) -> dict[str, Any]:
 
 def cells(seconds: float, track: Track) -> dict[str, Any]:
     """Time one robot's update against the number of cells."""
-    rows = []
-    for side in track(CELLS):
-        fresh_compiler()
-        drive = Drive(full_config(side), BPEARL, reach=5.0)
+    drives = {side**2: Drive(full_config(side), BPEARL, reach=5.0) for side in CELLS}
+    for drive in track(drives.values()):
         drive.watch(8)
-        rows.append({"cells": side**2} | meter.milliseconds(drive, seconds))
-    sizes, times = [row["cells"] for row in rows], [row["median"] for row in rows]
-    return {"points": BPEARL, "rows": rows, "exponent": meter.exponent(sizes[1:], times[1:])}
+    times = meter.interleaved(drives, seconds)
+    rows = [{"cells": count} | time for count, time in times.items()]
+    exponent = meter.exponent(CELLS[1:], [row["median"] for row in rows[1:]]) / 2  # cells are sides squared
+    return {"points": BPEARL, "rows": rows, "exponent": exponent}
 
 
 def rays(seconds: float, track: Track) -> dict[str, Any]:
     """Time one robot's update against the length of its rays, within the window and far beyond it."""
-    rows = []
-    for length in track(RAYS):
-        drive = Drive(full_config(), BPEARL, scans=4, reach=length)
-        # The farthest hit alone grows: all points on a ring just inside it.
-        for cloud in drive.clouds:
+    drives = {length: Drive(full_config(), BPEARL, scans=4, reach=length) for length in RAYS}
+    for length, drive in track(drives.items()):
+        for cloud in drive.clouds:  # all points on a ring, so that no ray is short
             xy = cloud[..., :2]
             xy *= length * torch.empty_like(cloud[..., :1]).uniform_(0.9, 1.0) / xy.norm(dim=-1, keepdim=True)
         drive.watch(8)
-        rows.append({"metres": length} | meter.milliseconds(drive, seconds))
-    sizes, times = [row["metres"] for row in rows], [row["median"] for row in rows]
-    return {"points": BPEARL, "rows": rows, "exponent": meter.exponent(sizes, times)}
+    times = meter.interleaved(drives, seconds)
+    rows = [{"metres": length} | time for length, time in times.items()]
+    return {"points": BPEARL, "rows": rows, "exponent": meter.exponent(RAYS, [row["median"] for row in rows])}
 
 
 def parts(seconds: float, track: Track) -> dict[str, Any]:
     """Time reset, recenter and sampling beside the update that they go with."""
     rows = []
     for count, cfg, n in track([(1, full_config(), BPEARL), (256, full_config(64), MANY_POINTS)]):
-        fresh_compiler()
         drive = Drive(cfg, n, robots=count, scans=4)
         drive.warm_up()
-        emap = drive.emap
-        update = meter.milliseconds(drive, seconds)
-        times = {"recenter": recenter_time(drive, seconds)}
+        emap, other = drive.emap, copy.deepcopy(drive.emap)
         scan = emap.center[:, None, :2] + torch.rand(count, 187, 2) - 0.5
-        some, mask = torch.arange(0, count, 2), torch.arange(count) % 2 == 0
-        times["sample 187"] = meter.milliseconds(lambda e=emap, xy=scan: e.sample(xy), seconds)
-        times["reset"] = meter.milliseconds(lambda e=emap: e.reset(), seconds)
-        times["reset ids"] = meter.milliseconds(lambda e=emap, ids=some: e.reset(ids), seconds)
-        times["reset mask"] = meter.milliseconds(lambda e=emap, m=mask: e.reset(mask=m), seconds)
-        shares = {name: time["median"] / update["median"] for name, time in times.items()}
-        rows.append({"robots": count, "update": update} | times | {"shares": shares})
+        ids, mask = torch.arange(0, count, 2), torch.arange(count) % 2 == 0
+        runs = {
+            "update": drive,
+            "recenter": compiled_alone(lambda state, m, g=cfg.grid: grid.recenter(state, m, g), chunks_of(drive)),
+            "sample 187": lambda emap=emap, scan=scan: emap.sample(scan),
+            "reset": other.reset,
+            "reset ids": lambda other=other, ids=ids: other.reset(ids),
+            "reset mask": lambda other=other, mask=mask: other.reset(mask=mask),
+        }
+        times = meter.interleaved(runs, seconds)
+        shares = {name: times[name]["median"] / times["update"]["median"] for name in runs if name != "update"}
+        rows.append({"robots": count} | times | {"shares": shares})
     return {"rows": rows}
 
 
-def recenter_time(drive: Drive, seconds: float) -> dict[str, float]:
-    """Time moving the windows to and fro by a cell, in the parts that an update has."""
-    emap, g = drive.emap, drive.emap.cfg.grid
-    runs = []
-    fresh_compiler()
-
-    def recenter(values: Any) -> Any:
-        state, m = tree_map(lambda t: as_mask(t) if t is not None and t.dtype == torch.uint8 else t, values)
-        return mask_bytes(grid.recenter(state, m, g))
-
-    compiled = torch.compile(recenter, fullgraph=True, options=pipeline.compiler_options())
+def chunks_of(drive: Drive) -> list[tuple[MapState, Measurement]]:
+    """Return states and measurements a cell ahead, in the parts that an update has."""
+    emap = drive.emap
     points, T = drive.next_scan()
     ahead = T.clone()
-    ahead[:, 0, 3] = emap.center[:, 0] + 0.04
+    ahead[:, 0, 3] = emap.center[:, 0] + emap.cfg.grid.resolution
     measurement = emap.measure(points, T, ahead, drive.dt)
-    for envs in emap._chunks():
-        state = map_layers(lambda layer, envs=envs: layer[envs], emap.state)
-        m = Measurement(*(None if value is None else value[envs] for value in measurement))
-        runs.append(mask_bytes((state, m)))
-
-    def all_parts() -> None:
-        for values in runs:
-            compiled(values)
-
-    with torch.no_grad():
-        all_parts()
-        return meter.milliseconds(all_parts, seconds)
+    state = map_layers(torch.clone, emap.state)
+    return [
+        (
+            map_layers(lambda layer, envs=envs: layer[envs], state),
+            Measurement(*(None if value is None else value[envs] for value in measurement)),
+        )
+        for envs in emap._chunks()
+    ]
 
 
 IMPORT = "import time, torch; t = time.perf_counter(); import torchelev; print(time.perf_counter() - t)"
