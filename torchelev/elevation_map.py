@@ -18,6 +18,7 @@ from torchelev.layers import LAYERS, Layer, sample_layer
 from torchelev.pipeline import compiled_update, fuse_measurement, rate_surface, update_in_place, write
 from torchelev.sensor import measure
 from torchelev.state import BLANK, MapState, Measurement, Statistics, blank_state, map_layers
+from torchelev.storage import keep_freed_memory
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -64,6 +65,7 @@ class ElevationMap(nn.Module):
         require(some, "chunk", "must be a positive int or None", repr(chunk), "give a number of environments")
         self.cfg, self.num_envs, self.check_values, self.chunk = cfg, num_envs, check_values, chunk
         self._compiled = False
+        keep_freed_memory()
         state = blank_state(cfg.grid, num_envs, device, torch.float32)
         for name, value in state._asdict().items():
             if name != "statistics":
