@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from torchelev.edges import UNSEEN, heights_around, lie_behind
+from torchelev.disputed import Disputed
+from torchelev.edges import UNSEEN, ends_of_step, heights_around, lie_behind
 from torchelev.windows import AROUND
 
 
@@ -25,3 +26,17 @@ def test_heights_around():
     assert got[0].tolist() == [0, 1, none, 2, none, 4, 5, none]
     assert got[1].tolist() == [none, 2, 3, none, 5, none, none, none]
     assert got[2].tolist() == [none, none, none, none, 7, none, 8, 9]
+
+
+def test_points_that_are_not_used_hold_no_level():
+    """One return far above the step's top is an outlier, also if points that are not used lie as high."""
+    z = torch.tensor([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 3.0, 3.0]])
+    weight = torch.tensor([[1.0] * 7 + [0.0] * 2])
+    slot, cells = torch.zeros(1, 9, dtype=torch.int64), torch.ones(1, 1, dtype=torch.uint8)
+    ends = []
+    for count in (7, 9):
+        points = Disputed(cells, *(value[:, :count] for value in (slot, z, torch.full((1, 9), 1e-4), weight)))
+        ends.append(ends_of_step(points, torch.tensor([6 / 7]), 7, 0.25, 2))
+    assert ends[0] == ends[1]
+    assert ends[0][0].item() == pytest.approx(6 / 7)  # the next level, 1.5, would be reached by the outlier alone
+    assert ends[0][1].item() == 0.0
