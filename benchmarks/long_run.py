@@ -9,6 +9,7 @@ each hundredth of a run, so that Ctrl-C loses nothing; growth within a process c
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import statistics
 import sys
@@ -20,13 +21,14 @@ import torch.utils.benchmark as bench
 from torch._dynamo.utils import counters
 from tqdm import tqdm
 
-from benchmarks.report import markdown_table, write_json
+from benchmarks.report import commit, machine, markdown_table, write_json
 from benchmarks.speed_sections import fresh_compiler
 from benchmarks.workload import BPEARL, MANY_POINTS, Drive, full_config
 
 CASES = {"one robot": (1, 250, BPEARL, 100_000), "256 robots": (256, 64, MANY_POINTS, 10_000)}
 BLOCKS = 100
 GROWTH = 1.05  # of the last quarter over the first
+RESULTS = Path("benchmarks/results")
 
 
 def resident_bytes() -> int:
@@ -65,14 +67,14 @@ def run_case(name: str, updates: int, save: Any) -> dict[str, Any]:
         values["ms"].append(1e3 * timer.timeit(size).mean)
         values["resident_bytes"].append(resident_bytes())
         values["graphs"].append(counters["stats"]["unique_graphs"])
-        values["updates"] = drive.step
+        values["updates"] = size * len(values["ms"])
         values["known_share"] = float(drive.emap.validity.float().mean())
         save(values)
     return values
 
 
 def growth(series: list[float]) -> float:
-    """Return the last quarter's median over the first's, of which the very first entries warm up."""
+    """Return the last quarter's median over the first's."""
     part = max(1, len(series) // 4)
     return statistics.median(series[-part:]) / statistics.median(series[:part])
 
@@ -83,17 +85,19 @@ def verdicts(result: dict[str, Any]) -> list[list[str]]:
     for name, values in result.items():
         time, memory = growth(values["ms"]), growth(values["resident_bytes"])
         part = max(1, len(values["ms"]) // 4)
-        fastest = [min(values["ms"][:part]), min(values["ms"][-part:])]
+        fastest = [min(values["ms"][:-part] or values["ms"]), min(values["ms"][-part:])]
         graphs = values["graphs"][-1]
         holds = fastest[1] / fastest[0] <= GROWTH and memory <= GROWTH and graphs == values["graphs"][0]
         figures = [f"{time:.2f}", f"{fastest[1] / fastest[0]:.2f}", f"{memory:.3f}", f"{graphs}"]
-        rows.append([name, f"{values['updates']:,}", *figures, "none grows" if holds else "GROWS"])
+        verdict = "none grows" if holds else "GROWS"
+        rows.append([name, f"{values['updates']:,}", *figures, verdict if len(values["ms"]) >= 10 else "too short"])
     return rows
 
 
 def table(result: dict[str, Any]) -> str:
     """Tabulate the cases."""
-    return markdown_table(["case", "updates", "time", "fastest block", "memory", "graphs", ""], verdicts(result))
+    head = ["case", "updates", "median time", "shortest time", "memory", "graphs compiled", ""]
+    return markdown_table(head, verdicts(result))
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
@@ -121,24 +125,36 @@ def main() -> int:
     """Run the cases, write JSON and plot, and fail if something grows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(map(repr, CASES))}; default: all")
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder (default: %(default)s)")
+    parser.add_argument("--out", type=Path, help=f"folder (default: {RESULTS}, for whole runs only)")
     parser.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
     parser.add_argument("--share", type=float, default=1.0, help="of the updates to run (default: %(default)s)")
     args = parser.parse_args()
     if unknown := [name for name in args.cases if name not in CASES]:
         parser.error(f"unknown case {', '.join(unknown)}: there are {', '.join(CASES)}")
+    if not 0 < args.share <= 1:
+        parser.error(f"--share must lie in (0, 1], not {args.share:g}")
+    if args.share < 1 and args.out is None:
+        parser.error("--share would replace whole runs by a part of one: give another folder with --out")
+    path = (args.out or RESULTS) / "long_run.json"
     torch.set_num_threads(args.threads)
-    result: dict[str, Any] = {}
+    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    interrupted = False
     for name in args.cases or CASES:
 
         def save(values: dict[str, Any], name: str = name) -> None:
-            result[name] = values
-            write_json(args.out / "long_run.json", result)
+            result[name] = {"commit": commit()} | values
+            write_json(path, {**result, "machine": machine()})
 
-        run_case(name, int(args.share * CASES[name][3]), save)
-    plot(result, args.out / "long_run.png")
-    print(table(result))
-    return int(any(row[-1] == "GROWS" for row in verdicts(result)))
+        try:
+            run_case(name, int(args.share * CASES[name][3]), save)
+        except KeyboardInterrupt:
+            interrupted = True
+            break
+    cases = {name: result[name] for name in CASES if name in result}
+    if cases:
+        plot(cases, path.with_suffix(".png"))
+        print(f"{table(cases)}\n\n{'interrupted; ' if interrupted else ''}wrote {path} and its picture")
+    return 130 if interrupted else int(any(row[-1] == "GROWS" for row in verdicts(cases)))
 
 
 if __name__ == "__main__":

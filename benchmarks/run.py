@@ -37,9 +37,11 @@ def default_path(folder: str) -> Path:
 
 def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[str, Any]:
     """Run sections, writing the file after each."""
-    result = json.loads(path.read_text()) if path.exists() else {"commits": {}}
+    result = json.loads(path.read_text()) if path.exists() else {"measured": {}}
     for name in names:
-        if resume and result["commits"].get(name) == commit():
+        stamp = {"commit": commit(), "seconds": seconds}
+        if resume and result["measured"].get(name) == stamp:
+            print(f"{name}: measured at {stamp['commit']}, skipped", file=sys.stderr)
             continue
 
         def track(values: Iterable, name: str = name) -> Iterator:
@@ -47,7 +49,7 @@ def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[
 
         fresh_compiler()
         result[name] = SECTIONS[name](seconds, track)
-        result["commits"][name] = commit()
+        result["measured"][name] = stamp
         result["copy_gigabytes_per_second"] = meter.copy_bandwidth() / 1e9
         result["config"] = full_config().to_dict()
         result["machine"] = machine()

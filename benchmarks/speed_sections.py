@@ -30,9 +30,9 @@ Track = Callable[[Iterable], Iterable]  # shows progress
 
 
 def fresh_compiler() -> None:
-    """Forget compiled updates: one process keeps no more than eight, and the next would be told to be general."""
+    """Forget compiled updates: the one for a second number of robots would be made for any number."""
     torch._dynamo.reset()
-    pipeline.compiled_update.cache_clear()
+    pipeline.graphs_of.cache_clear()
 
 
 def points(seconds: float, track: Track) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import io
+import itertools
 import pickle
 import subprocess
 import sys
@@ -36,7 +37,7 @@ from torchelev import (
     pipeline,
 )
 from torchelev.layers import LAYERS
-from torchelev.pipeline import compiled_update, guards_on_arguments
+from torchelev.pipeline import graphs_of, guards_on_arguments
 from torchelev.state import Statistics
 
 
@@ -425,20 +426,39 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
     assert graphs() == before + 1
 
 
-def test_configs_of_one_shape_have_their_own_graphs(monkeypatch):
-    """Nine: of one code object the compiler keeps eight graphs, and refuses the next."""
+@pytest.fixture
+def traced(monkeypatch):
+    """Compile with the real guards, but leave out the compiler behind them, which takes seconds."""
     guards = {"guard_filter_fn": guards_on_arguments}
     monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
-    stages = {"drift": None, "raycast": None, "overlap": None, "traversability": None}
+    graphs_of.cache_clear()
+    yield {"drift": None, "raycast": None, "overlap": None, "traversability": None}
+    graphs_of.cache_clear()
+
+
+def test_configs_of_one_shape_have_their_own_graphs(traced):
+    """Nine: of one code object the compiler keeps eight graphs, and refuses the next."""
     cloud, T = scan(0, 2, 60)
     for k in range(9):
-        maps = [small_map(2, **stages, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
+        maps = [small_map(2, **traced, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
         maps[1].compile()
         for emap in maps:
             emap.update(cloud, T, T, 0.3)
         assert_close(maps[0].state, maps[1].state)
-    compiled_update.cache_clear()
+
+
+def test_inputs_of_every_kind_have_their_own_graphs(traced):
+    """More than eight of one config: precisions, sensors, with and without base and variances, numbers of robots."""
+    for num_envs, sensors, dtype in ((2, 1, torch.float32), (5, 2, torch.float64), (3, 1, torch.bfloat16)):
+        cloud, T = scan(0, num_envs, 60)
+        clouds = cloud.to(dtype)[:, None].repeat(1, sensors, 1, 1)
+        for base, variance in itertools.product((T, None), (clouds[..., 0].abs() + 0.01, None)):
+            maps = [small_map(num_envs, **traced) for _ in range(2)]
+            maps[1].compile()
+            for emap in maps:
+                emap.update(clouds, T[:, None].repeat(1, sensors, 1, 1), base, 0.3, variance=variance)
+            assert_close(maps[0].state, maps[1].state)
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 5])
@@ -507,11 +527,11 @@ def compile_with(monkeypatch):
         monkeypatch.setattr(
             torch, "compile", lambda f, fullgraph, options: compiler(f, fullgraph=fullgraph, backend=backend)
         )
-        compiled_update.cache_clear()
+        graphs_of.cache_clear()
         torch._dynamo.reset()
 
     yield use
-    compiled_update.cache_clear()
+    graphs_of.cache_clear()
     torch._dynamo.reset()
 
 
@@ -567,8 +587,8 @@ def test_maps_of_equal_configs_share_one_graph(compile_with):
 
 
 def test_equal_configs_share_the_compiled_update():
-    assert compiled_update(small_config()) is compiled_update(small_config())
-    assert compiled_update(small_config()) is not compiled_update(small_config(drift=None))
+    assert graphs_of(small_config(), (), 1) is graphs_of(small_config(), (), 1)
+    assert graphs_of(small_config(), (), 1) is not graphs_of(small_config(drift=None), (), 1)
 
 
 def test_no_recompilation_for_new_values():

@@ -65,7 +65,6 @@ class ElevationMap(nn.Module):
         require(some, "chunk", "must be a positive int or None", repr(chunk), "give a number of environments")
         self.cfg, self.num_envs, self.check_values, self.chunk = cfg, num_envs, check_values, chunk
         self._compiled = False
-        keep_freed_memory()
         state = blank_state(cfg.grid, num_envs, device, torch.float32)
         for name, value in state._asdict().items():
             if name != "statistics":
@@ -134,7 +133,9 @@ class ElevationMap(nn.Module):
         Raises ValueError or TypeError before anything changed.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
-        run = compiled_update(self.cfg) if self._compiled else functools.partial(update_in_place, cfg=self.cfg)
+        if self.device.type == "cpu":
+            keep_freed_memory()
+        run = functools.partial(compiled_update if self._compiled else update_in_place, cfg=self.cfg)
         with torch.no_grad():
             chunks = self._chunks()
             if len(chunks) == 1:

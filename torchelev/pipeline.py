@@ -109,17 +109,19 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
 
     Checking these hundreds took a third of a millisecond.
     """
-    return [not guard.is_global and "plain" not in guard.name and "__dict__" not in guard.name for guard in guards]
+    return [not guard.is_global and "cfg" not in guard.name and "__dict__" not in guard.name for guard in guards]
 
 
 @contextlib.contextmanager
 def announced_compilation() -> Iterator[None]:
     """Say on stderr what is going on for a minute, and what it cost."""
     print("torchelev: compiling the update, for up to a minute ...", end=" ", file=sys.stderr, flush=True)
-    start = time.perf_counter()
-    yield
-    took = time.perf_counter() - start
-    print(f"done in {took:.0f} s. Later processes find it in the compiler's cache.", file=sys.stderr, flush=True)
+    start, end = time.perf_counter(), "failed"
+    try:
+        yield
+        end = f"done in {time.perf_counter() - start:.0f} s. Later processes find it in the compiler's cache."
+    finally:
+        print(end, file=sys.stderr, flush=True)
 
 
 def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -136,35 +138,31 @@ def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
 _number = itertools.count()
 
 
-@functools.cache
-def compiled_update(cfg: ElevationMapConfig) -> Callable[..., None]:
-    """Return the compiled update of a config, which writes into the state that it is given.
+def compiled_update(stored: MapState, points: Tensor, *others: Any, cfg: ElevationMapConfig) -> None:
+    """Do what `update_in_place` does, compiled: any number of points, and of environments from the second on."""
+    if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
+        update_in_place(stored, points, *others, cfg=cfg)
+        return
+    inputs = [None if value is None else packed(value) for value in (points, *others)]
+    for values in (inputs[0], inputs[-1]):
+        if values is not None:
+            torch._dynamo.maybe_mark_dynamic(values, 2)
+    kinds = tuple(None if value is None else (value.dtype, value.device, value.ndim) for value in inputs)
+    graph, known_sizes = graphs_of(cfg, kinds, points.shape[1])
+    with contextlib.nullcontext() if points.shape[0] in known_sizes else announced_compilation():
+        graph(with_masks(stored, as_bytes), *inputs)
+    known_sizes.add(points.shape[0])
 
-    Equal configs share it, and any number of points one graph.
-    """
-    plain: Callable[..., MapState] = functools.partial(update, cfg=cfg)
+
+@functools.cache
+def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> tuple[Callable[..., None], set[int]]:
+    """Return what compiles and keeps the updates of one kind of inputs, and a set for the sizes of batch it knows."""
 
     def in_place(stored: MapState, *others: Any) -> None:
         """Update; masks come as bytes, see `as_bytes`. Writing within the graph saves a copy of every layer."""
-        write(stored, with_masks(plain(with_masks(stored, as_mask), *others), as_bytes))
+        write(stored, with_masks(update(with_masks(stored, as_mask), *others, cfg=cfg), as_bytes))
 
-    graph = torch.compile(own_code(in_place), fullgraph=True, options=compiler_options())
-    first = True
-
-    def run(state: MapState, points: Tensor, *others: Any) -> None:
-        if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
-            update_in_place(state, points, *others, cfg=cfg)
-            return
-        nonlocal first
-        inputs = [None if value is None else packed(value) for value in (points, *others)]
-        for values in (inputs[0], inputs[-1]):
-            if values is not None:
-                torch._dynamo.maybe_mark_dynamic(values, 2)
-        with announced_compilation() if first else contextlib.nullcontext():
-            graph(with_masks(state, as_bytes), *inputs)
-        first = False
-
-    return run
+    return torch.compile(own_code(in_place), fullgraph=True, options=compiler_options()), set()
 
 
 def packed(value: Tensor) -> Tensor:

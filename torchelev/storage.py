@@ -67,4 +67,4 @@ def keep_freed_memory() -> None:
     32 MB. With less than that an update faults its pages in anew each time, at a third of its cost: measured, 16 MB
     at 407,040 points and 3.5 MB at 6,276. A block of nearly 32 MB, none of whose pages is touched, raises the limit.
     """
-    torch.empty(2**25 - 2**16, dtype=torch.uint8)
+    torch.empty(2**25 - 2**16, dtype=torch.uint8, device="cpu")
