@@ -6,6 +6,7 @@ import json
 import math
 import statistics
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,15 +25,19 @@ def milliseconds(run: Callable[[], Any], seconds: float) -> dict[str, float]:
     return interleaved({"": run}, seconds, rounds=1)[""]
 
 
-def interleaved(runs: dict[str, Callable[[], Any]], seconds: float, rounds: int = 5) -> dict[str, dict[str, float]]:
+def interleaved(runs: dict[Any, Callable[[], Any]], seconds: float, rounds: int = 5) -> dict[Any, dict[str, float]]:
     """Time several callables in turn, `seconds` each in all, so that a shared machine's bad minutes hit them alike."""
     threads = torch.get_num_threads()
     timers = {name: bench.Timer("run()", globals={"run": run}, num_threads=threads) for name, run in runs.items()}
-    parts: dict[str, list[bench.Measurement]] = {name: [] for name in runs}
+    # How many calls one time is the mean of is fixed for all rounds, or their minima would mean different things.
+    calls = {name: max(1, round(1e-3 / timer.timeit(1).mean)) for name, timer in timers.items()}
+    times: dict[Any, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
         for name, timer in timers.items():
-            parts[name].append(timer.blocked_autorange(min_run_time=seconds / rounds))
-    return {name: summary([t for part in measured for t in part.times]) for name, measured in parts.items()}
+            end = time.perf_counter() + seconds / rounds
+            while not times[name] or time.perf_counter() < end:
+                times[name].append(timer.timeit(calls[name]).mean)
+    return {name: summary(values) for name, values in times.items()}
 
 
 def summary(times: list[float]) -> dict[str, float]:

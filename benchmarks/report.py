@@ -34,7 +34,9 @@ def commit() -> str:
     """Return the checkout's commit, with "+changes" if the working tree differs from it."""
     try:
         name = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-        changes = subprocess.run(["git", "status", "--porcelain", "-uno", "torchelev"], capture_output=True, text=True)
+        changes = subprocess.run(
+            ["git", "status", "--porcelain", "-uno", "torchelev", "benchmarks/*.py"], capture_output=True, text=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return name.stdout.strip() + ("+changes" if changes.stdout.strip() else "")

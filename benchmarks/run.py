@@ -40,7 +40,8 @@ def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[
     result = json.loads(path.read_text()) if path.exists() else {"measured": {}}
     for name in names:
         stamp = {"commit": commit(), "seconds": seconds}
-        if resume and result["measured"].get(name) == stamp:
+        known = stamp["commit"] != "unknown" and "+" not in stamp["commit"]
+        if resume and known and result["measured"].get(name) == stamp:
             print(f"{name}: measured at {stamp['commit']}, skipped", file=sys.stderr)
             continue
 
@@ -70,17 +71,34 @@ def timings(values: Any, path: str = "") -> Iterator[tuple[str, dict[str, float]
             yield from timings(value, f"{path}/{key}")
 
 
-def regressions(new: dict[str, Any], old: dict[str, Any], limit: float = SLOWER) -> list[str]:
-    """List what takes more than `limit` times as long as before, by median and by minimum: one alone is noise."""
+def regressions(new: dict[str, Any], old: dict[str, Any], limit: float = SLOWER) -> tuple[list[str], int]:
+    """List what takes more than `limit` times as long as before, and count what could be compared.
+
+    Both median and minimum must say so: one alone is noise.
+    """
     before = dict(timings(old))
+    common = [(place, time, before[place]) for place, time in timings(new) if place in before]
     slower = []
-    for place, time in timings(new):
-        if place in before:
-            ratios = [time[kind] / before[place][kind] for kind in ("median", "min")]
-            if min(ratios) > limit:
-                change = f"{before[place]['median']:.3f} -> {time['median']:.3f} ms"
-                slower.append(f"{place}: {change}, {min(ratios):.2f} times as long")
-    return slower
+    for place, now, then in common:
+        ratios = {kind: now[kind] / then[kind] for kind in ("median", "min")}
+        if min(ratios.values()) > limit:
+            changes = [f"{kind} {then[kind]:.3f} -> {now[kind]:.3f} ms ({ratios[kind]:.2f} x)" for kind in ratios]
+            slower.append(f"{place}: {', '.join(changes)}")
+    return slower, len(common)
+
+
+def compare(new: dict[str, Any], old: dict[str, Any], name: Path) -> int:
+    """Print what became slower; return 1 if something did, 2 if nothing could be compared."""
+    slower, count = regressions(new, old)
+    print(f"\n{len(slower)} of {count} times are more than {SLOWER} times as long as in {name}", *slower, sep="\n")
+    return 2 if count == 0 else int(bool(slower))
+
+
+def existing(path: str) -> Path:
+    """Accept the path of a file that exists."""
+    if not Path(path).is_file():
+        raise argparse.ArgumentTypeError(f"no such file: {path}")
+    return Path(path)
 
 
 def main() -> int:
@@ -90,9 +108,13 @@ def main() -> int:
     parser.add_argument("--out", default="benchmarks/results", help="folder for the results (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=3.0, help="time for each figure [s] (default: %(default)s)")
-    parser.add_argument("--resume", action="store_true", help="skip the sections measured at this commit")
-    parser.add_argument("--against", type=Path, metavar="OLD.json", help="flag what became slower than there")
-    parser.add_argument("--compare", type=Path, metavar="NEW.json", help="measure nothing, compare this with --against")
+    parser.add_argument(
+        "--resume", action="store_true", help="skip the sections measured at this commit for as many --seconds"
+    )
+    parser.add_argument("--against", type=existing, metavar="OLD.json", help="flag what became slower than there")
+    parser.add_argument(
+        "--compare", type=existing, metavar="NEW.json", help="measure nothing, compare this with --against"
+    )
     args = parser.parse_args()
     unknown = [name for name in args.sections if name not in SECTIONS]
     if unknown:
@@ -101,19 +123,18 @@ def main() -> int:
         parser.error("--compare needs --against OLD.json")
     old = json.loads(args.against.read_text()) if args.against else None
     if args.compare:
-        result = json.loads(args.compare.read_text())
-    else:
-        torch.set_num_threads(args.threads)
-        path = default_path(args.out)
-        result = measure(path, args.sections or list(SECTIONS), args.seconds, args.resume)
-        speed_plots.draw(result, path.with_suffix(".png"))
-        print(speed_tables.report(result))
-        print(f"\nwrote {path} and {path.with_suffix('.png')}")
-    if old is not None:
-        slower = regressions(result, old)
-        print("\n".join([f"\nMore than {SLOWER} times as slow as in {args.against}: {len(slower)}", *slower]))
-        return 1 if slower else 0
-    return 0
+        return compare(json.loads(args.compare.read_text()), old, args.against)
+    torch.set_num_threads(args.threads)
+    path = default_path(args.out)
+    names = args.sections or list(SECTIONS)
+    try:
+        result = measure(path, names, args.seconds, args.resume)
+    except KeyboardInterrupt:
+        print(f"\ninterrupted: finished sections are in {path}; --resume goes on", file=sys.stderr)
+        return 130
+    speed_plots.draw(result, path.with_suffix(".png"))
+    print(f"{speed_tables.report(result)}\n\nwrote {path} and its picture")
+    return compare({name: result[name] for name in names}, old, args.against) if old is not None else 0
 
 
 if __name__ == "__main__":

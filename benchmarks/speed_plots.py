@@ -20,7 +20,8 @@ def draw(result: dict[str, Any], path: str | Path) -> None:
     if not shown:
         return
     rows = (len(shown) + 1) // 2
-    figure, axes = plt.subplots(rows, 2, figsize=(10, 3.6 * rows), layout="constrained", squeeze=False)
+    columns = min(2, len(shown))
+    figure, axes = plt.subplots(rows, columns, figsize=(5 * columns, 3.6 * rows), layout="constrained", squeeze=False)
     for ax in axes.flat[len(shown) :]:
         ax.axis("off")
     for ax, name in zip(axes.flat, shown, strict=False):
@@ -39,11 +40,21 @@ def draw_points(ax: Any, result: dict[str, Any]) -> None:
         ax.plot([r["points"] for r in rows], [r["median"] for r in rows], style, label=label)
     ax.set(xscale="log", yscale="log", xlabel="points", ylabel="time per update [ms]")
     ax.set_title("one robot, 10 x 10 m at 4 cm")
+    plain_ticks(ax.yaxis)
     for name, n, _, _ in SENSORS:
         ax.axvline(n, color="0.8", zorder=0)
-        ax.text(n, ax.get_ylim()[0], f" {name}", rotation=90, va="bottom", ha="right", fontsize=7, color="0.4")
+        ax.text(n, ax.get_ylim()[0], f" {name}", rotation=90, va="bottom", ha="left", fontsize=7, color="0.4")
     ax.legend(loc="upper left", fontsize=8)
     ax.grid(alpha=0.3)
+
+
+def plain_ticks(axis: Any) -> None:
+    """Label a logarithmic axis 1, 2, 5, 10, ... in place of powers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(ScalarFormatter())
+    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_robots(ax: Any, result: dict[str, Any]) -> None:
@@ -57,7 +68,7 @@ def draw_robots(ax: Any, result: dict[str, Any]) -> None:
     memory = ax.twinx()
     memory.plot(count, [r["bytes_per_robot"] / 1e3 for r in rows], "s--", color="C1", label="memory")
     memory.axhline(result["robots"]["needed_bytes_per_robot"] / 1e3, color="C1", alpha=0.4, linestyle=":")
-    memory.set_ylabel("kB per robot (dotted: need on paper)")
+    memory.set_ylabel("kB per robot; dotted: need on paper")
     memory.set_ylim(bottom=0)
     ax.legend(handles=[ax.lines[0], memory.lines[0]], fontsize=8)
     ax.grid(alpha=0.3)
@@ -78,6 +89,7 @@ def draw_cells(ax: Any, result: dict[str, Any]) -> None:
     ax.plot([r["cells"] for r in rows], [r["median"] for r in rows], "o-")
     ax.set(xscale="log", yscale="log", xlabel="cells", ylabel="time per update [ms]")
     ax.set_title(f"{result['cells']['points']:,} points, exponent {exponent:.2f}")
+    plain_ticks(ax.yaxis)
     ax.grid(alpha=0.3, which="both")
 
 
@@ -85,7 +97,7 @@ def draw_rays(ax: Any, result: dict[str, Any]) -> None:
     """Draw time against the length of the rays."""
     rows, exponent = result["rays"]["rows"], result["rays"]["exponent"]
     ax.plot([r["metres"] for r in rows], [r["median"] for r in rows], "o-")
-    ax.set(xlabel="length of the rays [m]; the window ends at 5 m", ylabel="time per update [ms]")
+    ax.set(xlabel="length of half of the rays [m]; the window ends at 5 m", ylabel="time per update [ms]")
     ax.set_title(f"{result['rays']['points']:,} points, exponent {exponent:.2f}")
     ax.set_ylim(bottom=0)
     ax.grid(alpha=0.3)

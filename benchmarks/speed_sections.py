@@ -143,15 +143,20 @@ def cells(seconds: float, track: Track) -> dict[str, Any]:
 
 
 def rays(seconds: float, track: Track) -> dict[str, Any]:
-    """Time one robot's update against the length of its rays, within the window and far beyond it."""
-    drives = {length: Drive(full_config(), BPEARL, scans=4, reach=length) for length in RAYS}
+    """Time one robot's update against the length of half of its rays; the others measure the ground nearby."""
+    drives = {length: Drive(full_config(), BPEARL, scans=4, reach=RAYS[0]) for length in RAYS}
     for length, drive in track(drives.items()):
-        for cloud in drive.clouds:  # all points on a ring, so that no ray is short
-            xy = cloud[..., :2]
-            xy *= length * torch.empty_like(cloud[..., :1]).uniform_(0.9, 1.0) / xy.norm(dim=-1, keepdim=True)
+        for cloud in drive.clouds:
+            far = cloud[:, ::2]
+            reach = length * torch.empty_like(far[..., :1]).uniform_(0.9, 1.0)
+            far *= reach / far[..., :2].norm(dim=-1, keepdim=True)  # along the same ray
         drive.watch(8)
+        work = {name: drive.seen[name] for name in ("points_used", "drift_points", "cells_bounded")}
+        assert min(work.values()) > 0, f"rays of {length} m: nothing to do, {work}"
     times = meter.interleaved(drives, seconds)
-    rows = [{"metres": length} | time for length, time in times.items()]
+    rows = [
+        {"metres": length} | time | {"bounded": drives[length].seen["cells_bounded"]} for length, time in times.items()
+    ]
     return {"points": BPEARL, "rows": rows, "exponent": meter.exponent(RAYS, [row["median"] for row in rows])}
 
 

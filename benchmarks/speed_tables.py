@@ -34,8 +34,8 @@ def targets(result: dict[str, Any]) -> list[tuple[str, str, str, bool]]:
             check(f"one robot, {n:,} points", full[n]["median"], limit, "{:.1f} ms")
         for n, row in eager.items():
             check(f"eager, {n:,} points", row["median"] / full[n]["median"], EAGER, "{:.1f} x compiled")
-        check("growth with points", result["points"]["exponent_from_43074"], GROWTH["points"], "{:.2f}")
-        check("graphs for 8 numbers of points", result["points"]["graphs"], 1, "{:.0f}")
+        check("growth with points", result["points"]["exponent_from_43074"], GROWTH["points"], "exponent {:.2f}")
+        check("graphs compiled for 8 numbers of points", result["points"]["graphs"], 1, "{:.0f}")
     if "robots" in result:
         many = by(result["robots"]["rows"], "robots")
         check("256 robots x 512 points", many[256]["median"], MANY, "{:.1f} ms")
@@ -44,9 +44,9 @@ def targets(result: dict[str, Any]) -> list[tuple[str, str, str, bool]]:
         most = max(many[n]["bytes_per_robot"] for n in many if n >= 256) / result["robots"]["needed_bytes_per_robot"]
         check("memory per robot from 256 on", most, MEMORY, "{:.2f} x the need on paper")
     if "cells" in result:
-        check("growth with cells", result["cells"]["exponent"], GROWTH["cells"], "{:.2f}")
+        check("growth with cells", result["cells"]["exponent"], GROWTH["cells"], "exponent {:.2f}")
     if "rays" in result:
-        check("growth with ray length", abs(result["rays"]["exponent"]), GROWTH["rays"], "{:.2f}")
+        check("growth with ray length", abs(result["rays"]["exponent"]), GROWTH["rays"], "exponent {:.2f}")
     for row in result["parts"]["rows"] if "parts" in result else []:
         for name, share in row["shares"].items():
             check(f"{name}, robots: {row['robots']}", 100 * share, 100 * SHARE, "{:.0f} % of an update")

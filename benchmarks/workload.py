@@ -115,4 +115,4 @@ class Drive:
         self.emap.elevation[:, part[0], part[1]] += 3.0
         self.watch(24)
         idle = [name for name, value in self.seen.items() if value == 0]
-        assert not idle, f"stages without effect in the timed run: {idle}"
+        assert not idle, f"stages without effect in the warm-up: {idle}"

@@ -151,3 +151,19 @@ def floats_finite(state):
     values = {**state._asdict(), **state.statistics._asdict()}
     values.pop("statistics")
     return [n for n, v in values.items() if v.is_floating_point() and not torch.isfinite(v).all()]
+
+
+def scan(seed, num_envs=2, num_points=300, dtype=torch.float32):
+    """Clouds and the poses they were taken from."""
+    rng = np.random.default_rng(seed)
+    T = random_poses(rng, num_envs)
+    return random_clouds(rng, T, num_points, dtype), T
+
+
+def mapped(num_envs=2, scans=2, **stages):
+    """A map after a few scans."""
+    emap = small_map(num_envs, **stages)
+    for k in range(scans):
+        cloud, T = scan(k, num_envs)
+        emap.update(cloud, T, T, 0.3)
+    return emap

@@ -58,9 +58,10 @@ def test_regressions_need_median_and_minimum():
     new = {
         "points": {"full": [{"points": n, "median": m, "min": k} for n, m, k in ((10, 4, 1), (20, 4, 2), (30, 2, 1))]}
     }
-    assert regressions(old, old) == []
-    (found,) = regressions(new, old)
-    assert found.startswith("/points/full/points 20: 2.000 -> 4.000 ms")
+    assert regressions(old, old) == ([], 3)
+    (found,), count = regressions(new, old)
+    assert found == "/points/full/points 20: median 2.000 -> 4.000 ms (2.00 x), min 1.000 -> 2.000 ms (2.00 x)"
+    assert count == 3
 
 
 def test_committed_result_has_its_table_and_picture(tmp_path):
@@ -125,6 +126,21 @@ def test_gpu_comparison():
     assert result["cells_known_by_one_alone"] == pytest.approx(1 / 64)
 
 
+def test_gpu_verdicts_of_what_was_measured():
+    result = {
+        "correctness": {"run to run, deterministic": {"largest_difference_m": 0.0}},
+        "host never waits, eager": {"holds": True},
+        "host never waits, compiled": {"error": "called a synchronizing CUDA operation"},
+        "one robot, captured": {"median": 0.2},
+        "many robots, update": {"median": 8.0},
+        "many robots, captured": {"median": 4.0},
+        "many robots, expected bytes": 10**9,
+        "copy, bytes per second": 10**12,
+    }
+    assert [row[-1] for row in gpu.verdicts(result)] == ["met", "missed", "met", "met", "met"]
+    assert [row[-1] for row in gpu.verdicts({"correctness": {"error": "none"}})] == ["missed", "met"]
+
+
 def run_compare(new, old):
     command = [sys.executable, "-m", "benchmarks.run", "--compare", str(new), "--against", str(old)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
@@ -134,6 +150,9 @@ def test_compare_fails_on_a_regression(tmp_path):
     fast, slow = tmp_path / "fast.json", tmp_path / "slow.json"
     fast.write_text(json.dumps({"update": {"median": 1.0, "min": 0.9}}))
     slow.write_text(json.dumps({"update": {"median": 3.0, "min": 2.9}}))
-    worse, better = run_compare(slow, fast), run_compare(fast, slow)
-    assert (worse.returncode, better.returncode) == (1, 0), worse.stderr
-    assert "/update: 1.000 -> 3.000 ms" in worse.stdout
+    other = tmp_path / "other.json"
+    other.write_text("{}")
+    worse, better, none = run_compare(slow, fast), run_compare(fast, slow), run_compare(fast, other)
+    assert (worse.returncode, better.returncode, none.returncode) == (1, 0, 2), worse.stderr
+    assert "/update: median 1.000 -> 3.000 ms (3.00 x)" in worse.stdout
+    assert "no such file" in run_compare(fast, tmp_path / "missing.json").stderr

@@ -1,10 +1,8 @@
-"""The contract of the module: state, reset, checkpoints, copies, inference mode, compilation, fake tensors."""
+"""The contract of the module: state, reset, checkpoints, copies, inference mode, parts, precision, fake tensors."""
 
 import copy
 import dataclasses
-import functools
 import io
-import itertools
 import pickle
 import subprocess
 import sys
@@ -15,15 +13,14 @@ import torch
 from conftest import (
     assert_close,
     differences,
+    mapped,
     nans,
     pose,
-    random_clouds,
-    random_poses,
+    scan,
     small_config,
     small_map,
     snapshot,
 )
-from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import torchelev
@@ -34,27 +31,9 @@ from torchelev import (
     ElevationMapConfig,
     GridConfig,
     SensorConfig,
-    pipeline,
 )
 from torchelev.layers import LAYERS
-from torchelev.pipeline import graphs_of, guards_on_arguments
 from torchelev.state import Statistics
-
-
-def scan(seed, num_envs=2, num_points=300, dtype=torch.float32):
-    """Clouds and the poses they were taken from."""
-    rng = np.random.default_rng(seed)
-    T = random_poses(rng, num_envs)
-    return random_clouds(rng, T, num_points, dtype), T
-
-
-def mapped(num_envs=2, scans=2, **stages):
-    """A map after a few scans."""
-    emap = small_map(num_envs, **stages)
-    for k in range(scans):
-        cloud, T = scan(k, num_envs)
-        emap.update(cloud, T, T, 0.3)
-    return emap
 
 
 def round_trip(checkpoint):
@@ -345,120 +324,7 @@ def test_a_map_inside_another_module():
     policy["map"].update(cloud, T, T, 0.1)
 
 
-# Compilation and fake tensors -----------------------------------------------------------------------------------------
-
-
-def core(emap):
-    """The differentiable core as one function."""
-
-    def run(state, points, T_map_sensor, T_map_base, dt):
-        return emap(state, emap.measure(points, T_map_sensor, T_map_base, dt))
-
-    return run
-
-
-@pytest.mark.parametrize("with_base", [True, False])
-@pytest.mark.parametrize("sensors", [None, 2])
-def test_the_core_compiles_as_one_graph(with_base, sensors):
-    emap = mapped(sensor=SensorConfig(body=torchelev.BodyConfig()))
-    cloud, T = scan(5)
-    base = T if with_base else None
-    if sensors:
-        cloud, T_sensor = cloud.unflatten(1, (sensors, -1)), T[:, None].repeat(1, sensors, 1, 1)
-    else:
-        T_sensor = T
-    dt = torch.full((2,), 0.1)
-    compiled = torch.compile(core(emap), fullgraph=True, backend="eager")
-    state = compiled(snapshot(emap), cloud, T_sensor, base, dt)
-    assert_close(state, core(emap)(emap.state, cloud, T_sensor, base, dt), 1e-6)
-
-
-def test_readers_and_resets_compile_as_one_graph():
-    emap = mapped()
-
-    def read(state, xy):
-        layers = [emap.layer(name, state=state) for name in LAYERS]
-        return layers, [emap.sample(xy, mode=mode, state=state) for mode in ("bilinear", "nearest")]
-
-    xy = torch.rand(2, 9, 2, generator=torch.Generator().manual_seed(0)) - 0.5
-    compiled = torch.compile(read, fullgraph=True, backend="eager")(emap.state, xy)
-    torch.testing.assert_close(compiled, read(emap.state, xy), equal_nan=True)
-    torch.compile(emap.reset, fullgraph=True, backend="eager")(mask=torch.tensor([True, False]))
-    assert not emap.validity[0].any() and emap.validity[1].any()
-
-
-def test_gradients_through_the_compiled_core():
-    emap = mapped()
-    cloud, T = scan(5)
-    results = []
-    for run in (core(emap), torch.compile(core(emap), fullgraph=True, backend="aot_eager")):
-        points = cloud.clone().requires_grad_()
-        run(snapshot(emap), points, T, T, torch.full((2,), 0.1)).elevation.sum().backward()
-        results.append(points.grad)
-    torch.testing.assert_close(*results)
-
-
-def graphs():
-    """How many graphs were compiled so far."""
-    return torch._dynamo.utils.counters["stats"]["unique_graphs"]
-
-
-def test_compiled_update_equals_eager_and_shares_its_graph():
-    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice."""
-    torch._dynamo.reset()
-    before = graphs()
-    maps = {name: small_map(2) for name in ("eager", "compiled", "twin")}
-    maps["compiled"].compile()
-    maps["twin"].compile()
-    for k, number in enumerate((300, 290, 5000, 200)):
-        cloud, T = scan(k, 2, number)
-        cloud = cloud[:, :150] if number == 200 else cloud
-        T = T[:1].expand(2, 4, 4) if number == 200 else T
-        for emap in maps.values():
-            emap.update(cloud, T, T, 0.3)
-        for name in ("compiled", "twin"):
-            assert_close(maps["eager"].state, maps[name].state, 1e-5)
-            floats = {
-                n for n, v in maps["eager"].state._asdict().items() if n != "statistics" and v.is_floating_point()
-            }
-            rounded = floats | {"drift_error", "drift_correction"}
-            assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
-    assert graphs() == before + 1
-
-
-@pytest.fixture
-def traced(monkeypatch):
-    """Compile with the real guards, but leave out the compiler behind them, which takes seconds."""
-    guards = {"guard_filter_fn": guards_on_arguments}
-    monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
-    graphs_of.cache_clear()
-    yield {"drift": None, "raycast": None, "overlap": None, "traversability": None}
-    graphs_of.cache_clear()
-
-
-def test_configs_of_one_shape_have_their_own_graphs(traced):
-    """Nine: of one code object the compiler keeps eight graphs, and refuses the next."""
-    cloud, T = scan(0, 2, 60)
-    for k in range(9):
-        maps = [small_map(2, **traced, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
-        maps[1].compile()
-        for emap in maps:
-            emap.update(cloud, T, T, 0.3)
-        assert_close(maps[0].state, maps[1].state)
-
-
-def test_inputs_of_every_kind_have_their_own_graphs(traced):
-    """More than eight of one config: precisions, sensors, with and without base and variances, numbers of robots."""
-    for num_envs, sensors, dtype in ((2, 1, torch.float32), (5, 2, torch.float64), (3, 1, torch.bfloat16)):
-        cloud, T = scan(0, num_envs, 60)
-        clouds = cloud.to(dtype)[:, None].repeat(1, sensors, 1, 1)
-        for base, variance in itertools.product((T, None), (clouds[..., 0].abs() + 0.01, None)):
-            maps = [small_map(num_envs, **traced) for _ in range(2)]
-            maps[1].compile()
-            for emap in maps:
-                emap.update(clouds, T[:, None].repeat(1, sensors, 1, 1), base, 0.3, variance=variance)
-            assert_close(maps[0].state, maps[1].state)
+# Parts, precision, fake tensors ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 5])
@@ -475,16 +341,6 @@ def test_many_maps_are_updated_in_equal_parts():
     assert [(c.start, c.stop) for c in ElevationMap(small_config(), 10, chunk=4)._chunks()] == [(0, 4), (4, 8), (8, 12)]
     assert len(ElevationMap(small_config((256, 256)), 8)._chunks()) == 2
     assert len(ElevationMap(small_config(), 8, device="meta")._chunks()) == 1
-
-
-def test_the_first_compiled_update_says_what_it_costs(compile_with, capsys):
-    compile_with("eager")
-    emap = small_map(2)
-    emap.compile()
-    for k in range(2):
-        cloud, T = scan(k, 2)
-        emap.update(cloud, T, T, 0.1)
-    assert capsys.readouterr().err.count("compiling the update") == 1
 
 
 def test_same_clouds_same_map_to_the_bit():
@@ -516,90 +372,6 @@ def test_points_of_half_the_bytes(dtype, tolerance):
     both = exact.validity & maps[1].validity
     error = (exact.elevation - maps[1].elevation)[both].abs()
     assert both.float().mean() > 0.9 * exact.validity.float().mean() and error.median() < tolerance
-
-
-@pytest.fixture
-def compile_with(monkeypatch):
-    """Let emap.compile() use another backend of the compiler."""
-    compiler = torch.compile
-
-    def use(backend):
-        monkeypatch.setattr(
-            torch, "compile", lambda f, fullgraph, options: compiler(f, fullgraph=fullgraph, backend=backend)
-        )
-        graphs_of.cache_clear()
-        torch._dynamo.reset()
-
-    yield use
-    graphs_of.cache_clear()
-    torch._dynamo.reset()
-
-
-@pytest.mark.parametrize("sensors", [None, 2])
-@pytest.mark.parametrize("with_variance", [False, True])
-def test_a_new_number_of_points_compiles_nothing(compile_with, sensors, with_variance):
-    """One graph for every number of points from 2 on, with the statistics and the map of the eager update."""
-    counter = CompileCounter()
-    compile_with(counter)
-    eager, compiled = small_map(2, drift=None), small_map(2, drift=None)
-    compiled.compile()
-    for k, number in enumerate((300, 290, 2, 310, 64, 65, 3, 1000)):
-        cloud, T = scan(k, 2, number * (sensors or 1))
-        variance = torch.full(cloud.shape[:-1], 1e-3)
-        T_sensor = T
-        if sensors:
-            cloud, variance = (v.unflatten(1, (sensors, number)) for v in (cloud, variance))
-            T_sensor = T[:, None].repeat(1, sensors, 1, 1)
-        for emap in (eager, compiled):
-            emap.update(cloud, T_sensor, T, 0.1, variance=variance if with_variance else None)
-        assert differences(eager.state, compiled.state) == [], number
-        assert counter.frame_count == 1, number
-
-
-@pytest.mark.parametrize("sensors", [None, 2])
-def test_clouds_of_no_or_one_point_run_eagerly(compile_with, sensors):
-    """The compiler takes sizes 0 and 1 for constants; they must not cost a graph each."""
-    counter = CompileCounter()
-    compile_with(counter)
-    eager, compiled = small_map(2), small_map(2)
-    compiled.compile()
-    for number in (0, 1):
-        cloud, T = scan(number, 2, number * (sensors or 1))
-        T_sensor = T
-        if sensors:
-            cloud, T_sensor = cloud.unflatten(1, (sensors, number)), T[:, None].repeat(1, sensors, 1, 1)
-        for emap in (eager, compiled):
-            emap.update(cloud, T_sensor, T, 0.1)
-            emap.update(cloud, T_sensor, T, 0.1, variance=torch.full(cloud.shape[:-1], 1e-3))
-        assert differences(eager.state, compiled.state) == []
-    assert compiled.validity.any() and counter.frame_count == 0
-
-
-def test_maps_of_equal_configs_share_one_graph(compile_with):
-    counter = CompileCounter()
-    compile_with(counter)
-    maps = small_map(2), small_map(2)
-    for k, emap in enumerate(maps):
-        emap.compile()
-        cloud, T = scan(k, 2, 300 + k)
-        emap.update(cloud, T, T, 0.1)
-    assert counter.frame_count == 1
-
-
-def test_equal_configs_share_the_compiled_update():
-    assert graphs_of(small_config(), (), 1) is graphs_of(small_config(), (), 1)
-    assert graphs_of(small_config(), (), 1) is not graphs_of(small_config(drift=None), (), 1)
-
-
-def test_no_recompilation_for_new_values():
-    """New dt, poses and clouds are data, not constants."""
-    emap, counter = mapped(), CompileCounter()
-    torch._dynamo.reset()
-    compiled = torch.compile(core(emap), fullgraph=True, backend=counter)
-    for k in range(4):
-        cloud, T = scan(k)
-        compiled(snapshot(emap), cloud, T, T, torch.full((2,), 0.1 * k))
-    assert counter.frame_count == 1
 
 
 @pytest.mark.parametrize("with_base", [True, False])
