@@ -18,14 +18,20 @@ from torch import Tensor
 )
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
-    results = [torch.full_like(layer, blank) for layer, blank in zip(layers, blanks, strict=True)]
+    results = [torch.empty_like(layer) for layer in layers]
     H, W = layers[0].shape[1:]
     for env, (i, j) in enumerate(shift.tolist()):
-        if abs(i) < H and abs(j) < W:
-            to = (env, slice(max(0, -i), H - max(0, i)), slice(max(0, -j), W - max(0, j)))
-            source = (env, slice(max(0, i), H - max(0, -i)), slice(max(0, j), W - max(0, -j)))
-            for result, layer in zip(results, layers, strict=True):
-                result[to].copy_(layer[source])
+        i, j = max(-H, min(i, H)), max(-W, min(j, W))
+        to = (env, slice(max(0, -i), H - max(0, i)), slice(max(0, -j), W - max(0, j)))
+        source = (env, slice(max(0, i), H - max(0, -i)), slice(max(0, j), W - max(0, -j)))
+        # Strips, not the whole layer: filling that first would cost as much as moving it.
+        rows = (env, slice(H - i, H) if i > 0 else slice(0, -i))
+        columns = (env, slice(None), slice(W - j, W) if j > 0 else slice(0, -j))
+        entering = [strip for strip, steps in ((rows, i), (columns, j)) if steps]
+        for result, layer, blank in zip(results, layers, blanks, strict=True):
+            for strip in entering:
+                result[strip] = blank
+            result[to].copy_(layer[source])
     return results
 
 
