@@ -37,11 +37,12 @@ def default_path(folder: str) -> Path:
 
 def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[str, Any]:
     """Run sections, writing the file after each."""
-    result = json.loads(path.read_text()) if path.exists() else {"measured": {}}
+    result = json.loads(path.read_text()) if path.exists() else {}
     for name in names:
         stamp = {"commit": commit(), "seconds": seconds}
+        measured = result.setdefault("measured", {})
         known = stamp["commit"] != "unknown" and "+" not in stamp["commit"]
-        if resume and known and result["measured"].get(name) == stamp:
+        if resume and known and measured.get(name) == stamp:
             print(f"{name}: measured at {stamp['commit']}, skipped", file=sys.stderr)
             continue
 
@@ -50,7 +51,7 @@ def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[
 
         fresh_compiler()
         result[name] = SECTIONS[name](seconds, track)
-        result["measured"][name] = stamp
+        measured[name] = stamp
         result["copy_gigabytes_per_second"] = meter.copy_bandwidth() / 1e9
         result["config"] = full_config().to_dict()
         result["machine"] = machine()
