@@ -99,5 +99,5 @@ def draw_rays(ax: Any, result: dict[str, Any]) -> None:
     ax.plot([r["metres"] for r in rows], [r["median"] for r in rows], "o-")
     ax.set(xlabel="length of half of the rays [m]; the window ends at 5 m", ylabel="time per update [ms]")
     ax.set_title(f"{result['rays']['points']:,} points, exponent {exponent:.2f}")
-    ax.set_ylim(bottom=0)
+    ax.set_ylim(0, 1.2 * max(r["median"] for r in rows))
     ax.grid(alpha=0.3)
