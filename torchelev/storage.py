@@ -64,7 +64,7 @@ def keep_freed_memory() -> None:
     """Let glibc keep up to 64 MB that a CPU's updates free. Does nothing to other allocators.
 
     It gives back what lies free above twice the largest block that it ever took from the system and saw freed, up to
-    32 MB. With less than that an update faults its pages in anew each time, at a third of its cost: measured, 16 MB
-    at 407,040 points and 3.5 MB at 6,276. A block of nearly 32 MB, none of whose pages is touched, raises the limit.
+    32 MB. With less than that an update faults its pages in anew each time: measured, 16 MB at 407,040 points and
+    3.5 MB at 6,276, a quarter of the time. A block of nearly 32 MB, none of whose pages is touched, raises the limit.
     """
     torch.empty(2**25 - 2**16, dtype=torch.uint8, device="cpu")
