@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks import meter
-from benchmarks.report import markdown_table, write_json
+from benchmarks.report import markdown_table, slug, write_json
 from benchmarks.speed_sections import fresh_compiler
 from benchmarks.workload import BPEARL, Drive, full_config
 from torchelev import ElevationMap
@@ -99,10 +98,7 @@ def deterministic() -> Iterator[None]:
 def host_never_waits(drive: Drive) -> dict[str, bool]:
     """Update, sample and reset while every wait of the host raises."""
     drive()
-    xy, mask = (
-        drive.clouds[0][..., :2].contiguous(),
-        torch.ones(drive.emap.num_envs, dtype=torch.bool).to(drive.dt.device),
-    )
+    xy, mask = drive.clouds[0][..., :2].contiguous(), drive.dt > 0
     torch.cuda.set_sync_debug_mode("error")
     try:
         drive()
@@ -232,8 +228,7 @@ def main() -> int:
             result[name] = {"error": str(error)[:500]}
         print(f"{name}: {json.dumps(result[name])[:300]}", flush=True)
         if not dry:
-            slug = "-".join(re.findall(r"[a-z0-9]+", torch.cuda.get_device_name().lower()))
-            write_json(f"{args.out}/gpu-{slug}.json", result)
+            write_json(f"{args.out}/gpu-{slug(torch.cuda.get_device_name())}.json", result)
     if dry:
         print("dry run: nothing is judged or written")
         return 0

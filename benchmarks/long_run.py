@@ -13,6 +13,7 @@ import json
 import math
 import statistics
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import torch.utils.benchmark as bench
 from torch._dynamo.utils import counters
 from tqdm import tqdm
 
-from benchmarks.report import commit, machine, markdown_table, write_json
+from benchmarks.report import commit, markdown_table, write_json
 from benchmarks.speed_sections import fresh_compiler
 from benchmarks.workload import BPEARL, MANY_POINTS, Drive, full_config
 
@@ -52,8 +53,8 @@ def onward(drive: Drive) -> None:
     drive.next_scan = next_scan  # type: ignore[method-assign]
 
 
-def run_case(name: str, updates: int, save: Any) -> dict[str, Any]:
-    """Run in blocks; note each block's time per update, and memory and graphs after it."""
+def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) -> None:
+    """Run in blocks; save each block's time per update, and memory and graphs after it."""
     robots, side, points, _ = CASES[name]
     fresh_compiler()
     counters.clear()
@@ -71,7 +72,6 @@ def run_case(name: str, updates: int, save: Any) -> dict[str, Any]:
         values["updates"] = size * len(values["ms"])
         values["known_share"] = float(drive.emap.validity.float().mean())
         save(values)
-    return values
 
 
 def growth(series: list[float]) -> float:
@@ -144,7 +144,7 @@ def main() -> int:
 
         def save(values: dict[str, Any], name: str = name) -> None:
             result[name] = {"commit": commit()} | values
-            write_json(path, {**result, "machine": machine()})
+            write_json(path, result)
 
         try:
             run_case(name, int(args.share * CASES[name][3]), save)

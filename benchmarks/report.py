@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,13 @@ def commit() -> str:
 def write_json(path: str | Path, values: dict[str, Any]) -> None:
     """Write a result with the machine it was measured on."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(json.dumps({"machine": machine()} | values, indent=1) + "\n")
+    described = {"machine": None} | values | {"machine": machine()}  # values read from a file hold another machine's
+    Path(path).write_text(json.dumps(described, indent=1) + "\n")
+
+
+def slug(name: str) -> str:
+    """Return a name fit for a file: small letters and digits, joined by hyphens."""
+    return "-".join(re.findall(r"[a-z0-9]+", name.lower()))
 
 
 def markdown_table(head: list[str], rows: list[list[str]]) -> str:

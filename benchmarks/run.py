@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -22,7 +21,7 @@ import torch
 from tqdm import tqdm
 
 from benchmarks import meter, speed_plots, speed_tables
-from benchmarks.report import commit, machine, write_json
+from benchmarks.report import commit, machine, slug, write_json
 from benchmarks.speed_sections import SECTIONS, fresh_compiler
 from benchmarks.workload import full_config
 
@@ -31,13 +30,14 @@ SLOWER = 1.3  # a ratio of times above it is a regression, if medians and minima
 
 def default_path(folder: str) -> Path:
     """Return where this machine's result lies: one file per processor and number of threads."""
-    words = re.findall(r"[a-z0-9]+", machine()["processor"].lower())
-    return Path(folder) / f"speed-{'-'.join(words)}-{torch.get_num_threads()}-threads.json"
+    return Path(folder) / f"speed-{slug(machine()['processor'])}-{torch.get_num_threads()}-threads.json"
 
 
 def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[str, Any]:
     """Run sections, writing the file after each."""
     result = json.loads(path.read_text()) if path.exists() else {}
+    result["copy_gigabytes_per_second"] = meter.copy_bandwidth() / 1e9
+    result["config"] = full_config().to_dict()
     for name in names:
         stamp = {"commit": commit(), "seconds": seconds}
         measured = result.setdefault("measured", {})
@@ -52,9 +52,6 @@ def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[
         fresh_compiler()
         result[name] = SECTIONS[name](seconds, track)
         measured[name] = stamp
-        result["copy_gigabytes_per_second"] = meter.copy_bandwidth() / 1e9
-        result["config"] = full_config().to_dict()
-        result["machine"] = machine()
         write_json(path, result)
     return result
 

@@ -21,12 +21,13 @@ def by(rows: list[dict[str, Any]], key: str) -> dict[Any, dict[str, Any]]:
     return {row[key]: row for row in rows}
 
 
-def targets(result: dict[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """List what was aimed at: case, figure, target, and whether it is met."""
+def verdicts(result: dict[str, Any]) -> str:
+    """Tabulate what was aimed at: case, figure, target, and whether it is met."""
     rows = []
 
     def check(case: str, value: float, limit: float, form: str) -> None:
-        rows.append((case, form.format(value), "<= " + form.format(limit), value <= limit))
+        verdict = "met" if value <= limit else "missed"
+        rows.append([case, form.format(value), "<= " + form.format(limit), verdict])
 
     if "points" in result:
         full, eager = (by(result["points"][kind], "points") for kind in ("full", "eager"))
@@ -53,7 +54,7 @@ def targets(result: dict[str, Any]) -> list[tuple[str, str, str, bool]]:
     if "start" in result:
         check("import beyond torch", result["start"]["import_seconds"], 0.3, "{:.2f} s")
         check("first compiled update", result["start"]["first_update_seconds"], 60, "{:.0f} s")
-    return rows
+    return markdown_table(["case", "measured", "target", ""], rows)
 
 
 def sensors(result: dict[str, Any]) -> str:
@@ -81,12 +82,6 @@ def robots(result: dict[str, Any]) -> str:
         memory = f"{row['bytes_per_robot'] / 1e3:.0f}"
         rows.append([f"{row['robots']:,}", f"{row['median']:.1f}", f"{1e3 * row['ms_per_robot']:.0f}", memory])
     return markdown_table(["robots", "ms", "µs per robot", "kB per robot"], rows)
-
-
-def verdicts(result: dict[str, Any]) -> str:
-    """Tabulate the targets."""
-    rows = [[case, value, limit, "met" if met else "missed"] for case, value, limit, met in targets(result)]
-    return markdown_table(["case", "measured", "target", ""], rows)
 
 
 def report(result: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ from torch._dynamo.testing import CompileCounter
 import torchelev
 from torchelev import SensorConfig, pipeline
 from torchelev.layers import LAYERS
-from torchelev.pipeline import graphs_of, guards_on_arguments
+from torchelev.pipeline import graphs_of
 
 
 def core(emap):
@@ -93,34 +93,45 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
 
 
 @pytest.fixture
-def traced(monkeypatch):
-    """Compile with the real guards, but leave out the compiler behind them, which takes seconds."""
-    guards = {"guard_filter_fn": guards_on_arguments}
-    monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
+def compile_with(monkeypatch):
+    """Let emap.compile() use another backend of the compiler, with the guards of the real one."""
+    compiler, options = torch.compile, pipeline.compiler_options()
+    guards = {name: value for name, value in options.items() if name == "guard_filter_fn"}
+
+    def use(backend):
+        monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
+        monkeypatch.setattr(torch, "compile", functools.partial(compiler, backend=backend))
+        graphs_of.cache_clear()
+        torch._dynamo.reset()
+
+    yield use
     graphs_of.cache_clear()
-    yield {"drift": None, "raycast": None, "overlap": None, "traversability": None}
-    graphs_of.cache_clear()
+    torch._dynamo.reset()
 
 
-def test_configs_of_one_shape_have_their_own_graphs(traced):
+PLAIN = {"drift": None, "raycast": None, "overlap": None, "traversability": None}  # quick to trace
+
+
+def test_configs_of_one_shape_have_their_own_graphs(compile_with):
     """Nine: of one code object the compiler keeps eight graphs, and refuses the next."""
+    compile_with("eager")
     cloud, T = scan(0, 2, 60)
     for k in range(9):
-        maps = [small_map(2, **traced, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
+        maps = [small_map(2, **PLAIN, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
         maps[1].compile()
         for emap in maps:
             emap.update(cloud, T, T, 0.3)
         assert_close(maps[0].state, maps[1].state)
 
 
-def test_inputs_of_every_kind_have_their_own_graphs(traced):
+def test_inputs_of_every_kind_have_their_own_graphs(compile_with):
     """More than eight of one config: precisions, sensors, with and without base and variances, numbers of robots."""
+    compile_with("eager")
     for num_envs, sensors, dtype in ((2, 1, torch.float32), (5, 2, torch.float64), (3, 1, torch.bfloat16)):
         cloud, T = scan(0, num_envs, 60)
         clouds = cloud.to(dtype)[:, None].repeat(1, sensors, 1, 1)
         for base, variance in itertools.product((T, None), (clouds[..., 0].abs() + 0.01, None)):
-            maps = [small_map(num_envs, **traced) for _ in range(2)]
+            maps = [small_map(num_envs, **PLAIN) for _ in range(2)]
             maps[1].compile()
             for emap in maps:
                 emap.update(clouds, T[:, None].repeat(1, sensors, 1, 1), base, 0.3, variance=variance)
@@ -140,23 +151,6 @@ def test_the_first_compiled_update_says_what_it_costs(compile_with, capsys):
     cloud, T = scan(0, 3)
     other.update(cloud, T, T, 0.1)
     assert capsys.readouterr().err.count("compiling the update") == 1  # another number of environments
-
-
-@pytest.fixture
-def compile_with(monkeypatch):
-    """Let emap.compile() use another backend of the compiler."""
-    compiler = torch.compile
-
-    def use(backend):
-        monkeypatch.setattr(
-            torch, "compile", lambda f, fullgraph, options: compiler(f, fullgraph=fullgraph, backend=backend)
-        )
-        graphs_of.cache_clear()
-        torch._dynamo.reset()
-
-    yield use
-    graphs_of.cache_clear()
-    torch._dynamo.reset()
 
 
 @pytest.mark.parametrize("sensors", [None, 2])

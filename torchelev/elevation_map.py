@@ -17,7 +17,7 @@ from torchelev.initialize import METHODS, interpolate
 from torchelev.layers import LAYERS, Layer, sample_layer
 from torchelev.pipeline import compiled_update, fuse_measurement, rate_surface, update_in_place, write
 from torchelev.sensor import measure
-from torchelev.state import BLANK, MapState, Measurement, Statistics, blank_state, map_layers
+from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
 from torchelev.storage import keep_freed_memory
 
 if TYPE_CHECKING:
@@ -212,11 +212,7 @@ class ElevationMap(nn.Module):
         if env_ids is not None:
             env_ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
         with torch.no_grad():
-            for name, value in (self.state._asdict() | self.statistics._asdict()).items():
-                if name not in ("corner", "statistics"):
-                    _fill(value, BLANK.get(name, 0), env_ids, mask)
-            for corner, size in zip(self.corner.unbind(1), (self.cfg.grid.height, self.cfg.grid.width), strict=True):
-                _fill(corner, -(size // 2), env_ids, mask)
+            forget(self.state, self.cfg.grid, env_ids, mask)
 
     def initialize(self, feet: Float[Tensor, "B K 3"], method: str = "linear") -> None:
         """Found the unknown cells on ground points such as the feet, map frame [m].
@@ -296,14 +292,3 @@ class ElevationMap(nn.Module):
         state = self.state if state is None else state
         uv = (xy.double() / self.cfg.grid.resolution - state.corner[:, None]).to(self.elevation.dtype)
         return sample_layer(self._read(layer, state), uv, self.cfg.grid, mode)
-
-
-
-def _fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | None) -> None:
-    """Set the values (B, ...) of some environments, in place: those of the ids or of the mask, or all."""
-    if env_ids is not None:
-        values.index_fill_(0, env_ids, blank)
-    elif mask is not None:
-        values.masked_fill_(mask.view(-1, *[1] * (values.ndim - 1)), blank)
-    else:
-        values.fill_(blank)

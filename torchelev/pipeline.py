@@ -124,6 +124,9 @@ def announced_compilation() -> Iterator[None]:
         print(end, file=sys.stderr, flush=True)
 
 
+_number = itertools.count()
+
+
 def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function with a code object of its own.
 
@@ -135,9 +138,6 @@ def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
     return FunctionType(code, function.__globals__, code.co_name, function.__defaults__, function.__closure__)
 
 
-_number = itertools.count()
-
-
 def compiled_update(stored: MapState, points: Tensor, *others: Any, cfg: ElevationMapConfig) -> None:
     """Do what `update_in_place` does, compiled: any number of points, and of environments from the second on."""
     if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
@@ -147,7 +147,7 @@ def compiled_update(stored: MapState, points: Tensor, *others: Any, cfg: Elevati
     for values in (inputs[0], inputs[-1]):
         if values is not None:
             torch._dynamo.maybe_mark_dynamic(values, 2)
-    kinds = tuple(None if value is None else (value.dtype, value.device, value.ndim) for value in inputs)
+    kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     graph, known_sizes = graphs_of(cfg, kinds, points.shape[1])
     with contextlib.nullcontext() if points.shape[0] in known_sizes else announced_compilation():
         graph(with_masks(stored, as_bytes), *inputs)

@@ -77,19 +77,43 @@ class Measurement(NamedTuple):
 BLANK = {"variance": 1.0}
 
 
+def blank_corner(grid: GridConfig) -> tuple[int, int]:
+    """Return the corner of a window centred on the map frame's origin."""
+    return -(grid.height // 2), -(grid.width // 2)
+
+
 def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dtype: torch.dtype) -> MapState:
     """Return B maps of which nothing is known, centred on the map frame's origin."""
     layer = torch.zeros(num_envs, grid.height, grid.width, device=device, dtype=dtype)
     mask = torch.zeros_like(layer, dtype=torch.bool)
     number = torch.zeros(num_envs, device=device, dtype=dtype)
     zero = torch.zeros(num_envs, device=device, dtype=torch.int64)
-    corner = torch.stack([zero - grid.height // 2, zero - grid.width // 2], -1)
+    corner = torch.stack([zero + cells for cells in blank_corner(grid)], -1)
     heights = {"drift_error", "drift_correction"}
     masks = {"validity", "bounded"}
     layers = MapState._fields[2:-1]
     values = {name: (mask if name in masks else layer + BLANK.get(name, 0.0)).clone() for name in layers}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))
     return MapState(corner=corner, base_height=number, statistics=statistics, **values)
+
+
+def forget(state: MapState, grid: GridConfig, env_ids: Tensor | None, mask: Tensor | None) -> None:
+    """Make some environments of a state blank, in place: those of the ids or of the mask, or all."""
+    for name, value in (state._asdict() | state.statistics._asdict()).items():
+        if name not in ("corner", "statistics"):
+            _fill(value, BLANK.get(name, 0), env_ids, mask)
+    for corner, number in zip(state.corner.unbind(1), blank_corner(grid), strict=True):
+        _fill(corner, number, env_ids, mask)
+
+
+def _fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | None) -> None:
+    """Set the values (B, ...) of some environments, in place: those of the ids or of the mask, or all."""
+    if env_ids is not None:
+        values.index_fill_(0, env_ids, blank)
+    elif mask is not None:
+        values.masked_fill_(mask.view(-1, *[1] * (values.ndim - 1)), blank)
+    else:
+        values.fill_(blank)
 
 
 def map_layers(function: Callable[..., Tensor], *states: MapState) -> MapState:
