@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchelev.disputed import Disputed, moved_by
-from torchelev.grid import GridConfig
-from torchelev.storage import as_bytes
+from torchelev.errors import require
 from torchelev.windows import around
 
 if TYPE_CHECKING:
-    from torchelev.fusion import FusionConfig, Prior, Scan
+    from torchelev.disputed import Disputed
+
+UNSEEN = -1e6  # [m] below every height
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,120 +30,101 @@ class EdgeConfig:
     margin: float = 0.25  # standard deviations below the top that still belong to it
     min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
 
+    def __post_init__(self) -> None:
+        require(self.refinements >= 2, "edges.refinements", "must be at least 2", self.refinements, "give 7")
+
+    @property
+    def numbers(self) -> list[float]:
+        """The settings in their order, for operators, which take no config."""
+        return [float(getattr(self, name)) for name in self.__dataclass_fields__]
+
+    @classmethod
+    def of(cls, numbers: list[float]) -> EdgeConfig:
+        """Return the config of these settings."""
+        return cls(**dict(zip(cls.__dataclass_fields__, numbers, strict=True)))  # type: ignore[arg-type]
+
 
 def side_of_step(
-    scan: Scan, prior: Prior, step: Tensor, mean: Tensor, number: Tensor, grid: GridConfig, cfg: FusionConfig
+    points: Disputed,
+    low: Tensor,
+    low_passed: Tensor,
+    x: Tensor,
+    y: Tensor,
+    shown: Tensor,
+    width: int,
+    relief: float,
+    cfg: EdgeConfig,
 ) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
     where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
-    what lies at the centre, and points above are ignored. Returns the side (B, C), +1 top, -1 ground and 0 no step,
-    and that side's height [m]. `mean` [m] and `number` (B, C) are those of the cell's points.
+    what lies at the centre, and points above are ignored. Returns the side (K,), +1 top and -1 ground, and its height
+    (K,) [m] above the mean. `low` (K,) counts the points below the mean, `low_passed` those of them that passed the
+    centre, `x` and `y` (K,) sum the points' rays, `shown` (2, B * C) holds the heights that scan and map show.
     """
-    edges = cfg.edges
-    assert edges is not None
-    points = (*scan.columns(), [part.detach() for part in scan.ray], as_bytes(scan.passed))
-    shown = [torch.where(number > 0, mean, UNSEEN), torch.where(prior.known, prior.elevation, UNSEEN).detach()]
-    limits = (edges.refinements, edges.margin, edges.min_extreme, edges.min_passed, cfg.relief * grid.resolution)
-    side, height = step_side(as_bytes(step), *points, mean, shown, grid.width, *limits).unbind(0)
-    return side, height
-
-
-UNSEEN = -1e6  # [m] below every height
-
-
-@torch.library.custom_op(
-    "torchelev::step_side",
-    mutates_args=(),
-    schema="(Tensor cells, Tensor slot, Tensor z, Tensor spread, Tensor weight, Tensor[] ray, Tensor passed, "
-    "Tensor mean, Tensor[] shown, SymInt width, SymInt refinements, float margin, SymInt min_extreme, "
-    "float min_passed, float relief) -> Tensor",
-)
-def step_side(
-    cells: Tensor,
-    slot: Tensor,
-    z: Tensor,
-    spread: Tensor,
-    weight: Tensor,
-    ray: list[Tensor],
-    passed: Tensor,
-    mean: Tensor,
-    shown: list[Tensor],
-    width: int,
-    refinements: int,
-    margin: float,
-    min_extreme: int,
-    min_passed: float,
-    relief: float,
-) -> Tensor:
-    """Return the side and its height of each cell marked as a step, (2, B, C); zero elsewhere.
-
-    `shown` holds the heights (B, C) that the scan and the map show, `width` counts cells along y, `relief` is in [m].
-    """
-    points = Disputed(cells, slot, z, spread, weight, passed, *ray)
-    passed, *ray = points.others
-    middle = points.of(mean)
-    top, bottom = ends_of_step(points, middle, refinements, margin, min_extreme)
-    used = (points.weight > 0).to(mean.dtype)
-    low = used * (points.z < points.at_points(middle))
-    ground = points.sum(low * passed) > min_passed * points.sum(low)
+    top, bottom = ends_of_step(points, cfg)
+    ground = low_passed > cfg.min_passed * low
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
-    scanned, mapped = heights_around(shown, points.cells, width)
-    x, y = (points.sum(used * part) for part in ray)
-    mapped = torch.where(lie_behind(x, y), mapped, UNSEEN)
-    elsewhere = (scanned.amax(1) >= 0.5 * (middle + top)) | (mapped.amax(1) >= top - relief)
+    di, dj = around(x.device)
+    scanned, mapped = heights_around(shown, points.cells, di, dj, points.shape[1], width)
+    mapped = torch.where(lie_behind(x, y, di, dj), mapped, UNSEEN)
+    elsewhere = (scanned.amax(1) >= points.mean + 0.5 * top) | (mapped.amax(1) >= points.mean + top - relief)
     ground = ground & elsewhere
-    return points.spread_out(torch.where(ground, -1.0, 1.0).to(mean.dtype), torch.where(ground, bottom, top))
+    return torch.where(ground, -1.0, 1.0).to(x.dtype), torch.where(ground, bottom, top)
 
 
-@step_side.register_fake
-def _(cells: Tensor, slot: Tensor, z: Tensor, *others: Any) -> Tensor:
-    return z.new_empty(2, *cells.shape)
-
-
-def ends_of_step(
-    points: Disputed, middle: Tensor, refinements: int, margin: float, min_extreme: int
-) -> tuple[Tensor, Tensor]:
-    """Return the heights (K,) of the step's top and bottom: the bottom is the top of the step upside down.
+def ends_of_step(points: Disputed, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
+    """Return the heights (K,) of the step's top and bottom [m] above the mean.
 
     The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
-    top of a wall's face. The bottom takes two. Up to `margin` standard deviations short of a level lies past it.
-    A level that fewer than `min_extreme` reach, give or take a standard deviation, is an outlier's.
+    top of a wall's face. The bottom is the top of the step upside down, and takes two. Up to `margin` standard
+    deviations short of a level lies past it. A level that fewer than `min_extreme` points reach, give or take a
+    standard deviation, is an outlier's.
     """
     noise = points.spread.sqrt()
-    widest = torch.where(points.weight > 0, noise, -torch.inf)
+    z = torch.stack([points.z, -points.z])  # the step, and the step upside down
+    past = z + cfg.margin * noise
+    most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), int(cfg.min_extreme))
+    columns = torch.stack([points.weight * z, points.weight.expand_as(z)], 1)
+    height = torch.zeros_like(most)
+    for k in range(int(cfg.refinements)):
+        if k == 2:
+            bottom = -height[1]
+            height, past, most, columns = height[:1], past[:1], most[:1], columns[:1]
+        moment, total = points.sum(columns * (past >= points.at_points(height))[:, None]).unbind(1)
+        further = moment / total.clamp(min=torch.finfo(total.dtype).tiny)
+        height = torch.where(most >= further, further, height)
+    return height[0], bottom
 
-    def level(z: Tensor, height: Tensor, rounds: int) -> Tensor:
-        past, reached = z + margin * noise, z + widest
-        for _ in range(rounds):
-            start = points.at_points(height)
-            outer = points.weight * (past >= start)
-            further = moved_by(height, points.sum(outer * (z - start)), points.sum(outer))
-            there = (reached >= points.at_points(further)).to(height.dtype)
-            height = torch.where(points.sum(there) >= min_extreme, further, height)
-        return height
 
-    return level(points.z, middle, refinements), -level(-points.z, -middle, 2)
+def level_reached(points: Disputed, reached: Tensor, number: int) -> Tensor:
+    """Return the highest level (2, K) that so many of a cell's points reach; `reached` (2, P) is how high each does."""
+    level = points.highest(reached)
+    for _ in range(number - 1):
+        at = points.at_points(level)
+        next_level = points.highest(torch.where(reached < at, reached, -torch.inf))
+        enough = points.sum((reached >= at).to(reached.dtype)) >= number
+        level = torch.where(enough, level, next_level)
+    return level
 
 
-def heights_around(layers: list[Tensor], cells: Tensor, width: int) -> list[Tensor]:
-    """Read layers (B, C) at the eight neighbours of cells (K,) numbered across environments: each -> (K, 8)."""
-    num_cells = layers[0].shape[1]
+def heights_around(shown: Tensor, cells: Tensor, di: Tensor, dj: Tensor, num_cells: int, width: int) -> Tensor:
+    """Read layers (n, B * C) at the eight neighbours (di, dj) of cells (K,) numbered across environments: (n, K, 8)."""
     i, j = cells % num_cells // width, cells % width
-    di, dj = around(cells.device)
     i, j = i[:, None] + di, j[:, None] + dj
     exists = (i >= 0) & (i < num_cells // width) & (j >= 0) & (j < width)
     place = torch.where(exists, cells[:, None] + di * width + dj, 0)
-    return [torch.where(exists, layer.take(place), UNSEEN) for layer in layers]
+    heights = shown.index_select(1, place.flatten()).unflatten(1, place.shape)
+    return torch.where(exists, heights, UNSEEN)
 
 
-def lie_behind(x: Tensor, y: Tensor) -> Tensor:
-    """Tell which neighbours (K, 8) of a cell lie behind it, within 50 degrees of where its rays (K,) go.
+def lie_behind(x: Tensor, y: Tensor, di: Tensor, dj: Tensor) -> Tensor:
+    """Tell which neighbours (di, dj) of a cell lie behind it, (K, 8), within 50 degrees of where its rays (K,) go.
 
     Beside it along a wall lie cells that show the wall's face too, and the wall would end as every other cell's.
     """
-    di, dj = (steps.to(x.dtype) for steps in around(x.device))
+    di, dj = di.to(x.dtype), dj.to(x.dtype)
     limit = math.cos(math.radians(50)) * (di.square() + dj.square()).sqrt()
     along = x[:, None] * di + y[:, None] * dj
     return along > limit * (x.square() + y.square()).sqrt()[:, None]

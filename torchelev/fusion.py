@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.disputed import robust_mean
-from torchelev.edges import EdgeConfig, side_of_step
+from torchelev.disputed import STEP, UNTRUSTED, dispute
+from torchelev.edges import UNSEEN, EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
 from torchelev.state import BLANK, MapState, Measurement, count, tally
@@ -54,9 +54,9 @@ class Scan(NamedTuple):
         """Sum numbers, or count what is true, over the points of each cell."""
         return self.cells.sums(*(column.to(self.z.dtype) for column in columns))
 
-    def columns(self) -> tuple[Tensor, ...]:
-        """Return what `disputed` needs of every point."""
-        return self.cells.slot, self.z.detach(), self.spread.detach(), self.weight.detach()
+    def columns(self) -> list[Tensor]:
+        """Return what `Disputed` needs of every point, without a gradient."""
+        return [value.detach() for value in (self.z, self.spread, self.weight, as_bytes(self.passed), *self.ray)]
 
 
 class Prior(NamedTuple):
@@ -74,7 +74,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
 
     Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of
     the cell's elevation where most agree with it, else those around the scan's own robust mean. In cells that hold a
-    step, `edges.side_of_step` drops the points of the wrong side. The points kept have the information sum
+    step, `edges.side_of_step` tells how to drop the points of the wrong side. The points kept have the information sum
     1 / R = sum 1 / sigma_p^2 with a floor on R, because the points of one scan share the error of its pose.
     Equations (1) and (2), in information form and so in no order:
 
@@ -115,17 +115,14 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
     mean = ratio(moment, weight).detach()
     trusted = prior.known & (2 * agreeing >= number)
-    untrusted = as_bytes(~trusted & (number > 0))
-    robust, robustly = robust_mean(untrusted, *scan.columns(), mean, cfg.gate).unbind(0)
-    height = torch.where(trusted, prior.elevation, robust).detach()
-    gate_variance = torch.where(trusted, prior.gate_variance, 0.0)
-    side = torch.zeros_like(height)
-    if cfg.edges is not None:
-        far = number - torch.where(trusted, agreeing, robustly)
-        step = (number >= cfg.edges.min_points) & (far >= cfg.edges.min_share * number)
-        side, end = side_of_step(scan, prior, step, mean, number, grid, cfg)
-        height = torch.where(step, end, height)
-    return Guess(height, gate_variance, side, number, near)
+    far, edges = number - agreeing, cfg.edges
+    step = (number >= edges.min_points) & (far >= edges.min_share * number) if edges is not None else trusted & False
+    marks = torch.where(trusted, torch.where(step, STEP, 0), torch.where(number > 0, UNTRUSTED, 0)).to(torch.uint8)
+    shown = [torch.where(number > 0, mean, UNSEEN), torch.where(prior.known, prior.elevation, UNSEEN).detach()]
+    limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
+    height, side = dispute(marks, scan.cells.slot, scan.columns(), mean, torch.stack(shown), *limits).unbind(0)
+    height = torch.where(marks > 0, height, torch.where(trusted, prior.elevation, 0.0)).detach()
+    return Guess(height, torch.where(trusted, prior.gate_variance, 0.0), side, number, near)
 
 
 def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> tuple[ScanOfCells, Tensor]:

@@ -28,7 +28,6 @@ class TraversabilityConfig:
             value = getattr(self, name)
             require(value > 0, f"traversability.{name}", "must be positive", value, "see its default")
 
-
     def cells(self, grid: GridConfig) -> int:
         """Return the window's radius in cells."""
         return max(1, round(self.radius / grid.resolution))
