@@ -90,7 +90,8 @@ def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype
         fits = tuple(value.shape) in ((), (num_envs,))
         require(fits, "dt", f"expected a number or ({num_envs},)", tuple(value.shape), "give one dt per environment")
         if readable(value, always):
-            good = bool(torch.isfinite(value).all()) and bool((value >= 0).all())
+            seconds = value.detach().double().cpu().numpy()
+            good = bool(((seconds >= 0) & (seconds < math.inf)).all())
             require(good, "dt", "must be finite and not negative", value.tolist(), "give seconds since the last update")
         return value.to(dtype).expand(num_envs)
     number = isinstance(dt, int | float) and not isinstance(dt, bool)

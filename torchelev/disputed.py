@@ -119,13 +119,10 @@ def dispute(
         return points.spread_out(points.mean + height, torch.zeros_like(height))
     residual = points.z - points.at_points(height)
     near = points.used * (residual.square() <= gate**2 * points.spread)
-    low = points.used * (points.z < 0)
-    ray = [points.used * part for part in points.ray]
-    sums = points.sum(torch.stack([points.used, near, low, low * points.passed, *ray]))
+    number, close = points.sum(torch.stack([points.used, near])).unbind(0)
     cfg = EdgeConfig.of(edges)
-    number, far = sums[0], sums[0] - sums[1]
-    step = (number >= cfg.min_points) & (far >= cfg.min_share * number) | (points.of(marks) == STEP)
-    side, end = side_of_step(points, *sums[2:].unbind(0), shown.flatten(1), width, relief, cfg)
+    step = (number >= cfg.min_points) & (number - close >= cfg.min_share * number) | (points.of(marks) == STEP)
+    side, end = side_of_step(points, shown.flatten(1), width, relief, cfg)
     height = points.mean + torch.where(step, end, height)
     return points.spread_out(height, torch.where(step, side, 0.0))
 

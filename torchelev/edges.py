@@ -44,33 +44,24 @@ class EdgeConfig:
         return cls(**dict(zip(cls.__dataclass_fields__, numbers, strict=True)))  # type: ignore[arg-type]
 
 
-def side_of_step(
-    points: Disputed,
-    low: Tensor,
-    low_passed: Tensor,
-    x: Tensor,
-    y: Tensor,
-    shown: Tensor,
-    width: int,
-    relief: float,
-    cfg: EdgeConfig,
-) -> tuple[Tensor, Tensor]:
+def side_of_step(points: Disputed, shown: Tensor, width: int, relief: float, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
     where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
     what lies at the centre, and points above are ignored. Returns the side (K,), +1 top and -1 ground, and its height
-    (K,) [m] above the mean. `low` (K,) counts the points below the mean, `low_passed` those of them that passed the
-    centre, `x` and `y` (K,) sum the points' rays, `shown` (2, B * C) holds the heights that scan and map show.
+    (K,) [m] above the mean. `shown` (2, B * C) holds the heights that the scan and the map show.
     """
     top, bottom = ends_of_step(points, cfg)
-    ground = low_passed > cfg.min_passed * low
+    low = points.used * (points.z < 0)
+    columns = [low, low * points.passed, *(points.used * part for part in points.ray)]
+    number_low, number_passed, x, y = points.sum(torch.stack(columns)).unbind(0)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
     di, dj = around(x.device)
     scanned, mapped = heights_around(shown, points.cells, di, dj, points.shape[1], width)
     mapped = torch.where(lie_behind(x, y, di, dj), mapped, UNSEEN)
     elsewhere = (scanned.amax(1) >= points.mean + 0.5 * top) | (mapped.amax(1) >= points.mean + top - relief)
-    ground = ground & elsewhere
+    ground = (number_passed > cfg.min_passed * number_low) & elsewhere
     return torch.where(ground, -1.0, 1.0).to(x.dtype), torch.where(ground, bottom, top)
 
 

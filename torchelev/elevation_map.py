@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -82,13 +82,15 @@ class ElevationMap(nn.Module):
     @property
     def state(self) -> MapState:
         """The maps' buffers as one value. They change with the next update; clone what you keep."""
-        layers = {name: getattr(self, name) for name in MapState._fields[:-1]}
+        buffers = cast("dict[str, Tensor]", self._buffers)  # reading attributes takes five times as long
+        layers = {name: buffers[name] for name in MapState._fields[:-1]}
         return MapState(**layers, statistics=self.statistics)
 
     @property
     def statistics(self) -> Statistics:
         """What the last update did, as (B,) tensors."""
-        return Statistics(*(getattr(self, f"last_{name}") for name in Statistics._fields))
+        buffers = cast("dict[str, Tensor]", self._buffers)
+        return Statistics(*(buffers[f"last_{name}"] for name in Statistics._fields))
 
     def _store(self, state: MapState) -> None:
         # Copied, not rebound: see the rules on deepcopy and inference mode in CONTRIBUTING.md.

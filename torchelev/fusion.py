@@ -117,11 +117,12 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     trusted = prior.known & (2 * agreeing >= number)
     far, edges = number - agreeing, cfg.edges
     step = (number >= edges.min_points) & (far >= edges.min_share * number) if edges is not None else trusted & False
-    marks = torch.where(trusted, torch.where(step, STEP, 0), torch.where(number > 0, UNTRUSTED, 0)).to(torch.uint8)
+    # A single point is its cell's robust mean, and most cells of a sparse scan have one.
+    marks = torch.where(trusted, torch.where(step, STEP, 0), torch.where(number > 1, UNTRUSTED, 0)).to(torch.uint8)
     shown = [torch.where(number > 0, mean, UNSEEN), torch.where(prior.known, prior.elevation, UNSEEN).detach()]
     limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
     height, side = dispute(marks, scan.cells.slot, scan.columns(), mean, torch.stack(shown), *limits).unbind(0)
-    height = torch.where(marks > 0, height, torch.where(trusted, prior.elevation, 0.0)).detach()
+    height = torch.where(marks > 0, height, torch.where(trusted, prior.elevation, mean)).detach()
     return Guess(height, torch.where(trusted, prior.gate_variance, 0.0), side, number, near)
 
 

@@ -18,21 +18,15 @@ from torch import Tensor
 )
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
-    results = [torch.empty_like(layer) for layer in layers]
     H, W = layers[0].shape[1:]
-    for env, (i, j) in enumerate(shift.tolist()):
-        i, j = max(-H, min(i, H)), max(-W, min(j, W))
-        to = (env, slice(max(0, -i), H - max(0, i)), slice(max(0, -j), W - max(0, j)))
-        source = (env, slice(max(0, i), H - max(0, -i)), slice(max(0, j), W - max(0, -j)))
-        # Strips, not the whole layer: filling that first would cost as much as moving it.
-        rows = (env, slice(H - i, H) if i > 0 else slice(0, -i))
-        columns = (env, slice(None), slice(W - j, W) if j > 0 else slice(0, -j))
-        entering = [strip for strip, steps in ((rows, i), (columns, j)) if steps]
-        for result, layer, blank in zip(results, layers, blanks, strict=True):
-            for strip in entering:
-                result[strip] = blank
-            result[to].copy_(layer[source])
-    return results
+    # Padded where cells enter, and by as many less than nothing where they leave.
+    rims = [(-j, j, -i, i) for i, j in ((max(-H, min(i, H)), max(-W, min(j, W))) for i, j in shift.tolist())]
+    if len(rims) == 1:
+        return [F.pad(layer, rims[0], value=blank) for layer, blank in zip(layers, blanks, strict=True)]
+    return [
+        torch.stack([F.pad(part, rim, value=blank) for part, rim in zip(layer, rims, strict=True)])
+        for layer, blank in zip(layers, blanks, strict=True)
+    ]
 
 
 @moved.register_fake

@@ -27,10 +27,10 @@ def _line(values: Tensor, rim: int, dim: int, k: int) -> Tensor:
 
 def _line_sum(values: Tensor, rim: int, radius: int, dim: int, power: int) -> Tensor:
     """Sum k^power * values over k = -radius .. radius along one dimension."""
-    total = torch.zeros_like(_line(values, rim, dim, 0))
-    for k in range(-radius, radius + 1):
-        if power == 0 or k != 0:
-            total = total + float(k) ** power * _line(values, rim, dim, k)
+    first, *others = [k for k in range(-radius, radius + 1) if power == 0 or k != 0]
+    total = _line(values, rim, dim, first) * float(first) ** power
+    for k in others:
+        total = torch.add(total, _line(values, rim, dim, k), alpha=float(k) ** power)
     return total
 
 
