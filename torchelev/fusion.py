@@ -246,7 +246,7 @@ def merge(
 
     hit_now = store(taken)
     elevation, variance, support, validity, time = realize_all(
-        torch.where(hit_now, store(fused), state.elevation),
+        store(fused),
         torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         state.validity | hit_now,

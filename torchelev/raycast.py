@@ -63,6 +63,13 @@ class PolarGrid(NamedTuple):
         levels = math.ceil(math.log2(2 * width))  # the sensor's own cell has a range of half a cell
         return cls(reach, azimuths, tuple(math.ceil(width / 2**k) for k in range(levels)))
 
+    def widths(self, k: Tensor) -> Tensor:
+        """Return how many azimuth bins an entry of `polar_minimum` covers at range k, a whole number of bins."""
+        width = torch.ones_like(k)
+        for level, rows in enumerate(self.widen):
+            width = torch.add(width, k < rows, alpha=2.0**level)
+        return width
+
 
 def turn(x: Tensor, y: Tensor) -> Tensor:
     """Return the azimuth as a fraction of a turn in [0, 1], within 0.001 turns of atan2 and without its cost.
@@ -107,11 +114,14 @@ def rays_of(m: Measurement, s: int) -> Rays:
 
 def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
     """Tell which rays may clear and bound: their end is credible, and they pass below no ground hit of late."""
-    clearance = horizon(state, m, rays, grid, cfg) + rays.slope
-    return rays.casts & ends_well(state, m, rays, grid, cfg) & (clearance >= 0)
+    lowest = state.elevation - height_margin(state, grid, cfg)
+    clearance = horizon(state, m, rays, lowest, grid, cfg) + rays.slope
+    return rays.casts & ends_well(state, m, rays, lowest, grid, cfg) & (clearance >= 0)
 
 
-def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
+def ends_well(
+    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
+) -> Bool[Tensor, "B N"]:
     """Tell which rays end, or leave the window, in a well supported cell and not below it.
 
     Where nothing is known nobody vouches for a ray, unless its point is above the exclusion ramp: too long a return
@@ -126,7 +136,6 @@ def ends_well(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg
     share = (room / along).amin(-1).clamp(0, 1)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
-    lowest = state.elevation - height_margin(state, grid, cfg)
     floor = realize(torch.where(well_supported(state, cfg, grid.resolution), lowest, 1e6)).flatten(1).gather(1, slot)
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
     return inside & (height >= floor) | rays.overhang
@@ -145,7 +154,9 @@ def height_margin(state: MapState, grid: GridConfig, cfg: RaycastConfig) -> Floa
     return cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
 
 
-def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B N"]:
+def horizon(
+    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
+) -> Float[Tensor, "B N"]:
     """Return the steepest fall -dz/dr that a ray may have before it passes below ground hit within `min_time`.
 
     Rays that pass below it contradict it, and are wrong returns. Kept in a polar table of half the resolution, filled
@@ -161,13 +172,12 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
     x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(realize_all(angle.cos(), angle.sin())))
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     recent = state.validity & (state.time <= cfg.min_time)
-    depth = rays.origin[:, 2, None, None] - state.elevation + height_margin(state, grid, cfg)
-    below_sensor = torch.where(recent, depth, NO_RAY)
+    below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_RAY)
     fall = torch.where(inside, read(realize(below_sensor).flatten(1), slot), NO_RAY * step) / rho
-    lowest = running_minimum(fall, from_end=False)
+    steepest = running_minimum(fall, from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
-    limit = lowest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths))
+    limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths))
     return torch.where(k >= 0, limit, NO_RAY)
 
 
@@ -213,15 +223,15 @@ def look_up(
     x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
     rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
     k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
-    width = 1.0 + sum((k < rows) * 2.0**level for level, rows in enumerate(polar.widen))
-    a = torch.floor(turn(*torch.broadcast_tensors(x, y)) * polar.azimuths - 0.5 * (width - 1))
+    width = polar.widths(k)
+    a = torch.floor(turn(x, y) * polar.azimuths - 0.5 * (width - 1))
     a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
     # Realized, or the compiler would gather twice, for the masks and for the heights.
     slope = realize(read(table.flatten(1), flat(k, a, polar.azimuths)))
     found = slope < NO_RAY
     slope = torch.where(found, slope, 0.0)
     gx, gy = state.gradient_x, state.gradient_y
-    along = (slope - gx * x / rho - gy * y / rho).abs()
+    along = (slope - torch.addcmul(gx * x, gy, y) / rho).abs()
     incidence = along / ((1 + slope.square()) * (1 + gx.square() + gy.square())).sqrt()
     return RayOverCell(found, z_s + slope * rho, incidence)
 

@@ -54,6 +54,11 @@ class Plane(NamedTuple):
     residual: Float[Tensor, "B H W"]  # [m^2] mean squared distance in z
 
 
+def less(value: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return value - x * y, in one operation."""
+    return torch.addcmul(value, x, y, value=-1)
+
+
 def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     """Fit z = c + g_x x + g_y y by least squares to the known cells within `radius` cells of each cell.
 
@@ -65,16 +70,16 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     n, n_v, n_vv, n_u, n_uv, n_uu, s_z, s_vz, s_uz, s_zz = moments
     share = 1 / n.clamp(min=1)
     mu, mv, mz = n_u * share, n_v * share, s_z * share
-    uu, vv, uv = n_uu * share - mu * mu, n_vv * share - mv * mv, n_uv * share - mu * mv
-    uz, vz = s_uz * share - mu * mz, s_vz * share - mv * mz
-    det = uu * vv - uv * uv
+    uu, vv, uv = less(n_uu * share, mu, mu), less(n_vv * share, mv, mv), less(n_uv * share, mu, mv)
+    uz, vz = less(s_uz * share, mu, mz), less(s_vz * share, mv, mz)
+    det = less(uu * vv, uv, uv)
     spread = uu + vv
     regular = det > 1e-4
     safe_det = torch.where(regular, det, 1.0)
     safe_spread = torch.where(spread > 1e-4, spread, 1.0)
-    gu = torch.where(regular, (vv * uz - uv * vz) / safe_det, uz / safe_spread)
-    gv = torch.where(regular, (uu * vz - uv * uz) / safe_det, vz / safe_spread)
-    residual = (s_zz * share - mz * mz - gu * uz - gv * vz).clamp(min=0)
+    gu = torch.where(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
+    gv = torch.where(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
+    residual = less(less(less(s_zz * share, mz, mz), gu, uz), gv, vz).clamp(min=0)
     return Plane(gu / resolution, gv / resolution, residual)
 
 

@@ -35,7 +35,8 @@ class TraversabilityConfig:
 
 def height_range(ground: Ground, radius: int) -> Tensor:
     """Return the height difference of the highest and the lowest known cell of each window [m]; -inf without any."""
-    signed = (torch.where(ground.known > 0, z, -torch.inf) for z in (ground.height, -ground.height))
+    known = ground.known > 0
+    signed = (torch.where(known, z, -torch.inf) for z in (ground.height, -ground.height))
     highest, minus_lowest = window_maximum(list(signed), ground.rim, radius)
     return highest + minus_lowest
 

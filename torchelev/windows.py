@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -25,12 +26,24 @@ def _line(values: Tensor, rim: int, dim: int, k: int) -> Tensor:
     return values.narrow(dim, rim + k, values.shape[dim] - 2 * rim)
 
 
-def _line_sum(values: Tensor, rim: int, radius: int, dim: int, power: int) -> Tensor:
-    """Sum k^power * values over k = -radius .. radius along one dimension."""
-    first, *others = [k for k in range(-radius, radius + 1) if power == 0 or k != 0]
-    total = _line(values, rim, dim, first) * float(first) ** power
-    for k in others:
-        total = torch.add(total, _line(values, rim, dim, k), alpha=float(k) ** power)
+def _line_sums(values: Tensor, rim: int, radius: int, dim: int, order: int) -> list[Tensor]:
+    """Sum k^power * values over k = -radius .. radius along one dimension, for each power up to the order of 0 to 2."""
+    middle, steps = _line(values, rim, dim, 0), range(1, radius + 1)
+    sides = [(_line(values, rim, dim, -k), _line(values, rim, dim, k)) for k in steps]
+    both = [before + after for before, after in sides]
+    sums = [functools.reduce(torch.add, both, middle)]
+    if order >= 1:
+        sums.append(_weighted(steps, [after - before for before, after in sides]))
+    if order >= 2:
+        sums.append(_weighted([k * k for k in steps], both))
+    return sums
+
+
+def _weighted(weights: Sequence[int], values: list[Tensor]) -> Tensor:
+    """Sum weight * value; the first weight is 1."""
+    total = values[0]
+    for weight, value in zip(weights[1:], values[1:], strict=True):
+        total = torch.add(total, value, alpha=weight)
     return total
 
 
@@ -38,12 +51,13 @@ def window_moments(layers: list[tuple[Tensor, int]], rim: int, radius: int) -> l
     """Sum u^a v^b * values over the (2 * radius + 1)^2 window around each cell.
 
     u and v count cells from the window's centre along H and W. For each layer (B, H + 2 * rim, W + 2 * rim) with its
-    order, all moments (B, H, W) with a + b <= order: (0, 0), (0, 1), ... (1, 0), ... The rim is at least the radius.
+    order, 0 to 2, all moments (B, H, W) with a + b <= order: (0, 0), (0, 1), ... (1, 0), ... The rim is at least the
+    radius.
     """
-    lines = realize_all(*(_line_sum(v, rim, radius, -2, a) for v, order in layers for a in range(order + 1)))
+    lines = realize_all(*(line for v, order in layers for line in _line_sums(v, rim, radius, -2, order)))
     orders = [order - a for _, order in layers for a in range(order + 1)]
     return [
-        _line_sum(line, rim, radius, -1, b) for line, order in zip(lines, orders, strict=True) for b in range(order + 1)
+        moment for line, order in zip(lines, orders, strict=True) for moment in _line_sums(line, rim, radius, -1, order)
     ]
 
 
