@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchelev.disputed import Disputed
-from torchelev.edges import UNSEEN, EdgeConfig, ends_of_step, heights_around, lie_behind
+from torchelev.edges import EdgeConfig, ends_of_step, lie_behind, values_around
 from torchelev.windows import AROUND, around
 
 
@@ -18,11 +18,12 @@ def test_neighbours_behind_a_cell_lie_within_50_degrees_of_its_rays(degrees):
     assert lie_behind(x, y, *around(x.device))[0].tolist() == [o < 50 for o in off]
 
 
-def test_heights_around():
-    """Of two maps of 3 x 2 cells; outside a map nothing is seen, the other map's cells least of all."""
-    layer, cells = torch.arange(12.0)[None], torch.tensor([3, 4, 6])
-    (got,) = heights_around(layer, cells, *around(layer.device), num_cells=6, width=2)
-    none = UNSEEN
+def test_values_around():
+    """Of two maps of 3 x 2 cells; outside a map there is nothing, the other map's cells least of all."""
+    layer, cells = torch.arange(12.0).view(2, 6), torch.tensor([3, 4, 6])
+    exists, (got,) = values_around([layer], cells, *around(layer.device), width=2)
+    none = -1.0
+    got = torch.where(exists, got, none)
     assert got[0].tolist() == [0, 1, none, 2, none, 4, 5, none]
     assert got[1].tolist() == [none, 2, 3, none, 5, none, none, none]
     assert got[2].tolist() == [none, none, none, none, 7, none, 8, 9]
@@ -37,7 +38,7 @@ def test_points_that_are_not_used_hold_no_level():
     ends = []
     for count in (7, 9):
         columns = [value[:, :count] for value in (z, torch.full((1, 9), 1e-4), weight, passed, ray, ray)]
-        ends.append(ends_of_step(Disputed(cells, slot[:, :count], mean, columns), EdgeConfig()))
+        ends.append(ends_of_step(Disputed(cells, slot[:, :count], columns, mean), EdgeConfig()))
     assert ends[0] == ends[1]
     top, bottom = (mean.item() + end.item() for end in ends[0])
     assert top == pytest.approx(6 / 7)  # the next level, 1.5, would be reached by the outlier alone

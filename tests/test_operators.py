@@ -59,11 +59,11 @@ def test_gradient_of_padded():
 
 
 TABLE = torch.linspace(0, 1, 64).view(2, 8, 4)
-MARKED = torch.tensor([[0, 1, 0, 0], [2, 0, 0, 0]], dtype=torch.uint8)
+MARKED = torch.tensor([[[0, 1, 0, 0], [1, 0, 0, 0]], [[0, 1, 0, 0], [0, 0, 0, 0]]], dtype=torch.uint8)
 SLOT = torch.tensor([[1, 1, 2], [0, 3, 0]])
 POINTS = [torch.rand(2, 3, generator=torch.Generator().manual_seed(k)) + 0.1 for k in range(6)]  # see Disputed
 POINTS[3] = (POINTS[3] > 0.5).to(torch.uint8)
-LAYERS = torch.stack([torch.zeros(2, 4), torch.ones(2, 4)])
+LAYERS = [torch.zeros(2, 4), torch.ones(2, 4), torch.zeros(2, 4), torch.ones(2, 4, dtype=torch.uint8)]
 
 
 @pytest.mark.parametrize(
@@ -75,8 +75,8 @@ LAYERS = torch.stack([torch.zeros(2, 4), torch.ones(2, 4)])
         ("polar_minimum", (torch.tensor([[0, 11]]), torch.ones(1, 2), 4, [3, 1], 8, 9.0)),
         ("cell_sums", (torch.tensor([[0, 1], [1, 1]]), torch.ones(3, 2, 2), 2)),
         ("moved", ([TABLE, TABLE > 0.5], torch.tensor([[1, 0], [0, -2]]), [1.0, 0.0])),
-        ("dispute", (MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, EdgeConfig().numbers)),
-        ("dispute", (MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, [])),
+        ("dispute", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, EdgeConfig().numbers)),
+        ("dispute", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, [])),
     ],
 )
 def test_operators_are_registered_right(operator, arguments):

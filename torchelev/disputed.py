@@ -17,33 +17,31 @@ from torchelev.edges import EdgeConfig, side_of_step
 if TYPE_CHECKING:
     from jaxtyping import Float, Int, UInt8
 
-STEP, UNTRUSTED = 1, 2  # marks of disputed cells, see `dispute`
-
 
 class Disputed:
     """K disputed cells, numbered across environments, and their P points; on a GPU all cells and all points."""
 
     def __init__(
         self,
-        marks: UInt8[Tensor, "B C"],
+        cells: UInt8[Tensor, "B C"],
         slot: Int[Tensor, "B M"],
-        mean: Float[Tensor, "B C"],
         columns: list[Tensor],
+        mean: Float[Tensor, "B C"],
     ) -> None:
-        """Pick out the cells whose mark is not zero, and of their points z, spread, weight, passed, ray x and y."""
-        self.shape = marks.shape
-        first = torch.arange(marks.shape[0], device=marks.device)[:, None] * marks.shape[1]
+        """Pick out the cells that are not zero, and of their points z, spread, weight, passed, ray x and ray y."""
+        self.num_cells = cells.shape[1]
+        first = torch.arange(cells.shape[0], device=cells.device)[:, None] * self.num_cells
         slot, columns = (slot + first).flatten(), [column.flatten() for column in columns]
-        if marks.device.type == "cpu":
-            marked = marks.flatten()
+        if cells.device.type == "cpu":
+            marked = cells.flatten()
             self.cells = marked.nonzero().squeeze(1)
             chosen = marked.index_select(0, slot).nonzero().squeeze(1)
-            number = torch.empty(marks.numel(), dtype=torch.int64)
+            number = torch.empty(cells.numel(), dtype=torch.int64)
             number[self.cells] = torch.arange(len(self.cells))
             self.owner = number.index_select(0, slot.index_select(0, chosen))
             columns = [column.index_select(0, chosen) for column in columns]
         else:
-            self.cells, self.owner = torch.arange(marks.numel(), device=marks.device), slot
+            self.cells, self.owner = torch.arange(cells.numel(), device=cells.device), slot
         self.mean = self.of(mean)
         z, self.spread, self.weight, self.passed, *self.ray = columns
         self.z = z - self.at_points(self.mean)  # [m] above the mean of the cell's points
@@ -67,10 +65,9 @@ class Disputed:
         """Read a layer (B, C) at the disputed cells: -> (K,)."""
         return layer.flatten().index_select(0, self.cells)
 
-    def spread_out(self, *values: Tensor) -> Tensor:
-        """Make layers of the cells' values, zero elsewhere: n times (K,) -> (n, B, C)."""
-        layers = values[0].new_zeros(len(values), self.shape.numel())
-        return layers.index_copy_(1, self.cells, torch.stack(values)).unflatten(1, self.shape)
+    def put(self, layer: Tensor, values: Tensor) -> Tensor:
+        """Return a layer (B, C) with values (K,) put into the disputed cells."""
+        return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 
 
 def robust_mean(points: Disputed) -> Tensor:
@@ -91,42 +88,42 @@ def robust_mean(points: Disputed) -> Tensor:
 @torch.library.custom_op(
     "torchelev::dispute",
     mutates_args=(),
-    schema="(Tensor marks, Tensor slot, Tensor[] columns, Tensor mean, Tensor shown, SymInt width, float gate, "
-    "float relief, float[] edges) -> Tensor",
+    schema="(Tensor cells, Tensor steps, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, "
+    "float gate, float relief, float[] edges) -> (Tensor, Tensor)",
 )
 def dispute(
-    marks: UInt8[Tensor, "B C"],
+    cells: UInt8[Tensor, "B C"],
+    steps: UInt8[Tensor, "B C"],
     slot: Int[Tensor, "B M"],
     columns: list[Tensor],
-    mean: Float[Tensor, "B C"],
-    shown: Float[Tensor, "2 B C"],
+    height: Float[Tensor, "B C"],
+    shown: list[Tensor],
     width: int,
     gate: float,
     relief: float,
     edges: list[float],
-) -> Float[Tensor, "2 B C"]:
-    """Return the height [m] of each disputed cell and its side: of a step +1 top, -1 ground, else 0.
+) -> tuple[Float[Tensor, "B C"], Float[Tensor, "B C"]]:
+    """Settle the disputed cells: return the heights [m] and the side of each cell: of a step +1 top, -1 ground, else 0.
 
-    The mark of an UNTRUSTED cell asks for the robust mean of its points unless too many of them are far from that,
-    that of a STEP for the height of one of its ends. Where there is no mark, the results are zero, or mean nothing.
-    `columns` (B, M) are those of `Disputed`, the weight zero where a point is not used; `shown` holds the heights that
-    the scan and the map show, `width` counts cells along y, `relief` is in [m], `edges` is `EdgeConfig.numbers`, or
-    empty if steps do not matter.
+    A disputed cell gets the robust mean of its points, or, if it is one of `steps` or too many of its points are far
+    from that mean, the height of one end of the step. The other cells keep their `height`. `columns` (B, M) are those
+    of `Disputed`, the weight zero where a point is not used. `shown` (B, C) holds the mean and the number of the
+    scan's points, and the elevation of the map and whether it is known. `width` counts cells along y, `relief` is in
+    [m], `edges` is `EdgeConfig.numbers`, or empty if steps do not matter.
     """
-    points = Disputed(marks, slot, mean, columns)
-    height = robust_mean(points)
-    if not edges:
-        return points.spread_out(points.mean + height, torch.zeros_like(height))
-    residual = points.z - points.at_points(height)
-    near = points.used * (residual.square() <= gate**2 * points.spread)
-    number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-    cfg = EdgeConfig.of(edges)
-    step = (number >= cfg.min_points) & (number - close >= cfg.min_share * number) | (points.of(marks) == STEP)
-    side, end = side_of_step(points, shown.flatten(1), width, relief, cfg)
-    height = points.mean + torch.where(step, end, height)
-    return points.spread_out(height, torch.where(step, side, 0.0))
+    points = Disputed(cells, slot, columns, shown[0])
+    settled, side = robust_mean(points), torch.zeros_like(points.mean)
+    if edges:
+        cfg = EdgeConfig.of(edges)
+        residual = points.z - points.at_points(settled)
+        near = points.used * (residual.square() <= gate**2 * points.spread)
+        number, close = points.sum(torch.stack([points.used, near])).unbind(0)
+        step = (number >= cfg.min_points) & (number - close >= cfg.min_share * number) | (points.of(steps) > 0)
+        which, end = side_of_step(points, shown, width, relief, cfg)
+        settled, side = torch.where(step, end, settled), torch.where(step, which, side)
+    return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
 
 
 @dispute.register_fake
-def _(marks: Tensor, slot: Tensor, columns: list[Tensor], mean: Tensor, *others: Any) -> Tensor:
-    return mean.new_empty(2, *mean.shape)
+def _(cells: Tensor, steps: Tensor, slot: Tensor, columns: list[Tensor], height: Tensor, *others: Any) -> Any:
+    return torch.empty_like(height), torch.empty_like(height)

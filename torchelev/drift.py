@@ -65,7 +65,7 @@ def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConf
     correction = torch.where(applies, cfg.gain * mean, 0.0)
     shift = correction[:, None, None]
     state = state._replace(
-        elevation=torch.where(state.validity, state.elevation + shift, state.elevation),
-        upper_bound=torch.where(state.bounded, state.upper_bound + shift, state.upper_bound),
+        elevation=state.elevation + shift * state.validity,
+        upper_bound=state.upper_bound + shift * state.bounded,
     )
     return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

@@ -15,8 +15,6 @@ from torchelev.windows import around
 if TYPE_CHECKING:
     from torchelev.disputed import Disputed
 
-UNSEEN = -1e6  # [m] below every height
-
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeConfig:
@@ -44,13 +42,15 @@ class EdgeConfig:
         return cls(**dict(zip(cls.__dataclass_fields__, numbers, strict=True)))  # type: ignore[arg-type]
 
 
-def side_of_step(points: Disputed, shown: Tensor, width: int, relief: float, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
+def side_of_step(
+    points: Disputed, shown: list[Tensor], width: int, relief: float, cfg: EdgeConfig
+) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
     where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
     what lies at the centre, and points above are ignored. Returns the side (K,), +1 top and -1 ground, and its height
-    (K,) [m] above the mean. `shown` (2, B * C) holds the heights that the scan and the map show.
+    (K,) [m] above the mean. `shown` holds what the scan and the map show, see `dispute`.
     """
     top, bottom = ends_of_step(points, cfg)
     low = points.used * (points.z < 0)
@@ -58,9 +58,11 @@ def side_of_step(points: Disputed, shown: Tensor, width: int, relief: float, cfg
     number_low, number_passed, x, y = points.sum(torch.stack(columns)).unbind(0)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
     di, dj = around(x.device)
-    scanned, mapped = heights_around(shown, points.cells, di, dj, points.shape[1], width)
-    mapped = torch.where(lie_behind(x, y, di, dj), mapped, UNSEEN)
-    elsewhere = (scanned.amax(1) >= points.mean + 0.5 * top) | (mapped.amax(1) >= points.mean + top - relief)
+    exists, (mean, number, elevation, known) = values_around(shown, points.cells, di, dj, width)
+    middle, top_height = points.mean + 0.5 * top, points.mean + top - relief
+    in_scan = exists & (number > 0) & (mean >= middle[:, None])
+    in_map = exists & (known > 0) & (elevation >= top_height[:, None]) & lie_behind(x, y, di, dj)
+    elsewhere = (in_scan | in_map).any(1)
     ground = (number_passed > cfg.min_passed * number_low) & elsewhere
     return torch.where(ground, -1.0, 1.0).to(x.dtype), torch.where(ground, bottom, top)
 
@@ -100,14 +102,19 @@ def level_reached(points: Disputed, reached: Tensor, number: int) -> Tensor:
     return level
 
 
-def heights_around(shown: Tensor, cells: Tensor, di: Tensor, dj: Tensor, num_cells: int, width: int) -> Tensor:
-    """Read layers (n, B * C) at the eight neighbours (di, dj) of cells (K,) numbered across environments: (n, K, 8)."""
+def values_around(
+    layers: list[Tensor], cells: Tensor, di: Tensor, dj: Tensor, width: int
+) -> tuple[Tensor, list[Tensor]]:
+    """Read layers (B, C) at the eight neighbours (di, dj) of cells (K,) numbered across environments.
+
+    Returns which neighbours lie on the map, (K, 8), and each layer's values there, (K, 8).
+    """
+    num_cells = layers[0].shape[1]
     i, j = cells % num_cells // width, cells % width
     i, j = i[:, None] + di, j[:, None] + dj
     exists = (i >= 0) & (i < num_cells // width) & (j >= 0) & (j < width)
     place = torch.where(exists, cells[:, None] + di * width + dj, 0)
-    heights = shown.index_select(1, place.flatten()).unflatten(1, place.shape)
-    return torch.where(exists, heights, UNSEEN)
+    return exists, [layer.take(place) for layer in layers]
 
 
 def lie_behind(x: Tensor, y: Tensor, di: Tensor, dj: Tensor) -> Tensor:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.disputed import STEP, UNTRUSTED, dispute
-from torchelev.edges import UNSEEN, EdgeConfig
+from torchelev.disputed import dispute
+from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
 from torchelev.state import BLANK, MapState, Measurement, count, tally
@@ -118,11 +118,12 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     far, edges = number - agreeing, cfg.edges
     step = (number >= edges.min_points) & (far >= edges.min_share * number) if edges is not None else trusted & False
     # A single point is its cell's robust mean, and most cells of a sparse scan have one.
-    marks = torch.where(trusted, torch.where(step, STEP, 0), torch.where(number > 1, UNTRUSTED, 0)).to(torch.uint8)
-    shown = [torch.where(number > 0, mean, UNSEEN), torch.where(prior.known, prior.elevation, UNSEEN).detach()]
+    step, untrusted = trusted & step, ~trusted & (number > 1)
+    height = torch.where(trusted, prior.elevation, mean).detach()
+    shown = [mean, number.detach(), prior.elevation.detach(), as_bytes(prior.known)]
     limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
-    height, side = dispute(marks, scan.cells.slot, scan.columns(), mean, torch.stack(shown), *limits).unbind(0)
-    height = torch.where(marks > 0, height, torch.where(trusted, prior.elevation, mean)).detach()
+    masks = as_bytes(step | untrusted), as_bytes(step)
+    height, side = dispute(*masks, scan.cells.slot, scan.columns(), height, shown, *limits)
     return Guess(height, torch.where(trusted, prior.gate_variance, 0.0), side, number, near)
 
 
@@ -142,7 +143,7 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
     votes = kept_number + edge
     cells = ScanOfCells(
         height=height,
-        variance=(1.0 / torch.where(kept_number > 0, information, 1.0)).clamp(min=cfg.scan_variance_floor),
+        variance=(1.0 / information.clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor),
         kept=kept_number,
         votes=votes,
         dissent=guess.number - votes,
@@ -198,8 +199,8 @@ def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> T
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """Divide; zero where there is nothing to divide by."""
-    return numerator / torch.where(denominator > 0, denominator, 1.0)
+    """Divide; zero where both are."""
+    return numerator / denominator.clamp(min=torch.finfo(denominator.dtype).tiny)
 
 
 def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
@@ -234,7 +235,7 @@ def merge(
     found = hit & ~agree & (~prior.known | (support < 0))
     taken = realize(agree | found)
 
-    information = torch.where(agree, 1.0 / prior.variance, 0.0) + 1.0 / scan.variance
+    information = agree / prior.variance + 1.0 / scan.variance
     fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
     outvoted = torch.where(hit, prior.variance + cfg.outlier_variance * scan.kept, prior.variance)
     posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)

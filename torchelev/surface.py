@@ -41,8 +41,8 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
     known = validity.to(elevation.dtype)
     number = known.sum((1, 2), keepdim=True).clamp(min=1)
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
-    datum = (torch.where(validity, elevation, 0.0).sum((1, 2), keepdim=True) / number).detach()
-    layers = padded(torch.stack([known, torch.where(validity, elevation - datum, 0.0)]), rim, 0.0)
+    datum = ((elevation * known).sum((1, 2), keepdim=True) / number).detach()
+    layers = padded(torch.stack([known, (elevation - datum) * known]), rim, 0.0)
     return Ground(layers[0], layers[1], rim)
 
 
@@ -75,8 +75,8 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     det = less(uu * vv, uv, uv)
     spread = uu + vv
     regular = det > 1e-4
-    safe_det = torch.where(regular, det, 1.0)
-    safe_spread = torch.where(spread > 1e-4, spread, 1.0)
+    # Both are far above these limits unless they are zero but for rounding.
+    safe_det, safe_spread = det.clamp(min=1e-4), spread.clamp(min=1e-2)
     gu = torch.where(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
     gv = torch.where(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
     residual = less(less(less(s_zz * share, mz, mz), gu, uz), gv, vz).clamp(min=0)
@@ -90,6 +90,6 @@ def normals(state: MapState, ground: Ground, grid: GridConfig, cfg: SurfaceConfi
     """
     plane = fit_plane(ground, cfg.radius, grid.resolution)
     return state._replace(
-        gradient_x=torch.where(state.validity, plane.gradient_x, 0.0),
-        gradient_y=torch.where(state.validity, plane.gradient_y, 0.0),
+        gradient_x=plane.gradient_x * state.validity,
+        gradient_y=plane.gradient_y * state.validity,
     )
