@@ -124,7 +124,7 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
     masks = as_bytes(step | untrusted), as_bytes(step)
     height, side = dispute(*masks, scan.cells.slot, scan.columns(), height, shown, *limits)
-    return Guess(height, torch.where(trusted, prior.gate_variance, 0.0), side, number, near)
+    return Guess(height, prior.gate_variance * trusted, side, number, near)
 
 
 def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> tuple[ScanOfCells, Tensor]:

@@ -78,7 +78,7 @@ def turn(x: Tensor, y: Tensor) -> Tensor:
     """
     ax, ay = x.abs(), y.abs()
     high = torch.maximum(ax, ay)
-    t = torch.minimum(ax, ay) / torch.where(high > 0, high, 1.0)
+    t = torch.minimum(ax, ay) / high.clamp(min=1e-30)
     eighth = t * (0.125 + 0.0434 * (1 - t))  # atan(t) / 2 pi
     quarter = torch.where(ay > ax, 0.25 - eighth, eighth)
     half = torch.where(x < 0, 0.5 - quarter, quarter)
