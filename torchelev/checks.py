@@ -32,12 +32,15 @@ def check_tensor(
     convert: str = "convert it with .to(dtype)",
 ) -> Tensor:
     """Refuse what is no tensor, or lies elsewhere, or has another dtype, which `convert` says how to mend."""
+    here = (device.type, device.index or 0)
+    same = isinstance(value, Tensor) and (value.device.type, value.device.index or 0) == here
+    if isinstance(value, Tensor) and same and value.dtype in dtypes:
+        return value  # before a message is made, which takes as long as all the rest
     came = type(value).__name__
     require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
     assert isinstance(value, Tensor)
     kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
     require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, convert, TypeError)
-    same = value.device.type == device.type and (value.device.index or 0) == (device.index or 0)
     came = f"{tuple(value.shape)} on {value.device}"
     require(same, name, f"must be on {device}", came, "move it with .to(emap.device)")
     return value
