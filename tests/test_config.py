@@ -6,7 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev import BodyConfig, DriftConfig, ElevationMapConfig, FusionConfig, GridConfig, RaycastConfig, SensorConfig
+from torchelev import (
+    BodyConfig,
+    DriftConfig,
+    EdgeConfig,
+    ElevationMapConfig,
+    FusionConfig,
+    GridConfig,
+    RaycastConfig,
+    SensorConfig,
+)
 from torchelev.config import differing_fields
 
 SOME = [
@@ -62,6 +71,12 @@ def test_configs_are_frozen_and_keyword_only():
 def test_fusion_refuses(name):
     with pytest.raises(ValueError, match=f"fusion.{name}"):
         FusionConfig(**{name: 0.0})
+
+
+@pytest.mark.parametrize("bad", [dict(refinements=1), dict(min_points=2.5), dict(min_extreme=0), dict(min_share=0.0)])
+def test_edges_refuse(bad):
+    with pytest.raises(ValueError, match=rf"fusion\.edges\.{next(iter(bad))}"):
+        EdgeConfig(**bad)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchelev.disputed import Disputed
+from torchelev.disputed import Disputed, settle
 from torchelev.edges import EdgeConfig, ends_of_step, lie_behind, values_around
 from torchelev.windows import AROUND, around
 
@@ -43,3 +43,62 @@ def test_points_that_are_not_used_hold_no_level():
     top, bottom = (mean.item() + end.item() for end in ends[0])
     assert top == pytest.approx(6 / 7)  # the next level, 1.5, would be reached by the outlier alone
     assert bottom == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("refinements, top", [(2, 0.875), (3, 0.9375), (7, 1 - 2**-8)])
+def test_each_refinement_halves_the_distance_to_the_top_of_a_face(refinements, top):
+    """A wall's face of 1 m, its points evenly spread; the bottom takes two."""
+    z = torch.linspace(0, 1, 20_001, dtype=torch.float64)[None]
+    slot, passed, cells = torch.zeros_like(z, dtype=torch.int64), torch.zeros_like(z), torch.ones(1, 1)
+    columns = [z, torch.full_like(z, 1e-10), torch.ones_like(z), passed, passed, passed]
+    points = Disputed(cells.to(torch.uint8), slot, columns, 0.5 * cells.double())
+    ends = ends_of_step(points, EdgeConfig(refinements=refinements))
+    assert [0.5 + end.item() for end in ends] == pytest.approx([top, 0.125], abs=1e-3)
+
+
+def one_cell(z, weight, step=0, passed=0, seen=None, known=None):
+    """Height and side of the middle cell of 3 x 3, with these points, whose rays go along +x.
+
+    `seen` and `known` give its neighbours' heights in the scan and in the map, by number from 0 to 8.
+    """
+    z, weight = torch.tensor([z]), torch.tensor([weight])
+    cells, zeros = torch.zeros(1, 9), torch.zeros_like(z)
+    marked = cells.to(torch.uint8).index_fill(1, torch.tensor([4]), 1)
+    shown = [cells.clone(), cells.clone(), cells.clone(), torch.zeros_like(marked)]
+    neighbours = [(0, 1, seen or {}), (2, 3, known or {}), (0, 1, {4: (z * weight).sum() / weight.sum()})]
+    for heights, there, values in neighbours:
+        for cell, height in values.items():
+            shown[heights][0, cell], shown[there][0, cell] = height, 1
+    columns = [z, zeros + 1e-4, weight, (zeros + passed).to(torch.uint8), zeros + 1.0, zeros]
+    slot, settings = (zeros + 4).to(torch.int64), (3, 3.0, 0.01, EdgeConfig().numbers)
+    results = settle(marked, step * marked, slot, columns, cells, shown, *settings)
+    return [result[0, 4].item() for result in results]
+
+
+def test_a_wall_without_a_cell_behind_it_stays():
+    """Rays passed the cell's centre and hit the ground before it: that counts once the wall's top shows elsewhere.
+
+    What nobody saw shows no top, although its height is zero and the wall lies below that.
+    """
+    points = [-5.0] * 6 + [-4.7] * 4, [1.0] * 10
+    top, ground = pytest.approx([-4.7, 1.0]), pytest.approx([-5.0, -1.0])
+    assert one_cell(*points, passed=1) == top
+    assert one_cell(*points, passed=0, seen={3: -4.7}) == top
+    assert one_cell(*points, passed=1, seen={3: -4.7}) == ground
+    assert one_cell(*points, passed=1, known={7: -4.7}) == ground
+    assert one_cell(*points, passed=1, known={1: -4.7}) == top  # before the wall, not behind it
+    assert one_cell(*points, passed=1, seen={3: -5.0}, known={7: -5.0}) == top
+
+
+def test_a_cell_marked_as_a_step_has_a_side():
+    """Although all its points lie within the gate around their robust mean."""
+    z = [0.0] * 6 + [0.025] * 4
+    height, side = one_cell(z, [1.0] * 10, step=0)
+    assert 0 < height < 0.0125 and side == 0
+    assert one_cell(z, [1.0] * 10, step=1) == pytest.approx([0.025, 1.0])
+
+
+def test_points_that_are_not_used_hide_no_step():
+    step = [0.0] * 6 + [0.3] * 4
+    assert one_cell(step, [1.0] * 10, step=0) == pytest.approx([0.3, 1.0])
+    assert one_cell(step + [0.0] * 40, [1.0] * 10 + [0.0] * 40, step=0) == pytest.approx([0.3, 1.0])

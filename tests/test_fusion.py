@@ -1,6 +1,7 @@
 """The height update."""
 
 import dataclasses
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev import EdgeConfig, FusionConfig, SensorConfig
+from torchelev.disputed import Disputed
 from torchelev.fusion import fuse
 
 SEEDS = st.integers(0, 10_000)
@@ -63,18 +65,46 @@ def test_agrees_with_the_reference(seed, num_points, sensors, cfg):
     compare_with_reference(seed, num_points, sensors, cfg)
 
 
-@given(SEEDS, st.sampled_from([200, 500]), st.integers(1, 2))
-def test_agrees_with_the_reference_at_steps(seed, num_points, sensors):
-    compare_with_reference(seed, num_points, sensors, FusionConfig())
+EDGES = [EdgeConfig(), EdgeConfig(min_extreme=1, refinements=2), EdgeConfig(min_extreme=4, refinements=3, margin=0.0)]
 
 
-def compare_with_reference(seed, num_points, sensors, cfg):
+@given(
+    SEEDS,
+    st.sampled_from([200, 500]),
+    st.integers(1, 2),
+    st.sampled_from(EDGES),
+    st.booleans(),
+    st.sampled_from([0.0, -5.0]),
+)
+def test_agrees_with_the_reference_at_steps(seed, num_points, sensors, edges, picks_out, altitude):
+    """On a CPU, which picks the disputed cells out, and as on a GPU, which goes through all cells."""
+    with patch.object(Disputed, "picks_out", lambda self, device: picks_out):
+        compare_with_reference(seed, num_points, sensors, FusionConfig(edges=edges), altitude)
+
+
+@pytest.mark.parametrize("picks_out", [True, False])
+def test_nothing_disputed(monkeypatch, picks_out):
+    """Other cells keep their heights: with no points at all, and where all points agree with the map."""
+    monkeypatch.setattr(Disputed, "picks_out", lambda self, device: picks_out)
+    emap = small_map(1, CELLS)
+    emap.update(torch.empty(1, 0, 3), pose((0.0, 0.0, 1.0)))
+    assert not emap.validity.any()
+    flat = torch.tensor([[[x, y, -1.0] for x in (-0.15, 0.05) for y in (-0.15, 0.05)]]).repeat(1, 5, 1)
+    for _ in range(2):
+        emap.update(flat, pose((0.0, 0.0, 1.0)))
+    assert emap.elevation[emap.validity].tolist() == pytest.approx([0.0] * 4, abs=1e-6)
+    assert emap.statistics.points_used.item() == 20
+
+
+def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0):
     rng = np.random.default_rng(seed)
     emap = small_map(2, CELLS, dtype=torch.float64)
     state = random_state(rng, emap.cfg.grid, 2)
-    state = state._replace(elevation=torch.where(state.validity, state.elevation * 0.1, 0.0))
+    state = state._replace(elevation=torch.where(state.validity, state.elevation * 0.1 + altitude, 0.0))
     T = torch.stack([random_poses(rng, sensors, reach=1.0) for _ in range(2)])
     in_map = np.stack([[steps_and_outliers(rng, num_points) for _ in range(sensors)] for _ in range(2)])
+    T[..., 2, 3] += altitude
+    in_map[..., 2] += altitude
     cloud = (torch.from_numpy(in_map) - T[:, :, None, :3, 3]) @ T[:, :, :3, :3]
     m = emap.measure(cloud, T, None, 0.1)
     after = fuse(state, m, emap.cfg.grid, cfg)

@@ -15,7 +15,7 @@ OPERATORS = [
     operators.padded,
     operators.running_minimum,
     operators.polar_minimum,
-    disputed.dispute,
+    disputed.settle,
 ]
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev.edges import EdgeConfig
-from torchelev.operators import cell_sums, padded, polar_minimum, running_minimum
+from torchelev.operators import cell_sums, moved, padded, polar_minimum, running_minimum
 
 
 @given(st.integers(0, 10_000), st.integers(1, 2), st.integers(1, 4), st.integers(1, 6), st.booleans())
@@ -47,6 +47,17 @@ def test_cell_sums(seed, columns, num_envs, num_points):
     np.testing.assert_allclose(cell_sums(torch.from_numpy(index), torch.from_numpy(values), 5), expected)
 
 
+@given(st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=3))
+def test_moved(shifts):
+    layer = torch.arange(12.0 * len(shifts)).view(len(shifts), 3, 4)
+    floats, masks = moved([layer, layer > 5], torch.tensor(shifts), [-1.0, 0.0])
+    for b, i, j in np.ndindex(*layer.shape):
+        k, n = i + shifts[b][0], j + shifts[b][1]
+        inside = 0 <= k < 3 and 0 <= n < 4
+        assert floats[b, i, j] == (layer[b, k, n] if inside else -1.0)
+        assert masks[b, i, j] == (layer[b, k, n] > 5 if inside else False)
+
+
 def test_gradient_of_cell_sums():
     index = torch.tensor([[0, 2, 2, 1], [1, 1, 1, 3]])
     values = torch.randn(3, 2, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
@@ -75,8 +86,8 @@ LAYERS = [torch.zeros(2, 4), torch.ones(2, 4), torch.zeros(2, 4), torch.ones(2, 
         ("polar_minimum", (torch.tensor([[0, 11]]), torch.ones(1, 2), 4, [3, 1], 8, 9.0)),
         ("cell_sums", (torch.tensor([[0, 1], [1, 1]]), torch.ones(3, 2, 2), 2)),
         ("moved", ([TABLE, TABLE > 0.5], torch.tensor([[1, 0], [0, -2]]), [1.0, 0.0])),
-        ("dispute", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, EdgeConfig().numbers)),
-        ("dispute", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, [])),
+        ("settle", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, EdgeConfig().numbers)),
+        ("settle", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, [])),
     ],
 )
 def test_operators_are_registered_right(operator, arguments):

@@ -32,9 +32,7 @@ def check_tensor(
     convert: str = "convert it with .to(dtype)",
 ) -> Tensor:
     """Refuse what is no tensor, or lies elsewhere, or has another dtype, which `convert` says how to mend."""
-    here = (device.type, device.index or 0)
-    same = isinstance(value, Tensor) and (value.device.type, value.device.index or 0) == here
-    if isinstance(value, Tensor) and same and value.dtype in dtypes:
+    if isinstance(value, Tensor) and value.dtype in dtypes and _same(value.device, device):
         return value  # before a message is made, which takes as long as all the rest
     came = type(value).__name__
     require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
@@ -42,8 +40,12 @@ def check_tensor(
     kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
     require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, convert, TypeError)
     came = f"{tuple(value.shape)} on {value.device}"
-    require(same, name, f"must be on {device}", came, "move it with .to(emap.device)")
+    require(_same(value.device, device), name, f"must be on {device}", came, "move it with .to(emap.device)")
     return value
+
+
+def _same(one: torch.device, other: torch.device) -> bool:
+    return (one.type, one.index or 0) == (other.type, other.index or 0)
 
 
 def check_points(points: object, num_envs: int, device: torch.device) -> Tensor:

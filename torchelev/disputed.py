@@ -7,7 +7,7 @@ gradient: a height is a guess around which `fusion` averages.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +16,15 @@ from torchelev.edges import EdgeConfig, side_of_step
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int, UInt8
+
+
+class Shown(NamedTuple):
+    """What the scan and the map show of each cell, (B, C)."""
+
+    mean: Float[Tensor, "B C"]  # [m] of the scan's points
+    number: Float[Tensor, "B C"]  # of the scan's points
+    elevation: Float[Tensor, "B C"]  # [m]
+    known: UInt8[Tensor, "B C"]
 
 
 class Disputed:
@@ -29,10 +38,10 @@ class Disputed:
         mean: Float[Tensor, "B C"],
     ) -> None:
         """Pick out the cells that are not zero, and of their points z, spread, weight, passed, ray x and ray y."""
-        self.num_cells = cells.shape[1]
-        first = torch.arange(cells.shape[0], device=cells.device)[:, None] * self.num_cells
+        self.marked = cells
+        first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
         slot, columns = (slot + first).flatten(), [column.flatten() for column in columns]
-        if cells.device.type == "cpu":
+        if self.picks_out(cells.device):
             marked = cells.flatten()
             self.cells = marked.nonzero().squeeze(1)
             chosen = marked.index_select(0, slot).nonzero().squeeze(1)
@@ -46,6 +55,11 @@ class Disputed:
         z, self.spread, self.weight, self.passed, *self.ray = columns
         self.z = z - self.at_points(self.mean)  # [m] above the mean of the cell's points
         self.used = (self.weight > 0).to(z.dtype)
+
+    @staticmethod
+    def picks_out(device: torch.device) -> bool:
+        """Tell whether the host may learn how many cells are disputed without waiting for the device."""
+        return device.type == "cpu"
 
     def sum(self, values: Tensor) -> Tensor:
         """Sum the points' values (..., P) per cell: -> (..., K)."""
@@ -67,6 +81,8 @@ class Disputed:
 
     def put(self, layer: Tensor, values: Tensor) -> Tensor:
         """Return a layer (B, C) with values (K,) put into the disputed cells."""
+        if len(self.cells) == layer.numel():  # a GPU's K counts the other cells too
+            return torch.where(self.marked > 0, values.view_as(layer), layer)
         return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 
 
@@ -86,12 +102,12 @@ def robust_mean(points: Disputed) -> Tensor:
 
 
 @torch.library.custom_op(
-    "torchelev::dispute",
+    "torchelev::settle",
     mutates_args=(),
     schema="(Tensor cells, Tensor steps, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, "
     "float gate, float relief, float[] edges) -> (Tensor, Tensor)",
 )
-def dispute(
+def settle(
     cells: UInt8[Tensor, "B C"],
     steps: UInt8[Tensor, "B C"],
     slot: Int[Tensor, "B M"],
@@ -107,11 +123,10 @@ def dispute(
 
     A disputed cell gets the robust mean of its points, or, if it is one of `steps` or too many of its points are far
     from that mean, the height of one end of the step. The other cells keep their `height`. `columns` (B, M) are those
-    of `Disputed`, the weight zero where a point is not used. `shown` (B, C) holds the mean and the number of the
-    scan's points, and the elevation of the map and whether it is known. `width` counts cells along y, `relief` is in
-    [m], `edges` is `EdgeConfig.numbers`, or empty if steps do not matter.
+    of `Disputed`, the weight zero where a point is not used, `shown` those of `Shown`. `width` counts cells along y,
+    `relief` is in [m], `edges` is `EdgeConfig.numbers`, or empty if steps do not matter.
     """
-    points = Disputed(cells, slot, columns, shown[0])
+    points = Disputed(cells, slot, columns, Shown(*shown).mean)
     settled, side = robust_mean(points), torch.zeros_like(points.mean)
     if edges:
         cfg = EdgeConfig.of(edges)
@@ -119,11 +134,11 @@ def dispute(
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
         step = (number >= cfg.min_points) & (number - close >= cfg.min_share * number) | (points.of(steps) > 0)
-        which, end = side_of_step(points, shown, width, relief, cfg)
+        which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
         settled, side = torch.where(step, end, settled), torch.where(step, which, side)
     return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
 
 
-@dispute.register_fake
+@settle.register_fake
 def _(cells: Tensor, steps: Tensor, slot: Tensor, columns: list[Tensor], height: Tensor, *others: Any) -> Any:
     return torch.empty_like(height), torch.empty_like(height)

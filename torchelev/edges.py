@@ -13,7 +13,7 @@ from torchelev.errors import require
 from torchelev.windows import around
 
 if TYPE_CHECKING:
-    from torchelev.disputed import Disputed
+    from torchelev.disputed import Disputed, Shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,10 @@ class EdgeConfig:
     min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
 
     def __post_init__(self) -> None:
-        require(self.refinements >= 2, "edges.refinements", "must be at least 2", self.refinements, "give 7")
+        for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
+            value, rule = getattr(self, name), f"must be a whole number of at least {least}"
+            require(isinstance(value, int) and value >= least, f"fusion.edges.{name}", rule, value, "see its default")
+        require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
 
     @property
     def numbers(self) -> list[float]:
@@ -39,18 +42,16 @@ class EdgeConfig:
     @classmethod
     def of(cls, numbers: list[float]) -> EdgeConfig:
         """Return the config of these settings."""
-        return cls(**dict(zip(cls.__dataclass_fields__, numbers, strict=True)))  # type: ignore[arg-type]
+        kinds = {name: type(value) for name, value in vars(cls()).items()}
+        return cls(**{name: kind(number) for (name, kind), number in zip(kinds.items(), numbers, strict=True)})
 
 
-def side_of_step(
-    points: Disputed, shown: list[Tensor], width: int, relief: float, cfg: EdgeConfig
-) -> tuple[Tensor, Tensor]:
-    """Keep walls and steps sharp (paper, Sec. II-C): in a cell that holds a step, ignore the points of the wrong side.
+def side_of_step(points: Disputed, shown: Shown, width: int, relief: float, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
+    """Keep walls and steps sharp (paper, Sec. II-C): tell which side of a step is the cell's; `fusion` drops the other.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
     where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
-    what lies at the centre, and points above are ignored. Returns the side (K,), +1 top and -1 ground, and its height
-    (K,) [m] above the mean. `shown` holds what the scan and the map show, see `dispute`.
+    what lies at the centre. Returns the side (K,), +1 top and -1 ground, and its height (K,) [m] above the mean.
     """
     top, bottom = ends_of_step(points, cfg)
     low = points.used * (points.z < 0)
@@ -58,7 +59,7 @@ def side_of_step(
     number_low, number_passed, x, y = points.sum(torch.stack(columns)).unbind(0)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
     di, dj = around(x.device)
-    exists, (mean, number, elevation, known) = values_around(shown, points.cells, di, dj, width)
+    exists, (mean, number, elevation, known) = values_around(list(shown), points.cells, di, dj, width)
     middle, top_height = points.mean + 0.5 * top, points.mean + top - relief
     in_scan = exists & (number > 0) & (mean >= middle[:, None])
     in_map = exists & (known > 0) & (elevation >= top_height[:, None]) & lie_behind(x, y, di, dj)
@@ -75,20 +76,24 @@ def ends_of_step(points: Disputed, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
     deviations short of a level lies past it. A level that fewer than `min_extreme` points reach, give or take a
     standard deviation, is an outlier's.
     """
-    noise = points.spread.sqrt()
-    z = torch.stack([points.z, -points.z])  # the step, and the step upside down
-    past = z + cfg.margin * noise
-    most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), int(cfg.min_extreme))
+    z, noise = torch.stack([points.z, -points.z]), points.spread.sqrt()
+    most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), cfg.min_extreme)
+    height = further_up(points, z, z + cfg.margin * noise, most, torch.zeros_like(most), 2)
+    top = further_up(points, z[:1], z[:1] + cfg.margin * noise, most[:1], height[:1], cfg.refinements - 2)
+    return top[0], -height[1]
+
+
+def further_up(points: Disputed, z: Tensor, past: Tensor, most: Tensor, height: Tensor, rounds: int) -> Tensor:
+    """Move heights (n, K) to the mean of the points at or past them, so many times, but nowhere above `most`.
+
+    Each point has its height `z` and counts as past all that is no higher than `past`, both (n, P).
+    """
     columns = torch.stack([points.weight * z, points.weight.expand_as(z)], 1)
-    height = torch.zeros_like(most)
-    for k in range(int(cfg.refinements)):
-        if k == 2:
-            bottom = -height[1]
-            height, past, most, columns = height[:1], past[:1], most[:1], columns[:1]
+    for _ in range(rounds):
         moment, total = points.sum(columns * (past >= points.at_points(height))[:, None]).unbind(1)
-        further = moment / total.clamp(min=torch.finfo(total.dtype).tiny)
+        further = moment / total  # NaN where no point lies past the height, which compares as false
         height = torch.where(most >= further, further, height)
-    return height[0], bottom
+    return height
 
 
 def level_reached(points: Disputed, reached: Tensor, number: int) -> Tensor:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.disputed import dispute
+from torchelev.disputed import Shown, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
@@ -74,8 +74,9 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
 
     Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of
     the cell's elevation where most agree with it, else those around the scan's own robust mean. In cells that hold a
-    step, `edges.side_of_step` tells how to drop the points of the wrong side. The points kept have the information sum
-    1 / R = sum 1 / sigma_p^2 with a floor on R, because the points of one scan share the error of its pose.
+    step, `edges.side_of_step` tells which side counts, and the points of the other are dropped. The points kept have
+    the information sum 1 / R = sum 1 / sigma_p^2 with a floor on R, because the points of one scan share the error of
+    its pose.
     Equations (1) and (2), in information form and so in no order:
 
         1 / sigma^2 = 1 / sigma_m^2 + 1 / R,    h = sigma^2 * (h / sigma_m^2 + z_s / R).
@@ -115,15 +116,15 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
     mean = ratio(moment, weight).detach()
     trusted = prior.known & (2 * agreeing >= number)
-    far, edges = number - agreeing, cfg.edges
-    step = (number >= edges.min_points) & (far >= edges.min_share * number) if edges is not None else trusted & False
     # A single point is its cell's robust mean, and most cells of a sparse scan have one.
-    step, untrusted = trusted & step, ~trusted & (number > 1)
+    step, untrusted = torch.zeros_like(trusted), ~trusted & (number > 1)
+    if (edges := cfg.edges) is not None:
+        step = trusted & (number >= edges.min_points) & (number - agreeing >= edges.min_share * number)
     height = torch.where(trusted, prior.elevation, mean).detach()
-    shown = [mean, number.detach(), prior.elevation.detach(), as_bytes(prior.known)]
+    shown = Shown(mean, number.detach(), prior.elevation.detach(), as_bytes(prior.known))
     limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
     masks = as_bytes(step | untrusted), as_bytes(step)
-    height, side = dispute(*masks, scan.cells.slot, scan.columns(), height, shown, *limits)
+    height, side = settle(*masks, scan.cells.slot, scan.columns(), height, list(shown), *limits)
     return Guess(height, prior.gate_variance * trusted, side, number, near)
 
 
@@ -143,6 +144,7 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
     votes = kept_number + edge
     cells = ScanOfCells(
         height=height,
+        # Of cells with points; elsewhere it need but be finite.
         variance=(1.0 / information.clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor),
         kept=kept_number,
         votes=votes,
@@ -199,7 +201,7 @@ def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> T
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """Divide; zero where both are."""
+    """Divide sums over the points of a cell; zero where there is none."""
     return numerator / denominator.clamp(min=torch.finfo(denominator.dtype).tiny)
 
 
@@ -235,7 +237,7 @@ def merge(
     found = hit & ~agree & (~prior.known | (support < 0))
     taken = realize(agree | found)
 
-    information = agree / prior.variance + 1.0 / scan.variance
+    information = ratio(agree, prior.variance) + 1.0 / scan.variance
     fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
     outvoted = torch.where(hit, prior.variance + cfg.outlier_variance * scan.kept, prior.variance)
     posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)

@@ -41,8 +41,9 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
     known = validity.to(elevation.dtype)
     number = known.sum((1, 2), keepdim=True).clamp(min=1)
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
-    datum = ((elevation * known).sum((1, 2), keepdim=True) / number).detach()
-    layers = padded(torch.stack([known, (elevation - datum) * known]), rim, 0.0)
+    heights = torch.where(validity, elevation, 0.0)
+    datum = (heights.sum((1, 2), keepdim=True) / number).detach()
+    layers = padded(torch.stack([known, (heights - datum) * known]), rim, 0.0)
     return Ground(layers[0], layers[1], rim)
 
 

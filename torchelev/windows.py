@@ -14,7 +14,6 @@ from torchelev.storage import realize_all
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 
 
-@functools.cache
 def around(device: torch.device) -> tuple[Tensor, Tensor]:
     """Return AROUND's rows and columns, (8,) int64; computed, as a copy to a GPU would make the host wait."""
     k = torch.arange(8, device=device)
