@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from benchmarks import gpu, long_run, meter, speed_plots, speed_sections, speed_tables
+from benchmarks import gpu, long_run, meter, run, speed_plots, speed_sections, speed_tables
 from benchmarks.readme import ROOT, SPEED, load
 from benchmarks.run import regressions, timings
 from benchmarks.workload import Drive, full_config
@@ -118,6 +118,14 @@ def test_sections_measure_at_small_sizes(section, monkeypatch, eager):
     monkeypatch.setattr(speed_sections, "SENSORS", [("none", 6276, 1, 1)])
     result = {section: speed_sections.SECTIONS[section](0.001, lambda values: values)}
     assert len(list(timings(result))) >= 2
+
+
+def test_one_section_into_a_new_folder(tmp_path, monkeypatch, capsys, eager):
+    monkeypatch.setattr(speed_sections, "RAYS", [1.2, 4.8])
+    monkeypatch.setattr(sys, "argv", ["run", "rays", "--out", str(tmp_path), "--seconds", "0.001"])
+    assert run.main() == 0
+    assert "growth with ray length" in capsys.readouterr().out
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png"}
 
 
 def test_gpu_comparison():

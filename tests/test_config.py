@@ -67,6 +67,21 @@ def test_configs_are_frozen_and_keyword_only():
         GridConfig(0.1)
 
 
+@pytest.mark.parametrize(
+    "bad",
+    [dict(grid=None), dict(grid={"resolution": 0.1}), dict(sensor=GridConfig()), dict(drift=False)]
+    + [dict(raycast=RaycastConfig), dict(grid=ElevationMapConfig()), dict(surface=None)],
+)
+def test_a_stage_takes_its_own_config_alone(bad):
+    with pytest.raises(TypeError, match=rf"cfg\.{next(iter(bad))}: must be a \w+Config"):
+        ElevationMapConfig(**bad)
+
+
+def test_edges_take_their_own_config_alone():
+    with pytest.raises(TypeError, match=r"fusion\.edges: must be an EdgeConfig or None, got True"):
+        FusionConfig(edges=True)
+
+
 @pytest.mark.parametrize("name", ["gate", "scan_variance_floor", "max_variance"])
 def test_fusion_refuses(name):
     with pytest.raises(ValueError, match=f"fusion.{name}"):

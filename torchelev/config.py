@@ -34,6 +34,13 @@ class ElevationMapConfig:
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     traversability: TraversabilityConfig | None = field(default_factory=TraversabilityConfig)
 
+    def __post_init__(self) -> None:
+        for name, hint in typing.get_type_hints(type(self)).items():
+            value, kinds = getattr(self, name), typing.get_args(hint) or (hint,)
+            rule = f"must be {' or '.join('None' if kind is type(None) else f'a {kind.__name__}' for kind in kinds)}"
+            mend = "give an object, or build the whole with ElevationMapConfig.from_dict"
+            require(isinstance(value, hint), f"cfg.{name}", rule, repr(value), mend, TypeError)
+
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain dicts, as written to YAML and to `state_dict`."""
         return dataclasses.asdict(self)

@@ -59,9 +59,9 @@ class ElevationMap(nn.Module):
         require(
             config, "cfg", "must be an ElevationMapConfig", type(cfg).__name__, "wrap grid=GridConfig(...)", TypeError
         )
-        whole = isinstance(num_envs, int) and num_envs >= 1
+        whole = type(num_envs) is int and num_envs >= 1
         require(whole, "num_envs", "must be a positive int", repr(num_envs), "give the number of maps")
-        some = chunk is None or (isinstance(chunk, int) and chunk >= 1)
+        some = chunk is None or (type(chunk) is int and chunk >= 1)
         require(some, "chunk", "must be a positive int or None", repr(chunk), "give a number of environments")
         self.cfg, self.num_envs, self.check_values, self.chunk = cfg, num_envs, check_values, chunk
         self._compiled = False

@@ -33,6 +33,8 @@ class FusionConfig:
     edges: EdgeConfig | None = EdgeConfig()
 
     def __post_init__(self) -> None:
+        fits, mend = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"
+        require(fits, "fusion.edges", "must be an EdgeConfig or None", repr(self.edges), mend, TypeError)
         for name in ("gate", "max_gate_std", "scan_variance_floor", "max_variance"):
             require(
                 getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
