@@ -86,6 +86,11 @@ class Disputed:
         return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 
 
+def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """Divide sums over the points of a cell; zero where there is none."""
+    return numerator / denominator.clamp(min=torch.finfo(denominator.dtype).tiny)
+
+
 def robust_mean(points: Disputed) -> Tensor:
     """Return each cell's robust mean (K,) [m] above its mean.
 
@@ -97,7 +102,7 @@ def robust_mean(points: Disputed) -> Tensor:
         residual = points.z - points.at_points(height)
         reduced = points.weight / (1.0 + residual.square() / points.spread).square()
         moment, total = points.sum(torch.stack([reduced * residual, reduced])).unbind(0)
-        height = height + moment / total.clamp(min=torch.finfo(total.dtype).tiny)
+        height = height + ratio(moment, total)
     return height
 
 
@@ -129,11 +134,11 @@ def settle(
     points = Disputed(cells, slot, columns, Shown(*shown).mean)
     settled, side = robust_mean(points), torch.zeros_like(points.mean)
     if edges:
-        cfg = EdgeConfig.of(edges)
+        cfg = EdgeConfig.of(*edges)
         residual = points.z - points.at_points(settled)
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-        step = (number >= cfg.min_points) & (number - close >= cfg.min_share * number) | (points.of(steps) > 0)
+        step = cfg.holds_step(number, number - close) | (points.of(steps) > 0)
         which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
         settled, side = torch.where(step, end, settled), torch.where(step, which, side)
     return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)

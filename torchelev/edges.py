@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -40,10 +41,15 @@ class EdgeConfig:
         return [float(getattr(self, name)) for name in self.__dataclass_fields__]
 
     @classmethod
-    def of(cls, numbers: list[float]) -> EdgeConfig:
+    @functools.cache  # every update asks
+    def of(cls, *numbers: float) -> EdgeConfig:
         """Return the config of these settings."""
         kinds = {name: type(value) for name, value in vars(cls()).items()}
         return cls(**{name: kind(number) for (name, kind), number in zip(kinds.items(), numbers, strict=True)})
+
+    def holds_step(self, number: Tensor, far: Tensor) -> Tensor:
+        """Tell which cells hold a step, by the number of their points and of those far from the estimate."""
+        return (number >= self.min_points) & (far >= self.min_share * number)
 
 
 def side_of_step(points: Disputed, shown: Shown, width: int, relief: float, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
@@ -78,8 +84,9 @@ def ends_of_step(points: Disputed, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
     """
     z, noise = torch.stack([points.z, -points.z]), points.spread.sqrt()
     most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), cfg.min_extreme)
-    height = further_up(points, z, z + cfg.margin * noise, most, torch.zeros_like(most), 2)
-    top = further_up(points, z[:1], z[:1] + cfg.margin * noise, most[:1], height[:1], cfg.refinements - 2)
+    past = z + cfg.margin * noise
+    height = further_up(points, z, past, most, torch.zeros_like(most), 2)
+    top = further_up(points, z[:1], past[:1], most[:1], height[:1], cfg.refinements - 2)
     return top[0], -height[1]
 
 

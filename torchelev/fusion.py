@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.disputed import Shown, settle
+from torchelev.disputed import Shown, ratio, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
@@ -121,7 +121,7 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     # A single point is its cell's robust mean, and most cells of a sparse scan have one.
     step, untrusted = torch.zeros_like(trusted), ~trusted & (number > 1)
     if (edges := cfg.edges) is not None:
-        step = trusted & (number >= edges.min_points) & (number - agreeing >= edges.min_share * number)
+        step = trusted & edges.holds_step(number, number - agreeing)
     height = torch.where(trusted, prior.elevation, mean).detach()
     shown = Shown(mean, number.detach(), prior.elevation.detach(), as_bytes(prior.known))
     limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
@@ -200,11 +200,6 @@ def gather_prior(state: MapState, cfg: FusionConfig) -> Prior:
 def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
     """Tell which points lie within the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
     return scan.used & ((scan.z - height).square() <= cfg.gate**2 * (scan.spread + variance))
-
-
-def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """Divide sums over the points of a cell; zero where there is none."""
-    return numerator / denominator.clamp(min=torch.finfo(denominator.dtype).tiny)
 
 
 def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
