@@ -8,6 +8,7 @@ from torchelev.fusion import EdgeConfig, FusionConfig
 from torchelev.grid import GridConfig
 from torchelev.overlap import OverlapConfig
 from torchelev.raycast import RaycastConfig
+from torchelev.scan import HeightScan, MapImage
 from torchelev.sensor import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
 from torchelev.state import MapState, Measurement, Statistics
 from torchelev.surface import SurfaceConfig
@@ -24,6 +25,8 @@ __all__ = [
     "ExclusionConfig",
     "FusionConfig",
     "GridConfig",
+    "HeightScan",
+    "MapImage",
     "MapState",
     "Measurement",
     "OverlapConfig",

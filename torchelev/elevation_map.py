@@ -268,8 +268,8 @@ class ElevationMap(nn.Module):
         mend = f"there are {', '.join(LAYERS)}"
         require(name in LAYERS, "layer", "must be a layer's name", repr(name), mend, KeyError)
         values, known = LAYERS[name](self.state if state is None else state)
-        has_answer = name != "traversability" or self.cfg.traversability is not None
-        return values, known & has_answer
+        unrated = name == "traversability" and self.cfg.traversability is None
+        return values, torch.zeros_like(known) if unrated else known
 
     def sample(
         self,

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 Layer = tuple[Tensor, Tensor]  # values and where they are known, both (B, H, W)
 
@@ -44,6 +45,13 @@ LAYERS: dict[str, Callable[[MapState], Layer]] = {
 }
 
 
+class Corners(NamedTuple):
+    """The K cells that each point is read from; a cell's number H * W stands for nothing."""
+
+    cell: Int[Tensor, "B KM"]
+    weight: Float[Tensor, "B K M"]  # 0 for nothing
+
+
 def sample_layer(
     layer: Layer, uv: Float[Tensor, "B M 2"], grid: GridConfig, mode: str
 ) -> tuple[Float[Tensor, "B M"], Bool[Tensor, "B M"]]:
@@ -52,27 +60,53 @@ def sample_layer(
     Bilinear: weights of the known ones of the four surrounding cells, renormalised; valid from a weight of one half.
     Nearest: the cell that holds the point.
     """
+    return sample_layers([layer], uv, grid, mode)[0]
+
+
+def sample_layers(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridConfig, mode: str) -> list[Layer]:
+    """Sample several layers at the same points; those that are known where another is share its look-up."""
+    around = _corners(uv, grid, mode)
+    found: list[tuple[Tensor, Corners]] = []
+    sampled = []
+    for values, known in layers:
+        corners = next((corners for mask, corners in found if mask is known), None)
+        if corners is None:
+            corners = _known(around, known)
+            found.append((known, corners))
+        sampled.append(_weighted_mean(values, corners))
+    return sampled
+
+
+def _corners(uv: Tensor, grid: GridConfig, mode: str) -> Corners:
     finite = torch.isfinite(uv).all(-1, keepdim=True)
-    uv = torch.where(finite, uv.clamp(-1e6, 1e6), -1e6)
+    u, v = torch.where(finite, uv.clamp(-1e6, 1e6), -1e6).unbind(-1)
     if mode == "nearest":
-        return _read_cells(layer, torch.floor(uv), grid)
-    low = torch.floor(uv - 0.5)
-    (u, v), (i, j) = (uv - 0.5 - low).unbind(-1), low.unbind(-1)
-    # All four corners at once: (B, M, 4).
-    weight = torch.stack([(1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v], -1)
-    cell = torch.stack([torch.stack([i, i, i + 1, i + 1], -1), torch.stack([j, j + 1, j, j + 1], -1)], -1)
-    value, known = (corners.view_as(weight) for corners in _read_cells(layer, cell.flatten(1, 2), grid))
-    weight = torch.where(known, weight, 0.0)
-    total, weighted = weight.sum(-1), (weight * value).sum(-1)
-    valid = total >= 0.5
-    return torch.where(valid, weighted / torch.where(valid, total, 1.0), 0.0), valid
-
-
-def _read_cells(layer: Layer, cell: Tensor, grid: GridConfig) -> Layer:
-    values, known = layer
-    i, j = cell.unbind(-1)
+        i, j = (torch.floor(w)[:, None] for w in (u, v))
+        weight = torch.ones_like(i)
+    else:
+        low_i, low_j = torch.floor(u - 0.5), torch.floor(v - 0.5)
+        a, b = u - 0.5 - low_i, v - 0.5 - low_j
+        i, j = torch.stack([low_i, low_i, low_i + 1, low_i + 1], 1), torch.stack([low_j, low_j + 1] * 2, 1)
+        weight = torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], 1)
     inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
-    index = torch.where(inside, i * grid.width + j, 0).to(torch.int64)
-    known = known.flatten(1).gather(1, index) & inside
-    # A masked read: what an unknown cell holds must not reach values or gradients.
-    return torch.where(known, values.flatten(1).gather(1, index), 0.0), known
+    cell = (i * grid.width + j).to(torch.int64)
+    return Corners(_unless(inside, cell, grid.num_cells).flatten(1), weight * inside)
+
+
+def _known(corners: Corners, known: Bool[Tensor, "B H W"]) -> Corners:
+    """Leave out the cells that are not known: what they hold must not reach values or gradients."""
+    found = F.pad(known.flatten(1), (0, 1)).gather(1, corners.cell)
+    index = _unless(found, corners.cell, known[0].numel())
+    return Corners(index, corners.weight * found.view_as(corners.weight))
+
+
+def _unless(mask: Tensor, index: Tensor, nothing: int) -> Tensor:
+    """Return the index where the mask is true, else `nothing`; `torch.where` takes five times as long on a CPU."""
+    return (index - nothing) * mask + nothing
+
+
+def _weighted_mean(values: Tensor, corners: Corners) -> Layer:
+    corner = F.pad(values.flatten(1), (0, 1)).gather(1, corners.cell).view_as(corners.weight)
+    total = corners.weight.sum(1)
+    valid = total >= 0.5
+    return (corners.weight * corner).sum(1) * valid / torch.where(valid, total, 1.0), valid
