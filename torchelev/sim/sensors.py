@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from torchelev.errors import require
 from torchelev.sim.scenes import Box, Scene
 
 FINEST = 0.02  # [m] shortest step along a ray while looking for the terrain
@@ -28,9 +29,14 @@ class _Sensor:
 
     def cast(self, scene: Scene, T_map_sensor: Tensor, t: float = 0.0) -> Tensor:
         """Return the points (M, 3) [m] seen at time t [s] in the SENSOR frame, float32, NaN where nothing was hit."""
-        T = T_map_sensor.double()
-        distance = cast(scene, T[:3, 3], self.directions @ T[:3, :3].T, self.max_range, t)
-        return (self.directions * distance[:, None]).float()
+        return points_seen(self.directions, scene, T_map_sensor, self.max_range, t)
+
+
+def points_seen(directions: Tensor, scene: Scene, T_map_sensor: Tensor, max_range: float, t: float = 0.0) -> Tensor:
+    """Return the points (M, 3) [m] that rays (M, 3) of the sensor frame see, in that frame, NaN where nothing."""
+    T = T_map_sensor.double()
+    distance = cast(scene, T[:3, 3], directions @ T[:3, :3].T, max_range, t)
+    return (directions * distance[:, None]).float()
 
 
 @dataclass(frozen=True)
@@ -42,13 +48,43 @@ class DepthCamera(_Sensor):
     fov_x_deg: float = 86.0
     fov_y_deg: float = 58.0
     max_range: float = 8.0  # [m]
+    pinhole: tuple[float, float, float, float] | None = None  # fx, fy, cx, cy [pixels], in place of the fields of view
+
+    @classmethod
+    def from_intrinsics(
+        cls, fx: float, fy: float, cx: float, cy: float, width: int, height: int, max_range: float = 8.0
+    ) -> DepthCamera:
+        """Make a camera of given intrinsics [pixels]; the middle of the upper left pixel is at (0, 0).
+
+        Raises ValueError for focal lengths that are not positive.
+        """
+        require(fx > 0 and fy > 0, "fx, fy", "must be positive", (fx, fy), "give the focal lengths in pixels")
+        fov_x, fov_y = (
+            math.degrees(math.atan((c + 0.5) / f) + math.atan((size - 0.5 - c) / f))
+            for f, c, size in ((fx, cx, width), (fy, cy, height))
+        )
+        return cls(width, height, fov_x, fov_y, max_range, (fx, fy, cx, cy))
+
+    @cached_property
+    def intrinsics(self) -> Tensor:
+        """The matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels], float64, as `depth_to_points` takes it."""
+        fx, fy = (
+            size / 2 / math.tan(math.radians(fov) / 2)
+            for size, fov in ((self.width, self.fov_x_deg), (self.height, self.fov_y_deg))
+        )
+        fx, fy, cx, cy = self.pinhole or (fx, fy, (self.width - 1) / 2, (self.height - 1) / 2)
+        return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
     @cached_property
     def directions(self) -> Tensor:
         """Unit vectors (height * width, 3), through the middles of the pixels."""
-        across, down = math.tan(math.radians(self.fov_x_deg) / 2), math.tan(math.radians(self.fov_y_deg) / 2)
-        left = across * (1 - 2 * (torch.arange(self.width, dtype=torch.float64) + 0.5) / self.width)
-        up = down * (1 - 2 * (torch.arange(self.height, dtype=torch.float64) + 0.5) / self.height)
+        u, v = (torch.arange(size, dtype=torch.float64) for size in (self.width, self.height))
+        if self.pinhole is None:
+            across, down = math.tan(math.radians(self.fov_x_deg) / 2), math.tan(math.radians(self.fov_y_deg) / 2)
+            left, up = across * (1 - 2 * (u + 0.5) / self.width), down * (1 - 2 * (v + 0.5) / self.height)
+        else:
+            fx, fy, cx, cy = self.pinhole
+            left, up = (cx - u) / fx, (cy - v) / fy
         z, y = torch.meshgrid(up, left, indexing="ij")
         rays = torch.stack([torch.ones_like(y), y, z], -1).reshape(-1, 3)
         return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
@@ -71,6 +107,38 @@ class Lidar(_Sensor):
         azimuth = (torch.arange(self.azimuths, dtype=torch.float64) + 0.5) / self.azimuths * 2 * math.pi - math.pi
         e, a = torch.meshgrid(elevation, azimuth, indexing="ij")
         return torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()], -1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class NonRepetitiveLidar:
+    """A lidar whose every step shows another part of its field of view, as Livox's do: an imitation of their pattern.
+
+    Two prisms that turn at speeds 1 + k and 1 - k deflect the beam by equal angles, which sum to a rose curve: with
+    rho the angle to the sensor's x axis and theta that around it, rho = fov / 2 * cos(k theta) (rhodonea; see Brazeal
+    et al., "A Rigorous Observation Model for the Risley Prism-Based Livox Mid-40 Lidar Sensor", Sensors 2021, and
+    "Symmetries of Scan Patterns of Laser Scanners with Rotational Risley Prisms", Symmetry 2023). With an irrational k
+    no petal comes twice. Real sensors' speeds, channels and timing differ. Sensor frame: x forward, y left, z up.
+    """
+
+    rays: int = 1024  # in a step
+    fov_deg: float = 70.0  # full cone; chosen
+    turns: float = 4.618  # of theta in a step; chosen
+    k: float = 3.618033988749895  # half petals in a turn; chosen, 2 + the golden ratio
+    max_range: float = 20.0  # [m]
+
+    def directions(self, step: int | Tensor) -> Tensor:
+        """Return the unit vectors of a step, float64: (rays, 3), or (B, rays, 3) for steps (B,), on their device."""
+        step = step if isinstance(step, Tensor) else torch.full((), step)
+        ray = step.to(torch.float64)[..., None] * self.rays + torch.arange(self.rays, device=step.device)
+        turn = ray * (self.turns / self.rays)
+        # Whole turns are left out before an angle is made, so that late steps are as exact as early ones.
+        theta, phase = (2 * math.pi * (value - value.floor()) for value in (turn, self.k * turn))
+        rho = math.radians(self.fov_deg / 2) * phase.cos()
+        return torch.stack([rho.cos(), rho.sin() * theta.cos(), rho.sin() * theta.sin()], -1)
+
+    def cast(self, scene: Scene, T_map_sensor: Tensor, t: float = 0.0, step: int = 0) -> Tensor:
+        """Return the points (M, 3) [m] seen in a step, as `Lidar.cast` does."""
+        return points_seen(self.directions(step), scene, T_map_sensor, self.max_range, t)
 
 
 def cast(scene: Scene, origin: Tensor, directions: Tensor, max_range: float, t: float = 0.0) -> Tensor:

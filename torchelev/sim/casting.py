@@ -1,0 +1,103 @@
+"""Rays against height fields and boxes, batched over environments."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.checks import readable
+from torchelev.errors import require
+from torchelev.sim.heightfield import HeightField
+from torchelev.sim.tracing import HUGE, TINY, trace
+from torchelev.storage import keep_freed_memory
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+
+class Boxes(NamedTuple):
+    """K boxes in each environment. Those with a half size of zero or less are not there."""
+
+    T_map_box: Float[Tensor, "B K 4 4"]  # the box's frame lies in its middle
+    half_size: Float[Tensor, "B K 3"]  # [m]
+
+    def moved(self, T: Float[Tensor, "B 4 4"]) -> Boxes:
+        """Return the boxes, given in frame b, in frame a: `T` is T_a_b."""
+        return Boxes(T[:, None].to(self.T_map_box.dtype) @ self.T_map_box, self.half_size)
+
+    def joined(self, other: Boxes) -> Boxes:
+        """Return these boxes and the others."""
+        T = torch.cat([self.T_map_box, other.T_map_box.to(self.T_map_box.dtype)], 1)
+        return Boxes(T, torch.cat([self.half_size, other.half_size.to(self.half_size.dtype)], 1))
+
+
+def cast(
+    field: HeightField,
+    tile_ids: Int[Tensor, "B"],
+    origin: Float[Tensor, "B 3"],
+    directions: Float[Tensor, "B M 3"],
+    max_range: float,
+    boxes: Boxes | None = None,
+) -> Float[Tensor, "B M"]:
+    """Return the distance [m] to the first hit of each ray, float32, inf where there is none within `max_range`.
+
+    `origin` [m] and unit `directions` are in the map frame, which is that of the environment's tile. A ray that starts
+    below the ground or inside a box hits at once; rays from an origin that is not finite hit nothing. No hit is inf and
+    not NaN: the nearer of two hits is then their minimum, and comparing needs no exception. There is no gradient.
+
+    Raises ValueError for shapes that do not fit and, on a CPU, for tile ids out of range.
+    """
+    _check(field, tile_ids, origin, directions, max_range)
+    with torch.no_grad():
+        origin, directions = origin.float(), directions.float()
+        if origin.device.type == "cpu":
+            keep_freed_memory()
+        nearest = trace(field, tile_ids, origin, directions, max_range)
+        if boxes is not None:
+            nearest = torch.minimum(nearest, distance_to_boxes(boxes, origin, directions))
+        hit = (nearest <= max_range) & origin.isfinite().all(-1, keepdim=True)
+        return nearest.masked_fill(~hit, math.inf)
+
+
+def _check(field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Tensor, max_range: float) -> None:
+    B = len(tile_ids)
+    fits = tuple(origin.shape) == (B, 3) and directions.ndim == 3 and directions.shape[::2] == (B, 3)
+    came = f"{tuple(origin.shape)} and {tuple(directions.shape)}"
+    require(fits, "origin, directions", f"expected ({B}, 3) and ({B}, M, 3)", came, "give one origin per tile id")
+    require(0 < max_range < math.inf, "max_range", "must be positive and finite", max_range, "give metres")
+    if readable(tile_ids) and B:
+        low, high = int(tile_ids.min()), int(tile_ids.max())
+        known = low >= 0 and high < field.num_tiles
+        require(known, "tile_ids", f"must lie in [0, {field.num_tiles})", f"{low}..{high}", "number tiles from 0")
+
+
+def distance_to_boxes(
+    boxes: Boxes, origin: Float[Tensor, "B 3"], directions: Float[Tensor, "B M 3"]
+) -> Float[Tensor, "B M"]:
+    """Return the distance [m] to where each ray enters the first box, more than HUGE where it meets none.
+
+    Between the planes of a pair of faces a ray is from (-x - h) / d to (-x + h) / d, with its start x, its direction d
+    and the half size h along their normal. It is in the box where it is between all three pairs (slab method).
+
+    Raises ValueError for shapes that do not fit.
+    """
+    B, K = boxes.half_size.shape[:2]
+    fits = tuple(boxes.T_map_box.shape) == (B, K, 4, 4) and tuple(boxes.half_size.shape) == (len(origin), K, 3)
+    came = f"{tuple(boxes.T_map_box.shape)} and {tuple(boxes.half_size.shape)}"
+    require(fits, "boxes", f"expected ({len(origin)}, K, 4, 4) and ({len(origin)}, K, 3)", came, "pad with half size 0")
+    if not K:
+        return directions.new_full(directions.shape[:2], math.inf)
+    rotation = boxes.T_map_box[..., :3, :3].permute(0, 3, 1, 2)  # (B, axis of the box, K, axis of the map)
+    offset = origin[:, None] - boxes.T_map_box[..., :3, 3]
+    start = (rotation * offset[:, None]).sum(-1).to(origin.dtype)[..., None]
+    along = (rotation.to(origin.dtype).flatten(1, 2) @ directions.mT).unflatten(1, (3, K))
+    # A ray parallel to a face would divide zero by zero on it; a tiny slope keeps it inside or outside.
+    inverse = along.add_(torch.copysign(torch.full_like(along, TINY), along)).reciprocal_()
+    present = (boxes.half_size > 0).all(-1, keepdim=True)
+    half = torch.where(present, boxes.half_size, -math.inf).to(origin.dtype).transpose(1, 2)[..., None]
+    middle, reach = -start * inverse, half * inverse.abs()
+    enter, leave = (middle - reach).amax(1).clamp_(min=0), (middle + reach).amin(1)
+    return (enter + (enter - leave).clamp_(min=0) * HUGE).amin(1)
