@@ -10,7 +10,7 @@ help:  ## list the targets
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[io,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[io,rl,dev]'
 	touch $@
 
 setup: $(BIN)/.ready  ## make the environment .venv

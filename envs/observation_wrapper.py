@@ -1,0 +1,230 @@
+"""The elevation map as an observation of any gymnasium environment, single or vector, NumPy or torch.
+
+Functions of the environment give its points (or depth images) and poses. The wrapper fuses one cloud per reset and step
+and adds what `read` makes of the map to the observation. MuJoCo's Ant with a depth camera on its torso:
+
+>>> import gymnasium, mujoco
+>>> import numpy as np
+>>> from envs.observation_wrapper import ElevationMapObservation
+>>> from torchelev import ElevationMapConfig, GridConfig
+>>> from torchelev.sim import DepthCamera, mount
+>>> rays = DepthCamera(width=32, height=24).directions.numpy()
+>>> def T_map_base(env):
+...     torso, T = env.unwrapped.data.body("torso"), np.eye(4)
+...     T[:3, :3], T[:3, 3] = torso.xmat.reshape(3, 3), torso.xpos
+...     return T
+>>> def T_map_sensor(env):
+...     return T_map_base(env) @ mount(pitch_deg=40).numpy()
+>>> def points(env):
+...     model, data, T = env.unwrapped.model, env.unwrapped.data, T_map_sensor(env)
+...     geom, distance = np.zeros(len(rays), np.int32), np.zeros(len(rays))
+...     world, torso = (rays @ T[:3, :3].T).ravel(), model.body("torso").id
+...     mujoco.mj_multiRay(model, data, T[:3, 3], world, None, 1, torso, geom, distance, None, len(rays), 8.0)
+...     nothing_or_a_leg = (geom < 0) | (model.geom_bodyid[geom] != 0)
+...     return np.where(nothing_or_a_leg, np.nan, distance)[:, None] * rays
+>>> ant = gymnasium.make("Ant-v5")
+>>> env = ElevationMapObservation(
+...     ant, points=points, T_map_sensor=T_map_sensor, T_map_base=T_map_base, dt=ant.unwrapped.dt,
+...     cfg=ElevationMapConfig(grid=GridConfig(resolution=0.1, length_x=4.0, length_y=4.0)))
+>>> observation, info = env.reset(seed=0)
+>>> {name: value.shape for name, value in observation.items()}
+{'observation': (105,), 'map': (2, 16, 10)}
+>>> observation, *_ = env.step(env.action_space.sample())
+>>> elevation = env.emap.layer("elevation")[0]  # the floor at 0, NaN where the camera has not looked
+>>> bool(elevation.nan_to_num().abs().max() < 1e-3)
+True
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from envs.map_feed import MapFeed, as_tensor
+from torchelev import ElevationMap, ElevationMapConfig
+from torchelev.errors import require
+
+
+class _MapObservation(RecordConstructorArgs):
+    """What both wrappers share: their arguments, and what they add to spaces and observations."""
+
+    _wraps: type  # the kind of environment
+    _wrapper: type  # its gymnasium wrapper
+    _mend: str  # for the other kind
+
+    def __init__(
+        self,
+        env: Any,
+        *,
+        points: Callable[[Any], Any] | None = None,
+        depth: Callable[[Any], Any] | None = None,
+        intrinsics: Any = None,
+        T_map_sensor: Callable[[Any], Any] | None = None,
+        T_map_base: Callable[[Any], Any] | None = None,
+        dt: float | None = None,
+        read: Callable[[ElevationMap, Tensor], Any] | None = None,
+        cfg: ElevationMapConfig | None = None,
+        device: torch.device | str = "cpu",
+        key: str = "map",
+    ) -> None:
+        kind = self._wraps.__name__
+        require(isinstance(env, self._wraps), "env", f"must be a {kind}", type(env).__name__, self._mend, TypeError)
+        sources = {"points": points, "depth": depth, "intrinsics": intrinsics}
+        poses = {"T_map_sensor": T_map_sensor, "T_map_base": T_map_base, "dt": dt}
+        maps = {"read": read, "cfg": cfg, "device": device}
+        # Not copied: a function may be the method of something large, such as the simulation.
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **sources, **poses, **maps, key=key)
+        self._wrapper.__init__(self, env)  # type: ignore[misc]
+        num_envs = env.num_envs if isinstance(env, VectorEnv) else None
+        self._key, self._feed = key, MapFeed(num_envs, **sources, **poses, **maps)  # type: ignore[arg-type]
+        self._ended = torch.zeros(self.emap.num_envs, dtype=torch.bool, device=self.emap.device)
+        shape = tuple(self._feed.read_blank().shape[1:])
+        self._extend_spaces(spaces.Box(-np.inf, np.inf, shape, np.float32))
+
+    @property
+    def emap(self) -> ElevationMap:
+        """The maps: for `layer`, `state_dict`, `compile`."""
+        return self._feed.emap
+
+    def _extend_spaces(self, box: spaces.Box) -> None:
+        raise NotImplementedError
+
+    def _extended(self, space: spaces.Space, box: spaces.Space) -> spaces.Dict:
+        parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
+        require(self._key not in parts, "key", "must be a new key", repr(self._key), f"there are {', '.join(parts)}")
+        return spaces.Dict({**parts, self._key: box})
+
+    def _joined(self, observation: Any, values: Tensor) -> dict[str, Any]:
+        """Add the map's values to an observation, as the kind of array that it holds."""
+        leaf = observation
+        while isinstance(leaf, dict | tuple):
+            leaf = next(iter(leaf.values() if isinstance(leaf, dict) else leaf), None)
+        array = values.to(leaf.device) if isinstance(leaf, Tensor) else values.cpu().numpy()
+        return {**(observation if isinstance(observation, dict) else {"observation": observation}), self._key: array}
+
+
+class ElevationMapObservation(_MapObservation, gymnasium.Wrapper):
+    """Add the elevation map to the observation of a single environment.
+
+    The observation becomes a Dict of what it was, under "observation" or its own keys, and of `key`. `reset` forgets
+    the map, and so does a step in which a `gymnasium.wrappers.Autoreset` below resets.
+
+    Args:
+        env: the environment to wrap. The functions below get it; NaN points are ignored.
+        points: env -> (N, 3) or (S, N, 3) [m], sensor frame.
+        depth: env -> (h, w) or (S, h, w) [m] along the optical axis, in place of `points`.
+        intrinsics: (3, 3) [pixels], with `depth`. The sensor frame is then x right, y down, z forward.
+        T_map_sensor: env -> (4, 4) or (S, 4, 4), sensor frame to map frame.
+        T_map_base: env -> (4, 4), the robot, which the map's window follows.
+        dt: time of one step [s].
+        read: (emap, T_map_base (B, 4, 4)) -> (B, ...), such as a `torchelev.scan.MapImage`, or values and validity,
+            such as a `HeightScan`, which are stacked to (B, 2, ...); here B = 1. What is not finite becomes 0. None:
+            elevation less the base's z, and validity, every 0.1 m of 1.6 x 1.0 m around the base.
+        cfg: of the map.
+        device: of the map.
+        key: of the map in the observation.
+
+    Raises ValueError or TypeError for what is missing or does not fit, naming the argument, the rule, what came and
+    the mend.
+    """
+
+    _wraps, _wrapper, _mend = gymnasium.Env, gymnasium.Wrapper, "use VectorElevationMapObservation for a VectorEnv"
+
+    def _extend_spaces(self, box: spaces.Box) -> None:
+        self.observation_space = self._extended(self.env.observation_space, box)
+        self._autoreset = _has_autoreset(self.env)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment and forget its map."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._ended = torch.zeros_like(self._ended)
+        values = self._feed.observe(self.env, torch.ones_like(self._ended), stepped=False)[0]
+        return self._joined(observation, values), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment and fuse what it sees."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        began, self._ended = self._ended, torch.full_like(self._ended, self._autoreset and (terminated or truncated))
+        values = self._feed.observe(self.env, began, stepped=True)[0]
+        return self._joined(observation, values), reward, terminated, truncated, info
+
+
+class VectorElevationMapObservation(_MapObservation, VectorWrapper):
+    """Add the elevation map to the observations of a vector environment.
+
+    As `ElevationMapObservation`, for B environments: each function returns a leading dimension B, or a list or tuple
+    of B arrays, as `env.call` does. An environment's map begins anew exactly when its episode does. In
+    `metadata["autoreset_mode"]` NEXT_STEP that is the step after the last one; in SAME_STEP the last one, and
+    `infos["final_obs"]` then gets the map of one step before, as the final cloud is gone when the step returns; in any
+    mode `reset(options={"reset_mask": ...})`, which leaves the other maps as they are.
+    """
+
+    _wraps, _wrapper, _mend = VectorEnv, VectorWrapper, "use ElevationMapObservation for a single Env"
+
+    def _extend_spaces(self, box: spaces.Box) -> None:
+        modes = [mode.name for mode in AutoresetMode]
+        came = self.env.metadata.get("autoreset_mode", "none")
+        known = came in AutoresetMode.__members__.values()
+        require(known, 'env.metadata["autoreset_mode"]', "must be an AutoresetMode", came, f"set {' or '.join(modes)}")
+        self._mode, self._last = came, self._feed.read_blank()
+        self.single_observation_space = self._extended(self.env.single_observation_space, box)
+        self.observation_space = self._extended(self.env.observation_space, batch_space(box, self.num_envs))
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environments, all or those of `options["reset_mask"]`, and forget their maps."""
+        mask = None if options is None else options.get("reset_mask")
+        began = torch.ones_like(self._ended) if mask is None else self._flags(mask)
+        # A copy, as environments take the mask out of their options.
+        observations, infos = self.env.reset(seed=seed, options=None if options is None else dict(options))
+        self._ended = self._ended & ~began
+        return self._observed(observations, began, stepped=False), infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step the environments, fuse what they see, and forget the maps of those that began anew."""
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        ended = self._flags(terminations) | self._flags(truncations)
+        if self._mode is AutoresetMode.SAME_STEP and "final_obs" in infos:
+            infos = {**infos, "final_obs": self._final(infos["final_obs"])}
+        began = {
+            AutoresetMode.NEXT_STEP: self._ended,
+            AutoresetMode.SAME_STEP: ended,
+            AutoresetMode.DISABLED: torch.zeros_like(ended),
+        }[self._mode]
+        self._ended = ended
+        return self._observed(observations, began, stepped=True), rewards, terminations, truncations, infos
+
+    def _flags(self, value: Any) -> Tensor:
+        return as_tensor("flags", value, self.emap.device).bool()
+
+    def _observed(self, observations: Any, began: Tensor, stepped: bool) -> dict[str, Any]:
+        values = self._feed.observe(self.env, began, stepped)
+        if self._mode is AutoresetMode.SAME_STEP:
+            self._last = values.clone()  # the caller owns the other
+        return self._joined(observations, values)
+
+    def _final(self, observations: Any) -> Any:
+        """Add the last map to the final observations, which are an array of objects, or batched."""
+        if not (isinstance(observations, np.ndarray) and observations.dtype == object):
+            return self._joined(observations, self._last)
+        joined = np.full_like(observations, None)
+        for i, observation in enumerate(observations):
+            if observation is not None:
+                joined[i] = self._joined(observation, self._last[i])
+        return joined
+
+
+def _has_autoreset(env: Any) -> bool:
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, gymnasium.wrappers.Autoreset):
+            return True
+        env = env.env
+    return False

@@ -1,0 +1,103 @@
+"""The settings of TerrainNav, all in one place, so that an experiment is fixed before its first run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchelev.errors import require
+
+PERCEPTION = ("map", "truth", "blind")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CourseConfig:
+    """The ground: square tiles with obstacles that a robot must walk around, and some that it can walk over."""
+
+    num_tiles: int = 64
+    length: float = 12.0  # [m] side of a tile
+    resolution: float = 0.05  # [m]
+    seed: int = 0
+    spacing: float = 2.0  # [m] between the sites of obstacles
+    jitter: float = 0.15  # [m] how far a site is off its lattice, each way
+    half_diagonal: tuple[float, float] = (0.5, 0.75)  # [m] of an obstacle's footprint
+    block_height: tuple[float, float] = (0.3, 0.7)  # [m] too high to climb
+    pit_depth: tuple[float, float] = (0.5, 1.0)  # [m] deep enough to fall into
+    step_height: tuple[float, float] = (0.06, 0.15)  # [m] low enough to walk over
+    shares: tuple[float, float, float] = (0.4, 0.3, 0.2)  # of the sites: blocks, pits, steps; the rest is free
+    roughness: float = 0.03  # [m] amplitude of the ground's waves
+    distance: tuple[float, float] = (4.0, 6.0)  # [m] from start to goal
+    clearance: float = 0.5  # [m] level ground around starts and goals
+    num_routes: int = 256  # pairs of start and goal per tile
+
+    def __post_init__(self) -> None:
+        room = self.spacing - 2 * (self.half_diagonal[1] + self.jitter)
+        require(room >= 0, "course.spacing", "must leave a gap between obstacles", f"{room:.2f} m", "raise it")
+        require(sum(self.shares) <= 1, "course.shares", "must not exceed 1 together", self.shares, "lower one")
+        require(self.num_tiles >= 1, "course.num_tiles", "must be positive", self.num_tiles, "give one or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotConfig:
+    """A base that follows velocity commands over the ground, and where it cannot."""
+
+    length: float = 0.6  # [m] of the footprint
+    width: float = 0.4  # [m]
+    body_height: float = 0.45  # [m] of the base over the ground under its feet
+    max_speed: float = 1.0  # [m/s] forward; a third of it backward
+    max_yaw_rate: float = 1.5  # [rad/s]
+    response: float = 0.2  # [s] in which the velocity follows the command
+    max_climb: float = 0.22  # [m] ground this much above the feet blocks the way
+    max_drop: float = 0.3  # [m] ground this much below the feet is a fall
+    reach: float = 0.1  # [m] around the footprint in which ground blocks the way
+    max_slope: float = 0.8  # gradient at which the robot comes to a stop
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig:
+    """Weights of the reward's terms; see `TerrainNav` for the formula."""
+
+    progress: float = 1.0  # per metre towards the goal
+    success: float = 5.0
+    fall: float = -5.0
+    stuck: float = -5.0
+    blocked: float = -0.1  # per step
+    time: float = -0.02  # per step
+    action_rate: float = -0.01  # per squared change of the action
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightConfig:
+    """What the robot sees: its map, and the crop of it that a policy reads."""
+
+    resolution: float = 0.1  # [m] of the map
+    window: float = 6.0  # [m] side of the map
+    crop_length: float = 3.2  # [m] side of the crop, in the base's yaw frame
+    crop_resolution: float = 0.2  # [m]
+    crop_ahead: float = 0.8  # [m] of the crop's middle before the base
+    camera_pixels: tuple[int, int] = (16, 16)  # width, height of each depth camera
+    camera_fov_deg: tuple[float, float] = (90.0, 60.0)
+    camera_pitch_deg: float = 32.0  # downwards
+    max_range: float = 5.0  # [m]
+    sensor_errors: str = "depth_camera"  # a preset of torchelev.sim
+    pose_errors: str = "leg_odometry"  # a preset of torchelev.sim
+    truth_noise: float = 0.1  # [m] uniform, each way, on the heights of perception "truth"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainNavConfig:
+    """Everything about the task."""
+
+    course: CourseConfig = field(default_factory=CourseConfig)
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    sight: SightConfig = field(default_factory=SightConfig)
+    dt: float = 0.2  # [s] between actions
+    substeps: int = 4
+    episode_length: float = 20.0  # [s]
+    goal_radius: float = 0.4  # [m]
+    stuck_after: float = 3.0  # [s] of being blocked without a break
+
+    @property
+    def max_episode_length(self) -> int:
+        """Steps after which an episode is truncated."""
+        return round(self.episode_length / self.dt)

@@ -1,0 +1,139 @@
+"""TerrainNav for gymnasium: one environment of arrays, and many of tensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from torch import Tensor
+
+from envs.terrain_nav.config import TerrainNavConfig
+from envs.terrain_nav.task import NUM_ACTIONS, TerrainNav
+
+GROUPS = ("policy", "map")  # what a robot has; the others are a critic's
+
+
+def _spaces(task: TerrainNav) -> tuple[spaces.Dict, spaces.Box]:
+    shapes = {name: value.shape[1:] for name, value in task.observe().items() if name in GROUPS}
+    seen = {name: spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in shapes.items()}
+    return spaces.Dict(seen), spaces.Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32)
+
+
+class TerrainNavEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """One robot, NumPy in and out: `gymnasium.make("torchelev/TerrainNav-v0", perception="map")`."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        cfg: TerrainNavConfig | None = None,
+        perception: str = "map",
+        device: str = "cpu",
+    ) -> None:
+        self.render_mode = render_mode
+        self.task = TerrainNav(cfg, 1, device, perception)
+        self.observation_space, self.action_space = _spaces(self.task)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.task.seed(seed)
+        self.task.reset()
+        self.task.sense()
+        return self._observe(), self._info()
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Move, look and return what is seen."""
+        outcome = self.task.advance(torch.as_tensor(np.asarray(action), device=self.task.device)[None])
+        self.task.sense()
+        info = self._info() | {name: bool(getattr(outcome, name)) for name in ("success", "fallen", "stuck")}
+        return self._observe(), float(outcome.reward), bool(outcome.terminated), bool(outcome.truncated), info
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {name: value[0].cpu().numpy() for name, value in self.task.observe().items() if name in GROUPS}
+
+    def _info(self) -> dict[str, Any]:
+        return {"distance": float(self.task.distance)}
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Return a picture (h, w, 3) of truth and map with the robot and its goal, if `render_mode` is "rgb_array"."""
+        from envs.terrain_nav.render import draw
+
+        return draw(self.task) if self.render_mode == "rgb_array" else None
+
+
+class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
+    """Many robots, tensors in and out: `gymnasium.make_vec("torchelev/TerrainNav-v0", num_envs=N)`.
+
+    An environment whose episode ended begins the next one in the following step, whose action it ignores
+    (`AutoresetMode.NEXT_STEP`).
+    """
+
+    metadata: dict[str, Any] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 5,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+        "torch": True,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        cfg: TerrainNavConfig | None = None,
+        perception: str = "map",
+        device: str = "cpu",
+        compiled: bool = False,
+    ) -> None:
+        self.num_envs, self.render_mode, self.max_episode_steps = num_envs, render_mode, max_episode_steps
+        self.task = TerrainNav(cfg, num_envs, device, perception, compiled=compiled)
+        self.single_observation_space, self.single_action_space = _spaces(self.task)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
+        self._ended = torch.zeros(num_envs, dtype=torch.bool, device=self.task.device)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Begin episodes everywhere, or where `options["reset_mask"]` (B,) is true."""
+        if seed is not None:
+            self.task.seed(seed)
+        mask = (options or {}).get("reset_mask")
+        mask = None if mask is None else torch.as_tensor(mask, dtype=torch.bool, device=self.task.device)
+        self.task.reset(mask)
+        self._ended = self._ended & ~mask if mask is not None else torch.zeros_like(self._ended)
+        self.task.sense()
+        return self._observe(), {"distance": self.task.distance}
+
+    def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Move, or begin the next episode where the last one ended, and look."""
+        began, task = self._ended, self.task
+        outcome = task.advance(torch.as_tensor(actions, device=task.device))
+        task.reset(began)
+        task.sense()
+        truncated = outcome.truncated
+        if self.max_episode_steps is not None:
+            truncated = truncated | (task.episode_length >= self.max_episode_steps) & ~outcome.terminated
+        terminated, truncated = outcome.terminated & ~began, truncated & ~began
+        self._ended = terminated | truncated
+        info = {"distance": task.distance}
+        info |= {name: getattr(outcome, name) & ~began for name in ("success", "fallen", "stuck")}
+        return self._observe(), torch.where(began, 0.0, outcome.reward), terminated, truncated, info
+
+    def _observe(self) -> dict[str, Tensor]:
+        return {name: value for name, value in self.task.observe().items() if name in GROUPS}
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """Return a picture of each of the first four environments."""
+        from envs.terrain_nav.render import draw
+
+        return tuple(draw(self.task, k) for k in range(min(4, self.num_envs))) if self.render_mode else None

@@ -1,0 +1,95 @@
+"""Pictures of TerrainNav: the ground, the robot's map of it, robot and goal. Needs matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from envs.terrain_nav.config import RobotConfig, TerrainNavConfig
+from envs.terrain_nav.robot import contacts
+from envs.terrain_nav.task import TerrainNav
+from torchelev.plot import UNKNOWN_COLOR
+
+OUTLINE = (0, 1, 3, 2)  # the footprint's corners in turn, of `contacts`
+
+
+class Snapshot(NamedTuple):
+    """One environment at one moment, as arrays."""
+
+    truth: np.ndarray  # (H, W) [m]
+    truth_extent: tuple[float, float, float, float]  # [m] x_min, x_max, y_min, y_max
+    seen: np.ndarray | None  # (H, W) [m], NaN where unknown; None without a map
+    seen_extent: tuple[float, float, float, float]
+    footprint: np.ndarray  # (4, 2) [m]
+    xy: np.ndarray  # (2,) [m]
+    goal: np.ndarray  # (2,) [m]
+    seconds: float
+
+
+def snapshot(task: TerrainNav, env: int = 0) -> Snapshot:
+    """Copy what a picture of one environment needs."""
+    cfg, field = task.cfg, task.course.field
+    half = (field.heights.shape[1] - 1) / 2 * field.resolution
+    emap = getattr(task.sight, "emap", None)
+    x, y = (float(v) for v in (emap.center[env, :2] if emap is not None else task.xy[env]))
+    reach = cfg.sight.window / 2
+    return Snapshot(
+        truth=field.heights[task.tile_ids[env]].cpu().numpy(),
+        truth_extent=(-half, half, -half, half),
+        seen=emap.layer("elevation")[env].cpu().numpy() if emap is not None else None,
+        seen_extent=(x - reach, x + reach, y - reach, y + reach),
+        footprint=contacts(task.xy, task.yaw, cfg.robot)[env, list(OUTLINE)].cpu().numpy(),
+        xy=task.xy[env].cpu().numpy(),
+        goal=task.goal[env].cpu().numpy(),
+        seconds=float(task.episode_length[env]) * cfg.dt,
+    )
+
+
+def draw(task: TerrainNav, env: int = 0) -> np.ndarray:
+    """Return a picture (h, w, 3) uint8 of one environment: truth to the left, map to the right."""
+    figure = Figure(figsize=(8, 4), layout="compressed", dpi=80)
+    canvas = FigureCanvasAgg(figure)
+    shot = snapshot(task, env)
+    _draw_column(figure.subplots(1, 2), shot, [shot.xy], task.cfg.robot)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def save_strip(shots: Sequence[Snapshot], path: Path, *, trail: Sequence[np.ndarray], cfg: TerrainNavConfig) -> None:
+    """Write an episode as one PNG: a column per moment, truth above, map below; `trail` is the path walked."""
+    figure = Figure(figsize=(3 * len(shots), 6), layout="compressed", dpi=80)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(shots))
+    for column, shot in zip(axes.T, shots, strict=True):
+        walked = trail[: round(shot.seconds / cfg.dt) + 1]
+        _draw_column(column, shot, walked, cfg.robot)
+    figure.savefig(path)
+
+
+def _draw_column(axes: Sequence[Axes], shot: Snapshot, walked: Sequence[np.ndarray], robot: RobotConfig) -> None:
+    level = float(np.median(shot.truth))
+    limits = {"vmin": level - 0.6, "vmax": level + 0.6}
+    _draw(axes[0], shot.truth, shot.truth_extent, limits)
+    axes[0].set_title(f"ground, {shot.seconds:.1f} s", fontsize=9)
+    seen = np.full((1, 1), np.nan) if shot.seen is None else shot.seen
+    _draw(axes[1], seen, shot.seen_extent, limits)
+    axes[1].set_title("the robot's map" if shot.seen is not None else "no map", fontsize=9)
+    for ax in axes:
+        ax.plot(*np.array(walked).T, color="tab:red", linewidth=1)
+        ax.add_patch(Polygon(shot.footprint, facecolor="none", edgecolor="tab:red", linewidth=1.5))
+        ax.plot(*shot.goal, marker="*", color="tab:orange", markersize=12, clip_on=True)
+        ax.tick_params(labelsize=7)
+    axes[1].set_xlim(shot.seen_extent[:2])
+    axes[1].set_ylim(shot.seen_extent[2:])
+
+
+def _draw(ax: Axes, height: np.ndarray, extent: tuple[float, float, float, float], limits: dict[str, float]) -> None:
+    ax.set_facecolor(UNKNOWN_COLOR)
+    ax.imshow(height.T, origin="lower", extent=extent, cmap="terrain", interpolation="nearest", **limits)

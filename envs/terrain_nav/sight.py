@@ -1,0 +1,165 @@
+"""What TerrainNav's robots see: the map in the loop, the ground itself with white noise, or nothing.
+
+All give an image (B, 4, n, n) of one crop in the base's yaw frame: elevation and upper bound over the ground under the
+base [m], validity, traversability. `sense` looks and draws what is random; `image` and `estimate` only read.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from envs.terrain_nav.config import TerrainNavConfig
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.pipeline import rate_surface
+from torchelev.scan import MapImage
+from torchelev.sim import DepthCamera
+from torchelev.sim.error_models import SensorErrors
+from torchelev.sim.heightfield import HeightField
+from torchelev.sim.mounted import MountedSensor
+from torchelev.sim.pose_error import PoseErrors
+from torchelev.sim.presets import preset
+from torchelev.sim.trajectories import pose
+
+LAYERS = ("elevation", "upper_bound", "validity", "traversability")
+
+
+def crop(cfg: TerrainNavConfig) -> MapImage:
+    """Return the crop that policies read."""
+    sight = cfg.sight
+    return MapImage(
+        length_x=sight.crop_length,
+        length_y=sight.crop_length,
+        resolution=sight.crop_resolution,
+        offset=(sight.crop_ahead, 0.0),
+        layers=LAYERS,
+        nominal_height=cfg.robot.body_height,
+    )
+
+
+class Blind(nn.Module):
+    """Sees nothing: an image of unknown ground."""
+
+    def __init__(
+        self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, seed: int, compiled: bool = False
+    ) -> None:
+        super().__init__()
+        self.cfg, self.field, self.num_envs, self.crop = cfg, field, num_envs, crop(cfg)
+        self.generator = torch.Generator(field.device).manual_seed(seed)
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget, in the environments of `mask` (B,)."""
+
+    def sense(self, T_map_base: Tensor, tile_ids: Tensor) -> None:
+        """Look once from where the robots are."""
+
+    def estimate(self, T_map_base: Tensor) -> Tensor:
+        """Return where the robots believe to be."""
+        return T_map_base
+
+    def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
+        """Return the crop (B, 4, n, n)."""
+        return torch.zeros(self.num_envs, *self.crop.shape, device=self.field.device)
+
+
+class Truth(Blind):
+    """Sees the ground itself, each height with uniform noise that is new at each look."""
+
+    noise: Tensor
+
+    def __init__(
+        self,
+        cfg: TerrainNavConfig,
+        field: HeightField,
+        num_envs: int,
+        seed: int,
+        compiled: bool = False,
+        noise: float | None = None,
+    ) -> None:
+        super().__init__(cfg, field, num_envs, seed)
+        self.amplitude = cfg.sight.truth_noise if noise is None else noise
+        self.traversability = HeightField(rate(field, cfg), field.resolution)
+        shape = self.crop.shape[1:]
+        self.register_buffer("noise", torch.zeros(num_envs, *shape, device=field.device))
+
+    def sense(self, T_map_base: Tensor, tile_ids: Tensor) -> None:
+        """Draw new noise."""
+        if self.amplitude > 0:
+            u = torch.rand(self.noise.shape, generator=self.generator, device=self.noise.device)
+            self.noise.copy_((2 * u - 1) * self.amplitude)
+
+    def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
+        """Return the crop of the ground: all known, the upper bound is the elevation."""
+        xy = self.crop.xy(T_map_base)
+        ground = T_map_base[:, 2, 3] - self.cfg.robot.body_height
+        shape = self.noise.shape
+        elevation = (self.field.height(tile_ids, xy) - ground[:, None]).view(shape) + self.noise
+        rating = self.traversability.height(tile_ids, xy).view(shape)
+        return torch.stack([elevation, elevation, torch.ones_like(elevation), rating], 1)
+
+
+def rate(field: HeightField, cfg: TerrainNavConfig) -> Tensor:
+    """Return the analytic traversability (K, H, W) of the true ground, rated as a map of it is."""
+    size = tuple(n * field.resolution for n in field.heights.shape[1:])
+    grid = GridConfig(resolution=field.resolution, length_x=size[0], length_y=size[1])
+    emap = ElevationMap(ElevationMapConfig(grid=grid), field.num_tiles, field.device)
+    known = emap.state._replace(elevation=field.heights, validity=torch.ones_like(emap.state.validity))
+    return rate_surface(known, emap.cfg).traversability
+
+
+class Mapped(Blind):
+    """Sees with two depth cameras, fore and aft, whose points an elevation map fuses at poses that drift."""
+
+    T_estimated: Tensor
+
+    def __init__(
+        self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, seed: int, compiled: bool = False
+    ) -> None:
+        super().__init__(cfg, field, num_envs, seed)
+        sight, device = cfg.sight, field.device
+        grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
+        self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs, device)
+        if compiled:
+            self.emap.compile()
+        camera = DepthCamera(*sight.camera_pixels, *sight.camera_fov_deg, max_range=sight.max_range)
+        ahead, aft = (torch.tensor([x, 0.0, 0.05]) for x in (0.3, -0.3))
+        pitch = math.radians(sight.camera_pitch_deg)
+        mounts = (pose(place, torch.tensor(yaw), pitch) for place, yaw in ((ahead, 0.0), (aft, math.pi)))
+        self.cameras = [MountedSensor(camera, T.to(device, torch.float32)) for T in mounts]
+        sensor, odometry = preset(sight.sensor_errors).sensor, preset(sight.pose_errors).pose
+        self.sensor_errors = nn.ModuleList(SensorErrors(sensor, num_envs, device, seed + k) for k in range(2))
+        self.pose_errors = PoseErrors(odometry, num_envs, device, seed + 2)
+        self.register_buffer("T_estimated", torch.eye(4, device=device).repeat(num_envs, 1, 1))
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget the map; draw new errors."""
+        self.emap.reset(mask=mask)
+        for errors in (*self.sensor_errors, self.pose_errors):
+            errors.reset(mask=mask)
+
+    def sense(self, T_map_base: Tensor, tile_ids: Tensor) -> None:
+        """Cast rays from where the robots are, and map them from where they believe to be."""
+        self.T_estimated.copy_(self.pose_errors(T_map_base, self.cfg.dt))
+        self.emap.update(*self.look(T_map_base, tile_ids), self.T_estimated, self.cfg.dt)
+
+    def look(self, T_map_base: Tensor, tile_ids: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the cameras' points (B, 2, M, 3) and where they are believed to be (B, 2, 4, 4)."""
+        clouds = []
+        for camera, errors in zip(self.cameras, self.sensor_errors, strict=True):
+            points = camera(self.field, tile_ids, T_map_base, T_base_sensor=camera.T_base_sensor @ errors.mounting())
+            shape = (camera.pattern.height, camera.pattern.width)
+            clouds.append(errors(points, camera.T_map_sensor(self.T_estimated), image_shape=shape))
+        return tuple(torch.stack(parts, 1) for parts in zip(*clouds, strict=True))
+
+    def estimate(self, T_map_base: Tensor) -> Tensor:
+        """Return the poses of the odometry."""
+        return self.T_estimated.clone()
+
+    def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
+        """Return the crop of the map."""
+        return self.crop(self.emap, self.T_estimated)
+
+
+SIGHTS: dict[str, type[Blind]] = {"map": Mapped, "truth": Truth, "blind": Blind}

@@ -1,0 +1,79 @@
+"""TerrainNav through gymnasium: one environment and many, with their resets."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import envs  # noqa: F401  (registers)
+from envs.terrain_nav import CourseConfig, TerrainNavConfig
+
+CFG = TerrainNavConfig(course=CourseConfig(num_tiles=2, num_routes=8), episode_length=1.0)
+ID = "torchelev/TerrainNav-v0"
+
+
+@pytest.mark.parametrize("perception", ["map", "truth", "blind"])
+def test_check_env(perception):
+    env = gymnasium.make(ID, cfg=CFG, perception=perception)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*infinity.*")  # heights have no bounds
+        check_env(env.unwrapped)
+
+
+def test_an_episode_of_arrays():
+    env = gymnasium.make(ID, cfg=CFG)
+    observation, info = env.reset(seed=0)
+    assert observation["policy"].dtype == np.float32 and observation["map"].shape == (4, 16, 16)
+    steps, over = 0, False
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(np.array([0.0, 1.0], np.float32))
+        over, steps = terminated or truncated, steps + 1
+    assert steps == 5 and truncated and isinstance(reward, float) and info["distance"] > 0.4
+
+
+def test_render_draws_ground_and_map():
+    env = gymnasium.make(ID, cfg=CFG, render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.dtype == np.uint8 and picture.shape == (320, 640, 3)
+    env.step(np.array([1.0, 0.0], np.float32))
+    assert (env.render() != picture).any()
+    assert gymnasium.make(ID, cfg=CFG).unwrapped.render() is None
+
+
+def test_make_vec_gives_tensors_and_declares_its_autoreset():
+    env = gymnasium.make_vec(ID, num_envs=3, cfg=CFG)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    observation, info = env.reset(seed=4)
+    again, _ = env.reset(seed=4)
+    assert torch.equal(observation["map"], again["map"]) and observation["policy"].shape == (3, 12)
+    assert env.observation_space["map"].shape == (3, 4, 16, 16) and env.action_space.shape == (3, 2)
+
+
+def test_an_ended_episode_begins_anew_in_the_next_step():
+    env = gymnasium.make_vec(ID, num_envs=3, cfg=CFG, perception="truth")
+    env.reset(seed=4)
+    for step in range(1, 14):
+        _, reward, terminated, truncated, _ = env.step(torch.tensor([[0.0, 1.0]] * 3))
+        ends, begins = step % 6 == 5, step % 6 == 0
+        assert bool(truncated.all()) == ends and not bool(terminated.any())
+        assert bool((reward == 0).all()) == begins
+        assert (env.unwrapped.task.episode_length == (0 if begins else step % 6)).all()
+
+
+def test_a_limit_of_steps_and_a_reset_of_some():
+    env = gymnasium.make_vec(ID, num_envs=3, cfg=CFG, perception="blind", max_episode_steps=3)
+    env.reset(seed=4)
+    for step in range(1, 4):
+        truncated = env.step(torch.zeros(3, 2))[3]
+        assert bool(truncated.all()) == (step == 3)
+    mask = np.array([True, False, False])
+    env.reset(options={"reset_mask": mask})
+    task = env.unwrapped.task
+    assert task.episode_length.tolist() == [0, 3, 3]
+    env.step(torch.zeros(3, 2))
+    assert task.episode_length.tolist() == [1, 0, 0]

@@ -1,0 +1,1 @@
+"""Trainings: one file per job. Application code: run from the checkout."""

@@ -1,0 +1,133 @@
+"""Does a policy need the map in the loop while it learns? `python -m training.nav_experiment`
+
+Trains with each perception and seed, deploys every policy with the map in the loop on held-out ground, and writes
+training/results/nav.json and nav.png. What is finished is kept: after Ctrl-C, run it again.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+from tqdm import tqdm
+
+from benchmarks.report import markdown_table, write_json
+from envs.terrain_nav.config import PERCEPTION
+from training.nav import task_config
+from training.nav_evaluate import Policy, evaluate, straight_line
+
+# Fixed before the first run.
+SEEDS = (0, 1, 2)
+ITERATIONS, NUM_ENVS, EPISODES = 150, 256, 512
+RESULTS = Path(__file__).parent / "results"
+NAMES = {"map": "map in the loop", "truth": "truth with white noise", "blind": "blind"}
+
+
+def train(perception: str, seed: int, folder: Path) -> None:
+    """Run one training in a process of its own, or finish one that was stopped."""
+    command = [sys.executable, "-m", "training.nav", "--perception", perception, "--seed", str(seed)]
+    command += ["--iterations", str(ITERATIONS), "--num-envs", str(NUM_ENVS), "--out", str(folder)]
+    subprocess.run([*command, *(["--resume"] if (folder / "checkpoint.pt").exists() else [])], check=True)
+
+
+def load_policy(folder: Path) -> Policy:
+    """Load an exported policy."""
+    scripted = torch.jit.load(str(folder / "policy.pt"))
+    return lambda observation: scripted(observation["policy"], [observation["map"]])
+
+
+def curve(folder: Path) -> dict[str, list[float]]:
+    """Read environment steps and success while training from the TensorBoard log."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log = EventAccumulator(str(folder))
+    log.Reload()
+    points = log.Scalars("/success")
+    return {"steps": [(p.step + 1) * 24 * NUM_ENVS for p in points], "success": [round(p.value, 4) for p in points]}
+
+
+def run(folder: Path) -> dict[str, Any]:
+    """Train and deploy everything; return the result."""
+    cfg, rows = task_config(held_out=True), []
+    cases = [(perception, seed) for perception in PERCEPTION for seed in SEEDS]
+    for perception, seed in tqdm(cases, unit="training"):
+        at = folder / f"{perception}-{seed}"
+        if not (at / "result.json").exists():
+            train(perception, seed, at)
+        trained = json.loads((at / "result.json").read_text())["training"]
+        policy = load_policy(at)
+        deployed = evaluate(policy, cfg, "map", EPISODES, compiled=True)
+        own = evaluate(policy, cfg, perception, EPISODES, compiled=True)["success"]
+        row = {"perception": perception, "seed": seed, "training": trained, "deployed": deployed, "own": own}
+        rows.append(row | {"curve": curve(at)})
+    fixed = {"seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES}
+    line = evaluate(straight_line, cfg, "map", EPISODES, compiled=True)
+    return {"config": fixed, "straight_line": line, "rows": rows}
+
+
+def table(result: dict[str, Any]) -> str:
+    """Tabulate success by what the policy was trained with: mean over the seeds, and the lowest and highest."""
+    head = ["trained with", "success with the map in the loop", "fallen", "stuck", "out of time",
+            "success as trained", "steps / s", "minutes"]  # fmt: skip
+    lines = []
+    for perception in PERCEPTION:
+        rows = [row for row in result["rows"] if row["perception"] == perception]
+        ends = {name: [row["deployed"][name] for row in rows] for name in ("success", "fallen", "stuck", "truncated")}
+        cells = [_spread(ends["success"]), *(f"{100 * _mean(ends[name]):.0f} %" for name in list(ends)[1:])]
+        rate = _mean([row["training"]["steps"] / row["training"]["seconds"] for row in rows])
+        minutes = _mean([row["training"]["seconds"] / 60 for row in rows])
+        own = _spread([row["own"] for row in rows])
+        lines.append([NAMES[perception], *cells, own, f"{rate:,.0f}", f"{minutes:.1f}"])
+    line = result["straight_line"]
+    shares = [f"{100 * line[name]:.0f} %" for name in ("success", "fallen", "stuck", "truncated")]
+    return markdown_table(head, [*lines, ["(a straight line)", *shares, "", "", ""]])
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _spread(values: list[float]) -> str:
+    return f"{100 * _mean(values):.1f} % ({100 * min(values):.1f} to {100 * max(values):.1f})"
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Draw success while training, and deployed."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="compressed", dpi=90)
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    colors = dict(zip(PERCEPTION, ("tab:green", "tab:blue", "tab:gray"), strict=True))
+    for row in result["rows"]:
+        first = row["seed"] == SEEDS[0]
+        name, color = row["perception"], colors[row["perception"]]
+        left.plot(*row["curve"].values(), color=color, linewidth=1, label=NAMES[name] if first else None)
+        right.plot(PERCEPTION.index(name), row["deployed"]["success"], "o", color=color)
+    left.set(xlabel="environment steps", ylabel="success while training, as trained", ylim=(0, 1))
+    left.legend(loc="lower right", fontsize=8)
+    right.axhline(result["straight_line"]["success"], color="black", linestyle=":", linewidth=1)
+    right.text(-0.3, result["straight_line"]["success"] + 0.02, "straight line", fontsize=8)
+    right.set(ylabel="success, map in the loop, held-out ground", ylim=(0, 1), xlim=(-0.4, 2.4))
+    right.set_xticks(range(3), [NAMES[name].replace(" with ", "\nwith ") for name in PERCEPTION], fontsize=8)
+    figure.savefig(path)
+
+
+@click.command()
+@click.option("--runs", type=click.Path(path_type=Path), default=Path("runs/nav_experiment"), show_default=True)
+def main(runs: Path) -> None:
+    """Train, deploy, write training/results/nav.json and nav.png; finished trainings in RUNS are kept."""
+    result = run(runs)
+    write_json(RESULTS / "nav.json", result)
+    plot(result, RESULTS / "nav.png")
+    click.echo(table(result))
+
+
+if __name__ == "__main__":
+    main()
