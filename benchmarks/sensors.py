@@ -33,7 +33,7 @@ SENSORS = {
     "lidar 16 x 32, 20 m": MountedSensor(Lidar(rings=16, azimuths=32), mount(0.0, 0.0, 0.25)),
     "rosette 512, 20 m": MountedSensor(NonRepetitiveLidar(rays=512), mount(20.0, 0.3, 0.1)),
 }
-CASES = [(name, robots, boxes) for name in SENSORS for robots in (64, 256) for boxes in (0, 12) if robots < 256 or not boxes]
+CASES = [(name, robots, boxes) for name in SENSORS for robots, boxes in ((64, 0), (64, 12), (256, 0))]
 HEIGHT = 0.55  # [m] of the base over the ground
 
 

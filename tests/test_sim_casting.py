@@ -242,6 +242,26 @@ def only_touches(field, tile, origin, d, got, expected):
     return over.min() > -1e-5
 
 
+def test_ray_that_is_next_to_a_border_by_rounding():
+    # -1e-9 lies before border 0, but its distance from border -1 rounds to 1: that cell must be searched all the same.
+    field, start = flat(0.0, resolution=1.0), torch.tensor([[-1e-9], [5.5], [0.1]])
+    step, none = torch.tensor([[-1.0], [0.0], [-1.0]]), torch.zeros(1, dtype=torch.int64)
+    inverse = torch.tensor([[1.0], [1e9]])
+    rays = tracing.Rays(none, none, torch.zeros(1), start, step, torch.tensor([[-1.0], [1.0]]), inverse)
+    for count in (1, 2, 5):
+        ahead, horizon = tracing.search(field, rays, count)
+        assert float(ahead) == pytest.approx(0.1) and float(horizon) == count + 1
+
+
+def test_air_above_everything_takes_one_round(monkeypatch):
+    field, tiles, origin, _ = scene(3)
+    counts, search = [], tracing.search
+    monkeypatch.setattr(tracing, "search", lambda *args: (counts.append(1), search(*args))[1])
+    d = torch.tensor([[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [0.0, 0.6, 0.8]]).expand(3, 3, 3)
+    assert cast(field, tiles, origin + torch.tensor([0.0, 0.0, 5.0]), d, 100.0).isinf().all()
+    assert len(counts) == 1
+
+
 def test_march_finds_what_it_must():
     """The reference itself, where the answer is known."""
     heights = torch.zeros(1, 41, 41)
@@ -347,6 +367,16 @@ def test_far_more_rays_than_a_round_searches_at_once():
     same(t[:, ::97], part)
 
 
+def test_parts_make_the_whole(monkeypatch):
+    field, tiles, origin, d = scene(2, B=5)
+    boxes = Boxes(torch.eye(4).expand(5, 1, 4, 4) + 0, torch.rand(5, 1, 3))
+    whole = cast(field, tiles, origin, d, 3.0, boxes)
+    monkeypatch.setattr("torchelev.sim.casting.MOST_RAYS", 2 * d.shape[1] + 1)
+    same(cast(field, tiles, origin, d, 3.0, boxes), whole)
+    monkeypatch.setattr("torchelev.sim.casting.MOST_RAYS", 1)
+    same(cast(field, tiles, origin, d, 3.0, boxes), whole)
+
+
 # Boxes ----------------------------------------------------------------------------------------------------------------
 
 
@@ -363,6 +393,8 @@ def test_faces_of_a_box():
     expected = torch.tensor([1.5, math.inf, 1.5 * math.hypot(1, 0.12), math.inf, math.inf])
     torch.testing.assert_close(one(flat(), o, rays, 5.0, cube), expected, atol=1e-5, rtol=0)
     assert float(one(flat(), (2.0, 0.1, 3.0), [0, 0, -1.0], 5.0, cube)) == pytest.approx(1.9, abs=1e-5)
+    for y, expected in ((0.24, 1.5), (0.26, math.inf), (-0.26, math.inf)):  # along two pairs of faces
+        assert float(one(flat(), (0.0, y, 1.05), [1.0, 0, 0], 5.0, cube)) == pytest.approx(expected, abs=1e-5)
     # Turned by 45 degrees about z its edge points here: at 2 - 0.25 sqrt(2) of a square of 0.25.
     square = box((2.0, 0.0, 1.0), (0.25, 0.25, 0.1), yaw=math.pi / 4)
     expected = 2 - 0.25 * math.sqrt(2)
@@ -386,6 +418,13 @@ def test_absent_boxes_are_not_there(half_size):
     d = unit(np.random.default_rng(1), 50)
     absent = box((0.5, 0.0, 1.0), half_size)
     assert torch.equal(one(flat(), (0.5, 0.0, 1.0), d, 5.0, absent), one(flat(), (0.5, 0.0, 1.0), d, 5.0))
+
+
+def test_absent_boxes_may_lack_a_pose():
+    d = unit(np.random.default_rng(1), 50)
+    absent, there = box((math.nan, 0.0, 1.0), (0.0, 0.0, 0.0)), box((0.5, 0.0, 1.0), (0.1, 0.1, 0.1))
+    both = there.joined(absent)
+    assert torch.equal(one(flat(), (0.0, 0.0, 1.0), d, 5.0, both), one(flat(), (0.0, 0.0, 1.0), d, 5.0, there))
 
 
 def slab(T, half, origin, d):
@@ -512,11 +551,14 @@ def test_no_rays_no_environments_no_boxes():
         (dict(max_range=math.inf), "max_range"),
         (dict(tile_ids=torch.tensor([0, 2])), "tile_ids"),
         (dict(tile_ids=torch.tensor([-1, 0])), "tile_ids"),
+        (dict(tile_ids=torch.tensor([0, 1], dtype=torch.int32)), "tile_ids: must be int64"),
+        (dict(origin=torch.zeros(2, 3, device="meta")), "must be on cpu"),
         (dict(boxes=Boxes(torch.eye(4).expand(1, 3, 4, 4), torch.ones(1, 3, 3))), "boxes"),
         (dict(boxes=Boxes(torch.eye(4).expand(2, 4, 4), torch.ones(2, 3))), "boxes"),
     ],
 )
 def test_refuses(change, text):
+    error = TypeError if "must be int64" in text else ValueError
     names = ("field", "tile_ids", "origin", "directions", "max_range", "boxes")
-    with pytest.raises(ValueError, match=text):
+    with pytest.raises(error, match=text):
         cast(**{**dict(zip(names, on("cpu"), strict=True)), **change})

@@ -34,7 +34,7 @@ def weights(runner):
 def test_a_vec_env_of_rsl_rl():
     env = RslRlTerrainNav(TerrainNav(CFG, 4, perception="truth"))
     seen = env.get_observations()
-    assert set(seen.keys()) == {"policy", "map", "privileged", "truth"} and seen.batch_size == (4,)
+    assert set(seen.keys()) == {"policy", "map", "truth"} and seen.batch_size == (4,)
     for step in range(1, 11):
         seen, reward, done, extras = env.step(torch.tensor([[0.0, 1.0]] * 4))
         assert reward.shape == done.shape == extras["time_outs"].shape == (4,)

@@ -28,7 +28,7 @@ def ppo_config(num_steps: int = 24, save_interval: int = 10) -> dict[str, Any]:
     return {
         "num_steps_per_env": num_steps,
         "save_interval": save_interval,
-        "obs_groups": {"actor": ["policy", "map"], "critic": ["privileged", "truth"]},
+        "obs_groups": {"actor": ["policy", "map"], "critic": ["policy", "truth"]},
         "algorithm": {
             "class_name": "PPO",
             "num_learning_epochs": 4,
@@ -62,7 +62,7 @@ def make_runner(
 
 @click.command()
 @click.option("--num-envs", default=256, show_default=True, help="Robots at once.")
-@click.option("--iterations", default=150, show_default=True, help="PPO iterations in all, those of --resume included.")
+@click.option("--iterations", default=180, show_default=True, help="PPO iterations in all, those of --resume included.")
 @click.option("--perception", type=click.Choice(PERCEPTION), default="map", show_default=True)
 @click.option("--seed", default=0, show_default=True)
 @click.option("--device", default=None, help="Default: a GPU if there is one.")

@@ -15,7 +15,7 @@ from envs.terrain_nav.task import NUM_ACTIONS, TerrainNav
 class RslRlTerrainNav(VecEnv):
     """A `TerrainNav` for `rsl_rl.runners.OnPolicyRunner` (rsl-rl-lib 5.4 and 5.5).
 
-    Observation groups: "policy" and "map" for the actor, "privileged" and "truth" for the critic. `extras` holds
+    Observation groups: "policy" and "map" for the actor, "policy" and "truth" for the critic. `extras` holds
     "time_outs" (B,) and "log": shares of the last finished episodes that ended in each way.
     """
 

@@ -1,7 +1,7 @@
 """What TerrainNav's robots see: the map in the loop, the ground itself with white noise, or nothing.
 
 All give an image (B, 4, n, n) of one crop in the base's yaw frame: elevation and upper bound over the ground under the
-base [m], validity, traversability. `sense` looks and draws what is random; `image` and `estimate` only read.
+base [m], validity, traversability. `sense` looks and draws what is random; `image` only reads.
 """
 
 from __future__ import annotations
@@ -12,15 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from envs.terrain_nav.config import TerrainNavConfig
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, MapImage
 from torchelev.pipeline import rate_surface
-from torchelev.scan import MapImage
-from torchelev.sim import DepthCamera
-from torchelev.sim.error_models import SensorErrors
-from torchelev.sim.heightfield import HeightField
-from torchelev.sim.mounted import MountedSensor
-from torchelev.sim.pose_error import PoseErrors
-from torchelev.sim.presets import preset
+from torchelev.sim import DepthCamera, HeightField, MountedSensor, PoseErrors, SensorErrors, preset
 from torchelev.sim.trajectories import pose
 
 LAYERS = ("elevation", "upper_bound", "validity", "traversability")
@@ -42,22 +36,16 @@ def crop(cfg: TerrainNavConfig) -> MapImage:
 class Blind(nn.Module):
     """Sees nothing: an image of unknown ground."""
 
-    def __init__(
-        self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, seed: int, compiled: bool = False
-    ) -> None:
+    def __init__(self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, compiled: bool = False) -> None:
         super().__init__()
         self.cfg, self.field, self.num_envs, self.crop = cfg, field, num_envs, crop(cfg)
-        self.generator = torch.Generator(field.device).manual_seed(seed)
+        self.generator = torch.Generator(field.device)
 
     def reset(self, mask: Tensor) -> None:
         """Forget, in the environments of `mask` (B,)."""
 
     def sense(self, T_map_base: Tensor, tile_ids: Tensor) -> None:
         """Look once from where the robots are."""
-
-    def estimate(self, T_map_base: Tensor) -> Tensor:
-        """Return where the robots believe to be."""
-        return T_map_base
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
         """Return the crop (B, 4, n, n)."""
@@ -74,11 +62,10 @@ class Truth(Blind):
         cfg: TerrainNavConfig,
         field: HeightField,
         num_envs: int,
-        seed: int,
         compiled: bool = False,
         noise: float | None = None,
     ) -> None:
-        super().__init__(cfg, field, num_envs, seed)
+        super().__init__(cfg, field, num_envs)
         self.amplitude = cfg.sight.truth_noise if noise is None else noise
         self.traversability = HeightField(rate(field, cfg), field.resolution)
         shape = self.crop.shape[1:]
@@ -114,10 +101,8 @@ class Mapped(Blind):
 
     T_estimated: Tensor
 
-    def __init__(
-        self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, seed: int, compiled: bool = False
-    ) -> None:
-        super().__init__(cfg, field, num_envs, seed)
+    def __init__(self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, compiled: bool = False) -> None:
+        super().__init__(cfg, field, num_envs)
         sight, device = cfg.sight, field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
         self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs, device)
@@ -129,8 +114,8 @@ class Mapped(Blind):
         mounts = (pose(place, torch.tensor(yaw), pitch) for place, yaw in ((ahead, 0.0), (aft, math.pi)))
         self.cameras = [MountedSensor(camera, T.to(device, torch.float32)) for T in mounts]
         sensor, odometry = preset(sight.sensor_errors).sensor, preset(sight.pose_errors).pose
-        self.sensor_errors = nn.ModuleList(SensorErrors(sensor, num_envs, device, seed + k) for k in range(2))
-        self.pose_errors = PoseErrors(odometry, num_envs, device, seed + 2)
+        self.sensor_errors = nn.ModuleList(SensorErrors(sensor, num_envs, device) for _ in range(2))
+        self.pose_errors = PoseErrors(odometry, num_envs, device)
         self.register_buffer("T_estimated", torch.eye(4, device=device).repeat(num_envs, 1, 1))
 
     def reset(self, mask: Tensor) -> None:
@@ -152,10 +137,6 @@ class Mapped(Blind):
             shape = (camera.pattern.height, camera.pattern.width)
             clouds.append(errors(points, camera.T_map_sensor(self.T_estimated), image_shape=shape))
         return tuple(torch.stack(parts, 1) for parts in zip(*clouds, strict=True))
-
-    def estimate(self, T_map_base: Tensor) -> Tensor:
-        """Return the poses of the odometry."""
-        return self.T_estimated.clone()
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
         """Return the crop of the map."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from envs.terrain_nav.config import PERCEPTION, TerrainNavConfig
 from envs.terrain_nav.course import make_course
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
-from envs.terrain_nav.sight import SIGHTS
+from envs.terrain_nav.sight import SIGHTS, Truth
 from torchelev.errors import require
 
 NUM_ACTIONS = 2  # forward speed and yaw rate
@@ -87,9 +87,9 @@ class TerrainNav(nn.Module):
         self.cfg, self.num_envs, self.perception = cfg or TerrainNavConfig(), num_envs, perception
         self.course = make_course(self.cfg.course, device)
         self.ground = Ground(self.course.field, self.cfg.robot.reach)
-        self.generator = torch.Generator(device).manual_seed(seed)
-        self.sight = SIGHTS[perception](self.cfg, self.course.field, num_envs, seed, compiled)
-        self.truth = SIGHTS["truth"](self.cfg, self.course.field, num_envs, seed, compiled, noise=0.0)
+        self.generator = torch.Generator(device)
+        self.sight = SIGHTS[perception](self.cfg, self.course.field, num_envs, compiled)
+        self.truth = Truth(self.cfg, self.course.field, num_envs, noise=0.0)
         for name, size in (("xy", 2), ("velocity", 2), ("goal", 2), ("last_action", NUM_ACTIONS)):
             self.register_buffer(name, torch.zeros(num_envs, size, device=device))
         for name in ("yaw", "blocked_time"):
@@ -98,6 +98,7 @@ class TerrainNav(nn.Module):
             kind = torch.bool if dtype is bool else torch.int64
             self.register_buffer(name, torch.zeros(num_envs, dtype=kind, device=device))
         self.register_buffer("endings", torch.zeros(len(ENDINGS), num_envs, device=device))
+        self.seed(seed)
         self.reset()
         self.sense()
 
@@ -182,27 +183,27 @@ class TerrainNav(nn.Module):
         """Return fresh observations.
 
         policy (B, 12): see `_proprioception`; map (B, 4, n, n): elevation and upper bound over the ground under the
-        base [m], validity, traversability; truth (B, 4, n, n): the same of the ground itself, for a critic; and
-        privileged (B, 12), the proprioception with the true pose.
+        base [m], validity, traversability; truth (B, 4, n, n): the same of the ground itself, for a critic.
         """
         T_map_base = self.T_map_base
-        image = self.sight.image(T_map_base, self.tile_ids)
-        truth = self.truth.image(T_map_base, self.tile_ids)
         return {
-            "policy": self._proprioception(self.sight.estimate(T_map_base)),
-            "map": image,
-            "privileged": self._proprioception(T_map_base),
-            "truth": truth,
+            "policy": self._proprioception(T_map_base),
+            "map": self.sight.image(T_map_base, self.tile_ids),
+            "truth": self.truth.image(T_map_base, self.tile_ids),
         }
 
     def _proprioception(self, T_map_base: Tensor) -> Tensor:
-        """Return (B, 12): goal ahead and aside [m], within 3 m, its distance / 5 m, direction's cos and sin, forward
-        velocity [m/s], yaw rate [rad/s], slopes ahead and aside, last action, blocked time [s]."""
+        """Return (B, 12).
+
+        Goal ahead and aside [m], within 3 m, its distance / 5 m, direction's cos and sin, forward velocity [m/s], yaw
+        rate [rad/s], slopes ahead and aside, last action, blocked time [s]. Where the goal is comes from somewhere
+        else, a localisation that does not drift; odometry alone places the map.
+        """
         away = self.goal - T_map_base[:, :2, 3]
         distance = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
         ahead = torch.nn.functional.normalize(T_map_base[:, :2, 0], dim=-1)
         cos = (away * ahead).sum(-1, keepdim=True)
-        sin = (ahead[:, :1] * away[:, 1:] - ahead[:, 1:] * away[:, :1])
+        sin = ahead[:, :1] * away[:, 1:] - ahead[:, 1:] * away[:, :1]
         near = torch.cat([cos, sin], -1)
         direction = near / distance.clamp(min=1e-3)
         parts = [near.clamp(-3.0, 3.0), distance / 5.0, direction, self.velocity, T_map_base[:, 2, :2]]
@@ -224,7 +225,7 @@ class TerrainNav(nn.Module):
     def seed(self, seed: int) -> None:
         """Seed all random numbers; `reset` then begins the same episodes each time."""
         for number, generator in enumerate(self._generators()):
-            generator.manual_seed(seed + number)
+            generator.manual_seed(1000 * seed + number)  # no two alike, of this seed or its neighbours
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the states of the random numbers, so that a resumed training goes on as if never stopped."""

