@@ -68,7 +68,29 @@ def long_run() -> str:
     return long_runs.table(cases)
 
 
-TABLES = {"accuracy": accuracy, "features": features, "real": real, "speed": speed, "long_run": long_run}
+def nav() -> str:
+    """Tabulate what policies reach, by what they were trained with."""
+    from training import nav_experiment  # what it needs is not on every machine that measures speed
+
+    return nav_experiment.table(json.loads((nav_experiment.RESULTS / "nav.json").read_text()))
+
+
+def sight() -> str:
+    """Tabulate what sight costs while a policy learns."""
+    from benchmarks import sight as costs
+
+    return costs.table(load("sight")["rows"])
+
+
+TABLES = {
+    "accuracy": accuracy,
+    "features": features,
+    "real": real,
+    "speed": speed,
+    "long_run": long_run,
+    "nav": nav,
+    "sight": sight,
+}
 
 
 def with_tables(text: str) -> str:

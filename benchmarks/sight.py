@@ -7,18 +7,19 @@ and with the true ground, into benchmarks/results/sight.json.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import click
 import torch
 
 from benchmarks.meter import interleaved
-from benchmarks.readme import RESULTS
 from benchmarks.report import markdown_table, write_json
 from envs.terrain_nav import TerrainNav
 from envs.terrain_nav.task import NUM_ACTIONS
 from torchelev import HeightScan
 
+RESULTS = Path(__file__).parent / "results"
 NUM_ENVS = 256
 
 

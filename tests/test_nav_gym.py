@@ -10,7 +10,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import envs  # noqa: F401  (registers)
-from envs.terrain_nav import CourseConfig, TerrainNavConfig
+from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
+from envs.terrain_nav.render import snapshot
 
 CFG = TerrainNavConfig(course=CourseConfig(num_tiles=2, num_routes=8), episode_length=1.0)
 ID = "torchelev/TerrainNav-v0"
@@ -43,6 +44,16 @@ def test_render_draws_ground_and_map():
     env.step(np.array([1.0, 0.0], np.float32))
     assert (env.render() != picture).any()
     assert gymnasium.make(ID, cfg=CFG).unwrapped.render() is None
+
+
+def test_a_snapshot_does_not_change_with_the_next_step():
+    task = TerrainNav(CFG, 1, perception="blind")
+    shot = snapshot(task)
+    kept = [np.array(value, copy=True) for value in (shot.xy, shot.goal, shot.footprint)]
+    task.advance(torch.ones(1, 2))
+    task.reset()
+    for value, before in zip((shot.xy, shot.goal, shot.footprint), kept, strict=True):
+        np.testing.assert_array_equal(value, before)
 
 
 def test_make_vec_gives_tensors_and_declares_its_autoreset():

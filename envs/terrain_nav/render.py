@@ -46,8 +46,8 @@ def snapshot(task: TerrainNav, env: int = 0) -> Snapshot:
         seen=emap.layer("elevation")[env].cpu().numpy() if emap is not None else None,
         seen_extent=(x - reach, x + reach, y - reach, y + reach),
         footprint=contacts(task.xy, task.yaw, cfg.robot)[env, list(OUTLINE)].cpu().numpy(),
-        xy=task.xy[env].cpu().numpy(),
-        goal=task.goal[env].cpu().numpy(),
+        xy=task.xy[env].cpu().numpy().copy(),
+        goal=task.goal[env].cpu().numpy().copy(),
         seconds=float(task.episode_length[env]) * cfg.dt,
     )
 

@@ -90,13 +90,11 @@ class TerrainNav(nn.Module):
         self.generator = torch.Generator(device)
         self.sight = SIGHTS[perception](self.cfg, self.course.field, num_envs, compiled)
         self.truth = Truth(self.cfg, self.course.field, num_envs, noise=0.0)
-        for name, size in (("xy", 2), ("velocity", 2), ("goal", 2), ("last_action", NUM_ACTIONS)):
-            self.register_buffer(name, torch.zeros(num_envs, size, device=device))
-        for name in ("yaw", "blocked_time"):
-            self.register_buffer(name, torch.zeros(num_envs, device=device))
-        for name, dtype in (("blocked", bool), ("fallen", bool), ("tile_ids", int), ("episode_length", int)):
-            kind = torch.bool if dtype is bool else torch.int64
-            self.register_buffer(name, torch.zeros(num_envs, dtype=kind, device=device))
+        for name in ("xy", "velocity", "goal", "last_action"):
+            self.register_buffer(name, torch.zeros(num_envs, 2, device=device))
+        dtypes = {"yaw": torch.float32, "blocked_time": torch.float32, "blocked": torch.bool, "fallen": torch.bool}
+        for name, dtype in {**dtypes, "tile_ids": torch.int64, "episode_length": torch.int64}.items():
+            self.register_buffer(name, torch.zeros(num_envs, dtype=dtype, device=device))
         self.register_buffer("endings", torch.zeros(len(ENDINGS), num_envs, device=device))
         self.seed(seed)
         self.reset()
