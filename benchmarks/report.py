@@ -36,7 +36,7 @@ def commit() -> str:
     try:
         name = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
         changes = subprocess.run(
-            ["git", "status", "--porcelain", "-uno", "torchelev", "benchmarks/*.py"], capture_output=True, text=True
+            ["git", "status", "--porcelain", "-uno", "torchelev", "envs", "training/*.py", "benchmarks/*.py"], capture_output=True, text=True
         )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

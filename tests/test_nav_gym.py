@@ -88,3 +88,21 @@ def test_a_limit_of_steps_and_a_reset_of_some():
     assert task.episode_length.tolist() == [0, 3, 3]
     env.step(torch.zeros(3, 2))
     assert task.episode_length.tolist() == [1, 0, 0]
+
+
+def test_a_reset_of_some_leaves_what_the_others_see():
+    env = gymnasium.make_vec(ID, num_envs=3, cfg=CFG)
+    env.reset(seed=4)
+    before = {name: value.clone() for name, value in env.step(torch.ones(3, 2))[0].items()}
+    emap = env.unwrapped.task.sight.emap
+    elevation = emap.layer("elevation").nan_to_num()
+    after, _ = env.reset(options={"reset_mask": np.array([False, True, False])})
+    for name, value in after.items():
+        assert torch.equal(value[::2], before[name][::2]) and not torch.equal(value[1], before[name][1]), name
+    assert torch.equal(emap.layer("elevation").nan_to_num()[::2], elevation[::2])
+
+
+def test_environments_without_a_seed_differ():
+    seen = [gymnasium.make(ID, cfg=CFG, perception="blind").reset()[0]["policy"] for _ in range(3)]
+    assert (seen[0] != seen[1]).any() and (seen[1] != seen[2]).any()
+    gymnasium.make(ID, cfg=CFG, perception="blind").reset(seed=2**62)

@@ -211,6 +211,17 @@ def test_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match=r"action: expected \(2, 2\), got \(3, 2\)"):
         task.advance(torch.ones(3, 2))
     assert torch.equal(task.xy, xy) and int(task.episode_length.sum()) == 0
+    with pytest.raises(ValueError, match="dt: must be positive"):
+        TerrainNavConfig(dt=0.0)
+    with pytest.raises(ValueError, match="sight.window: must hold the crop at any heading"):
+        SightConfig(crop_length=5.0)
+
+
+def test_actions_that_are_no_numbers_count_as_zero():
+    task = TerrainNav(TerrainNavConfig(course=FLAT), 2, perception="blind")
+    xy = task.xy.clone()
+    assert bool(task.advance(torch.full((2, 2), torch.nan)).reward.isfinite().all())
+    assert torch.equal(task.xy, xy)
 
 
 # Sight --------------------------------------------------------------------------------------------------------------

@@ -20,9 +20,9 @@ ROOT = Path(__file__).parents[1]
 CFG = TerrainNavConfig(course=CourseConfig(num_tiles=2, num_routes=8), episode_length=2.0)
 
 
-def make_runner(folder, perception="map", cfg=CFG, num_envs=4):
-    torch.manual_seed(0)
-    task = TerrainNav(cfg, num_envs, perception=perception, seed=3)
+def make_runner(folder, perception="map", cfg=CFG, num_envs=4, seed=0):
+    torch.manual_seed(seed)
+    task = TerrainNav(cfg, num_envs, perception=perception, seed=seed)
     settings = nav.ppo_config(num_steps=6, save_interval=100)
     return ResumableRunner(RslRlTerrainNav(task), settings, str(folder) if folder else None)
 
@@ -86,6 +86,16 @@ def test_a_checkpoint_of_other_observations_is_refused_before_anything_changed(t
     assert all(torch.equal(value, before[name]) for name, value in weights(other).items())
 
 
+@pytest.mark.parametrize("perception, num_envs, named", [("truth", 4, "perception truth"), ("blind", 3, "num_envs 3")])
+def test_a_checkpoint_of_another_kind_is_refused_before_anything_changed(tmp_path, perception, num_envs, named):
+    make_runner(tmp_path, "blind").learn(1)
+    other = make_runner(None, perception, num_envs=num_envs)
+    before = weights(other)
+    with pytest.raises(ValueError, match=f"checkpoint: must be of {named}, got"):
+        other.resume(tmp_path / CHECKPOINT)
+    assert all(torch.equal(value, before[name]) for name, value in weights(other).items())
+
+
 def invoke(*arguments):
     return CliRunner().invoke(nav.main, [*map(str, arguments), "--no-compile"], catch_exceptions=False)
 
@@ -129,16 +139,26 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path):
 def test_two_processes_train_one_policy(tmp_path):
     script = tmp_path / "two.py"
     script.write_text(
-        "import torch, training.nav as nav, tests.test_training_nav as t\n"
+        "import os, torch, tests.test_training_nav as t\n"
         "torch.set_num_threads(1)\n"
-        "runner = t.make_runner(None, 'blind')\n"
+        f"folder = r'{tmp_path}/run'\n"
+        "runner = t.make_runner(folder, 'blind', seed=int(os.environ['RANK']))\n"
+        "if os.path.exists(folder + '/checkpoint.pt'):\n"
+        "    runner.resume(folder + '/checkpoint.pt')\n"
         "runner.learn(2)\n"
         "runner.close()\n"
         "total = sum(value.double().sum() for value in t.weights(runner).values())\n"
-        f"open(r'{tmp_path}/' + str(runner.gpu_global_rank), 'w').write(repr(float(total)))\n"
+        "place = float(runner.env.task.xy.sum())\n"
+        f"open(r'{tmp_path}/' + str(runner.gpu_global_rank), 'w').write(repr([float(total), place]))\n"
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert (tmp_path / "0").read_text() == (tmp_path / "1").read_text()
+    totals = []
+    for _ in range(2):  # the second goes on where the first ended
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr[-2000:]
+        one, other = (json.loads((tmp_path / name).read_text()) for name in "01")
+        assert one[0] == other[0], "the processes' policies differ"
+        assert one[1] != other[1], "both processes walk the same robots"
+        totals.append(one[0])
+    assert totals[0] != totals[1]

@@ -10,7 +10,7 @@ import json
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from benchmarks.report import markdown_table, write_json
 from envs.terrain_nav.config import PERCEPTION
-from training.nav import task_config
+from training.nav import ppo_config, task_config
 from training.nav_evaluate import Policy, evaluate, straight_line
 
 # Fixed before the first run.
@@ -54,8 +54,9 @@ def curve(folder: Path) -> dict[str, list[float]]:
 
     log = EventAccumulator(str(folder))
     log.Reload()
-    points = log.Scalars("/success")
-    return {"steps": [(p.step + 1) * 24 * NUM_ENVS for p in points], "success": [round(p.value, 4) for p in points]}
+    values = {point.step: round(point.value, 4) for point in log.Scalars("/success")}  # a resume repeats some
+    each = ppo_config()["num_steps_per_env"] * NUM_ENVS
+    return {"steps": [(step + 1) * each for step in sorted(values)], "success": [values[k] for k in sorted(values)]}
 
 
 def train_all(folder: Path, jobs: int) -> None:
@@ -64,9 +65,13 @@ def train_all(folder: Path, jobs: int) -> None:
     left = [case for case in cases if not (case_folder(folder, *case) / "result.json").exists()]
     bar = tqdm(total=len(cases), initial=len(cases) - len(left), unit="training")
     with ThreadPoolExecutor(jobs) as pool, bar:
-        for done in [pool.submit(train, *case, case_folder(folder, *case)) for case in left]:
-            done.result()
-            bar.update()
+        try:
+            for done in as_completed([pool.submit(train, *case, case_folder(folder, *case)) for case in left]):
+                done.result()
+                bar.update()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # or it would begin all that are queued
+            raise
 
 
 def case_folder(folder: Path, perception: str, seed: int) -> Path:

@@ -23,8 +23,9 @@ LOGGED = ("tot_timesteps", "tot_time", "rewbuffer", "lenbuffer", "cur_reward_sum
 class ResumableRunner(OnPolicyRunner):
     """An `OnPolicyRunner` whose `checkpoint.pt` holds the environments and random numbers too.
 
-    `env.task` is an `nn.Module` with the whole state of the environments. Ctrl-C ends the training after the running
-    iteration and leaves a checkpoint. Under `torchrun` it uses gloo on CPUs and rsl-rl's own way on GPUs.
+    `env.task` is an `nn.Module` with the whole state of the environments, and a `perception`. Ctrl-C ends the training
+    after the running iteration and leaves a checkpoint. Under `torchrun` it uses gloo on CPUs and rsl-rl's own way on
+    GPUs, and each process keeps a checkpoint of its own environments.
     """
 
     def __init__(self, env: Any, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu") -> None:
@@ -67,6 +68,9 @@ class ResumableRunner(OnPolicyRunner):
         assert self.bar is not None
         self.bar.set_postfix(shown | {"steps/s": f"{rate:.0f}"})
         self.bar.update()
+        last, due = figures["it"] + 1 == figures["total_it"], figures["it"] % self.cfg["save_interval"] == 0
+        if self.gpu_global_rank and (self._stop or last or due) and self.logger.log_dir:
+            self._save_whole(Path(self.logger.log_dir))  # rsl-rl lets the first process save alone
         if self._stop:
             if self.logger.writer is not None:
                 self.save(os.path.join(self.logger.log_dir, f"model_{figures['it']}.pt"))
@@ -75,29 +79,52 @@ class ResumableRunner(OnPolicyRunner):
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
         """Save the models to `path`, and all that a resume needs to `checkpoint.pt` beside it."""
         super().save(path, infos)
+        self._save_whole(Path(path).parent)
+
+    def _save_whole(self, folder: Path) -> None:
         whole = self.alg.save() | {"iter": self.current_learning_iteration, "infos": self._snapshot()}
-        target = Path(path).with_name(CHECKPOINT)
+        target = self._own(folder / CHECKPOINT)
         torch.save(whole, target.with_suffix(".tmp"))
         os.replace(target.with_suffix(".tmp"), target)  # a kill meanwhile leaves the older one
 
+    def _own(self, path: Path) -> Path:
+        """Return this process's checkpoint beside the first one's."""
+        return path.with_stem(f"{path.stem}-rank{self.gpu_global_rank}") if self.gpu_global_rank else path
+
+    def _kind(self) -> dict[str, Any]:
+        """Return what a checkpoint must agree in."""
+        shapes = {name: tuple(value.shape[1:]) for name, value in sorted(self.env.get_observations().items())}
+        task = self.env.task
+        settings = {"perception": task.perception, "num_envs": task.num_envs, "processes": self.gpu_world_size}
+        return {"observations": shapes, **settings}
+
     def _snapshot(self) -> dict[str, Any]:
+        cuda = str(self.device).startswith("cuda")
         return {
-            "layout": _layout(self.env.get_observations()),
+            "kind": self._kind(),
             "task": self.env.task.state_dict(),
             "random": torch.get_rng_state(),
+            "random_cuda": torch.cuda.get_rng_state(self.device) if cuda else None,
             "logger": {name: getattr(self.logger, name) for name in LOGGED},
         }
 
     def resume(self, path: str | Path) -> None:
-        """Go on from a `checkpoint.pt`. Raises ValueError, before anything changed, if it is of other observations."""
+        """Go on from a `checkpoint.pt`.
+
+        Raises ValueError, before anything changed, if it is of other observations, of another perception or number of
+        environments, or of another number of processes.
+        """
+        path = self._own(Path(path))
         found = torch.load(path, weights_only=False, map_location=self.device)["infos"]
         require(found is not None, "checkpoint", "must hold the environments", str(path), f"give a {CHECKPOINT}")
-        there, here = found["layout"], _layout(self.env.get_observations())
-        mend = "use the settings that it was trained with"
-        require(there == here, "checkpoint", f"must be of observations {here}", there, mend)
+        for name, here in self._kind().items():
+            there, mend = found["kind"][name], "use the settings that it was trained with"
+            require(there == here, "checkpoint", f"must be of {name} {here}", there, mend)
         self.load(str(path), map_location=self.device)
         self.env.task.load_state_dict(found["task"])
         torch.set_rng_state(found["random"].cpu())
+        if found["random_cuda"] is not None:
+            torch.cuda.set_rng_state(found["random_cuda"].cpu(), self.device)
         for name, value in found["logger"].items():
             setattr(self.logger, name, value)
         self.current_learning_iteration += 1  # the saved one was complete
@@ -111,7 +138,3 @@ class ResumableRunner(OnPolicyRunner):
         self.is_distributed, self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = True, world, rank, local
         self.cfg["multi_gpu"] = {"global_rank": rank, "local_rank": local, "world_size": world}
         torch.distributed.init_process_group("gloo", rank=rank, world_size=world)
-
-
-def _layout(observations: Any) -> dict[str, tuple[int, ...]]:
-    return {name: tuple(value.shape[1:]) for name, value in sorted(observations.items())}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from torchelev.errors import require
@@ -49,7 +50,7 @@ class RobotConfig:
     max_climb: float = 0.22  # [m] ground this much above the feet blocks the way
     max_drop: float = 0.3  # [m] ground this much below the feet is a fall
     reach: float = 0.1  # [m] around the footprint in which ground blocks the way
-    max_slope: float = 0.8  # gradient at which the robot comes to a stop
+    max_slope: float = 0.8  # gradient towards which the speed falls, to a fifth of what it is on the level
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +83,11 @@ class SightConfig:
     pose_errors: str = "leg_odometry"  # a preset of torchelev.sim
     truth_noise: float = 0.1  # [m] uniform, each way, on the heights of perception "truth"
 
+    def __post_init__(self) -> None:
+        reach = 2 * math.hypot(self.crop_length / 2 + abs(self.crop_ahead), self.crop_length / 2)
+        rule = f"must hold the crop at any heading, {reach:.2f} m and two cells"
+        require(reach + 2 * self.resolution <= self.window, "sight.window", rule, self.window, "enlarge it")
+
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainNavConfig:
@@ -96,6 +102,11 @@ class TerrainNavConfig:
     episode_length: float = 20.0  # [s]
     goal_radius: float = 0.4  # [m]
     stuck_after: float = 3.0  # [s] of being blocked without a break
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "substeps", "episode_length", "goal_radius", "stuck_after"):
+            value = getattr(self, name)
+            require(value > 0, name, "must be positive", value, "see its default")
 
     @property
     def max_episode_length(self) -> int:

@@ -1,7 +1,7 @@
 """Where TerrainNav takes place: tiles of rough ground with blocks, pits and steps, and routes across them.
 
-Obstacles stand on a jittered lattice, wide enough apart that a robot fits between any two: every route can be walked,
-few of them straight.
+Obstacles stand on a jittered lattice. They never meet, most leave room for a robot between them, and few routes can be
+walked straight.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from envs.terrain_nav.config import CourseConfig
-from torchelev.sim.heightfield import HeightField
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.pipeline import rate_surface
+from torchelev.sim import HeightField
 
-BORDER = 1.0  # [m] at a tile's rim without obstacles
+BORDER = 1.0  # [m] at a tile's rim where no route begins or ends
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Course:
     """Tiles and, for each, pairs of start and goal."""
 
     field: HeightField
+    traversability: HeightField  # of the true ground, rated as a map rates it
     starts: Tensor  # (K, R, 2) [m] tile frame
     goals: Tensor  # (K, R, 2) [m]
 
@@ -33,7 +36,17 @@ def make_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> Course
     generator = torch.Generator().manual_seed(cfg.seed)
     heights = torch.stack([_tile(cfg, generator) for _ in range(cfg.num_tiles)])
     starts, goals = _routes(heights, cfg, generator)
-    return Course(HeightField(heights.to(device), cfg.resolution), starts.to(device), goals.to(device))
+    field = HeightField(heights.to(device), cfg.resolution)
+    return Course(field, HeightField(_rate(field), cfg.resolution), starts.to(device), goals.to(device))
+
+
+def _rate(field: HeightField) -> Tensor:
+    """Return the analytic traversability (K, H, W) of the ground."""
+    size = [n * field.resolution for n in field.heights.shape[1:]]
+    grid = GridConfig(resolution=field.resolution, length_x=size[0], length_y=size[1])
+    emap = ElevationMap(ElevationMapConfig(grid=grid), field.num_tiles, field.device)
+    known = emap.state._replace(elevation=field.heights, validity=torch.ones_like(emap.state.validity))
+    return rate_surface(known, emap.cfg).traversability
 
 
 def _axis(cfg: CourseConfig) -> Tensor:

@@ -14,11 +14,11 @@ from torch import Tensor
 from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.task import NUM_ACTIONS, TerrainNav
 
-GROUPS = ("policy", "map")  # what a robot has; the others are a critic's
+MOST_SEED = 2**31
 
 
 def _spaces(task: TerrainNav) -> tuple[spaces.Dict, spaces.Box]:
-    shapes = {name: value.shape[1:] for name, value in task.observe().items() if name in GROUPS}
+    shapes = {name: value.shape[1:] for name, value in task.observe(critic=False).items()}
     seen = {name: spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in shapes.items()}
     return spaces.Dict(seen), spaces.Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32)
 
@@ -38,14 +38,16 @@ class TerrainNavEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.render_mode = render_mode
         self.task = TerrainNav(cfg, 1, device, perception)
         self.observation_space, self.action_space = _spaces(self.task)
+        self._seeded = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode."""
         super().reset(seed=seed)
-        if seed is not None:
-            self.task.seed(seed)
+        if seed is not None or not self._seeded:
+            self.task.seed(int(self.np_random.integers(MOST_SEED)))
+            self._seeded = True
         self.task.reset()
         self.task.sense()
         return self._observe(), self._info()
@@ -58,7 +60,7 @@ class TerrainNavEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return self._observe(), float(outcome.reward), bool(outcome.terminated), bool(outcome.truncated), info
 
     def _observe(self) -> dict[str, np.ndarray]:
-        return {name: value[0].cpu().numpy() for name, value in self.task.observe().items() if name in GROUPS}
+        return {name: value[0].cpu().numpy() for name, value in self.task.observe(critic=False).items()}
 
     def _info(self) -> dict[str, Any]:
         return {"distance": float(self.task.distance)}
@@ -100,18 +102,21 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
         self._ended = torch.zeros(num_envs, dtype=torch.bool, device=self.task.device)
+        self._seeded = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Begin episodes everywhere, or where `options["reset_mask"]` (B,) is true."""
-        if seed is not None:
-            self.task.seed(seed)
+        super().reset(seed=seed)
+        if seed is not None or not self._seeded:
+            self.task.seed(int(self.np_random.integers(MOST_SEED)))
+            self._seeded = True
         mask = (options or {}).get("reset_mask")
         mask = None if mask is None else torch.as_tensor(mask, dtype=torch.bool, device=self.task.device)
         self.task.reset(mask)
         self._ended = self._ended & ~mask if mask is not None else torch.zeros_like(self._ended)
-        self.task.sense()
+        self.task.sense(mask)
         return self._observe(), {"distance": self.task.distance}
 
     def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -130,7 +135,7 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         return self._observe(), torch.where(began, 0.0, outcome.reward), terminated, truncated, info
 
     def _observe(self) -> dict[str, Tensor]:
-        return {name: value for name, value in self.task.observe().items() if name in GROUPS}
+        return self.task.observe(critic=False)
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """Return a picture of each of the first four environments."""

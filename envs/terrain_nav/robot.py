@@ -5,6 +5,7 @@ No physics engine: four substeps of kinematics over the height field, for all en
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -36,11 +37,17 @@ class Ground:
 
 def contacts(xy: Tensor, yaw: Tensor, cfg: RobotConfig) -> Tensor:
     """Return the footprint's corners and the middles of its sides (B, 8, 2) [m]; the corners are the feet."""
-    a, b = cfg.length / 2, cfg.width / 2
-    points = xy.new_tensor([(a, b), (a, -b), (-a, b), (-a, -b), (a, 0), (-a, 0), (0, b), (0, -b)])
+    points = _footprint(cfg.length / 2, cfg.width / 2, xy.device)
     cos, sin = yaw.cos()[:, None], yaw.sin()[:, None]
     x, y = cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]
     return torch.stack([x, y], -1) + xy[:, None]
+
+
+@functools.cache  # a list becomes a tensor on a GPU by a copy that the host waits for
+def _footprint(a: float, b: float, device: torch.device) -> Tensor:
+    points = [(a, b), (a, -b), (-a, b), (-a, -b), (a, 0), (-a, 0), (0, b), (0, -b)]
+    with torch.inference_mode(False):
+        return torch.tensor(points, device=device)
 
 
 def base_pose(xy: Tensor, yaw: Tensor, tile_ids: Tensor, field: HeightField, cfg: RobotConfig) -> Tensor:
@@ -64,7 +71,8 @@ def advance(
 
     The velocity approaches the command in `response` seconds. A substep after which ground within `reach` of the
     footprint lies `max_climb` above the feet is not taken; one after which ground under the footprint lies `max_drop`
-    below them is a fall. Speed falls linearly with the gradient under the feet, to a fifth of it at `max_slope`.
+    below them is a fall. Speed falls linearly with the gradient under the feet, as if to 0 at `max_slope`, but not
+    below a fifth.
     """
     forward = action[:, 0] * torch.where(action[:, 0] > 0, cfg.max_speed, cfg.max_speed / 3)
     command = torch.stack([forward, action[:, 1] * cfg.max_yaw_rate], -1)

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from envs.terrain_nav.config import TerrainNavConfig
+from envs.terrain_nav.course import Course
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, MapImage
-from torchelev.pipeline import rate_surface
-from torchelev.sim import DepthCamera, HeightField, MountedSensor, PoseErrors, SensorErrors, preset
+from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, preset
 from torchelev.sim.trajectories import pose
 
 LAYERS = ("elevation", "upper_bound", "validity", "traversability")
@@ -36,64 +36,62 @@ def crop(cfg: TerrainNavConfig) -> MapImage:
 class Blind(nn.Module):
     """Sees nothing: an image of unknown ground."""
 
-    def __init__(self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, compiled: bool = False) -> None:
+    def __init__(self, cfg: TerrainNavConfig, course: Course, num_envs: int, compiled: bool = False) -> None:
         super().__init__()
-        self.cfg, self.field, self.num_envs, self.crop = cfg, field, num_envs, crop(cfg)
-        self.generator = torch.Generator(field.device)
+        self.cfg, self.course, self.num_envs, self.crop = cfg, course, num_envs, crop(cfg)
+        self.generator = torch.Generator(course.field.device)
 
     def reset(self, mask: Tensor) -> None:
         """Forget, in the environments of `mask` (B,)."""
 
-    def sense(self, T_map_base: Tensor, tile_ids: Tensor) -> None:
-        """Look once from where the robots are."""
+    def sense(self, T_map_base: Tensor, tile_ids: Tensor, mask: Tensor) -> None:
+        """Look once from where the robots are, those of `mask` (B,)."""
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
         """Return the crop (B, 4, n, n)."""
-        return torch.zeros(self.num_envs, *self.crop.shape, device=self.field.device)
+        return torch.zeros(self.num_envs, *self.crop.shape, device=self.course.field.device)
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return the state of the random numbers."""
+        return {"generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Set the state of the random numbers."""
+        self.generator.set_state(state["generator"].cpu())
 
 
 class Truth(Blind):
-    """Sees the ground itself, each height with uniform noise that is new at each look."""
+    """Sees the ground itself, each height with uniform noise that is new at each look; traversability has none."""
 
     noise: Tensor
 
     def __init__(
         self,
         cfg: TerrainNavConfig,
-        field: HeightField,
+        course: Course,
         num_envs: int,
         compiled: bool = False,
         noise: float | None = None,
     ) -> None:
-        super().__init__(cfg, field, num_envs)
+        super().__init__(cfg, course, num_envs)
         self.amplitude = cfg.sight.truth_noise if noise is None else noise
-        self.traversability = HeightField(rate(field, cfg), field.resolution)
         shape = self.crop.shape[1:]
-        self.register_buffer("noise", torch.zeros(num_envs, *shape, device=field.device))
+        self.register_buffer("noise", torch.zeros(num_envs, *shape, device=course.field.device))
 
-    def sense(self, T_map_base: Tensor, tile_ids: Tensor) -> None:
+    def sense(self, T_map_base: Tensor, tile_ids: Tensor, mask: Tensor) -> None:
         """Draw new noise."""
         if self.amplitude > 0:
             u = torch.rand(self.noise.shape, generator=self.generator, device=self.noise.device)
-            self.noise.copy_((2 * u - 1) * self.amplitude)
+            self.noise.copy_(torch.where(mask[:, None, None], (2 * u - 1) * self.amplitude, self.noise))
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
         """Return the crop of the ground: all known, the upper bound is the elevation."""
         xy = self.crop.xy(T_map_base)
         ground = T_map_base[:, 2, 3] - self.cfg.robot.body_height
         shape = self.noise.shape
-        elevation = (self.field.height(tile_ids, xy) - ground[:, None]).view(shape) + self.noise
-        rating = self.traversability.height(tile_ids, xy).view(shape)
+        elevation = (self.course.field.height(tile_ids, xy) - ground[:, None]).view(shape) + self.noise
+        rating = self.course.traversability.height(tile_ids, xy).view(shape)
         return torch.stack([elevation, elevation, torch.ones_like(elevation), rating], 1)
-
-
-def rate(field: HeightField, cfg: TerrainNavConfig) -> Tensor:
-    """Return the analytic traversability (K, H, W) of the true ground, rated as a map of it is."""
-    size = tuple(n * field.resolution for n in field.heights.shape[1:])
-    grid = GridConfig(resolution=field.resolution, length_x=size[0], length_y=size[1])
-    emap = ElevationMap(ElevationMapConfig(grid=grid), field.num_tiles, field.device)
-    known = emap.state._replace(elevation=field.heights, validity=torch.ones_like(emap.state.validity))
-    return rate_surface(known, emap.cfg).traversability
 
 
 class Mapped(Blind):
@@ -101,9 +99,9 @@ class Mapped(Blind):
 
     T_estimated: Tensor
 
-    def __init__(self, cfg: TerrainNavConfig, field: HeightField, num_envs: int, compiled: bool = False) -> None:
-        super().__init__(cfg, field, num_envs)
-        sight, device = cfg.sight, field.device
+    def __init__(self, cfg: TerrainNavConfig, course: Course, num_envs: int, compiled: bool = False) -> None:
+        super().__init__(cfg, course, num_envs)
+        sight, device = cfg.sight, course.field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
         self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs, device)
         if compiled:
@@ -124,16 +122,21 @@ class Mapped(Blind):
         for errors in (*self.sensor_errors, self.pose_errors):
             errors.reset(mask=mask)
 
-    def sense(self, T_map_base: Tensor, tile_ids: Tensor) -> None:
+    def sense(self, T_map_base: Tensor, tile_ids: Tensor, mask: Tensor) -> None:
         """Cast rays from where the robots are, and map them from where they believe to be."""
-        self.T_estimated.copy_(self.pose_errors(T_map_base, self.cfg.dt))
-        self.emap.update(*self.look(T_map_base, tile_ids), self.T_estimated, self.cfg.dt)
+        dt = torch.where(mask, self.cfg.dt, 0.0)
+        estimated = self.pose_errors(T_map_base, dt)
+        self.T_estimated.copy_(torch.where(mask[:, None, None], estimated, self.T_estimated))
+        points, T_map_sensor = self.look(T_map_base, tile_ids)
+        points = points.masked_fill(~mask[:, None, None, None], torch.nan)
+        self.emap.update(points, T_map_sensor, self.T_estimated, dt)
 
     def look(self, T_map_base: Tensor, tile_ids: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cameras' points (B, 2, M, 3) and where they are believed to be (B, 2, 4, 4)."""
         clouds = []
         for camera, errors in zip(self.cameras, self.sensor_errors, strict=True):
-            points = camera(self.field, tile_ids, T_map_base, T_base_sensor=camera.T_base_sensor @ errors.mounting())
+            mounting = camera.T_base_sensor @ errors.mounting()
+            points = camera(self.course.field, tile_ids, T_map_base, T_base_sensor=mounting)
             shape = (camera.pattern.height, camera.pattern.width)
             clouds.append(errors(points, camera.T_map_sensor(self.T_estimated), image_shape=shape))
         return tuple(torch.stack(parts, 1) for parts in zip(*clouds, strict=True))

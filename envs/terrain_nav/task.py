@@ -88,8 +88,8 @@ class TerrainNav(nn.Module):
         self.course = make_course(self.cfg.course, device)
         self.ground = Ground(self.course.field, self.cfg.robot.reach)
         self.generator = torch.Generator(device)
-        self.sight = SIGHTS[perception](self.cfg, self.course.field, num_envs, compiled)
-        self.truth = Truth(self.cfg, self.course.field, num_envs, noise=0.0)
+        self.sight = SIGHTS[perception](self.cfg, self.course, num_envs, compiled)
+        self.truth = Truth(self.cfg, self.course, num_envs, noise=0.0)
         for name in ("xy", "velocity", "goal", "last_action"):
             self.register_buffer(name, torch.zeros(num_envs, 2, device=device))
         dtypes = {"yaw": torch.float32, "blocked_time": torch.float32, "blocked": torch.bool, "fallen": torch.bool}
@@ -138,14 +138,14 @@ class TerrainNav(nn.Module):
         self.sight.reset(mask)
 
     def advance(self, action: Tensor) -> Outcome:
-        """Move by one step of `cfg.dt`; `action` (B, 2), clipped to [-1, 1]: forward speed and yaw rate.
+        """Move by one step of `cfg.dt`; `action` (B, 2), clipped to [-1, 1], NaN is 0: forward speed and yaw rate.
 
         Raises ValueError for another shape.
         """
         expected = (self.num_envs, NUM_ACTIONS)
         require(tuple(action.shape) == expected, "action", f"expected {expected}", tuple(action.shape), "one per robot")
         cfg, before = self.cfg, self.distance
-        action = action.to(self.xy.dtype).clamp(-1.0, 1.0)
+        action = action.to(self.xy.dtype).nan_to_num(0.0).clamp(-1.0, 1.0)
         robot = RobotState(self.xy, self.yaw, self.velocity, self.blocked, self.fallen)
         hit = torch.zeros_like(self.blocked)
         for _ in range(cfg.substeps):
@@ -173,22 +173,20 @@ class TerrainNav(nn.Module):
         reward = reward + weight.blocked * self.blocked
         return Outcome(reward, success, self.fallen.clone(), stuck, truncated)
 
-    def sense(self) -> None:
-        """Let the robots look once from where they are."""
-        self.sight.sense(self.T_map_base, self.tile_ids)
+    def sense(self, mask: Tensor | None = None) -> None:
+        """Let the robots look once from where they are: those of `mask` (B,) bool, or all."""
+        mask = torch.ones_like(self.blocked) if mask is None else mask
+        self.sight.sense(self.T_map_base, self.tile_ids, mask)
 
-    def observe(self) -> dict[str, Tensor]:
+    def observe(self, critic: bool = True) -> dict[str, Tensor]:
         """Return fresh observations.
 
         policy (B, 12): see `_proprioception`; map (B, 4, n, n): elevation and upper bound over the ground under the
-        base [m], validity, traversability; truth (B, 4, n, n): the same of the ground itself, for a critic.
+        base [m], validity, traversability; with `critic` truth (B, 4, n, n): the same of the ground itself.
         """
         T_map_base = self.T_map_base
-        return {
-            "policy": self._proprioception(T_map_base),
-            "map": self.sight.image(T_map_base, self.tile_ids),
-            "truth": self.truth.image(T_map_base, self.tile_ids),
-        }
+        seen = {"policy": self._proprioception(T_map_base), "map": self.sight.image(T_map_base, self.tile_ids)}
+        return seen | ({"truth": self.truth.image(T_map_base, self.tile_ids)} if critic else {})
 
     def _proprioception(self, T_map_base: Tensor) -> Tensor:
         """Return (B, 12).
@@ -226,10 +224,9 @@ class TerrainNav(nn.Module):
             generator.manual_seed(1000 * seed + number)  # no two alike, of this seed or its neighbours
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the states of the random numbers, so that a resumed training goes on as if never stopped."""
-        return {"generators": [generator.get_state() for generator in self._generators()]}
+        """Return the state of the random numbers, so that a resumed training goes on as if never stopped."""
+        return {"generator": self.generator.get_state()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Set the states of the random numbers."""
-        for generator, value in zip(self._generators(), state["generators"], strict=True):
-            generator.set_state(value.cpu())
+        """Set the state of the random numbers."""
+        self.generator.set_state(state["generator"].cpu())

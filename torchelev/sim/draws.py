@@ -133,6 +133,14 @@ class PerEnvironment(nn.Module):
             drawn[:, n] = (low[:, n] + (high[:, n] - low[:, n] + 1) * u[:, n]).floor().minimum(high[:, n])
         self.values.copy_(torch.where(mask[:, None], drawn, self.values))
 
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return the state of the random numbers."""
+        return {"generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Set the state of the random numbers."""
+        self.generator.set_state(state["generator"].cpu())
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PerEnvironment:
         before = self.device
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]

@@ -90,14 +90,15 @@ class HeightField:
         return moved
 
     def height(self, tile_ids: Int[Tensor, "B"], xy: Float[Tensor, "B M 2"]) -> Float[Tensor, "B M"]:
-        """Return the surface's height [m] at places xy [m] of each environment's tile.
+        """Return the surface's height [m] at places xy [m] of each environment's tile; at NaN, of the tile's middle.
 
         Raises ValueError for shapes that do not fit.
         """
         fits = tile_ids.ndim == 1 and xy.ndim == 3 and xy.shape[::2] == (len(tile_ids), 2)
         came = f"{tuple(tile_ids.shape)} and {tuple(xy.shape)}"
         require(fits, "tile_ids, xy", "must be (B,) and (B, M, 2)", came, "give one tile and M places each")
-        place = (xy / self.resolution).to(self.padded.dtype).movedim(-1, 0) + self.middle[:, None, None]
+        offset = (xy / self.resolution).to(self.padded.dtype).nan_to_num(0.0)  # NaN would become an index
+        place = offset.movedim(-1, 0) + self.middle[:, None, None]
         cell = place.floor()
         a, b, c, d = self.surface(cell, tile_ids[:, None])
         u, v = place - cell
