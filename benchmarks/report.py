@@ -35,9 +35,9 @@ def commit() -> str:
     """Return the checkout's commit, with "+changes" if the working tree differs from it."""
     try:
         name = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-        changes = subprocess.run(
-            ["git", "status", "--porcelain", "-uno", "torchelev", "envs", "training/*.py", "benchmarks/*.py"], capture_output=True, text=True
-        )
+        paths = ["torchelev", "envs", "training/*.py", "benchmarks/*.py"]
+        status = ["git", "status", "--porcelain", "-uno", *paths]
+        changes = subprocess.run(status, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return name.stdout.strip() + ("+changes" if changes.stdout.strip() else "")
