@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ TOLERANCE = 1e-4
 
 def export(runner: ResumableRunner, folder: Path) -> None:
     """Write policy.pt and policy.onnx. Raises ValueError if either acts otherwise on random observations."""
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of each operator of packages that are missing
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporters, about their own deprecations
         runner.export_policy_to_jit(str(folder), "policy.pt")

@@ -60,9 +60,8 @@ class ResumableRunner(OnPolicyRunner):
     def _show(self, **figures: Any) -> None:
         """Log an iteration as rsl-rl does, and show it in the bar."""
         with contextlib.redirect_stdout(io.StringIO()):
-            ends = self.logger.ep_extras[-1] if self.logger.ep_extras else {}
-            shown = {name.strip("/"): f"{float(value):.2f}" for name, value in ends.items()}
             self._log(**figures)
+        shown = {name: f"{float(share):.2f}" for name, share in self.env.task.shares.items()}
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         rate = steps / (figures["collect_time"] + figures["learn_time"])
         assert self.bar is not None
