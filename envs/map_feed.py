@@ -99,7 +99,8 @@ def _check(sources: dict[str, Any], intrinsics: Any, dt: Any) -> None:
         require(callable(sources[name]), name, "must be a function of the environment", came, "give env -> (4, 4)")
     given = [name for name in ("points", "depth") if callable(sources[name])]
     mend = "give env -> (N, 3), or env -> (h, w) with intrinsics="
-    came = " and ".join(given) or "neither"
+    others = [f"{name} = {type(sources[name]).__name__}" for name in ("points", "depth") if sources[name] is not None]
+    came = " and ".join(given) or " and ".join(others) or "neither"
     require(len(given) == 1, "points, depth", "must be one function of the environment", came, mend)
     paired = (intrinsics is not None) == (given == ["depth"])
     require(paired, "intrinsics", "must come with depth alone", given[0], "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")

@@ -95,11 +95,12 @@ def test_a_reset_of_some_leaves_what_the_others_see():
     env.reset(seed=4)
     before = {name: value.clone() for name, value in env.step(torch.ones(3, 2))[0].items()}
     emap = env.unwrapped.task.sight.emap
-    elevation = emap.layer("elevation").nan_to_num()
+    layers = {name: emap.layer(name).nan_to_num() for name in ("elevation", "variance", "time")}
     after, _ = env.reset(options={"reset_mask": np.array([False, True, False])})
     for name, value in after.items():
         assert torch.equal(value[::2], before[name][::2]) and not torch.equal(value[1], before[name][1]), name
-    assert torch.equal(emap.layer("elevation").nan_to_num()[::2], elevation[::2])
+    for name, value in layers.items():
+        assert torch.equal(emap.layer(name).nan_to_num()[::2], value[::2]), name
 
 
 def test_environments_without_a_seed_differ():

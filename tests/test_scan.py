@@ -682,7 +682,7 @@ GOOD = dict(xy=[(0.0, 0.1)])
         (lambda: HeightScan.points(torch.zeros(4, 3)), "pattern: must be one or more points"),
         (lambda: HeightScan.points([(0.0, math.nan)]), "pattern: must be finite"),
         (lambda: HeightScan.feet(num_feet=0), "num_feet: must be positive"),
-        (lambda: HeightScan.feet(rings=[(0.1, 0)]), "pattern: must be one or more points"),
+        (lambda: HeightScan.feet(rings=[]), "pattern: must be one or more points"),
         (lambda: HeightScan.grid(resolution=0.3), "length_x: must be a whole number of times 0.3 m, got 5.33333"),
         (lambda: HeightScan.isaac_lab(resolution=0.0), "resolution: must be a positive number"),
         (lambda: MapImage(layers=("elevation", "height")), "layers: must be some of elevation, validity"),
@@ -705,7 +705,7 @@ def test_bad_settings_are_refused(make, message):
         (lambda e, T: ONE(e, T * 2), "T_map_base: must be rigid"),
         (lambda e, T: MapImage(length_x=0.4, length_y=0.4)(e, T[:1]), r"T_map_base: expected \(2, 4, 4\)"),
         (lambda e, T: ONE(e, T, torch.zeros(2, 4, 3)), "feet: must be left out, got feet for a scan around the base"),
-        (lambda e, T: HeightScan.feet(reach=0.3)(e, T), "feet: must be a torch.Tensor, got NoneType"),
+        (lambda e, T: HeightScan.feet(reach=0.3)(e, T), r"feet: expected \(2, 4, 3\), got None"),
         (lambda e, T: HeightScan.feet(reach=0.3)(e, T, T[:, :3, :3]), r"feet: expected \(2, 4, 3\), got \(2, 3, 3\)"),
         (lambda e, T: ONE(e, T, noise=True), "noise: must be off, as this scan has none, got on; build"),
         (lambda e, T: dataclasses.replace(ONE, noise=0.1)(e, T, noise=torch.rand(2)), r"noise: expected \(2, 1\)"),
@@ -724,3 +724,14 @@ def test_where_an_images_pixels_lie():
     torch.testing.assert_close(xy[0], torch.tensor([3.05, 5.85], dtype=torch.float64))
     torch.testing.assert_close(xy[1], torch.tensor([2.95, 5.85], dtype=torch.float64))
     torch.testing.assert_close(xy[7], torch.tensor([2.95, 6.15], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("rings", [(0.1, 8), [(0.1, 8, 1)], [(8, 0.1)], [(-0.1, 8)], [(0.1, 0)]])
+def test_rings_that_are_none_are_refused(rings):
+    with pytest.raises(ValueError, match="rings: must be pairs of a radius and a number of points"):
+        HeightScan.feet(rings=rings)
+
+
+def test_a_scan_around_feet_asks_for_them():
+    with pytest.raises(ValueError, match=r"feet: expected \(1, 4, 3\), got None; give the feet's positions"):
+        HeightScan.feet()(small_map(1, (30, 30)), pose())

@@ -254,3 +254,11 @@ def test_host_reads_nothing_back(monkeypatch):
 
 def test_the_table_names_every_kind():
     assert all(f"| {kind} |" in (terrain_shapes.__doc__ or "") for kind in KINDS)
+
+
+@pytest.mark.parametrize("level, kind, named", [(3, 0, "level"), (-1, 0, "level"), (0, 2, "kind"), (0, -1, "kind")])
+def test_tiles_that_do_not_exist_are_refused(level, kind, named):
+    grid = terrain_grid(["flat", "slope"], 3, length=4.0, resolution=0.1)
+    assert grid.tile_ids(torch.tensor([2]), torch.tensor([1])).tolist() == [5]
+    with pytest.raises(ValueError, match=f"{named}: must lie in"):
+        grid.tile_ids(torch.tensor([level]), torch.tensor([kind]))

@@ -288,6 +288,33 @@ def test_the_map_shows_the_ground_where_errors_are_none():
     assert float(error.median()) < 0.01 and float(error.quantile(0.99)) < 0.05
 
 
+def test_rays_start_where_cameras_are_and_points_go_where_odometry_says(monkeypatch):
+    task = TerrainNav(TerrainNavConfig(course=SMALL, sight=SightConfig(sensor_errors="perfect")), 3)
+    for _ in range(5):
+        task.advance(torch.ones(3, 2))
+        task.sense()
+    sight, T = task.sight, task.T_map_base
+    assert float((sight.T_estimated - T).abs().max()) > 1e-3
+    bent = torch.eye(4).repeat(3, 1, 1)
+    bent[:, :3, 3] = torch.tensor([0.1, -0.05, 0.02])
+    for errors in sight.sensor_errors:
+        monkeypatch.setattr(errors, "mounting", lambda: bent)
+    points, poses = sight.look(T, task.tile_ids)
+    for k, camera in enumerate(sight.cameras):
+        seen = camera(task.course.field, task.tile_ids, T, T_base_sensor=camera.T_base_sensor @ bent)
+        torch.testing.assert_close(points[:, k], seen, equal_nan=True)
+        torch.testing.assert_close(poses[:, k], sight.T_estimated @ camera.T_base_sensor)
+
+
+def test_each_look_casts_from_the_true_pose(monkeypatch):
+    task = TerrainNav(TerrainNavConfig(course=SMALL), 3)
+    asked, look = [], task.sight.look
+    monkeypatch.setattr(task.sight, "look", lambda T, tile_ids: asked.append(T) or look(T, tile_ids))
+    task.advance(torch.ones(3, 2))
+    task.sense()
+    torch.testing.assert_close(asked[0], task.T_map_base)
+
+
 def test_the_map_is_placed_by_odometry_that_drifts():
     task = TerrainNav(TerrainNavConfig(course=FLAT), 8)
     errors = []

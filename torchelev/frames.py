@@ -23,8 +23,8 @@ def transform(position: Float[Tensor, "B 3"], quat_wxyz: Float[Tensor, "B 4"]) -
     require(fits, "position, quat_wxyz", "must be (..., 3) and (..., 4)", came, "give one quaternion per position")
     if type(quat_wxyz) is Tensor and quat_wxyz.device.type == "cpu" and not torch.compiler.is_compiling():
         norm = torch.linalg.vector_norm(quat_wxyz.double(), dim=-1)
-        worst = float((norm - 1).abs().max()) if norm.numel() else 0.0
-        require(worst < 1e-3, "quat_wxyz", "must have norm 1", f"a norm off by {worst:.3g}", "divide it by its norm")
+        worst = float(norm.flatten()[(norm - 1).abs().argmax()]) if norm.numel() else 1.0
+        require(abs(worst - 1) < 1e-3, "quat_wxyz", "must have norm 1", f"{worst:.6g}", "divide it by its norm")
     w, x, y, z = quat_wxyz.unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), position[..., 0]],

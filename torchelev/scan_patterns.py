@@ -48,6 +48,11 @@ def centered(count: int, resolution: float, middle: float) -> list[float]:
 
 def ring_points(rings: Iterable[tuple[float, int]]) -> Points:
     """Return rings of (radius [m], number of points), one after the other; each starts at +x and turns left."""
+    rings = list(rings)
+    for ring in rings:
+        pair = isinstance(ring, list | tuple) and len(ring) == 2
+        good = pair and isinstance(ring[0], int | float) and ring[0] >= 0 and type(ring[1]) is int and ring[1] >= 1
+        require(good, "rings", "must be pairs of a radius and a number of points", ring, "give [(0.08, 6), (0.16, 8)]")
     angles = ((radius, 2 * math.pi * k / count) for radius, count in rings for k in range(count))
     return tuple((radius * math.cos(angle), radius * math.sin(angle)) for radius, angle in angles)
 

@@ -83,7 +83,9 @@ def main(
 ) -> None:
     """Train with rsl-rl's PPO, then evaluate on held-out ground with the map in the loop, and export.
 
-    OUT receives TensorBoard logs, checkpoints, result.json, episode.png, policy.pt (TorchScript) and policy.onnx.
+    OUT receives TensorBoard logs, checkpoints, result.json, episode.png, policy.pt and policy.onnx. policy.pt
+    (TorchScript) takes the observation "policy" (B, 12) and a list of "map" (B, 4, 16, 16); policy.onnx takes "obs"
+    (1, 12) and "map" (1, 4, 16, 16). Both return actions (B, 2).
     """
     device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
     checkpoint = out / CHECKPOINT
@@ -93,13 +95,16 @@ def main(
         raise click.UsageError(f"--out: {out} holds a training; add --resume, or choose another folder")
     runner = make_runner(num_envs, perception, seed, device, out, compiled)
     if resume:
-        runner.resume(checkpoint)
+        try:
+            runner.resume(checkpoint)
+        except ValueError as error:
+            raise click.UsageError(str(error)) from None
     left = iterations - runner.current_learning_iteration
     if left > 0:
         try:
             runner.learn(left, init_at_random_ep_len=not resume)
         except KeyboardInterrupt:
-            raise click.Abort from None
+            raise click.ClickException(f"stopped; {checkpoint} is saved, go on with --resume") from None
     runner.close()
     if int(os.environ.get("RANK", "0")) == 0:
         finish(runner, out, episodes, compiled)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,8 @@ def evaluate(
         task.reset(outcome.done)
         task.sense()
     shares = {name: float(share.float().mean()) for name, share in zip(ENDINGS, endings, strict=True)}
-    return shares | {"seconds": float(seconds.sum() / endings[0].sum().clamp(min=1)), "episodes": episodes}
+    reached = int(endings[0].sum())
+    return shares | {"seconds": float(seconds.sum()) / reached if reached else math.nan, "episodes": episodes}
 
 
 @torch.inference_mode()

@@ -122,6 +122,9 @@ PRESETS: dict[str, Callable[[], ErrorPreset]] = {
 
 
 def preset(name: str) -> ErrorPreset:
-    """Return a preset by name. Raises ValueError, naming them all, for another."""
+    """Return a preset by name: `SensorErrors(preset("depth_camera").sensor, num_envs)`, `PoseErrors(... .pose, ...)`.
+
+    Raises ValueError, naming them all, for another.
+    """
     require(name in PRESETS, "name", f"must be one of {', '.join(PRESETS)}", repr(name), "use one of them")
     return PRESETS[name]()

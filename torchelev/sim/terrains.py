@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchelev import checks
 from torchelev.errors import require
 from torchelev.sim.heightfield import HeightField
 from torchelev.sim.terrain_shapes import SHAPES, TABLE
@@ -45,12 +46,20 @@ class Terrain:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TerrainGrid(Terrain):
-    """Tiles of each kind at each level of difficulty, and the rule by which robots change level."""
+    """Tiles of each kind at each level of difficulty, and the rule by which robots change level: see `terrain_grid`."""
 
     num_levels: int
 
     def tile_ids(self, level: Int[Tensor, "B"], kind: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        """Return the tiles of levels 0 to num_levels - 1 and kinds, numbers in `kinds`."""
+        """Return the tiles of levels 0 to num_levels - 1 and kinds, numbers in `kinds`.
+
+        Raises ValueError for others, of tensors on the CPU.
+        """
+        for name, value, count in (("level", level, self.num_levels), ("kind", kind, len(self.kinds))):
+            if checks.readable(value) and value.numel():
+                low, high = int(value.min()), int(value.max())
+                inside = low >= 0 and high < count
+                require(inside, name, f"must lie in [0, {count})", f"{low}..{high}", "leave out the others")
         return level * len(self.kinds) + kind
 
     def promote(
