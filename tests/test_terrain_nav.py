@@ -10,6 +10,7 @@ import torch
 from envs.terrain_nav import CourseConfig, RobotConfig, SightConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.course import make_course
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
+from envs.terrain_nav.task import ENDINGS
 from torchelev.sim.heightfield import HeightField
 from training.nav_evaluate import evaluate, straight_line
 
@@ -118,7 +119,9 @@ def test_routes_are_of_the_wanted_length_between_level_places():
 
 def test_a_straight_line_fails_more_often_than_not():
     cfg = TerrainNavConfig(course=SMALL)
-    assert evaluate(straight_line, cfg, "truth", episodes=256)["success"] < 0.5
+    result = evaluate(straight_line, cfg, "truth", episodes=256)
+    assert result["success"] < 0.5
+    assert sum(result[name] for name in ENDINGS) == 1.0, "each robot counts once, by its first episode"
 
 
 def test_obstacles_leave_gaps_and_bad_settings_are_refused():

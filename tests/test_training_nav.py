@@ -12,6 +12,7 @@ import torch
 from click.testing import CliRunner
 
 import training.nav as nav
+import training.nav_export as nav_export
 from envs.terrain_nav import CourseConfig, SightConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav
 from training.runner import CHECKPOINT, ResumableRunner
@@ -120,6 +121,15 @@ def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkey
     assert json.loads((out / "result.json").read_text())["training"]["steps"] == 3 * 24 * 4
     missing = invoke("--out", tmp_path / "nowhere", "--resume")
     assert missing.exit_code == 2 and "leave --resume out" in missing.output
+
+
+def test_an_export_that_acts_otherwise_is_refused(tmp_path, monkeypatch):
+    runner = make_runner(tmp_path, "blind")
+    nav_export.export(runner, tmp_path)
+    run = nav_export._run_onnx
+    monkeypatch.setattr(nav_export, "_run_onnx", lambda path, observation: run(path, observation) + 0.01)
+    with pytest.raises(ValueError, match="policy.onnx: must act as the policy does, got an error of 0.01"):
+        nav_export.export(runner, tmp_path)
 
 
 def test_ctrl_c_leaves_a_checkpoint(tmp_path):

@@ -49,7 +49,7 @@ class Corners(NamedTuple):
     """The K cells that each point is read from; a cell's number H * W stands for nothing."""
 
     cell: Int[Tensor, "B KM"]
-    weight: Float[Tensor, "B K M"]  # 0 for nothing
+    weight: Float[Tensor, "B K M"]
 
 
 def sample_layer(
@@ -90,7 +90,7 @@ def _corners(uv: Tensor, grid: GridConfig, mode: str) -> Corners:
         weight = torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], 1)
     inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
     cell = (i * grid.width + j).to(torch.int64)
-    return Corners(_unless(inside, cell, grid.num_cells).flatten(1), weight * inside)
+    return Corners(_unless(inside, cell, grid.num_cells).flatten(1), weight)
 
 
 def _known(corners: Corners, known: Bool[Tensor, "B H W"]) -> Corners:
