@@ -107,16 +107,23 @@ def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype
     return torch.full((num_envs,), float(dt), device=device, dtype=dtype)
 
 
+def require_indices(
+    name: str, value: Tensor, count: int, mend: str = "leave out the others", always: bool = False
+) -> None:
+    """Refuse numbers outside of [0, count), where they may be read."""
+    if readable(value, always) and value.numel():
+        low, high = int(value.min()), int(value.max())
+        require(low >= 0 and high < count, name, f"must lie in [0, {count})", f"{low}..{high}", mend)
+
+
 def check_env_ids(env_ids: object, num_envs: int, device: torch.device, always: bool) -> Tensor:
     """Return ids (K,) int64: each in range, none twice."""
     is_mask = isinstance(env_ids, Tensor) and env_ids.dtype == torch.bool
     convert = "pass it as mask=" if is_mask else "convert it with .to(torch.int64)"
     value = check_tensor("env_ids", env_ids, device, (torch.int64,), convert)
     require(value.ndim == 1, "env_ids", "must be 1-D", tuple(value.shape), "flatten it, or pass mask=")
+    require_indices("env_ids", value, num_envs, always=always)
     if readable(value, always) and value.numel():
-        low, high = int(value.min()), int(value.max())
-        inside = low >= 0 and high < num_envs
-        require(inside, "env_ids", f"must lie in [0, {num_envs})", f"{low}..{high}", "leave out the others")
         unique = value.unique().numel() == value.numel()
         require(unique, "env_ids", "must not repeat", value.tolist(), "use torch.unique or pass mask=")
     return value

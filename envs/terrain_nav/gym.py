@@ -23,6 +23,13 @@ def _spaces(task: TerrainNav) -> tuple[spaces.Dict, spaces.Box]:
     return spaces.Dict(seen), spaces.Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32)
 
 
+def _seed(env: TerrainNavEnv | TerrainNavVectorEnv, seed: int | None) -> None:
+    """Seed the task from gymnasium's generator: when a seed is given, and the first time."""
+    if seed is not None or not env._seeded:
+        env.task.seed(int(env.np_random.integers(MOST_SEED)))
+        env._seeded = True
+
+
 class TerrainNavEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """One robot, NumPy in and out: `gymnasium.make("torchelev/TerrainNav-v0", perception="map")`."""
 
@@ -45,9 +52,7 @@ class TerrainNavEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode."""
         super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            self.task.seed(int(self.np_random.integers(MOST_SEED)))
-            self._seeded = True
+        _seed(self, seed)
         self.task.reset()
         self.task.sense()
         return self._observe(), self._info()
@@ -109,9 +114,7 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Begin episodes everywhere, or where `options["reset_mask"]` (B,) is true."""
         super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            self.task.seed(int(self.np_random.integers(MOST_SEED)))
-            self._seeded = True
+        _seed(self, seed)
         mask = (options or {}).get("reset_mask")
         mask = None if mask is None else torch.as_tensor(mask, dtype=torch.bool, device=self.task.device)
         self.task.reset(mask)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import readable
+from torchelev.checks import require_indices
 from torchelev.errors import require
 from torchelev.sim.heightfield import HeightField
 from torchelev.sim.tracing import HUGE, trace
@@ -92,10 +92,7 @@ def _check(field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Ten
     there = all(device == field.device for device in devices)
     require(there, "tile_ids, origin, directions", f"must be on {field.device}", devices, "move them, or the field")
     require(0 < max_range < math.inf, "max_range", "must be positive and finite", max_range, "give metres")
-    if readable(tile_ids) and B:
-        low, high = int(tile_ids.min()), int(tile_ids.max())
-        known = low >= 0 and high < field.num_tiles
-        require(known, "tile_ids", f"must lie in [0, {field.num_tiles})", f"{low}..{high}", "number tiles from 0")
+    require_indices("tile_ids", tile_ids, field.num_tiles, "number tiles from 0")
 
 
 def _check_boxes(boxes: Boxes, num_envs: int) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchelev import checks
+from torchelev.checks import require_indices
 from torchelev.errors import require
 from torchelev.sim.heightfield import HeightField
 from torchelev.sim.terrain_shapes import SHAPES, TABLE
@@ -55,11 +55,8 @@ class TerrainGrid(Terrain):
 
         Raises ValueError for others, of tensors on the CPU.
         """
-        for name, value, count in (("level", level, self.num_levels), ("kind", kind, len(self.kinds))):
-            if checks.readable(value) and value.numel():
-                low, high = int(value.min()), int(value.max())
-                inside = low >= 0 and high < count
-                require(inside, name, f"must lie in [0, {count})", f"{low}..{high}", "leave out the others")
+        require_indices("level", level, self.num_levels)
+        require_indices("kind", kind, len(self.kinds))
         return level * len(self.kinds) + kind
 
     def promote(
