@@ -167,3 +167,13 @@ def mapped(num_envs=2, scans=2, **stages):
         cloud, T = scan(k, num_envs)
         emap.update(cloud, T, T, 0.3)
     return emap
+
+
+class NoGenerator:
+    """Stands in for `torch.Generator` on "meta", which has none."""
+
+    def __init__(self, device):
+        pass
+
+    def manual_seed(self, seed):
+        return None

@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from conftest import NoGenerator
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -466,13 +467,6 @@ def test_presets_have_the_numbers_of_their_sources():
 
 def test_host_reads_nothing_back(monkeypatch):
     # Tensors on "meta" have no values, so that reading one raises.
-    class NoGenerator:
-        def __init__(self, device):
-            pass
-
-        def manual_seed(self, seed):
-            return None
-
     monkeypatch.setattr(torch, "Generator", NoGenerator)
     errors = SensorErrors(LIVELY, 2, "meta")
     for constructor in ("tensor", "as_tensor", "from_numpy"):

@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from conftest import pose
+from conftest import NoGenerator, pose
 
 from torchelev.sim.pose_error import PoseErrorConfig, PoseErrors
 from torchelev.sim.presets import PRESETS, preset
@@ -255,13 +255,6 @@ def test_bad_arguments_are_refused():
 
 def test_host_reads_nothing_back(monkeypatch):
     # Tensors on "meta" have no values, so that reading one raises.
-    class NoGenerator:
-        def __init__(self, device):
-            pass
-
-        def manual_seed(self, seed):
-            return None
-
     monkeypatch.setattr(torch, "Generator", NoGenerator)
     errors = PoseErrors(LIVELY, 2, "meta")
     for constructor in ("tensor", "as_tensor", "from_numpy"):
