@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchelev import ElevationMap, ElevationMapConfig, depth_to_points
 from torchelev.errors import require
-from torchelev.scan import MapImage
+from torchelev.map_image import MapImage
 
 Source = Callable[[Any], Any]
 READ = MapImage(length_x=1.6, length_y=1.0, resolution=0.1, layers=("elevation", "validity"))

@@ -126,7 +126,7 @@ class ElevationMapObservation(_MapObservation, gymnasium.Wrapper):
         T_map_sensor: env -> (4, 4) or (S, 4, 4), sensor frame to map frame.
         T_map_base: env -> (4, 4), the robot, which the map's window follows.
         dt: time of one step [s].
-        read: (emap, T_map_base (B, 4, 4)) -> (B, ...), such as a `torchelev.scan.MapImage`, or values and validity,
+        read: (emap, T_map_base (B, 4, 4)) -> (B, ...), such as a `torchelev.MapImage`, or values and validity,
             such as a `HeightScan`, which are stacked to (B, 2, ...); here B = 1. What is not finite becomes 0. None:
             elevation less the base's z, and validity, every 0.1 m of 1.6 x 1.0 m around the base.
         cfg: of the map.

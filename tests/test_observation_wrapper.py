@@ -18,8 +18,7 @@ from test_gpu import OPERATORS, OneDevice
 import envs.observation_wrapper
 from envs.map_feed import READ
 from envs.observation_wrapper import ElevationMapObservation, VectorElevationMapObservation
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.scan import HeightScan, MapImage
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
 
 CONFIG = small_config((24, 24))
 DT = 0.5  # [s]

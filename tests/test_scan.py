@@ -16,7 +16,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torchelev import ElevationMap, checks
 from torchelev.fill import FILLS, MODES, inpaint
-from torchelev.scan import CHANNELS, PRESETS, HeightScan, MapImage
+from torchelev.map_image import CHANNELS, MapImage
+from torchelev.scan import PRESETS, HeightScan
 from torchelev.scan_patterns import ALIGNMENTS, heading, steps
 
 SEEDS = st.integers(0, 10_000)

@@ -233,7 +233,7 @@ def test_bad_arguments_are_refused():
         make_terrain("flat", torch.zeros(2, 2))
     with pytest.raises(ValueError, match="length"):
         terrain("flat", 0.5, length=8.03)
-    with pytest.raises(ValueError, match="length"):
+    with pytest.raises(ValueError, match="resolution: must be a positive"):
         terrain("flat", 0.5, resolution=-0.1)
     with pytest.raises(ValueError, match="kinds"):
         terrain_grid([], 3)

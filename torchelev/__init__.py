@@ -6,9 +6,10 @@ from torchelev.drift import DriftConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.fusion import EdgeConfig, FusionConfig
 from torchelev.grid import GridConfig
+from torchelev.map_image import MapImage
 from torchelev.overlap import OverlapConfig
 from torchelev.raycast import RaycastConfig
-from torchelev.scan import HeightScan, MapImage
+from torchelev.scan import HeightScan
 from torchelev.sensor import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
 from torchelev.state import MapState, Measurement, Statistics
 from torchelev.surface import SurfaceConfig

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
+
 
 def message(argument: str, rule: str, came: object, mend: str) -> str:
     """Compose the text of an error."""
@@ -14,3 +17,20 @@ def require(
     """Raise `error` with a full message unless the rule holds."""
     if not holds:
         raise error(message(argument, rule, came, mend))
+
+
+def require_positive(**values: object) -> None:
+    """Refuse what is no positive, finite number."""
+    for name, value in values.items():
+        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+        require(number and value > 0, name, "must be a positive number", repr(value), "give metres")  # type: ignore[operator]
+
+
+def whole_cells(name: str, length: float, resolution: float) -> int:
+    """Return length / resolution, which must be a whole number."""
+    require_positive(resolution=resolution, **{name: length})
+    cells = length / resolution
+    whole = round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * cells
+    mend = f"try {max(1, round(cells)) * resolution:.6g}"
+    require(whole, name, f"must be a whole number of times {resolution:g} m", f"{cells:.6g} times", mend)
+    return round(cells)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
+from torchelev.errors import require_positive, whole_cells
 from torchelev.operators import cell_sums, moved
 from torchelev.state import BLANK, MapState, Measurement
 from torchelev.storage import as_bytes, as_mask, realize, realize_all
@@ -27,12 +26,9 @@ class GridConfig:
     length_y: float = 10.0  # [m]
 
     def __post_init__(self) -> None:
-        require(self.resolution > 0, "grid.resolution", "must be positive", self.resolution, "give metres per cell")
+        require_positive(**{"grid.resolution": self.resolution})
         for name in ("length_x", "length_y"):
-            cells = getattr(self, name) / self.resolution
-            whole = math.isfinite(cells) and round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * max(1.0, cells)
-            mend = f"try {max(1, round(cells)) * self.resolution:.6g}" if math.isfinite(cells) else "give metres"
-            require(whole, f"grid.{name}", "must be a whole number of cells", f"{cells:.6g} cells", mend)
+            whole_cells(f"grid.{name}", getattr(self, name), self.resolution)
 
     @property
     def height(self) -> int:

@@ -57,23 +57,6 @@ def ring_points(rings: Iterable[tuple[float, int]]) -> Points:
     return tuple((radius * math.cos(angle), radius * math.sin(angle)) for radius, angle in angles)
 
 
-def require_positive(**values: object) -> None:
-    """Refuse what is no positive, finite number."""
-    for name, value in values.items():
-        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        require(number and value > 0, name, "must be a positive number", repr(value), "give metres")  # type: ignore
-
-
-def whole_cells(name: str, length: float, resolution: float) -> int:
-    """Return length / resolution, which must be a whole number."""
-    require_positive(resolution=resolution, **{name: length})
-    cells = length / resolution
-    whole = round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * cells
-    mend = f"try {max(1, round(cells)) * resolution:.6g}"
-    require(whole, name, f"must be a whole number of times {resolution:g} m", f"{cells:.6g} times", mend)
-    return round(cells)
-
-
 def as_points(xy: Any) -> Points:
     """Return what may be a tensor, an array or a list of pairs as points."""
     rows = xy.tolist() if hasattr(xy, "tolist") else xy

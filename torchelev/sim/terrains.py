@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.checks import require_indices
-from torchelev.errors import require
+from torchelev.errors import require, whole_cells
 from torchelev.sim.heightfield import HeightField
 from torchelev.sim.terrain_shapes import SHAPES, TABLE
 
@@ -139,14 +139,12 @@ def _tiles(
         require(name in SHAPES, "kind", f"must be one of {', '.join(SHAPES)}", repr(name), "use one of them")
     within = difficulty.ndim == 1 and len(difficulty) > 0 and bool(((difficulty >= 0) & (difficulty <= 1)).all())
     require(within, "difficulty", "must be (K,) within 0 to 1", difficulty, "give one number for each tile")
-    cells = length / resolution if resolution > 0 else 0.0
-    fits = round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * cells
-    require(fits, "length", f"must be a multiple of the resolution {resolution}", length, "change one of them")
+    cells = whole_cells("length", length, resolution)
     # Drawn on the CPU: the tiles are then the same on all devices.
     random = torch.rand(len(difficulty), TABLE * TABLE, generator=torch.Generator().manual_seed(seed))
     difficulty = difficulty.float().cpu()
     kind = tuple(kinds[number] for number in kind_ids.tolist())
-    heights = _heights(kind, difficulty, random, round(cells) + 1, resolution)
+    heights = _heights(kind, difficulty, random, cells + 1, resolution)
     return {
         "field": HeightField(heights.to(device), resolution),
         "kind": kind,
