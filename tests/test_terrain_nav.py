@@ -6,11 +6,16 @@ import math
 import numpy as np
 import pytest
 import torch
+from conftest import NoGenerator
+from tensordict import TensorDict
 
+import envs.terrain_nav.task as task_module
 from envs.terrain_nav import CourseConfig, RobotConfig, SightConfig, TerrainNav, TerrainNavConfig
-from envs.terrain_nav.course import make_course
+from envs.terrain_nav.course import Course, make_course
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
+from envs.terrain_nav.rsl_rl import mirror
 from envs.terrain_nav.task import ENDINGS
+from torchelev.sim import mounted
 from torchelev.sim.heightfield import HeightField
 from training.nav_evaluate import evaluate, straight_line
 
@@ -366,3 +371,53 @@ def test_seeds_make_episodes():
         seen.append(rollout(task, 3)[-1])
     assert torch.equal(seen[0]["map"], seen[1]["map"]) and torch.equal(seen[0]["policy"], seen[1]["policy"])
     assert not torch.equal(seen[0]["policy"], seen[2]["policy"])
+
+
+@pytest.mark.parametrize("perception", ["map", "truth", "blind"])
+def test_host_reads_nothing_back_from_the_device(monkeypatch, perception):
+    # Tensors on "meta" have no values, so that reading one raises; copying one from the host needs a constructor.
+    course = make_course(SMALL)
+    ground = Ground(course.field, ROBOT.reach)
+    ground.field, ground.highest = ground.field.to("meta"), ground.highest.to("meta")
+    moved = [course.field, course.traversability, course.starts, course.goals]
+    monkeypatch.setattr(task_module, "make_course", lambda cfg, device: Course(*(part.to(device) for part in moved)))
+    monkeypatch.setattr(task_module, "Ground", lambda field, reach: ground)
+    monkeypatch.setattr(torch, "Generator", NoGenerator)
+    monkeypatch.setattr(mounted, "check_pose", lambda *_: None)  # reads the cameras' mountings when they are built
+    monkeypatch.setattr(TerrainNav, "seed", lambda *_: None)
+    rand = torch.rand
+    monkeypatch.setattr(torch, "rand", lambda *shape, generator, device: rand(*shape, device=device))
+    task = TerrainNav(TerrainNavConfig(course=SMALL), 3, "meta", perception)
+    for number in range(3):
+        if number:  # the first step copies patterns to the device
+            for name in ("tensor", "as_tensor", "from_numpy"):
+                monkeypatch.setattr(torch, name, None)
+        task.reset(task.advance(torch.empty(3, 2, device="meta")).done)
+        task.sense()
+        assert all(part.is_meta for part in [*task.observe().values(), *task.shares.values()])
+
+
+def test_a_mirror_exchanges_left_and_right():
+    task, mirrored = (TerrainNav(TerrainNavConfig(course=SMALL), 16, perception="truth", seed=3) for _ in range(2))
+    for field in ("field", "traversability"):
+        flipped = HeightField(getattr(task.course, field).heights.flip(2), SMALL.resolution)
+        mirrored.course = dataclasses.replace(mirrored.course, **{field: flipped})
+    mirrored.ground = Ground(mirrored.course.field, ROBOT.reach)
+    mirrored.truth.course = mirrored.sight.course = mirrored.course
+    for name in ("xy", "goal"):
+        getattr(mirrored, name).mul_(torch.tensor([1.0, -1.0]))
+    mirrored.yaw.neg_()
+    mirrored.sight.noise.zero_(), task.sight.noise.zero_()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(10):
+        seen = {name: TensorDict(each.observe(), batch_size=[16]) for name, each in (("", task), ("mirror", mirrored))}
+        doubled, _ = mirror(None, seen[""])
+        assert doubled.batch_size == (32,)
+        for name, expected in seen["mirror"].items():
+            assert torch.equal(doubled[name][:16], seen[""][name])
+            torch.testing.assert_close(doubled[name][16:], expected, atol=1e-4, rtol=1e-4)
+        action = 2 * torch.rand(16, 2, generator=generator) - 1
+        _, actions = mirror(None, None, action)
+        assert torch.equal(actions[:16], action)
+        outcomes = task.advance(action), mirrored.advance(actions[16:])
+        torch.testing.assert_close(*outcomes, atol=1e-4, rtol=1e-4)

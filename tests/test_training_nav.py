@@ -118,7 +118,9 @@ def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkey
     refused = invoke(*common)
     assert refused.exit_code == 2 and "add --resume" in refused.output
     assert invoke(*common, "--iterations", 3, "--resume").exit_code == 0
-    assert json.loads((out / "result.json").read_text())["training"]["steps"] == 3 * 24 * 4
+    strict = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
+    assert strict["training"]["steps"] == 3 * 24 * 4 and strict["evaluation"]["seconds"] is None, "nobody arrives"
+    assert "has 3 iterations already: only evaluating" in invoke(*common, "--iterations", 2, "--resume").output
     missing = invoke("--out", tmp_path / "nowhere", "--resume")
     assert missing.exit_code == 2 and "leave --resume out" in missing.output
 

@@ -12,7 +12,7 @@ import torch
 
 from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.config import PERCEPTION
-from envs.terrain_nav.rsl_rl import RslRlTerrainNav
+from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
 from training.nav_evaluate import evaluate, picture
 from training.nav_export import export
 from training.runner import CHECKPOINT, ResumableRunner
@@ -39,6 +39,7 @@ def ppo_config(num_steps: int = 24, save_interval: int = 10) -> dict[str, Any]:
             "gamma": 0.98,
             "lam": 0.95,
             "entropy_coef": 0.003,
+            "symmetry_cfg": {"data_augmentation_func": mirror, "use_data_augmentation": True},
         },
         "actor": model | {"cnn_cfg": dict(cnn), "distribution_cfg": gaussian},
         "critic": model | {"cnn_cfg": dict(cnn)},
@@ -62,7 +63,7 @@ def make_runner(
 
 @click.command()
 @click.option("--num-envs", default=256, show_default=True, help="Robots at once.")
-@click.option("--iterations", default=180, show_default=True, help="PPO iterations in all, those of --resume included.")
+@click.option("--iterations", default=140, show_default=True, help="PPO iterations in all, those of --resume included.")
 @click.option("--perception", type=click.Choice(PERCEPTION), default="map", show_default=True)
 @click.option("--seed", default=0, show_default=True)
 @click.option("--device", default=None, help="Default: a GPU if there is one.")
@@ -100,7 +101,9 @@ def main(
         except ValueError as error:
             raise click.UsageError(str(error)) from None
     left = iterations - runner.current_learning_iteration
-    if left > 0:
+    if left <= 0:
+        click.echo(f"{checkpoint} has {runner.current_learning_iteration} iterations already: only evaluating it.")
+    else:
         try:
             runner.learn(left, init_at_random_ep_len=not resume)
         except KeyboardInterrupt:
@@ -110,11 +113,11 @@ def main(
         finish(runner, out, episodes, compiled)
 
 
-def finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> dict[str, float]:
+def finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> dict[str, float | None]:
     """Evaluate with the map in the loop, draw an episode, export; return the evaluation."""
     policy = runner.get_inference_policy(device=runner.device)
     result = evaluate(policy, task_config(held_out=True), "map", episodes, runner.device, compiled)
-    click.echo(" ".join(f"{name} {value:.3f}" for name, value in result.items()))
+    click.echo(" ".join(f"{name} {value:.3f}" for name, value in result.items() if value is not None))
     picture(policy, task_config(held_out=True), out / "episode.png", runner.device)
     export(runner, out)
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,8 +36,8 @@ def evaluate(
     device: str = "cpu",
     compiled: bool = False,
     seed: int = 7,
-) -> dict[str, float]:
-    """Run that many first episodes; return the share of each ending and the mean time to success [s]."""
+) -> dict[str, float | None]:
+    """Run that many first episodes; return the share of each ending and the mean time to success [s], if any did."""
     task = TerrainNav(cfg, episodes, device, perception, seed, compiled)
     endings = torch.zeros(len(ENDINGS), episodes, dtype=torch.bool, device=device)
     seconds = torch.zeros(episodes, device=device)
@@ -53,7 +52,7 @@ def evaluate(
         task.sense()
     shares = {name: float(share.float().mean()) for name, share in zip(ENDINGS, endings, strict=True)}
     reached = int(endings[0].sum())
-    return shares | {"seconds": float(seconds.sum()) / reached if reached else math.nan, "episodes": episodes}
+    return shares | {"seconds": float(seconds.sum()) / reached if reached else None, "episodes": episodes}
 
 
 @torch.inference_mode()

@@ -25,7 +25,7 @@ from training.nav_evaluate import Policy, evaluate, straight_line
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
-ITERATIONS, NUM_ENVS, EPISODES = 180, 256, 512
+ITERATIONS, NUM_ENVS, EPISODES = 140, 256, 512
 RESULTS = Path(__file__).parent / "results"
 NAMES = {"map": "map in the loop", "truth": "truth with white noise", "blind": "blind"}
 

@@ -75,7 +75,8 @@ class SightConfig:
     crop_length: float = 3.2  # [m] side of the crop, in the base's yaw frame
     crop_resolution: float = 0.2  # [m]
     crop_ahead: float = 0.8  # [m] of the crop's middle before the base
-    camera_pixels: tuple[int, int] = (16, 16)  # width, height of each depth camera
+    camera_yaws_deg: tuple[float, ...] = (45.0, -45.0)  # where each depth camera looks, counted from ahead
+    camera_pixels: tuple[int, int] = (16, 16)  # width, height of each
     camera_fov_deg: tuple[float, float] = (90.0, 60.0)
     camera_pitch_deg: float = 32.0  # downwards
     max_range: float = 5.0  # [m]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.terrain_nav.task import NUM_ACTIONS, TerrainNav
+from envs.terrain_nav.task import ASIDE, NUM_ACTIONS, TerrainNav
 
 
 class RslRlTerrainNav(VecEnv):
@@ -46,3 +47,26 @@ class RslRlTerrainNav(VecEnv):
         log = {f"/{name}": share for name, share in self.task.shares.items()}
         extras = {"time_outs": outcome.truncated.float(), "log": log}
         return self.get_observations(), outcome.reward, outcome.done.long(), extras
+
+
+def mirror(
+    env: VecEnv, obs: TensorDict | None = None, actions: Tensor | None = None
+) -> tuple[TensorDict | None, Tensor | None]:
+    """Append to N samples the same with left and right exchanged (2N): rsl-rl's `data_augmentation_func`.
+
+    The task looks the same in a mirror as long as the cameras do, so that each step teaches twice. After Mittal et al.,
+    "Symmetry Considerations for Learning Task Symmetric Robot Policies" (ICRA 2024).
+    """
+    if obs is not None:
+        seen = {name: image.flip(-1) for name, image in obs.items() if name != "policy"}  # columns grow with y
+        seen["policy"] = _turned(obs["policy"], ASIDE)
+        obs = torch.cat([obs, TensorDict(seen, batch_size=obs.batch_size)])
+    if actions is not None:
+        actions = torch.cat([actions, _turned(actions, (1,))])
+    return obs, actions
+
+
+def _turned(values: Tensor, which: tuple[int, ...]) -> Tensor:
+    sign = torch.ones(values.shape[-1], device=values.device)
+    sign[list(which)] = -1.0
+    return values * sign

@@ -94,8 +94,14 @@ class Truth(Blind):
         return torch.stack([elevation, elevation, torch.ones_like(elevation), rating], 1)
 
 
+def _mounting(yaw: float, cfg: TerrainNavConfig) -> Tensor:
+    """Return T_base_sensor (4, 4) of a camera at the rim of the robot's body that looks out and down."""
+    place = [cfg.robot.length / 2 * math.cos(yaw), cfg.robot.width / 2 * math.sin(yaw), 0.05]
+    return pose(torch.tensor(place), torch.tensor(yaw), math.radians(cfg.sight.camera_pitch_deg)).float()
+
+
 class Mapped(Blind):
-    """Sees with two depth cameras, fore and aft, whose points an elevation map fuses at poses that drift."""
+    """Sees with depth cameras whose points an elevation map fuses, at poses that drift."""
 
     T_estimated: Tensor
 
@@ -107,12 +113,10 @@ class Mapped(Blind):
         if compiled:
             self.emap.compile()
         camera = DepthCamera(*sight.camera_pixels, *sight.camera_fov_deg, max_range=sight.max_range)
-        ahead, aft = (torch.tensor([x, 0.0, 0.05]) for x in (0.3, -0.3))
-        pitch = math.radians(sight.camera_pitch_deg)
-        mounts = (pose(place, torch.tensor(yaw), pitch) for place, yaw in ((ahead, 0.0), (aft, math.pi)))
-        self.cameras = [MountedSensor(camera, T.to(device, torch.float32)) for T in mounts]
+        mounts = (_mounting(math.radians(yaw), cfg) for yaw in sight.camera_yaws_deg)
+        self.cameras = [MountedSensor(camera, T.to(device)) for T in mounts]
         sensor, odometry = preset(sight.sensor_errors).sensor, preset(sight.pose_errors).pose
-        self.sensor_errors = nn.ModuleList(SensorErrors(sensor, num_envs, device) for _ in range(2))
+        self.sensor_errors = nn.ModuleList(SensorErrors(sensor, num_envs, device) for _ in self.cameras)
         self.pose_errors = PoseErrors(odometry, num_envs, device)
         self.register_buffer("T_estimated", torch.eye(4, device=device).repeat(num_envs, 1, 1))
 
@@ -132,7 +136,7 @@ class Mapped(Blind):
         self.emap.update(points, T_map_sensor, self.T_estimated, dt)
 
     def look(self, T_map_base: Tensor, tile_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the cameras' points (B, 2, M, 3) and where they are believed to be (B, 2, 4, 4)."""
+        """Return the K cameras' points (B, K, M, 3) and where they are believed to be (B, K, 4, 4)."""
         clouds = []
         for camera, errors in zip(self.cameras, self.sensor_errors, strict=True):
             mounting = camera.T_base_sensor @ errors.mounting()

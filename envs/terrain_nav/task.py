@@ -18,6 +18,7 @@ from envs.terrain_nav.sight import SIGHTS, Truth
 from torchelev.errors import require
 
 NUM_ACTIONS = 2  # forward speed and yaw rate
+ASIDE = (1, 4, 6, 8, 10)  # entries of the observation "policy" that a mirror turns round
 ENDINGS = ("success", "fallen", "stuck", "truncated")
 
 
