@@ -1,12 +1,16 @@
 """What is written of a map can be read back, and lies where the map lay."""
 
+import dataclasses
+
 import numpy as np
 import plyfile
 import pytest
 import torch
+from conftest import small_config
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.export import load_npz, save_mesh, save_npz, triangulate
+from torchelev.export import load_npz, save_cloud, save_mesh, save_npz, take, to_mesh, to_points, triangulate
+from torchelev.filters import FilterConfig, register
 
 
 @pytest.fixture
@@ -72,3 +76,69 @@ def test_mesh_leaves_holes_open():
 def test_mesh_of_an_empty_map(tmp_path, emap):
     assert save_mesh(tmp_path / "empty.ply", emap, env=0) == 0
     assert plyfile.PlyData.read(tmp_path / "empty.ply")["vertex"].count == 0
+
+
+def test_points_are_the_known_cells(tmp_path, emap):
+    points = to_points(emap, env=1)
+    known = emap.validity[1]
+    expected = torch.cat([emap.cell_centers()[1][known], emap.elevation[1][known][:, None].double()], -1)
+    np.testing.assert_allclose(points, expected, rtol=0, atol=1e-9)
+    assert points.dtype == np.float64 and len(points) == 20 * 8
+    assert save_cloud(tmp_path / "cloud.ply", emap, env=1) == len(points)
+    data = plyfile.PlyData.read(tmp_path / "cloud.ply")
+    assert [element.name for element in data.elements] == ["vertex"]
+    np.testing.assert_array_equal(np.stack([data["vertex"][axis] for axis in "xyz"], -1), points)
+
+
+def test_points_and_mesh_of_another_layer_share_its_known_cells(emap):
+    vertices, triangles = to_mesh(emap, env=1, layer="validity")
+    assert len(vertices) == 20 * 10 and len(triangles) == 2 * 19 * 9 and set(vertices[:, 2]) == {0.0, 1.0}
+    np.testing.assert_array_equal(to_points(emap, env=1, layer="validity"), vertices)
+
+
+def test_a_cloud_of_an_empty_map(tmp_path, emap):
+    assert to_points(emap, env=0).shape == (0, 3)
+    assert save_cloud(tmp_path / "empty.ply", emap) == 0
+
+
+def test_takes_the_layers_that_are_asked_for(emap):
+    assert list(take(emap, layers=("variance", "time")).layers) == ["variance", "time"]
+    with pytest.raises(KeyError, match="height"):
+        take(emap, layers=("height",))
+    for env in (2, -1):
+        with pytest.raises(ValueError, match=rf"env: must lie in \[0, 2\), got {env}"):
+            take(emap, env=env)
+
+
+def test_takes_bfloat16_as_float32(emap):
+    heights = take(emap.to(torch.bfloat16), env=1).layers["elevation"]
+    assert heights.dtype == np.float32
+    np.testing.assert_array_equal(heights, emap.layer("elevation")[1].float().numpy())
+
+
+def test_refuses_what_is_no_npz(tmp_path):
+    (tmp_path / "map.npz").write_text("elevation")
+    with pytest.raises(ValueError, match=r"map\.npz: must be an \.npz file, got another"):
+        load_npz(tmp_path / "map.npz")
+
+
+@register
+def seven_everywhere(layer):
+    return torch.full_like(layer[0], 7.0), torch.ones_like(layer[1])
+
+
+def with_filter(name):
+    """A map with one filter, which makes a layer of this name."""
+    step = FilterConfig(layer=name, filter="seven_everywhere")
+    return ElevationMap(dataclasses.replace(small_config(), filters=(step,)))
+
+
+def test_layers_of_filters_are_saved_too(tmp_path):
+    save_npz(tmp_path / "map.npz", with_filter("more"))
+    saved = load_npz(tmp_path / "map.npz")
+    assert list(saved.layers)[-1] == "more" and (saved.layers["more"] == 7).all()
+
+
+def test_refuses_a_layer_named_as_a_fact(tmp_path):
+    with pytest.raises(ValueError, match="layers: must not be named resolution, center, axes, config, got center"):
+        save_npz(tmp_path / "map.npz", with_filter("center"))

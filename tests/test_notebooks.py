@@ -12,8 +12,8 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_it_runs(path):
     notebook = nbformat.read(path, as_version=4)
-    shortened = [cell for cell in notebook.cells if "ITERATIONS = 60" in cell.source]
-    assert len(shortened) == 1
+    trains = sum("ITERATIONS = 60" in cell.source for cell in notebook.cells)
+    assert trains == (path.stem == "01_map_in_the_loop")
     for cell in notebook.cells:
         for long, short in (("ITERATIONS = 60", "ITERATIONS = 2"), ("compiled=True", "compiled=False"), ("=128", "=8")):
             cell.source = cell.source.replace(long, short)

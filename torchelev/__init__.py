@@ -4,6 +4,7 @@ from torchelev.aging import AgingConfig
 from torchelev.config import ElevationMapConfig
 from torchelev.drift import DriftConfig
 from torchelev.elevation_map import ElevationMap
+from torchelev.filters.chain import FilterConfig
 from torchelev.fusion import EdgeConfig, FusionConfig
 from torchelev.grid import GridConfig
 from torchelev.map_image import MapImage
@@ -24,6 +25,7 @@ __all__ = [
     "ElevationMap",
     "ElevationMapConfig",
     "ExclusionConfig",
+    "FilterConfig",
     "FusionConfig",
     "GridConfig",
     "HeightScan",

@@ -11,6 +11,7 @@ from typing import Any
 from torchelev.aging import AgingConfig
 from torchelev.drift import DriftConfig
 from torchelev.errors import require
+from torchelev.filters.chain import FilterConfig, filters_from_list
 from torchelev.fusion import FusionConfig
 from torchelev.grid import GridConfig
 from torchelev.overlap import OverlapConfig
@@ -22,7 +23,10 @@ from torchelev.traversability import TraversabilityConfig
 
 @dataclass(frozen=True, kw_only=True)
 class ElevationMapConfig:
-    """All stages; None switches drift, raycast, overlap or traversability off (and `fusion.edges`)."""
+    """All stages; None switches drift, raycast, overlap or traversability off (and `fusion.edges`).
+
+    `filters` make further layers when they are read, see `torchelev.filters`.
+    """
 
     grid: GridConfig = field(default_factory=GridConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
@@ -33,9 +37,15 @@ class ElevationMapConfig:
     overlap: OverlapConfig | None = field(default_factory=OverlapConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     traversability: TraversabilityConfig | None = field(default_factory=TraversabilityConfig)
+    filters: tuple[FilterConfig, ...] = ()
 
     def __post_init__(self) -> None:
+        chain = isinstance(self.filters, tuple) and all(isinstance(step, FilterConfig) for step in self.filters)
+        mend = "give (FilterConfig(layer=..., filter=...), ...)"
+        require(chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), mend, TypeError)
         for name, hint in typing.get_type_hints(type(self)).items():
+            if name == "filters":
+                continue
             value, kinds = getattr(self, name), typing.get_args(hint) or (hint,)
             rule = f"must be {' or '.join('None' if kind is type(None) else f'a {kind.__name__}' for kind in kinds)}"
             mend = "give an object, or build the whole with ElevationMapConfig.from_dict"
@@ -43,7 +53,8 @@ class ElevationMapConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain dicts, as written to YAML and to `state_dict`."""
-        return dataclasses.asdict(self)
+        filters = [step.to_dict() for step in self.filters]
+        return dataclasses.asdict(dataclasses.replace(self, filters=())) | {"filters": filters}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ElevationMapConfig:
@@ -51,7 +62,10 @@ class ElevationMapConfig:
 
         Raises ValueError for an unknown key, naming it and what exists.
         """
-        return _build(cls, values, "config")
+        if not isinstance(values, dict) or "filters" not in values:
+            return _build(cls, values, "config")
+        stages = {name: value for name, value in values.items() if name != "filters"}
+        return dataclasses.replace(_build(cls, stages, "config"), filters=filters_from_list(values["filters"]))
 
 
 def _build(cls: type, values: object, where: str) -> Any:

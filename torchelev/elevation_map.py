@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from typing import TYPE_CHECKING, Any, cast
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 from torchelev import checks
 from torchelev.config import ElevationMapConfig, differing_fields
 from torchelev.errors import require
+from torchelev.filters.chain import FilterChain
 from torchelev.grid import cell_centers
 from torchelev.initialize import METHODS, interpolate
 from torchelev.layers import LAYERS, Layer, sample_layer
@@ -65,6 +67,9 @@ class ElevationMap(nn.Module):
         require(some, "chunk", "must be a positive int or None", repr(chunk), "give a number of environments")
         self.cfg, self.num_envs, self.check_values, self.chunk = cfg, num_envs, check_values, chunk
         self._compiled = False
+        self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
+        self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
+        self._filtered: dict[str, Layer] = {}  # what filters made of the stored state
         state = blank_state(cfg.grid, num_envs, device, torch.float32)
         for name, value in state._asdict().items():
             if name != "statistics":
@@ -94,6 +99,7 @@ class ElevationMap(nn.Module):
 
     def _store(self, state: MapState) -> None:
         # Copied, not rebound: see the rules on deepcopy and inference mode in CONTRIBUTING.md.
+        self._filtered.clear()
         with torch.no_grad():
             write(self.state, state)
 
@@ -107,10 +113,16 @@ class ElevationMap(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Refuse a checkpoint of another config, naming the settings that differ, before anything changed."""
         extra = state_dict.get(f"{prefix}_extra_state")
-        fields = differing_fields(self.cfg.to_dict(), extra["config"]) if extra else []
+        there = {**extra["config"], "filters": self.cfg.to_dict()["filters"]} if extra else {}  # they hold no state
+        fields = differing_fields(self.cfg.to_dict(), there) if extra else []
         mend = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", mend)
+        self._filtered.clear()
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> ElevationMap:
+        self._filtered.clear()
+        return super()._apply(*args, **kwargs)
 
     # Writing --------------------------------------------------------------------------------------------------------
 
@@ -137,7 +149,8 @@ class ElevationMap(nn.Module):
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
         if self.device.type == "cpu":
             keep_freed_memory()
-        run = functools.partial(compiled_update if self._compiled else update_in_place, cfg=self.cfg)
+        run = functools.partial(compiled_update if self._compiled else update_in_place, cfg=self._stages)
+        self._filtered.clear()
         with torch.no_grad():
             chunks = self._chunks()
             if len(chunks) == 1:
@@ -213,6 +226,7 @@ class ElevationMap(nn.Module):
             require(fits, "mask", f"expected ({self.num_envs},)", tuple(mask.shape), "give one bool per environment")
         if env_ids is not None:
             env_ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
+        self._filtered.clear()
         with torch.no_grad():
             forget(self.state, self.cfg.grid, env_ids, mask)
 
@@ -254,22 +268,39 @@ class ElevationMap(nn.Module):
         return cell_centers(self.corner, self.cfg.grid)
 
     def layer(self, name: str, *, state: MapState | None = None) -> Float[Tensor, "B H W"]:
-        """Return a fresh tensor of one layer, NaN where unknown.
+        """Return a fresh tensor of one layer, NaN where unknown: one of the map's, or of the configured filters'.
 
         elevation, upper_bound [m]; variance [m^2]; time [s] since the last hit; traversability, 0 to 1, the better;
         normal_x, normal_y, normal_z of unit length; validity, 1 where the elevation is known, else 0. The upper bound
-        equals the elevation where that is known; elsewhere the ground lies no higher, as rays passed above it.
+        equals the elevation where that is known; elsewhere the ground lies no higher, as rays passed above it. A
+        filter runs when its layer is read, with those it needs, and again only after something was stored.
         Raises KeyError for an unknown name.
         """
         values, known = self._read(name, state)
         return torch.where(known, values, torch.nan)
 
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """The names of all layers: the map's, then those of the configured filters."""
+        return (*LAYERS, *self.filters.inputs)
+
     def _read(self, name: str, state: MapState | None) -> Layer:
-        mend = f"there are {', '.join(LAYERS)}"
-        require(name in LAYERS, "layer", "must be a layer's name", repr(name), mend, KeyError)
-        values, known = LAYERS[name](self.state if state is None else state)
-        unrated = name == "traversability" and self.cfg.traversability is None
-        return values, torch.zeros_like(known) if unrated else known
+        require(
+            name in self.layers,
+            "layer",
+            "must be a layer's name",
+            repr(name),
+            f"there are {', '.join(self.layers)}",
+            KeyError,
+        )
+        if name not in self.filters:
+            values, known = LAYERS[name](self.state if state is None else state)
+            unrated = name == "traversability" and self.cfg.traversability is None
+            return values, torch.zeros_like(known) if unrated else known
+        if state is not None:
+            return self.filters.read(name, lambda source: self._read(source, state), {})
+        with torch.inference_mode(False), torch.no_grad():  # kept, and perhaps read outside of inference mode later
+            return self.filters.read(name, lambda source: self._read(source, None), self._filtered)
 
     def sample(
         self,

@@ -106,7 +106,7 @@ def _panel_size(extent: tuple[float, float, float, float]) -> tuple[float, float
 
 def _draw_panel(figure: Figure, ax: Axes, panel: Panel, extent, path_xy: NDArray | None) -> None:
     values = np.ma.masked_invalid(np.asarray(panel.values, dtype=float))
-    vmin, vmax = _limits(panel, values)
+    vmin, vmax = limits(panel, values)
     ax.set_facecolor(UNKNOWN_COLOR)
     # imshow takes rows downwards; the map's first index is x. Transposed and with its origin below, x runs right, y up.
     image = ax.imshow(
@@ -119,7 +119,8 @@ def _draw_panel(figure: Figure, ax: Axes, panel: Panel, extent, path_xy: NDArray
     bar.set_label(f"[{panel.unit}]" if panel.unit else "")
 
 
-def _limits(panel: Panel, values: np.ma.MaskedArray) -> tuple[float, float]:
+def limits(panel: Panel, values: np.ma.MaskedArray) -> tuple[float, float]:
+    """Return a panel's limits, those that it leaves open from its values."""
     known = values.compressed()
     low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
     vmin = float(low) if panel.vmin is None else panel.vmin

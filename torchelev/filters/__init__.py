@@ -1,0 +1,81 @@
+"""Filters from layers to layers, batched over maps, each a function that is known by its name.
+
+A layer is (values, known), both (B, H, W), as `as_layer` makes of values with NaN. A filter is called itself, as a
+module, or in a chain that a map's config holds:
+
+```python
+smooth = filters.gaussian(layer, resolution=0.04, sigma=0.1)
+smooth = filters.Filter("gaussian", sigma=0.1)(layer, resolution=0.04)
+cfg = ElevationMapConfig(filters=(FilterConfig(layer="smooth", filter="gaussian", settings={"sigma": 0.1}),))
+```
+"""
+
+from torchelev.filters.chain import FilterChain, FilterConfig
+from torchelev.filters.distance import signed_distance
+from torchelev.filters.distance_field import SignedDistanceField
+from torchelev.filters.expression import Expression, expression
+from torchelev.filters.extrema import closing, dilation, erosion, maximum, minimum, opening
+from torchelev.filters.footholds import foothold_score
+from torchelev.filters.geometry import (
+    curvature,
+    normal_x,
+    normal_y,
+    normal_z,
+    roughness,
+    slope,
+    standard_deviation,
+    step_height,
+    traversability_three_part,
+)
+from torchelev.filters.inpainting import (
+    fill_from,
+    inpaint_diffusion,
+    inpaint_minimum,
+    inpaint_navier_stokes,
+    inpaint_nearest,
+    inpaint_telea,
+)
+from torchelev.filters.registry import FILTERS, Filter, as_layer, as_nan, register
+from torchelev.filters.smoothing import box, gaussian, median
+from torchelev.filters.virtual_floor import smooth_ground, virtual_floor
+
+__all__ = [
+    "FILTERS",
+    "Expression",
+    "Filter",
+    "FilterChain",
+    "FilterConfig",
+    "SignedDistanceField",
+    "as_layer",
+    "as_nan",
+    "box",
+    "closing",
+    "curvature",
+    "dilation",
+    "erosion",
+    "expression",
+    "fill_from",
+    "foothold_score",
+    "gaussian",
+    "inpaint_diffusion",
+    "inpaint_minimum",
+    "inpaint_navier_stokes",
+    "inpaint_nearest",
+    "inpaint_telea",
+    "maximum",
+    "median",
+    "minimum",
+    "normal_x",
+    "normal_y",
+    "normal_z",
+    "opening",
+    "register",
+    "roughness",
+    "signed_distance",
+    "slope",
+    "smooth_ground",
+    "standard_deviation",
+    "step_height",
+    "traversability_three_part",
+    "virtual_floor",
+]

@@ -1,0 +1,146 @@
+"""Filters by name: functions from layers to a layer, and a module that holds one with its settings.
+
+A filter is a function of one or more layers, each (values, known) of shape (B, H, W), and of keyword-only settings. It
+returns a layer. `register` makes it known by its name, and keeps what is not known from every filter: values are 0
+there, coming in and going out, so that no NaN of a user's reaches a sum or a gradient.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from torchelev.errors import require, require_positive
+from torchelev.layers import Layer
+from torchelev.storage import as_bytes
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+CPU_CELLS = 2**16  # filtered at a time on a CPU
+FILTERS: dict[str, Callable[..., Layer]] = {}
+F = TypeVar("F", bound=Callable[..., Layer])
+
+
+def register(function: F) -> F:
+    """Make a function a filter, known by its name.
+
+    Its positional parameters are layers; its keyword-only ones are settings, of which `resolution` [m] is given by the
+    map. It filters each map on its own: on a CPU it is given a few of many maps at a time. Raises ValueError for a name
+    that is taken.
+    """
+    name = function.__name__
+    taken = FILTERS.get(name)
+    ours = taken is None or (taken.__module__, taken.__qualname__) == (function.__module__, function.__qualname__)
+    require(ours, "function", "must have a name of its own", repr(name), "choose another name")
+
+    @functools.wraps(function)
+    def checked(*layers: Layer, **settings: Any) -> Layer:
+        check_layers(name, layers)
+        parts = [masked(function(*map(masked, part), **settings)) for part in _parts(layers)]
+        if len(parts) == 1:
+            return parts[0]
+        return torch.cat([values for values, _ in parts]), torch.cat([known for _, known in parts])
+
+    FILTERS[name] = checked
+    return checked  # type: ignore[return-value]
+
+
+def check_layers(name: str, layers: tuple[Layer, ...]) -> None:
+    """Raise ValueError unless layers are (B, H, W) with a mask each, all of one shape."""
+    shapes = []
+    for number, (values, known) in enumerate(layers):
+        argument = f"{name}, layer {number}"
+        fits = values.ndim == 3 and values.shape == known.shape and values.is_floating_point()
+        came = f"{tuple(values.shape)} {values.dtype} and {tuple(known.shape)}"
+        require(fits, argument, "expected values (B, H, W) of floats and known (B, H, W)", came, "see as_layer")
+        require(known.dtype == torch.bool, argument, "known must be bool", known.dtype, "see as_layer")
+        shapes.append(values.shape)
+    same = len(set(shapes)) == 1
+    require(same, name, "expected one or more layers of one shape", [tuple(s) for s in shapes], "read them from a map")
+
+
+def masked(layer: Layer) -> Layer:
+    """Put 0 where nothing is known, and for what is not finite; `torch.where` takes five times as long on a CPU."""
+    values, known = layer
+    return values.nan_to_num(0.0, 0.0, 0.0) * as_bytes(known).to(values.dtype), known
+
+
+def _parts(layers: tuple[Layer, ...]) -> list[list[Layer]]:
+    """Divide the maps into parts that fit into a CPU's caches."""
+    maps, height, width = layers[0][0].shape
+    some = max(1, CPU_CELLS // max(1, height * width)) if layers[0][0].device.type == "cpu" else max(1, maps)
+    if maps <= some:
+        return [list(layers)]
+    pieces = [zip(values.split(some), known.split(some), strict=True) for values, known in layers]
+    return [list(part) for part in zip(*pieces, strict=True)]
+
+
+def settings_of(name: str) -> dict[str, inspect.Parameter]:
+    """Return the settings that a filter takes, `resolution` left out."""
+    parameters = inspect.signature(FILTERS[name]).parameters
+    return {n: p for n, p in parameters.items() if p.kind is p.KEYWORD_ONLY and n != "resolution"}
+
+
+def as_layer(values: Float[Tensor, "B H W"]) -> Layer:
+    """Turn values, NaN or inf where unknown, into a layer."""
+    known = torch.isfinite(values)
+    return torch.where(known, values, 0.0), known
+
+
+def as_nan(layer: Layer) -> Float[Tensor, "B H W"]:
+    """Return the values of a layer, NaN where unknown."""
+    values, known = layer
+    return torch.where(known, values, torch.nan)
+
+
+def radius_cells(radius: float, resolution: float) -> int:
+    """Return how many cells a window reaches from its middle: the nearest whole number, at least 1."""
+    require_positive(radius=radius, resolution=resolution)
+    return max(1, round(radius / resolution))
+
+
+class Filter(nn.Module):
+    """A filter and its settings: `Filter("gaussian", sigma=0.1)(layer, resolution=0.04)`.
+
+    It is tried on a small map when it is built, so that a setting that does not exist or is out of range is refused
+    then. Raises ValueError, naming what there is.
+    """
+
+    def __init__(self, name: str, **settings: Any) -> None:
+        super().__init__()
+        known = ", ".join(sorted(FILTERS))
+        require(name in FILTERS, "filter", "must be a filter's name", repr(name), f"there are {known}")
+        there = settings_of(name)
+        others = sorted(set(settings) - set(there))
+        mend = f"it takes {', '.join(there) or 'none'}"
+        require(not others, f"filter {name}", "must be given settings that it has", ", ".join(others), mend)
+        missing = [n for n, p in there.items() if p.default is p.empty and n not in settings]
+        require(not missing, f"filter {name}", f"needs {', '.join(missing)}", "none", "give a number for each")
+        self.name, self.settings = name, settings
+        self.takes_resolution = "resolution" in inspect.signature(FILTERS[name]).parameters
+
+    def forward(self, *layers: Layer, resolution: float) -> Layer:
+        """Filter layers of cells of `resolution` [m]."""
+        given = {"resolution": resolution} if self.takes_resolution else {}
+        return FILTERS[self.name](*layers, **given, **self.settings)
+
+    def try_out(self, inputs: int, resolution: float) -> None:
+        """Run on a small map, to refuse settings out of range and a wrong number of layers."""
+        parameters = inspect.signature(FILTERS[self.name]).parameters.values()
+        wanted = sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
+        any_number = any(p.kind is p.VAR_POSITIONAL for p in parameters)
+        fits = inputs >= max(1, wanted) if any_number else inputs == wanted
+        came = f"{inputs} inputs"
+        require(fits, f"filter {self.name}", f"takes {wanted} layers", came, "name as many inputs")
+        layer = torch.zeros(1, 4, 4), torch.eye(4, dtype=torch.bool)[None]
+        self(*[layer] * inputs, resolution=resolution)
+
+    def extra_repr(self) -> str:
+        """Say which filter it is, and its settings."""
+        return ", ".join([self.name, *(f"{name}={value!r}" for name, value in self.settings.items())])
