@@ -19,7 +19,7 @@ from filter_cases import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.filters.holes import join, nearest_known
+from torchelev.filters.holes import compressed, join, lowest_of_border, nearest_known
 from torchelev.filters.inpainting import (
     fill_from,
     inpaint_diffusion,
@@ -205,6 +205,16 @@ def test_parts_of_the_worst_graphs_within_all_steps(order, monkeypatch):
     nodes = torch.randperm(1000, generator=torch.Generator().manual_seed(0)) if nodes is None else nodes
     a, b = (torch.arange(999), torch.full((999,), 999)) if order == "star" else (nodes[1:], nodes[:-1])
     assert (join(a, b, 1000) == 0).all()
+
+
+def test_a_chain_is_followed_to_its_end(stops):
+    assert (compressed(torch.arange(-1, 999).clamp(min=0)) == 0).all()
+
+
+def test_of_equally_low_border_cells_the_first_is_taken(stops):
+    known = torch.tensor([[[True, True, True, True], [True, False, False, True], [True, True, True, True]]])
+    heights = torch.tensor([[[2.0, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]])
+    assert lowest_of_border(heights, known)[0, 1].tolist() == [4, 1, 1, 7]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.6, 0.9, 1.0])

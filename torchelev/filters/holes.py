@@ -31,11 +31,11 @@ def join(a: Tensor, b: Tensor, count: int) -> Tensor:
         low, high = torch.minimum(*ends), torch.maximum(*ends)
         if _stops(a.device) and torch.equal(low, high):
             break
-        label = _compressed(label.scatter_reduce(0, high, low, "amin"))
+        label = compressed(label.scatter_reduce(0, high, low, "amin"))
     return label
 
 
-def _compressed(parent: Tensor) -> Tensor:
+def compressed(parent: Tensor) -> Tensor:
     """Follow each chain of parents to its end, twice as far each time."""
     for _ in range(math.ceil(math.log2(max(2, len(parent))))):
         before, parent = parent, parent[parent]

@@ -71,29 +71,18 @@ class _Wires:
 
 
 @functools.cache
-def _sorting(count: int) -> Network:
+def sorting(count: int) -> Network:
+    """Return the network that sorts `count` wires."""
     wires = _Wires(count)
     return wires.network(wires.sort(list(range(count))))
 
 
 @functools.cache
-def _merging(first: int, second: int, keep: int) -> Network:
+def merging(first: int, second: int, keep: int) -> Network:
+    """Return the network that merges two sorted lists, and gives the `keep` lowest."""
     wires = _Wires(first + second)
     merged = wires.merge(list(range(first)), list(range(first, first + second)))
     return wires.network(merged[:keep])
-
-
-# The compiler would draw the networks up itself, and warn of the cache.
-@torch.compiler.assume_constant_result
-def sorting(count: int) -> Network:
-    """Return the network that sorts `count` wires."""
-    return _sorting(count)
-
-
-@torch.compiler.assume_constant_result
-def merging(first: int, second: int, keep: int) -> Network:
-    """Return the network that merges two sorted lists, and gives the `keep` lowest."""
-    return _merging(first, second, keep)
 
 
 def lowest_of_windows(rimmed: Tensor, width: int, keep: int) -> list[Tensor]:
