@@ -82,6 +82,14 @@ def sight() -> str:
     return costs.table(load("sight")["rows"])
 
 
+def postprocessing() -> str:
+    """Tabulate filters and planes."""
+    from benchmarks import postprocessing as times
+
+    result = load("postprocessing")
+    return f"{times.table(result['rows'])}\n\n{times.planes_table(result['planes'])}"
+
+
 TABLES = {
     "accuracy": accuracy,
     "features": features,
@@ -90,6 +98,7 @@ TABLES = {
     "long_run": long_run,
     "nav": nav,
     "sight": sight,
+    "postprocessing": postprocessing,
 }
 
 

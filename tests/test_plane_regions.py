@@ -5,8 +5,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from plane_scenes import RISE, RUN, mixed, noisy, stairs
 
+from benchmarks.plane_scenes import RISE, RUN, mixed, noisy, stairs
 from torchelev.planes import PlaneConfig, convex_region, segment
 from torchelev.planes.polygons import crossings, nearest
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from plane_scenes import RISE, RUN, SCENES, TREADS, grid, hills, mixed, noisy, ramp, stairs
 
+from benchmarks.plane_scenes import RISE, RUN, SCENES, TREADS, grid, hills, mixed, noisy, ramp, stairs
 from torchelev.planes import PlaneConfig, segment
 
 pytest.importorskip("cv2")

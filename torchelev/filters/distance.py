@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -110,22 +110,10 @@ def _squared_distance_opencv(seeds: Tensor, reach: int) -> Tensor:
     import cv2  # an optional dependency
 
     squared = torch.full(seeds.shape, float((reach + 1) ** 2))
-    free = (~seeds).view(torch.uint8)
-
-    def fill(maps: tuple[Tensor, Tensor]) -> None:
-        for image, away in zip(maps[0].numpy(), maps[1], strict=True):
-            if image.all():  # without seeds OpenCV returns anything
-                continue
-            distance = torch.from_numpy(cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
-            torch.round(distance.square_(), out=away)
-
-    threads = min(torch.get_num_threads(), max(1, len(seeds)))
-    shares = list(zip(free.tensor_split(threads), squared.tensor_split(threads), strict=True))
-    if threads == 1:
-        fill(shares[0])
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(fill, shares))
+    for image, away in zip((~seeds).view(torch.uint8).numpy(), squared.numpy(), strict=True):
+        if not image.all():  # without seeds OpenCV returns anything
+            distance = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            np.rint(np.multiply(distance, distance, out=distance), out=away)
     return squared
 
 

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from torchelev.errors import require, require_positive
 from torchelev.layers import Layer
-from torchelev.storage import as_bytes
+from torchelev.storage import as_bytes, keep_freed_memory
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-CPU_CELLS = 2**16  # filtered at a time on a CPU
+CPU_CELLS = 2**18  # filtered at a time on a CPU; measured: a third faster than all of 256 maps of 64 x 64 at once
 FILTERS: dict[str, Callable[..., Layer]] = {}
 F = TypeVar("F", bound=Callable[..., Layer])
 
@@ -42,6 +42,8 @@ def register(function: F) -> F:
     @functools.wraps(function)
     def checked(*layers: Layer, **settings: Any) -> Layer:
         check_layers(name, layers)
+        if layers[0][0].device.type == "cpu":
+            keep_freed_memory()
         parts = [masked(function(*map(masked, part), **settings)) for part in _parts(layers)]
         if len(parts) == 1:
             return parts[0]
