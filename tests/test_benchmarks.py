@@ -5,10 +5,11 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 
-from benchmarks import gpu, long_run, meter, run, speed_plots, speed_sections, speed_tables
+from benchmarks import gpu, long_run, meter, postprocessing, run, speed_plots, speed_sections, speed_tables
 from benchmarks.readme import ROOT, SPEED, load
 from benchmarks.run import regressions, timings
 from benchmarks.workload import Drive, full_config
@@ -169,3 +170,22 @@ def test_compare_fails_on_a_regression(tmp_path):
     assert (worse.returncode, better.returncode, none.returncode) == (1, 0, 2), worse.stderr
     assert "/update: median 1.000 -> 3.000 ms (3.00 x)" in worse.stdout
     assert "no such file" in run_compare(fast, tmp_path / "missing.json").stderr
+
+
+@pytest.mark.parametrize("name", [name for name, (_, _, same) in postprocessing.cases().items() if same])
+def test_filters_give_what_opencv_and_scipy_give(name):
+    ours, peer, _ = postprocessing.cases()[name]
+    layer = postprocessing.ground(2, 40)
+    values, known = ours(layer)
+    expected = np.stack([peer(*arrays) for arrays in zip(layer[0].numpy(), layer[1].numpy(), strict=True)])
+    assert bool(known.any())
+    np.testing.assert_allclose(
+        values[known], expected[known.numpy()], atol=2e-3 if name == "standard_deviation" else 1e-4
+    )
+
+
+def test_postprocessing_is_measured_and_tabulated(monkeypatch):
+    monkeypatch.setattr(postprocessing, "SIZES", ((1, 20), (2, 16)))
+    rows = postprocessing.measure(0.0)
+    text = postprocessing.table(rows)
+    assert all(f"| {name} |" in text for name in postprocessing.cases())
