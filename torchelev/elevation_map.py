@@ -14,8 +14,8 @@ from torchelev import checks
 from torchelev.config import ElevationMapConfig, differing_fields
 from torchelev.errors import require
 from torchelev.filters.chain import FilterChain
-from torchelev.grid import cell_centers
-from torchelev.initialize import METHODS, interpolate
+from torchelev.grid import cell_centers, window_center
+from torchelev.initialize import METHODS, initialize
 from torchelev.layers import LAYERS, Layer, sample_layer
 from torchelev.pipeline import compiled_update, fuse_measurement, rate_surface, update_in_place, write
 from torchelev.sensor import measure
@@ -242,16 +242,7 @@ class ElevationMap(nn.Module):
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         if checks.readable(feet, self.check_values):
             require(bool(torch.isfinite(feet).all()), "feet", "must be finite", "NaN or inf", "leave those feet out")
-        state, dtype = self.state, self.elevation.dtype
-        center = self.center[:, None]
-        xy = (self.cell_centers().flatten(1, 2) - center[..., :2]).to(dtype)
-        near = torch.cat([feet[..., :2].double() - center[..., :2], feet[..., 2:].double()], -1).to(dtype)
-        height, inside = interpolate(xy, near, method, self.cfg.grid.resolution)
-        found = inside.view_as(state.validity) & ~state.validity
-        elevation = torch.where(found, height.view_as(state.elevation), state.elevation)
-        variance = torch.where(found, self.cfg.fusion.max_variance, state.variance)
-        state = state._replace(elevation=elevation, variance=variance, validity=state.validity | found)
-        state = state._replace(time=torch.where(found, 0.0, state.time), support=torch.where(found, 0.0, state.support))
+        state = initialize(self.state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
         self._store(rate_surface(state, self.cfg))
 
     # Reading --------------------------------------------------------------------------------------------------------
@@ -259,8 +250,7 @@ class ElevationMap(nn.Module):
     @property
     def center(self) -> Float[Tensor, "B 3"]:
         """The windows' centres [m], map frame, float64; z is the base's last height."""
-        size = torch.stack([self.corner.new_full((), n) for n in (self.cfg.grid.height, self.cfg.grid.width)])
-        xy = (self.corner.double() + size.double() / 2) * self.cfg.grid.resolution
+        xy = window_center(self.corner, self.cfg.grid)
         return torch.cat([xy, self.base_height.double()[:, None]], -1)
 
     def cell_centers(self) -> Float[Tensor, "B H W 2"]:

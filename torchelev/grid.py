@@ -143,6 +143,12 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     return state._replace(corner=corner, base_height=m.base[:, 2], **fields)
 
 
+def window_center(corner: Int[Tensor, "B 2"], grid: GridConfig) -> Float[Tensor, "B 2"]:
+    """Return the windows' centres [m], map frame, float64."""
+    size = torch.stack([corner.new_full((), cells) for cells in (grid.height, grid.width)])
+    return (corner.double() + size.double() / 2) * grid.resolution
+
+
 def cell_centers(corner: Int[Tensor, "B 2"], grid: GridConfig) -> Float[Tensor, "B H W 2"]:
     """Return the cell centres [m], map frame, float64: (k + 0.5) * resolution for cell number k."""
     x = torch.arange(grid.height, device=corner.device) + corner[:, 0, None]

@@ -8,10 +8,31 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchelev.grid import GridConfig, cell_centers, window_center
+from torchelev.state import MapState
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 METHODS = ("linear", "nearest")
+
+
+def initialize(
+    state: MapState, feet: Float[Tensor, "B K 3"], method: str, grid: GridConfig, variance: float
+) -> MapState:
+    """Give unknown cells the height that `interpolate` finds for them, and that variance [m^2]."""
+    dtype, center = state.elevation.dtype, window_center(state.corner, grid)[:, None]
+    xy = (cell_centers(state.corner, grid).flatten(1, 2) - center).to(dtype)
+    near = torch.cat([feet[..., :2].double() - center, feet[..., 2:].double()], -1).to(dtype)
+    height, inside = interpolate(xy, near, method, grid.resolution)
+    found = inside.view_as(state.validity) & ~state.validity
+    return state._replace(
+        elevation=torch.where(found, height.view_as(state.elevation), state.elevation),
+        variance=torch.where(found, variance, state.variance),
+        validity=state.validity | found,
+        time=torch.where(found, 0.0, state.time),
+        support=torch.where(found, 0.0, state.support),
+    )
 
 
 def interpolate(xy: Float[Tensor, "B C 2"], feet: Float[Tensor, "B K 3"], method: str, cell: float) -> tuple:
