@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import inspect
 
 import pytest
 import torch
@@ -13,6 +14,10 @@ from torchelev.filters import FILTERS, Filter, FilterChain, FilterConfig, as_lay
 from torchelev.filters.registry import radius_cells
 
 CALLS = []
+
+
+def parameters_of(name):
+    return inspect.signature(FILTERS[name]).parameters.values()
 
 
 @register
@@ -49,6 +54,44 @@ def test_a_filter_gets_and_gives_zero_where_nothing_is_known():
     known = torch.tensor([[[True, False]]])
     out, still = FILTERS["counted_offset"]((values, known), by=2.0)
     assert out.tolist() == [[[3.0, 0.0]]] and torch.equal(still, known)
+
+
+@register
+def logarithm(layer):
+    return layer[0].log(), layer[1]
+
+
+def test_what_is_not_finite_is_unknown():
+    values, known = FILTERS["logarithm"](as_layer(torch.tensor([[[0.0, 1.0, -1.0]]])))
+    assert values.tolist() == [[[0.0, 0.0, 0.0]]] and known.tolist() == [[[False, True, False]]]
+    marked = torch.tensor([[[5.0, torch.nan, 5.0]]]), torch.ones(1, 1, 3, dtype=torch.bool)
+    values, known = FILTERS["box"](marked, resolution=0.1, radius=0.1)
+    assert values.tolist() == [[[5.0, 0.0, 5.0]]] and known.tolist() == [[[True, False, True]]]
+
+
+SINGLE = sorted(
+    name
+    for name in FILTERS
+    if sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters_of(name)) == 1 and name != "in_cells"
+)
+
+
+@pytest.mark.parametrize("name", SINGLE)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(name, dtype):
+    values = torch.rand(2, 9, 8, generator=torch.Generator().manual_seed(1)).to(dtype)
+    values[0, 2:5, 3:5] = torch.nan
+    step = Filter(name)
+    half, known = step(as_layer(values), resolution=0.05)
+    full, expected = step(as_layer(values.float()), resolution=0.05)
+    assert half.dtype == dtype and torch.equal(known, expected)
+    torch.testing.assert_close(half, full.to(dtype))
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_no_map_at_all(name):
+    values, known = Filter(name)(as_layer(torch.zeros(0, 3, 5)), resolution=0.05)
+    assert values.shape == known.shape == (0, 3, 5)
 
 
 def test_many_maps_are_filtered_in_parts(monkeypatch):
@@ -117,6 +160,24 @@ def test_a_name_is_registered_once(monkeypatch):
         register(difference)
     difference.__qualname__ = "difference"
     register(difference)  # a function defined again, as in a notebook, replaces itself
+
+
+def test_a_setting_must_not_be_named_as_a_key():
+    def keyed(a, *, inputs: int = 1):
+        return a
+
+    with pytest.raises(ValueError, match="keyed: must have no setting named layer, filter, inputs, got inputs"):
+        register(keyed)
+
+
+def test_a_formula_names_its_inputs():
+    formula = "elevation - variance"
+    assert step("a", "expression", formula=formula).inputs == ("elevation", "variance")
+    assert step("a", "expression", ("elevation", "variance"), formula=formula).inputs == ("elevation", "variance")
+    with pytest.raises(ValueError, match="filters.a: reads elevation, variance, got .*slope.*leave inputs out"):
+        step("a", "expression", "slope", formula=formula)
+    with pytest.raises(TypeError, match="filters.layer: must be a name, got 1"):
+        step(1, "expression")
 
 
 def test_a_chain_makes_its_layers_in_order():
@@ -203,7 +264,7 @@ def test_a_filter_runs_once_until_something_is_stored():
     before = CALLS.count(7.0)
 
     def runs():
-        emap.layer("c"), emap.layer("b")
+        emap.layer("c"), emap.layer("b"), emap.sample(torch.zeros(2, 1, 2), "b")
         return CALLS.count(7.0) - before
 
     assert (runs(), runs()) == (1, 1)
@@ -229,6 +290,7 @@ def test_a_layer_made_in_inference_mode_can_be_read_outside():
     emap = filtered(step("b", "counted_offset"))
     with torch.inference_mode():
         emap.layer("b")
+    assert not emap._filtered["b"][0].is_inference()
     xy = torch.zeros(2, 1, 2, requires_grad=True)
     emap.sample(xy, "b")[0].sum().backward()
     assert xy.grad.isfinite().all()

@@ -312,6 +312,6 @@ class ElevationMap(nn.Module):
         require(fits, "xy", f"expected ({self.num_envs}, M, 2)", tuple(xy.shape), "give points for each environment")
         good = mode in ("bilinear", "nearest")
         require(good, "mode", 'must be "bilinear" or "nearest"', repr(mode), "use bilinear")
-        state = self.state if state is None else state
-        uv = (xy.double() / self.cfg.grid.resolution - state.corner[:, None]).to(self.elevation.dtype)
+        corner = (self.state if state is None else state).corner
+        uv = (xy.double() / self.cfg.grid.resolution - corner[:, None]).to(self.elevation.dtype)
         return sample_layer(self._read(layer, state), uv, self.cfg.grid, mode)

@@ -30,7 +30,7 @@ def whole_cells(name: str, length: float, resolution: float) -> int:
     """Return length / resolution, which must be a whole number."""
     require_positive(resolution=resolution, **{name: length})
     cells = length / resolution
-    whole = round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * cells
-    mend = f"try {max(1, round(cells)) * resolution:.6g}"
+    whole = math.isfinite(cells) and round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * cells
+    mend = f"try {max(1, round(cells)) * resolution:.6g}" if math.isfinite(cells) else "give metres"
     require(whole, name, f"must be a whole number of times {resolution:g} m", f"{cells:.6g} times", mend)
     return round(cells)

@@ -65,7 +65,7 @@ def take(emap: ElevationMap, env: int = 0, layers: Sequence[str] | None = None) 
     an unknown layer, ValueError for an environment that does not exist.
     """
     require(0 <= env < emap.num_envs, "env", f"must lie in [0, {emap.num_envs})", env, "environments count from 0")
-    arrays = {name: as_array(emap.layer(name)[env]) for name in (emap.layers if layers is None else layers)}
+    arrays = {name: as_array(emap.layer(name)[env].clone()) for name in (emap.layers if layers is None else layers)}
     center = as_array(emap.center[env])
     return SavedMap(arrays, emap.cfg.grid.resolution, center, emap.cfg.to_dict())
 
@@ -78,8 +78,9 @@ def save_npz(path: str | Path, emap: ElevationMap, env: int = 0) -> None:
     filter's layer with one of these names.
     """
     saved = take(emap, env)
-    clash = [name for name in FACTS if name in saved.layers]
-    require(not clash, "layers", f"must not be named {', '.join(FACTS)}", ", ".join(clash), "rename the filter's layer")
+    clash = [name for name in (*FACTS, "file") if name in saved.layers]  # savez has a parameter of that name
+    rule = f"must not be named {', '.join(FACTS)}, file"
+    require(not clash, "layers", rule, ", ".join(clash), "rename the filter's layer")
     config = np.array(json.dumps(saved.config))
     arrays: dict[str, Any] = dict(saved.layers, resolution=saved.resolution, center=saved.center, axes=AXES)
     with Path(path).open("wb") as file:  # a file object: numpy appends .npz to names that lack it

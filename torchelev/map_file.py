@@ -50,8 +50,11 @@ def load_map(
     arrays = read_npz(path, "write it with save_map")
     header = _header(path, arrays)
     ids = _ids(env_ids, _num_envs(path, arrays))
-    cfg = ElevationMapConfig.from_dict(header["config"])
-    emap = ElevationMap(cfg, len(ids), device).to(DTYPES[header["dtype"]])
+    try:
+        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
+    emap = emap.to(DTYPES[header["dtype"]])
     emap._store(_state(path, arrays, emap.state, ids))
     return emap
 

@@ -10,10 +10,8 @@ from torch import nn
 
 from torchelev.errors import require
 from torchelev.filters.expression import Expression
-from torchelev.filters.registry import Filter
+from torchelev.filters.registry import KEYS, Filter
 from torchelev.layers import LAYERS, Layer
-
-OWN = ("layer", "filter", "inputs")  # the keys of a filter's mapping that are no settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +28,15 @@ class FilterConfig:
 
     def __post_init__(self) -> None:
         settings = {n: tuple(value) if isinstance(value, list) else value for n, value in dict(self.settings).items()}
+        for name in ("layer", "filter"):
+            value = getattr(self, name)
+            require(isinstance(value, str), f"filters.{name}", "must be a name", repr(value), "give text", TypeError)
         inputs = (self.inputs,) if isinstance(self.inputs, str) else tuple(self.inputs)
         if self.filter == "expression" and "formula" in settings:
-            inputs = Expression(str(settings["formula"])).names
+            names = Expression(str(settings["formula"])).names
+            mend = "leave inputs out: a formula names its own"
+            require(inputs in ((), names), f"filters.{self.layer}", f"reads {', '.join(names)}", inputs, mend)
+            inputs = names
         object.__setattr__(self, "inputs", inputs or ("elevation",))
         object.__setattr__(self, "settings", tuple(sorted(settings.items())))
 
@@ -53,8 +57,8 @@ def filters_from_list(values: object) -> tuple[FilterConfig, ...]:
 
 
 def _from_dict(entry: dict[str, Any]) -> FilterConfig:
-    settings = {name: value for name, value in entry.items() if name not in OWN}
-    return FilterConfig(**{name: entry[name] for name in OWN if name in entry}, settings=settings)
+    settings = {name: value for name, value in entry.items() if name not in KEYS}
+    return FilterConfig(**{name: entry[name] for name in KEYS if name in entry}, settings=settings)
 
 
 class FilterChain(nn.Module):

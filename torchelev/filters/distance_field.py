@@ -45,7 +45,7 @@ class FieldSample(NamedTuple):
     valid: Bool[Tensor, "B M"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SignedDistanceField:
     """The distance to the ground, and its gradient, for points on and around it.
 

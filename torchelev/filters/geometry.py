@@ -46,7 +46,7 @@ def plane_around(layer: Layer, resolution: float, radius: float) -> Plane:
 def slope(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """Return the inclination [rad] of the plane z = c + g_x x + g_y y around each cell: atan(sqrt(g_x^2 + g_y^2)).
 
-    0 where a cell is alone in its window; the slope along the line where all its neighbours lie on one.
+    At least 1e-6, as where a cell is alone in its window; the slope along the line where all its neighbours lie on one.
     """
     plane = plane_around(layer, resolution, radius)
     return torch.atan(root(plane.gradient_x.square() + plane.gradient_y.square())), layer[1]

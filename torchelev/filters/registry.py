@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 CPU_CELLS = 2**18  # filtered at a time on a CPU; measured: a third faster than all of 256 maps of 64 x 64 at once
+KEYS = ("layer", "filter", "inputs")  # of a chain's entry, beside the filter's settings
 FILTERS: dict[str, Callable[..., Layer]] = {}
 F = TypeVar("F", bound=Callable[..., Layer])
 
@@ -31,23 +32,30 @@ def register(function: F) -> F:
     """Make a function a filter, known by its name.
 
     Its positional parameters are layers; its keyword-only ones are settings, of which `resolution` [m] is given by the
-    map. It filters each map on its own: on a CPU it is given a few of many maps at a time. Raises ValueError for a name
-    that is taken.
+    map. It filters each map on its own: on a CPU it is given a few of many maps at a time, and float32 instead of half
+    precision. What it returns that is not finite is unknown. Raises ValueError for a name that is taken, and for
+    settings named as a chain's own keys.
     """
     name = function.__name__
     taken = FILTERS.get(name)
     ours = taken is None or (taken.__module__, taken.__qualname__) == (function.__module__, function.__qualname__)
     require(ours, "function", "must have a name of its own", repr(name), "choose another name")
+    parameters = inspect.signature(function).parameters
+    clash = [key for key in KEYS if key in parameters and parameters[key].kind is inspect.Parameter.KEYWORD_ONLY]
+    require(not clash, name, f"must have no setting named {', '.join(KEYS)}", ", ".join(clash), "rename it")
 
     @functools.wraps(function)
     def checked(*layers: Layer, **settings: Any) -> Layer:
         check_layers(name, layers)
         if layers[0][0].device.type == "cpu":
             keep_freed_memory()
+        if len(layers[0][0]) == 0:
+            return layers[0]
         parts = [masked(function(*map(masked, part), **settings)) for part in _parts(layers)]
         if len(parts) == 1:
-            return parts[0]
-        return torch.cat([values for values, _ in parts]), torch.cat([known for _, known in parts])
+            return parts[0][0].to(layers[0][0].dtype), parts[0][1]
+        values, known = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+        return values.to(layers[0][0].dtype), known
 
     FILTERS[name] = checked
     return checked  # type: ignore[return-value]
@@ -68,8 +76,13 @@ def check_layers(name: str, layers: tuple[Layer, ...]) -> None:
 
 
 def masked(layer: Layer) -> Layer:
-    """Put 0 where nothing is known, and for what is not finite; `torch.where` takes five times as long on a CPU."""
+    """Put 0 where nothing is known, and take what is not finite for unknown; at least float32.
+
+    Not by `torch.where`, which takes five times as long on a CPU.
+    """
     values, known = layer
+    values = values.to(torch.promote_types(values.dtype, torch.float32))
+    known = known & values.isfinite()
     return values.nan_to_num(0.0, 0.0, 0.0) * as_bytes(known).to(values.dtype), known
 
 
@@ -110,8 +123,8 @@ def radius_cells(radius: float, resolution: float) -> int:
 class Filter(nn.Module):
     """A filter and its settings: `Filter("gaussian", sigma=0.1)(layer, resolution=0.04)`.
 
-    It is tried on a small map when it is built, so that a setting that does not exist or is out of range is refused
-    then. Raises ValueError, naming what there is.
+    A filter or a setting that does not exist is refused when it is built, with what there is; a setting out of range
+    when it runs, or by `try_out`. Raises ValueError.
     """
 
     def __init__(self, name: str, **settings: Any) -> None:

@@ -43,7 +43,8 @@ class PlaneConfig:
             require_positive(**{f"planes.{name}": getattr(self, name)})
         for name in ("min_area", "margin"):
             value = getattr(self, name)
-            require(0 <= value < math.inf, f"planes.{name}", "must not be negative", value, "give 0 for none")
+            number = isinstance(value, int | float) and 0 <= value < math.inf
+            require(number, f"planes.{name}", "must not be negative", value, "give 0 for none")
         sloped = 0 < self.max_inclination < math.pi / 2
         require(
             sloped, "planes.max_inclination", "must lie in (0, pi / 2) rad", self.max_inclination, "see its default"
@@ -99,6 +100,7 @@ def segment(
     Raises TypeError or ValueError for inputs that do not fit.
     """
     cfg = PlaneConfig() if cfg is None else cfg
+    require(isinstance(cfg, PlaneConfig), "cfg", "must be a PlaneConfig", repr(cfg), "build one", TypeError)
     _check(elevation, resolution)
     heights = elevation.detach().to(torch.float64).reshape(-1, *elevation.shape[-2:])
     middles = _middles(center, len(heights))
