@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import inspect
 
+import numpy as np
 import pytest
 import torch
 from conftest import mapped, scan, small_config
@@ -199,7 +200,7 @@ def test_a_chain_makes_its_layers_in_order():
         ([step("elevation", "counted_offset")], "filters.elevation: must be a name of its own"),
         ([step("b c", "counted_offset")], "filters.b c: must be a name of its own, of letters"),
         ([step("b", "counted_offset"), step("b", "counted_offset")], "filters.b: must be a name of its own"),
-        ([step("b", "nothing")], "filter: must be a filter's name"),
+        ([step("b", "nothing")], "filters.b: filter: must be a filter's name"),
         ([step("b", "difference")], "filter difference: takes 2 layers"),
         ([step("b", "in_cells", length="far")], "length"),
     ],
@@ -241,7 +242,33 @@ def test_filters_that_yaml_gets_wrong(values, message):
 
 def test_filters_of_a_config_are_checked():
     with pytest.raises(TypeError, match="cfg.filters: must be a tuple of FilterConfig"):
-        ElevationMapConfig(filters=[step("b", "counted_offset")])
+        ElevationMapConfig(filters=["gaussian"])
+    assert ElevationMapConfig(filters=[step("b", "counted_offset")]).filters == (step("b", "counted_offset"),)
+
+
+def test_settings_of_numpy_and_lists_become_plain():
+    cfg = step("b", "counted_offset", by=np.float32(0.5), more=[1, 2])
+    assert dict(cfg.settings) == {"by": 0.5, "more": (1, 2)} and type(dict(cfg.settings)["by"]) is float
+
+
+def test_what_a_filter_returns_is_checked(monkeypatch):
+    monkeypatch.setattr(registry, "FILTERS", dict(FILTERS))
+    wrong = {
+        "alone": lambda layer: layer[0],
+        "nothing": lambda layer: None,
+        "numpy_pair": lambda layer: (layer[0].numpy(), layer[1].numpy()),
+        "float_mask": lambda layer: (layer[0], layer[0]),
+        "cropped": lambda layer: (layer[0][:, 1:], layer[1][:, 1:]),
+    }
+    for name, function in wrong.items():
+        function.__name__ = name
+        with pytest.raises((TypeError, ValueError), match=f"filter {name}"):
+            register(function)(as_layer(torch.zeros(1, 3, 3)))
+
+
+def test_a_tensor_is_no_layer():
+    with pytest.raises(TypeError, match="gaussian, layer 0: must be a layer .*got Tensor; make one .*as_layer"):
+        FILTERS["gaussian"](torch.zeros(2, 3, 3), resolution=0.1)
 
 
 def test_a_map_reads_the_layers_of_its_filters():

@@ -210,3 +210,17 @@ def test_refuses_arrays_that_do_not_fit(path, changes, message):
 def test_refuses_environments_that_do_not_exist(path, env_ids):
     with pytest.raises(ValueError, match="env_ids"):
         load_map(path, env_ids=env_ids)
+
+
+def test_a_save_that_fails_leaves_the_older_file(path, monkeypatch):
+    before = path.read_bytes()
+
+    def full_disk(file, **arrays):
+        file.write(b"half")
+        raise OSError("no space left")
+
+    emap = load_map(path)
+    monkeypatch.setattr(np, "savez_compressed", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        save_map(path, emap)
+    assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == [path.name]

@@ -115,7 +115,9 @@ def test_refuses_footholds_off_the_region():
     for xy, margin in (((0.6, 0.0), 0.0), ((0.5, 0.0), 0.0), ((0.45, 0.0), 0.1)):
         with pytest.raises(ValueError, match="foothold_xy: must lie in the region"):
             convex_region(region, xy, margin)
-    for xy in ((0.0, np.nan), (0.0, 0.0, 0.0), 1.0):
+    by_point, by_xy = (convex_region(region, at) for at in ((0.1, 0.2, 7.0), (0.1, 0.2)))
+    np.testing.assert_array_equal(by_point, by_xy)
+    for xy in ((0.0, np.nan), (0.0, 0.0, 0.0, 0.0), 1.0):
         with pytest.raises(ValueError, match="xy: must be two finite numbers"):
             convex_region(region, xy)
         with pytest.raises(ValueError, match="xy: must be two finite numbers"):

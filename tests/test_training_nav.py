@@ -121,6 +121,10 @@ def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkey
     strict = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
     assert strict["training"]["steps"] == 3 * 24 * 4 and strict["evaluation"]["seconds"] is None, "nobody arrives"
     assert "has 3 iterations already: only evaluating" in invoke(*common, "--iterations", 2, "--resume").output
+    for option in ("--num-envs", "--iterations", "--episodes"):
+        assert option in invoke(option, 0).output
+    if not torch.cuda.is_available():
+        assert "there is no GPU for cuda" in invoke("--device", "cuda").output
     missing = invoke("--out", tmp_path / "nowhere", "--resume")
     assert missing.exit_code == 2 and "leave --resume out" in missing.output
 

@@ -40,6 +40,8 @@ class ElevationMapConfig:
     filters: tuple[FilterConfig, ...] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.filters, list):
+            object.__setattr__(self, "filters", tuple(self.filters))
         chain = isinstance(self.filters, tuple) and all(isinstance(step, FilterConfig) for step in self.filters)
         mend = "give (FilterConfig(layer=..., filter=...), ...)"
         require(chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), mend, TypeError)

@@ -112,6 +112,8 @@ def to_grid_map(
     The pose is the window's centre, without its z, as GridMap's own converter writes it. Raises KeyError for an unknown
     layer, ValueError for an environment that does not exist and for basic layers that are not among the layers.
     """
+    names = not isinstance(layers, str)
+    require(names, "layers", "must be a sequence of names", repr(layers), f"give ({layers!r},)")
     among = set(basic_layers) <= set(layers)
     require(among, "basic_layers", "must be among the layers", list(basic_layers), f"layers are {', '.join(layers)}")
     taken, grid = take(emap, env, layers), emap.cfg.grid

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -33,8 +34,14 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
     arrays: dict[str, Any] = {name: as_array(value) for name, value in _tensors(emap.state).items()}
-    with Path(path).open("wb") as file:  # a file object: numpy appends .npz to names that lack it
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+    text, path = np.array(json.dumps(header)), Path(path)
+    unfinished = path.with_name(f"{path.name}.tmp")
+    try:
+        with unfinished.open("wb") as file:  # a file object: numpy appends .npz to names that lack it
+            np.savez_compressed(file, header=text, **arrays)
+        os.replace(unfinished, path)  # whatever fails before leaves an older map whole
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def load_map(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -51,7 +52,8 @@ class Publisher:
     def __init__(self, emap: ElevationMap, layers: Sequence[str] = ("elevation",), rate: float = 5.0) -> None:
         names = not isinstance(layers, str) and len(layers) > 0
         require(names, "layers", "must be a sequence of names", repr(layers), 'give ("elevation",)')
-        require(rate > 0, "rate", "must be positive", rate, "give a number of copies per second")
+        positive = isinstance(rate, Real) and rate > 0
+        require(positive, "rate", "must be positive", repr(rate), "give a number of copies per second")
         for name in layers:
             emap.layer(name)  # refuses what does not exist
         self.emap, self.layers, self.rate = emap, tuple(layers), rate

@@ -17,6 +17,7 @@ from training.nav_evaluate import evaluate, picture
 from training.nav_export import export
 from training.runner import CHECKPOINT, ResumableRunner
 
+POSITIVE = click.IntRange(1)
 TRAIN_SEED, HELD_OUT_SEED = 1, 1001  # of the courses
 
 
@@ -62,15 +63,15 @@ def make_runner(
 
 
 @click.command()
-@click.option("--num-envs", default=256, show_default=True, help="Robots at once.")
-@click.option("--iterations", default=140, show_default=True, help="PPO iterations in all, those of --resume included.")
+@click.option("--num-envs", type=POSITIVE, default=256, show_default=True, help="Robots at once.")
+@click.option("--iterations", type=POSITIVE, default=140, show_default=True, help="In all, those of --resume included.")
 @click.option("--perception", type=click.Choice(PERCEPTION), default="map", show_default=True)
 @click.option("--seed", default=0, show_default=True)
 @click.option("--device", default=None, help="Default: a GPU if there is one.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("runs/nav"), show_default=True)
 @click.option("--resume", is_flag=True, help="Go on from OUT/checkpoint.pt.")
 @click.option("--compile/--no-compile", "compiled", default=True, help="Compile the map's update.")
-@click.option("--episodes", default=256, show_default=True, help="Episodes of the final evaluation.")
+@click.option("--episodes", type=POSITIVE, default=256, show_default=True, help="Of the final evaluation.")
 def main(
     num_envs: int,
     iterations: int,
@@ -89,6 +90,8 @@ def main(
     (1, 12) and "map" (1, 4, 16, 16). Both return actions (B, 2).
     """
     device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
     checkpoint = out / CHECKPOINT
     if resume and not checkpoint.exists():
         raise click.UsageError(f"--resume: there is no {checkpoint}; leave --resume out to begin")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from torch import nn
 
 from torchelev.errors import require
@@ -27,7 +28,7 @@ class FilterConfig:
     settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  # kept as pairs, as a config is hashed
 
     def __post_init__(self) -> None:
-        settings = {n: tuple(value) if isinstance(value, list) else value for n, value in dict(self.settings).items()}
+        settings = {name: _plain(value) for name, value in dict(self.settings).items()}
         for name in ("layer", "filter"):
             value = getattr(self, name)
             require(isinstance(value, str), f"filters.{name}", "must be a name", repr(value), "give text", TypeError)
@@ -43,6 +44,13 @@ class FilterConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the entry that YAML has."""
         return {"layer": self.layer, "filter": self.filter, "inputs": list(self.inputs), **dict(self.settings)}
+
+
+def _plain(value: Any) -> Any:
+    """Return what can be hashed and written: tuples for lists, Python's numbers for NumPy's."""
+    if isinstance(value, list):
+        return tuple(value)
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def filters_from_list(values: object) -> tuple[FilterConfig, ...]:
@@ -90,8 +98,11 @@ class FilterChain(nn.Module):
         missing = [str(name) for name in cfg.inputs if name not in there]
         mend = f"there are {', '.join(there)}"
         require(not missing, where, "must read layers that are made before it", ", ".join(missing), mend)
-        step = Filter(cfg.filter, **dict(cfg.settings))
-        step.try_out(len(cfg.inputs), self.resolution)
+        try:
+            step = Filter(cfg.filter, **dict(cfg.settings))
+            step.try_out(len(cfg.inputs), self.resolution)
+        except (ValueError, TypeError) as error:
+            raise type(error)(f"{where}: {error}") from error
         self.inputs[cfg.layer] = tuple(cfg.inputs)
         self.steps.append(step)
 

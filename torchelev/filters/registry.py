@@ -51,7 +51,7 @@ def register(function: F) -> F:
             keep_freed_memory()
         if len(layers[0][0]) == 0:
             return layers[0]
-        parts = [masked(function(*map(masked, part), **settings)) for part in _parts(layers)]
+        parts = [_filtered(name, function, part, settings) for part in _parts(layers)]
         if len(parts) == 1:
             return parts[0][0].to(layers[0][0].dtype), parts[0][1]
         values, known = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
@@ -61,11 +61,25 @@ def register(function: F) -> F:
     return checked  # type: ignore[return-value]
 
 
+def _filtered(name: str, function: Callable[..., Layer], layers: list[Layer], settings: dict[str, Any]) -> Layer:
+    """Run a filter, and check what it returns: it may be a user's."""
+    result = function(*map(masked, layers), **settings)
+    rule, mend = "must return (values, known) of its layers' shape", "return values, known"
+    pair = isinstance(result, tuple) and len(result) == 2 and all(isinstance(part, Tensor) for part in result)
+    require(pair, f"filter {name}", rule, type(result).__name__, mend, TypeError)
+    check_layers(f"what filter {name} returns", (result, layers[0]))
+    return masked(result)
+
+
 def check_layers(name: str, layers: tuple[Layer, ...]) -> None:
     """Raise ValueError unless layers are (B, H, W) with a mask each, all of one shape."""
     shapes = []
-    for number, (values, known) in enumerate(layers):
+    for number, layer in enumerate(layers):
         argument = f"{name}, layer {number}"
+        pair = isinstance(layer, tuple) and len(layer) == 2 and all(isinstance(part, Tensor) for part in layer)
+        mend = "make one of values with NaN by filters.as_layer"
+        require(pair, argument, "must be a layer (values, known)", type(layer).__name__, mend, TypeError)
+        values, known = layer
         fits = values.ndim == 3 and values.shape == known.shape and values.is_floating_point()
         came = f"{tuple(values.shape)} {values.dtype} and {tuple(known.shape)}"
         require(fits, argument, "expected values (B, H, W) of floats and known (B, H, W)", came, "see as_layer")

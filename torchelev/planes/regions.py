@@ -30,10 +30,12 @@ class Region:
     label: int  # of its cells in `Planes.labels`
     normal: Float[ndarray, "3"]  # unit, up
     point: Float[ndarray, "3"]  # on the plane, above the cells' mean x and y
-    boundary: Float[ndarray, "K 3"]
-    holes: list[Float[ndarray, "_ 3"]]
-    inset: list[Float[ndarray, "_ 3"]]  # what is left of the region a margin away from its border and holes
-    inset_holes: list[Float[ndarray, "_ 3"]]  # what to leave out of the inset
+    boundary: Float[ndarray, "K 3"] = field(repr=False)
+    holes: list[Float[ndarray, "_ 3"]] = field(repr=False)
+    inset: list[Float[ndarray, "_ 3"]] = field(
+        repr=False
+    )  # what is left of the region a margin away from its border and holes
+    inset_holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  # what to leave out of the inset
     area: float  # [m^2] of its cells, projected onto x and y
     roughness: float  # [m] root mean square distance of its cells from the plane
 
@@ -134,6 +136,7 @@ def convex_region(region: Region, foothold_xy: Any, margin: float = 0.0) -> Floa
 
 def _as_xy(name: str, xy: Any) -> Float[ndarray, "2"]:
     point = np.asarray(xy.detach().cpu() if isinstance(xy, Tensor) else xy, np.float64)
+    point = point[:2] if point.shape == (3,) else point  # a foothold's own point
     good = point.shape == (2,) and bool(np.isfinite(point).all())
     require(good, name, "must be two finite numbers, x and y [m]", xy, "give (x, y) in the map frame")
     return point

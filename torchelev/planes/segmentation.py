@@ -32,7 +32,7 @@ class PlaneConfig:
 
     window: float = 0.2  # [m] the side of the square whose cells make a cell's local plane; 3 cells at least
     max_inclination: float = 0.6  # [rad] of local planes and of regions
-    max_roughness: float = 0.01  # [m] root mean square distance of the cells from the plane of a window or a region
+    max_roughness: float = 0.01  # [m] root mean square distance of the cells from their plane, more than the noise
     max_distance: float = 0.025  # [m] of any cell from its region's plane
     max_curvature: float = 2.0  # [1/m] change of slope between neighbouring cells of a region, where it begins
     min_area: float = 0.04  # [m^2] projected onto x and y
