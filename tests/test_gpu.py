@@ -19,6 +19,14 @@ OPERATORS = [
 ]
 
 
+def forbid_reading(monkeypatch):
+    """Make what reads or copies values raise: the operators' own code on "meta", and constants made on the host."""
+    for operator in OPERATORS:
+        monkeypatch.setattr(operator, "_abstract_fn", operator._init_fn)
+    for constructor in ("tensor", "as_tensor", "from_numpy"):  # copies a constant, while the host waits
+        monkeypatch.setattr(torch, constructor, None)
+
+
 class OneDevice(TorchDispatchMode):
     """Refuses operations between devices, for which the host waits."""
 
@@ -32,12 +40,9 @@ class OneDevice(TorchDispatchMode):
 
 def test_host_reads_nothing_back(monkeypatch):
     # Tensors on "meta" have no values, so that reading one raises; all but the CPU takes the GPU's paths.
-    for operator in OPERATORS:
-        monkeypatch.setattr(operator, "_abstract_fn", operator._init_fn)
+    forbid_reading(monkeypatch)
     emap = ElevationMap(small_config(sensor=SensorConfig(body=BodyConfig())), 5, "meta")
     cloud, T = torch.empty(5, 2, 100, 3, device="meta"), torch.empty(5, 2, 4, 4, device="meta")
-    for constructor in ("tensor", "as_tensor", "from_numpy"):  # copies a constant, while the host waits
-        monkeypatch.setattr(torch, constructor, None)
     with OneDevice():
         emap.update(cloud, T, T[:, 0], 0.1)
         emap.update(cloud, T, T[:, 0], torch.empty(5, device="meta"), variance=cloud[..., 0])

@@ -9,7 +9,7 @@ from conftest import pose
 from hypothesis import given
 from hypothesis import strategies as st
 from test_footprint import ground_map, random_map, rectangle
-from test_gpu import OPERATORS, OneDevice
+from test_gpu import OneDevice, forbid_reading
 
 from torchelev import ElevationMap
 from torchelev.footprint import FootprintConfig, check_footprint
@@ -169,10 +169,7 @@ def test_batches_equal_single_paths():
 
 def test_checks_do_not_read_values(monkeypatch):
     """Tensors on "meta" have no values, so that reading one raises."""
-    for operator in OPERATORS:
-        monkeypatch.setattr(operator, "_abstract_fn", operator._init_fn)
-    for constructor in ("tensor", "as_tensor", "from_numpy"):  # copies a constant, while the host waits
-        monkeypatch.setattr(torch, constructor, None)
+    forbid_reading(monkeypatch)
     emap = ElevationMap(num_envs=2, device="meta")
     with OneDevice():
         for poses in (torch.empty(2, 3, 3, device="meta"), torch.empty(2, 3, 4, 4, device="meta")):

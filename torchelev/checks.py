@@ -127,3 +127,11 @@ def check_env_ids(env_ids: object, num_envs: int, device: torch.device, always: 
         unique = value.unique().numel() == value.numel()
         require(unique, "env_ids", "must not repeat", value.tolist(), "use torch.unique or pass mask=")
     return value
+
+
+def check_xy(name: str, xy: object, num_envs: int, device: torch.device) -> Tensor:
+    """Return points (B, M, 2) of each environment."""
+    value = check_tensor(name, xy, device, FLOATS)
+    fits = value.ndim == 3 and value.shape[0] == num_envs and value.shape[2] == 2
+    require(fits, name, f"expected ({num_envs}, M, 2)", tuple(value.shape), "give points for each environment")
+    return value

@@ -275,18 +275,15 @@ class ElevationMap(nn.Module):
         return (*LAYERS, *self.filters.inputs)
 
     def _read(self, name: str, state: MapState | None) -> Layer:
-        require(
-            name in self.layers,
-            "layer",
-            "must be a layer's name",
-            repr(name),
-            f"there are {', '.join(self.layers)}",
-            KeyError,
-        )
-        if name not in self.filters:
-            values, known = LAYERS[name](self.state if state is None else state)
-            unrated = name == "traversability" and self.cfg.traversability is None
-            return values, torch.zeros_like(known) if unrated else known
+        if name in self.filters:
+            return self._filter(name, state)
+        mend = f"there are {', '.join(self.layers)}"
+        require(name in LAYERS, "layer", "must be a layer's name", repr(name), mend, KeyError)
+        values, known = LAYERS[name](self.state if state is None else state)
+        unrated = name == "traversability" and self.cfg.traversability is None
+        return values, torch.zeros_like(known) if unrated else known
+
+    def _filter(self, name: str, state: MapState | None) -> Layer:
         if state is not None:
             return self.filters.read(name, lambda source: self._read(source, state), {})
         with torch.inference_mode(False), torch.no_grad():  # kept, and perhaps read outside of inference mode later
@@ -307,9 +304,7 @@ class ElevationMap(nn.Module):
 
         Raises KeyError for an unknown layer, ValueError for another mode or shape.
         """
-        xy = checks.check_tensor("xy", xy, self.device, checks.FLOATS)
-        fits = xy.ndim == 3 and xy.shape[0] == self.num_envs and xy.shape[2] == 2
-        require(fits, "xy", f"expected ({self.num_envs}, M, 2)", tuple(xy.shape), "give points for each environment")
+        xy = checks.check_xy("xy", xy, self.num_envs, self.device)
         good = mode in ("bilinear", "nearest")
         require(good, "mode", 'must be "bilinear" or "nearest"', repr(mode), "use bilinear")
         corner = (self.state if state is None else state).corner

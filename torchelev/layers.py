@@ -18,10 +18,14 @@ if TYPE_CHECKING:
 Layer = tuple[Tensor, Tensor]  # values and where they are known, both (B, H, W)
 
 
-def _normal(state: MapState, axis: int) -> Layer:
-    gx, gy = state.gradient_x, state.gradient_y
+def normal_component(gx: Tensor, gy: Tensor, axis: int) -> Tensor:
+    """Return x, y or z of a plane's unit normal (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2)."""
     component = (-gx, -gy, torch.ones_like(gx))[axis]
-    return component / (1 + gx.square() + gy.square()).sqrt(), state.validity
+    return component / (1 + gx.square() + gy.square()).sqrt()
+
+
+def _normal(state: MapState, axis: int) -> Layer:
+    return normal_component(state.gradient_x, state.gradient_y, axis), state.validity
 
 
 def _upper_bound(state: MapState) -> Layer:

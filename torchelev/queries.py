@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor, readable
+from torchelev.checks import FLOATS, check_tensor, check_xy, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, whole_cells
 from torchelev.state import MapState
@@ -54,7 +54,8 @@ def height_profile(
     Raises KeyError for an unknown layer; ValueError or TypeError for wrong shapes, dtypes and devices, another mode,
     and fewer than 2 points.
     """
-    start, end = (_check_points(emap, name, xy) for name, xy in (("start", start), ("end", end)))
+    both = (("start", start), ("end", end))
+    start, end = (check_xy(name, xy, emap.num_envs, emap.device).double() for name, xy in both)
     mend = "give each line a start and an end"
     require(start.shape == end.shape, "end", f"expected {tuple(start.shape)}", tuple(end.shape), mend)
     whole = type(num_points) is int and num_points >= 2
@@ -96,13 +97,6 @@ def submap(
     size = torch.stack([first.new_full((), cells) for cells in (h, w)])
     center = (first.double() + size.double() / 2) * grid.resolution
     return Submap({name: _read_cells(*layer, cell) for name, layer in found.items()}, center, grid.resolution)
-
-
-def _check_points(emap: ElevationMap, name: str, xy: object) -> Float[Tensor, "B M 2"]:
-    value = check_tensor(name, xy, emap.device, FLOATS)
-    fits = value.ndim == 3 and value.shape[0] == emap.num_envs and value.shape[2] == 2
-    require(fits, name, f"expected ({emap.num_envs}, M, 2)", tuple(value.shape), "give points for each environment")
-    return value.double()
 
 
 def _first_cell(emap: ElevationMap, center_xy: object, shape: tuple[int, int]) -> Int[Tensor, "B 2"]:

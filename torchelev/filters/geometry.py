@@ -20,7 +20,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.filters.extrema import dilation, erosion
 from torchelev.filters.registry import radius_cells, register
-from torchelev.layers import Layer
+from torchelev.layers import Layer, normal_component
 from torchelev.storage import as_bytes
 from torchelev.surface import Plane, fit_plane, known_ground, less
 from torchelev.windows import window_moments
@@ -54,8 +54,7 @@ def slope(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
 
 def _normal(layer: Layer, resolution: float, radius: float, axis: int) -> Layer:
     gx, gy, _ = plane_around(layer, resolution, radius)
-    component = (-gx, -gy, torch.ones_like(gx))[axis]
-    return component / (1 + gx.square() + gy.square()).sqrt(), layer[1]
+    return normal_component(gx, gy, axis), layer[1]
 
 
 @register

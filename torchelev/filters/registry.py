@@ -64,9 +64,6 @@ def register(function: F) -> F:
 def _filtered(name: str, function: Callable[..., Layer], layers: list[Layer], settings: dict[str, Any]) -> Layer:
     """Run a filter, and check what it returns: it may be a user's."""
     result = function(*map(masked, layers), **settings)
-    rule, mend = "must return (values, known) of its layers' shape", "return values, known"
-    pair = isinstance(result, tuple) and len(result) == 2 and all(isinstance(part, Tensor) for part in result)
-    require(pair, f"filter {name}", rule, type(result).__name__, mend, TypeError)
     check_layers(f"what filter {name} returns", (result, layers[0]))
     return masked(result)
 
