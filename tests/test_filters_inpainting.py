@@ -326,6 +326,19 @@ def test_becomes_known_wherever_the_map_knows_anything(function, shape, share, d
 
 
 @pytest.mark.parametrize("function", OPENCV)
+@pytest.mark.parametrize("shape", [(1, 1, 40), (1, 40, 1)])
+def test_a_single_line_of_cells_gives_the_same_each_time(function, shape):
+    """Of a single line OpenCV reads what lies in memory behind it, so that results differ and are not finite."""
+    values, known = random_layer(4, shape, 0.4, torch.float32)
+    results = []
+    for junk in [math.nan, 1e30] * 300:
+        blocks = [np.full(size, junk, np.float32) for size in (16, 33, 64, 128, 200, 300)]
+        del blocks  # what OpenCV is given next
+        results.append(function((values, known), resolution=0.04))
+    assert all(found.all() and torch.equal(filled, results[0][0]) for filled, found in results)
+
+
+@pytest.mark.parametrize("function", OPENCV)
 def test_opencv_is_not_quantised_to_8_bits(function):
     """A hole in a plane: hundreds of different heights within half a metre, at any altitude."""
     x = (torch.arange(60) * 0.04).repeat(60, 1)

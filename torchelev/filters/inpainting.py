@@ -136,11 +136,18 @@ def _inpainted(layer: Layer, radius: int, method: int) -> Layer:
     weight = as_bytes(known).to(values.dtype)
     datum = mean_of_known(values, weight)
     heights = ((values.detach() - datum) * UNITS * weight).float().cpu()
-    images = zip(heights.numpy(), (~known).byte().cpu().numpy(), strict=True)
+    images = zip(_two_lines(heights).numpy(), _two_lines((~known).byte().cpu()).numpy(), strict=True)
     filled = [image if holes.all() else cv2.inpaint(image, holes, radius, method) for image, holes in images]
     found = known.any(2, keepdim=True).any(1, keepdim=True)
-    filling = torch.stack([torch.from_numpy(image) for image in filled]).to(values) / UNITS + datum
+    H, W = known.shape[1:]
+    filling = torch.stack([torch.from_numpy(image) for image in filled])[:, :H, :W].to(values) / UNITS + datum
     return torch.where(known, values, filling), known | found
+
+
+def _two_lines(images: Tensor) -> Tensor:
+    """Repeat the only row or column of images (B, H, W): of a single one OpenCV reads beyond its memory."""
+    H, W = images.shape[1:]
+    return images.expand(-1, max(2, H), max(2, W)).contiguous()
 
 
 @register
