@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require_positive
+from torchelev.filters import opencv
 from torchelev.filters.registry import register
 from torchelev.layers import Layer
 from torchelev.storage import as_bytes
@@ -49,10 +50,10 @@ def signed_distance(
     for name, limit in dict(step=step, max_distance=max_distance).items():
         if limit is not None:
             require_positive(**{name: limit})
-    obstacle = _obstacles(values, below, above)
     farthest = math.hypot(*values.shape[1:])
     if max_distance is not None:
         farthest = min(farthest, max_distance / resolution)
+    obstacle = _obstacles(values, below, above)
     borders = _beside_borders(values.detach(), known, obstacle, step, unknown)
     squared = squared_distance(borders, math.ceil(farthest)).to(values.dtype)
     distance = (squared.sqrt() + 0.5).clamp(max=farthest) * resolution
@@ -80,6 +81,9 @@ def _beside_borders(
     weight = as_bytes(known).to(values.dtype)
     level = torch.add(level * weight, 1 - weight, alpha=-FAR)
     limit = FAR / 10 if step is None else step
+    if opencv.serves(level):
+        among = None if unknown else known.numpy()
+        return torch.from_numpy(opencv.differs_from_a_side(level.numpy(), among, limit, rim=-FAR))
     rimmed, there = F.pad(level, [1] * 4, value=-FAR), F.pad(known, [1] * 4)
     beside = torch.zeros_like(known)
     for dim in (1, 2):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchelev.filters import opencv
 from torchelev.filters.registry import radius_cells, register
 from torchelev.layers import Layer
 from torchelev.operators import padded
@@ -26,14 +27,14 @@ def dilation(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     Raises ValueError for a radius that is not positive.
     """
     values, known = layer
-    return _highest(values, known, radius_cells(radius, resolution)), known
+    return highest_known(values, known, radius_cells(radius, resolution)), known
 
 
 @register
 def erosion(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """Return the lowest known cell of the square window around each known cell, as `dilation` the highest."""
     values, known = layer
-    return -_highest(-values, known, radius_cells(radius, resolution)), known
+    return lowest_known(values, known, radius_cells(radius, resolution)), known
 
 
 @register
@@ -44,7 +45,7 @@ def opening(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """
     values, known = layer
     cells = radius_cells(radius, resolution)
-    return _highest(-_highest(-values, known, cells), known, cells), known
+    return highest_known(lowest_known(values, known, cells), known, cells), known
 
 
 @register
@@ -55,7 +56,7 @@ def closing(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """
     values, known = layer
     cells = radius_cells(radius, resolution)
-    return -_highest(-_highest(values, known, cells), known, cells), known
+    return lowest_known(highest_known(values, known, cells), known, cells), known
 
 
 @register
@@ -92,10 +93,26 @@ def blank(dtype: torch.dtype) -> float:
     return -torch.finfo(dtype).max / 4
 
 
-def _highest(values: Tensor, known: Tensor, radius: int) -> Tensor:
+def highest_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
     """Return the highest known cell of the window around each known cell; what is at unknown cells has no meaning."""
+    if opencv.serves(values):
+        return opencv.highest((values, known), radius)
     rimmed = padded(lowered(values, as_bytes(known).to(values.dtype)), radius, blank(values.dtype))
     return highest_of_windows(rimmed, 2 * radius + 1)
+
+
+def lowest_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
+    """Return the lowest known cell of the window around each known cell, as `highest_known` the highest."""
+    if opencv.serves(values):
+        return opencv.lowest((values, known), radius)
+    return -highest_known(-values, known, radius)
+
+
+def range_of_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
+    """Return the height of the highest known cell of the window around each known cell over the lowest."""
+    if opencv.serves(values):
+        return opencv.height_range((values, known), radius)
+    return highest_known(values, known, radius) - lowest_known(values, known, radius)
 
 
 def highest_of_windows(rimmed: Tensor, width: int) -> Tensor:

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.filters.extrema import dilation, erosion
+from torchelev.filters import opencv
+from torchelev.filters.extrema import range_of_known
 from torchelev.filters.registry import radius_cells, register
 from torchelev.layers import Layer, normal_component
 from torchelev.storage import as_bytes
@@ -88,6 +89,8 @@ def roughness(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
 def standard_deviation(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """Return the standard deviation [m] around the window's mean, sqrt(mean z^2 - (mean z)^2): slopes count too."""
     cells = radius_cells(radius, resolution)
+    if opencv.serves(layer[0]):
+        return opencv.deviation(layer, cells, math.sqrt(TINY)), layer[1]
     known, height, _ = known_ground(*layer, cells)
     (sums,) = window_moments([(torch.stack([known, height, height.square()]), 0)], cells, cells)
     number, total, squares = sums.unbind(0)
@@ -104,12 +107,12 @@ def step_height(layer: Layer, *, resolution: float, radius: float = 0.1, less_sl
     dilation of it is the second stage, less that one's count of critical cells. A slope has height too:
     `less_slope` takes off what the window's own plane explains, 2 radius (|g_x| + |g_y|), and returns at least 0.
     """
-    highest, known = dilation(layer, resolution=resolution, radius=radius)
-    height = highest - erosion(layer, resolution=resolution, radius=radius)[0]
+    values, known = layer
+    cells = radius_cells(radius, resolution)
+    height = range_of_known(values, known, cells)
     if less_slope:
         plane = plane_around(layer, resolution, radius)
-        reach = radius_cells(radius, resolution) * resolution
-        explained = 2 * reach * (plane.gradient_x.abs() + plane.gradient_y.abs())
+        explained = 2 * cells * resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())
         height = (height - explained).clamp(min=0)
     return height, known
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from torchelev.errors import require, require_positive
+from torchelev.filters import opencv
 from torchelev.layers import Layer
 from torchelev.storage import as_bytes, keep_freed_memory
 
@@ -93,6 +94,8 @@ def masked(layer: Layer) -> Layer:
     """
     values, known = layer
     values = values.to(torch.promote_types(values.dtype, torch.float32))
+    if opencv.serves(values):
+        return opencv.masked(values, known)
     known = known & values.isfinite()
     return values.nan_to_num(0.0, 0.0, 0.0) * as_bytes(known).to(values.dtype), known
 

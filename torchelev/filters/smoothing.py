@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require_positive
+from torchelev.filters import opencv
 from torchelev.filters.extrema import blank, lowered
 from torchelev.filters.order import lowest_of_windows
 from torchelev.filters.registry import radius_cells, register
@@ -33,6 +34,8 @@ def gaussian(layer: Layer, *, resolution: float, sigma: float = 0.1) -> Layer:
     """
     require_positive(sigma=sigma)
     radius, width = radius_cells(3 * sigma, resolution), sigma / resolution
+    if opencv.serves(layer[0]):
+        return opencv.gaussian_mean(layer, radius, width), layer[1]
     return _mean(layer, radius, lambda rimmed, dim: gaussian_sums(rimmed, radius, width, dim))
 
 
@@ -42,7 +45,10 @@ def box(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
 
     `radius` [m], to the nearest cell, at least one. Raises ValueError for a radius that is not positive.
     """
-    width = 2 * radius_cells(radius, resolution) + 1
+    cells = radius_cells(radius, resolution)
+    width = 2 * cells + 1
+    if opencv.serves(layer[0]):
+        return opencv.box_mean(layer, cells), layer[1]
     return _mean(layer, width // 2, lambda rimmed, dim: running_sums(rimmed, width, dim))
 
 

@@ -1,0 +1,90 @@
+"""What OpenCV does on a CPU is what tensor operations do elsewhere."""
+
+import numpy as np
+import pytest
+import torch
+from filter_cases import SEEDS, SHARES, assert_batch_is_single, random_layer
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchelev import filters
+from torchelev.filters import opencv
+
+SHAPES = st.tuples(st.integers(1, 3), st.integers(1, 12), st.integers(1, 11))
+SERVED = {
+    "gaussian": dict(sigma=0.15),
+    "box": dict(radius=0.2),
+    "dilation": dict(radius=0.2),
+    "erosion": dict(radius=0.2),
+    "opening": dict(radius=0.1),
+    "closing": dict(radius=0.1),
+    "step_height": dict(radius=0.2),
+    "standard_deviation": dict(radius=0.2),
+    "signed_distance": dict(step=0.5),
+    "signed_distance of obstacles": dict(step=0.5, below=-0.3, above=0.9),
+    "signed_distance, unknown left out": dict(step=0.5, unknown=False),
+}
+
+
+def filtered(name, layer):
+    return filters.FILTERS[name.split()[0].strip(",")](layer, resolution=0.1, **SERVED[name])
+
+
+def by_tensors(name, layer):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(opencv, "serves", lambda values: False)
+        return filtered(name, layer)
+
+
+@pytest.mark.parametrize("name", SERVED)
+@given(SEEDS, SHAPES, SHARES, st.sampled_from([0.0, 300.0]))
+def test_the_same_as_tensor_operations(name, seed, shape, share, altitude):
+    values, known = random_layer(seed, shape, share, torch.float32)
+    layer = values + altitude, known
+    assert opencv.serves(layer[0])
+    got, expected = filtered(name, layer), by_tensors(name, layer)
+    assert torch.equal(got[1], expected[1])
+    torch.testing.assert_close(got[0], expected[0], atol=2e-6 if altitude == 0 else 1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", SERVED)
+def test_maps_below_one_another_do_not_touch(name):
+    layer = random_layer(1, (5, 9, 8), 0.8, torch.float32)
+    assert_batch_is_single(lambda layer: filtered(name, layer), layer)
+
+
+@pytest.mark.parametrize("name", SERVED)
+def test_slices_are_filtered_as_copies(name):
+    """Of maps that lie otherwise in memory."""
+    values, known = random_layer(2, (2, 9, 8), 0.8, torch.float32)
+    whole = filtered(name, (values.mT.contiguous(), known.mT.contiguous()))
+    turned = filtered(name, (values.mT, known.mT))
+    assert torch.equal(whole[0], turned[0]) and torch.equal(whole[1], turned[1])
+
+
+def test_the_arguments_stay_as_they_are():
+    values, known = torch.full((1, 5, 5), 2.0), torch.ones(1, 5, 5, dtype=torch.bool)
+    values[0, 2, 2] = np.inf
+    for name in SERVED:
+        smooth, there = filtered(name, (values, known))
+        assert known.all() and values[0, 2, 2] == np.inf and not there[0, 2, 2] and there.sum() == 24
+        assert smooth.isfinite().all()
+
+
+def test_serves_plain_float32_on_a_cpu_without_gradient():
+    values = torch.zeros(1, 3, 3)
+    assert opencv.serves(values)
+    assert not opencv.serves(values.double()) and not opencv.serves(values.to("meta"))
+    learns = values.clone().requires_grad_()
+    assert not opencv.serves(learns)
+    with torch.no_grad():
+        assert opencv.serves(learns)
+        smooth, _ = filtered("gaussian", (learns, torch.ones(1, 3, 3, dtype=torch.bool)))
+    assert not smooth.requires_grad
+
+
+def test_without_opencv_tensors_do_it(monkeypatch):
+    layer = random_layer(3, (2, 7, 6), 0.8, torch.float32)
+    expected = by_tensors("gaussian", layer)
+    monkeypatch.setattr(opencv, "_installed", lambda: False)
+    assert torch.equal(filtered("gaussian", layer)[0], expected[0])
