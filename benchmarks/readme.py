@@ -90,6 +90,14 @@ def postprocessing() -> str:
     return f"{times.table(result['rows'])}\n\n{times.planes_table(result['planes'])}"
 
 
+def occlusion() -> str:
+    """Tabulate who was right over whole walks [%], by rule and kind of ground."""
+    right = load("occlusion")["right [%]"]
+    kinds = list(next(iter(right.values())))
+    rows = [[rule, *(f"{shares[kind]['whole walk']:.0f}" for kind in kinds)] for rule, shares in right.items()]
+    return markdown_table(["rule for unknown ground", *kinds], rows)
+
+
 TABLES = {
     "accuracy": accuracy,
     "features": features,
@@ -99,6 +107,7 @@ TABLES = {
     "nav": nav,
     "sight": sight,
     "postprocessing": postprocessing,
+    "occlusion": occlusion,
 }
 
 

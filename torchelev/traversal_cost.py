@@ -1,0 +1,175 @@
+"""What a metre of way costs a robot: from the rating of known ground, and the upper bound where nothing is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.checks import FLOATS, check_tensor
+from torchelev.elevation_map import ElevationMap
+from torchelev.errors import require, require_positive
+from torchelev.layers import Layer
+from torchelev.operators import padded
+from torchelev.state import MapState
+from torchelev.windows import window_maximum
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TraversalCostConfig:
+    """What makes ground impassable, and what the rest costs. The weights are added to 1 for each metre."""
+
+    min_traversability: float = 0.3  # known ground rated below it is impassable
+    weight_traversability: float = 4.0  # of ground rated 0
+    weight_confidence: float = 1.0  # of ground whose rating is worth nothing, or that is not known
+    cross_unknown: bool = True  # False: whatever is not known is impassable
+    max_inclination: float = 0.5  # [rad] of the upper bound; steeper, what is not known is taken for a drop
+    inclination_distance: float = 0.3  # [m] over which the inclination is taken: half of what the feet span
+    weight_inclination: float = 1.0  # of unknown ground at max_inclination
+    inflation_radius: float = 0.0  # [m] by which what is impassable grows; 0 for ratings that count the robot's size
+    stand_radius: float = 0.4  # [m] around a path's start unknown ground is passable: the robot stands on it
+
+    def __post_init__(self) -> None:
+        whole = isinstance(self.cross_unknown, bool)
+        require(whole, "cost.cross_unknown", "must be a bool", repr(self.cross_unknown), "give True or False")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            good = isinstance(value, int | float) and 0 <= value < math.inf
+            require(good, f"cost.{field.name}", "must be at least 0", repr(value), "leave it out for its default")
+        rated = self.min_traversability <= 1
+        require(rated, "cost.min_traversability", "must lie in [0, 1]", self.min_traversability, "give 0.3")
+        flat = 0 < self.max_inclination < math.pi / 2
+        require(flat, "cost.max_inclination", "must lie between 0 and pi / 2", self.max_inclination, "give radians")
+        require_positive(**{"cost.inclination_distance": self.inclination_distance})
+
+    @classmethod
+    def of(cls, cfg: object) -> TraversalCostConfig:
+        """Return what was given for a config; the defaults for None."""
+        cfg = cls() if cfg is None else cfg
+        require(isinstance(cfg, cls), "cfg", "must be a TraversalCostConfig", repr(cfg), "build one", TypeError)
+        assert isinstance(cfg, cls)
+        return cfg
+
+
+def traversal_cost(
+    emap: ElevationMap,
+    cfg: TraversalCostConfig | None = None,
+    *,
+    confidence: Float[Tensor, "B H W"] | None = None,
+    state: MapState | None = None,
+) -> Float[Tensor, "B H W"]:
+    """Return what each cell costs for each metre of way: at least 1, inf where it is impassable.
+
+    With traversability t, its confidence q and the inclination a of the upper bound (`inclination`), of ground that is
+
+        known:        1 + w_t (1 - t)      + w_c (1 - q)   impassable where t < min_traversability
+        only bounded: 1 + w_a a / max_a    + w_c           impassable where a > max_inclination
+        neither:      impassable
+
+    Behind an edge, rays that passed over it bound the unseen ground. The nearer the robot, the steeper they look down,
+    and ground that they still do not meet falls more steeply than they: a steep bound means a drop, a gentle one
+    ground that may go on (paper, Sec. II-H). From afar a drop looks gentle too, so plan again on the way.
+
+    Args:
+        emap: the maps.
+        cfg: thresholds and weights.
+        confidence: of the traversability, 0 to 1, as the learned head gives it; None: 1.
+        state: of the maps; None: their own.
+
+    Raises ValueError or TypeError for a confidence that does not fit, and a map whose traversability is switched off.
+    """
+    cfg = TraversalCostConfig.of(cfg)
+    mend = "give ElevationMapConfig a TraversabilityConfig"
+    require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", mend)
+    state = emap.state if state is None else state
+    if confidence is not None:
+        confidence = check_tensor("confidence", confidence, emap.device, FLOATS)
+        shape = tuple(state.elevation.shape)
+        fits = tuple(confidence.shape) == shape
+        require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
+    rated, bound = emap._read("traversability", state), emap._read("upper_bound", state)
+    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence)
+
+
+def cost_of_layers(
+    rated: Layer, bound: Layer, resolution: float, cfg: TraversalCostConfig, confidence: Tensor | None = None
+) -> Float[Tensor, "B H W"]:
+    """Return `traversal_cost` of layers: the traversability, and the upper bound, which is the elevation where known.
+
+    Each is values and where they are known, (B, H, W) both. What a layer holds where it is not known does not count.
+    """
+    t, known = rated
+    doubt = torch.zeros_like(t) if confidence is None else 1 - confidence.to(t.dtype).nan_to_num(0.0).clamp(0, 1)
+    cost = 1 + cfg.weight_traversability * (1 - t.clamp(0, 1)) + cfg.weight_confidence * doubt
+    cost = torch.where(known & (t >= cfg.min_traversability), cost, torch.inf)
+    if cfg.cross_unknown:
+        angle, tells = inclination(bound, resolution, cfg.inclination_distance)
+        guess = 1 + cfg.weight_confidence + cfg.weight_inclination / cfg.max_inclination * angle
+        gentle = tells & ~known & (angle <= cfg.max_inclination)
+        cost = torch.where(gentle, guess, cost)
+    return _inflated(cost, round(cfg.inflation_radius / resolution))
+
+
+def inclination(bound: Layer, resolution: float, distance: float) -> Layer:
+    """Return how steeply a surface rises or falls around each cell [rad], and where it is known.
+
+    atan max_k |u_k - u| / d_k over eight places, `distance` [m] away along x, y and the diagonals to the nearest cell,
+    as far as they are known. Known where the cell and one of those are. Over the span of its feet a robot crosses a
+    step of some height as it does a slope; a steeper place in between does not count.
+    """
+    known = bound[1]
+    values = torch.where(known, bound[0], 0.0)
+    reach = max(1, round(distance / resolution))
+    aslant = max(1, round(reach / math.sqrt(2)))
+    offsets = [(i * n, j * n) for i, j, n in _compass(reach, aslant)]
+    height, there = (padded(layer, reach, 0.0) for layer in (values, known.to(values.dtype)))
+    steepest, found = torch.zeros_like(values), torch.zeros_like(known)
+    for i, j in offsets:
+        step = _shifted(height, reach, i, j) - values
+        other = _shifted(there, reach, i, j)
+        steepest = torch.maximum(steepest, step.abs() * other / (math.hypot(i, j) * resolution))
+        found = found | (other > 0)
+    found = found & known
+    return torch.where(found, torch.atan(steepest), 0.0), found
+
+
+def _compass(reach: int, aslant: int) -> list[tuple[int, int, int]]:
+    """Return the eight directions with how many cells to go along each axis."""
+    axes = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    return [(i, j, aslant if i and j else reach) for i, j in axes]
+
+
+def _shifted(rimmed: Tensor, rim: int, i: int, j: int) -> Tensor:
+    H, W = rimmed.shape[1] - 2 * rim, rimmed.shape[2] - 2 * rim
+    return rimmed.narrow(1, rim + i, H).narrow(2, rim + j, W)
+
+
+def _inflated(cost: Tensor, radius: int) -> Float[Tensor, "B H W"]:
+    """Make impassable what lies within a square of so many cells around impassable ground."""
+    if radius == 0:
+        return cost
+    blocked = torch.isinf(cost).to(cost.dtype)
+    (near,) = window_maximum([padded(blocked, radius, 0.0)], radius, radius)
+    return torch.where(near > 0, torch.inf, cost)
+
+
+def passable_start(
+    cost: Float[Tensor, "B H W"],
+    known: Bool[Tensor, "B H W"],
+    start: Tensor,
+    resolution: float,
+    cfg: TraversalCostConfig,
+) -> Float[Tensor, "B H W"]:
+    """Make the cell `start` (B, 2) passable, and what is not known within `stand_radius` of it."""
+    i = torch.arange(cost.shape[1], device=cost.device)[None, :, None] - start[:, 0, None, None]
+    j = torch.arange(cost.shape[2], device=cost.device)[None, None, :] - start[:, 1, None, None]
+    away = i.square() + j.square()
+    under = (~known & (away <= (cfg.stand_radius / resolution) ** 2)) | (away == 0)
+    worst = 1 + cfg.weight_traversability + cfg.weight_confidence
+    return torch.where(under & torch.isinf(cost), worst, cost)
