@@ -1,5 +1,6 @@
 """What the tests share: small configs, poses, clouds, random states, and how two states are compared."""
 
+import functools
 import math
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
 
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, pipeline
+from torchelev.pipeline import graphs_of
 from torchelev.state import MapState, Statistics, blank_state
 
 settings.register_profile(
@@ -27,6 +29,23 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def compile_with(monkeypatch):
+    """Let emap.compile() use another backend of the compiler, with the guards of the real one."""
+    compiler, options = torch.compile, pipeline.compiler_options()
+    guards = {name: value for name, value in options.items() if name == "guard_filter_fn"}
+
+    def use(backend):
+        monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
+        monkeypatch.setattr(torch, "compile", functools.partial(compiler, backend=backend))
+        graphs_of.cache_clear()
+        torch._dynamo.reset()
+
+    yield use
+    graphs_of.cache_clear()
+    torch._dynamo.reset()
 
 
 def small_config(cells=(12, 10), resolution=0.1, **stages):

@@ -1,6 +1,5 @@
 """Compilation: one graph, the same results, shared where inputs are alike and apart where they are not."""
 
-import functools
 import itertools
 
 import pytest
@@ -9,7 +8,7 @@ from conftest import assert_close, differences, mapped, scan, small_config, smal
 from torch._dynamo.testing import CompileCounter
 
 import torchelev
-from torchelev import SensorConfig, pipeline
+from torchelev import SensorConfig
 from torchelev.layers import LAYERS
 from torchelev.pipeline import graphs_of
 
@@ -90,23 +89,6 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
             rounded = floats | {"drift_error", "drift_correction"}
             assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
     assert graphs() == before + 1
-
-
-@pytest.fixture
-def compile_with(monkeypatch):
-    """Let emap.compile() use another backend of the compiler, with the guards of the real one."""
-    compiler, options = torch.compile, pipeline.compiler_options()
-    guards = {name: value for name, value in options.items() if name == "guard_filter_fn"}
-
-    def use(backend):
-        monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
-        monkeypatch.setattr(torch, "compile", functools.partial(compiler, backend=backend))
-        graphs_of.cache_clear()
-        torch._dynamo.reset()
-
-    yield use
-    graphs_of.cache_clear()
-    torch._dynamo.reset()
 
 
 PLAIN = {"drift": None, "raycast": None, "overlap": None, "traversability": None}  # quick to trace

@@ -10,11 +10,13 @@ from torchelev.grid import GridConfig
 from torchelev.map_image import MapImage
 from torchelev.overlap import OverlapConfig
 from torchelev.raycast import RaycastConfig
+from torchelev.robot import RobotConfig
 from torchelev.scan import HeightScan
 from torchelev.sensor import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
 from torchelev.state import MapState, Measurement, Statistics
 from torchelev.surface import SurfaceConfig
-from torchelev.traversability import TraversabilityConfig
+from torchelev.traversability import LearnedTraversabilityConfig, TraversabilityConfig
+from torchelev.traversability_net import TraversabilityNet
 
 __version__ = "0.1.0"
 __all__ = [
@@ -29,15 +31,18 @@ __all__ = [
     "FusionConfig",
     "GridConfig",
     "HeightScan",
+    "LearnedTraversabilityConfig",
     "MapImage",
     "MapState",
     "Measurement",
     "OverlapConfig",
     "RaycastConfig",
+    "RobotConfig",
     "SensorConfig",
     "Statistics",
     "SurfaceConfig",
     "TraversabilityConfig",
+    "TraversabilityNet",
     "depth_to_points",
     "voxel_filter",
 ]

@@ -18,7 +18,7 @@ from torchelev.overlap import OverlapConfig
 from torchelev.raycast import RaycastConfig
 from torchelev.sensor import SensorConfig
 from torchelev.surface import SurfaceConfig
-from torchelev.traversability import TraversabilityConfig
+from torchelev.traversability import LearnedTraversabilityConfig, TraversabilityConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,9 @@ class ElevationMapConfig:
     raycast: RaycastConfig | None = field(default_factory=RaycastConfig)
     overlap: OverlapConfig | None = field(default_factory=OverlapConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
-    traversability: TraversabilityConfig | None = field(default_factory=TraversabilityConfig)
+    traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
+        default_factory=TraversabilityConfig
+    )
     filters: tuple[FilterConfig, ...] = ()
 
     def __post_init__(self) -> None:
@@ -84,9 +86,12 @@ def _value(hint: Any, value: object, where: str) -> Any:
     if value is None:
         require(type(None) in options, where, "cannot be switched off", "None", "leave it out to keep its default")
         return None
-    kind = next(option for option in options if option is not type(None))
+    kinds = [option for option in options if option is not type(None)]
+    kind = kinds[0]
     if dataclasses.is_dataclass(kind):
-        return _build(typing.cast(type, kind), value, where)
+        names = set(value) if isinstance(value, dict) else set()
+        fits = (k for k in kinds if names <= set(typing.get_type_hints(k)))  # of several, by their settings' names
+        return _build(typing.cast(type, next(fits, kind)), value, where)
     if isinstance(value, list):
         return tuple(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)

@@ -21,6 +21,8 @@ from torchelev.pipeline import compiled_update, fuse_measurement, rate_surface, 
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
 from torchelev.storage import keep_freed_memory
+from torchelev.traversability import LearnedTraversabilityConfig, learned_rating
+from torchelev.traversability_net import Rating, Weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -68,6 +70,8 @@ class ElevationMap(nn.Module):
         self.cfg, self.num_envs, self.check_values, self.chunk = cfg, num_envs, check_values, chunk
         self._compiled = False
         self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
+        learned = isinstance(cfg.traversability, LearnedTraversabilityConfig)
+        self.head = cfg.traversability.make_head(cfg.grid).to(device) if learned else None  # type: ignore[union-attr]
         self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
         self._filtered: dict[str, Layer] = {}  # what filters made of the stored state
         state = blank_state(cfg.grid, num_envs, device, torch.float32)
@@ -149,7 +153,9 @@ class ElevationMap(nn.Module):
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
         if self.device.type == "cpu":
             keep_freed_memory()
-        run = functools.partial(compiled_update if self._compiled else update_in_place, cfg=self._stages)
+        run = compiled_update if self._compiled else update_in_place
+        weights = None if self.head is None else self.head.weights.detached()
+        run = functools.partial(run, cfg=self._stages, weights=weights)
         self._filtered.clear()
         with torch.no_grad():
             chunks = self._chunks()
@@ -183,7 +189,11 @@ class ElevationMap(nn.Module):
 
     def forward(self, state: MapState, measurement: Measurement) -> MapState:
         """Fuse a measurement into a state and return the new one; touches no buffer (paper, Fig. 2)."""
-        return fuse_measurement(state, measurement, self.cfg)
+        return fuse_measurement(state, measurement, self.cfg, self._weights)
+
+    @property
+    def _weights(self) -> Weights | None:
+        return None if self.head is None else self.head.weights
 
     def _check_inputs(
         self, points: Any, T_map_sensor: Any, T_map_base: Any, dt: Any, variance: Any
@@ -243,7 +253,7 @@ class ElevationMap(nn.Module):
         if checks.readable(feet, self.check_values):
             require(bool(torch.isfinite(feet).all()), "feet", "must be finite", "NaN or inf", "leave those feet out")
         state = initialize(self.state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
-        self._store(rate_surface(state, self.cfg))
+        self._store(rate_surface(state, self.cfg, self._weights))
 
     # Reading --------------------------------------------------------------------------------------------------------
 
@@ -288,6 +298,20 @@ class ElevationMap(nn.Module):
             return self.filters.read(name, lambda source: self._read(source, state), {})
         with torch.inference_mode(False), torch.no_grad():  # kept, and perhaps read outside of inference mode later
             return self.filters.read(name, lambda source: self._read(source, None), self._filtered)
+
+    def rate(self, *, state: MapState | None = None) -> Rating:
+        """Return traversability and confidence of every cell, (B, H, W) each, 0 to 1.
+
+        The learned head rates unknown cells too, with a low confidence: the probability that "traversability is at
+        least one half" is right. The analytic head gives 0 to unknown cells, and confidence 1 to known ones.
+        Differentiable in the state and in the weights of `head`. Raises ValueError if traversability is switched off.
+        """
+        state, cfg = self.state if state is None else state, self.cfg.traversability
+        require(cfg is not None, "cfg.traversability", "must not be None", None, "give a TraversabilityConfig")
+        if isinstance(cfg, LearnedTraversabilityConfig) and self.head is not None:
+            return learned_rating(state, self.cfg.grid, cfg, self.head.weights)
+        rated = rate_surface(state, self.cfg).traversability
+        return Rating(rated, state.validity.to(rated.dtype))
 
     def sample(
         self,

@@ -29,11 +29,13 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     """Write the whole map: all environments, the layers that only an update reads too, config and precision.
 
     The file is an `.npz` without pickled objects: `header` (JSON: format, version, dtype, config), each field of
-    `MapState` by its name, and each of `Statistics` as `last_<name>`; NaN-free, as the map holds them.
+    `MapState` by its name, and each of `Statistics` as `last_<name>`; NaN-free, as the map holds them; and the learned
+    head's weights, if there is one, as `head_<name>`.
     """
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
     arrays: dict[str, Any] = {name: as_array(value) for name, value in _tensors(emap.state).items()}
+    arrays |= {f"head_{name}": as_array(value) for name, value in _head(emap).items()}
     text, path = np.array(json.dumps(header)), Path(path)
     unfinished = path.with_name(f"{path.name}.tmp")
     try:
@@ -62,8 +64,16 @@ def load_map(
     except ValueError as error:
         raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
     emap = emap.to(DTYPES[header["dtype"]])
+    for name, value in _head(emap).items():
+        found = _array(path, arrays, f"head_{name}", tuple(value.shape))
+        value.copy_(torch.from_numpy(found))
     emap._store(_state(path, arrays, emap.state, ids))
     return emap
+
+
+def _head(emap: ElevationMap) -> dict[str, Tensor]:
+    """Return the learned head's weights by name, if there is one."""
+    return {} if emap.head is None else dict(emap.head.state_dict())
 
 
 def as_array(value: Tensor) -> NDArray:
@@ -128,10 +138,13 @@ def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Te
     """Return the chosen environments of the arrays, each of the shape that it has in `like`."""
     B, values = len(arrays["corner"]), {}
     for name, blank in _tensors(like).items():
-        require(name in arrays, str(path), f"must have {name}", "none", "save it again")
-        expected = (B, *blank.shape[1:])
-        fits = arrays[name].shape == expected
-        require(fits, f"{path}, {name}", f"expected {expected}", arrays[name].shape, "save it again")
-        values[name] = torch.from_numpy(arrays[name])[ids]
+        values[name] = torch.from_numpy(_array(path, arrays, name, (B, *blank.shape[1:])))[ids]
     statistics = Statistics(*(values.pop(f"last_{name}") for name in Statistics._fields))
     return MapState(statistics=statistics, **values)
+
+
+def _array(path: str | Path, arrays: dict[str, NDArray], name: str, shape: tuple[int, ...]) -> NDArray:
+    """Return an array of the file, which must have this shape."""
+    require(name in arrays, str(path), f"must have {name}", "none", "save it again")
+    require(arrays[name].shape == shape, f"{path}, {name}", f"expected {shape}", arrays[name].shape, "save it again")
+    return arrays[name]

@@ -25,11 +25,14 @@ from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, count, map_layers, tally
 from torchelev.storage import as_bytes, as_mask
 from torchelev.surface import known_ground, normals
-from torchelev.traversability import rate_all, traversability
+from torchelev.traversability import TraversabilityConfig, learned_rating, rate_all, traversability
+from torchelev.traversability_net import Weights
 
 
-def fuse_measurement(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
-    """Run the stages in order (paper, Fig. 2). Pure: it changes none of its arguments."""
+def fuse_measurement(
+    state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None
+) -> MapState:
+    """Run the stages in order (paper, Fig. 2). Pure: it changes none of its arguments. `weights` are the head's."""
     grid = cfg.grid
     state = start_tally(state, m)
     state = recenter(state, m, grid)
@@ -41,17 +44,22 @@ def fuse_measurement(state: MapState, m: Measurement, cfg: ElevationMapConfig) -
         state = clear_seen_through(state, m, grid, cfg.raycast)
     if cfg.overlap is not None:
         state = clear_other_floors(state, m, grid, cfg.overlap)
-    state = rate_surface(state, cfg)
+    state = rate_surface(state, cfg, weights)
     return tally(state, cells_bounded=count(state.bounded & ~state.validity))
 
 
-def rate_surface(state: MapState, cfg: ElevationMapConfig) -> MapState:
+def rate_surface(state: MapState, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
     """Compute normals and traversability from the elevation."""
     head = cfg.traversability
-    rim = max(cfg.surface.radius, head.cells(cfg.grid) if head is not None else 0)
+    rim = max(cfg.surface.radius, head.cells(cfg.grid) if isinstance(head, TraversabilityConfig) else 0)
     ground = known_ground(state.elevation, state.validity, rim)
     state = normals(state, ground, cfg.grid, cfg.surface)
-    return traversability(state, ground, cfg.grid, head) if head is not None else rate_all(state)
+    if head is None:
+        return rate_all(state)
+    if isinstance(head, TraversabilityConfig):
+        return traversability(state, ground, cfg.grid, head)
+    assert weights is not None
+    return state._replace(traversability=learned_rating(state, cfg.grid, head, weights).traversability)
 
 
 def start_tally(state: MapState, m: Measurement) -> MapState:
@@ -70,15 +78,16 @@ def update(
     variance: Tensor | None,
     *,
     cfg: ElevationMapConfig,
+    weights: Weights | None = None,
 ) -> MapState:
     """Measure and fuse; points come as (B, S, N, 3)."""
     m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, state.elevation.dtype)
-    return fuse_measurement(state, m, cfg)
+    return fuse_measurement(state, m, cfg, weights)
 
 
-def update_in_place(stored: MapState, *inputs: Any, cfg: ElevationMapConfig) -> None:
+def update_in_place(stored: MapState, *inputs: Any, cfg: ElevationMapConfig, weights: Weights | None = None) -> None:
     """Measure, fuse, and write the new values into the stored state's own tensors."""
-    write(stored, update(stored, *inputs, cfg=cfg))
+    write(stored, update(stored, *inputs, cfg=cfg, weights=weights))
 
 
 def write(stored: MapState, new: MapState) -> None:
@@ -138,10 +147,12 @@ def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
     return FunctionType(code, function.__globals__, code.co_name, function.__defaults__, function.__closure__)
 
 
-def compiled_update(stored: MapState, points: Tensor, *others: Any, cfg: ElevationMapConfig) -> None:
+def compiled_update(
+    stored: MapState, points: Tensor, *others: Any, cfg: ElevationMapConfig, weights: Weights | None = None
+) -> None:
     """Do what `update_in_place` does, compiled: any number of points, and of environments from the second on."""
     if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
-        update_in_place(stored, points, *others, cfg=cfg)
+        update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
     inputs = [None if value is None else packed(value) for value in (points, *others)]
     for values in (inputs[0], inputs[-1]):
@@ -150,7 +161,7 @@ def compiled_update(stored: MapState, points: Tensor, *others: Any, cfg: Elevati
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     graph, known_sizes = graphs_of(cfg, kinds, points.shape[1])
     with contextlib.nullcontext() if points.shape[0] in known_sizes else announced_compilation():
-        graph(with_masks(stored, as_bytes), *inputs)
+        graph(with_masks(stored, as_bytes), *inputs, weights=weights)
     known_sizes.add(points.shape[0])
 
 
@@ -158,9 +169,9 @@ def compiled_update(stored: MapState, points: Tensor, *others: Any, cfg: Elevati
 def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> tuple[Callable[..., None], set[int]]:
     """Return what compiles and keeps the updates of one kind of inputs, and a set for the sizes of batch it knows."""
 
-    def in_place(stored: MapState, *others: Any) -> None:
+    def in_place(stored: MapState, *others: Any, weights: Weights | None) -> None:
         """Update; masks come as bytes, see `as_bytes`. Writing within the graph saves a copy of every layer."""
-        write(stored, with_masks(update(with_masks(stored, as_mask), *others, cfg=cfg), as_bytes))
+        write(stored, with_masks(update(with_masks(stored, as_mask), *others, cfg=cfg, weights=weights), as_bytes))
 
     return torch.compile(own_code(in_place), fullgraph=True, options=compiler_options()), set()
 

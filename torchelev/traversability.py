@@ -1,17 +1,24 @@
-"""Traversability: a head that looks at the map and says where a robot can stand."""
+"""Traversability: a head that looks at the map and says where a robot can stand.
+
+Two heads share one place in the map: an analytic one, and one that was trained (paper, Sec. II-G).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.robot import RobotConfig
 from torchelev.state import MapState
 from torchelev.surface import Ground, fit_plane
+from torchelev.traversability_net import Rating, TraversabilityNet, Weights, rate
 from torchelev.windows import window_maximum
+
+__all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "TraversabilityConfig", "TraversabilityNet"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +40,33 @@ class TraversabilityConfig:
         return max(1, round(self.radius / grid.resolution))
 
 
+@dataclass(frozen=True, kw_only=True)
+class LearnedTraversabilityConfig:
+    """The trained head: the robot that it rates the ground for, and a file of weights if not those of torchelev."""
+
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    weights: str | None = None  # path of what `TraversabilityNet.save` wrote
+
+    def __post_init__(self) -> None:
+        mend = "build a RobotConfig"
+        fits = isinstance(self.robot, RobotConfig)
+        require(fits, "traversability.robot", "must be a RobotConfig", repr(self.robot), mend, TypeError)
+        path = self.weights is None or isinstance(self.weights, str)
+        require(path, "traversability.weights", "must be a path or None", repr(self.weights), "give a str", TypeError)
+
+    def make_head(self, grid: GridConfig) -> TraversabilityNet:
+        """Load the weights, frozen. Raises ValueError if they do not suit the robot or the resolution."""
+        net = TraversabilityNet.from_pretrained(self.weights)
+        net.require_trained(self.robot, grid.resolution)
+        return net.requires_grad_(False)
+
+
+def learned_rating(state: MapState, grid: GridConfig, cfg: LearnedTraversabilityConfig, weights: Weights) -> Rating:
+    """Rate every cell, unknown ones too, by the trained head."""
+    layers = (state.elevation, state.validity, state.variance, state.upper_bound, state.bounded)
+    return Rating(*map(torch.sigmoid, rate(weights, *layers, resolution=grid.resolution, robot=cfg.robot)))
+
+
 def height_range(ground: Ground, radius: int) -> Tensor:
     """Return the height difference of the highest and the lowest known cell of each window [m]; -inf without any."""
     known = ground.known > 0
@@ -47,7 +81,7 @@ def rate_all(state: MapState) -> MapState:
 
 
 def traversability(state: MapState, ground: Ground, grid: GridConfig, cfg: TraversabilityConfig) -> MapState:
-    """Rate every known cell by the worst of slope, step and roughness (the seam for a learned head).
+    """Rate every known cell by the worst of slope, step and roughness.
 
     t = 1 - max(slope / critical, step / critical, roughness / critical), not below 0. The step is the height range of
     the window less what its own plane explains.

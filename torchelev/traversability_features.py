@@ -1,0 +1,224 @@
+"""What the learned head sees: the map's surface, completed and made dimensionless by the robot's sizes.
+
+Windows are squares whose radii are lengths of the robot in whole cells. Everything is computed on the map with a rim
+of unknown cells around it, which each window eats a part of, so that the rim of a map is unknown ground and no more.
+All is unchanged when the map is turned by 90 degrees or mirrored: windows are symmetric, gradients enter as squares.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.operators import padded
+from torchelev.robot import RobotConfig
+from torchelev.storage import realize, realize_all
+from torchelev.traversability_stances import Scales, Stance, stances
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+QUARTER = 0.25  # share of known cells from which a window's mean counts in full
+NOISE = 0.02  # [m] standard deviation of heights at which a map counts as noisy
+NUM_FEATURES = 18
+
+
+# Windows ------------------------------------------------------------------------------------------------------------
+
+
+def shifted(values: Tensor, rim: int, i: int, j: int) -> Tensor:
+    """Return what lies (i, j) cells on, of (..., H + 2 rim, W + 2 rim) the inner (..., H, W)."""
+    H, W = values.shape[-2] - 2 * rim, values.shape[-1] - 2 * rim
+    return values.narrow(-2, rim + i, H).narrow(-1, rim + j, W)
+
+
+def cropped(values: Tensor, rim: int) -> Tensor:
+    """Take a rim off (..., H, W)."""
+    return shifted(values, rim, 0, 0)
+
+
+def _taps(values: Tensor, step: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return three views along a dimension, `step` entries apart, which is 2 * step shorter."""
+    size = values.shape[dim] - 2 * step
+    before, middle, after = (values.narrow(dim, k * step, size) for k in range(3))
+    return before, middle, after
+
+
+def widened_mean(values: Tensor, step: int) -> Tensor:
+    """Return the mean of 3 x 3 entries `step` apart."""
+    for dim in (-2, -1):
+        before, middle, after = _taps(values, step, dim)
+        values = realize((before + after + middle) * (1 / 3))
+    return values
+
+
+def widened_maximum(values: Tensor, step: int) -> Tensor:
+    """Return the highest of 3 x 3 entries `step` apart."""
+    for dim in (-2, -1):
+        before, middle, after = _taps(values, step, dim)
+        values = realize(torch.maximum(torch.maximum(before, after), middle))
+    return values
+
+
+# The surface --------------------------------------------------------------------------------------------------------
+
+
+class Surface(NamedTuple):
+    """The ground around every cell and the cells of the margin, unknown ones completed. Heights from the map's mean."""
+
+    height: Float[Tensor, "B h w"]  # [m]
+    known: Float[Tensor, "B h w"]  # 1 or 0
+    shares: list[Tensor]  # (B, h, w) of known cells in each window
+    means: list[Tensor]  # (B, h, w) [m] of each window, blended with the next where it knows little
+    hidden: Float[Tensor, "B h w"]  # [m] of the upper bound below what completes the ground
+    bounded: Float[Tensor, "B h w"]  # 1 or 0, of unknown cells
+    variance: Float[Tensor, "B h w"]  # [m^2] mean of the known ones of 3 x 3 cells
+
+
+def complete(
+    elevation: Tensor, validity: Tensor, variance: Tensor, upper_bound: Tensor, bounded: Tensor, scales: Scales
+) -> Surface:
+    """Fill unknown cells with the mean of the smallest window that knows enough, not above the upper bound.
+
+    Where no window knows anything, the height is 0.
+    """
+    known, unseen = validity.to(elevation.dtype), (bounded & ~validity).to(elevation.dtype)
+    # Heights from the map's mean, so that altitude costs no precision.
+    height = torch.where(validity, elevation, 0.0)
+    datum = (height.sum((1, 2), keepdim=True) / known.sum((1, 2), keepdim=True).clamp(min=1)).detach()
+    noise = torch.where(validity, variance, 0.0)
+    layers = torch.stack([known, (height - datum) * known, noise, upper_bound - datum, unseen])
+    layers = padded(layers, scales.rim, 0.0)
+
+    shares, means, noise = _windows(layers[:3], scales)
+    inner = cropped(layers, sum(scales.steps))
+    known, height, bound, unseen = inner[0], inner[1], inner[3], inner[4]
+    for k in (2, 1, 0):
+        means[k] = means[k + 1] + (shares[k] * (1 / QUARTER)).clamp(max=1) * (means[k] - means[k + 1])
+    means = realize_all(*means)
+    hidden = (means[0] - bound).clamp(min=0) * unseen * (shares[-1] > 0)
+    hidden, height = realize_all(hidden, height + (means[0] - hidden) * (1 - known))
+    return Surface(height, known, shares, means, hidden, unseen, noise)
+
+
+def _windows(layers: Tensor, scales: Scales) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Return each window's share of known cells and their mean height, and the mean variance of the smallest one."""
+    shares, means, noise, rest = [], [], layers[2], sum(scales.steps)
+    for number, step in enumerate(scales.steps):
+        rest -= step
+        layers = widened_mean(layers, step) if step > 0 else layers
+        inner = cropped(layers, rest)
+        inverse = 1 / inner[0].clamp(min=1e-5)
+        shares.append(inner[0])
+        means.append(inner[1] * inverse)
+        if number == 0:
+            noise = inner[2] * inverse
+            layers = layers[:2]
+    return shares, means, noise
+
+
+# Features -----------------------------------------------------------------------------------------------------------
+
+
+class Extremes(NamedTuple):
+    """Of the windows around every cell that feet may stand on, and of the body's window around every cell."""
+
+    near: tuple[Tensor, Tensor]  # (B, h, w) [m] highest and lowest of 3 x 3 cells
+    far: tuple[Tensor, Tensor]  # (B, h, w) [m] of a foot's reach
+    complete: Float[Tensor, "B h w"]  # 1 or 0: all of a foot's reach is completed ground
+    body: Float[Tensor, "B h' w'"]  # [m] highest of half the body's width
+    body_complete: Float[Tensor, "B h' w'"]  # 1 or 0
+
+
+def extremes(ground: Surface, scales: Scales) -> Extremes:
+    """Find the highest and lowest ground of each window."""
+    missing = (ground.shares[-1] <= 0).to(ground.height.dtype)
+    near = widened_maximum(torch.stack([ground.height, -ground.height, missing]), 1)
+    far = widened_maximum(near, scales.steps[1]) if scales.steps[1] > 0 else near
+    body = widened_maximum(far[::2], scales.steps[2]) if scales.steps[2] > 0 else far[::2]
+    rim = scales.margin - scales.stood_on
+    near, far = cropped(near, rim - 1), cropped(far, rim - scales.reach)
+    body = cropped(body, scales.margin - scales.spine - scales.body)
+    return Extremes((near[0], -near[1]), (far[0], -far[1]), 1 - far[2], body[0], 1 - body[1])
+
+
+def squashed(ratio: Tensor) -> Tensor:
+    """Return x / (1 + |x|): linear in small ratios, and no outlier counts for more than 1."""
+    return ratio / (1 + ratio.abs())
+
+
+def _slope(height: Tensor, distance: int, rim: int) -> Tensor:
+    """Return the squared gradient [m^2 per cell^2] between places `distance` cells to both sides."""
+    gx, gy = (shifted(height, rim, i, j) - shifted(height, rim, -i, -j) for i, j in ((distance, 0), (0, distance)))
+    return (gx.square() + gy.square()) * (0.5 / distance) ** 2
+
+
+def features(
+    ground: Surface, extreme: Extremes, scales: Scales, resolution: float, robot: RobotConfig
+) -> Float[Tensor, "B F h w"]:
+    """Return what is seen around every cell that feet may stand on; 0 where nothing is known in reach."""
+    rim = scales.margin - scales.stood_on
+    step, steep = 1 / robot.step_height, (1 / (resolution * math.tan(robot.max_slope))) ** 2
+    inner = [cropped(layer, rim) for layer in (ground.height, *ground.means)]
+    slopes = [_slope(mean, d, rim) * steep for mean, d in ((ground.means[0], 1), (ground.means[1], scales.reach))]
+    heights = [above - below for above, below in itertools.pairwise(inner)]
+    for (highest, lowest), mean in ((extreme.near, inner[1]), (extreme.far, inner[2])):
+        heights += [highest - mean, mean - lowest]
+    return torch.stack(
+        [
+            cropped(ground.known, rim),
+            *(cropped(share, rim) for share in ground.shares),
+            *(squashed(height * step) * extreme.complete for height in heights),
+            *(squashed(slope) * extreme.complete for slope in slopes),
+            squashed(cropped(ground.variance, rim) * (1 / NOISE**2)),
+            squashed(cropped(ground.hidden, rim) * step),
+            cropped(ground.bounded, rim),
+        ],
+        1,
+    )
+
+
+class Attitude(NamedTuple):
+    """How a body stands at one heading on four feet."""
+
+    slope: Float[Tensor, "B H W"]  # squared gradient of the body over the steepest that the robot stands on
+    twist: Float[Tensor, "B H W"]  # height of the feet over a plane, of opposite signs, over the step height
+    belly: Float[Tensor, "B H W"]  # height of the highest ground under the body over the feet, over the clearance
+
+
+def attitudes(
+    ground: Surface, extreme: Extremes, scales: Scales, robot: RobotConfig, resolution: float
+) -> list[Attitude]:
+    """Return how the body stands at each heading; 0 where a foot or the body would leave the completed ground."""
+    height = widened_mean(cropped(ground.height, scales.margin - scales.foot - 1), 1)
+    return [_attitude(height, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
+
+
+def _attitude(
+    height: Tensor, extreme: Extremes, stance: Stance, scales: Scales, robot: RobotConfig, resolution: float
+) -> Attitude:
+    a, b, c, d = (shifted(height, scales.foot, *foot) for foot in stance.feet)
+    pitch = (a + b - (c + d)) * (0.5 / (stance.length * resolution))
+    roll = (a + c - (b + d)) * (0.5 / (stance.width * resolution))
+    slope = (pitch.square() + roll.square()) * (1 / math.tan(robot.max_slope) ** 2)
+    twist = ((a + d - (b + c)) * (0.25 / robot.step_height)).square()
+    middle = (a + d + (b + c)) * 0.25
+    belly = (_highest(extreme.body, stance, scales, pitch, roll, resolution) - middle) * (1 / robot.clearance)
+    whole = functools.reduce(torch.mul, (shifted(extreme.complete, scales.stood_on, *foot) for foot in stance.feet))
+    under = functools.reduce(torch.mul, (shifted(extreme.body_complete, scales.spine, *at) for at in stance.spine))
+    return Attitude(squashed(slope) * whole, squashed(twist) * whole, squashed(belly) * (whole * under))
+
+
+def _highest(
+    body: Tensor, stance: Stance, scales: Scales, pitch: Tensor, roll: Tensor, resolution: float
+) -> Float[Tensor, "B H W"]:
+    """Return the highest ground [m] under the body, less what its inclination explains within each square."""
+    middle, front, hind = (shifted(body, scales.spine, *at) for at in stance.spine)
+    rise = pitch * (math.hypot(*stance.spine[1]) * resolution)
+    inclined = (pitch.abs() + roll.abs()) * (scales.body * resolution)
+    return torch.maximum(torch.maximum(front - rise, hind + rise), middle) - inclined

@@ -1,0 +1,245 @@
+"""The learned traversability head: where a legged robot can stand on the map, and how sure that is."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from torchelev.errors import require
+from torchelev.robot import RobotConfig
+from torchelev.storage import realize_all
+from torchelev.traversability_features import attitudes, complete, cropped, extremes, features, shifted, widened_maximum
+from torchelev.traversability_stances import Scales, in_cells, stances
+from torchelev.traversability_weights import (
+    RANGES,
+    Weights,
+    conditions,
+    read_weights,
+    require_in_ranges,
+    require_same_shapes,
+    weight_shapes,
+    write_weights,
+)
+from torchelev.traversability_weights import (
+    RESOLUTIONS as RESOLUTIONS,
+)
+from torchelev.traversability_weights import (
+    ratios as ratios,
+)
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+PRETRAINED = Path(__file__).parent / "weights" / "traversability.pt"
+
+
+class Rating(NamedTuple):
+    """What the head says of every cell."""
+
+    traversability: Float[Tensor, "B H W"]  # 0 to 1, the share of headings at which the robot stands there
+    confidence: Float[Tensor, "B H W"]  # 0 to 1, the probability that "traversability >= 0.5" is right
+
+
+def _biased(bias: Tensor, weight: Tensor, values: list[float]) -> Tensor:
+    """Return bias + weight @ values; floats become constants of a compiled graph, where a tensor would be copied."""
+    for column, value in zip(weight.unbind(1), values, strict=True):
+        bias = torch.add(bias, column, alpha=value)
+    return bias[:, None, None]
+
+
+def _mixed(weight: Float[Tensor, "O C"], values: Float[Tensor, "B C H W"]) -> Float[Tensor, "B O H W"]:
+    """Mix channels, cell by cell."""
+    return torch.bmm(weight.expand(len(values), -1, -1), values.flatten(2)).unflatten(2, values.shape[2:])
+
+
+def _spread(weight: Float[Tensor, "O C"], values: Sequence[Tensor]) -> Float[Tensor, "B O H W"]:
+    """Mix a few layers (B, H, W) without a copy of them all."""
+    columns = zip(weight.unbind(1), realize_all(*values), strict=True)
+    return functools.reduce(torch.add, (column[:, None, None] * value[:, None] for column, value in columns))
+
+
+def best_in_reach(cell: Tensor, scales: Scales) -> Tensor:
+    """Return each channel's lowest value within a foot's reach, where a foot may choose its place."""
+    worse = -cell
+    for step in scales.steps[:2]:
+        worse = widened_maximum(worse, step) if step > 0 else worse
+    return -worse
+
+
+def _sum_of_four(places: list[Tensor]) -> Tensor:
+    """Add in an order that turns and mirrors, which exchange a with d or b with c, leave as it is to rounding."""
+    a, b, c, d = places
+    return (a + d) + (b + c)
+
+
+def rate(
+    weights: Weights,
+    elevation: Float[Tensor, "B H W"],
+    validity: Bool[Tensor, "B H W"],
+    variance: Float[Tensor, "B H W"],
+    upper_bound: Float[Tensor, "B H W"],
+    bounded: Bool[Tensor, "B H W"],
+    *,
+    resolution: float,
+    robot: RobotConfig,
+) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+    """Return the logits of traversability and confidence.
+
+    Every cell is described by its surroundings. The body is put over each cell at four headings: what its feet stand
+    on, how it is inclined and what is under its belly tell whether it stands there; the headings' mean tells of all.
+    """
+    scales = in_cells(robot, resolution)
+    ground = complete(elevation, validity, variance, upper_bound, bounded, scales)
+    extreme = extremes(ground, scales)
+    sizes = conditions(robot, resolution)
+
+    seen = _mixed(weights.cell, features(ground, extreme, scales, resolution, robot))
+    cell = F.relu(seen + _biased(weights.cell_bias, weights.cell_condition, sizes))
+    around = torch.cat([cropped(cell, scales.reach), best_in_reach(cell.chunk(2, 1)[0], scales)], 1)
+    foot, side, center = _mixed(torch.cat([weights.foot, weights.side, weights.center]), around).chunk(3, 1)
+    center = cropped(center, scales.foot) + _biased(weights.stance_bias, weights.stance_condition, sizes)
+
+    mean = torch.zeros_like(center)
+    headings = stances(robot, resolution)
+    for stance, attitude in zip(headings, attitudes(ground, extreme, scales, robot, resolution), strict=True):
+        stood_on = _sum_of_four([shifted(foot, scales.foot, *place) for place in stance.feet])
+        between = _sum_of_four([shifted(side, scales.foot, *place) for place in stance.sides])
+        mean = mean + F.relu(stood_on + between + center + _spread(weights.attitude, attitude))
+    mixed = F.relu(_mixed(weights.mixed, mean * (1 / len(headings))) + weights.mixed_bias[:, None, None])
+    traversability, confidence = (_mixed(weights.answer, mixed) + weights.answer_bias[:, None, None]).unbind(1)
+    return traversability, confidence
+
+
+class TraversabilityNet(nn.Module):
+    """Says of every cell of a map where a legged robot, its body over that cell, can stand.
+
+    Unchanged by altitude, and turned and mirrored with the map; cells of 1 to 15 cm, robots within `ranges`.
+
+    Args:
+        cell_channels: C, numbers that describe a cell.
+        stance_channels: S, numbers that describe a stance.
+        ranges: of the robots that it is trained for, by the names in `ratios`; None: RANGES.
+    """
+
+    def __init__(
+        self,
+        cell_channels: int = 12,
+        stance_channels: int = 8,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        super().__init__()
+        ranges = RANGES if ranges is None else ranges
+        self.ranges = {name: (float(low), float(high)) for name, (low, high) in ranges.items()}
+        self.config: dict[str, Any] = {
+            "cell_channels": cell_channels,
+            "stance_channels": stance_channels,
+            "ranges": self.ranges,
+        }
+        for name, shape in weight_shapes(cell_channels, stance_channels).items():
+            self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draw new weights."""
+        for name, value in self.named_parameters():
+            if name.endswith(("bias", "condition")):
+                nn.init.zeros_(value)
+            else:
+                nn.init.kaiming_uniform_(value, a=1)
+
+    @property
+    def weights(self) -> Weights:
+        """The parameters, for `rate`."""
+        return Weights(*(getattr(self, name) for name in Weights._fields))
+
+    def require_trained(self, robot: RobotConfig, resolution: float) -> None:
+        """Raise ValueError for a robot or a resolution that the head is not made for."""
+        require_in_ranges(self.ranges, robot, resolution)
+
+    def logits(
+        self,
+        elevation: Float[Tensor, "B H W"],
+        validity: Bool[Tensor, "B H W"],
+        variance: Float[Tensor, "B H W"] | None = None,
+        upper_bound: Float[Tensor, "B H W"] | None = None,
+        bounded: Bool[Tensor, "B H W"] | None = None,
+        *,
+        resolution: float,
+        robot: RobotConfig,
+    ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+        """Return the logits of traversability and confidence, which training fits; arguments as `forward`'s."""
+        self.require_trained(robot, resolution)
+        nothing = torch.zeros_like(elevation)
+        variance = nothing if variance is None else variance
+        both = (upper_bound is None) == (bounded is None)
+        require(both, "upper_bound, bounded", "must come together", "one of them", "give both or none")
+        if upper_bound is None or bounded is None:
+            upper_bound, bounded = nothing, torch.zeros_like(validity)
+        layers = (elevation, validity, variance, upper_bound, bounded)
+        _check_layers(layers, self.weights.cell)
+        return rate(self.weights, *layers, resolution=resolution, robot=robot)
+
+    def forward(
+        self,
+        elevation: Float[Tensor, "B H W"],
+        validity: Bool[Tensor, "B H W"],
+        variance: Float[Tensor, "B H W"] | None = None,
+        upper_bound: Float[Tensor, "B H W"] | None = None,
+        bounded: Bool[Tensor, "B H W"] | None = None,
+        *,
+        resolution: float,
+        robot: RobotConfig,
+    ) -> Rating:
+        """Rate every cell of B maps for one robot.
+
+        Args:
+            elevation: heights [m]; any finite numbers where not valid.
+            validity: where the elevation is known.
+            variance: of the elevation [m^2]; None: the heights are exact.
+            upper_bound: of the ground [m] where it is not known.
+            bounded: where the upper bound is known; None, with the bound: nowhere.
+            resolution: of the maps [m], 0.01 to 0.15.
+            robot: whose sizes count.
+
+        Cells of which nothing is known within the robot's reach get the answer that training gives to unknown ground.
+
+        Raises ValueError for layers of other shapes or types, and for a resolution or a robot out of range.
+        """
+        logits = self.logits(elevation, validity, variance, upper_bound, bounded, resolution=resolution, robot=robot)
+        return Rating(*(torch.sigmoid(logit) for logit in logits))
+
+    def save(self, path: str | Path) -> None:
+        """Write the weights, for `from_pretrained`."""
+        write_weights(path, self.config, self.state_dict())
+
+    @classmethod
+    def from_pretrained(cls, path: str | Path | None = None) -> TraversabilityNet:
+        """Build a head with the weights of a file; None: those that come with torchelev.
+
+        Raises FileNotFoundError if there is no such file, ValueError if it holds no weights of this version.
+        """
+        path = PRETRAINED if path is None else Path(path)
+        config, state = read_weights(path)
+        net = cls(**config)
+        require_same_shapes(path, net.state_dict(), state)
+        net.load_state_dict(state)
+        return net
+
+
+def _check_layers(layers: tuple[Tensor, ...], weight: Tensor) -> None:
+    """Refuse layers that are not (B, H, W) alike, heights that are not of the weights' type and masks not of bool."""
+    elevation = layers[0]
+    shape, device = tuple(elevation.shape), weight.device
+    require(elevation.ndim == 3, "elevation", "must be (B, H, W)", shape, "add a dimension")
+    for name, layer in zip(("elevation", "validity", "variance", "upper_bound", "bounded"), layers, strict=True):
+        dtype = torch.bool if name in ("validity", "bounded") else weight.dtype
+        alike = tuple(layer.shape) == shape and layer.dtype == dtype and layer.device == device
+        came = f"{tuple(layer.shape)} {layer.dtype} on {layer.device}"
+        mend = "give the map's layers as they are, and move the head with .to(elevation)"
+        require(alike, name, f"must be {shape} {dtype} on {device}", came, mend)

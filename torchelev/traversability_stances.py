@@ -1,0 +1,88 @@
+"""A robot's sizes in whole cells: the windows that the learned head looks at, and where the feet of each stance are."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from torchelev.robot import RobotConfig
+
+Cells = tuple[int, int]  # along x and y, from the cell under the body's centre
+
+
+class Stance(NamedTuple):
+    """A heading of the body over a cell, in cells."""
+
+    feet: tuple[Cells, ...]  # front left, front right, hind left, hind right
+    spine: tuple[Cells, ...]  # centres of squares under the body: the middle, the front, the hind one
+    length: float  # between front and hind feet
+    width: float
+
+    @property
+    def sides(self) -> tuple[Cells, ...]:
+        """The middles between neighbouring feet."""
+        a, b, c, d = self.feet
+        # Python rounds halves to even numbers, so that opposite sides stay opposite.
+        return tuple((round((p[0] + q[0]) / 2), round((p[1] + q[1]) / 2)) for p, q in ((a, b), (c, d), (a, c), (b, d)))
+
+    def turned(self) -> Stance:
+        """Return the stance a quarter turn on."""
+        feet, spine = (tuple((-j, i) for i, j in places) for places in (self.feet, self.spine))
+        return Stance(feet, spine, self.length, self.width)
+
+
+def stances(robot: RobotConfig, resolution: float) -> list[Stance]:
+    """Return the stances at headings of 0, 90, 45 and 135 degrees, which turns and mirrors of the map interchange.
+
+    No two feet share a cell, however coarse.
+    """
+    half, diagonal = 0.5 / resolution, math.sqrt(0.5)
+    length, width = robot.length * half, robot.width * half
+    p, q, s = max(1, round(length)), max(1, round(width)), round((length - width) / 2)
+    along = Stance(((p, q), (p, -q), (-p, q), (-p, -q)), ((0, 0), (s, 0), (-s, 0)), 2 * p, 2 * q)
+    a, s = max(1, round((length + width) * diagonal)), round((length - width) / 2 * diagonal)
+    b = min(a - 1, round((length - width) * diagonal))
+    feet = ((b, a), (a, b), (-a, -b), (-b, -a))
+    across = Stance(feet, ((0, 0), (s, s), (-s, -s)), (a + b) / diagonal, (a - b) / diagonal)
+    return [along, along.turned(), across, across.turned()]
+
+
+class Scales(NamedTuple):
+    """Windows, their radii in cells, and how far they are needed."""
+
+    steps: tuple[int, ...]  # by which each window grows over the one before
+    reach: int  # radius of the window of a foot's reach
+    body: int  # radius of the window of half the body's width
+    foot: int  # farthest foot from the body's centre, along x or y
+    spine: int  # farthest square under the body
+
+    @property
+    def stood_on(self) -> int:
+        """Rim within which feet may stand, within reach of their places."""
+        return self.foot + self.reach
+
+    @property
+    def margin(self) -> int:
+        """Rim that the windows around feet and body need."""
+        return max(self.stood_on + self.reach, self.spine + self.body)
+
+    @property
+    def rim(self) -> int:
+        """Rim that the map needs."""
+        return self.margin + sum(self.steps)
+
+
+def in_cells(robot: RobotConfig, resolution: float) -> Scales:
+    """Return the robot's windows: the cell and its neighbours, a foot's reach, half the body's width, half its length.
+
+    Each is at most three times as wide as the one before, which it is made of, so that it leaves no cell out.
+    """
+    steps, radii = [1], [1]
+    for length in (robot.foot_reach, robot.width / 2, robot.length / 2):
+        step = min(max(0, round(length / resolution) - radii[-1]), 2 * radii[-1] + 1)
+        steps.append(step)
+        radii.append(radii[-1] + step)
+    around = stances(robot, resolution)
+    foot = max(abs(n) for stance in around for place in stance.feet for n in place)
+    spine = max(abs(n) for stance in around for place in stance.spine for n in place)
+    return Scales(tuple(steps), radii[1], radii[2], foot, spine)

@@ -1,0 +1,67 @@
+"""Maps, their labels, and what the heads say of them, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchelev.plot import UNKNOWN_COLOR
+from torchelev.traversability_net import TraversabilityNet
+from training.traversability_data import MappedTerrain
+from training.traversability_heads import Score
+
+Layers = dict[str, tuple[Tensor, Tensor]]  # values and where to show them, both (H, W)
+
+
+@torch.no_grad()
+def layers_of(net: TraversabilityNet, others: dict[str, Score], maps: MappedTerrain, number: int) -> Layers:
+    """Return what is drawn of one map."""
+    rating = net(*maps.maps, resolution=maps.resolution, robot=maps.robot)
+    everywhere = torch.ones_like(maps.validity)
+    shown = {
+        "elevation [m]": (maps.elevation, maps.validity),
+        "label": (maps.label, maps.rated),
+        "learned": (rating.traversability, everywhere),
+        "confidence": (rating.confidence, everywhere),
+    }
+    shown |= {name: (score(maps), everywhere) for name, score in others.items()}
+    return {name: (values[number], mask[number]) for name, (values, mask) in shown.items()}
+
+
+def picture(net: TraversabilityNet, others: dict[str, Score], batches: Sequence[MappedTerrain], path: Path) -> None:
+    """Draw one map of each kind of ground, a row each, x to the right and y up; grey is unknown or not rated."""
+    rows: dict[str, tuple[MappedTerrain, int]] = {}
+    for maps in batches:
+        for number, kind in enumerate(maps.kinds):
+            rows.setdefault(kind, (maps, number))
+    _draw({kind: layers_of(net, others, *where) for kind, where in rows.items()}, rows, path)
+
+
+def _draw(rows: dict[str, Layers], sources: dict[str, tuple[MappedTerrain, int]], path: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = len(next(iter(rows.values())))
+    figure = Figure(figsize=(1.9 * columns, 2.0 * len(rows)), layout="compressed", dpi=80)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(rows), columns, squeeze=False)
+    for line, (kind, layers) in zip(axes, rows.items(), strict=True):
+        maps = sources[kind][0]
+        for ax, (name, layer) in zip(line, layers.items(), strict=True):
+            _panel(ax, *layer, share=name != "elevation [m]")
+        line[0].set_ylabel(f"{kind}\n{100 * maps.resolution:.2g} cm, robot {maps.robot.length:.2f} m", fontsize=7)
+    for ax, name in zip(axes[0], next(iter(rows.values())), strict=True):
+        ax.set_title(name, fontsize=8)
+    figure.savefig(path)
+
+
+def _panel(ax: Any, values: Tensor, mask: Tensor, share: bool) -> None:
+    shown = np.ma.masked_array(values.double().numpy(), ~mask.numpy()).T
+    limits = {"vmin": 0.0, "vmax": 1.0, "cmap": "RdYlGn"} if share else {"cmap": "viridis"}
+    ax.imshow(shown, origin="lower", interpolation="nearest", **limits)
+    ax.set(xticks=[], yticks=[], facecolor=UNKNOWN_COLOR)
