@@ -12,6 +12,7 @@ import pytest
 
 from torchelev.cli import main, whole_scans
 from torchelev.export import load_npz
+from torchelev.filters import FILTERS
 from torchelev.io import Recording
 
 NUM_SCANS = 4
@@ -114,6 +115,18 @@ def test_config_file_and_options_over_it(run, recording, tmp_path):
     assert saved.config["sensor"]["noise_factor"] == 2e-4
     assert run("map", recording, "--config", "cfg.yaml", "--resolution", 0.5)[0] == 0
     assert load_npz(tmp_path / "map.npz").layers["elevation"].shape == (8, 12)
+
+
+def test_filters_are_drawn_and_listed(run, recording, tmp_path, monkeypatch):
+    (tmp_path / "cfg.yaml").write_text("filters: [{layer: smooth, filter: gaussian, sigma: 0.2}]\n")
+    drawn = []
+    monkeypatch.setattr("torchelev.plot.save_layers", lambda path, panels, **_: drawn.extend(panels))
+    assert run("map", recording, "--config", "cfg.yaml")[0] == 0
+    assert [panel.title for panel in drawn][4:] == ["smooth"]
+    np.testing.assert_array_equal(drawn[4].values, load_npz(tmp_path / "map.npz").layers["smooth"])
+    code, out, _ = run("filters")
+    assert code == 0 and "gaussian(layer)  sigma=0.1\n    Return the Gaussian mean" in out
+    assert [line.split("(")[0] for line in out.splitlines()[::2]] == sorted(FILTERS)
 
 
 def test_fixed_window_keeps_its_place(run, recording, tmp_path):

@@ -368,5 +368,14 @@ def test_fields_refuse():
     for points in (torch.zeros(2, 5), torch.zeros(1, 5, 3), torch.zeros(2, 5, 2)):
         with pytest.raises(ValueError, match="points: expected"):
             field_of(layer).sample(points)
+    with pytest.raises(TypeError, match="points: must be a torch.Tensor, got ndarray"):
+        field_of(layer).sample(np.zeros((2, 5, 3)))
+    with pytest.raises(ValueError, match="floor: must be a number or a tensor, got nan"):
+        field_of(layer, floor=math.nan)
     with pytest.raises(ValueError, match="expected values"):
         field_of((layer[0][0], layer[1][0]))
+
+
+def test_one_floor_for_all_maps():
+    layer = random_layer(0)
+    assert torch.equal(field_of(layer, floor=-1).values, field_of(layer, floor=torch.full((2,), -1.0)).values)

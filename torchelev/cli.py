@@ -134,6 +134,14 @@ def demo(out: Path) -> None:
     click.echo(f"wrote {out}")
 
 
+@main.command("filters")
+def filters_command() -> None:
+    """List the filters that a config can name, with their inputs and settings."""
+    from torchelev.filters.registry import listing
+
+    click.echo(listing())
+
+
 def run_map(
     recording: Path,
     poses: Path | None,
@@ -271,6 +279,12 @@ def write_outputs(run: MappingRun, prefix: Path) -> list[Path]:
     export.save_npz(npz, run.emap)
     saved = export.take(run.emap)
     path_xy = np.array(run.sensor_xy)
-    save_layers(png, map_panels(saved.layers), extent=saved.extent, path_xy=path_xy, title=prefix.name)
+    save_layers(
+        png,
+        map_panels(saved.layers, tuple(run.emap.filters.inputs)),
+        extent=saved.extent,
+        path_xy=path_xy,
+        title=prefix.name,
+    )
     export.save_mesh(ply, run.emap)
     return [npz, png, ply]

@@ -29,7 +29,8 @@ class FootprintConfig:
     """What is asked of the ground below a footprint. Shares are of all the cells in the polygon.
 
     The defaults are meant for the analytic head, whose 0.5 is a slope of 20 degrees, a step of 10 cm or a roughness of
-    2.5 cm, and whose 0.3 is 28 degrees, 14 cm or 3.5 cm.
+    2.5 cm, and whose 0.3 is 28 degrees, 14 cm or 3.5 cm. The learned head says of each cell whether the body may stand
+    over it: for that, give polygons of where the body's centre may be instead of the body's own.
     """
 
     layer: str = "traversability"  # 0 to 1, the better

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.checks import FLOATS, check_tensor
 from torchelev.errors import require, require_positive
 from torchelev.filters.geometry import root
 from torchelev.filters.registry import check_layers, masked
@@ -77,7 +78,7 @@ class SignedDistanceField:
         *,
         resolution: float,
         center: Float[Tensor, "B 3"] | None = None,
-        floor: Float[Tensor, "B"] | None = None,
+        floor: float | Float[Tensor, "B"] | None = None,
         cfg: FieldConfig | None = None,
     ) -> SignedDistanceField:
         """Build the field of heights [m]; `center` [m] is where the window lies, as `ElevationMap.center`.
@@ -98,6 +99,10 @@ class SignedDistanceField:
         if floor is None:
             lowest = torch.where(known, heights.detach(), torch.inf).amin((1, 2))
             floor = torch.where(torch.isfinite(lowest), lowest, 0.0) - cfg.below
+        if not isinstance(floor, Tensor):
+            number = isinstance(floor, int | float) and math.isfinite(floor)
+            require(number, "floor", "must be a number or a tensor", repr(floor), "give metres")
+            floor = heights.new_full((B,), float(floor))
         require(floor.shape == (B,), "floor", f"expected ({B},)", tuple(floor.shape), "give one height per map")
         levels = math.ceil(cfg.height / spacing - 1e-6) + 1
         values = _distances(heights - floor[:, None, None], known, levels, spacing / resolution, resolution, cfg)
@@ -108,9 +113,10 @@ class SignedDistanceField:
 
         Valid between the lowest and the highest level, inside the window, where at least half of the columns around
         the point are known, by their bilinear weights. Differentiable in the points; the gradient is too. Raises
-        ValueError for points of another shape.
+        TypeError for what is no tensor of floats, ValueError for points of another shape.
         """
         B, K, H, W = self.values.shape
+        points = check_tensor("points", points, self.values.device, FLOATS)
         fits = points.ndim == 3 and points.shape[0] == B and points.shape[2] == 3
         require(fits, "points", f"expected ({B}, M, 3)", tuple(points.shape), "give x, y, z in the map frame")
         place, inside = self._place(points)

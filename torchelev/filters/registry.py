@@ -116,6 +116,18 @@ def settings_of(name: str) -> dict[str, inspect.Parameter]:
     return {n: p for n, p in parameters.items() if p.kind is p.KEYWORD_ONLY and n != "resolution"}
 
 
+def listing() -> str:
+    """Describe all filters, a paragraph each: inputs, settings with their defaults, and what it returns."""
+    lines = []
+    for name, function in sorted(FILTERS.items()):
+        inputs = [str(p) for p in inspect.signature(function).parameters.values() if p.kind is not p.KEYWORD_ONLY]
+        settings = [n if p.default is p.empty else f"{n}={p.default!r}" for n, p in settings_of(name).items()]
+        names = ", ".join(text.split(":")[0] for text in inputs)
+        lines.append(f"{name}({names})" + (f"  {', '.join(settings)}" if settings else ""))
+        lines.append(f"    {(inspect.getdoc(function) or '').partition(chr(10))[0]}")
+    return "\n".join(lines)
+
+
 def as_layer(values: Float[Tensor, "B H W"]) -> Layer:
     """Turn values, NaN or inf where unknown, into a layer."""
     known = torch.isfinite(values)

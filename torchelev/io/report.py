@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,8 +62,11 @@ def warnings(run: MappingRun) -> list[str]:
     return []
 
 
-def map_panels(layers: dict[str, NDArray]) -> list[Panel]:
-    """The four layers (H, W) that tell most. Elevation and upper bound share their colours, so that they compare."""
+def map_panels(layers: dict[str, NDArray], filters: Sequence[str] = ()) -> list[Panel]:
+    """The four layers (H, W) that tell most, and those of filters.
+
+    Elevation and upper bound share their colours, so that they compare.
+    """
     from torchelev.plot import Panel
 
     elevation, traversability = layers["elevation"], layers["traversability"]
@@ -73,4 +77,5 @@ def map_panels(layers: dict[str, NDArray]) -> list[Panel]:
         Panel(title="standard deviation", values=np.sqrt(layers["variance"]), unit="m", cmap="magma", vmin=0.0),
         Panel(title="traversability", values=traversability, unit="0 to 1", cmap="RdYlGn", vmin=0.0, vmax=1.0),
         Panel(title="upper bound", values=layers["upper_bound"], unit="m", vmin=low, vmax=high),
+        *(Panel(title=name, values=layers[name]) for name in filters),
     ]
