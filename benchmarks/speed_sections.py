@@ -74,7 +74,7 @@ def stages(seconds: float, track: Track) -> dict[str, Any]:
         "point transform, gates, noise": transform,
         "recenter": lambda state, m: grid.recenter(state, m, g),
         "age": lambda state, m: aging.age(state, m, cfg.aging),
-        "drift compensation": lambda state, m: drift.compensate(state, m, g, cfg.drift),
+        "drift compensation": lambda state, m: drift.compensate(state, m, g, cfg.drift, 0.5),
         "height update": lambda state, m: fusion.fuse(state, m, g, cfg.fusion),
         "ray casting": lambda state, m: raycast.clear_seen_through(state, m, g, cfg.raycast),
         "overlap clearance": lambda state, m: overlap.clear_other_floors(state, m, g, cfg.overlap),

@@ -21,12 +21,12 @@ def test_agrees_with_the_reference(seed, offset, gain, min_points):
     rng = np.random.default_rng(seed)
     sensor = SensorConfig(noise_factor=0.0, noise_floor=SIGMA2)
     emap = small_map(2, (7, 6), dtype=torch.float64, sensor=sensor)
-    cfg = DriftConfig(gain=gain, min_points=min_points, max_error=0.4, max_variance=5e-3)
+    cfg = DriftConfig(gain=gain, min_points=min_points, max_error=0.4, max_variance=5e-3, min_traversability=0.5)
     state = random_state(rng, emap.cfg.grid, 2)
     points = [terrain(rng, 150, (7, 6), roughness=0.1) + [0, 0, offset] for _ in range(2)]
     T = pose((0.1, 0.2, 1.0), num_envs=2)
     m = emap.measure(seen_from(T, torch.from_numpy(np.stack(points))), T, None, 0.1)
-    after = compensate(state, m, emap.cfg.grid, cfg)
+    after = compensate(state, m, emap.cfg.grid, cfg, 0.5)
     for b in range(2):
         layers = {name: getattr(state, name)[b].numpy() for name in state._fields[2:-1]}
         used = [p for p, u in zip(points[b], m.used[b], strict=True) if u]
@@ -79,7 +79,18 @@ def test_off_or_too_few_points_or_too_much_drift(drift):
     assert emap.statistics.drift_correction.item() == 0
 
 
-@pytest.mark.parametrize("bad", [dict(gain=0.0), dict(gain=1.5), dict(min_points=0)])
+def test_the_config_overrules_the_gate_of_the_head():
+    """Ground rated 0.6 counts from 0.6 on."""
+    emap = small_map(1)
+    emap.update(flat_cloud(0.0), pose(), None, 0.1)
+    state = emap.state._replace(traversability=torch.full_like(emap.state.traversability, 0.6))
+    m = emap.measure(flat_cloud(0.05), pose(), None, 0.1)
+    for of_config, of_head, counts in ((None, 0.6, True), (None, 0.61, False), (0.6, 0.9, True), (0.61, 0.1, False)):
+        after = compensate(state, m, emap.cfg.grid, DriftConfig(min_traversability=of_config), of_head)
+        assert (after.statistics.drift_points.item() > 0) == counts
+
+
+@pytest.mark.parametrize("bad", [dict(gain=0.0), dict(gain=1.5), dict(min_points=0), dict(min_traversability=1.5)])
 def test_refuses(bad):
     with pytest.raises(ValueError, match=f"drift.{next(iter(bad))}"):
         DriftConfig(**bad)

@@ -18,7 +18,7 @@ NOWHERE = 1e6  # [m]
 class DriftConfig:
     """Which points measure the drift, and how much of it is corrected."""
 
-    min_traversability: float = 0.5  # flat enough for a height error to mean drift
+    min_traversability: float | None = None  # flat enough for a height error to mean drift; None: the head's own
     max_variance: float = 0.01  # [m^2] certain enough cells
     max_error: float = 0.1  # [m] larger errors of single points are obstacles
     gate: float = 2.0  # standard deviations around the mean error that still count
@@ -29,6 +29,10 @@ class DriftConfig:
 
     def __post_init__(self) -> None:
         require(0 < self.gain <= 1, "drift.gain", "must lie in (0, 1]", self.gain, "the paper's value is 1")
+        gate = self.min_traversability
+        share = gate is None or (isinstance(gate, int | float) and 0 <= gate <= 1)
+        mend = "leave it out for the head's own"
+        require(share, "drift.min_traversability", "must lie in [0, 1] or be None", repr(gate), mend)
         require(self.min_points >= 1, "drift.min_points", "must be at least 1", self.min_points, "give 50")
 
 
@@ -39,16 +43,18 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     return (total / count(mask).clamp(min=1)).to(values.dtype)
 
 
-def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig) -> MapState:
+def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig, head_gate: float) -> MapState:
     """Add the mean height error over certain, flat cells to elevation and upper bound (paper, Sec. II-D).
 
     e = (1 / n) * sum (p_z - h), h the height at the point of its cell's plane, over points whose cell is known,
     traversable and certain, with |p_z - h| <= max_error and then within `gate` standard deviations of their mean.
-    Corrected by gain * e where n >= min_points and |e| <= max_drift.
+    Corrected by gain * e where n >= min_points and |e| <= max_drift. Traversable is what the config says, else what is
+    rated `head_gate` or more.
     """
     px, py, pz = m.points.unbind(-1)
     cells = cells_of(m, lattice_offset(state, m, grid), grid)
-    suits = state.validity & (state.traversability >= cfg.min_traversability) & (state.variance <= cfg.max_variance)
+    gate = head_gate if cfg.min_traversability is None else cfg.min_traversability
+    suits = state.validity & (state.traversability >= gate) & (state.variance <= cfg.max_variance)
     # On a slope the height within a cell depends on where in the cell the point lies.
     x, y = center_offsets(state, m, grid)
     gx, gy = state.gradient_x.detach(), state.gradient_y.detach()

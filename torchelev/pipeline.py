@@ -38,7 +38,7 @@ def fuse_measurement(
     state = recenter(state, m, grid)
     state = age(state, m, cfg.aging)
     if cfg.drift is not None:
-        state = compensate(state, m, grid, cfg.drift)
+        state = compensate(state, m, grid, cfg.drift, (cfg.traversability or TraversabilityConfig).drift_gate)
     state = fuse(state, m, grid, cfg.fusion)
     if cfg.raycast is not None:
         state = clear_seen_through(state, m, grid, cfg.raycast)

@@ -6,6 +6,7 @@ Two heads share one place in the map: an analytic one, and one that was trained 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -30,6 +31,8 @@ class TraversabilityConfig:
     critical_step: float = 0.2  # [m]
     critical_roughness: float = 0.05  # [m] standard deviation around the local plane
 
+    drift_gate: ClassVar[float] = 0.5  # from which rating on cells measure the height drift: `benchmarks.drift_gate`
+
     def __post_init__(self) -> None:
         for name in ("radius", "critical_slope", "critical_step", "critical_roughness"):
             value = getattr(self, name)
@@ -46,6 +49,8 @@ class LearnedTraversabilityConfig:
 
     robot: RobotConfig = field(default_factory=RobotConfig)
     weights: str | None = None  # path of what `TraversabilityNet.save` wrote
+
+    drift_gate: ClassVar[float] = 0.5  # as of the analytic head
 
     def __post_init__(self) -> None:
         mend = "build a RobotConfig"

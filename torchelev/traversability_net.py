@@ -26,12 +26,6 @@ from torchelev.traversability_weights import (
     weight_shapes,
     write_weights,
 )
-from torchelev.traversability_weights import (
-    RESOLUTIONS as RESOLUTIONS,
-)
-from torchelev.traversability_weights import (
-    ratios as ratios,
-)
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
