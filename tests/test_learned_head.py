@@ -112,7 +112,7 @@ def test_config_round_trip_and_what_is_refused(cfg, tmp_path):
     with pytest.raises(FileNotFoundError, match="must be a file of weights"):
         ElevationMap(ElevationMapConfig(traversability=LearnedTraversabilityConfig(weights=str(tmp_path / "none.pt"))))
     coarse = GridConfig(resolution=0.2, length_x=4.0, length_y=4.0)
-    with pytest.raises(ValueError, match="resolution: must be 0.01 to 0.15 m"):
+    with pytest.raises(ValueError, match="resolution: must be 0.02 to 0.1 m"):
         ElevationMap(ElevationMapConfig(grid=coarse, traversability=cfg.traversability))
     large = RobotConfig(length=0.7, width=0.1)
     learned = LearnedTraversabilityConfig(robot=large, weights=cfg.traversability.weights)

@@ -38,7 +38,7 @@ def random_maps(seed, shape=(2, 13, 11), share=0.7, dtype=torch.float64):
     heights = torch.from_numpy(z + rng.normal(0, 0.05, shape)).to(dtype)
     variance = torch.from_numpy(rng.uniform(0, 1e-3, shape)).to(dtype)
     bound = torch.from_numpy(rng.normal(0, 0.3, shape)).to(dtype)
-    garbage = torch.from_numpy(rng.normal(0, 1e3, shape)).to(dtype)
+    garbage = torch.from_numpy(rng.choice([1e3, -1e3, np.nan, np.inf], shape)).to(dtype)
     hold = (torch.where(mask, layer, garbage) for layer, mask in ((heights, known), (variance, known)))
     elevation, variance = hold
     return elevation, known, variance, torch.where(bounded, bound, garbage), bounded
@@ -175,6 +175,7 @@ def test_gradients_reach_every_weight():
 def test_nothing_known_gets_the_answer_of_far_unknown_ground():
     net = random_net()
     maps = list(random_maps(0, (1, 60, 8)))
+    maps[0], maps[2] = (maps[k].nan_to_num(0.0, 0.0, 0.0) for k in (0, 2))
     maps[1] = torch.zeros_like(maps[1])
     nothing = logits(net, maps)
     unbounded = logits(net, (*maps[:4], torch.zeros_like(maps[4])))
@@ -190,6 +191,17 @@ def test_never_waits():
         net, layer, mask = TraversabilityNet(), torch.zeros(2, 9, 8), torch.ones(2, 9, 8, dtype=torch.bool)
         rating = net(layer, mask, layer, layer, mask, resolution=CELLS, robot=ROBOT)
     assert all(answer.shape == (2, 9, 8) for answer in rating)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_rated_in_float32(dtype):
+    """To what the heights' own rounding makes of it."""
+    net, maps = random_net(0, torch.float32), random_maps(0, (1, 20, 17), dtype=torch.float32)
+    coarse = [layer.to(dtype) if layer.is_floating_point() else layer for layer in maps]
+    exact = [layer.float() if layer.is_floating_point() else layer for layer in coarse]
+    got = logits(net.to(dtype), coarse)
+    assert got.dtype == torch.float32 and got.isfinite().all()
+    torch.testing.assert_close(got, logits(net.float(), exact), atol=1e-5, rtol=1e-5)
 
 
 def test_compiles_to_the_same():
@@ -211,7 +223,7 @@ def test_stances_by_hand():
     robot = RobotConfig(length=0.8, width=0.4)
     along, turned, across, _ = stances(robot, 0.1)
     assert along.feet == ((4, 2), (4, -2), (-4, 2), (-4, -2)) and (along.length, along.width) == (8, 4)
-    assert along.spine == ((0, 0), (1, 0), (-1, 0))
+    assert along.spine == ((0, 0), (2, 0), (-2, 0))  # squares of 0.4 m: the body ends 0.4 m from its middle
     assert along.sides == ((4, 0), (-4, 0), (0, 2), (0, -2))
     assert turned.feet == ((-2, 4), (2, 4), (-2, -4), (2, -4))
     # Half the diagonals of length + width and length - width: 0.424 m and 0.141 m.
@@ -228,10 +240,10 @@ def test_no_two_feet_share_a_cell(robot, resolution):
 
 
 def test_windows_by_hand():
-    # Reach 0.1 m, half the width 0.2 m, half the length 0.35 m; the last one may triple the one before at most.
-    assert in_cells(ROBOT, 0.04).steps == (1, 1, 3, 4)
-    assert in_cells(ROBOT, 0.02).steps == (1, 3, 6, 8)  # from 1 to 5 cells would leave one out
-    assert in_cells(ROBOT, 0.1).steps == (1, 0, 1, 1)
+    # Reach 0.1 m, half the width 0.2 m, half the length 0.35 m.
+    assert in_cells(ROBOT, 0.04).steps == ((1,), (1,), (3,), (4,)) and in_cells(ROBOT, 0.04).radii == (1, 2, 5, 9)
+    assert in_cells(ROBOT, 0.02).steps == ((1,), (3, 1), (5,), (8,))  # from 1 to 5 cells at once would leave one out
+    assert in_cells(ROBOT, 0.1).steps == ((1,), (), (1,), (1,)) and in_cells(ROBOT, 0.1).radii == (1, 1, 2, 3)
 
 
 def test_unknown_cells_are_completed_below_their_bound():
@@ -292,7 +304,13 @@ def spoilt(fault):
     net = TraversabilityNet()
     found = {"version": 1, "config": net.config, "state_dict": dict(net.state_dict())}
     if fault == "version":
-        found["version"] = 2
+        found |= {"version": 2, "config": {"other": 1}}
+    elif fault == "ranges":
+        found["config"] = net.config | {"ranges": 3}
+    elif fault == "type":
+        found["config"] = net.config | {"cell_channels": "12"}
+    elif fault == "no tensor":
+        found["state_dict"]["foot"] = 1.0
     elif fault == "shape":
         found["state_dict"]["foot"] = torch.zeros(3, 3)
     elif fault == "missing":
@@ -313,6 +331,9 @@ def spoilt(fault):
         ("shape", r"foot \(3, 3\) instead of"),
         ("missing", "answer_bias None instead of"),
         ("config", "must be a file of weights"),
+        ("ranges", "must be a file of weights"),
+        ("type", "must be a file of weights"),
+        ("no tensor", "must be a file of weights"),
         ("nan", "must be finite, got NaN or inf in foot"),
         ("none", "must be a file of weights"),
     ],
@@ -330,6 +351,8 @@ def test_refuses_files(tmp_path):
         (tmp_path / "text.pt").write_bytes(content)
         with pytest.raises(ValueError, match="text.pt: must be a file of weights"):
             TraversabilityNet.from_pretrained(tmp_path / "text.pt")
+    with pytest.raises(ValueError, match="must be a file of weights"):
+        TraversabilityNet.from_pretrained(tmp_path)
     torch.save([1, 2], tmp_path / "list.pt")
     with pytest.raises(ValueError, match="list.pt: must be a file of weights"):
         TraversabilityNet.from_pretrained(tmp_path / "list.pt")
@@ -337,7 +360,7 @@ def test_refuses_files(tmp_path):
 
 @pytest.mark.parametrize("resolution", [0.005, 0.2, float("nan")])
 def test_refuses_resolutions(resolution):
-    with pytest.raises(ValueError, match=r"resolution: must be 0.01 to 0.15 m"):
+    with pytest.raises(ValueError, match=r"resolution: must be 0.02 to 0.1 m"):
         TraversabilityNet()(*random_maps(0), resolution=resolution, robot=ROBOT)
 
 

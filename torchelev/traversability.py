@@ -69,7 +69,8 @@ class LearnedTraversabilityConfig:
 def learned_rating(state: MapState, grid: GridConfig, cfg: LearnedTraversabilityConfig, weights: Weights) -> Rating:
     """Rate every cell, unknown ones too, by the trained head."""
     layers = (state.elevation, state.validity, state.variance, state.upper_bound, state.bounded)
-    return Rating(*map(torch.sigmoid, rate(weights, *layers, resolution=grid.resolution, robot=cfg.robot)))
+    logits = rate(weights, *layers, resolution=grid.resolution, robot=cfg.robot)
+    return Rating(*(torch.sigmoid(logit).to(state.elevation.dtype) for logit in logits))
 
 
 def height_range(ground: Ground, radius: int) -> Tensor:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 QUARTER = 0.25  # share of known cells from which a window's mean counts in full
 NOISE = 0.02  # [m] standard deviation of heights at which a map counts as noisy
 NUM_FEATURES = 18
+TINY = 1e-9  # below any window's share of known cells but 0
 
 
 # Windows ------------------------------------------------------------------------------------------------------------
@@ -49,17 +51,17 @@ def _taps(values: Tensor, step: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
     return before, middle, after
 
 
-def widened_mean(values: Tensor, step: int) -> Tensor:
-    """Return the mean of 3 x 3 entries `step` apart."""
-    for dim in (-2, -1):
+def widened_mean(values: Tensor, steps: Sequence[int]) -> Tensor:
+    """Return the mean of 3 x 3 entries a step apart, of that the mean of those the next step apart, and so on."""
+    for step, dim in itertools.product(steps, (-2, -1)):
         before, middle, after = _taps(values, step, dim)
         values = realize((before + after + middle) * (1 / 3))
     return values
 
 
-def widened_maximum(values: Tensor, step: int) -> Tensor:
-    """Return the highest of 3 x 3 entries `step` apart."""
-    for dim in (-2, -1):
+def widened_maximum(values: Tensor, steps: Sequence[int]) -> Tensor:
+    """Return the highest of 3 x 3 entries a step apart, of that the highest of those the next step apart, and so on."""
+    for step, dim in itertools.product(steps, (-2, -1)):
         before, middle, after = _taps(values, step, dim)
         values = realize(torch.maximum(torch.maximum(before, after), middle))
     return values
@@ -92,11 +94,12 @@ def complete(
     height = torch.where(validity, elevation, 0.0)
     datum = (height.sum((1, 2), keepdim=True) / known.sum((1, 2), keepdim=True).clamp(min=1)).detach()
     noise = torch.where(validity, variance, 0.0)
-    layers = torch.stack([known, (height - datum) * known, noise, upper_bound - datum, unseen])
+    bound = torch.where(bounded, upper_bound - datum, 0.0)
+    layers = torch.stack([known, (height - datum) * known, noise, bound, unseen])
     layers = padded(layers, scales.rim, 0.0)
 
     shares, means, noise = _windows(layers[:3], scales)
-    inner = cropped(layers, sum(scales.steps))
+    inner = cropped(layers, scales.radii[-1])
     known, height, bound, unseen = inner[0], inner[1], inner[3], inner[4]
     for k in (2, 1, 0):
         means[k] = means[k + 1] + (shares[k] * (1 / QUARTER)).clamp(max=1) * (means[k] - means[k + 1])
@@ -108,12 +111,11 @@ def complete(
 
 def _windows(layers: Tensor, scales: Scales) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """Return each window's share of known cells and their mean height, and the mean variance of the smallest one."""
-    shares, means, noise, rest = [], [], layers[2], sum(scales.steps)
-    for number, step in enumerate(scales.steps):
-        rest -= step
-        layers = widened_mean(layers, step) if step > 0 else layers
-        inner = cropped(layers, rest)
-        inverse = 1 / inner[0].clamp(min=1e-5)
+    shares, means, noise = [], [], layers[2]
+    for number, (steps, radius) in enumerate(zip(scales.steps, scales.radii, strict=True)):
+        layers = widened_mean(layers, steps)
+        inner = cropped(layers, scales.radii[-1] - radius)
+        inverse = 1 / inner[0].clamp(min=TINY)
         shares.append(inner[0])
         means.append(inner[1] * inverse)
         if number == 0:
@@ -138,9 +140,9 @@ class Extremes(NamedTuple):
 def extremes(ground: Surface, scales: Scales) -> Extremes:
     """Find the highest and lowest ground of each window."""
     missing = (ground.shares[-1] <= 0).to(ground.height.dtype)
-    near = widened_maximum(torch.stack([ground.height, -ground.height, missing]), 1)
-    far = widened_maximum(near, scales.steps[1]) if scales.steps[1] > 0 else near
-    body = widened_maximum(far[::2], scales.steps[2]) if scales.steps[2] > 0 else far[::2]
+    near = widened_maximum(torch.stack([ground.height, -ground.height, missing]), scales.steps[0])
+    far = widened_maximum(near, scales.steps[1])
+    body = widened_maximum(far[::2], scales.steps[2])
     rim = scales.margin - scales.stood_on
     near, far = cropped(near, rim - 1), cropped(far, rim - scales.reach)
     body = cropped(body, scales.margin - scales.spine - scales.body)
@@ -195,7 +197,7 @@ def attitudes(
     ground: Surface, extreme: Extremes, scales: Scales, robot: RobotConfig, resolution: float
 ) -> list[Attitude]:
     """Return how the body stands at each heading; 0 where a foot or the body would leave the completed ground."""
-    height = widened_mean(cropped(ground.height, scales.margin - scales.foot - 1), 1)
+    height = widened_mean(cropped(ground.height, scales.margin - scales.foot - 1), (1,))
     return [_attitude(height, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
 
 

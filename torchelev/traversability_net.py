@@ -60,10 +60,7 @@ def _spread(weight: Float[Tensor, "O C"], values: Sequence[Tensor]) -> Float[Ten
 
 def best_in_reach(cell: Tensor, scales: Scales) -> Tensor:
     """Return each channel's lowest value within a foot's reach, where a foot may choose its place."""
-    worse = -cell
-    for step in scales.steps[:2]:
-        worse = widened_maximum(worse, step) if step > 0 else worse
-    return -worse
+    return -widened_maximum(-cell, (*scales.steps[0], *scales.steps[1]))
 
 
 def _sum_of_four(places: list[Tensor]) -> Tensor:
@@ -83,11 +80,14 @@ def rate(
     resolution: float,
     robot: RobotConfig,
 ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
-    """Return the logits of traversability and confidence.
+    """Return the logits of traversability and confidence, in float32 at least.
 
     Every cell is described by its surroundings. The body is put over each cell at four headings: what its feet stand
     on, how it is inclined and what is under its belly tell whether it stands there; the headings' mean tells of all.
     """
+    dtype = torch.promote_types(elevation.dtype, torch.float32)  # half precision has no room for shares of windows
+    weights = Weights(*(weight.to(dtype) for weight in weights))
+    elevation, variance, upper_bound = (layer.to(dtype) for layer in (elevation, variance, upper_bound))
     scales = in_cells(robot, resolution)
     ground = complete(elevation, validity, variance, upper_bound, bounded, scales)
     extreme = extremes(ground, scales)
@@ -113,7 +113,7 @@ def rate(
 class TraversabilityNet(nn.Module):
     """Says of every cell of a map where a legged robot, its body over that cell, can stand.
 
-    Unchanged by altitude, and turned and mirrored with the map; cells of 1 to 15 cm, robots within `ranges`.
+    Unchanged by altitude, and turned and mirrored with the map; cells of 2 to 10 cm, robots within `ranges`.
 
     Args:
         cell_channels: C, numbers that describe a cell.
@@ -193,12 +193,12 @@ class TraversabilityNet(nn.Module):
         """Rate every cell of B maps for one robot.
 
         Args:
-            elevation: heights [m]; any finite numbers where not valid.
+            elevation: heights [m]; anything where not valid.
             validity: where the elevation is known.
             variance: of the elevation [m^2]; None: the heights are exact.
-            upper_bound: of the ground [m] where it is not known.
+            upper_bound: of the ground [m] where it is not known; anything where not bounded.
             bounded: where the upper bound is known; None, with the bound: nowhere.
-            resolution: of the maps [m], 0.01 to 0.15.
+            resolution: of the maps [m], 0.02 to 0.1.
             robot: whose sizes count.
 
         Cells of which nothing is known within the robot's reach get the answer that training gives to unknown ground.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -38,9 +39,9 @@ def stances(robot: RobotConfig, resolution: float) -> list[Stance]:
     """
     half, diagonal = 0.5 / resolution, math.sqrt(0.5)
     length, width = robot.length * half, robot.width * half
-    p, q, s = max(1, round(length)), max(1, round(width)), round((length - width) / 2)
+    p, q, s = max(1, round(length)), max(1, round(width)), round(length - width)
     along = Stance(((p, q), (p, -q), (-p, q), (-p, -q)), ((0, 0), (s, 0), (-s, 0)), 2 * p, 2 * q)
-    a, s = max(1, round((length + width) * diagonal)), round((length - width) / 2 * diagonal)
+    a, s = max(1, round((length + width) * diagonal)), round((length - width) * diagonal)
     b = min(a - 1, round((length - width) * diagonal))
     feet = ((b, a), (a, b), (-a, -b), (-b, -a))
     across = Stance(feet, ((0, 0), (s, s), (-s, -s)), (a + b) / diagonal, (a - b) / diagonal)
@@ -48,13 +49,26 @@ def stances(robot: RobotConfig, resolution: float) -> list[Stance]:
 
 
 class Scales(NamedTuple):
-    """Windows, their radii in cells, and how far they are needed."""
+    """Windows, how they grow, and how far they are needed, in cells."""
 
-    steps: tuple[int, ...]  # by which each window grows over the one before
-    reach: int  # radius of the window of a foot's reach
-    body: int  # radius of the window of half the body's width
+    steps: tuple[tuple[int, ...], ...]  # of each window over the one before
     foot: int  # farthest foot from the body's centre, along x or y
     spine: int  # farthest square under the body
+
+    @property
+    def radii(self) -> tuple[int, ...]:
+        """Of the windows."""
+        return tuple(itertools.accumulate(sum(steps) for steps in self.steps))
+
+    @property
+    def reach(self) -> int:
+        """Radius of the window of a foot's reach."""
+        return self.radii[1]
+
+    @property
+    def body(self) -> int:
+        """Radius of the window of half the body's width."""
+        return self.radii[2]
 
     @property
     def stood_on(self) -> int:
@@ -69,20 +83,28 @@ class Scales(NamedTuple):
     @property
     def rim(self) -> int:
         """Rim that the map needs."""
-        return self.margin + sum(self.steps)
+        return self.margin + self.radii[-1]
 
 
 def in_cells(robot: RobotConfig, resolution: float) -> Scales:
     """Return the robot's windows: the cell and its neighbours, a foot's reach, half the body's width, half its length.
 
-    Each is at most three times as wide as the one before, which it is made of, so that it leaves no cell out.
+    Each holds the one before. It is made of it in steps that at most triple its width, so that no cell is left out.
     """
-    steps, radii = [1], [1]
-    for length in (robot.foot_reach, robot.width / 2, robot.length / 2):
-        step = min(max(0, round(length / resolution) - radii[-1]), 2 * radii[-1] + 1)
-        steps.append(step)
-        radii.append(radii[-1] + step)
+    steps, radius = [], 0
+    for length in (resolution, robot.foot_reach, robot.width / 2, robot.length / 2):
+        steps.append(_steps(radius, round(length / resolution)))
+        radius += sum(steps[-1])
     around = stances(robot, resolution)
     foot = max(abs(n) for stance in around for place in stance.feet for n in place)
     spine = max(abs(n) for stance in around for place in stance.spine for n in place)
-    return Scales(tuple(steps), radii[1], radii[2], foot, spine)
+    return Scales(tuple(steps), foot, spine)
+
+
+def _steps(radius: int, wanted: int) -> tuple[int, ...]:
+    """Return by how many cells to grow, one step after the other, from one radius to another."""
+    steps = []
+    while radius < wanted:
+        steps.append(min(wanted - radius, 2 * radius + 1))
+        radius += steps[-1]
+    return tuple(steps)

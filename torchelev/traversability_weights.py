@@ -18,7 +18,7 @@ from torchelev.traversability_features import NUM_FEATURES, Attitude
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-RESOLUTIONS = (0.01, 0.15)  # [m]
+RESOLUTIONS = (0.02, 0.1)  # [m]
 ROUNDING = 1e-6  # of ratios
 VERSION = 1  # of the file
 CONFIG = {"cell_channels", "stance_channels", "ranges"}
@@ -80,14 +80,14 @@ def ratios(robot: RobotConfig, resolution: float) -> dict[str, float]:
     }
 
 
-# Of the robots that weights are trained for unless they say otherwise; resolutions go beyond, by extrapolation.
+# Of the robots that weights are trained for unless they say otherwise.
 RANGES = {
     "robot.width / length": (0.4, 0.8),
     "robot.clearance / step_height": (0.85, 3.4),
     "robot.foot_radius / length": (0.03, 0.06),
     "robot.foot_reach / length": (0.1, 0.2),
     "tan(robot.max_slope) * length / step_height": (0.88, 5.7),
-    "resolution / robot.length": (0.01, 0.375),
+    "resolution / robot.length": (0.02, 0.25),
     "robot.step_height": (0.06, 0.35),
 }
 
@@ -101,7 +101,7 @@ def conditions(robot: RobotConfig, resolution: float) -> list[float]:
 def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotConfig, resolution: float) -> None:
     """Raise ValueError for a resolution that no head is made for, or a robot outside of the ranges."""
     low, high = RESOLUTIONS
-    within = low <= resolution <= high
+    within = low * (1 - ROUNDING) <= resolution <= high * (1 + ROUNDING)
     require(within, "resolution", f"must be {low:g} to {high:g} m", resolution, "resample the map")
     mend = "train a head for this robot: python -m training.traversability --robot ..."
     for name, ratio in ratios(robot, resolution).items():
@@ -125,14 +125,25 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     require(path.exists(), str(path), "must be a file of weights", "no file", missing, FileNotFoundError)
     try:
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
         raise ValueError(message(str(path), "must be a file of weights", type(error).__name__, mend)) from error
-    ours = isinstance(found, dict) and all(isinstance(found.get(name), dict) for name in ("config", "state_dict"))
-    ours = ours and found["config"].keys() == CONFIG and found["config"]["ranges"].keys() == RANGES.keys()
-    require(ours, str(path), "must be a file of weights", "something else", mend)
-    version = found.get("version")
+    version = found.get("version") if isinstance(found, dict) else None
+    require(isinstance(version, int), str(path), "must be a file of weights", "something else", mend)
     require(version == VERSION, str(path), f"must be of version {VERSION}", version, "train with this torchelev")
+    require(_is_whole(found), str(path), "must be a file of weights", "other parts or types", mend)
     return found["config"], found["state_dict"]
+
+
+def _is_whole(found: dict[str, Any]) -> bool:
+    """Tell whether a file's content has all parts, of their types."""
+    config, state = found.get("config"), found.get("state_dict")
+    if not isinstance(config, dict) or config.keys() != CONFIG or not isinstance(state, dict):
+        return False
+    ranges = config["ranges"]
+    sizes = all(type(config[name]) is int and config[name] > 0 for name in ("cell_channels", "stance_channels"))
+    tensors = all(isinstance(value, Tensor) for value in state.values())
+    pairs = isinstance(ranges, dict) and ranges.keys() == RANGES.keys()
+    return sizes and tensors and pairs and all(len(pair) == 2 for pair in ranges.values())
 
 
 def require_same_shapes(path: Path, expected: Mapping[str, Tensor], came: Mapping[str, Tensor]) -> None:

@@ -26,7 +26,7 @@ SHOWN = ("analytic (defaults)", "paper (at 4 cm)")  # in the picture
 @click.option("--seed", default=0, show_default=True, help="Of data, first weights and order.")
 @click.option("--batches", type=POSITIVE, default=300, show_default=True, help="Of two maps, to train on.")
 @click.option("--steps", type=POSITIVE, default=4000, show_default=True, help="In all, those of --resume included.")
-@click.option("--evaluation-batches", type=POSITIVE, default=16, show_default=True, help="At each resolution.")
+@click.option("--evaluation-batches", type=POSITIVE, default=20, show_default=True, help="At each resolution.")
 @click.option("--paper-weights", type=click.Path(path_type=Path, exists=True), default=None, help="To compare with.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("runs/traversability"), show_default=True)
 @click.option("--data", type=click.Path(path_type=Path), default=None, help="Where maps are kept. Default: OUT/data.")
@@ -54,6 +54,7 @@ def main(
         raise click.UsageError(f"--out: {out} holds a training; add --resume, or choose another folder")
     cfg, data = DataConfig(robot=robot), data or out / "data"
     try:
+        baselines(paper_weights)  # a file that cannot be read is refused now, not after the training
         maps = data_set(data, "train", batches, seed, cfg)
         trainer = Trainer(maps, FitConfig(steps=steps, seed=seed), robot)
         if resume:

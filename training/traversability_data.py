@@ -226,8 +226,9 @@ def data_set(
 
 def save_atomically(values: dict[str, Any], path: Path) -> None:
     """Write a file by `torch.save`, so that a kill meanwhile leaves the older one."""
-    torch.save(values, path.with_suffix(".tmp"))
-    os.replace(path.with_suffix(".tmp"), path)
+    unfinished = path.with_suffix(f".tmp{os.getpid()}")  # another process may make the same
+    torch.save(values, unfinished)
+    os.replace(unfinished, path)
 
 
 def _load(path: Path, settings: dict[str, Any]) -> MappedTerrain:

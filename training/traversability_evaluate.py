@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +147,7 @@ def _cell(values: list[float | None]) -> str:
 @click.command()
 @click.option("--weights", "paths", type=click.Path(path_type=Path), multiple=True, help="Of several seeds: repeat it.")
 @click.option("--data", type=click.Path(path_type=Path), default=Path("runs/traversability/data"), show_default=True)
-@click.option("--batches", type=click.IntRange(1), default=16, show_default=True, help="At each resolution and split.")
+@click.option("--batches", type=click.IntRange(1), default=20, show_default=True, help="At each resolution and split.")
 @click.option("--robot", type=RobotType(), default=None, help="length=0.7,width=0.4,... or a YAML file. Default: any.")
 @click.option("--paper-weights", type=click.Path(path_type=Path, exists=True), default=None, help="A file (npz).")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("runs/traversability/evaluation.json"))
@@ -165,7 +164,7 @@ def main(
         result = evaluate(nets, data, batches, DataConfig(robot=robot), paper_weights)
     except (ValueError, OSError) as error:
         raise click.UsageError(str(error)) from None
-    write_json(out, json.loads(json.dumps(result)))
+    write_json(out, result)
     for split in SPLITS:
         click.echo(f"\n{split}\n\n{table(result, split)}")
 
