@@ -1,5 +1,7 @@
 """What OpenCV does on a CPU is what tensor operations do elsewhere."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -81,6 +83,22 @@ def test_serves_plain_float32_on_a_cpu_without_gradient():
         assert opencv.serves(learns)
         smooth, _ = filtered("gaussian", (learns, torch.ones(1, 3, 3, dtype=torch.bool)))
     assert not smooth.requires_grad
+
+
+def test_serves_no_tensors_of_functorch():
+    values, known = random_layer(3, (2, 7, 6), 0.8, torch.float32)
+    values = values.nan_to_num()
+    smooth = torch.func.vmap(lambda v, k: filters.gaussian((v[None], k[None]), resolution=0.1)[0][0])(values, known)
+    torch.testing.assert_close(smooth, filters.gaussian((values, known), resolution=0.1)[0])
+
+
+def test_an_opencv_that_does_not_load_counts_as_none(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)  # an import of it raises ImportError
+    opencv._installed.cache_clear()
+    assert not opencv.serves(torch.zeros(1, 3, 3))
+    monkeypatch.undo()
+    opencv._installed.cache_clear()
+    assert opencv.serves(torch.zeros(1, 3, 3))
 
 
 def test_without_opencv_tensors_do_it(monkeypatch):

@@ -1,6 +1,8 @@
 """The learned head in the map: what the config names runs, compiled or not, and gradients reach its weights."""
 
 import copy
+import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
@@ -127,14 +129,33 @@ def test_copies_checkpoints_and_files_carry_the_weights(cfg, tmp_path):
     with torch.no_grad():
         emap.head.answer_bias.add_(1.0)
     look(emap)
-    other = ElevationMap(cfg, num_envs=2)
+    elsewhere = str(tmp_path / "elsewhere.pt")
+    TraversabilityNet().save(elsewhere)
+    learned = LearnedTraversabilityConfig(weights=elsewhere)
+    other = ElevationMap(dataclasses.replace(cfg, traversability=learned), num_envs=2)
     other.load_state_dict(emap.state_dict())
     assert torch.equal(other.rate().traversability, emap.rate().traversability)
     assert torch.equal(copy.deepcopy(emap).rate().traversability, emap.rate().traversability)
     alone = TraversabilityNet()  # whatever the batch
     alone.load_state_dict({n[5:]: v for n, v in emap.state_dict().items() if n.startswith("head.")})
     save_map(tmp_path / "map.npz", emap)
+    Path(cfg.traversability.weights).unlink()
     assert torch.equal(load_map(tmp_path / "map.npz").rate().traversability, emap.rate().traversability)
+
+
+def test_a_head_may_be_given(cfg):
+    net = TraversabilityNet()
+    emap = ElevationMap(cfg, num_envs=1, head=net)
+    assert emap.head is net and net.answer.requires_grad
+    with pytest.raises(ValueError, match="head: must be None unless the config asks for a trained one"):
+        ElevationMap(ElevationMapConfig(grid=GRID), head=net)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_maps_of_other_precision(cfg, dtype):
+    emap = ElevationMap(cfg, num_envs=1).to(dtype)
+    look(emap)
+    assert emap.state.traversability.isfinite().all() and emap.state.traversability.dtype == dtype
 
 
 def test_no_known_cell_gives_a_defined_answer(cfg):

@@ -21,8 +21,8 @@ from torchelev.pipeline import compiled_update, fuse_measurement, rate_surface, 
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
 from torchelev.storage import keep_freed_memory
-from torchelev.traversability import LearnedTraversabilityConfig, learned_rating
-from torchelev.traversability_net import Rating, Weights
+from torchelev.traversability import LearnedTraversabilityConfig, learned_rating, make_head
+from torchelev.traversability_net import Rating, TraversabilityNet, Weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -41,6 +41,7 @@ class ElevationMap(nn.Module):
             wait for the device.
         chunk: update at most so many environments at a time, for less memory and the same result. None: all on a GPU;
             on a CPU as many as fit into its caches, which is faster too.
+        head: a trained head to take, itself and not a copy, in place of the weights that the config names.
 
     Raises ValueError or TypeError for bad arguments, naming the argument, the rule, what came and the mend.
     """
@@ -56,6 +57,7 @@ class ElevationMap(nn.Module):
         device: torch.device | str = "cpu",
         check_values: bool = False,
         chunk: int | None = None,
+        head: TraversabilityNet | None = None,
     ) -> None:
         super().__init__()
         cfg = ElevationMapConfig() if cfg is None else cfg
@@ -70,8 +72,7 @@ class ElevationMap(nn.Module):
         self.cfg, self.num_envs, self.check_values, self.chunk = cfg, num_envs, check_values, chunk
         self._compiled = False
         self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
-        learned = isinstance(cfg.traversability, LearnedTraversabilityConfig)
-        self.head = cfg.traversability.make_head(cfg.grid).to(device) if learned else None  # type: ignore[union-attr]
+        self.head = make_head(cfg.traversability, cfg.grid, head)
         self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
         self._filtered: dict[str, Layer] = {}  # what filters made of the stored state
         state = blank_state(cfg.grid, num_envs, device, torch.float32)
@@ -80,6 +81,8 @@ class ElevationMap(nn.Module):
                 self.register_buffer(name, value)
         for name, value in state.statistics._asdict().items():
             self.register_buffer(f"last_{name}", value, persistent=False)
+        if self.head is not None:
+            self.head.to(device)
 
     # The state ------------------------------------------------------------------------------------------------------
 
@@ -117,8 +120,10 @@ class ElevationMap(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Refuse a checkpoint of another config, naming the settings that differ, before anything changed."""
         extra = state_dict.get(f"{prefix}_extra_state")
-        there = {**extra["config"], "filters": self.cfg.to_dict()["filters"]} if extra else {}  # they hold no state
-        fields = differing_fields(self.cfg.to_dict(), there) if extra else []
+        # Filters hold no state, and the head's weights are loaded from here, whatever file they came from.
+        apart = ("filters", "traversability.weights")
+        fields = differing_fields(self.cfg.to_dict(), extra["config"]) if extra else []
+        fields = [name for name in fields if not name.startswith(apart)]
         mend = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", mend)
         self._filtered.clear()

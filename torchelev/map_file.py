@@ -20,6 +20,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.state import MapState, Statistics
+from torchelev.traversability_net import TraversabilityNet
 
 FORMAT, VERSION = "torchelev map", 1
 DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
@@ -34,6 +35,7 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     """
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
+    header |= {"head": None if emap.head is None else emap.head.config}
     arrays: dict[str, Any] = {name: as_array(value) for name, value in _tensors(emap.state).items()}
     arrays |= {f"head_{name}": as_array(value) for name, value in _head(emap).items()}
     text, path = np.array(json.dumps(header)), Path(path)
@@ -60,7 +62,8 @@ def load_map(
     header = _header(path, arrays)
     ids = _ids(env_ids, _num_envs(path, arrays))
     try:
-        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device)
+        head = None if header.get("head") is None else TraversabilityNet(**header["head"]).requires_grad_(False)
+        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, head=head)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
     emap = emap.to(DTYPES[header["dtype"]])

@@ -59,11 +59,21 @@ class LearnedTraversabilityConfig:
         path = self.weights is None or isinstance(self.weights, str)
         require(path, "traversability.weights", "must be a path or None", repr(self.weights), "give a str", TypeError)
 
-    def make_head(self, grid: GridConfig) -> TraversabilityNet:
-        """Load the weights, frozen. Raises ValueError if they do not suit the robot or the resolution."""
-        net = TraversabilityNet.from_pretrained(self.weights)
-        net.require_trained(self.robot, grid.resolution)
-        return net.requires_grad_(False)
+
+def make_head(
+    cfg: TraversabilityConfig | LearnedTraversabilityConfig | None, grid: GridConfig, given: TraversabilityNet | None
+) -> TraversabilityNet | None:
+    """Return the trained head that a config asks for: the given one, or one of its file, frozen; else None.
+
+    Raises ValueError if it does not suit the robot or the resolution, or if the config asks for none.
+    """
+    if not isinstance(cfg, LearnedTraversabilityConfig):
+        mend = "give the config a LearnedTraversabilityConfig"
+        require(given is None, "head", "must be None unless the config asks for a trained one", "a head", mend)
+        return None
+    net = TraversabilityNet.from_pretrained(cfg.weights).requires_grad_(False) if given is None else given
+    net.require_trained(cfg.robot, grid.resolution)
+    return net
 
 
 def learned_rating(state: MapState, grid: GridConfig, cfg: LearnedTraversabilityConfig, weights: Weights) -> Rating:

@@ -108,13 +108,6 @@ def lowest_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
     return -highest_known(-values, known, radius)
 
 
-def range_of_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
-    """Return the height of the highest known cell of the window around each known cell over the lowest."""
-    if opencv.serves(values):
-        return opencv.height_range((values, known), radius)
-    return highest_known(values, known, radius) - lowest_known(values, known, radius)
-
-
 def highest_of_windows(rimmed: Tensor, width: int) -> Tensor:
     """Return the maxima of the square windows of `width` cells; (B, H, W) becomes smaller by width - 1."""
     return running_maximum(realize(running_maximum(rimmed, width, -2)), width, -1)

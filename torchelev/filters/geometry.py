@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.filters import opencv
-from torchelev.filters.extrema import range_of_known
+from torchelev.filters.extrema import highest_known, lowest_known
 from torchelev.filters.registry import radius_cells, register
 from torchelev.layers import Layer, normal_component
 from torchelev.storage import as_bytes
@@ -109,7 +109,7 @@ def step_height(layer: Layer, *, resolution: float, radius: float = 0.1, less_sl
     """
     values, known = layer
     cells = radius_cells(radius, resolution)
-    height = range_of_known(values, known, cells)
+    height = highest_known(values, known, cells) - lowest_known(values, known, cells)
     if less_slope:
         plane = plane_around(layer, resolution, radius)
         explained = 2 * cells * resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())

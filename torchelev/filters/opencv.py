@@ -7,7 +7,6 @@ operation in a loop, would take OpenCV's their cores.
 from __future__ import annotations
 
 import functools
-import importlib.util
 from collections.abc import Callable
 
 import numpy as np
@@ -22,18 +21,19 @@ BLANK = float(np.finfo(np.float32).max / 4)  # beyond all heights
 
 @functools.cache
 def _installed() -> bool:
-    return importlib.util.find_spec("cv2") is not None
-
-
-def on_host(values: Tensor) -> bool:
-    """Tell whether NumPy can read these values: data on the CPU that no gradient is wanted of."""
-    learns = values.requires_grad and torch.is_grad_enabled()
-    return type(values) is Tensor and values.device.type == "cpu" and not learns and not torch.compiler.is_compiling()
+    try:
+        import cv2  # noqa: F401
+    except ImportError:  # not there, or without a library that it needs
+        return False
+    return True
 
 
 def serves(values: Tensor) -> bool:
-    """Tell whether OpenCV can filter these values."""
-    return values.dtype == torch.float32 and on_host(values) and _installed()
+    """Tell whether OpenCV can filter these values: float32 on the CPU that no gradient is wanted of."""
+    plain = type(values) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(values)
+    learns = values.requires_grad and torch.is_grad_enabled()
+    float32 = values.device.type == "cpu" and values.dtype == torch.float32
+    return plain and float32 and not learns and not torch.compiler.is_compiling() and _installed()
 
 
 def masked(values: Tensor, known: Tensor) -> Layer:
@@ -81,11 +81,6 @@ def lowest(layer: Layer, radius: int) -> Tensor:
 
     heights, window = filled(*_arrays(layer), BLANK), _square(radius)
     return torch.from_numpy(of_windows(lambda image: cv2.erode(image, window), heights, radius, BLANK))
-
-
-def height_range(layer: Layer, radius: int) -> Tensor:
-    """Return the highest less the lowest known cell of the window around each known cell."""
-    return torch.from_numpy(highest(layer, radius).numpy() - lowest(layer, radius).numpy())
 
 
 def box_mean(layer: Layer, radius: int) -> Tensor:
