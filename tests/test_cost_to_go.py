@@ -187,7 +187,7 @@ def test_dtypes_and_gradients():
     cost, goal = random_case(3)
     for dtype, tolerance in ((torch.float32, 1e-5), (torch.float16, 5e-3), (torch.bfloat16, 5e-2)):
         value = to_go(cost.to(dtype).requires_grad_(), goal)
-        assert value.dtype == dtype and not value.requires_grad
+        assert value.dtype == torch.float32 and not value.requires_grad
         torch.testing.assert_close(value.double(), to_go(cost, goal), rtol=tolerance, atol=0)
 
 
@@ -229,3 +229,27 @@ def test_bad_starts_are_refused():
     ):
         with pytest.raises(ValueError, match=text):
             descend(value, cost, begin, resolution=RESOLUTION, max_cells=number)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_added_up_in_float32(dtype):
+    cost, goal = torch.ones(1, 60, 60, dtype=dtype), torch.zeros(1, 60, 60, dtype=torch.bool)
+    goal[0, 59, 59] = True
+    value = cost_to_go(cost, goal, resolution=0.1)
+    assert value[0, 0, 0].item() == pytest.approx(5.9 * 2**0.5, rel=1e-5)
+    assert descend(value, cost, torch.tensor([[0, 0]]), resolution=0.1, max_cells=99).length.item() == pytest.approx(
+        5.9 * 2**0.5, rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("bad", [math.nan, 0.0, -1.0])
+def test_refuses_costs_that_are_not_positive(bad):
+    cost = torch.ones(1, 4, 4)
+    cost[0, 1, 1] = bad
+    with pytest.raises(ValueError, match="cost: must be positive"):
+        cost_to_go(cost, torch.ones(1, 4, 4, dtype=torch.bool), resolution=0.1)
+
+
+def test_no_maps():
+    empty = torch.ones(0, 4, 5)
+    assert cost_to_go(empty, empty > 0, resolution=0.1).shape == (0, 4, 5)

@@ -13,15 +13,32 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from benchmarks.occlusion import decide, piece_costs, refine
 from benchmarks.occlusion_scenes import VIEWS, abyss, cliff, hump, step_down, views
-from torchelev import ElevationMap
+from torchelev import (
+    ElevationMap,
+    ElevationMapConfig,
+    GridConfig,
+    LearnedTraversabilityConfig,
+    TraversabilityNet,
+)  # fmt: skip
 from torchelev.planner import plan
-from torchelev.traversal_cost import TraversalCostConfig, passable_start, traversal_cost
+from torchelev.traversal_cost import TraversalCostConfig, traversal_cost
 
 SEEDS = st.integers(0, 10_000)
 
 
 def place(x, y, num_envs=1):
     return torch.tensor([[x, y]], dtype=torch.float64).repeat(num_envs, 1)
+
+
+def test_it_reads_the_learned_heads_confidence(tmp_path):
+    TraversabilityNet().save(tmp_path / "head.pt")
+    learned = LearnedTraversabilityConfig(weights=str(tmp_path / "head.pt"))
+    grid = GridConfig(resolution=0.1, length_x=2.0, length_y=2.0)
+    emap = ElevationMap(ElevationMapConfig(grid=grid, traversability=learned))
+    emap.validity.fill_(True)
+    emap.traversability.fill_(1.0)
+    confidence = emap.rate().confidence
+    assert (confidence < 0.99).any() and torch.equal(traversal_cost(emap), traversal_cost(emap, confidence=confidence))
 
 
 # By hand --------------------------------------------------------------------------------------------------------------
@@ -96,7 +113,7 @@ def test_the_cost_is_dijkstras_and_the_cells_are_passable(seed):
     start, goal = emap.center[:, :2] - torch.tensor([0.8, 0.6]), emap.center[:, :2] + torch.tensor([0.7, 0.5])
     path = plan(emap, start, goal, cfg)
     first, last = (torch.floor(p / RESOLUTION).long() - CORNER for p in (start, goal))
-    cost = passable_start(traversal_cost(emap, cfg), emap.validity, first, RESOLUTION, cfg)
+    cost = traversal_cost(emap, cfg, start=first)
     for b in range(2):
         value = dijkstra(cost[b].numpy(), [tuple(last[b].tolist())]) * RESOLUTION / 0.5  # its cells are 0.5 m wide
         assert path.cost[b].item() == pytest.approx(value[tuple(first[b])])

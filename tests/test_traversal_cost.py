@@ -18,7 +18,6 @@ from torchelev.traversal_cost import (
     TraversalCostConfig,
     cost_of_layers,
     inclination,
-    passable_start,
     traversal_cost,
 )
 
@@ -134,13 +133,24 @@ def test_inflation():
 def test_where_the_robot_stands():
     """Radius 0.26 m is two cells: unknown ground there is passable, known bad ground in its own cell alone."""
     cfg = TraversalCostConfig(stand_radius=0.26)
-    cost, known = torch.full((1, 9, 9), INF), torch.zeros(1, 9, 9, dtype=torch.bool)
+    none, known = torch.zeros(1, 9, 9, dtype=torch.bool), torch.zeros(1, 9, 9, dtype=torch.bool)
     known[0, 4, 3:6] = True
-    found = passable_start(cost, known, torch.tensor([[4, 4]]), RESOLUTION, cfg)[0]
+    bad, start = torch.zeros(1, 9, 9), torch.tensor([[4, 4]])
+    found = cost_of_layers((bad, known), (bad, none), RESOLUTION, cfg, start=start)[0]
     assert found[4, 4] == 6.0 and found[4, 3].isinf() and found[4, 2] == 6.0 and found[3, 3] == 6.0
     assert found.isfinite().sum() == 13 - 2 and found[2, 3].isinf()
-    kept = passable_start(torch.full_like(cost, 2.5), known, torch.tensor([[4, 4]]), RESOLUTION, cfg)
-    assert kept.eq(2.5).all()
+    kept = cost_of_layers((bad + 0.9, ~none), (bad, none), RESOLUTION, cfg, start=start)
+    assert torch.equal(kept, cost_of_layers((bad + 0.9, ~none), (bad, none), RESOLUTION, cfg))
+
+
+def test_unknown_ground_below_the_robot_does_not_cage_it():
+    """It does not grow, but what is unknown farther away does."""
+    known = torch.ones(1, 16, 14, dtype=torch.bool)
+    known[0, 4:7, 4:7] = known[0, 12, 12] = False
+    emap = ground_map(known=known)
+    cfg = TraversalCostConfig(inflation_radius=0.25, stand_radius=0.26)
+    cost = traversal_cost(emap, cfg, start=torch.tensor([[5, 5]]))[0]
+    assert cost[:10, :10].isfinite().all() and cost[10:15, 10:14].isinf().all() and cost.isinf().sum() == 20
 
 
 # Against loops --------------------------------------------------------------------------------------------------------
@@ -243,9 +253,8 @@ def test_nothing_waits_for_the_device(monkeypatch):
     emap = ElevationMap(num_envs=2, device="meta")
     with OneDevice():
         confidence = torch.empty(2, 250, 250, device="meta")
-        cost = traversal_cost(emap, confidence=confidence)
         start = torch.empty(2, 2, device="meta", dtype=torch.int64)
-        assert passable_start(cost, emap.validity, start, 0.04, TraversalCostConfig()).shape == cost.shape
+        assert traversal_cost(emap, confidence=confidence, start=start).shape == confidence.shape
 
 
 @pytest.mark.parametrize("settings, text", [

@@ -47,16 +47,20 @@ def cost_to_go(
         rounds: at most so many; None: on a CPU until nothing changes, elsewhere 16, as looking would make the host
             wait. What so many do not reach stays inf, and a way that is found may not be the cheapest.
 
-    Raises ValueError or TypeError for shapes and dtypes that do not fit.
+    Returns float32 at least. Raises ValueError or TypeError for shapes and dtypes that do not fit and, on a CPU, for
+    costs that are not positive.
     """
     _check_grids(cost, goal)
     require_positive(resolution=resolution)
     whole = rounds is None or (type(rounds) is int and rounds >= 1)
     require(whole, "rounds", "must be a positive int or None", repr(rounds), "give 16")
     look = readable(cost)
-    limit = rounds or (cost[0].numel() + 1 if look else ROUNDS)
+    limit = rounds or (cost.shape[1] * cost.shape[2] + 1 if look else ROUNDS)
+    if look:
+        mend = "give 1 for easy ground and inf for impassable"
+        require(bool((cost > 0).all()), "cost", "must be positive", "NaN, or 0 and less", mend)
     with torch.no_grad():
-        lines = cost.detach().transpose(0, 1).contiguous()  # (H, B, W)
+        lines = _summable(cost.detach()).transpose(0, 1).contiguous()  # (H, B, W)
         ahead, across = (_steps(c, resolution) for c in (lines, lines.transpose(0, 2).contiguous()))
         free = goal.transpose(0, 1) & torch.isfinite(lines)
         value = torch.where(free, 0.0, torch.inf).to(lines.dtype)
@@ -69,6 +73,11 @@ def cost_to_go(
             if look and torch.equal(before, value):
                 break
     return value.transpose(0, 1).contiguous()
+
+
+def _summable(cost: Tensor) -> Tensor:
+    """Return costs as float32 at least: half precision cannot add up a way."""
+    return cost.to(torch.promote_types(cost.dtype, torch.float32))
 
 
 def _check_grids(cost: object, goal: object) -> None:
@@ -147,7 +156,8 @@ def descend(
     require(tuple(start.shape) == (B, 2), "start", f"expected {(B, 2)}", tuple(start.shape), mend)
     for k, size in enumerate((H, W)):
         require_indices("start", start[:, k], size, "give cells of the map")
-    onward = _next_cells(value, cost, resolution)
+    cost = _summable(cost)
+    onward = _next_cells(_summable(value), cost, resolution)
     cells = [start[:, :1] * W + start[:, 1:]]
     for _ in range(max_cells - 1):
         cells.append(onward.gather(1, cells[-1]))

@@ -12,7 +12,7 @@ from torchelev.cost_to_go import cost_to_go, descend
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.state import MapState
-from torchelev.traversal_cost import TraversalCostConfig, passable_start, traversal_cost
+from torchelev.traversal_cost import TraversalCostConfig, traversal_cost
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -47,7 +47,7 @@ def plan(
         start_xy: where the robots stand [m], map frame.
         goal_xy: where they should go [m], map frame.
         cfg: thresholds and weights.
-        confidence: of the traversability, 0 to 1; None: 1.
+        confidence: of the traversability, 0 to 1; None: the learned head's own, else 1.
         max_cells: K, of the longest way; None: twice the cells along x and y together. Of a longer way the first K
             cells come back, and `reached` is False.
         rounds: as of `cost_to_go`.
@@ -62,9 +62,8 @@ def plan(
         _cell(emap, *place, current) for place in (("start_xy", start_xy), ("goal_xy", goal_xy))
     )
     longest = 2 * (grid.height + grid.width) if max_cells is None else max_cells
-    cost = traversal_cost(emap, cfg, confidence=confidence, state=state)
-    cost = passable_start(cost, current.validity, start, grid.resolution, cfg)
-    value = cost_to_go(cost, _mark(goal, ends, cost), resolution=grid.resolution, rounds=rounds)
+    cost = traversal_cost(emap, cfg, confidence=confidence, start=start, state=state)
+    value = cost_to_go(cost, _mark(goal, starts & ends, cost), resolution=grid.resolution, rounds=rounds)
     way = descend(value, cost, start, resolution=grid.resolution, max_cells=longest)
     at_start = value.flatten(1).gather(1, (start[:, :1] * grid.width + start[:, 1:]))[:, 0]
     xy = (way.cells + current.corner[:, None]).double().add(0.5) * grid.resolution

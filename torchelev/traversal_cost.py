@@ -18,7 +18,7 @@ from torchelev.state import MapState
 from torchelev.windows import window_maximum
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,7 @@ def traversal_cost(
     cfg: TraversalCostConfig | None = None,
     *,
     confidence: Float[Tensor, "B H W"] | None = None,
+    start: Int[Tensor, "B 2"] | None = None,
     state: MapState | None = None,
 ) -> Float[Tensor, "B H W"]:
     """Return what each cell costs for each metre of way: at least 1, inf where it is impassable.
@@ -79,7 +80,8 @@ def traversal_cost(
     Args:
         emap: the maps.
         cfg: thresholds and weights.
-        confidence: of the traversability, 0 to 1, as the learned head gives it; None: 1.
+        confidence: of the traversability, 0 to 1; None: the learned head's own, else 1.
+        start: cell (i, j) on which each robot stands: it is passable, as is unknown ground within `stand_radius`.
         state: of the maps; None: their own.
 
     Raises ValueError or TypeError for a confidence that does not fit, and a map whose traversability is switched off.
@@ -88,17 +90,24 @@ def traversal_cost(
     mend = "give ElevationMapConfig a TraversabilityConfig"
     require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", mend)
     state = emap.state if state is None else state
+    if confidence is None and emap.head is not None:
+        confidence = emap.rate(state=state).confidence
     if confidence is not None:
         confidence = check_tensor("confidence", confidence, emap.device, FLOATS)
         shape = tuple(state.elevation.shape)
         fits = tuple(confidence.shape) == shape
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
     rated, bound = emap._read("traversability", state), emap._read("upper_bound", state)
-    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence)
+    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start)
 
 
 def cost_of_layers(
-    rated: Layer, bound: Layer, resolution: float, cfg: TraversalCostConfig, confidence: Tensor | None = None
+    rated: Layer,
+    bound: Layer,
+    resolution: float,
+    cfg: TraversalCostConfig,
+    confidence: Tensor | None = None,
+    start: Int[Tensor, "B 2"] | None = None,
 ) -> Float[Tensor, "B H W"]:
     """Return `traversal_cost` of layers: the traversability, and the upper bound, which is the elevation where known.
 
@@ -113,7 +122,13 @@ def cost_of_layers(
         guess = 1 + cfg.weight_confidence + cfg.weight_inclination / cfg.max_inclination * angle
         gentle = tells & ~known & (angle <= cfg.max_inclination)
         cost = torch.where(gentle, guess, cost)
-    return _inflated(cost, round(cfg.inflation_radius / resolution))
+    cells = round(cfg.inflation_radius / resolution)
+    if start is None:
+        return _inflated(cost, cells)
+    away = _squared_distance(start, cost)
+    # Before what is impassable grows: unknown ground below the robot must not cage it.
+    cost = _opened(cost, ~known & (away <= (cfg.stand_radius / resolution) ** 2), cfg)
+    return _opened(_inflated(cost, cells), away == 0, cfg)
 
 
 def inclination(bound: Layer, resolution: float, distance: float) -> Layer:
@@ -159,17 +174,14 @@ def _inflated(cost: Tensor, radius: int) -> Float[Tensor, "B H W"]:
     return torch.where(near > 0, torch.inf, cost)
 
 
-def passable_start(
-    cost: Float[Tensor, "B H W"],
-    known: Bool[Tensor, "B H W"],
-    start: Tensor,
-    resolution: float,
-    cfg: TraversalCostConfig,
-) -> Float[Tensor, "B H W"]:
-    """Make the cell `start` (B, 2) passable, and what is not known within `stand_radius` of it."""
-    i = torch.arange(cost.shape[1], device=cost.device)[None, :, None] - start[:, 0, None, None]
-    j = torch.arange(cost.shape[2], device=cost.device)[None, None, :] - start[:, 1, None, None]
-    away = i.square() + j.square()
-    under = (~known & (away <= (cfg.stand_radius / resolution) ** 2)) | (away == 0)
+def _squared_distance(start: Int[Tensor, "B 2"], like: Tensor) -> Int[Tensor, "B H W"]:
+    """Return the squared distance [cells^2] of each cell from `start`."""
+    i = torch.arange(like.shape[1], device=like.device)[None, :, None] - start[:, 0, None, None]
+    j = torch.arange(like.shape[2], device=like.device)[None, None, :] - start[:, 1, None, None]
+    return i.square() + j.square()
+
+
+def _opened(cost: Tensor, cells: Bool[Tensor, "B H W"], cfg: TraversalCostConfig) -> Float[Tensor, "B H W"]:
+    """Make impassable cells passable, at the cost of ground rated 0 in doubt."""
     worst = 1 + cfg.weight_traversability + cfg.weight_confidence
-    return torch.where(under & torch.isinf(cost), worst, cost)
+    return torch.where(cells & torch.isinf(cost), worst, cost)
