@@ -21,8 +21,8 @@ from benchmarks.report import machine, markdown_table, write_json
 from torchelev import ElevationMap, ElevationMapConfig, LearnedTraversabilityConfig, TraversabilityConfig
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability_data import DataConfig, Look, blank_map, tile_places, walk_and_look
-from training.traversability_terrain import KINDS, LENGTH, LOOK_INTERVAL, draw_robot, make_tiles
+from training.traversability.data import DataConfig, Look, blank_map, tile_places, walk_and_look
+from training.traversability.terrain import KINDS, LENGTH, LOOK_INTERVAL, draw_robot, make_tiles
 
 RESULTS = Path(__file__).parent / "results"
 THRESHOLDS = (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9)

@@ -8,10 +8,10 @@ import pytest
 import torch
 from conftest import pose
 
-import training.traversability_data as data
+import training.traversability.data as data
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability_data import (
+from training.traversability.data import (
     DataConfig,
     batch_seed,
     blank_map,
@@ -22,8 +22,8 @@ from training.traversability_data import (
     tile_places,
     walk_and_map,
 )
-from training.traversability_sight import Sight
-from training.traversability_terrain import (
+from training.traversability.sight import Sight
+from training.traversability.terrain import (
     KINDS,
     LENGTH,
     RESOLUTION,

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability_footholds import carrying, disc, lattice_around, sole, within_reach
-from training.traversability_labels import stand, verdicts
-from training.traversability_stances import VERDICTS, gentle, ground_around, plane_through, stances
+from training.traversability.footholds import carrying, disc, lattice_around, sole, within_reach
+from training.traversability.labels import stand, verdicts
+from training.traversability.stances import VERDICTS, gentle, ground_around, plane_through, stances
 
 ROBOT = RobotConfig()  # 0.7 x 0.4 m, feet of 3 cm that reach 0.1 m, steps of 0.2 m, clearance 0.3 m, 0.5 rad
 SMALL = RobotConfig(length=0.45, width=0.3, foot_radius=0.02, foot_reach=0.07, step_height=0.1, clearance=0.15)
@@ -397,7 +397,7 @@ def test_every_criterion_decides_on_rough_ground():
 def test_drops_agree_where_it_is_plain():
     """On flat ground it stands, without ground under its hind feet it falls."""
     pytest.importorskip("mujoco")
-    from training.traversability_drop import drop, on_footholds, on_nominal_places
+    from training.traversability.drop import drop, on_footholds, on_nominal_places
 
     xy, theta = torch.tensor([0.02, 0.01]), 0.3
     flat, cliff = tile(lambda x, y: 0.2), tile(lambda x, y: -1.0 * (x < 0.02))
@@ -412,7 +412,7 @@ def test_drops_agree_where_it_is_plain():
 
 def test_nominal_postures_keep_to_what_legs_can_do():
     """A foot over a hole hangs half a step below the body's plane, which is no steeper than its limit."""
-    from training.traversability_drop import on_nominal_places, rest_heights
+    from training.traversability.drop import on_nominal_places, rest_heights
 
     hole, middle = tile(lambda x, y: -1.0 * ((x > 0.2) & (y > 0.1))), torch.zeros(2)
     posture = on_nominal_places(hole, 0, middle, 0.0, ROBOT)
@@ -427,7 +427,7 @@ def test_nominal_postures_keep_to_what_legs_can_do():
 
 def test_a_body_that_touches_does_not_stand():
     pytest.importorskip("mujoco")
-    from training.traversability_drop import Outcome, drop, on_nominal_places
+    from training.traversability.drop import Outcome, drop, on_nominal_places
 
     box = tile(lambda x, y: 0.31 * ((x.abs() < 0.08) & (y.abs() < 0.05)))
     outcome = drop(box, 0, on_nominal_places(box, 0, torch.zeros(2), 0.0, ROBOT), ROBOT, 0.9)
@@ -438,7 +438,7 @@ def test_a_body_that_touches_does_not_stand():
 
 def test_a_robot_slides_where_the_friction_does_not_hold():
     pytest.importorskip("mujoco")
-    from training.traversability_drop import drop, on_nominal_places
+    from training.traversability.drop import drop, on_nominal_places
 
     slope = tile(lambda x, y: 0.5 * x)
     posture = on_nominal_places(slope, 0, torch.tensor([0.0, 0.0]), 0.0, ROBOT)
@@ -448,7 +448,7 @@ def test_a_robot_slides_where_the_friction_does_not_hold():
 
 
 def test_legs_that_cut_the_ground_are_counted():
-    from training.traversability_drop import legs_clear, on_footholds
+    from training.traversability.drop import legs_clear, on_footholds
 
     posture = on_footholds(tile(lambda x, y: 0.0), 0, torch.tensor(
         [[0.25, 0.2, 0], [0.25, -0.2, 0], [-0.35, -0.2, 0], [-0.35, 0.2, 0]]), torch.zeros(2), 0.0, ROBOT)  # fmt: skip
@@ -457,7 +457,7 @@ def test_legs_that_cut_the_ground_are_counted():
 
 
 def test_balls_rest_on_what_they_touch_first():
-    from training.traversability_drop import rest_heights
+    from training.traversability.drop import rest_heights
 
     ball = rest_heights(ledge(0.1), 0, torch.tensor([[-1.0, 0.0], [1.0, 0.0]]), 0.03)
     assert ball.tolist() == pytest.approx([0.03, 0.13], abs=1e-6)
@@ -466,7 +466,7 @@ def test_balls_rest_on_what_they_touch_first():
 
 
 def test_agreement_by_hand():
-    from training.traversability_physics import summarize, table
+    from training.traversability.physics import summarize, table
 
     def row(kind, verdict, stood, limit):
         return {"kind": kind, "verdict": verdict, "stood": stood, "stood_at_limit": limit, "legs_clear": stood}
@@ -486,7 +486,7 @@ def test_agreement_by_hand():
 
 def test_a_tile_gives_stances_of_both_labels():
     pytest.importorskip("mujoco")
-    from training.traversability_physics import rows_of_tile
+    from training.traversability.physics import rows_of_tile
 
     field = tile(lambda x, y: -1.0 * (x.remainder(1.1) < 0.5), 8.0)
     rows = rows_of_tile(field, "moats", ROBOT, 2, np.random.default_rng(0))

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev.robot import RobotConfig
-from training.traversability_data import MappedTerrain
-from training.traversability_heads import analytic, as_mapped, baselines, family, lowest_under_body, paper, resize
-from training.traversability_metrics import (
+from training.traversability.data import MappedTerrain
+from training.traversability.heads import analytic, as_mapped, baselines, family, lowest_under_body, paper, resize
+from training.traversability.metrics import (
     RatedMap,
     calibration_error,
     edge_length,

@@ -11,14 +11,14 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-import training.traversability as training
-import training.traversability_evaluate as evaluation
-import training.traversability_experiment as experiment
+import training.traversability.__main__ as training
+import training.traversability.evaluate as evaluation
+import training.traversability.experiment as experiment
 from torchelev.robot import RobotConfig
 from torchelev.traversability_net import Rating, TraversabilityNet
-from training.traversability_data import DataConfig, MappedTerrain, make_batch
-from training.traversability_robot import RobotType
-from training.traversability_trainer import CHECKPOINT, FitConfig, Trainer, losses, mean_over_maps
+from training.traversability.data import DataConfig, MappedTerrain, make_batch
+from training.traversability.robot import RobotType
+from training.traversability.trainer import CHECKPOINT, FitConfig, Trainer, losses, mean_over_maps
 
 TINY = functools.partial(
     DataConfig, num_maps=2, window=2.0, looks=(2, 2), headings=2, camera_pixels=(16, 12), lidar_rays=(8, 64)

@@ -20,6 +20,7 @@ from torchelev.operators import padded
 from torchelev.robot import RobotConfig
 from torchelev.storage import realize, realize_all
 from torchelev.traversability_stances import Scales, Stance, stances
+from torchelev.windows import shifted
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -31,17 +32,6 @@ TINY = 1e-9  # below any window's share of known cells but 0
 
 
 # Windows ------------------------------------------------------------------------------------------------------------
-
-
-def shifted(values: Tensor, rim: int, i: int, j: int) -> Tensor:
-    """Return what lies (i, j) cells on, of (..., H + 2 rim, W + 2 rim) the inner (..., H, W)."""
-    H, W = values.shape[-2] - 2 * rim, values.shape[-1] - 2 * rim
-    return values.narrow(-2, rim + i, H).narrow(-1, rim + j, W)
-
-
-def cropped(values: Tensor, rim: int) -> Tensor:
-    """Take a rim off (..., H, W)."""
-    return shifted(values, rim, 0, 0)
 
 
 def _taps(values: Tensor, step: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -99,7 +89,7 @@ def complete(
     layers = padded(layers, scales.rim, 0.0)
 
     shares, means, noise = _windows(layers[:3], scales)
-    inner = cropped(layers, scales.radii[-1])
+    inner = shifted(layers, scales.radii[-1])
     known, height, bound, unseen = inner[0], inner[1], inner[3], inner[4]
     for k in (2, 1, 0):
         means[k] = means[k + 1] + (shares[k] * (1 / QUARTER)).clamp(max=1) * (means[k] - means[k + 1])
@@ -114,7 +104,7 @@ def _windows(layers: Tensor, scales: Scales) -> tuple[list[Tensor], list[Tensor]
     shares, means, noise = [], [], layers[2]
     for number, (steps, radius) in enumerate(zip(scales.steps, scales.radii, strict=True)):
         layers = widened_mean(layers, steps)
-        inner = cropped(layers, scales.radii[-1] - radius)
+        inner = shifted(layers, scales.radii[-1] - radius)
         inverse = 1 / inner[0].clamp(min=TINY)
         shares.append(inner[0])
         means.append(inner[1] * inverse)
@@ -144,8 +134,8 @@ def extremes(ground: Surface, scales: Scales) -> Extremes:
     far = widened_maximum(near, scales.steps[1])
     body = widened_maximum(far[::2], scales.steps[2])
     rim = scales.margin - scales.stood_on
-    near, far = cropped(near, rim - 1), cropped(far, rim - scales.reach)
-    body = cropped(body, scales.margin - scales.spine - scales.body)
+    near, far = shifted(near, rim - 1), shifted(far, rim - scales.reach)
+    body = shifted(body, scales.margin - scales.spine - scales.body)
     return Extremes((near[0], -near[1]), (far[0], -far[1]), 1 - far[2], body[0], 1 - body[1])
 
 
@@ -166,20 +156,20 @@ def features(
     """Return what is seen around every cell that feet may stand on; 0 where nothing is known in reach."""
     rim = scales.margin - scales.stood_on
     step, steep = 1 / robot.step_height, (1 / (resolution * math.tan(robot.max_slope))) ** 2
-    inner = [cropped(layer, rim) for layer in (ground.height, *ground.means)]
+    inner = [shifted(layer, rim) for layer in (ground.height, *ground.means)]
     slopes = [_slope(mean, d, rim) * steep for mean, d in ((ground.means[0], 1), (ground.means[1], scales.reach))]
     heights = [above - below for above, below in itertools.pairwise(inner)]
     for (highest, lowest), mean in ((extreme.near, inner[1]), (extreme.far, inner[2])):
         heights += [highest - mean, mean - lowest]
     return torch.stack(
         [
-            cropped(ground.known, rim),
-            *(cropped(share, rim) for share in ground.shares),
+            shifted(ground.known, rim),
+            *(shifted(share, rim) for share in ground.shares),
             *(squashed(height * step) * extreme.complete for height in heights),
             *(squashed(slope) * extreme.complete for slope in slopes),
-            squashed(cropped(ground.variance, rim) * (1 / NOISE**2)),
-            squashed(cropped(ground.hidden, rim) * step),
-            cropped(ground.bounded, rim),
+            squashed(shifted(ground.variance, rim) * (1 / NOISE**2)),
+            squashed(shifted(ground.hidden, rim) * step),
+            shifted(ground.bounded, rim),
         ],
         1,
     )
@@ -197,7 +187,7 @@ def attitudes(
     ground: Surface, extreme: Extremes, scales: Scales, robot: RobotConfig, resolution: float
 ) -> list[Attitude]:
     """Return how the body stands at each heading; 0 where a foot or the body would leave the completed ground."""
-    height = widened_mean(cropped(ground.height, scales.margin - scales.foot - 1), (1,))
+    height = widened_mean(shifted(ground.height, scales.margin - scales.foot - 1), (1,))
     return [_attitude(height, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.storage import realize_all
-from torchelev.traversability_features import attitudes, complete, cropped, extremes, features, shifted, widened_maximum
+from torchelev.traversability_features import attitudes, complete, extremes, features, widened_maximum
 from torchelev.traversability_stances import Scales, in_cells, stances
 from torchelev.traversability_weights import (
     RANGES,
@@ -26,6 +26,7 @@ from torchelev.traversability_weights import (
     weight_shapes,
     write_weights,
 )
+from torchelev.windows import shifted
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -95,9 +96,9 @@ def rate(
 
     seen = _mixed(weights.cell, features(ground, extreme, scales, resolution, robot))
     cell = F.relu(seen + _biased(weights.cell_bias, weights.cell_condition, sizes))
-    around = torch.cat([cropped(cell, scales.reach), best_in_reach(cell.chunk(2, 1)[0], scales)], 1)
+    around = torch.cat([shifted(cell, scales.reach), best_in_reach(cell.chunk(2, 1)[0], scales)], 1)
     foot, side, center = _mixed(torch.cat([weights.foot, weights.side, weights.center]), around).chunk(3, 1)
-    center = cropped(center, scales.foot) + _biased(weights.stance_bias, weights.stance_condition, sizes)
+    center = shifted(center, scales.foot) + _biased(weights.stance_bias, weights.stance_condition, sizes)
 
     mean = torch.zeros_like(center)
     headings = stances(robot, resolution)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from torchelev.errors import message, require
 from torchelev.layers import Layer
+from torchelev.windows import shifted
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -58,7 +59,7 @@ class PaperFilter(nn.Module):
             return torch.zeros_like(elevation)
         z = elevation[:, None]
         banks = zip(DILATIONS, self.banks, strict=True)
-        seen = [F.conv2d(_cropped(z, RIM - d), weight.to(z.dtype), dilation=d) for d, weight in banks]
+        seen = [F.conv2d(shifted(z, RIM - d), weight.to(z.dtype), dilation=d) for d, weight in banks]
         rated = torch.exp(-F.conv2d(torch.cat(seen, 1).abs(), self.final.to(z.dtype)))
         return F.pad(rated[:, 0], [RIM] * 4)
 
@@ -68,11 +69,6 @@ class PaperFilter(nn.Module):
         unknown = F.pad((~known).to(values.dtype), [RIM] * 4, value=1.0)
         rated = F.max_pool2d(unknown[:, None], 2 * RIM + 1, 1)[:, 0] == 0
         return torch.where(rated, self(torch.where(known, values, 0.0)), 0.0), rated
-
-
-def _cropped(values: Tensor, rim: int) -> Tensor:
-    H, W = values.shape[-2:]
-    return values[..., rim : H - rim, rim : W - rim]
 
 
 def _read(path: Path) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ from torchelev.errors import require, require_positive
 from torchelev.layers import Layer
 from torchelev.operators import padded
 from torchelev.state import MapState
-from torchelev.windows import window_maximum
+from torchelev.windows import AROUND, shifted, window_maximum
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -142,27 +142,16 @@ def inclination(bound: Layer, resolution: float, distance: float) -> Layer:
     values = torch.where(known, bound[0], 0.0)
     reach = max(1, round(distance / resolution))
     aslant = max(1, round(reach / math.sqrt(2)))
-    offsets = [(i * n, j * n) for i, j, n in _compass(reach, aslant)]
+    offsets = [(i * n, j * n) for i, j in AROUND for n in [aslant if i and j else reach]]
     height, there = (padded(layer, reach, 0.0) for layer in (values, known.to(values.dtype)))
     steepest, found = torch.zeros_like(values), torch.zeros_like(known)
     for i, j in offsets:
-        step = _shifted(height, reach, i, j) - values
-        other = _shifted(there, reach, i, j)
+        step = shifted(height, reach, i, j) - values
+        other = shifted(there, reach, i, j)
         steepest = torch.maximum(steepest, step.abs() * other / (math.hypot(i, j) * resolution))
         found = found | (other > 0)
     found = found & known
     return torch.where(found, torch.atan(steepest), 0.0), found
-
-
-def _compass(reach: int, aslant: int) -> list[tuple[int, int, int]]:
-    """Return the eight directions with how many cells to go along each axis."""
-    axes = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    return [(i, j, aslant if i and j else reach) for i, j in axes]
-
-
-def _shifted(rimmed: Tensor, rim: int, i: int, j: int) -> Tensor:
-    H, W = rimmed.shape[1] - 2 * rim, rimmed.shape[2] - 2 * rim
-    return rimmed.narrow(1, rim + i, H).narrow(2, rim + j, W)
 
 
 def _inflated(cost: Tensor, radius: int) -> Float[Tensor, "B H W"]:

@@ -26,6 +26,11 @@ def _line(values: Tensor, rim: int, dim: int, k: int) -> Tensor:
     return values.narrow(dim, rim + k, values.shape[dim] - 2 * rim)
 
 
+def shifted(values: Tensor, rim: int, i: int = 0, j: int = 0) -> Tensor:
+    """Return what lies (i, j) cells on, of (..., H + 2 rim, W + 2 rim) the inner (..., H, W)."""
+    return _line(_line(values, rim, -2, i), rim, -1, j)
+
+
 def _line_sums(values: Tensor, rim: int, radius: int, dim: int, order: int) -> list[Tensor]:
     """Sum k^power * values over k = -radius .. radius along one dimension, for each power up to the order of 0 to 2."""
     middle, steps = _line(values, rim, dim, 0), range(1, radius + 1)

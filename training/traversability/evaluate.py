@@ -1,4 +1,4 @@
-"""How good is a learned head? `python -m training.traversability_evaluate --weights runs/traversability/weights.pt`"""
+"""How good is a learned head? `python -m training.traversability.evaluate --weights runs/traversability/weights.pt`"""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tqdm import tqdm
 from benchmarks.report import markdown_table, write_json
 from torchelev.robot import RobotConfig
 from torchelev.traversability_net import TraversabilityNet
-from training.traversability_data import DataConfig, MappedTerrain, data_set
-from training.traversability_heads import Score, baselines, family
-from training.traversability_metrics import SAFE, RatedMap, calibration_error, measure
-from training.traversability_robot import RobotType
-from training.traversability_terrain import KINDS, UNSEEN_KINDS
+from training.traversability.data import DataConfig, MappedTerrain, data_set
+from training.traversability.heads import Score, baselines, family
+from training.traversability.metrics import SAFE, RatedMap, calibration_error, measure
+from training.traversability.robot import RobotType
+from training.traversability.terrain import KINDS, UNSEEN_KINDS
 
 RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
 SPLITS = {"held_out": KINDS, "unseen": UNSEEN_KINDS}

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability_stances import CORNERS, corners, plane_through
+from training.traversability.stances import CORNERS, corners, plane_through
 
 if TYPE_CHECKING:
     from jaxtyping import Float

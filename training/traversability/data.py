@@ -25,9 +25,9 @@ from torchelev.errors import require, require_positive
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField, PoseErrors, preset
 from torchelev.sim.trajectories import pose
-from training.traversability_labels import stand
-from training.traversability_sight import Sight
-from training.traversability_terrain import KINDS, LENGTH, LOOK_INTERVAL, Footing, draw_robot, make_tiles, walks
+from training.traversability.labels import stand
+from training.traversability.sight import Sight
+from training.traversability.terrain import KINDS, LENGTH, LOOK_INTERVAL, Footing, draw_robot, make_tiles, walks
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchelev.plot import UNKNOWN_COLOR
 from torchelev.traversability_net import TraversabilityNet
-from training.traversability_data import MappedTerrain
-from training.traversability_heads import Score
+from training.traversability.data import MappedTerrain
+from training.traversability.heads import Score
 
 Layers = dict[str, tuple[Tensor, Tensor]]  # values and where to show them, both (H, W)
 

@@ -1,4 +1,4 @@
-"""Do the labels tell where a robot stands? `python -m training.traversability_physics` asks MuJoCo.
+"""Do the labels tell where a robot stands? `python -m training.traversability.physics` asks MuJoCo.
 
 On terrain as trained on, and on the kind never trained on, stances are drawn at random, as many that the labels let
 stand as not. A rigid box on four balls is put down there and simulated: on the label's footholds where it says that the
@@ -28,12 +28,12 @@ from tqdm import tqdm
 from benchmarks.report import markdown_table, write_json
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability_drop import drop, legs_clear, on_footholds, on_nominal_places
-from training.traversability_robot import RobotType
-from training.traversability_stances import STANDS, VERDICTS, ground_around, stances
-from training.traversability_terrain import KINDS, LENGTH, RIM, UNSEEN_KINDS, draw_robot, make_tiles
+from training.traversability.drop import drop, legs_clear, on_footholds, on_nominal_places
+from training.traversability.robot import RobotType
+from training.traversability.stances import STANDS, VERDICTS, ground_around, stances
+from training.traversability.terrain import KINDS, LENGTH, RIM, UNSEEN_KINDS, draw_robot, make_tiles
 
-RESULT = Path(__file__).parent / "results" / "traversability-physics.json"
+RESULT = Path(__file__).parents[1] / "results" / "traversability-physics.json"
 CANDIDATES = 400  # stances on a tile to draw from
 HEADINGS = 8
 FRICTION = 0.9  # as is usual between rubber and stone

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability_stances import STANDS, ground_around, stances
+from training.traversability.stances import STANDS, ground_around, stances
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -1,4 +1,4 @@
-"""Do other seeds train heads as good? `python -m training.traversability_experiment`
+"""Do other seeds train heads as good? `python -m training.traversability.experiment`
 
 Trains with three seeds, each on maps of its own, and evaluates all on the same ground beside the analytic heads and the
 paper's filter. What is finished is kept: after Ctrl-C, run it again. Writes training/results/traversability.json and
@@ -20,14 +20,14 @@ from tqdm import tqdm
 from benchmarks.report import write_json
 from torchelev.robot import RobotConfig
 from torchelev.traversability_net import TraversabilityNet
-from training.traversability_data import DataConfig
-from training.traversability_evaluate import SPLITS, evaluate, table
-from training.traversability_robot import RobotType
+from training.traversability.data import DataConfig
+from training.traversability.evaluate import SPLITS, evaluate, table
+from training.traversability.robot import RobotType
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
 BATCHES, STEPS, EVALUATION_BATCHES = 300, 4000, 20
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 
 
 def train(seed: int, folder: Path, data: Path, robot: str | None) -> None:

@@ -17,7 +17,7 @@ from torchelev.filters.smoothing import gaussian
 from torchelev.layers import Layer
 from torchelev.pipeline import rate_surface
 from torchelev.traversability_paper import RIM, PaperFilter
-from training.traversability_data import MappedTerrain, blank_map
+from training.traversability.data import MappedTerrain, blank_map
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

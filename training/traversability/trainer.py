@@ -22,8 +22,8 @@ from torchelev.errors import require, require_positive
 from torchelev.robot import RobotConfig
 from torchelev.traversability_net import TraversabilityNet
 from torchelev.traversability_weights import RESOLUTIONS, ratios
-from training.traversability_data import MappedTerrain, save_atomically
-from training.traversability_metrics import SAFE
+from training.traversability.data import MappedTerrain, save_atomically
+from training.traversability.metrics import SAFE
 
 CHECKPOINT = "checkpoint.pt"
 

@@ -9,13 +9,13 @@ from typing import Any
 import click
 
 from torchelev.robot import RobotConfig
-from training.traversability_data import DataConfig, data_set
-from training.traversability_evaluate import evaluate, table
-from training.traversability_heads import baselines
-from training.traversability_picture import picture
-from training.traversability_robot import RobotType
-from training.traversability_terrain import KINDS
-from training.traversability_trainer import CHECKPOINT, FitConfig, Trainer
+from training.traversability.data import DataConfig, data_set
+from training.traversability.evaluate import evaluate, table
+from training.traversability.heads import baselines
+from training.traversability.picture import picture
+from training.traversability.robot import RobotType
+from training.traversability.terrain import KINDS
+from training.traversability.trainer import CHECKPOINT, FitConfig, Trainer
 
 POSITIVE = click.IntRange(1)
 SHOWN = ("analytic (defaults)", "paper (at 4 cm)")  # in the picture

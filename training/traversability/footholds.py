@@ -23,6 +23,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
+from torchelev.windows import shifted
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -168,9 +169,9 @@ def within_reach(height: Float[Tensor, "H W"], reach: int, span: float) -> tuple
     steps = range(-reach, reach + 1)
     around = [(i, j) for i in steps for j in steps if i * i + j * j <= reach * reach]
     lower = torch.where(height > -torch.inf, height, torch.inf)
-    highest = functools.reduce(torch.maximum, (_rimless(height, reach, i, j) for i, j in around)).flatten()
-    lowest = functools.reduce(torch.minimum, (_rimless(lower, reach, i, j) for i, j in around)).flatten()
-    middle = _rimless(torch.arange(height.numel(), device=height.device).view(height.shape), reach).flatten()
+    highest = functools.reduce(torch.maximum, (shifted(height, reach, i, j) for i, j in around)).flatten()
+    lowest = functools.reduce(torch.minimum, (shifted(lower, reach, i, j) for i, j in around)).flatten()
+    middle = shifted(torch.arange(height.numel(), device=height.device).view(height.shape), reach).flatten()
     # Most places carry, and all around them is on one level: they need no search.
     levels = ((height.flatten()[middle] > -torch.inf) & (highest - lowest <= span)).long()
     chosen = middle[:, None].repeat(1, 2)
@@ -181,12 +182,6 @@ def within_reach(height: Float[Tensor, "H W"], reach: int, span: float) -> tuple
     chosen[ask] = torch.where((cost_low < cost_up)[:, None], pair.flip(1), pair)
     levels[ask] = 1 + (upper != lower).long()
     return chosen, levels
-
-
-def _rimless(values: Tensor, rim: int, i: int = 0, j: int = 0) -> Tensor:
-    """Return what lies (i, j) nodes on from each node that has a rim."""
-    H, W = (size - 2 * rim for size in values.shape)
-    return values[rim + i : rim + i + H, rim + j : rim + j + W]
 
 
 def _nearest(

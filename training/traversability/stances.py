@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability_footholds import (
+from training.traversability.footholds import (
     SPACING,
     Footholds,
     Lattice,

@@ -1,0 +1,1 @@
+"""The training of the learned traversability head: labels, maps, fit and evaluation."""
