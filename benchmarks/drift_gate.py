@@ -40,7 +40,7 @@ class Recording(NamedTuple):
 
 
 def record(index: int) -> Recording:
-    """Walk over four tiles of random kinds."""
+    """Walk over two tiles of random kinds."""
     rng, cfg = np.random.default_rng([SEED, index]), DataConfig()
     robot = draw_robot(rng)
     field = make_tiles([str(kind) for kind in rng.choice(list(KINDS), cfg.num_maps)], rng)
@@ -72,7 +72,7 @@ def height_errors(recording: Recording, cfg: ElevationMapConfig) -> Tensor:
 
 
 @click.command()
-@click.option("--batches", type=click.IntRange(1), default=16, show_default=True, help="Of four robots.")
+@click.option("--batches", type=click.IntRange(1), default=16, show_default=True, help="Of two robots of one kind.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "drift_gate.json")
 def main(batches: int, out: Path) -> None:
     """Measure every head at every threshold, and no compensation."""

@@ -15,7 +15,8 @@ flat cell  at least 3 held-out points that span less than 10 cm in height: told 
 error      |height of the cell that holds the point - height of the point|, over held-out points on known flat cells
 driven     |height of the cell - (height of the lidar that passed over it - 0.48 m)|, over the known cells below the
            straight lines between the poses of the path, less those within 0.6 m of the lidar at the time of the scan,
-           where it saw the robot itself; traversable: share of these cells with a traversability above 0.5
+           where it saw the robot itself; traversable: share of these cells with a traversability above 0.5, by the
+           analytic head and by the learned one for its default robot
 
 Beside the map stand the per-cell mean of all points of the same scan, which knows no ceiling and no tree from the
 ground, and the per-cell mean of its points below the ramp.
@@ -23,7 +24,7 @@ ground, and the per-cell mean of its points below the ramp.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.report import markdown_table, write_json
+from torchelev import LearnedTraversabilityConfig as Head
 from torchelev.cli import MapOptions, fuse_all, load_config, new_map
 from torchelev.export import SavedMap, take
 from torchelev.io import Frame, MappingRun, Recording, open_recording, read_poses
@@ -99,12 +101,14 @@ def below_ramp(frame: Frame) -> NDArray:
     return points[~above_ramp(relative, ExclusionConfig()).numpy()]
 
 
-def map_it(case: Case) -> tuple[SavedMap, float]:
+def map_it(case: Case, head: Head | None = None, repeats: int = REPEATS) -> tuple[SavedMap, float]:
     """Map a case as the command line would; return the map and the median time [ms] of a scan's update."""
     options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=False)
+    cfg = load_config(None, case.resolution, SIZE)
+    cfg = cfg if head is None else replace(cfg, traversability=head)
     times = []
-    for _ in range(REPEATS):
-        run = MappingRun(new_map(load_config(None, case.resolution, SIZE), "cpu", options))
+    for _ in range(repeats):
+        run = MappingRun(new_map(cfg, "cpu", options))
         stopped = fuse_all(run, case.recording, options)
         if stopped is not None:
             raise stopped
@@ -197,18 +201,21 @@ def measure_case(case: Case) -> list[dict[str, Any]]:
     rows[0]["ms_per_scan"] = ms
     if case.driven is not None:
         rows[0]["driven_traversable"] = traversable_share(saved, case.driven)
+        learned, _ = map_it(case, Head(), repeats=1)
+        rows[0]["driven_traversable_learned"] = traversable_share(learned, case.driven)
     return rows
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """The table, lengths in centimetres."""
     head = ["recording", "cell", "method", "flat: median", "p90", "all: median", "p90", "coverage", "driven: median",
-            "p90", "traversable", "ms/scan"]  # fmt: skip
+            "p90", "traversable", "learned", "ms/scan"]  # fmt: skip
     keys = ("flat_median_m", "flat_p90_m", "all_median_m", "all_p90_m")
     lines = []
     for row in rows:
         first = [row["recording"], f"{100 * row['resolution_m']:.0f} cm", row["method"]]
         driven = [_cm(row, "driven_median_m"), _cm(row, "driven_p90_m"), _percent(row, "driven_traversable")]
+        driven.append(_percent(row, "driven_traversable_learned"))
         time = f"{row['ms_per_scan']:.1f}" if "ms_per_scan" in row else ""
         lines.append([*first, *(_cm(row, key) for key in keys), _percent(row, "coverage"), *driven, time])
     return markdown_table(head, lines)

@@ -50,7 +50,7 @@ class LearnedTraversabilityConfig:
     robot: RobotConfig = field(default_factory=RobotConfig)
     weights: str | None = None  # path of what `TraversabilityNet.save` wrote
 
-    drift_gate: ClassVar[float] = 0.5  # as of the analytic head
+    drift_gate: ClassVar[float] = 0.2  # as of the analytic head
 
     def __post_init__(self) -> None:
         mend = "build a RobotConfig"
