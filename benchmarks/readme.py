@@ -98,6 +98,22 @@ def occlusion() -> str:
     return markdown_table(["rule for unknown ground", *kinds], rows)
 
 
+def traversability() -> str:
+    """Tabulate how good the heads are, on held-out ground and on a kind that was never trained on."""
+    from training.traversability import evaluate as heads
+
+    result = json.loads((ROOT / "training" / "results" / "traversability.json").read_text())
+    names = {"held_out": "Kinds of ground that it trained on", "unseen": "Stepping stones, which it never saw"}
+    return "\n\n".join(f"{name}:\n\n{heads.table(result, split)}" for split, name in names.items())
+
+
+def head() -> str:
+    """Tabulate what the heads cost."""
+    from benchmarks import head as costs
+
+    return costs.table(load("head")["rows"])
+
+
 TABLES = {
     "accuracy": accuracy,
     "features": features,
@@ -108,6 +124,8 @@ TABLES = {
     "sight": sight,
     "postprocessing": postprocessing,
     "occlusion": occlusion,
+    "traversability": traversability,
+    "head": head,
 }
 
 
