@@ -7,10 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 from torch._dynamo.testing import CompileCounter
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, LearnedTraversabilityConfig, RobotConfig
 from torchelev.map_file import load_map, save_map
+from torchelev.pipeline import rate_surface
+from torchelev.state import blank_state
 from torchelev.traversability import TraversabilityConfig, TraversabilityNet
+from torchelev.traversability_weights import Weights, weight_shapes
 
 GRID = GridConfig(resolution=0.1, length_x=3.0, length_y=2.6)
 
@@ -156,6 +160,17 @@ def test_maps_of_other_precision(cfg, dtype):
     emap = ElevationMap(cfg, num_envs=1).to(dtype)
     look(emap)
     assert emap.state.traversability.isfinite().all() and emap.state.traversability.dtype == dtype
+
+
+def test_nothing_waits_for_the_device(cfg):
+    """On tensors without values."""
+    with FakeTensorMode():
+        state = rate_surface(
+            blank_state(GRID, 2, "cpu", torch.float32),
+            cfg,
+            Weights(*(torch.zeros(shape) for shape in weight_shapes(12, 8).values())),
+        )
+    assert state.traversability.shape == (2, 30, 26)
 
 
 def test_no_known_cell_gives_a_defined_answer(cfg):

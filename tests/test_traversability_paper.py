@@ -1,6 +1,7 @@
 """The paper's open filter."""
 
 import math
+import os
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from filter_cases import SEEDS, assert_batch_is_single, assert_gradients, assert_never_waits, random_layer
 from hypothesis import given
 
-from torchelev.traversability_paper import SHAPES, PaperFilter
+from torchelev.traversability_paper import RIM, SHAPES, PaperFilter
 
 
 def random_weights(seed=0):
@@ -31,6 +32,18 @@ def by_loops(weights, z, i, j):
         answer = sum(kernel[u + 1, v + 1] * z[i + d * u, j + d * v] for u in (-1, 0, 1) for v in (-1, 0, 1))
         total += float(weights["conv_final.weight"][0, k, 0, 0]) * abs(answer)
     return math.exp(-total)
+
+
+@pytest.mark.skipif("PAPER_FILTER" not in os.environ, reason="PAPER_FILTER names no file of its weights and pairs")
+def test_agrees_with_the_original():
+    """Pairs of heights and ratings that the original made: in_0 (H, W) and out_0 (H - 6, W - 6), and so on."""
+    path = os.environ["PAPER_FILTER"]
+    original, net = np.load(path), PaperFilter.from_npz(path)
+    numbers = [name[3:] for name in original.files if name.startswith("in_")]
+    assert numbers
+    for number in numbers:
+        got = net(torch.from_numpy(original[f"in_{number}"])[None])[0, RIM:-RIM, RIM:-RIM].detach().numpy()
+        np.testing.assert_allclose(got, original[f"out_{number}"], atol=1e-6, rtol=0)
 
 
 def test_agrees_with_loops(net):

@@ -1,10 +1,10 @@
 """Do the labels tell where a robot stands? `python -m training.traversability.physics` asks MuJoCo.
 
-On terrain as trained on, and on the kind never trained on, stances are drawn at random, as many that the labels let
-stand as not. A rigid box on four balls is put down there and simulated: on the label's footholds where it says that the
-robot stands, else with its feet under the body's corners, each stretched towards the ground (`traversability_drop`). It
-stood if after 1.5 s it has moved by less than 7 % of its length and tilted by less than 0.1 rad, and nothing but feet
-touched the ground. Each is dropped twice: with a usual friction of 0.9, and with hardly more than max_slope needs.
+On terrain as trained on, and on the kind never trained on, stances are drawn at random, up to as many that the labels
+let stand as not. A rigid box on four balls is put down there and simulated: on the label's footholds where it says that
+the robot stands, else with its feet under the body's corners, each stretched towards the ground (`drop`). It stood if
+after 1.5 s it has moved by less than 7 % of its length and tilted by less than 0.1 rad, and nothing but feet touched
+the ground. Each is dropped twice: with a usual friction of 0.9, and with hardly more than max_slope needs.
 
 What this sees: footholds that do not hold, stances that tip or slide, bodies that touch. What it does not: whether a
 leg can lift its foot over the step between two feet; whether a body can keep gentler than the plane through its feet,
