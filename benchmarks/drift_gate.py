@@ -21,7 +21,7 @@ from benchmarks.report import machine, markdown_table, write_json
 from torchelev import ElevationMap, ElevationMapConfig, LearnedTraversabilityConfig, TraversabilityConfig
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability.data import DataConfig, Look, blank_map, tile_places, walk_and_look
+from training.traversability.data import DataConfig, Look, map_config, tile_places, walk_and_look
 from training.traversability.terrain import KINDS, LENGTH, LOOK_INTERVAL, draw_robot, make_tiles
 
 RESULTS = Path(__file__).parent / "results"
@@ -49,7 +49,7 @@ def record(index: int) -> Recording:
 
 def configuration(recording: Recording, head: str, threshold: float | None) -> ElevationMapConfig:
     """Return the default configuration with a head and a gate; None: no compensation."""
-    cfg = blank_map(RESOLUTION, DataConfig().window, 1).cfg
+    cfg = map_config(RESOLUTION, DataConfig().window)
     learned = LearnedTraversabilityConfig(robot=recording.robot)
     rating = learned if head == "learned" else TraversabilityConfig()
     assert cfg.drift is not None

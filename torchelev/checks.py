@@ -7,6 +7,7 @@ host wait for the device, so they run for CPU tensors and, on request, for other
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from torchelev.errors import require
 
 FARTHEST = 1e9  # [m] farther, a float64 counts cells wrongly
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+Config = TypeVar("Config")
 
 
 def readable(value: Tensor, always: bool = False) -> bool:
@@ -46,6 +48,14 @@ def check_tensor(
 
 def _same(one: torch.device, other: torch.device) -> bool:
     return (one.type, one.index or 0) == (other.type, other.index or 0)
+
+
+def given_or_default(kind: type[Config], cfg: object) -> Config:
+    """Return what was given for a config of this kind; the defaults for None."""
+    cfg = kind() if cfg is None else cfg
+    require(isinstance(cfg, kind), "cfg", f"must be a {kind.__name__}", repr(cfg), "build one", TypeError)
+    assert isinstance(cfg, kind)
+    return cfg
 
 
 def check_points(points: object, num_envs: int, device: torch.device) -> Tensor:

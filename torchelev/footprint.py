@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor, readable
+from torchelev.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.grid import GridConfig
@@ -51,14 +51,6 @@ class FootprintConfig:
     def cells(self, grid: GridConfig) -> int:
         """Return how many cells a polygon may extend along x and y."""
         return math.ceil(self.max_extent / grid.resolution - 1e-6)
-
-    @classmethod
-    def of(cls, cfg: object) -> FootprintConfig:
-        """Return what was given for a config; the defaults for None."""
-        cfg = cls() if cfg is None else cfg
-        require(isinstance(cfg, cls), "cfg", "must be a FootprintConfig", repr(cfg), "build one", TypeError)
-        assert isinstance(cfg, cls)
-        return cfg
 
 
 class FootprintCheck(NamedTuple):
@@ -107,7 +99,7 @@ def check_footprint(
     `max_extent` (rounded up to whole cells), are refused on a CPU. On other devices, where looking would make the host
     wait, they are not safe and nothing is known of them, unless the map has `check_values`.
     """
-    cfg = FootprintConfig.of(cfg)
+    cfg = given_or_default(FootprintConfig, cfg)
     ground = _ground(emap, polygons, cfg, state)
     values = ground.values
     masks = (ground.cells.inside, ground.known, ground.unsafe)
@@ -133,7 +125,7 @@ def unsafe_area(
     differ in length, so they are made on the host, which waits for the device. Inputs and errors as of
     `check_footprint`.
     """
-    cfg = FootprintConfig.of(cfg)
+    cfg = given_or_default(FootprintConfig, cfg)
     ground = _ground(emap, polygons, cfg, state)
     corner = (emap.state if state is None else state).corner
     marks, first = ground.unsafe.cpu().numpy(), (ground.cells.first + corner[:, None]).cpu().numpy()

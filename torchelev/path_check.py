@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_pose, check_tensor, readable
+from torchelev.checks import FLOATS, check_pose, check_tensor, given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.footprint import FootprintCheck, FootprintConfig, check_footprint
@@ -58,7 +58,7 @@ def check_path(
     are refused on a CPU, as is a footprint wider than `max_extent`; on other devices the path is not safe there, unless
     the map has `check_values`.
     """
-    cfg = FootprintConfig.of(cfg)
+    cfg = given_or_default(FootprintConfig, cfg)
     given = _as_xy_yaw(emap, poses)
     footprint = _check_polygon(emap, footprint, cfg.max_extent)
     require(type(samples) is int and samples >= 1, "samples", "must be a positive int", repr(samples), "give 8")

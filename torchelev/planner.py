@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor, readable
+from torchelev.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.cost_to_go import cost_to_go, descend
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
@@ -56,7 +56,7 @@ def plan(
     Raises ValueError or TypeError for wrong shapes, dtypes and devices. Places outside of the window or not finite are
     refused on a CPU; on other devices they are not reached, unless the map has `check_values`.
     """
-    cfg, grid = TraversalCostConfig.of(cfg), emap.cfg.grid
+    cfg, grid = given_or_default(TraversalCostConfig, cfg), emap.cfg.grid
     current = emap.state if state is None else state
     (start, starts), (goal, ends) = (
         _cell(emap, *place, current) for place in (("start_xy", start_xy), ("goal_xy", goal_xy))

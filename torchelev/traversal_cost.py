@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor
+from torchelev.checks import FLOATS, check_tensor, given_or_default
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.layers import Layer
@@ -48,14 +48,6 @@ class TraversalCostConfig:
         require(flat, "cost.max_inclination", "must lie between 0 and pi / 2", self.max_inclination, "give radians")
         require_positive(**{"cost.inclination_distance": self.inclination_distance})
 
-    @classmethod
-    def of(cls, cfg: object) -> TraversalCostConfig:
-        """Return what was given for a config; the defaults for None."""
-        cfg = cls() if cfg is None else cfg
-        require(isinstance(cfg, cls), "cfg", "must be a TraversalCostConfig", repr(cfg), "build one", TypeError)
-        assert isinstance(cfg, cls)
-        return cfg
-
 
 def traversal_cost(
     emap: ElevationMap,
@@ -86,7 +78,7 @@ def traversal_cost(
 
     Raises ValueError or TypeError for a confidence that does not fit, and a map whose traversability is switched off.
     """
-    cfg = TraversalCostConfig.of(cfg)
+    cfg = given_or_default(TraversalCostConfig, cfg)
     mend = "give ElevationMapConfig a TraversabilityConfig"
     require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", mend)
     state = emap.state if state is None else state

@@ -133,11 +133,16 @@ def walk_and_map(
     return emap, look.T_tile_base @ torch.linalg.inv(look.T_map_base)
 
 
-def blank_map(resolution: float, window: float, num_maps: int) -> ElevationMap:
-    """Return maps that know nothing, of about `window` [m], without a head of their own."""
+def map_config(resolution: float, window: float) -> ElevationMapConfig:
+    """Return the configuration of maps of about `window` [m], without a head of their own."""
     length = round(window / resolution) * resolution
     grid = GridConfig(resolution=resolution, length_x=length, length_y=length)
-    return ElevationMap(ElevationMapConfig(grid=grid, traversability=None), num_maps)
+    return ElevationMapConfig(grid=grid, traversability=None)
+
+
+def blank_map(resolution: float, window: float, num_maps: int) -> ElevationMap:
+    """Return maps that know nothing."""
+    return ElevationMap(map_config(resolution, window), num_maps)
 
 
 def _map_frames(num: int, rng: np.random.Generator) -> Tensor:

@@ -16,8 +16,9 @@ from torchelev.filters.inpainting import inpaint_minimum, inpaint_telea
 from torchelev.filters.smoothing import gaussian
 from torchelev.layers import Layer
 from torchelev.pipeline import rate_surface
+from torchelev.state import blank_state
 from torchelev.traversability_paper import RIM, PaperFilter
-from training.traversability.data import MappedTerrain, blank_map
+from training.traversability.data import MappedTerrain, map_config
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -34,9 +35,9 @@ def analytic(maps: MappedTerrain, layer: Layer, of_robot: bool) -> Float[Tensor,
     if of_robot:
         robot = maps.robot
         cfg = dataclasses.replace(cfg, critical_slope=robot.max_slope, critical_step=robot.step_height)
-    emap = blank_map(maps.resolution, values.shape[1] * maps.resolution, len(values))
-    state = emap.state._replace(elevation=torch.where(known, values, 0.0), validity=known)
-    return rate_surface(state, dataclasses.replace(emap.cfg, traversability=cfg)).traversability
+    whole = dataclasses.replace(map_config(maps.resolution, values.shape[1] * maps.resolution), traversability=cfg)
+    state = blank_state(whole.grid, len(values), values.device, values.dtype)
+    return rate_surface(state._replace(elevation=torch.where(known, values, 0.0), validity=known), whole).traversability
 
 
 def as_mapped(maps: MappedTerrain) -> Layer:

@@ -2,7 +2,7 @@
 
 The body is centred over a place, its feet at the corners of a rectangle, each free to take another place within its
 reach. Five criteria decide, each a function: support area, slope and roughness of the ground under a foot
-(`traversability_footholds`), and slope, step and clearance of the stance as a whole (`traversability_stances`). A robot
+(`footholds`), and slope, step and clearance of the stance as a whole (`stances`). A robot
 stands if some choice of footholds passes all.
 
 A label says that the robot stands there, not that it gets there: it may stand on an island, or on the floor of a pit.

@@ -46,7 +46,9 @@ class Sight:
         camera, lidar = DepthCamera(*camera_pixels, *FOV, CAMERA_RANGE), Lidar(*lidar_rays, max_range=LIDAR_RANGE)
         top = pose(torch.tensor([0.0, 0.0, 0.1 + 0.2 * robot.length]), torch.tensor(0.0))
         self.sensors = [
-            MountedSensor(lidar, top) if name == "lidar" else MountedSensor(camera, _mounted(name, pitch, robot))
+            MountedSensor(lidar, top)
+            if name == "lidar"
+            else MountedSensor(camera, camera_mounting(YAWS[name], pitch, robot))
             for name in names
         ]
         kinds = ["spinning_lidar" if name == "lidar" else "depth_camera" for name in names]
@@ -69,10 +71,6 @@ class Sight:
         most = max(cloud.points.shape[1] for cloud in clouds)
         padded = [F.pad(c.points, (0, 0, 0, most - c.points.shape[1]), value=math.nan) for c in clouds]
         return torch.stack(padded, 1), torch.stack([cloud.T_map_sensor for cloud in clouds], 1)
-
-
-def _mounted(name: str, pitch: float, robot: RobotConfig) -> Tensor:
-    return camera_mounting(YAWS[name], pitch, robot)
 
 
 def _image_shape(pattern: object) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """Stances: a robot's body over a place at a heading, its feet on footholds, and whether it stands so.
 
-Three criteria decide, beside those of `traversability_footholds` on the ground under each foot:
+Three criteria decide, beside those of `footholds` on the ground under each foot:
 
 - slope: of the plane through the feet,
 - step: what a foot must overcome between neighbouring feet,
