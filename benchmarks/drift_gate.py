@@ -21,7 +21,7 @@ from benchmarks.report import machine, markdown_table, write_json
 from torchelev import ElevationMap, ElevationMapConfig, LearnedTraversabilityConfig, TraversabilityConfig
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability.data import DataConfig, Look, map_config, tile_places, walk_and_look
+from training.traversability.mapping import DataConfig, Look, map_config, tile_places, walk_and_look
 from training.traversability.terrain import KINDS, LENGTH, LOOK_INTERVAL, draw_robot, make_tiles
 
 RESULTS = Path(__file__).parent / "results"

@@ -9,16 +9,15 @@ import torch
 from conftest import pose
 
 import training.traversability.data as data
+import training.traversability.mapping as mapping
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability.data import (
+from training.traversability.data import batch_seed, data_set, label_cells, make_batch, rated_cells
+from training.traversability.mapping import (
+    EXACT_NOISE,
     DataConfig,
-    batch_seed,
     blank_map,
-    data_set,
-    label_cells,
-    make_batch,
-    rated_cells,
+    exact_maps,
     tile_places,
     walk_and_map,
 )
@@ -59,7 +58,7 @@ def from_box(xy):
 def test_labels_lie_where_the_map_has_the_ground_that_they_are_of(seed, monkeypatch):
     # The robot starts off the middle and turned, in a map frame that is shifted and turned against the tile.
     path = torch.stack([pose((-0.5 + 0.1 * k, -1.2 + 0.1 * k, 0.5), yaw=0.9) for k in range(8)])
-    monkeypatch.setattr(data, "walks", lambda *_: path)
+    monkeypatch.setattr(mapping, "walks", lambda *_: path)
     field, robot, rng = flat_tile_with_a_box(), RobotConfig(length=0.6, width=0.4), np.random.default_rng(seed)
     cfg = dataclasses.replace(TINY, num_maps=1, window=4.0, camera_pixels=(64, 48), lidar_rays=(32, 256))
     emap, T_tile_map = walk_and_map(field, robot, 0.05, cfg, rng)
@@ -133,6 +132,23 @@ def test_kinds_resolution_and_robot_can_be_fixed():
     maps = make_batch(5, dataclasses.replace(TINY, robot=robot), UNSEEN_KINDS, 0.08)
     assert maps.kinds == ("stepping_stones",) * 2 and maps.resolution == 0.08 and maps.robot == robot
     assert not set(UNSEEN_KINDS) & set(KINDS)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_exact_maps_know_the_true_heights_to_their_variance(seed):
+    field = make_tiles(("boxes", "stairs_up"), np.random.default_rng(seed))
+    emap, T_tile_map = exact_maps(field, 0.05, TINY, np.random.default_rng(seed))
+    truth = field.height(torch.arange(2), tile_places(emap, T_tile_map).float().flatten(1, 2)).view(2, 40, 40)
+    errors, state = (emap.state.elevation - truth).std((1, 2)), emap.state
+    assert state.validity.all() and (state.variance.amax((1, 2)) == state.variance.amin((1, 2))).all()
+    torch.testing.assert_close(errors, state.variance[:, 0, 0].sqrt(), rtol=0.1, atol=1e-5)
+    assert (errors < EXACT_NOISE).all() and errors[0] != errors[1]
+
+
+def test_exact_batches_are_rated_everywhere(tmp_path):
+    (maps,) = data_set(tmp_path, "held_out_exact", 1, 0, TINY, resolution=0.1)
+    assert maps.validity.all() and maps.rated.all()
+    assert equal(maps, make_batch(batch_seed("held_out_exact", 0, 0), TINY, KINDS, 0.1, exact=True))
 
 
 def test_splits_and_data_sets_have_seeds_of_their_own():

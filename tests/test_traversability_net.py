@@ -1,6 +1,7 @@
 """The learned head: what holds of it whatever its weights, and its file."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from torchelev.robot import RobotConfig
 from torchelev.traversability_features import complete, extremes, features
 from torchelev.traversability_net import TraversabilityNet, best_in_reach, rate
 from torchelev.traversability_stances import in_cells, stances
-from torchelev.traversability_weights import RANGES, conditions, ratios
+from torchelev.traversability_weights import RANGES, VERSION, conditions, ratios
 
 ROBOT = RobotConfig()
 SMALL = dataclasses.replace(ROBOT, length=0.5, width=0.25, foot_radius=0.02, foot_reach=0.06, step_height=0.15)
@@ -151,16 +152,18 @@ def test_gradients_on_flat_ground_are_finite():
 def test_gradcheck():
     net = random_net(2)
     _, known, variance, _, bounded = random_maps(5, (1, 6, 5), 0.8)
-    # Heights apart from each other, so that no finite step changes their order.
-    order = torch.randperm(30, generator=torch.Generator().manual_seed(3)).view(1, 6, 5).double()
+    # Heights apart from each other, and differences too, so that no finite step changes their order.
+    generator = torch.Generator().manual_seed(3)
+    apart = (0.6 + 0.8 * torch.rand(30, generator=generator, dtype=torch.float64)).cumsum(0)
+    order = apart[torch.randperm(30, generator=generator)].view(1, 6, 5)
     leaves = [
         (0.03 * order).requires_grad_(),
-        (variance * known).requires_grad_(),
+        (1e4 * variance * known).requires_grad_(),  # [cm^2], as small as a finite step must be to pass no kink
         (0.03 * order - 0.31).requires_grad_(),
     ]
 
     def answers(z, v, u):
-        return net.logits(z, known, v, u, bounded, resolution=CELLS, robot=ROBOT)
+        return net.logits(z, known, 1e-4 * v, u, bounded, resolution=CELLS, robot=ROBOT)
 
     assert torch.autograd.gradcheck(answers, leaves, atol=1e-5)
 
@@ -224,11 +227,23 @@ def test_stances_by_hand():
     along, turned, across, _ = stances(robot, 0.1)
     assert along.feet == ((4, 2), (4, -2), (-4, 2), (-4, -2)) and (along.length, along.width) == (8, 4)
     assert along.spine == ((0, 0), (2, 0), (-2, 0))  # squares of 0.4 m: the body ends 0.4 m from its middle
-    assert along.sides == ((4, 0), (-4, 0), (0, 2), (0, -2))
+    # 4 and 8 cells apart, in steps of 3 or less.
+    assert along.ways[0] == ((0, 1), ((4, 0),)) and along.ways[1] == ((2, 3), ((-4, 0),))
+    assert along.ways[2] == ((0, 2), ((1, 2), (-1, 2))) and along.ways[3] == ((1, 3), ((1, -2), (-1, -2)))
     assert turned.feet == ((-2, 4), (2, 4), (-2, -4), (2, -4))
     # Half the diagonals of length + width and length - width: 0.424 m and 0.141 m.
     assert across.feet == ((1, 4), (4, 1), (-4, -1), (-1, -4))
     assert (across.length, across.width) == pytest.approx((5 * 2**0.5, 3 * 2**0.5))
+
+
+@pytest.mark.parametrize("resolution", [0.02, 0.03, 0.04, 0.1])
+@pytest.mark.parametrize("robot", [ROBOT, SMALL, RobotConfig(length=0.4, width=0.16)])
+def test_the_windows_between_feet_leave_no_cell_out(robot, resolution):
+    for stance in stances(robot, resolution):
+        for (start, end), places in stance.ways:
+            way = [stance.feet[start], *places, stance.feet[end]]
+            for p, q in itertools.pairwise(way):
+                assert max(abs(p[0] - q[0]), abs(p[1] - q[1])) <= 3
 
 
 @pytest.mark.parametrize("resolution", [0.01, 0.02, 0.04, 0.1, 0.15])
@@ -302,9 +317,9 @@ def test_saved_and_loaded_it_is_the_same(tmp_path):
 
 def spoilt(fault):
     net = TraversabilityNet()
-    found = {"version": 1, "config": net.config, "state_dict": dict(net.state_dict())}
+    found = {"version": VERSION, "config": net.config, "state_dict": dict(net.state_dict())}
     if fault == "version":
-        found |= {"version": 2, "config": {"other": 1}}
+        found |= {"version": VERSION + 1, "config": {"other": 1}}
     elif fault == "ranges":
         found["config"] = net.config | {"ranges": 3}
     elif fault == "type":
@@ -327,7 +342,7 @@ def spoilt(fault):
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("version", "must be of version 1, got 2"),
+        ("version", f"must be of version {VERSION}, got {VERSION + 1}"),
         ("shape", r"foot \(3, 3\) instead of"),
         ("missing", "answer_bias None instead of"),
         ("config", "must be a file of weights"),

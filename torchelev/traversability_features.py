@@ -7,7 +7,6 @@ All is unchanged when the map is turned by 90 degrees or mirrored: windows are s
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from torch import Tensor
 from torchelev.operators import padded
 from torchelev.robot import RobotConfig
 from torchelev.storage import realize, realize_all
-from torchelev.traversability_stances import Scales, Stance, stances
+from torchelev.traversability_stances import Scales
 from torchelev.windows import shifted
 
 if TYPE_CHECKING:
@@ -29,6 +28,7 @@ QUARTER = 0.25  # share of known cells from which a window's mean counts in full
 NOISE = 0.02  # [m] standard deviation of heights at which a map counts as noisy
 NUM_FEATURES = 18
 TINY = 1e-9  # below any window's share of known cells but 0
+LARGE = 1e6  # ratio whose square is finite
 
 
 # Windows ------------------------------------------------------------------------------------------------------------
@@ -140,8 +140,10 @@ def extremes(ground: Surface, scales: Scales) -> Extremes:
 
 
 def squashed(ratio: Tensor) -> Tensor:
-    """Return x / (1 + |x|): linear in small ratios, and no outlier counts for more than 1."""
-    return ratio / (1 + ratio.abs())
+    """Return x |x| / (1 + x^2): steep at 1, where a robot's limits are; no outlier counts for more than 1."""
+    ratio = ratio.clamp(-LARGE, LARGE)
+    square = ratio * ratio.abs()
+    return square / (1 + square.abs())
 
 
 def _slope(height: Tensor, distance: int, rim: int) -> Tensor:
@@ -173,44 +175,3 @@ def features(
         ],
         1,
     )
-
-
-class Attitude(NamedTuple):
-    """How a body stands at one heading on four feet."""
-
-    slope: Float[Tensor, "B H W"]  # squared gradient of the body over the steepest that the robot stands on
-    twist: Float[Tensor, "B H W"]  # height of the feet over a plane, of opposite signs, over the step height
-    belly: Float[Tensor, "B H W"]  # height of the highest ground under the body over the feet, over the clearance
-
-
-def attitudes(
-    ground: Surface, extreme: Extremes, scales: Scales, robot: RobotConfig, resolution: float
-) -> list[Attitude]:
-    """Return how the body stands at each heading; 0 where a foot or the body would leave the completed ground."""
-    height = widened_mean(shifted(ground.height, scales.margin - scales.foot - 1), (1,))
-    return [_attitude(height, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
-
-
-def _attitude(
-    height: Tensor, extreme: Extremes, stance: Stance, scales: Scales, robot: RobotConfig, resolution: float
-) -> Attitude:
-    a, b, c, d = (shifted(height, scales.foot, *foot) for foot in stance.feet)
-    pitch = (a + b - (c + d)) * (0.5 / (stance.length * resolution))
-    roll = (a + c - (b + d)) * (0.5 / (stance.width * resolution))
-    slope = (pitch.square() + roll.square()) * (1 / math.tan(robot.max_slope) ** 2)
-    twist = ((a + d - (b + c)) * (0.25 / robot.step_height)).square()
-    middle = (a + d + (b + c)) * 0.25
-    belly = (_highest(extreme.body, stance, scales, pitch, roll, resolution) - middle) * (1 / robot.clearance)
-    whole = functools.reduce(torch.mul, (shifted(extreme.complete, scales.stood_on, *foot) for foot in stance.feet))
-    under = functools.reduce(torch.mul, (shifted(extreme.body_complete, scales.spine, *at) for at in stance.spine))
-    return Attitude(squashed(slope) * whole, squashed(twist) * whole, squashed(belly) * (whole * under))
-
-
-def _highest(
-    body: Tensor, stance: Stance, scales: Scales, pitch: Tensor, roll: Tensor, resolution: float
-) -> Float[Tensor, "B H W"]:
-    """Return the highest ground [m] under the body, less what its inclination explains within each square."""
-    middle, front, hind = (shifted(body, scales.spine, *at) for at in stance.spine)
-    rise = pitch * (math.hypot(*stance.spine[1]) * resolution)
-    inclined = (pitch.abs() + roll.abs()) * (scales.body * resolution)
-    return torch.maximum(torch.maximum(front - rise, hind + rise), middle) - inclined

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.storage import realize_all
-from torchelev.traversability_features import attitudes, complete, extremes, features, widened_maximum
+from torchelev.traversability_attitude import attitudes
+from torchelev.traversability_features import complete, extremes, features, widened_maximum
 from torchelev.traversability_stances import Scales, in_cells, stances
 from torchelev.traversability_weights import (
     RANGES,
@@ -84,7 +85,7 @@ def rate(
     """Return the logits of traversability and confidence, in float32 at least.
 
     Every cell is described by its surroundings. The body is put over each cell at four headings: what its feet stand
-    on, how it is inclined and what is under its belly tell whether it stands there; the headings' mean tells of all.
+    on, how it is inclined and what is between them tell whether it stands there; the headings' mean tells of all.
     """
     dtype = torch.promote_types(elevation.dtype, torch.float32)  # half precision has no room for shares of windows
     weights = Weights(*(weight.to(dtype) for weight in weights))
@@ -97,15 +98,14 @@ def rate(
     seen = _mixed(weights.cell, features(ground, extreme, scales, resolution, robot))
     cell = F.relu(seen + _biased(weights.cell_bias, weights.cell_condition, sizes))
     around = torch.cat([shifted(cell, scales.reach), best_in_reach(cell.chunk(2, 1)[0], scales)], 1)
-    foot, side, center = _mixed(torch.cat([weights.foot, weights.side, weights.center]), around).chunk(3, 1)
+    foot, center = _mixed(torch.cat([weights.foot, weights.center]), around).chunk(2, 1)
     center = shifted(center, scales.foot) + _biased(weights.stance_bias, weights.stance_condition, sizes)
 
     mean = torch.zeros_like(center)
     headings = stances(robot, resolution)
     for stance, attitude in zip(headings, attitudes(ground, extreme, scales, robot, resolution), strict=True):
         stood_on = _sum_of_four([shifted(foot, scales.foot, *place) for place in stance.feet])
-        between = _sum_of_four([shifted(side, scales.foot, *place) for place in stance.sides])
-        mean = mean + F.relu(stood_on + between + center + _spread(weights.attitude, attitude))
+        mean = mean + F.relu(stood_on + center + _spread(weights.attitude, attitude))
     mixed = F.relu(_mixed(weights.mixed, mean * (1 / len(headings))) + weights.mixed_bias[:, None, None])
     traversability, confidence = (_mixed(weights.answer, mixed) + weights.answer_bias[:, None, None]).unbind(1)
     return traversability, confidence
@@ -124,7 +124,7 @@ class TraversabilityNet(nn.Module):
 
     def __init__(
         self,
-        cell_channels: int = 12,
+        cell_channels: int = 8,
         stance_channels: int = 8,
         ranges: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from fractions import Fraction
 from typing import NamedTuple
 
 from torchelev.robot import RobotConfig
@@ -20,16 +21,22 @@ class Stance(NamedTuple):
     width: float
 
     @property
-    def sides(self) -> tuple[Cells, ...]:
-        """The middles between neighbouring feet."""
-        a, b, c, d = self.feet
-        # Python rounds halves to even numbers, so that opposite sides stay opposite.
-        return tuple((round((p[0] + q[0]) / 2), round((p[1] + q[1]) / 2)) for p, q in ((a, b), (c, d), (a, c), (b, d)))
+    def ways(self) -> tuple[tuple[Cells, tuple[Cells, ...]], ...]:
+        """The pairs of neighbouring feet by number, and places between them, 3 cells or less apart."""
+        return tuple((pair, _between(*(self.feet[n] for n in pair))) for pair in ((0, 1), (2, 3), (0, 2), (1, 3)))
 
     def turned(self) -> Stance:
         """Return the stance a quarter turn on."""
         feet, spine = (tuple((-j, i) for i, j in places) for places in (self.feet, self.spine))
         return Stance(feet, spine, self.length, self.width)
+
+
+def _between(a: Cells, b: Cells) -> tuple[Cells, ...]:
+    """Return the cells nearest to even places between two."""
+    parts = math.ceil(max(abs(b[0] - a[0]), abs(b[1] - a[1])) / 3)
+    shares = [Fraction(k, parts) for k in range(1, parts)]  # exact, so that neither end of a line comes first
+    # Python rounds halves to even numbers, so that opposite places stay opposite.
+    return tuple((round(a[0] + k * (b[0] - a[0])), round(a[1] + k * (b[1] - a[1]))) for k in shares)
 
 
 def stances(robot: RobotConfig, resolution: float) -> list[Stance]:

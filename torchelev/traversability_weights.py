@@ -13,14 +13,15 @@ from torch import Tensor
 
 from torchelev.errors import message, require
 from torchelev.robot import RobotConfig
-from torchelev.traversability_features import NUM_FEATURES, Attitude
+from torchelev.traversability_attitude import Attitude
+from torchelev.traversability_features import NUM_FEATURES
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 RESOLUTIONS = (0.02, 0.1)  # [m]
 ROUNDING = 1e-6  # of ratios
-VERSION = 1  # of the file
+VERSION = 2  # of the file
 CONFIG = {"cell_channels", "stance_channels", "ranges"}
 
 
@@ -31,7 +32,6 @@ class Weights(NamedTuple):
     cell_bias: Float[Tensor, "C"]
     cell_condition: Float[Tensor, "C N"]  # of the robot's ratios
     foot: Float[Tensor, "S D"]  # of a cell with a foot on it
-    side: Float[Tensor, "S D"]  # of a cell halfway between two neighbouring feet
     center: Float[Tensor, "S D"]  # of the cell under the body's centre
     attitude: Float[Tensor, "S A"]
     stance_bias: Float[Tensor, "S"]
@@ -55,7 +55,6 @@ def weight_shapes(cell_channels: int, stance_channels: int) -> dict[str, tuple[i
         cell_bias=(C,),
         cell_condition=(C, N),
         foot=(S, D),
-        side=(S, D),
         center=(S, D),
         attitude=(S, len(Attitude._fields)),
         stance_bias=(S,),

@@ -9,9 +9,10 @@ from typing import Any
 import click
 
 from torchelev.robot import RobotConfig
-from training.traversability.data import DataConfig, data_set
+from training.traversability.data import data_set
 from training.traversability.evaluate import evaluate, table
 from training.traversability.heads import baselines
+from training.traversability.mapping import DataConfig
 from training.traversability.picture import picture
 from training.traversability.robot import RobotType
 from training.traversability.terrain import KINDS
@@ -24,7 +25,8 @@ SHOWN = ("analytic (defaults)", "paper (at 4 cm)")  # in the picture
 @click.command()
 @click.option("--robot", type=RobotType(), default=None, help="length=0.7,width=0.4,... or a YAML file. Default: any.")
 @click.option("--seed", default=0, show_default=True, help="Of data, first weights and order.")
-@click.option("--batches", type=POSITIVE, default=300, show_default=True, help="Of two maps, to train on.")
+@click.option("--batches", type=POSITIVE, default=300, show_default=True, help="Of two maps by sensors, to train on.")
+@click.option("--exact-batches", type=POSITIVE, default=100, show_default=True, help="More, of the true heights.")
 @click.option("--steps", type=POSITIVE, default=4000, show_default=True, help="In all, those of --resume included.")
 @click.option("--evaluation-batches", type=POSITIVE, default=20, show_default=True, help="At each resolution.")
 @click.option("--paper-weights", type=click.Path(path_type=Path, exists=True), default=None, help="To compare with.")
@@ -35,6 +37,7 @@ def main(
     robot: RobotConfig | None,
     seed: int,
     batches: int,
+    exact_batches: int,
     steps: int,
     evaluation_batches: int,
     paper_weights: Path | None,
@@ -42,7 +45,7 @@ def main(
     data: Path | None,
     resume: bool,
 ) -> None:
-    """Make maps by simulated sensors, label them by where the robot stands, train, and evaluate on other ground.
+    """Make maps, label them by where the robot stands on the true ground, train, and evaluate on other ground.
 
     Without --robot, the weights are for robots of 0.4 to 1.0 m length. OUT receives TensorBoard logs, checkpoint.pt,
     weights.pt (for `TraversabilityNet.from_pretrained`), result.json and maps.png. Maps that are made are kept.
@@ -55,7 +58,7 @@ def main(
     cfg, data = DataConfig(robot=robot), data or out / "data"
     try:
         baselines(paper_weights)  # a file that cannot be read is refused now, not after the training
-        maps = data_set(data, "train", batches, seed, cfg)
+        maps = data_set(data, "train", batches, seed, cfg) + data_set(data, "train_exact", exact_batches, seed, cfg)
         trainer = Trainer(maps, FitConfig(steps=steps, seed=seed), robot)
         if resume:
             trainer.resume(checkpoint)

@@ -1,16 +1,11 @@
-"""What a learned head sees and should say: maps of simulated sensors on walking robots, and the labels of their cells.
-
-The map's frame is turned and shifted against the tile's, and the robot's estimate drifts in it. A map is for the robot
-that it follows, so a cell's true place is the one that lies to the true base as the cell lies to the estimated one.
-"""
+"""What a learned head sees and should say: maps of simulated ground, and the labels of their cells."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,14 +15,13 @@ import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.errors import require, require_positive
+from torchelev import ElevationMap
+from torchelev.errors import require
 from torchelev.robot import RobotConfig
-from torchelev.sim import HeightField, PoseErrors, preset
-from torchelev.sim.trajectories import pose
+from torchelev.sim import HeightField
 from training.traversability.labels import stand
-from training.traversability.sight import Sight
-from training.traversability.terrain import KINDS, LENGTH, LOOK_INTERVAL, Footing, draw_robot, make_tiles, walks
+from training.traversability.mapping import DataConfig, exact_maps, tile_places, walk_and_map
+from training.traversability.terrain import KINDS, LENGTH, draw_robot, make_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -35,26 +29,7 @@ if TYPE_CHECKING:
 VERSION = 1  # of maps and labels; raise it where their making changes, so that kept ones are refused
 RATED_REACH = 0.3  # [m] around known cells in which unknown ones are rated
 RESOLUTIONS = (0.02, 0.1)  # [m]
-SPLITS = {"train": 0, "held_out": 1, "unseen": 2}
-
-
-@dataclass(frozen=True, kw_only=True)
-class DataConfig:
-    """How maps are made."""
-
-    num_maps: int = 2  # of a batch, which shares robot, resolution and sensors
-    window: float = 4.0  # [m] side of a map, to whole cells
-    looks: tuple[int, int] = (10, 20)  # fewest and most
-    headings: int = 8  # of a label
-    camera_pixels: tuple[int, int] = (64, 48)  # width, height
-    lidar_rays: tuple[int, int] = (32, 256)  # rings, azimuths
-    robot: RobotConfig | None = None  # None: each batch draws its own
-
-    def __post_init__(self) -> None:
-        require_positive(window=self.window)
-        positive = self.num_maps >= 1 and self.headings >= 1 and 1 <= self.looks[0] <= self.looks[1]
-        came = (self.num_maps, self.headings, self.looks)
-        require(positive, "num_maps, headings, looks", "must be at least 1", came, "see their defaults")
+SPLITS = {"train": 0, "held_out": 1, "unseen": 2, "train_exact": 3, "held_out_exact": 4}
 
 
 class MappedTerrain(NamedTuple):
@@ -82,6 +57,7 @@ def make_batch(
     cfg: DataConfig | None = None,
     kinds: Sequence[str] = KINDS,
     resolution: float | None = None,
+    exact: bool = False,
 ) -> MappedTerrain:
     """Make maps of ground of random kinds; the same seed makes the same maps.
 
@@ -90,6 +66,7 @@ def make_batch(
         cfg: how many maps, of what.
         kinds: to draw the ground from.
         resolution: of the maps [m]; None: drawn from 2 to 10 cm, evenly in its logarithm, in whole millimetres.
+        exact: maps that know the truth, in place of those that a robot makes.
     """
     cfg = cfg or DataConfig()
     rng = np.random.default_rng(seed)
@@ -97,58 +74,11 @@ def make_batch(
     robot = draw_robot(rng) if cfg.robot is None else cfg.robot
     resolution = resolution or round(math.exp(rng.uniform(*np.log(RESOLUTIONS))), 3)
     field = make_tiles(names, rng)
-    emap, T_tile_map = walk_and_map(field, robot, resolution, cfg, rng)
+    if exact:
+        emap, T_tile_map = exact_maps(field, resolution, cfg, rng)
+    else:
+        emap, T_tile_map = walk_and_map(field, robot, resolution, cfg, rng)
     return label_cells(emap, T_tile_map, field, robot, cfg.headings, names)
-
-
-class Look(NamedTuple):
-    """What the robots of a batch see at one time."""
-
-    points: Float[Tensor, "B S N 3"]  # [m] sensor frame
-    T_map_sensor: Float[Tensor, "B S 4 4"]  # as estimated
-    T_map_base: Float[Tensor, "B 4 4"]  # as estimated
-    T_tile_base: Float[Tensor, "B 4 4"]  # the truth
-
-
-def walk_and_look(field: HeightField, robot: RobotConfig, cfg: DataConfig, rng: np.random.Generator) -> Iterator[Look]:
-    """Walk over every tile, and yield what simulated sensors with errors see."""
-    num, looks = field.num_tiles, int(rng.integers(cfg.looks[0], cfg.looks[1], endpoint=True))
-    path = walks(Footing(field, robot), num, looks, rng)
-    sight = Sight(robot, num, cfg.camera_pixels, cfg.lidar_rays, rng)
-    odometry = PoseErrors(preset("leg_odometry").pose, num, seed=int(rng.integers(2**31)))
-    T_map_tile = _map_frames(num, rng)
-    for T_tile_base in path:
-        T_map_base = T_map_tile @ odometry(T_tile_base, LOOK_INTERVAL)
-        points, T_map_sensor = sight.look(field, T_tile_base, T_map_base)
-        yield Look(points, T_map_sensor, T_map_base, T_tile_base)
-
-
-def walk_and_map(
-    field: HeightField, robot: RobotConfig, resolution: float, cfg: DataConfig, rng: np.random.Generator
-) -> tuple[ElevationMap, Float[Tensor, "B 4 4"]]:
-    """Walk over every tile and map it; return the maps and T_tile_map (B, 4, 4), as at the last look."""
-    emap = blank_map(resolution, cfg.window, field.num_tiles)
-    for look in walk_and_look(field, robot, cfg, rng):
-        emap.update(look.points, look.T_map_sensor, look.T_map_base, LOOK_INTERVAL)
-    return emap, look.T_tile_base @ torch.linalg.inv(look.T_map_base)
-
-
-def map_config(resolution: float, window: float) -> ElevationMapConfig:
-    """Return the configuration of maps of about `window` [m], without a head of their own."""
-    length = round(window / resolution) * resolution
-    grid = GridConfig(resolution=resolution, length_x=length, length_y=length)
-    return ElevationMapConfig(grid=grid, traversability=None)
-
-
-def blank_map(resolution: float, window: float, num_maps: int) -> ElevationMap:
-    """Return maps that know nothing."""
-    return ElevationMap(map_config(resolution, window), num_maps)
-
-
-def _map_frames(num: int, rng: np.random.Generator) -> Tensor:
-    """Draw T_map_tile (num, 4, 4): turned anyhow, so that edges lie anyhow to the cells, and elsewhere."""
-    place = torch.from_numpy(rng.uniform(-20, 20, (num, 3)))
-    return pose(place, torch.from_numpy(rng.uniform(-math.pi, math.pi, num)))
 
 
 def label_cells(
@@ -180,12 +110,6 @@ def label_cells(
         robot=robot,
         kinds=kinds,
     )
-
-
-def tile_places(emap: ElevationMap, T_tile_map: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B H W 2"]:
-    """Return the true places [m] of the cells' centres in the tiles' frames, float64."""
-    turned = torch.einsum("bkl,bijl->bijk", T_tile_map[:, :2, :2], emap.cell_centers())
-    return turned + T_tile_map[:, None, None, :2, 3]
 
 
 def rated_cells(validity: Tensor, bounded: Tensor, resolution: float) -> Bool[Tensor, "B H W"]:
@@ -223,7 +147,7 @@ def data_set(
     for index in tqdm(range(count), desc=f"data {name}", unit="batch"):
         path = folder / f"{name}-{index:04d}.pt"
         if not path.exists():
-            batch = make_batch(batch_seed(split, seed, index), cfg, kinds, resolution)
+            batch = make_batch(batch_seed(split, seed, index), cfg, kinds, resolution, split.endswith("exact"))
             save_atomically({"settings": settings, **batch._asdict(), "robot": dataclasses.asdict(batch.robot)}, path)
         batches.append(_load(path, settings))
     return batches

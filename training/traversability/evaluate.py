@@ -15,14 +15,15 @@ from tqdm import tqdm
 from benchmarks.report import markdown_table, write_json
 from torchelev.robot import RobotConfig
 from torchelev.traversability_net import TraversabilityNet
-from training.traversability.data import DataConfig, MappedTerrain, data_set
+from training.traversability.data import MappedTerrain, data_set
 from training.traversability.heads import Score, baselines, family
+from training.traversability.mapping import DataConfig
 from training.traversability.metrics import SAFE, RatedMap, calibration_error, measure
 from training.traversability.robot import RobotType
 from training.traversability.terrain import KINDS, UNSEEN_KINDS
 
 RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
-SPLITS = {"held_out": KINDS, "unseen": UNSEEN_KINDS}
+SPLITS = {"held_out": KINDS, "unseen": UNSEEN_KINDS, "held_out_exact": KINDS}
 EVALUATION_SEED = 0  # of the maps: the same for all weights
 COLUMNS = {
     "average_precision": "AP safe",
@@ -97,7 +98,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Measure nets and baselines on ground that training never sees: result[split][resolution][head][metric].
 
-    The maps are made, or read from the folder `data`. A net's name becomes "learned (name)".
+    The maps are made, or read from the folder `data`; "held_out_exact" are of the true heights. A net's name becomes
+    "learned (name)".
     """
     cfg = cfg or DataConfig()
     scores = {f"learned ({name})": learned(net) for name, net in nets.items()} | baselines(paper_weights)

@@ -20,13 +20,13 @@ from tqdm import tqdm
 from benchmarks.report import write_json
 from torchelev.robot import RobotConfig
 from torchelev.traversability_net import TraversabilityNet
-from training.traversability.data import DataConfig
 from training.traversability.evaluate import SPLITS, evaluate, table
+from training.traversability.mapping import DataConfig
 from training.traversability.robot import RobotType
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
-BATCHES, STEPS, EVALUATION_BATCHES = 300, 4000, 20
+BATCHES, EXACT_BATCHES, STEPS, EVALUATION_BATCHES = 300, 100, 4000, 20
 RESULTS = Path(__file__).parents[1] / "results"
 
 
@@ -34,7 +34,7 @@ def train(seed: int, folder: Path, data: Path, robot: str | None) -> None:
     """Run one training in a process of its own, or finish one that was stopped."""
     command = [sys.executable, "-m", "training.traversability", "--seed", str(seed), "--out", str(folder)]
     command += ["--data", str(data), "--batches", str(BATCHES), "--steps", str(STEPS)]
-    command += ["--evaluation-batches", str(EVALUATION_BATCHES)]
+    command += ["--exact-batches", str(EXACT_BATCHES), "--evaluation-batches", str(EVALUATION_BATCHES)]
     command += ["--robot", robot] if robot else []
     command += ["--resume"] if (folder / "checkpoint.pt").exists() else []
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def main(runs: Path, jobs: int, robot: str | None, paper_weights: Path | None) -
     train_all(runs, jobs, robot)
     nets = {str(seed): TraversabilityNet.from_pretrained(runs / f"seed-{seed}" / "weights.pt") for seed in SEEDS}
     result = evaluate(nets, runs / "data", EVALUATION_BATCHES, cfg, paper_weights)
-    fixed = {"seeds": SEEDS, "batches": BATCHES, "steps": STEPS}
+    fixed = {"seeds": SEEDS, "batches": BATCHES, "exact_batches": EXACT_BATCHES, "steps": STEPS}
     write_json(RESULTS / "traversability.json", result | {"training": fixed})
     shutil.copy(runs / f"seed-{SEEDS[0]}" / "maps.png", RESULTS / "traversability.png")
     for split in SPLITS:

@@ -18,7 +18,8 @@ from torchelev.layers import Layer
 from torchelev.pipeline import rate_surface
 from torchelev.state import blank_state
 from torchelev.traversability_paper import RIM, PaperFilter
-from training.traversability.data import MappedTerrain, map_config
+from training.traversability.data import MappedTerrain
+from training.traversability.mapping import map_config
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
