@@ -13,6 +13,7 @@ from test_filters_geometry import random_layer, terrain, whole
 from torchelev.filters import distance
 from torchelev.filters.distance import signed_distance, squared_distance
 from torchelev.filters.distance_field import FieldConfig, SignedDistanceField
+from torchelev.filters.opencv_distance import nearest_seed
 from torchelev.filters.registry import FILTERS, Filter
 
 SEEDS = st.integers(0, 10_000)
@@ -55,18 +56,19 @@ def reference(values, known, resolution, *, step, below, above, unknown, max_dis
     return result
 
 
+@pytest.mark.parametrize("dtype, error", [(torch.float64, 1e-9), (torch.float32, 1e-6)])  # float32 is OpenCV's
 @given(
     SEEDS, st.tuples(st.integers(1, 2), st.integers(1, 9), st.integers(1, 8)), st.sampled_from([0.5, 0.9, 1.0]), RULES
 )
-def test_agrees_with_a_loop(seed, shape, share, rules):
-    layer = random_layer(seed, shape, share)
+def test_agrees_with_a_loop(dtype, error, seed, shape, share, rules):
+    layer = random_layer(seed, shape, share, dtype)
     # Smooth, so that cells far from borders exist.
     layer = (torch.cumsum(layer[0], 1) * 0.5).clamp(-0.3, 0.3), layer[1]
     result, known = signed_distance(layer, resolution=0.1, **rules)
     assert torch.equal(known, layer[1]) and not result[~known].any()
     for b in range(shape[0]):
         want = reference(layer[0][b].numpy(), known[b].numpy(), 0.1, **rules)
-        np.testing.assert_allclose(result[b].numpy(), np.nan_to_num(want), atol=1e-9)
+        np.testing.assert_allclose(result[b].numpy(), np.nan_to_num(want), atol=error)
 
 
 def test_a_step_by_hand():
@@ -114,6 +116,35 @@ def test_distances_are_exact_on_a_large_map():
     for squared in (squared_distance(seeds, 400), distance._squared_distance_tensors(seeds, 400)):
         np.testing.assert_array_equal(squared[0].numpy(), want)
         assert (squared[1] > 400**2).all()
+
+
+def test_a_map_without_seeds_is_as_far_away_as_it_is_told():
+    seeds = np.zeros((3, 30, 20), bool)
+    seeds[1, 3, 4] = True
+    away = nearest_seed(seeds, 40.0)
+    assert (away[[0, 2]] == 40).all() and away[1, 3, 4] == 0 and away[1, 6, 8] == 5
+
+
+@pytest.mark.parametrize("uses", [True, False])
+def test_the_switch_of_ipp_is_put_back(uses, monkeypatch):
+    cv2 = pytest.importorskip("cv2")
+    seeds, before, during = np.eye(30, dtype=bool)[None], cv2.ipp.useIPP(), []
+
+    def failing(*args, **settings):
+        during.append(cv2.ipp.useIPP())
+        raise RuntimeError
+
+    try:
+        cv2.ipp.setUseIPP(uses)
+        kept = cv2.ipp.useIPP()  # False where OpenCV has no IPP
+        nearest_seed(seeds, 40.0)
+        assert cv2.ipp.useIPP() == kept
+        monkeypatch.setattr(cv2, "distanceTransform", failing)
+        with pytest.raises(RuntimeError):
+            nearest_seed(seeds, 40.0)
+        assert cv2.ipp.useIPP() == kept and during == [False]
+    finally:
+        cv2.ipp.setUseIPP(before)
 
 
 def test_without_opencv(monkeypatch):

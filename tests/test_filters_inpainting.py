@@ -31,6 +31,7 @@ from torchelev.filters.inpainting import (
 
 FILLING = [inpaint_minimum, inpaint_nearest, inpaint_diffusion]
 OPENCV = [inpaint_telea, inpaint_navier_stokes]
+DTYPES = [torch.float64, torch.float32]  # by tensors; by OpenCV
 EIGHT = [(u, v) for u in (-1, 0, 1) for v in (-1, 0, 1) if (u, v) != (0, 0)]
 FOUR = [(0, 1), (1, 0), (0, -1), (-1, 0)]
 
@@ -114,9 +115,10 @@ def assert_filled(got, layer, reference, atol=0.0):
     np.testing.assert_allclose(got[0].numpy(), np.nan_to_num(expected), atol=atol, rtol=0)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
 @given(SEEDS, SHAPES, SHARES)
-def test_minimum_is_the_lowest_of_the_border_of_the_hole(seed, shape, share):
-    layer = random_layer(seed, shape, share)
+def test_minimum_is_the_lowest_of_the_border_of_the_hole(dtype, seed, shape, share):
+    layer = random_layer(seed, shape, share, dtype)
     assert_filled(inpaint_minimum(layer), layer, minimum_reference)
 
 
@@ -140,11 +142,12 @@ def test_minimum_with_enough_steps_is_that_of_the_whole_hole(seed, share):
     assert torch.equal(whole[0], bounded[0]) and torch.equal(whole[1], bounded[1])
 
 
-def test_minimum_by_hand():
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_minimum_by_hand(dtype):
     """Two holes that touch by a corner are one; the one at the rim has a border of its own."""
     nan = math.nan
-    heights = torch.tensor([[[5.0, nan, 4, 7, nan], [6, 8, nan, 9, nan], [3, 3, 3, 3, 2]]])
-    expected = torch.tensor([[[5.0, 3, 4, 7, 2], [6, 8, 3, 9, 2], [3, 3, 3, 3, 2]]])
+    heights = torch.tensor([[[5.0, nan, 4, 7, nan], [6, 8, nan, 9, nan], [3, 3, 3, 3, 2]]], dtype=dtype)
+    expected = torch.tensor([[[5.0, 3, 4, 7, 2], [6, 8, 3, 9, 2], [3, 3, 3, 3, 2]]], dtype=dtype)
     assert torch.equal(inpaint_minimum((heights, torch.isfinite(heights)))[0], expected)
     near, _ = inpaint_minimum((heights, torch.isfinite(heights)), iterations=1)
     expected[0, 0, 1], expected[0, 0, 4] = 4, 7
@@ -174,13 +177,14 @@ def stops(request, monkeypatch):
     monkeypatch.setattr("torchelev.filters.holes._stops", lambda device: request.param)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("mirror", [[], [0], [1], [0, 1]])
-def test_the_border_of_a_spiral_is_all_of_it_whatever_its_direction(mirror, stops):
+def test_the_border_of_a_spiral_is_all_of_it_whatever_its_direction(mirror, dtype, stops):
     """The lowest wall is at its inner end, or outside of its outer one."""
     known = torch.from_numpy(spiral(41)).flip(mirror)
     assert len(holes(known.numpy())) == 1 and 600 < (~known).sum() < 1200
     for cell in (known.nonzero()[0], known.nonzero()[len(known.nonzero()) // 2]):
-        heights = torch.where(known, 1.0, 0.0)
+        heights = torch.where(known, 1.0, 0.0).to(dtype)
         heights[tuple(cell)] = 0.5
         filled, _ = inpaint_minimum((heights[None], known[None]))
         assert (filled[0][~known] == 0.5).all()
@@ -323,6 +327,15 @@ def test_becomes_known_wherever_the_map_knows_anything(function, shape, share, d
     assert values.dtype == dtype and torch.isfinite(values).all()
     assert torch.equal(known, layer[1].flatten(1).any(1)[:, None, None].expand(shape))
     assert torch.equal(values[layer[1]], layer[0][layer[1]]) and (values[~known] == 0).all()
+
+
+@pytest.mark.parametrize("function", OPENCV)
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_opencv_fills_each_map_of_a_batch_as_alone(function, threads):
+    torch.set_num_threads(threads)  # until the end of the test, see conftest
+    layer = random_layer(6, (7, 12, 11), 0.6, torch.float32)
+    layer[1][2], layer[1][4] = False, True
+    assert_batch_is_single(lambda layer: function(layer, resolution=0.1), (layer[0].nan_to_num(), layer[1]))
 
 
 @pytest.mark.parametrize("function", OPENCV)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from torchelev import filters
 from torchelev.filters import opencv
+from torchelev.filters.registry import masked
 
 SHAPES = st.tuples(st.integers(1, 3), st.integers(1, 12), st.integers(1, 11))
 SERVED = {
@@ -25,11 +26,14 @@ SERVED = {
     "signed_distance": dict(step=0.5),
     "signed_distance of obstacles": dict(step=0.5, below=-0.3, above=0.9),
     "signed_distance, unknown left out": dict(step=0.5, unknown=False),
+    "signed_distance of obstacles alone": dict(step=None, below=-0.3, unknown=False),
+    "signed_distance, bounded": dict(step=0.5, above=0.9, max_distance=0.2),
+    "inpaint_minimum": {},
 }
 
 
 def filtered(name, layer):
-    return filters.FILTERS[name.split()[0].strip(",")](layer, resolution=0.1, **SERVED[name])
+    return filters.Filter(name.split()[0].strip(","), **SERVED[name])(layer, resolution=0.1)
 
 
 def by_tensors(name, layer):
@@ -69,8 +73,56 @@ def test_the_arguments_stay_as_they_are():
     values[0, 2, 2] = np.inf
     for name in SERVED:
         smooth, there = filtered(name, (values, known))
-        assert known.all() and values[0, 2, 2] == np.inf and not there[0, 2, 2] and there.sum() == 24
+        filled = name == "inpaint_minimum"
+        assert known.all() and values[0, 2, 2] == np.inf and there[0, 2, 2] == filled and there.sum() == 24 + filled
         assert smooth.isfinite().all()
+
+
+def test_results_are_no_views_of_the_arguments():
+    """Of a map whose cells are all finite, which needs no mask of its own."""
+    values, known = random_layer(4, (1, 6, 5), 0.8, torch.float32)
+    for name in SERVED:
+        smooth, there = filtered(name, (values, known))
+        memory = {part.data_ptr() for part in (values, known, smooth, there)}
+        assert len(memory) == 4
+
+
+NOT_FINITE = [[np.nan], [np.inf], [-np.inf], [np.inf, -np.inf], [-np.inf, np.nan, np.inf]]
+
+
+@pytest.mark.parametrize("bad", NOT_FINITE)
+@pytest.mark.parametrize("B", [1, 3])
+def test_known_heights_that_are_not_finite_count_as_unknown(bad, B):
+    values, known = random_layer(5, (B, 7, 6), 0.8, torch.float32)
+    known[-1, 2, 1 : 1 + len(bad)] = True
+    values[-1, 2, 1 : 1 + len(bad)] = torch.tensor(bad)
+    kept, there = opencv.masked(values, known)
+    assert torch.equal(there, known & values.isfinite()) and not there[-1, 2, 1]
+    assert torch.equal(kept, torch.where(there, values, 0.0))
+
+
+def test_heights_whose_sum_float32_does_not_hold_stay_known():
+    values, known = torch.full((1, 9, 8), 3e38), torch.ones(1, 9, 8, dtype=torch.bool)
+    kept, there = opencv.masked(values, known)
+    assert there.all() and torch.equal(kept, values)
+
+
+@pytest.mark.parametrize("name", SERVED)
+@pytest.mark.parametrize("B", [1, 3])
+@pytest.mark.filterwarnings("error")
+def test_far_within_the_unknown_nothing_divides_by_zero(name, B):
+    values, known = random_layer(6, (B, 30, 28), 1.0, torch.float32)
+    known[:, 4:, 3:] = False
+    smooth, there = filtered(name, (values + 300, known))
+    assert smooth.isfinite().all() and (smooth[~there] == 0).all()
+    assert there.all() if name == "inpaint_minimum" else torch.equal(there, known)
+
+
+@pytest.mark.parametrize("shape", [(0, 4, 4), (1, 0, 4), (1, 4, 0)])
+def test_serves_no_empty_images(shape):
+    assert not opencv.serves(torch.zeros(shape))
+    kept, there = masked((torch.zeros(shape), torch.zeros(shape, dtype=torch.bool)))
+    assert kept.shape == there.shape == shape
 
 
 def test_serves_plain_float32_on_a_cpu_without_gradient():

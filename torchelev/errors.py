@@ -22,8 +22,9 @@ def require(
 def require_positive(**values: object) -> None:
     """Refuse what is no positive, finite number."""
     for name, value in values.items():
-        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-        require(number and value > 0, name, "must be a positive number", repr(value), "give metres")  # type: ignore[operator]
+        number = isinstance(value, (float, Real)) and not isinstance(value, bool) and math.isfinite(value)
+        if not (number and value > 0):  # type: ignore[operator]
+            require(False, name, "must be a positive number", repr(value), "give metres")
 
 
 def whole_cells(name: str, length: float, resolution: float) -> int:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING
+import operator
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchelev.errors import require_positive
 from torchelev.filters import opencv
+from torchelev.filters.opencv_distance import FAR, nearest_seed, signed_cells
 from torchelev.filters.registry import register
 from torchelev.layers import Layer
 from torchelev.storage import as_bytes
@@ -20,7 +23,7 @@ from torchelev.storage import as_bytes
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-FAR = 1e30  # higher than any ground
+Values = TypeVar("Values", Tensor, NDArray)
 
 
 @register
@@ -47,43 +50,43 @@ def signed_distance(
     installed; elsewhere as tensors, each cell in the time of the map's larger side or `max_distance`, in cells.
     """
     values, known = layer
-    for name, limit in dict(step=step, max_distance=max_distance).items():
-        if limit is not None:
-            require_positive(**{name: limit})
+    for name, setting in dict(step=step, max_distance=max_distance).items():
+        if setting is not None:
+            require_positive(**{name: setting})
     farthest = math.hypot(*values.shape[1:])
     if max_distance is not None:
         farthest = min(farthest, max_distance / resolution)
+    limit = FAR / 10 if step is None else step  # above all ground's steps, below those from and to it
+    if opencv.serves(values.detach()):
+        heights, there = values.detach().numpy(), known.numpy()
+        away = signed_cells(heights, there, _obstacles(heights, below, above), limit, unknown, farthest)
+        away *= np.float32(resolution)
+        return torch.from_numpy(away), known
     obstacle = _obstacles(values, below, above)
-    borders = _beside_borders(values.detach(), known, obstacle, step, unknown)
+    weight = None if obstacle is None else as_bytes(obstacle).to(values.dtype)
+    borders = _beside_borders(values.detach(), known, weight, limit, unknown)
     squared = squared_distance(borders, math.ceil(farthest)).to(values.dtype)
     distance = (squared.sqrt() + 0.5).clamp(max=farthest) * resolution
-    return distance if obstacle is None else distance * (1 - 2 * obstacle), known
+    return distance if weight is None else distance * (1 - 2 * weight), known
 
 
-def _obstacles(values: Tensor, below: float | None, above: float | None) -> Tensor | None:
-    """Return 1 in obstacles and 0 elsewhere, if there is a rule for them."""
+def _obstacles(values: Values, below: float | None, above: float | None) -> Values | None:
+    """Tell which cells are obstacles, if there is a rule for them."""
     rules = [values < below] if below is not None else []
     rules += [values > above] if above is not None else []
-    return functools.reduce(torch.logical_or, rules).to(values.dtype) if rules else None
+    return functools.reduce(operator.or_, rules) if rules else None
 
 
-def _beside_borders(
-    values: Tensor, known: Tensor, obstacle: Tensor | None, step: float | None, unknown: bool
-) -> Tensor:
+def _beside_borders(level: Tensor, known: Tensor, obstacle: Tensor | None, limit: float, unknown: bool) -> Tensor:
     """Tell which cells have a border on one of their four sides; unknown ones too, which are never the nearest.
 
     Obstacles are put far above and unknown cells far below all ground, where everything is level. In sums, which on a
     CPU take a tenth of the time of `torch.where`; values are 0 where unknown.
     """
-    level = torch.zeros_like(values) if step is None else values
     if obstacle is not None:
         level = torch.add(level * (1 - obstacle), obstacle, alpha=FAR)
-    weight = as_bytes(known).to(values.dtype)
+    weight = as_bytes(known).to(level.dtype)
     level = torch.add(level * weight, 1 - weight, alpha=-FAR)
-    limit = FAR / 10 if step is None else step
-    if opencv.serves(level):
-        among = None if unknown else known.numpy()
-        return torch.from_numpy(opencv.differs_from_a_side(level.numpy(), among, limit, rim=-FAR))
     rimmed, there = F.pad(level, [1] * 4, value=-FAR), F.pad(known, [1] * 4)
     beside = torch.zeros_like(known)
     for dim in (1, 2):
@@ -111,14 +114,8 @@ def squared_distance(seeds: Bool[Tensor, "B H W"], reach: int) -> Float[Tensor, 
 
 
 def _squared_distance_opencv(seeds: Tensor, reach: int) -> Tensor:
-    import cv2  # an optional dependency
-
-    squared = torch.full(seeds.shape, float((reach + 1) ** 2))
-    for image, away in zip((~seeds).view(torch.uint8).numpy(), squared.numpy(), strict=True):
-        if not image.all():  # without seeds OpenCV returns anything
-            distance = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            np.rint(np.multiply(distance, distance, out=distance), out=away)
-    return squared
+    away = nearest_seed(seeds.numpy(), reach + 1)
+    return torch.from_numpy(np.rint(away * away))
 
 
 def _squared_distance_tensors(seeds: Tensor, reach: int) -> Tensor:

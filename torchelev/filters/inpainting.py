@@ -6,10 +6,15 @@ ring by ring, the mean of the known neighbours, and only as far as a scan's poin
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchelev.errors import require, require_positive
+from torchelev.filters import opencv
 from torchelev.filters.extrema import blank, highest_of_windows, lowered
 from torchelev.filters.harmonic import four_sum, harmonic
 from torchelev.filters.holes import lowest_of_border, nearest_known
@@ -35,6 +40,8 @@ def inpaint_minimum(layer: Layer, *, iterations: int | None = None) -> Layer:
     Raises ValueError for `iterations` below 1.
     """
     values, known = layer
+    if iterations is None and opencv.serves(values):
+        return opencv.lowest_of_holes(layer)
     if iterations is None:
         return _taken(values, lowest_of_border(values.detach(), known))
     _require_count(iterations, "give None for holes of any size")
@@ -130,18 +137,34 @@ def _inpainted(layer: Layer, radius: int, method: int) -> Layer:
     It adds a vector of length one to each height that it makes, and takes gradients below a hundredth for none: in
     metres both would show.
     """
-    import cv2
-
     values, known = layer
     weight = as_bytes(known).to(values.dtype)
     datum = mean_of_known(values, weight)
     heights = ((values.detach() - datum) * UNITS * weight).float().cpu()
-    images = zip(_two_lines(heights).numpy(), _two_lines((~known).byte().cpu()).numpy(), strict=True)
-    filled = [image if holes.all() else cv2.inpaint(image, holes, radius, method) for image, holes in images]
+    images = _two_lines(heights).numpy(), _two_lines((~known).byte().cpu()).numpy()
+    filled = _of_each(lambda image, holes: _filled(image, holes, radius, method), *images)
     found = known.any(2, keepdim=True).any(1, keepdim=True)
     H, W = known.shape[1:]
     filling = torch.stack([torch.from_numpy(image) for image in filled])[:, :H, :W].to(values) / UNITS + datum
     return torch.where(known, values, filling), known | found
+
+
+def _of_each(function: Callable[..., NDArray], *images: NDArray) -> list[NDArray]:
+    """Run a function for each map, one for each thread at a time: OpenCV fills a map by a single one.
+
+    A map that is alone stays in this thread; another would have to wait for a core that torch's threads hold.
+    """
+    threads = min(torch.get_num_threads(), len(images[0]))
+    if threads == 1:
+        return list(map(function, *images))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, *images))
+
+
+def _filled(image: NDArray, holes: NDArray, radius: int, method: int) -> NDArray:
+    import cv2
+
+    return image if holes.all() else cv2.inpaint(image, holes, radius, method)
 
 
 def _two_lines(images: Tensor) -> Tensor:

@@ -1,13 +1,13 @@
-"""Windows by OpenCV: what some filters run on a CPU instead of tensor operations, to the same result.
+"""Windows and holes by OpenCV: what some filters run on a CPU instead of tensor operations, to the same result.
 
 For float32 layers without gradient, where OpenCV is installed. All in NumPy: torch's threads, which wait for their next
-operation in a loop, would take OpenCV's their cores.
+operation in a loop, would take OpenCV's their cores. What comes out at unknown cells has no meaning, and may be NaN.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import math
 
 import numpy as np
 import torch
@@ -29,27 +29,39 @@ def _installed() -> bool:
 
 
 def serves(values: Tensor) -> bool:
-    """Tell whether OpenCV can filter these values: float32 on the CPU that no gradient is wanted of."""
+    """Tell whether OpenCV can filter these values: some, float32, on the CPU, that no gradient is wanted of."""
     plain = type(values) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(values)
     learns = values.requires_grad and torch.is_grad_enabled()
-    float32 = values.device.type == "cpu" and values.dtype == torch.float32
+    float32 = values.is_cpu and values.dtype == torch.float32 and values.numel() > 0
     return plain and float32 and not learns and not torch.compiler.is_compiling() and _installed()
 
 
 def masked(values: Tensor, known: Tensor) -> Layer:
-    """Put 0 where nothing is known, and take what is not finite for unknown."""
-    heights = values.detach().numpy()
-    there = np.isfinite(heights) & known.numpy()
-    return torch.from_numpy(filled(heights, there, 0.0)), torch.from_numpy(there)
+    """Put 0 where nothing is known, and take what is not finite for unknown. Both come as copies."""
+    import cv2  # an optional dependency
+
+    there = _image(known.numpy()).copy()
+    kept = cv2.copyTo(_image(values.detach().numpy()), there.view(np.uint8))  # into zeros
+    # Summed in float64, which finite float32 numbers do not exceed: one pass tells that no cell needs a look.
+    if not math.isfinite(cv2.sumElems(kept)[0]):
+        there &= np.isfinite(kept)
+        kept = cv2.copyTo(kept, there.view(np.uint8))
+    return torch.from_numpy(kept.reshape(values.shape)), torch.from_numpy(there.reshape(values.shape))
 
 
 def filled(values: NDArray, known: NDArray, blank: float) -> NDArray:
     """Return the values (B, H, W) where known, and `blank` elsewhere. NumPy's own masks take four times as long."""
-    import cv2  # an optional dependency
+    import cv2
 
-    target = np.full(values.shape, blank, values.dtype)
+    target = np.empty(values.shape, np.float32)
+    target.fill(blank)
     cv2.copyTo(_image(values), _image(known).view(np.uint8), _image(target))
     return target
+
+
+def arrays(layer: Layer) -> tuple[NDArray, NDArray]:
+    """Return values and mask as arrays that share the layer's memory."""
+    return layer[0].numpy(), layer[1].numpy()
 
 
 def _image(maps: NDArray) -> NDArray:
@@ -57,103 +69,119 @@ def _image(maps: NDArray) -> NDArray:
     return maps.reshape(-1, maps.shape[2])
 
 
-def of_windows(function: Callable[[NDArray], NDArray], maps: NDArray, radius: int, blank: float) -> NDArray:
-    """Run a function from image to image over maps (B, H, W), all at once: `radius` blank rows keep them apart."""
+def _apart(maps: NDArray, radius: int, blank: float) -> NDArray:
+    """Return maps (B, H, W) below one another, as one image: `radius` blank rows keep the windows of each from others.
+
+    For all of them together OpenCV takes three quarters of the time that it takes for one after the other.
+    """
     B, H, W = maps.shape
     if B == 1:
-        return function(maps[0])[None]
-    apart = np.full((B, H + radius, W), blank, maps.dtype)
-    apart[:, :H] = maps
-    return function(_image(apart)).reshape(apart.shape)[:, :H]
+        return maps[0]
+    apart = np.empty((B, H + radius, W), maps.dtype)
+    apart[:, :H], apart[:, H:] = maps, blank
+    return _image(apart)
+
+
+def _maps(image: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """Take the maps of a shape (B, H, W) from an image of them apart."""
+    return image[None] if shape[0] == 1 else image.reshape(shape[0], -1, shape[2])[:, : shape[1]]
 
 
 def highest(layer: Layer, radius: int) -> Tensor:
     """Return the highest known cell of the window around each known cell."""
     import cv2
 
-    heights, window = filled(*_arrays(layer), -BLANK), _square(radius)
-    return torch.from_numpy(of_windows(lambda image: cv2.dilate(image, window), heights, radius, -BLANK))
+    heights = _apart(filled(*arrays(layer), -BLANK), radius, -BLANK)
+    return torch.from_numpy(_maps(cv2.dilate(heights, _square(radius), dst=heights), layer[0].shape))
 
 
 def lowest(layer: Layer, radius: int) -> Tensor:
     """Return the lowest known cell of the window around each known cell."""
     import cv2
 
-    heights, window = filled(*_arrays(layer), BLANK), _square(radius)
-    return torch.from_numpy(of_windows(lambda image: cv2.erode(image, window), heights, radius, BLANK))
+    heights = _apart(filled(*arrays(layer), BLANK), radius, BLANK)
+    return torch.from_numpy(_maps(cv2.erode(heights, _square(radius), dst=heights), layer[0].shape))
 
 
 def box_mean(layer: Layer, radius: int) -> Tensor:
     """Return the mean of the known cells of the square window around each known cell. Summed in float64."""
-    values, known = _arrays(layer)
-    return torch.from_numpy(_box(values, radius) / np.maximum(_box(known, radius), 1))
+    values, known = arrays(layer)
+    return torch.from_numpy(_maps(_share(_box(values, radius), _box(known, radius)), values.shape))
 
 
 def gaussian_mean(layer: Layer, radius: int, sigma: float) -> Tensor:
     """Return the mean of the known cells around each known cell, weighted by a Gaussian of `sigma` cells."""
-    values, known = _arrays(layer)
+    values, known = arrays(layer)
     heights, datum = _from_datum(values, known)
-    weights = np.maximum(_gaussian(known.astype(np.float32), radius, sigma), np.finfo(np.float32).tiny)
-    return torch.from_numpy(_gaussian(heights, radius, sigma) / weights + datum)
+    mean = _share(_gaussian(heights, radius, sigma), _gaussian(known, radius, sigma))
+    return torch.from_numpy(_maps(mean, values.shape) + datum)
 
 
 def deviation(layer: Layer, radius: int, least: float) -> Tensor:
     """Return the standard deviation of the known cells of the window around each known cell, at least `least`."""
     import cv2
 
-    values, known = _arrays(layer)
+    values, known = arrays(layer)
     heights, _ = _from_datum(values, known)
-    number = np.maximum(_box(known, radius), 1)
-    mean = _box(heights, radius) / number
-    variance = np.maximum(_box(heights * heights, radius) / number - mean * mean, least**2)
-    return torch.from_numpy(cv2.sqrt(_image(variance)).reshape(variance.shape))
+    number = _box(known, radius)
+    mean = _share(_box(heights, radius), number)
+    variance = np.multiply(mean, -mean, out=mean)
+    variance += _share(_box(np.multiply(heights, heights, out=heights), radius), number)
+    return torch.from_numpy(_maps(cv2.sqrt(np.maximum(variance, least**2, out=variance)), values.shape))
 
 
-def _arrays(layer: Layer) -> tuple[NDArray, NDArray]:
-    return layer[0].detach().numpy(), layer[1].numpy()
-
-
+@functools.cache
 def _square(radius: int) -> NDArray:
     return np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
 
 
+def _share(total: NDArray, number: NDArray) -> NDArray:
+    """Return the quotient, for which a limit of the divisor would take longer than all else: a known cell has none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.divide(total, number, out=total)
+
+
 def _from_datum(values: NDArray, known: NDArray) -> tuple[NDArray, NDArray]:
     """Return heights from each map's mean, 0 where unknown: sums of high ones would cost float32 its millimetres."""
-    count = np.count_nonzero(known.reshape(len(known), -1), axis=1)
-    datum = values.reshape(len(known), -1).sum(1) / np.maximum(count, 1)
-    datum = datum.astype(np.float32)[:, None, None]
-    return values - known.astype(np.float32) * datum, datum
+    import cv2
+
+    maps = zip(values, known.view(np.uint8), strict=True)
+    means = [cv2.sumElems(heights)[0] / max(1, cv2.countNonZero(there)) for heights, there in maps]
+    datum = np.array(means, np.float32)[:, None, None]
+    return filled(values - datum, known, 0.0), datum
 
 
 def _box(values: NDArray, radius: int) -> NDArray:
-    """Return the sums of square windows, of floats or of a mask."""
+    """Return the sums of square windows, of floats or of a mask, as an image of maps apart."""
     import cv2
 
     width, border = (2 * radius + 1,) * 2, cv2.BORDER_CONSTANT
-    images = values.view(np.uint8) if values.dtype == np.bool_ else values
-    sums = functools.partial(cv2.boxFilter, ddepth=cv2.CV_32F, ksize=width, normalize=False, borderType=border)
-    return of_windows(sums, images, radius, 0)
+    return cv2.boxFilter(_numbers(values, radius), cv2.CV_32F, width, normalize=False, borderType=border)
 
 
 def _gaussian(values: NDArray, radius: int, sigma: float) -> NDArray:
-    """Return the weighted sums of windows of floats."""
+    """Return the weighted sums of windows, of floats or of a mask, as an image of maps apart."""
     import cv2
 
-    width, border = (2 * radius + 1,) * 2, cv2.BORDER_CONSTANT
-    return of_windows(lambda image: cv2.GaussianBlur(image, width, sigma, borderType=border), values, radius, 0)
+    weights = cv2.getGaussianKernel(2 * radius + 1, sigma, cv2.CV_32F)
+    return cv2.sepFilter2D(_numbers(values, radius), cv2.CV_32F, weights, weights, borderType=cv2.BORDER_CONSTANT)
 
 
-def differs_from_a_side(values: NDArray, known: NDArray | None, limit: float, rim: float) -> NDArray:
-    """Tell which cells differ by more than `limit` from one of the four beside them, `rim` lying around the map.
+def _numbers(values: NDArray, radius: int) -> NDArray:
+    """Return an image of maps apart that OpenCV adds up: floats, or the bytes of a mask, which take less time."""
+    return _apart(values.view(np.uint8) if values.dtype == np.bool_ else values, radius, 0)
 
-    With a mask, only known cells count, and nothing around the map does.
-    """
+
+def lowest_of_holes(layer: Layer) -> Layer:
+    """Return the layer with each hole at the lowest height of its border, known wherever a hole has one."""
     import cv2
 
-    cross, border = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), cv2.BORDER_CONSTANT
-    low, high = (values, values) if known is None else (filled(values, known, end) for end in (-BLANK, BLANK))
-    least, most = (rim, rim) if known is None else (-BLANK, BLANK)
-    above = of_windows(lambda image: cv2.dilate(image, cross, borderType=border, borderValue=least), low, 1, least)
-    below = of_windows(lambda image: cv2.erode(image, cross, borderType=border, borderValue=most), high, 1, most)
-    differs = np.maximum(above - values, values - below) > limit
-    return differs if known is None else differs & known
+    values, known = arrays(layer)
+    heights = _apart(filled(values, known, BLANK), 1, BLANK)
+    count, holes = cv2.connectedComponents(_apart((~known).view(np.uint8), 1, 0), connectivity=8)
+    place = np.flatnonzero(holes)  # of known cells and the rows between maps, the number is 0
+    number, lowest = holes.ravel()[place].astype(np.intp), np.full(count, BLANK, np.float32)
+    np.minimum.at(lowest, number, cv2.erode(heights, _square(1)).ravel()[place])
+    heights.ravel()[place] = lowest[number]
+    spanned = _maps(heights, values.shape)
+    return torch.from_numpy(spanned), torch.from_numpy(known | (spanned < BLANK))

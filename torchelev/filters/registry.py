@@ -48,15 +48,16 @@ def register(function: F) -> F:
     @functools.wraps(function)
     def checked(*layers: Layer, **settings: Any) -> Layer:
         check_layers(name, layers)
-        if layers[0][0].device.type == "cpu":
+        given = layers[0][0]
+        if given.is_cpu:
             keep_freed_memory()
-        if len(layers[0][0]) == 0:
+        if given.shape[0] == 0:
             return layers[0]
         parts = [_filtered(name, function, part, settings) for part in _parts(layers)]
-        if len(parts) == 1:
-            return parts[0][0].to(layers[0][0].dtype), parts[0][1]
-        values, known = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
-        return values.to(layers[0][0].dtype), known
+        values, known = parts[0]
+        if len(parts) > 1:
+            values, known = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+        return values if values.dtype == given.dtype else values.to(given.dtype), known
 
     FILTERS[name] = checked
     return checked  # type: ignore[return-value]
@@ -65,26 +66,36 @@ def register(function: F) -> F:
 def _filtered(name: str, function: Callable[..., Layer], layers: list[Layer], settings: dict[str, Any]) -> Layer:
     """Run a filter, and check what it returns: it may be a user's."""
     result = function(*map(masked, layers), **settings)
-    check_layers(f"what filter {name} returns", (result, layers[0]))
+    check_layers(f"what filter {name} returns", (result,), layers[0][0].shape)
     return masked(result)
 
 
-def check_layers(name: str, layers: tuple[Layer, ...]) -> None:
-    """Raise ValueError unless layers are (B, H, W) with a mask each, all of one shape."""
-    shapes = []
+def check_layers(name: str, layers: tuple[Layer, ...], shape: tuple[int, ...] | None = None) -> None:
+    """Raise ValueError unless layers are (B, H, W) with a mask each, all of one shape: of this one, if there is one."""
+    # A refusal's text is composed only when it comes: that of a fitting layer took as long as all checks.
     for number, layer in enumerate(layers):
-        argument = f"{name}, layer {number}"
-        pair = isinstance(layer, tuple) and len(layer) == 2 and all(isinstance(part, Tensor) for part in layer)
-        mend = "make one of values with NaN by filters.as_layer"
-        require(pair, argument, "must be a layer (values, known)", type(layer).__name__, mend, TypeError)
-        values, known = layer
-        fits = values.ndim == 3 and values.shape == known.shape and values.is_floating_point()
-        came = f"{tuple(values.shape)} {values.dtype} and {tuple(known.shape)}"
-        require(fits, argument, "expected values (B, H, W) of floats and known (B, H, W)", came, "see as_layer")
-        require(known.dtype == torch.bool, argument, "known must be bool", known.dtype, "see as_layer")
-        shapes.append(values.shape)
-    same = len(set(shapes)) == 1
-    require(same, name, "expected one or more layers of one shape", [tuple(s) for s in shapes], "read them from a map")
+        pair = isinstance(layer, tuple) and len(layer) == 2 and all([isinstance(part, Tensor) for part in layer])
+        if not pair or not _fits(*layer):
+            _refuse(f"{name}, layer {number}", layer, pair)
+    shapes = [values.shape for values, _ in layers] + ([] if shape is None else [shape])
+    if len(set(shapes)) != 1:
+        came = [tuple(shape) for shape in shapes]
+        require(False, name, "expected one or more layers of one shape", came, "read them from a map")
+
+
+def _fits(values: Tensor, known: Tensor) -> bool:
+    shaped = values.ndim == 3 and values.shape == known.shape
+    return shaped and values.is_floating_point() and known.dtype == torch.bool
+
+
+def _refuse(argument: str, layer: Layer, pair: bool) -> None:
+    mend = "make one of values with NaN by filters.as_layer"
+    require(pair, argument, "must be a layer (values, known)", type(layer).__name__, mend, TypeError)
+    values, known = layer
+    came = f"{tuple(values.shape)} {values.dtype} and {tuple(known.shape)} {known.dtype}"
+    rule = "expected values (B, H, W) of floats and known (B, H, W)"
+    require(known.dtype == torch.bool, argument, "known must be bool", known.dtype, "see as_layer")
+    require(False, argument, rule, came, "see as_layer")
 
 
 def masked(layer: Layer) -> Layer:
@@ -93,9 +104,9 @@ def masked(layer: Layer) -> Layer:
     Not by `torch.where`, which takes five times as long on a CPU.
     """
     values, known = layer
-    values = values.to(torch.promote_types(values.dtype, torch.float32))
     if opencv.serves(values):
         return opencv.masked(values, known)
+    values = values.to(torch.promote_types(values.dtype, torch.float32))
     known = known & values.isfinite()
     return values.nan_to_num(0.0, 0.0, 0.0) * as_bytes(known).to(values.dtype), known
 
@@ -103,7 +114,7 @@ def masked(layer: Layer) -> Layer:
 def _parts(layers: tuple[Layer, ...]) -> list[list[Layer]]:
     """Divide the maps into parts that fit into a CPU's caches."""
     maps, height, width = layers[0][0].shape
-    some = max(1, CPU_CELLS // max(1, height * width)) if layers[0][0].device.type == "cpu" else max(1, maps)
+    some = max(1, CPU_CELLS // max(1, height * width)) if layers[0][0].is_cpu else max(1, maps)
     if maps <= some:
         return [list(layers)]
     pieces = [zip(values.split(some), known.split(some), strict=True) for values, known in layers]
