@@ -87,6 +87,12 @@ def row(found: dict[str, Any], name: str) -> list[str]:
     return [f"{100 * found['height']:.0f} cm", name, f"{np.abs(says - label).mean():.2f}", mean, share]
 
 
+def table(profiles: list[dict[str, Any]]) -> str:
+    """Tabulate every head on every block."""
+    header = ["block", "head", "mean error", "mean rating where no heading stands", "of these at 0.5 and more"]
+    return markdown_table(header, [row(found, name) for found in profiles for name in HEADS])
+
+
 def draw(profiles: list[dict[str, Any]], path: Path) -> None:
     """Draw label and ratings over the way onto each block."""
     figure = Figure(figsize=(3 * len(profiles), 2.6), layout="constrained")
@@ -107,11 +113,9 @@ def draw(profiles: list[dict[str, Any]], path: Path) -> None:
 def main() -> None:
     """Rate the ground before and on blocks."""
     profiles = [profile(height) for height in HEIGHTS]
-    header = ["block", "head", "mean error", "where no heading stands", "of these at 0.5 and more"]
-    table = markdown_table(header, [row(found, name) for found in profiles for name in HEADS])
     write_json(RESULTS / "block.json", {"robot": vars(ROBOT), "profiles": profiles})
     draw(profiles, RESULTS / "block.png")
-    click.echo(table)
+    click.echo(table(profiles))
 
 
 if __name__ == "__main__":

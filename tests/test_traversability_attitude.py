@@ -18,7 +18,7 @@ ROBOT = RobotConfig(length=0.8, width=0.4, foot_reach=0.1, step_height=0.2, clea
 
 
 def of_map(heights, known=None, robot=ROBOT):
-    """Attitudes (headings, 3, H, W) over a map that has no upper bounds."""
+    """Attitudes (headings, 5, H, W) over a map that has no upper bounds."""
     z = torch.as_tensor(heights, dtype=torch.float64)[None]
     known = torch.ones_like(z) > 0 if known is None else torch.as_tensor(known)[None]
     scales = in_cells(robot, CELLS)
@@ -56,7 +56,9 @@ def slow(heights, i, j, stance, robot=ROBOT):
     tops = [around(place, radius).max() for place in stance.spine]
     highest = max(tops[0], tops[1] - ahead, tops[2] + ahead) - inclined
     belly = (highest - (a + b + c + d) / 4) / robot.clearance
-    return [squash(x) for x in (slope, step / robot.step_height, belly)]
+    ratios = slope**0.5, step / robot.step_height, max(0, belly)
+    stands = math.prod(1 / (1 + x**8) for x in ratios)
+    return [squash(slope), squash(ratios[1]), squash(belly), stands, 1]
 
 
 @given(st.integers(0, 2**31), st.sampled_from([0.02, 0.2, 1.0]))
@@ -75,21 +77,23 @@ def along(profile):
 
 
 def test_on_flat_ground_all_is_nothing():
-    assert of_map(np.full((31, 31), 7.0)) == pytest.approx(0, abs=1e-12)
+    slope_step_belly, verdict = np.split(of_map(np.full((31, 31), 7.0))[:, :, 10:21, 10:21], [3], 1)
+    assert slope_step_belly == pytest.approx(0, abs=1e-12) and verdict == pytest.approx(1)
 
 
 def test_a_plane_has_its_slope():
-    slope, step, belly = along([(-15, -0.15), (15, 0.15)])  # 1 in 10
+    slope, step, belly, stands, _ = along([(-15, -0.15), (15, 0.15)])  # 1 in 10
     assert slope == pytest.approx(squash((0.1 / math.tan(0.5)) ** 2))
     assert step == pytest.approx(squash(0.4 * 0.1 / 0.2))  # to the highest of 3 x 3 cells 0.3 m on
-    assert belly == pytest.approx(0, abs=1e-9)
+    assert belly == pytest.approx(0, abs=1e-9) and stands == pytest.approx(1, abs=1e-5)
 
 
 @pytest.mark.parametrize("height", [0.1, 0.25])
 def test_a_bar_between_the_feet_is_a_step_and_a_hole_is_none(height):
     bar, hole = (along([(-2, 0), (-1, 0), (0, sign * height), (1, 0), (2, 0)]) for sign in (1, -1))
-    assert bar[1:] == pytest.approx([squash(height / ROBOT.step_height), squash(height / ROBOT.clearance)])
-    assert hole[1:] == pytest.approx(0, abs=1e-12)
+    assert bar[1:3] == pytest.approx([squash(height / ROBOT.step_height), squash(height / ROBOT.clearance)])
+    assert bar[3] > 0.99 if height < ROBOT.step_height else bar[3] < 0.15
+    assert hole[1:3] == pytest.approx(0, abs=1e-12) and hole[3] > 0.9
 
 
 def test_each_riser_of_a_stair_counts_by_itself():

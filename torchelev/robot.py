@@ -17,7 +17,7 @@ class RobotConfig:
     foot_radius: float = 0.03  # [m]
     foot_reach: float = 0.1  # [m] by which a foot may choose another place than its nominal one
     step_height: float = 0.2  # [m] that a foot can overcome
-    clearance: float = 0.3  # [m] between the ground and the body's belly
+    clearance: float = 0.3  # [m] that the legs leave between ground and belly
     max_slope: float = 0.5  # [rad] of the body
 
     def __post_init__(self) -> None:

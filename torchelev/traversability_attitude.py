@@ -24,17 +24,19 @@ if TYPE_CHECKING:
 
 
 class Attitude(NamedTuple):
-    """How a body stands at one heading on four feet, as ratios to what the robot overcomes, squashed."""
+    """How a body stands at one heading on four feet, by ratios to what the robot overcomes; 0 unless `complete`."""
 
-    slope: Float[Tensor, "B H W"]  # squared gradient of the body
+    slope: Float[Tensor, "B H W"]  # squared gradient of the body; this, step and belly are squashed
     step: Float[Tensor, "B H W"]  # highest step between neighbouring feet
     belly: Float[Tensor, "B H W"]  # height of the highest ground under the body over the feet, by the clearance
+    stands: Float[Tensor, "B H W"]  # near 1 where none of these is above the limit, near 0 where one is
+    complete: Float[Tensor, "B H W"]  # 1 or 0: feet and body are over completed ground
 
 
 def attitudes(
     ground: Surface, extreme: Extremes, scales: Scales, robot: RobotConfig, resolution: float
 ) -> list[Attitude]:
-    """Return how the body stands at each heading; 0 where a foot or the body would leave the completed ground."""
+    """Return how the body stands at each heading; slope and step count wherever the feet are on completed ground."""
     height = widened_mean(shifted(ground.height, scales.margin - scales.foot - 1), (1,))
     return [_attitude(height, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
 
@@ -52,7 +54,15 @@ def _attitude(
     belly = (_highest(extreme.body, stance, scales, pitch, roll, resolution) - middle) * (1 / robot.clearance)
     whole = functools.reduce(torch.mul, (shifted(extreme.complete, scales.stood_on, *foot) for foot in stance.feet))
     under = functools.reduce(torch.mul, (shifted(extreme.body_complete, scales.spine, *at) for at in stance.spine))
-    return Attitude(squashed(slope) * whole, squashed(step) * whole, squashed(belly) * (whole * under))
+    complete = whole * under
+    stands = _below_one(slope, step.square(), belly.clamp(min=0).square()) * complete
+    return Attitude(squashed(slope) * whole, squashed(step) * whole, squashed(belly) * complete, stands, complete)
+
+
+def _below_one(*squares: Tensor) -> Tensor:
+    """Return the product of 1 / (1 + x^8) over ratios x, of which the squares are given."""
+    gates = (1 + square.clamp(max=100).square().square() for square in squares)  # whose product stays finite
+    return 1 / functools.reduce(torch.mul, gates)
 
 
 def _highest(

@@ -102,11 +102,14 @@ def rate(
     center = shifted(center, scales.foot) + _biased(weights.stance_bias, weights.stance_condition, sizes)
 
     mean = torch.zeros_like(center)
-    headings = stances(robot, resolution)
-    for stance, attitude in zip(headings, attitudes(ground, extreme, scales, robot, resolution), strict=True):
+    headings, standing = stances(robot, resolution), attitudes(ground, extreme, scales, robot, resolution)
+    for stance, attitude in zip(headings, standing, strict=True):
         stood_on = _sum_of_four([shifted(foot, scales.foot, *place) for place in stance.feet])
-        mean = mean + F.relu(stood_on + center + _spread(weights.attitude, attitude))
-    mixed = F.relu(_mixed(weights.mixed, mean * (1 / len(headings))) + weights.mixed_bias[:, None, None])
+        mean = mean + F.relu(stood_on + center + _spread(weights.attitude, attitude[:3]))
+    columns = zip(*(attitude[3:] for attitude in standing), strict=True)
+    verdicts = [functools.reduce(torch.add, column) * (1 / len(headings)) for column in columns]
+    mixed = _mixed(weights.mixed, mean * (1 / len(headings))) + _spread(weights.verdict, verdicts)
+    mixed = F.relu(mixed + weights.mixed_bias[:, None, None])
     traversability, confidence = (_mixed(weights.answer, mixed) + weights.answer_bias[:, None, None]).unbind(1)
     return traversability, confidence
 

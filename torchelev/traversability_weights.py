@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchelev.errors import message, require
 from torchelev.robot import RobotConfig
-from torchelev.traversability_attitude import Attitude
 from torchelev.traversability_features import NUM_FEATURES
 
 if TYPE_CHECKING:
@@ -33,10 +32,11 @@ class Weights(NamedTuple):
     cell_condition: Float[Tensor, "C N"]  # of the robot's ratios
     foot: Float[Tensor, "S D"]  # of a cell with a foot on it
     center: Float[Tensor, "S D"]  # of the cell under the body's centre
-    attitude: Float[Tensor, "S A"]
+    attitude: Float[Tensor, "S 3"]  # of its slope, step and belly
     stance_bias: Float[Tensor, "S"]
     stance_condition: Float[Tensor, "S N"]
     mixed: Float[Tensor, "C S"]  # of the mean over headings
+    verdict: Float[Tensor, "C 2"]  # of the shares of headings at which the body stands, and is over completed ground
     mixed_bias: Float[Tensor, "C"]
     answer: Float[Tensor, "2 C"]
     answer_bias: Float[Tensor, "2"]
@@ -56,10 +56,11 @@ def weight_shapes(cell_channels: int, stance_channels: int) -> dict[str, tuple[i
         cell_condition=(C, N),
         foot=(S, D),
         center=(S, D),
-        attitude=(S, len(Attitude._fields)),
+        attitude=(S, 3),
         stance_bias=(S,),
         stance_condition=(S, N),
         mixed=(C, S),
+        verdict=(C, 2),
         mixed_bias=(C,),
         answer=(2, C),
         answer_bias=(2,),
