@@ -227,9 +227,10 @@ def test_stances_by_hand():
     along, turned, across, _ = stances(robot, 0.1)
     assert along.feet == ((4, 2), (4, -2), (-4, 2), (-4, -2)) and (along.length, along.width) == (8, 4)
     assert along.spine == ((0, 0), (2, 0), (-2, 0))  # squares of 0.4 m: the body ends 0.4 m from its middle
-    # 4 and 8 cells apart, in steps of 3 or less.
-    assert along.ways[0] == ((0, 1), ((4, 0),)) and along.ways[1] == ((2, 3), ((-4, 0),))
-    assert along.ways[2] == ((0, 2), ((1, 2), (-1, 2))) and along.ways[3] == ((1, 3), ((1, -2), (-1, -2)))
+    ends, places, spacing = along.ways[0]  # 4 and 8 cells, in steps of 3 or less
+    assert ends == ((4, 2), (4, -2)) and places == ((4, 0),) and spacing == 2
+    assert along.ways[1].places == ((-4, 0),) and along.ways[2].places == ((1, 2), (-1, 2))
+    assert along.ways[3].places == ((1, -2), (-1, -2)) and along.ways[3].spacing == 3
     assert turned.feet == ((-2, 4), (2, 4), (-2, -4), (2, -4))
     # Half the diagonals of length + width and length - width: 0.424 m and 0.141 m.
     assert across.feet == ((1, 4), (4, 1), (-4, -1), (-1, -4))
@@ -240,9 +241,9 @@ def test_stances_by_hand():
 @pytest.mark.parametrize("robot", [ROBOT, SMALL, RobotConfig(length=0.4, width=0.16)])
 def test_the_windows_between_feet_leave_no_cell_out(robot, resolution):
     for stance in stances(robot, resolution):
-        for (start, end), places in stance.ways:
-            way = [stance.feet[start], *places, stance.feet[end]]
-            for p, q in itertools.pairwise(way):
+        assert {foot for way in stance.ways for foot in way.ends} == set(stance.feet)
+        for way in stance.ways:
+            for p, q in itertools.pairwise((way.ends[0], *way.places, way.ends[1])):
                 assert max(abs(p[0] - q[0]), abs(p[1] - q[1])) <= 3
 
 

@@ -15,12 +15,17 @@ import torch
 from torch import Tensor
 
 from torchelev.robot import RobotConfig
-from torchelev.traversability_features import Extremes, Surface, squashed, widened_mean
+from torchelev.storage import realize
+from torchelev.traversability_features import LARGE, Extremes, Surface, squashed, widened_mean
 from torchelev.traversability_stances import Scales, Stance, stances
 from torchelev.windows import shifted
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+
+
+LEVEL = 1e-6  # [m per cell] of ground that counts as level
+DIAGONAL = math.sqrt(2)  # of a cell
 
 
 class Attitude(NamedTuple):
@@ -33,30 +38,40 @@ class Attitude(NamedTuple):
     complete: Float[Tensor, "B H W"]  # 1 or 0: feet and body are over completed ground
 
 
+class Footing(NamedTuple):
+    """Where feet may stand, and what lies between them. Feet: (B, H + 2 foot, W + 2 foot)."""
+
+    height: Tensor  # [m] of feet
+    steepness: Tensor  # [m per cell] of the ground under feet
+    highest: Tensor  # [m] highest of 3 x 3 cells; far below all ground where it is not completed
+
+
 def attitudes(
     ground: Surface, extreme: Extremes, scales: Scales, robot: RobotConfig, resolution: float
 ) -> list[Attitude]:
     """Return how the body stands at each heading; slope and step count wherever the feet are on completed ground."""
-    height = widened_mean(shifted(ground.height, scales.margin - scales.foot - 1), (1,))
-    return [_attitude(height, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
+    height = shifted(ground.height, scales.margin - scales.foot - 1)
+    steepness = realize(_steepness(height).clamp(max=math.tan(robot.max_slope) * resolution))
+    highest = realize(extreme.near[0] - LARGE * (1 - extreme.complete))
+    footing = Footing(widened_mean(height, (1,)), steepness, highest)
+    return [_attitude(footing, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
 
 
 def _attitude(
-    height: Tensor, extreme: Extremes, stance: Stance, scales: Scales, robot: RobotConfig, resolution: float
+    footing: Footing, extreme: Extremes, stance: Stance, scales: Scales, robot: RobotConfig, resolution: float
 ) -> Attitude:
-    feet = [shifted(height, scales.foot, *foot) for foot in stance.feet]
-    a, b, c, d = feet
+    a, b, c, d = (shifted(footing.height, scales.foot, *foot) for foot in stance.feet)
     pitch = (a + b - (c + d)) * (0.5 / (stance.length * resolution))
     roll = (a + c - (b + d)) * (0.5 / (stance.width * resolution))
-    slope = (pitch.square() + roll.square()) * (1 / math.tan(robot.max_slope) ** 2)
-    step = _highest_step(feet, extreme.near[0], stance, scales) * (1 / robot.step_height)
+    inclination = (pitch.square() + roll.square()) * (1 / math.tan(robot.max_slope) ** 2)
+    step = _highest_step(footing, stance, scales) * (1 / robot.step_height)
     middle = (a + d + (b + c)) * 0.25
     belly = (_highest(extreme.body, stance, scales, pitch, roll, resolution) - middle) * (1 / robot.clearance)
     whole = functools.reduce(torch.mul, (shifted(extreme.complete, scales.stood_on, *foot) for foot in stance.feet))
     under = functools.reduce(torch.mul, (shifted(extreme.body_complete, scales.spine, *at) for at in stance.spine))
     complete = whole * under
-    stands = _below_one(slope, step.square(), belly.clamp(min=0).square()) * complete
-    return Attitude(squashed(slope) * whole, squashed(step) * whole, squashed(belly) * complete, stands, complete)
+    stands = _below_one(inclination, step.square(), belly.clamp(min=0).square()) * complete
+    return Attitude(squashed(inclination) * whole, squashed(step) * whole, squashed(belly) * complete, stands, complete)
 
 
 def _below_one(*squares: Tensor) -> Tensor:
@@ -65,26 +80,51 @@ def _below_one(*squares: Tensor) -> Tensor:
     return 1 / functools.reduce(torch.mul, gates)
 
 
+def _steepness(height: Tensor) -> Tensor:
+    """Return the slope [m per cell] around each cell, which edges beside it are none of.
+
+    Along each axis, of rows of three cells, the gentler one of the slopes to both sides, if both rise or both fall.
+    """
+    size = height.shape[-2] - 2, height.shape[-1] - 2
+    along_x = [height.narrow(-1, k, size[1]) for k in range(3)]
+    along_y = [height.narrow(-2, k, size[0]) for k in range(3)]
+    gx, gy = _gentler(along_x, -2, size[0]), _gentler(along_y, -1, size[1])
+    return (gx + gy).clamp(min=LEVEL**2).sqrt()
+
+
+def _gentler(rows: list[Tensor], dim: int, size: int) -> Tensor:
+    """Return the square of the gentler slope along a dimension of the mean of three rows."""
+    mean = (rows[0] + rows[2] + rows[1]) * (1 / 3)
+    before, middle, after = (mean.narrow(dim, k, size) for k in range(3))
+    first, second = middle - before, after - middle
+    rising, falling = torch.minimum(first, second).clamp(min=0), torch.maximum(first, second).clamp(max=0)
+    return rising.square() + falling.square()
+
+
 def _highest(
     body: Tensor, stance: Stance, scales: Scales, pitch: Tensor, roll: Tensor, resolution: float
 ) -> Float[Tensor, "B H W"]:
     """Return the highest ground [m] under the body, less what its inclination explains within each square."""
     middle, front, hind = (shifted(body, scales.spine, *at) for at in stance.spine)
     rise = pitch * (math.hypot(*stance.spine[1]) * resolution)
-    inclined = (pitch.abs() + roll.abs()) * (scales.body * resolution)
+    steepest = torch.maximum(pitch.abs(), roll.abs()) * DIAGONAL if stance.diagonal else pitch.abs() + roll.abs()
+    inclined = steepest * (scales.body * resolution)  # to the corner of a square that does not turn with the body
     return torch.maximum(torch.maximum(front - rise, hind + rise), middle) - inclined
 
 
-def _highest_step(feet: Sequence[Tensor], highest: Tensor, stance: Stance, scales: Scales) -> Float[Tensor, "B H W"]:
-    """Return the highest step [m] on the ways between neighbouring feet, from either to the other.
+def _highest_step(footing: Footing, stance: Stance, scales: Scales) -> Float[Tensor, "B H W"]:
+    """Return the highest step [m] on the ways between neighbouring feet, less what the slope under both explains.
 
     Holes are stepped over, and each riser of a stair counts by itself.
     """
     steps = []
-    for (start, end), places in stance.ways:
-        heights = [feet[start], *(shifted(highest, scales.stood_on, *place) for place in places), feet[end]]
-        steps += [_rise(heights), _rise(heights[::-1])]
-    return functools.reduce(torch.maximum, steps)
+    for way in stance.ways:
+        start, end = (shifted(footing.height, scales.foot, *foot) for foot in way.ends)
+        between = [shifted(footing.highest, scales.stood_on, *place) for place in way.places]
+        rise = torch.maximum(_rise([start, *between, end]), _rise([end, *between[::-1], start]))
+        explained = torch.minimum(*(shifted(footing.steepness, scales.foot, *foot) for foot in way.ends))
+        steps.append(rise - explained * (way.spacing + DIAGONAL))  # the highest of 3 x 3 cells lies so much farther on
+    return functools.reduce(torch.maximum, steps).clamp(min=0)
 
 
 def _rise(heights: Sequence[Tensor]) -> Tensor:

@@ -108,7 +108,7 @@ def rate(
         mean = mean + F.relu(stood_on + center + _spread(weights.attitude, attitude[:3]))
     columns = zip(*(attitude[3:] for attitude in standing), strict=True)
     verdicts = [functools.reduce(torch.add, column) * (1 / len(headings)) for column in columns]
-    mixed = _mixed(weights.mixed, mean * (1 / len(headings))) + _spread(weights.verdict, verdicts)
+    mixed = _mixed(weights.mixed[:, :-2], mean * (1 / len(headings))) + _spread(weights.mixed[:, -2:], verdicts)
     mixed = F.relu(mixed + weights.mixed_bias[:, None, None])
     traversability, confidence = (_mixed(weights.answer, mixed) + weights.answer_bias[:, None, None]).unbind(1)
     return traversability, confidence

@@ -12,6 +12,14 @@ from torchelev.robot import RobotConfig
 Cells = tuple[int, int]  # along x and y, from the cell under the body's centre
 
 
+class Way(NamedTuple):
+    """From foot to foot, in cells: 3 x 3 cells around each place and the feet leave none out."""
+
+    ends: tuple[Cells, Cells]
+    places: tuple[Cells, ...]  # between the ends, evenly
+    spacing: float  # at most
+
+
 class Stance(NamedTuple):
     """A heading of the body over a cell, in cells."""
 
@@ -21,9 +29,15 @@ class Stance(NamedTuple):
     width: float
 
     @property
-    def ways(self) -> tuple[tuple[Cells, tuple[Cells, ...]], ...]:
-        """The pairs of neighbouring feet by number, and places between them, 3 cells or less apart."""
-        return tuple((pair, _between(*(self.feet[n] for n in pair))) for pair in ((0, 1), (2, 3), (0, 2), (1, 3)))
+    def diagonal(self) -> bool:
+        """Whether the heading lies between the axes."""
+        (i, j), (k, m) = self.feet[:2]
+        return i != k and j != m
+
+    @property
+    def ways(self) -> list[Way]:
+        """The ways between neighbouring feet."""
+        return [_way(self.feet[m], self.feet[n]) for m, n in ((0, 1), (2, 3), (0, 2), (1, 3))]
 
     def turned(self) -> Stance:
         """Return the stance a quarter turn on."""
@@ -31,12 +45,13 @@ class Stance(NamedTuple):
         return Stance(feet, spine, self.length, self.width)
 
 
-def _between(a: Cells, b: Cells) -> tuple[Cells, ...]:
-    """Return the cells nearest to even places between two."""
+def _way(a: Cells, b: Cells) -> Way:
+    """Return the way between two cells, with places 3 cells or less apart along x and y."""
     parts = math.ceil(max(abs(b[0] - a[0]), abs(b[1] - a[1])) / 3)
-    shares = [Fraction(k, parts) for k in range(1, parts)]  # exact, so that neither end of a line comes first
+    shares = [Fraction(k, parts) for k in range(1, parts)]  # exact, so that neither end comes first
     # Python rounds halves to even numbers, so that opposite places stay opposite.
-    return tuple((round(a[0] + k * (b[0] - a[0])), round(a[1] + k * (b[1] - a[1]))) for k in shares)
+    places = tuple((round(a[0] + k * (b[0] - a[0])), round(a[1] + k * (b[1] - a[1]))) for k in shares)
+    return Way((a, b), places, max(math.dist(p, q) for p, q in itertools.pairwise((a, *places, b))))
 
 
 def stances(robot: RobotConfig, resolution: float) -> list[Stance]:

@@ -35,8 +35,7 @@ class Weights(NamedTuple):
     attitude: Float[Tensor, "S 3"]  # of its slope, step and belly
     stance_bias: Float[Tensor, "S"]
     stance_condition: Float[Tensor, "S N"]
-    mixed: Float[Tensor, "C S"]  # of the mean over headings
-    verdict: Float[Tensor, "C 2"]  # of the shares of headings at which the body stands, and is over completed ground
+    mixed: Float[Tensor, "C S+2"]  # of the mean over headings, of it also how it stands and whether all is complete
     mixed_bias: Float[Tensor, "C"]
     answer: Float[Tensor, "2 C"]
     answer_bias: Float[Tensor, "2"]
@@ -59,8 +58,7 @@ def weight_shapes(cell_channels: int, stance_channels: int) -> dict[str, tuple[i
         attitude=(S, 3),
         stance_bias=(S,),
         stance_condition=(S, N),
-        mixed=(C, S),
-        verdict=(C, 2),
+        mixed=(C, S + 2),
         mixed_bias=(C,),
         answer=(2, C),
         answer_bias=(2,),
