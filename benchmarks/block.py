@@ -53,7 +53,7 @@ def block(height: float) -> Float[Tensor, "H W"]:
     return torch.where(inside[:, None] & inside, height, 0.0)
 
 
-def rated(heights: Float[Tensor, "H W"], head: Any) -> ElevationMap:
+def mapped(heights: Float[Tensor, "H W"], head: Any) -> ElevationMap:
     """Map the ground from above."""
     generator = torch.Generator().manual_seed(0)
     axis = (torch.arange(len(heights)) - len(heights) // 2) * SPACING
@@ -69,7 +69,7 @@ def profile(height: float) -> dict[str, Any]:
     """Return the label and each head's rating of the cells of the line."""
     heights = block(height)
     middle = GRID.width // 2
-    maps = {name: rated(heights, head) for name, head in HEADS.items()}
+    maps = {name: mapped(heights, head) for name, head in HEADS.items()}
     centers = maps["learned"].cell_centers()[0, :, middle].float()
     line = (centers[:, 0] >= -SIDE / 2 - FAR) & (centers[:, 0] <= 0)
     stands = stand(HeightField(heights[None], SPACING), torch.tensor([0]), centers[line][None], [ROBOT], HEADINGS)

@@ -150,7 +150,7 @@ def test_the_switch_of_ipp_is_put_back(uses, monkeypatch):
 def test_without_opencv(monkeypatch):
     layer = random_layer(2)
     want, _ = signed_distance(layer, resolution=0.1)
-    monkeypatch.setitem(__import__("sys").modules, "cv2", None)
+    monkeypatch.setattr(distance.opencv, "_installed", lambda: False)
     called = []
     tensors = distance._squared_distance_tensors
     monkeypatch.setattr(distance, "_squared_distance_tensors", lambda *a: called.append(1) or tensors(*a))

@@ -19,6 +19,7 @@ from filter_cases import (
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchelev import filters
 from torchelev.filters.holes import compressed, join, lowest_of_border, nearest_known
 from torchelev.filters.inpainting import (
     fill_from,
@@ -464,3 +465,11 @@ def test_gradient_of_diffusion_grows_with_what_comes_in():
     (many,) = torch.autograd.grad(1000 * filled.sum(), values)
     torch.testing.assert_close(many, 1000 * one, atol=1e-4, rtol=0)
     assert one.sum() == pytest.approx(60, abs=1e-6)  # all cells rise with all known ones
+
+
+@pytest.mark.parametrize("shape", [(2, 0, 5), (2, 5, 0)])
+@pytest.mark.parametrize("name", ["inpaint_telea", "inpaint_navier_stokes", "inpaint_minimum"])
+def test_maps_without_cells_come_back(name, shape):
+    layer = torch.zeros(shape), torch.zeros(shape, dtype=torch.bool)
+    values, known = filters.Filter(name)(layer, resolution=0.1)
+    assert values.shape == known.shape == shape

@@ -140,8 +140,9 @@ def test_serves_plain_float32_on_a_cpu_without_gradient():
 def test_serves_no_tensors_of_functorch():
     values, known = random_layer(3, (2, 7, 6), 0.8, torch.float32)
     values = values.nan_to_num()
-    smooth = torch.func.vmap(lambda v, k: filters.gaussian((v[None], k[None]), resolution=0.1)[0][0])(values, known)
-    torch.testing.assert_close(smooth, filters.gaussian((values, known), resolution=0.1)[0])
+    for function in (filters.gaussian, filters.signed_distance):
+        each = torch.func.vmap(lambda v, k, f=function: f((v[None], k[None]), resolution=0.1)[0][0])(values, known)
+        torch.testing.assert_close(each, function((values, known), resolution=0.1)[0])
 
 
 def test_an_opencv_that_does_not_load_counts_as_none(monkeypatch):

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchelev.robot import RobotConfig
 from torchelev.storage import realize
 from torchelev.traversability_features import LARGE, Extremes, Surface, squashed, widened_mean
-from torchelev.traversability_stances import Scales, Stance, stances
+from torchelev.traversability_stances import Scales, Stance
 from torchelev.windows import shifted
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def attitudes(
     steepness = realize(_steepness(height).clamp(max=math.tan(robot.max_slope) * resolution))
     highest = realize(extreme.near[0] - LARGE * (1 - extreme.complete))
     footing = Footing(widened_mean(height, (1,)), steepness, highest)
-    return [_attitude(footing, extreme, stance, scales, robot, resolution) for stance in stances(robot, resolution)]
+    return [_attitude(footing, extreme, stance, scales, robot, resolution) for stance in scales.stances]
 
 
 def _attitude(

@@ -16,7 +16,7 @@ from torchelev.robot import RobotConfig
 from torchelev.storage import realize_all
 from torchelev.traversability_attitude import attitudes
 from torchelev.traversability_features import complete, extremes, features, widened_maximum
-from torchelev.traversability_stances import Scales, in_cells, stances
+from torchelev.traversability_stances import Scales, in_cells
 from torchelev.traversability_weights import (
     RANGES,
     Weights,
@@ -102,13 +102,13 @@ def rate(
     center = shifted(center, scales.foot) + _biased(weights.stance_bias, weights.stance_condition, sizes)
 
     mean = torch.zeros_like(center)
-    headings, standing = stances(robot, resolution), attitudes(ground, extreme, scales, robot, resolution)
-    for stance, attitude in zip(headings, standing, strict=True):
+    standing, share = attitudes(ground, extreme, scales, robot, resolution), 1 / len(scales.stances)
+    for stance, attitude in zip(scales.stances, standing, strict=True):
         stood_on = _sum_of_four([shifted(foot, scales.foot, *place) for place in stance.feet])
         mean = mean + F.relu(stood_on + center + _spread(weights.attitude, attitude[:3]))
     columns = zip(*(attitude[3:] for attitude in standing), strict=True)
-    verdicts = [functools.reduce(torch.add, column) * (1 / len(headings)) for column in columns]
-    mixed = _mixed(weights.mixed[:, :-2], mean * (1 / len(headings))) + _spread(weights.mixed[:, -2:], verdicts)
+    verdicts = [functools.reduce(torch.add, column) * share for column in columns]
+    mixed = _mixed(weights.mixed[:, :-2], mean * share) + _spread(weights.mixed[:, -2:], verdicts)
     mixed = F.relu(mixed + weights.mixed_bias[:, None, None])
     traversability, confidence = (_mixed(weights.answer, mixed) + weights.answer_bias[:, None, None]).unbind(1)
     return traversability, confidence

@@ -54,7 +54,7 @@ def _way(a: Cells, b: Cells) -> Way:
     return Way((a, b), places, max(math.dist(p, q) for p, q in itertools.pairwise((a, *places, b))))
 
 
-def stances(robot: RobotConfig, resolution: float) -> list[Stance]:
+def stances(robot: RobotConfig, resolution: float) -> tuple[Stance, ...]:
     """Return the stances at headings of 0, 90, 45 and 135 degrees, which turns and mirrors of the map interchange.
 
     No two feet share a cell, however coarse.
@@ -67,15 +67,24 @@ def stances(robot: RobotConfig, resolution: float) -> list[Stance]:
     b = min(a - 1, round((length - width) * diagonal))
     feet = ((b, a), (a, b), (-a, -b), (-b, -a))
     across = Stance(feet, ((0, 0), (s, s), (-s, -s)), (a + b) / diagonal, (a - b) / diagonal)
-    return [along, along.turned(), across, across.turned()]
+    return along, along.turned(), across, across.turned()
 
 
 class Scales(NamedTuple):
     """Windows, how they grow, and how far they are needed, in cells."""
 
     steps: tuple[tuple[int, ...], ...]  # of each window over the one before
-    foot: int  # farthest foot from the body's centre, along x or y
-    spine: int  # farthest square under the body
+    stances: tuple[Stance, ...]
+
+    @property
+    def foot(self) -> int:
+        """Farthest foot from the body's centre, along x or y."""
+        return max(abs(n) for stance in self.stances for place in stance.feet for n in place)
+
+    @property
+    def spine(self) -> int:
+        """Farthest square under the body."""
+        return max(abs(n) for stance in self.stances for place in stance.spine for n in place)
 
     @property
     def radii(self) -> tuple[int, ...]:
@@ -117,10 +126,7 @@ def in_cells(robot: RobotConfig, resolution: float) -> Scales:
     for length in (resolution, robot.foot_reach, robot.width / 2, robot.length / 2):
         steps.append(_steps(radius, round(length / resolution)))
         radius += sum(steps[-1])
-    around = stances(robot, resolution)
-    foot = max(abs(n) for stance in around for place in stance.feet for n in place)
-    spine = max(abs(n) for stance in around for place in stance.spine for n in place)
-    return Scales(tuple(steps), foot, spine)
+    return Scales(tuple(steps), stances(robot, resolution))
 
 
 def _steps(radius: int, wanted: int) -> tuple[int, ...]:

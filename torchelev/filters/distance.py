@@ -105,11 +105,8 @@ def squared_distance(seeds: Bool[Tensor, "B H W"], reach: int) -> Float[Tensor, 
 
     Whole numbers; beyond `reach` [cells], and without seeds, more than reach^2.
     """
-    if seeds.device.type == "cpu":
-        try:
-            return _squared_distance_opencv(seeds, reach)
-        except ImportError:  # OpenCV is an optional dependency
-            pass
+    if opencv.reads(seeds):
+        return _squared_distance_opencv(seeds, reach)
     return _squared_distance_tensors(seeds, reach)
 
 

@@ -6,6 +6,7 @@ ring by ring, the mean of the known neighbours, and only as far as a scan's poin
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -138,11 +139,13 @@ def _inpainted(layer: Layer, radius: int, method: int) -> Layer:
     metres both would show.
     """
     values, known = layer
+    if values.numel() == 0:
+        return layer
     weight = as_bytes(known).to(values.dtype)
     datum = mean_of_known(values, weight)
     heights = ((values.detach() - datum) * UNITS * weight).float().cpu()
     images = _two_lines(heights).numpy(), _two_lines((~known).byte().cpu()).numpy()
-    filled = _of_each(lambda image, holes: _filled(image, holes, radius, method), *images)
+    filled = _of_each(functools.partial(_filled, radius=radius, method=method), *images)
     found = known.any(2, keepdim=True).any(1, keepdim=True)
     H, W = known.shape[1:]
     filling = torch.stack([torch.from_numpy(image) for image in filled])[:, :H, :W].to(values) / UNITS + datum

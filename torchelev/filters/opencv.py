@@ -28,12 +28,16 @@ def _installed() -> bool:
     return True
 
 
-def serves(values: Tensor) -> bool:
-    """Tell whether OpenCV can filter these values: some, float32, on the CPU, that no gradient is wanted of."""
+def reads(values: Tensor) -> bool:
+    """Tell whether OpenCV is there and can read these values: plain ones on the CPU, outside compiled code."""
     plain = type(values) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(values)
+    return plain and values.is_cpu and not torch.compiler.is_compiling() and _installed()
+
+
+def serves(values: Tensor) -> bool:
+    """Tell whether OpenCV can filter these values: some, float32, that no gradient is wanted of, and that it reads."""
     learns = values.requires_grad and torch.is_grad_enabled()
-    float32 = values.is_cpu and values.dtype == torch.float32 and values.numel() > 0
-    return plain and float32 and not learns and not torch.compiler.is_compiling() and _installed()
+    return values.dtype == torch.float32 and values.numel() > 0 and not learns and reads(values)
 
 
 def masked(values: Tensor, known: Tensor) -> Layer:

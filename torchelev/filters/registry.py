@@ -10,12 +10,12 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from torchelev.errors import require, require_positive
+from torchelev.errors import message, require, require_positive
 from torchelev.filters import opencv
 from torchelev.layers import Layer
 from torchelev.storage import as_bytes, keep_freed_memory
@@ -80,7 +80,7 @@ def check_layers(name: str, layers: tuple[Layer, ...], shape: tuple[int, ...] | 
     shapes = [values.shape for values, _ in layers] + ([] if shape is None else [shape])
     if len(set(shapes)) != 1:
         came = [tuple(shape) for shape in shapes]
-        require(False, name, "expected one or more layers of one shape", came, "read them from a map")
+        raise ValueError(message(name, "expected one or more layers of one shape", came, "read them from a map"))
 
 
 def _fits(values: Tensor, known: Tensor) -> bool:
@@ -88,14 +88,14 @@ def _fits(values: Tensor, known: Tensor) -> bool:
     return shaped and values.is_floating_point() and known.dtype == torch.bool
 
 
-def _refuse(argument: str, layer: Layer, pair: bool) -> None:
+def _refuse(argument: str, layer: Layer, pair: bool) -> NoReturn:
     mend = "make one of values with NaN by filters.as_layer"
     require(pair, argument, "must be a layer (values, known)", type(layer).__name__, mend, TypeError)
     values, known = layer
     came = f"{tuple(values.shape)} {values.dtype} and {tuple(known.shape)} {known.dtype}"
     rule = "expected values (B, H, W) of floats and known (B, H, W)"
     require(known.dtype == torch.bool, argument, "known must be bool", known.dtype, "see as_layer")
-    require(False, argument, rule, came, "see as_layer")
+    raise ValueError(message(argument, rule, came, "see as_layer"))
 
 
 def masked(layer: Layer) -> Layer:

@@ -30,6 +30,7 @@ VERSION = 1  # of maps and labels; raise it where their making changes, so that 
 RATED_REACH = 0.3  # [m] around known cells in which unknown ones are rated
 RESOLUTIONS = (0.02, 0.1)  # [m]
 SPLITS = {"train": 0, "held_out": 1, "unseen": 2, "train_exact": 3, "held_out_exact": 4}
+EXACT_SPLITS = ("train_exact", "held_out_exact")  # of maps that know the truth
 
 
 class MappedTerrain(NamedTuple):
@@ -147,7 +148,7 @@ def data_set(
     for index in tqdm(range(count), desc=f"data {name}", unit="batch"):
         path = folder / f"{name}-{index:04d}.pt"
         if not path.exists():
-            batch = make_batch(batch_seed(split, seed, index), cfg, kinds, resolution, split.endswith("exact"))
+            batch = make_batch(batch_seed(split, seed, index), cfg, kinds, resolution, split in EXACT_SPLITS)
             save_atomically({"settings": settings, **batch._asdict(), "robot": dataclasses.asdict(batch.robot)}, path)
         batches.append(_load(path, settings))
     return batches
