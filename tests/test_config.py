@@ -111,3 +111,18 @@ def test_differing_fields(gain, body):
         b, names = dataclasses.replace(b, sensor=SensorConfig(body=BodyConfig())), [*names, "sensor.body"]
     assert differing_fields(a.to_dict(), b.to_dict()) == names
     assert differing_fields(a.to_dict(), a.to_dict()) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"drift_gate": 0.5}, "traversability.drift_gate: is not a setting.*there are radius"),
+        (
+            {"robot": {"length": 0.7}, "criticalstep": 3},
+            "traversability.criticalstep: is not a setting.*robot, weights",
+        ),
+    ],
+)
+def test_of_two_kinds_of_head_the_settings_tell_which_is_meant(values, words):
+    with pytest.raises(ValueError, match=words):
+        ElevationMapConfig.from_dict({"traversability": values})

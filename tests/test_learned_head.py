@@ -102,6 +102,11 @@ def test_gradients_reach_weights_and_elevation(cfg):
     assert not emap.state.traversability.requires_grad
 
 
+def test_weights_may_be_named_by_a_path_or_its_text():
+    named = LearnedTraversabilityConfig(weights=Path("some") / "weights.pt")
+    assert named == LearnedTraversabilityConfig(weights=str(Path("some/weights.pt")))
+
+
 def test_config_round_trip_and_what_is_refused(cfg, tmp_path):
     assert ElevationMapConfig.from_dict(cfg.to_dict()) == cfg
     analytic = ElevationMapConfig.from_dict({"traversability": {"radius": 0.2}})

@@ -142,6 +142,16 @@ def test_answers_and_gradients_are_finite(seed, shape, share):
         assert torch.isfinite(leaf.grad).all() and (leaf.grad[~counts] == 0).all()
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_what_is_not_finite_counts_as_unknown(value):
+    net, (elevation, known, *rest) = random_net(), random_maps(0)
+    known[0, 6, 5] = False
+    expected = logits(net, (elevation, known, *rest))
+    elevation, known = elevation.clone(), known.clone()
+    elevation[0, 6, 5], known[0, 6, 5] = value, True
+    assert torch.equal(logits(net, (elevation, known, *rest)), expected)
+
+
 def test_gradients_on_flat_ground_are_finite():
     flat = torch.zeros(1, 12, 12, requires_grad=True)
     rating = random_net(0, torch.float32)(flat, torch.ones(1, 12, 12) > 0, resolution=CELLS, robot=ROBOT)

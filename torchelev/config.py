@@ -72,10 +72,16 @@ class ElevationMapConfig:
         return dataclasses.replace(_build(cls, stages, "config"), filters=filters_from_list(values["filters"]))
 
 
+def _settings(cls: type) -> dict[str, Any]:
+    """Return the types of a config's settings."""
+    hints = typing.get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
 def _build(cls: type, values: object, where: str) -> Any:
     require(isinstance(values, dict), where, "must be a mapping", type(values).__name__, "see ElevationMapConfig")
     assert isinstance(values, dict)
-    hints = typing.get_type_hints(cls)
+    hints = _settings(cls)
     for name in values:
         require(name in hints, f"{where}.{name}", "is not a setting", repr(name), f"there are {', '.join(hints)}")
     return cls(**{name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()})
@@ -90,8 +96,8 @@ def _value(hint: Any, value: object, where: str) -> Any:
     kind = kinds[0]
     if dataclasses.is_dataclass(kind):
         names = set(value) if isinstance(value, dict) else set()
-        fits = (k for k in kinds if names <= set(typing.get_type_hints(k)))  # of several, by their settings' names
-        return _build(typing.cast(type, next(fits, kind)), value, where)
+        kind = max(kinds, key=lambda k: len(names & set(_settings(k))))  # of several, by their settings' names
+        return _build(typing.cast(type, kind), value, where)
     if isinstance(value, list):
         return tuple(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)

@@ -307,8 +307,9 @@ class ElevationMap(nn.Module):
     def rate(self, *, state: MapState | None = None) -> Rating:
         """Return traversability and confidence of every cell, (B, H, W) each, 0 to 1.
 
-        The learned head rates unknown cells too, with a low confidence: the probability that "traversability is at
-        least one half" is right. The analytic head gives 0 to unknown cells, and confidence 1 to known ones.
+        The learned head rates unknown cells too. Its confidence is the probability that "traversability is at least one
+        half" is right, of ground such as it was trained on: far from all that is known both are that ground's average.
+        `layer("validity")` tells what is known. The analytic head gives 0 to unknown cells, confidence 1 to known ones.
         Differentiable in the state and in the weights of `head`. Raises ValueError if traversability is switched off.
         """
         state, cfg = self.state if state is None else state, self.cfg.traversability

@@ -6,6 +6,7 @@ Two heads share one place in the map: an analytic one, and one that was trained 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -48,7 +49,7 @@ class LearnedTraversabilityConfig:
     """The trained head: the robot that it rates the ground for, and a file of weights if not those of torchelev."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
-    weights: str | None = None  # path of what `TraversabilityNet.save` wrote
+    weights: str | Path | None = None  # of what `TraversabilityNet.save` wrote
 
     drift_gate: ClassVar[float] = 0.2  # as of the analytic head
 
@@ -56,8 +57,10 @@ class LearnedTraversabilityConfig:
         mend = "build a RobotConfig"
         fits = isinstance(self.robot, RobotConfig)
         require(fits, "traversability.robot", "must be a RobotConfig", repr(self.robot), mend, TypeError)
-        path = self.weights is None or isinstance(self.weights, str)
+        path = self.weights is None or isinstance(self.weights, str | Path)
         require(path, "traversability.weights", "must be a path or None", repr(self.weights), "give a str", TypeError)
+        if isinstance(self.weights, Path):
+            object.__setattr__(self, "weights", str(self.weights))  # as files of settings hold it
 
 
 def make_head(

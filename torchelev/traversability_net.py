@@ -181,6 +181,7 @@ class TraversabilityNet(nn.Module):
             upper_bound, bounded = nothing, torch.zeros_like(validity)
         layers = (elevation, validity, variance, upper_bound, bounded)
         _check_layers(layers, self.weights.cell)
+        layers = elevation, validity & elevation.isfinite(), variance, upper_bound, bounded
         return rate(self.weights, *layers, resolution=resolution, robot=robot)
 
     def forward(
@@ -197,7 +198,7 @@ class TraversabilityNet(nn.Module):
         """Rate every cell of B maps for one robot.
 
         Args:
-            elevation: heights [m]; anything where not valid.
+            elevation: heights [m]; anything where not valid; what is not finite counts as unknown.
             validity: where the elevation is known.
             variance: of the elevation [m^2]; None: the heights are exact.
             upper_bound: of the ground [m] where it is not known; anything where not bounded.
