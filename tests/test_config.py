@@ -119,7 +119,7 @@ def test_differing_fields(gain, body):
         ({"drift_gate": 0.5}, "traversability.drift_gate: is not a setting.*there are radius"),
         (
             {"robot": {"length": 0.7}, "criticalstep": 3},
-            "traversability.criticalstep: is not a setting.*robot, weights",
+            "criticalstep: is not a setting.*robot, weights",
         ),
     ],
 )
