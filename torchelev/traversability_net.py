@@ -105,8 +105,9 @@ def rate(
     standing, share = attitudes(ground, extreme, scales, robot, resolution), 1 / len(scales.stances)
     for stance, attitude in zip(scales.stances, standing, strict=True):
         stood_on = _sum_of_four([shifted(foot, scales.foot, *place) for place in stance.feet])
-        mean = mean + F.relu(stood_on + center + _spread(weights.attitude, attitude[:3]))
-    columns = zip(*(attitude[3:] for attitude in standing), strict=True)
+        tilted = _spread(weights.attitude, (attitude.slope, attitude.step, attitude.belly))
+        mean = mean + F.relu(stood_on + center + tilted)
+    columns = zip(*((attitude.stands, attitude.complete) for attitude in standing), strict=True)
     verdicts = [functools.reduce(torch.add, column) * share for column in columns]
     mixed = _mixed(weights.mixed[:, :-2], mean * share) + _spread(weights.mixed[:, -2:], verdicts)
     mixed = F.relu(mixed + weights.mixed_bias[:, None, None])
