@@ -57,10 +57,10 @@ def mapped(heights: Float[Tensor, "H W"], head: Any) -> ElevationMap:
     """Map the ground from above."""
     generator = torch.Generator().manual_seed(0)
     axis = (torch.arange(len(heights)) - len(heights) // 2) * SPACING
+    x, y = torch.meshgrid(axis, axis, indexing="ij")
     emap = ElevationMap(ElevationMapConfig(grid=GRID, traversability=head))
     for _ in range(SCANS):
         z = heights + NOISE * torch.randn(heights.shape, generator=generator) - 1.0
-        x, y = torch.meshgrid(axis, axis, indexing="ij")
         emap.update(torch.stack([x, y, z], -1).view(1, -1, 3), torch.eye(4)[None], torch.eye(4)[None])
     return emap
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchelev.robot import RobotConfig
 from torchelev.storage import realize
-from torchelev.traversability_features import LARGE, Extremes, Surface, squashed, widened_mean
+from torchelev.traversability_features import Extremes, Surface, mean_of_three, squashed, taps, widened_mean
 from torchelev.traversability_stances import Scales, Stance
 from torchelev.windows import shifted
 
@@ -24,12 +24,16 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
+DEPTH = 1e6  # [m] below all ground
 LEVEL = 1e-6  # [m per cell] of ground that counts as level
 DIAGONAL = math.sqrt(2)  # of a cell
 
 
 class Attitude(NamedTuple):
-    """How a body stands at one heading on four feet, by ratios to what the robot overcomes; 0 unless `complete`."""
+    """How a body stands at one heading on four feet, by ratios to what the robot overcomes.
+
+    0 where the ground that each depends on is not completed: under the feet for slope and step, else under all.
+    """
 
     slope: Float[Tensor, "B H W"]  # squared gradient of the body; this, step and belly are squashed
     step: Float[Tensor, "B H W"]  # highest step between neighbouring feet
@@ -49,10 +53,10 @@ class Footing(NamedTuple):
 def attitudes(
     ground: Surface, extreme: Extremes, scales: Scales, robot: RobotConfig, resolution: float
 ) -> list[Attitude]:
-    """Return how the body stands at each heading; slope and step count wherever the feet are on completed ground."""
+    """Return how the body stands at each heading."""
     height = shifted(ground.height, scales.margin - scales.foot - 1)
     steepness = realize(_steepness(height).clamp(max=math.tan(robot.max_slope) * resolution))
-    highest = realize(extreme.near[0] - LARGE * (1 - extreme.complete))
+    highest = realize(extreme.near[0] - DEPTH * (1 - extreme.complete))
     footing = Footing(widened_mean(height, (1,)), steepness, highest)
     return [_attitude(footing, extreme, stance, scales, robot, resolution) for stance in scales.stances]
 
@@ -85,17 +89,12 @@ def _steepness(height: Tensor) -> Tensor:
 
     Along each axis, of rows of three cells, the gentler one of the slopes to both sides, if both rise or both fall.
     """
-    size = height.shape[-2] - 2, height.shape[-1] - 2
-    along_x = [height.narrow(-1, k, size[1]) for k in range(3)]
-    along_y = [height.narrow(-2, k, size[0]) for k in range(3)]
-    gx, gy = _gentler(along_x, -2, size[0]), _gentler(along_y, -1, size[1])
-    return (gx + gy).clamp(min=LEVEL**2).sqrt()
+    return (_gentler(height, -2) + _gentler(height, -1)).clamp(min=LEVEL**2).sqrt()
 
 
-def _gentler(rows: list[Tensor], dim: int, size: int) -> Tensor:
-    """Return the square of the gentler slope along a dimension of the mean of three rows."""
-    mean = (rows[0] + rows[2] + rows[1]) * (1 / 3)
-    before, middle, after = (mean.narrow(dim, k, size) for k in range(3))
+def _gentler(height: Tensor, dim: int) -> Tensor:
+    """Return the square of the gentler slope along a dimension, of the mean of three rows."""
+    before, middle, after = taps(mean_of_three(height, 1, -3 - dim), 1, dim)
     first, second = middle - before, after - middle
     rising, falling = torch.minimum(first, second).clamp(min=0), torch.maximum(first, second).clamp(max=0)
     return rising.square() + falling.square()

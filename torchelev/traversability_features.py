@@ -34,25 +34,30 @@ LARGE = 1e6  # ratio whose square is finite
 # Windows ------------------------------------------------------------------------------------------------------------
 
 
-def _taps(values: Tensor, step: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+def taps(values: Tensor, step: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return three views along a dimension, `step` entries apart, which is 2 * step shorter."""
     size = values.shape[dim] - 2 * step
     before, middle, after = (values.narrow(dim, k * step, size) for k in range(3))
     return before, middle, after
 
 
+def mean_of_three(values: Tensor, step: int, dim: int) -> Tensor:
+    """Return the mean of three entries along a dimension, `step` apart."""
+    before, middle, after = taps(values, step, dim)
+    return (before + after + middle) * (1 / 3)
+
+
 def widened_mean(values: Tensor, steps: Sequence[int]) -> Tensor:
     """Return the mean of 3 x 3 entries a step apart, of that the mean of those the next step apart, and so on."""
     for step, dim in itertools.product(steps, (-2, -1)):
-        before, middle, after = _taps(values, step, dim)
-        values = realize((before + after + middle) * (1 / 3))
+        values = realize(mean_of_three(values, step, dim))
     return values
 
 
 def widened_maximum(values: Tensor, steps: Sequence[int]) -> Tensor:
     """Return the highest of 3 x 3 entries a step apart, of that the highest of those the next step apart, and so on."""
     for step, dim in itertools.product(steps, (-2, -1)):
-        before, middle, after = _taps(values, step, dim)
+        before, middle, after = taps(values, step, dim)
         values = realize(torch.maximum(torch.maximum(before, after), middle))
     return values
 

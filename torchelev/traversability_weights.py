@@ -35,7 +35,7 @@ class Weights(NamedTuple):
     attitude: Float[Tensor, "S 3"]  # of its slope, step and belly
     stance_bias: Float[Tensor, "S"]
     stance_condition: Float[Tensor, "S N"]
-    mixed: Float[Tensor, "C S+2"]  # of the mean over headings, of it also how it stands and whether all is complete
+    mixed: Float[Tensor, "C S+2"]  # of the means over headings, the last two of `stands` and `complete`
     mixed_bias: Float[Tensor, "C"]
     answer: Float[Tensor, "2 C"]
     answer_bias: Float[Tensor, "2"]
