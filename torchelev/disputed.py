@@ -79,6 +79,10 @@ class Disputed:
         """Read a layer (B, C) at the disputed cells: -> (K,)."""
         return layer.flatten().index_select(0, self.cells)
 
+    def none(self, mask: Tensor) -> bool:
+        """Tell whether nothing is true, so that work can be left out; a GPU, which would have to wait, does it all."""
+        return self.picks_out(mask.device) and not bool(mask.any())
+
     def put(self, layer: Tensor, values: Tensor) -> Tensor:
         """Return a layer (B, C) with values (K,) put into the disputed cells."""
         if len(self.cells) == layer.numel():  # a GPU's K counts the other cells too
@@ -139,8 +143,9 @@ def settle(
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
         step = cfg.holds_step(number, number - close) | (points.of(steps) > 0)
-        which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
-        settled, side = torch.where(step, end, settled), torch.where(step, which, side)
+        if not points.none(step):
+            which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
+            settled, side = torch.where(step, end, settled), torch.where(step, which, side)
     return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
 
 

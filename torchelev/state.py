@@ -130,4 +130,5 @@ def tally(state: MapState, **counts: Tensor) -> MapState:
 
 def count(mask: Tensor) -> Tensor:
     """Count what is true in each environment: (B, ...) bool -> (B,) int64."""
-    return realize(mask).flatten(1).sum(1)
+    # Compiled code counts in 32 bits faster, and no map has so many cells or points.
+    return realize(mask).flatten(1).sum(1, dtype=torch.int32).to(torch.int64)

@@ -51,7 +51,7 @@ def _in_memory(value: Tensor) -> Tensor:
 
 def as_bytes(mask: Tensor) -> Tensor:
     """Return a mask as 0 and 1 in uint8. Compiled code stores bytes eight times as fast as booleans on a CPU."""
-    return torch.where(mask, 1, 0).to(torch.uint8) if torch.compiler.is_compiling() else mask.view(torch.uint8)
+    return mask.to(torch.int32).to(torch.uint8) if torch.compiler.is_compiling() else mask.view(torch.uint8)
 
 
 def as_mask(stored: Tensor) -> Tensor:
