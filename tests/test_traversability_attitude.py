@@ -53,10 +53,12 @@ def slow(heights, i, j, stance, robot=ROBOT):
         return min(max(math.hypot(*slopes), 1e-6), math.tan(robot.max_slope) * CELLS)
 
     step = 0
-    for way in stance.ways:
-        start, end = (around(foot, 1).mean() for foot in way.ends)
-        profile = [start, *(around(place, 1).max() for place in way.places), end]
-        explained = min(map(steepness, way.ends)) * (way.spacing + math.sqrt(2))
+    for m, n in ((0, 1), (2, 3), (0, 2), (1, 3)):
+        first, last = (np.array(stance.feet[k]) for k in (m, n))
+        (way,) = (w for w, starts in stance.ways.items() if tuple(first) in starts and w.end == tuple(last - first))
+        between = [around(first + place, 1).max() for place in way.places]
+        profile = [around(first, 1).mean(), *between, around(last, 1).mean()]
+        explained = min(steepness(first), steepness(last)) * (way.spacing + math.sqrt(2))
         for heading in (profile, profile[::-1]):
             highest = heading[0]
             for height in heading[1:]:

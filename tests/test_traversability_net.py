@@ -13,7 +13,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torchelev.robot import RobotConfig
 from torchelev.traversability_features import complete, extremes, features
 from torchelev.traversability_net import TraversabilityNet, best_in_reach, rate
-from torchelev.traversability_stances import in_cells, stances
+from torchelev.traversability_stances import Way, in_cells, stances
 from torchelev.traversability_weights import RANGES, VERSION, conditions, ratios
 
 ROBOT = RobotConfig()
@@ -237,10 +237,11 @@ def test_stances_by_hand():
     along, turned, across, _ = stances(robot, 0.1)
     assert along.feet == ((4, 2), (4, -2), (-4, 2), (-4, -2)) and (along.length, along.width) == (8, 4)
     assert along.spine == ((0, 0), (2, 0), (-2, 0))  # squares of 0.4 m: the body ends 0.4 m from its middle
-    ends, places, spacing = along.ways[0]  # 4 and 8 cells, in steps of 3 or less
-    assert ends == ((4, 2), (4, -2)) and places == ((4, 0),) and spacing == 2
-    assert along.ways[1].places == ((-4, 0),) and along.ways[2].places == ((1, 2), (-1, 2))
-    assert along.ways[3].places == ((1, -2), (-1, -2)) and along.ways[3].spacing == 3
+    # 4 and 8 cells, in steps of 3 or less: each way from the left or front feet to the others.
+    assert along.ways == {
+        Way((0, -4), ((0, -2),), 2): [(4, 2), (-4, 2)],
+        Way((-8, 0), ((-3, 0), (-5, 0)), 3): [(4, 2), (4, -2)],
+    }
     assert turned.feet == ((-2, 4), (2, 4), (-2, -4), (2, -4))
     # Half the diagonals of length + width and length - width: 0.424 m and 0.141 m.
     assert across.feet == ((1, 4), (4, 1), (-4, -1), (-1, -4))
@@ -251,9 +252,10 @@ def test_stances_by_hand():
 @pytest.mark.parametrize("robot", [ROBOT, SMALL, RobotConfig(length=0.4, width=0.16)])
 def test_the_windows_between_feet_leave_no_cell_out(robot, resolution):
     for stance in stances(robot, resolution):
-        assert {foot for way in stance.ways for foot in way.ends} == set(stance.feet)
-        for way in stance.ways:
-            for p, q in itertools.pairwise((way.ends[0], *way.places, way.ends[1])):
+        assert sum(map(len, stance.ways.values())) == 4
+        for way, starts in stance.ways.items():
+            assert {(i + way.end[0], j + way.end[1]) for i, j in starts} | set(starts) <= set(stance.feet)
+            for p, q in itertools.pairwise(((0, 0), *way.places, way.end)):
                 assert max(abs(p[0] - q[0]), abs(p[1] - q[1])) <= 3
 
 

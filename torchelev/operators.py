@@ -19,9 +19,10 @@ from torch import Tensor
 )
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift CPU layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
-    values = [torch.empty_like(layer) for layer in layers]
-    # In NumPy, which copies parts of small arrays twice as fast.
-    arrays = [(layer.numpy(), value.numpy(), blank) for layer, value, blank in zip(layers, values, blanks, strict=True)]
+    # In NumPy, which copies parts of small arrays twice as fast, but has no bfloat16.
+    known = [layer.float() if layer.dtype == torch.bfloat16 else layer for layer in layers]
+    values = [torch.empty_like(layer) for layer in known]
+    arrays = [(layer.numpy(), value.numpy(), blank) for layer, value, blank in zip(known, values, blanks, strict=True)]
     for env, (i, j) in enumerate(shift.tolist()):
         from_i, to_i, entering_i = _moves(layers[0].shape[1], i)
         from_j, to_j, entering_j = _moves(layers[0].shape[2], j)
@@ -29,7 +30,7 @@ def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tens
             value[env, to_i, to_j] = layer[env, from_i, from_j]
             value[env, entering_i] = blank
             value[env, :, entering_j] = blank
-    return values
+    return [value.to(layer.dtype) for layer, value in zip(layers, values, strict=True)]
 
 
 def _moves(size: int, shift: int) -> tuple[slice, slice, slice]:

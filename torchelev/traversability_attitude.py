@@ -17,7 +17,7 @@ from torch import Tensor
 from torchelev.robot import RobotConfig
 from torchelev.storage import realize
 from torchelev.traversability_features import Extremes, Surface, mean_of_three, squashed, taps, widened_mean
-from torchelev.traversability_stances import Scales, Stance
+from torchelev.traversability_stances import Cells, Scales, Stance, Way
 from torchelev.windows import shifted
 
 if TYPE_CHECKING:
@@ -116,14 +116,28 @@ def _highest_step(footing: Footing, stance: Stance, scales: Scales) -> Float[Ten
 
     Holes are stepped over, and each riser of a stair counts by itself.
     """
-    steps = []
-    for way in stance.ways:
-        start, end = (shifted(footing.height, scales.foot, *foot) for foot in way.ends)
-        between = [shifted(footing.highest, scales.stood_on, *place) for place in way.places]
-        rise = torch.maximum(_rise([start, *between, end]), _rise([end, *between[::-1], start]))
-        explained = torch.minimum(*(shifted(footing.steepness, scales.foot, *foot) for foot in way.ends))
-        steps.append(rise - explained * (way.spacing + DIAGONAL))  # the highest of 3 x 3 cells lies so much farther on
+    steps = [step for way, starts in stance.ways.items() for step in _steps(footing, way, starts, scales)]
     return functools.reduce(torch.maximum, steps).clamp(min=0)
+
+
+def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> list[Float[Tensor, "B H W"]]:
+    """Return the step [m] on the way from each start, found once for all places that any of them may lie on."""
+    first, last = ([extreme(values) for values in zip(*starts, strict=True)] for extreme in (min, max))
+
+    def at(values: Tensor, rim: int, place: Cells = (0, 0)) -> Tensor:
+        for dim in (0, 1):
+            size = values.shape[dim - 2] - 2 * rim + last[dim] - first[dim]
+            values = values.narrow(dim - 2, rim + first[dim] + place[dim], size)
+        return values
+
+    start, end = at(footing.height, scales.foot), at(footing.height, scales.foot, way.end)
+    between = [at(footing.highest, scales.stood_on, place) for place in way.places]
+    rise = torch.maximum(_rise([start, *between, end]), _rise([end, *between[::-1], start]))
+    explained = torch.minimum(at(footing.steepness, scales.foot), at(footing.steepness, scales.foot, way.end))
+    # The highest of 3 x 3 cells lies up to a diagonal farther on.
+    step = realize(rise - explained * (way.spacing + DIAGONAL))
+    H, W = (size - 2 * scales.foot for size in footing.height.shape[-2:])
+    return [step.narrow(-2, i - first[0], H).narrow(-1, j - first[1], W) for i, j in starts]
 
 
 def _rise(heights: Sequence[Tensor]) -> Tensor:

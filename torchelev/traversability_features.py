@@ -49,16 +49,18 @@ def mean_of_three(values: Tensor, step: int, dim: int) -> Tensor:
 
 def widened_mean(values: Tensor, steps: Sequence[int]) -> Tensor:
     """Return the mean of 3 x 3 entries a step apart, of that the mean of those the next step apart, and so on."""
-    for step, dim in itertools.product(steps, (-2, -1)):
-        values = realize(mean_of_three(values, step, dim))
+    for step in steps:
+        values = realize(mean_of_three(mean_of_three(values, step, -2), step, -1))
     return values
 
 
 def widened_maximum(values: Tensor, steps: Sequence[int]) -> Tensor:
     """Return the highest of 3 x 3 entries a step apart, of that the highest of those the next step apart, and so on."""
-    for step, dim in itertools.product(steps, (-2, -1)):
-        before, middle, after = taps(values, step, dim)
-        values = realize(torch.maximum(torch.maximum(before, after), middle))
+    for step in steps:
+        for dim in (-2, -1):
+            before, middle, after = taps(values, step, dim)
+            values = torch.maximum(torch.maximum(before, after), middle)
+        values = realize(values)
     return values
 
 

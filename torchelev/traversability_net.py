@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
-from torchelev.storage import realize_all
+from torchelev.storage import realize, realize_all
 from torchelev.traversability_attitude import attitudes
 from torchelev.traversability_features import complete, extremes, features, widened_maximum
 from torchelev.traversability_stances import Scales, in_cells
@@ -46,7 +46,7 @@ def _biased(bias: Tensor, weight: Tensor, values: list[float]) -> Tensor:
     """Return bias + weight @ values; floats become constants of a compiled graph, where a tensor would be copied."""
     for column, value in zip(weight.unbind(1), values, strict=True):
         bias = torch.add(bias, column, alpha=value)
-    return bias[:, None, None]
+    return realize(bias)[:, None, None]  # or every cell would compute it anew
 
 
 def _mixed(weight: Float[Tensor, "O C"], values: Float[Tensor, "B C H W"]) -> Float[Tensor, "B O H W"]:

@@ -13,10 +13,10 @@ Cells = tuple[int, int]  # along x and y, from the cell under the body's centre
 
 
 class Way(NamedTuple):
-    """From foot to foot, in cells: 3 x 3 cells around each place and the feet leave none out."""
+    """From foot to foot, in cells from the first: 3 x 3 cells around each place and the feet leave none out."""
 
-    ends: tuple[Cells, Cells]
-    places: tuple[Cells, ...]  # between the ends, evenly
+    end: Cells
+    places: tuple[Cells, ...]  # between the feet, evenly
     spacing: float  # at most
 
 
@@ -35,9 +35,12 @@ class Stance(NamedTuple):
         return i != k and j != m
 
     @property
-    def ways(self) -> list[Way]:
-        """The ways between neighbouring feet."""
-        return [_way(self.feet[m], self.feet[n]) for m, n in ((0, 1), (2, 3), (0, 2), (1, 3))]
+    def ways(self) -> dict[Way, list[Cells]]:
+        """The ways between neighbouring feet, each with the feet that it starts from: opposite ones are alike."""
+        starts: dict[Way, list[Cells]] = {}
+        for m, n in ((0, 1), (2, 3), (0, 2), (1, 3)):
+            starts.setdefault(_way(self.feet[m], self.feet[n]), []).append(self.feet[m])
+        return starts
 
     def turned(self) -> Stance:
         """Return the stance a quarter turn on."""
@@ -50,8 +53,10 @@ def _way(a: Cells, b: Cells) -> Way:
     parts = math.ceil(max(abs(b[0] - a[0]), abs(b[1] - a[1])) / 3)
     shares = [Fraction(k, parts) for k in range(1, parts)]  # exact, so that neither end comes first
     # Python rounds halves to even numbers, so that opposite places stay opposite.
-    places = tuple((round(a[0] + k * (b[0] - a[0])), round(a[1] + k * (b[1] - a[1]))) for k in shares)
-    return Way((a, b), places, max(math.dist(p, q) for p, q in itertools.pairwise((a, *places, b))))
+    places = [(round(a[0] + k * (b[0] - a[0])), round(a[1] + k * (b[1] - a[1]))) for k in shares]
+    spacing = max(math.dist(p, q) for p, q in itertools.pairwise((a, *places, b)))
+    end, *places = ((i - a[0], j - a[1]) for i, j in (b, *places))
+    return Way(end, tuple(places), spacing)
 
 
 def stances(robot: RobotConfig, resolution: float) -> tuple[Stance, ...]:
