@@ -26,6 +26,7 @@ POINTS = [1000, 3000, 6276, 15000, 43074, 100000, 200000, 407040]
 ROBOTS = [1, 4, 16, 64, 256, 1024, 4096]
 CELLS = [125, 250, 500, 1000]  # along each side
 RAYS = [1.2, 2.4, 4.8, 9.6, 19.2, 38.4]  # [m] horizontal length of the longest; the window ends at 5
+OVERHANG = 1.5  # [m] above the sensor and the exclusion ramp
 Track = Callable[[Iterable], Iterable]  # shows progress
 
 
@@ -143,13 +144,17 @@ def cells(seconds: float, track: Track) -> dict[str, Any]:
 
 
 def rays(seconds: float, track: Track) -> dict[str, Any]:
-    """Time one robot's update against the length of half of its rays; the others measure the ground nearby."""
+    """Time one robot's update against the length of half of its rays; the others measure the ground nearby.
+
+    The long ones end above the exclusion ramp, wherever that is: no ground, so that nothing but their length changes.
+    """
     drives = {length: Drive(full_config(), BPEARL, scans=4, reach=RAYS[0]) for length in RAYS}
     for length, drive in track(drives.items()):
         for cloud in drive.clouds:
             far = cloud[:, ::2]
             reach = length * torch.empty_like(far[..., :1]).uniform_(0.9, 1.0)
-            far *= reach / far[..., :2].norm(dim=-1, keepdim=True)  # along the same ray
+            far[..., :2] *= reach / far[..., :2].norm(dim=-1, keepdim=True)
+            far[..., 2] = OVERHANG
         drive.watch(8)
         work = {name: drive.seen[name] for name in ("points_used", "drift_points", "cells_bounded")}
         assert min(work.values()) > 0, f"rays of {length} m: nothing to do, {work}"

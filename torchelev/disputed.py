@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,7 +44,7 @@ class Disputed:
         slot, columns = (slot + first).flatten(), [column.flatten() for column in columns]
         if self.picks_out(cells.device):
             marked = cells.flatten()
-            self.cells = marked.nonzero().squeeze(1)
+            self.cells = torch.from_numpy(np.flatnonzero(marked.view(torch.bool).numpy()))  # faster where few are true
             chosen = marked.index_select(0, slot).nonzero().squeeze(1)
             number = torch.empty(cells.numel(), dtype=torch.int64)
             number[self.cells] = torch.arange(len(self.cells))
@@ -84,10 +85,10 @@ class Disputed:
         return self.picks_out(mask.device) and not bool(mask.any())
 
     def put(self, layer: Tensor, values: Tensor) -> Tensor:
-        """Return a layer (B, C) with values (K,) put into the disputed cells."""
+        """Return a layer (B, C), which is overwritten, with values (K,) in the disputed cells."""
         if len(self.cells) == layer.numel():  # a GPU's K counts the other cells too
             return torch.where(self.marked > 0, values.view_as(layer), layer)
-        return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
+        return layer.view(-1).index_copy_(0, self.cells, values).view_as(layer)
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
@@ -146,7 +147,7 @@ def settle(
         if not points.none(step):
             which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
             settled, side = torch.where(step, end, settled), torch.where(step, which, side)
-    return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
+    return points.put(height.clone(), points.mean + settled), points.put(torch.zeros_like(height), side)
 
 
 @settle.register_fake

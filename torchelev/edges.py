@@ -95,9 +95,9 @@ def further_up(points: Disputed, z: Tensor, past: Tensor, most: Tensor, height: 
 
     Each point has its height `z` and counts as past all that is no higher than `past`, both (n, P).
     """
-    columns = torch.stack([points.weight * z, points.weight.expand_as(z)], 1)
+    columns = torch.stack([points.weight * z, points.weight.expand_as(z)])
     for _ in range(rounds):
-        moment, total = points.sum(columns * (past >= points.at_points(height))[:, None]).unbind(1)
+        moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
         further = moment / total  # NaN where no point lies past the height, which compares as false
         height = torch.where(most >= further, further, height)
     return height

@@ -20,9 +20,9 @@ from torch import Tensor
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift CPU layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
     # In NumPy, which copies parts of small arrays twice as fast, but has no bfloat16.
-    known = [layer.float() if layer.dtype == torch.bfloat16 else layer for layer in layers]
-    values = [torch.empty_like(layer) for layer in known]
-    arrays = [(layer.numpy(), value.numpy(), blank) for layer, value, blank in zip(known, values, blanks, strict=True)]
+    plain = [layer.float() if layer.dtype == torch.bfloat16 else layer for layer in layers]
+    values = [torch.empty_like(layer) for layer in plain]
+    arrays = [(layer.numpy(), value.numpy(), blank) for layer, value, blank in zip(plain, values, blanks, strict=True)]
     for env, (i, j) in enumerate(shift.tolist()):
         from_i, to_i, entering_i = _moves(layers[0].shape[1], i)
         from_j, to_j, entering_j = _moves(layers[0].shape[2], j)
