@@ -19,14 +19,15 @@ from torch.utils._pytree import tree_map
 from benchmarks import meter
 from benchmarks.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
 from torchelev import aging, drift, fusion, grid, overlap, pipeline, raycast, sensor
+from torchelev.raycast import PolarGrid
 from torchelev.state import MapState, Measurement, map_layers
 from torchelev.storage import as_bytes, as_mask
 
 POINTS = [1000, 3000, 6276, 15000, 43074, 100000, 200000, 407040]
 ROBOTS = [1, 4, 16, 64, 256, 1024, 4096]
 CELLS = [125, 250, 500, 1000]  # along each side
-RAYS = [1.2, 2.4, 4.8, 9.6, 19.2, 38.4]  # [m] horizontal length of the longest; the window ends at 5
-OVERHANG = 1.5  # [m] above the sensor and the exclusion ramp
+RAYS = [1.2, 1.7, 2.4, 3.4, 4.8, 6.8, 19.2, 38.4]  # [m] horizontal length of the longest; the window ends at 5
+STEEPNESS = 0.5  # of rays that end above the exclusion ramp, however far
 Track = Callable[[Iterable], Iterable]  # shows progress
 
 
@@ -146,15 +147,20 @@ def cells(seconds: float, track: Track) -> dict[str, Any]:
 def rays(seconds: float, track: Track) -> dict[str, Any]:
     """Time one robot's update against the length of half of its rays; the others measure the ground nearby.
 
-    The long ones end above the exclusion ramp, wherever that is: no ground, so that nothing but their length changes.
+    Those of that half rise above the exclusion ramp, all at one slope: they give no heights, so that what they take is
+    casting alone. One that leaves the polar table has no more to do, so the exponent is of the lengths within it.
     """
-    drives = {length: Drive(full_config(), BPEARL, scans=4, reach=RAYS[0]) for length in RAYS}
+    cfg = full_config()
+    assert cfg.raycast
+    within = PolarGrid.of(cfg.grid, cfg.raycast).ranges * cfg.grid.resolution
+    drives = {length: Drive(cfg, BPEARL, scans=4, reach=RAYS[0]) for length in RAYS}
     for length, drive in track(drives.items()):
+        generator = torch.Generator().manual_seed(0)
         for cloud in drive.clouds:
             far = cloud[:, ::2]
-            reach = length * torch.empty_like(far[..., :1]).uniform_(0.9, 1.0)
+            reach = length * (0.9 + 0.1 * torch.rand(far[..., :1].shape, generator=generator))
             far[..., :2] *= reach / far[..., :2].norm(dim=-1, keepdim=True)
-            far[..., 2] = OVERHANG
+            far[..., 2:] = STEEPNESS * reach
         drive.watch(8)
         work = {name: drive.seen[name] for name in ("points_used", "drift_points", "cells_bounded")}
         assert min(work.values()) > 0, f"rays of {length} m: nothing to do, {work}"
@@ -162,7 +168,9 @@ def rays(seconds: float, track: Track) -> dict[str, Any]:
     rows = [
         {"metres": length} | time | {"bounded": drives[length].seen["cells_bounded"]} for length, time in times.items()
     ]
-    return {"points": BPEARL, "rows": rows, "exponent": meter.exponent(RAYS, [row["median"] for row in rows])}
+    shorter = [row for row in rows if row["metres"] <= within]
+    exponent = meter.exponent([row["metres"] for row in shorter], [row["median"] for row in shorter])
+    return {"points": BPEARL, "rows": rows, "exponent": exponent}
 
 
 def parts(seconds: float, track: Track) -> dict[str, Any]:

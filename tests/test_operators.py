@@ -47,10 +47,14 @@ def test_cell_sums(seed, columns, num_envs, num_points):
     np.testing.assert_allclose(cell_sums(torch.from_numpy(index), torch.from_numpy(values), 5), expected)
 
 
-@given(st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=3))
-def test_moved(shifts):
-    layer = torch.arange(12.0 * len(shifts)).view(len(shifts), 3, 4)
+@given(
+    st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=3),
+    st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64]),
+)
+def test_moved(shifts, dtype):
+    layer = torch.arange(12 * len(shifts), dtype=dtype).view(len(shifts), 3, 4)
     floats, masks = moved([layer, layer > 5], torch.tensor(shifts), [-1.0, 0.0])
+    assert floats.dtype == dtype and masks.dtype == torch.bool
     for b, i, j in np.ndindex(*layer.shape):
         k, n = i + shifts[b][0], j + shifts[b][1]
         inside = 0 <= k < 3 and 0 <= n < 4

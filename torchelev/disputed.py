@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,7 +43,7 @@ class Disputed:
         slot, columns = (slot + first).flatten(), [column.flatten() for column in columns]
         if self.picks_out(cells.device):
             marked = cells.flatten()
-            self.cells = torch.from_numpy(np.flatnonzero(marked.view(torch.bool).numpy()))  # faster where few are true
+            self.cells = marked.nonzero().squeeze(1)
             chosen = marked.index_select(0, slot).nonzero().squeeze(1)
             number = torch.empty(cells.numel(), dtype=torch.int64)
             number[self.cells] = torch.arange(len(self.cells))
@@ -80,15 +79,15 @@ class Disputed:
         """Read a layer (B, C) at the disputed cells: -> (K,)."""
         return layer.flatten().index_select(0, self.cells)
 
-    def none(self, mask: Tensor) -> bool:
-        """Tell whether nothing is true, so that work can be left out; a GPU, which would have to wait, does it all."""
-        return self.picks_out(mask.device) and not bool(mask.any())
+    def some(self, mask: Tensor) -> bool:
+        """Tell whether anything is true; of a GPU, which would have to wait to tell, assume so."""
+        return not self.picks_out(mask.device) or bool(mask.any())
 
     def put(self, layer: Tensor, values: Tensor) -> Tensor:
-        """Return a layer (B, C), which is overwritten, with values (K,) in the disputed cells."""
+        """Return a layer (B, C) with values (K,) put into the disputed cells."""
         if len(self.cells) == layer.numel():  # a GPU's K counts the other cells too
             return torch.where(self.marked > 0, values.view_as(layer), layer)
-        return layer.view(-1).index_copy_(0, self.cells, values).view_as(layer)
+        return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
@@ -144,10 +143,10 @@ def settle(
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
         step = cfg.holds_step(number, number - close) | (points.of(steps) > 0)
-        if not points.none(step):
+        if points.some(step):
             which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
             settled, side = torch.where(step, end, settled), torch.where(step, which, side)
-    return points.put(height.clone(), points.mean + settled), points.put(torch.zeros_like(height), side)
+    return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
 
 
 @settle.register_fake

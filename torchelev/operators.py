@@ -18,26 +18,16 @@ from torch import Tensor
     "torchelev::moved", mutates_args=(), schema="(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]"
 )
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
-    """Shift CPU layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
-    # In NumPy, which copies parts of small arrays twice as fast, but has no bfloat16.
-    plain = [layer.float() if layer.dtype == torch.bfloat16 else layer for layer in layers]
-    values = [torch.empty_like(layer) for layer in plain]
-    arrays = [(layer.numpy(), value.numpy(), blank) for layer, value, blank in zip(plain, values, blanks, strict=True)]
-    for env, (i, j) in enumerate(shift.tolist()):
-        from_i, to_i, entering_i = _moves(layers[0].shape[1], i)
-        from_j, to_j, entering_j = _moves(layers[0].shape[2], j)
-        for layer, value, blank in arrays:
-            value[env, to_i, to_j] = layer[env, from_i, from_j]
-            value[env, entering_i] = blank
-            value[env, :, entering_j] = blank
-    return [value.to(layer.dtype) for layer, value in zip(layers, values, strict=True)]
-
-
-def _moves(size: int, shift: int) -> tuple[slice, slice, slice]:
-    """Return which entries of a dimension stay, where they go, and where others enter, if they move by -shift."""
-    some = min(abs(shift), size)
-    ahead, behind = slice(some, size), slice(0, size - some)
-    return (ahead, behind, slice(size - some, size)) if shift >= 0 else (behind, ahead, slice(0, some))
+    """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
+    H, W = layers[0].shape[1:]
+    # Padded where cells enter, and by as many less than nothing where they leave.
+    rims = [(-j, j, -i, i) for i, j in ((max(-H, min(i, H)), max(-W, min(j, W))) for i, j in shift.tolist())]
+    if len(rims) == 1:
+        return [F.pad(layer, rims[0], value=blank) for layer, blank in zip(layers, blanks, strict=True)]
+    return [
+        torch.stack([F.pad(part, rim, value=blank) for part, rim in zip(layer, rims, strict=True)])
+        for layer, blank in zip(layers, blanks, strict=True)
+    ]
 
 
 @moved.register_fake

@@ -122,12 +122,12 @@ def _highest_step(footing: Footing, stance: Stance, scales: Scales) -> Float[Ten
 
 def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> list[Float[Tensor, "B H W"]]:
     """Return the step [m] on the way from each start, found once for all places that any of them may lie on."""
-    first, last = ([extreme(values) for values in zip(*starts, strict=True)] for extreme in (min, max))
+    low, high = ([end(values) for values in zip(*starts, strict=True)] for end in (min, max))
 
     def at(values: Tensor, rim: int, place: Cells = (0, 0)) -> Tensor:
         for dim in (0, 1):
-            size = values.shape[dim - 2] - 2 * rim + last[dim] - first[dim]
-            values = values.narrow(dim - 2, rim + first[dim] + place[dim], size)
+            size = values.shape[dim - 2] - 2 * rim + high[dim] - low[dim]
+            values = values.narrow(dim - 2, rim + low[dim] + place[dim], size)
         return values
 
     start, end = at(footing.height, scales.foot), at(footing.height, scales.foot, way.end)
@@ -137,7 +137,7 @@ def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> l
     # The highest of 3 x 3 cells lies up to a diagonal farther on.
     step = realize(rise - explained * (way.spacing + DIAGONAL))
     H, W = (size - 2 * scales.foot for size in footing.height.shape[-2:])
-    return [step.narrow(-2, i - first[0], H).narrow(-1, j - first[1], W) for i, j in starts]
+    return [step.narrow(-2, i - low[0], H).narrow(-1, j - low[1], W) for i, j in starts]
 
 
 def _rise(heights: Sequence[Tensor]) -> Tensor:

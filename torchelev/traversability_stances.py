@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from torchelev.robot import RobotConfig
 
-Cells = tuple[int, int]  # along x and y, from the cell under the body's centre
+Cells = tuple[int, int]  # along x and y; of places, from the cell under the body's centre
 
 
 class Way(NamedTuple):
@@ -36,7 +36,7 @@ class Stance(NamedTuple):
 
     @property
     def ways(self) -> dict[Way, list[Cells]]:
-        """The ways between neighbouring feet, each with the feet that it starts from: opposite ones are alike."""
+        """The ways between neighbouring feet, each with the feet it starts from; opposite ones are mostly alike."""
         starts: dict[Way, list[Cells]] = {}
         for m, n in ((0, 1), (2, 3), (0, 2), (1, 3)):
             starts.setdefault(_way(self.feet[m], self.feet[n]), []).append(self.feet[m])
