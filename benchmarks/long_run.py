@@ -3,7 +3,8 @@
     python -m benchmarks.long_run        # 100,000 updates of one robot, 10,000 of 256: about 20 minutes
 
 The robots drive on and on, and no two scans of a round have the same number of points. The result is written after
-each hundredth of a run, so that Ctrl-C loses nothing; growth within a process cannot be resumed in another.
+each hundredth of a run, so that Ctrl-C loses nothing; growth within a process cannot be resumed in another. In the end
+the process is timed in turn with a new one, which a shared machine's good and bad minutes hit alike.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import math
 import statistics
 import sys
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +30,10 @@ from benchmarks.speed_sections import fresh_compiler
 from benchmarks.workload import BPEARL, MANY_POINTS, Drive, full_config
 
 CASES = {"one robot": (1, 250, BPEARL, 100_000), "256 robots": (256, 64, MANY_POINTS, 10_000)}
+Case = tuple[int, int, int, int]  # robots, cells along each side, points, updates
 BLOCKS = 100
-GROWTH = 1.05  # of the last quarter over what was before
+ROUNDS = 30  # of this process and a new one, in turn
+GROWTH = 1.05  # of the last quarter over what was before, and of this process over a new one
 RESULTS = Path("benchmarks/results")
 
 
@@ -52,16 +57,47 @@ def onward(drive: Drive) -> None:
     drive.next_scan = next_scan  # type: ignore[method-assign]
 
 
-def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) -> None:
-    """Run in blocks; save each block's time per update, and memory and graphs after it."""
-    robots, side, points, _ = CASES[name]
+def start(case: Case) -> tuple[Drive, bench.Timer]:
+    """Make the robots of a case, on their way, and what times them."""
+    robots, side, points, _ = case
     fresh_compiler()
     counters.clear()
     drive = Drive(full_config(side), points, robots=robots, scans=8 if robots == 1 else 4)
     onward(drive)
     drive.watch(8)
+    return drive, bench.Timer("drive()", globals={"drive": drive}, num_threads=torch.get_num_threads())
+
+
+_timers: list[bench.Timer] = []  # of a new process
+
+
+def prepare(case: Case, threads: int) -> None:
+    """Start a case in a new process."""
+    torch.set_num_threads(threads)
+    _timers[:] = [start(case)[1]]
+
+
+def milliseconds(updates: int) -> float:
+    """Time updates in the new process."""
+    return 1e3 * _timers[0].timeit(updates).mean
+
+
+def beside_new(case: Case, timer: bench.Timer, updates: int) -> dict[str, list[float]]:
+    """Time so many updates of this process and of a new one in turn [ms]."""
+    times: dict[str, list[float]] = {"old_ms": [], "new_ms": []}
+    spawn = get_context("spawn")  # a forked process would inherit what this one has become
+    with ProcessPoolExecutor(1, spawn, prepare, (case, torch.get_num_threads())) as new:
+        for _ in range(ROUNDS):
+            times["new_ms"].append(new.submit(milliseconds, updates).result())
+            times["old_ms"].append(1e3 * timer.timeit(updates).mean)
+    return times
+
+
+def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) -> None:
+    """Run in blocks; save each block's time per update, and memory and graphs after it, and the end beside the new."""
+    robots, side, points, _ = case = CASES[name]
+    drive, timer = start(case)
     size = max(1, updates // BLOCKS)
-    timer = bench.Timer("drive()", globals={"drive": drive}, num_threads=torch.get_num_threads())
     values: dict[str, Any] = {"robots": robots, "points": points, "cells": side**2, "block": size}
     values |= {"ms": [], "resident_bytes": [], "graphs": []}
     for _ in tqdm(range(math.ceil(updates / size)), desc=name, disable=None):
@@ -71,6 +107,7 @@ def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) ->
         values["updates"] = size * len(values["ms"])
         values["known_share"] = float(drive.emap.validity.float().mean())
         save(values)
+    save(values | beside_new(case, timer, max(1, size // 10)))
 
 
 def growth(series: list[float]) -> float:
@@ -86,17 +123,20 @@ def verdicts(result: dict[str, Any]) -> list[list[str]]:
         time, memory = growth(values["ms"]), growth(values["resident_bytes"])
         part = max(1, len(values["ms"]) // 4)
         fastest = [min(values["ms"][:-part] or values["ms"]), min(values["ms"][-part:])]
+        pairs = zip(values.get("old_ms", []), values.get("new_ms", []), strict=True)
+        beside = statistics.median([old / new for old, new in pairs] or [math.nan])
         graphs = values["graphs"][-1]
-        holds = fastest[1] / fastest[0] <= GROWTH and memory <= GROWTH and graphs == values["graphs"][0]
-        figures = [f"{time:.2f}", f"{fastest[1] / fastest[0]:.2f}", f"{memory:.3f}", f"{graphs}"]
+        holds = beside <= GROWTH and memory <= GROWTH and graphs == values["graphs"][0]
+        figures = [f"{time:.2f}", f"{fastest[1] / fastest[0]:.2f}", f"{beside:.2f}", f"{memory:.3f}", f"{graphs}"]
         verdict = "none grows" if holds else "GROWS"
-        rows.append([name, f"{values['updates']:,}", *figures, verdict if len(values["ms"]) >= 10 else "too short"])
+        whole = len(values["ms"]) >= 10 and beside > 0
+        rows.append([name, f"{values['updates']:,}", *figures, verdict if whole else "too short"])
     return rows
 
 
 def table(result: dict[str, Any]) -> str:
     """Tabulate the cases."""
-    head = ["case", "updates", "median time", "shortest time", "memory", "graphs compiled", ""]
+    head = ["case", "updates", "median time", "shortest time", "beside a new one", "memory", "graphs compiled", ""]
     return markdown_table(head, verdicts(result))
 
 

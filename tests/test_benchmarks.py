@@ -4,6 +4,7 @@ import copy
 import json
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -87,17 +88,20 @@ def eager(monkeypatch):
 
 def test_long_run_writes_every_block(tmp_path, monkeypatch, capsys, eager):
     monkeypatch.setattr(long_run, "CASES", {"two robots": (2, 64, 400, 4)})
+    monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda n, kind, *start: ThreadPoolExecutor(n, "", *start))
     monkeypatch.setattr(sys, "argv", ["long_run", "--out", str(tmp_path), "--threads", "1"])
     long_run.main()
     values = json.loads((tmp_path / "long_run.json").read_text())["two robots"]
     assert len(values["ms"]) == len(values["resident_bytes"]) == len(values["graphs"]) == 4
     assert values["updates"] == 4 and values["known_share"] > 0.05
+    assert len(values["old_ms"]) == len(values["new_ms"]) == long_run.ROUNDS and min(values["new_ms"]) > 0
     assert (tmp_path / "long_run.png").exists() and "| two robots |" in capsys.readouterr().out
 
 
 def test_long_run_sees_growth():
     steady = {"updates": 400, "ms": [9.0, 3.0, 3.1, 3.0] * 3, "resident_bytes": [10**8] * 12, "graphs": [1] * 12}
-    slower = steady | {"ms": [3.0 + 0.1 * k for k in range(12)]}
+    steady |= {"old_ms": [3.0, 6.0, 3.1], "new_ms": [3.0, 6.1, 3.0]}
+    slower = steady | {"new_ms": [2.8, 5.6, 2.7]}
     larger = steady | {"resident_bytes": [10**8 + 10**6 * k for k in range(12)]}
     again = steady | {"graphs": [1] * 6 + [2] * 6}
     rows = long_run.verdicts({"steady": steady, "slower": slower, "larger": larger, "again": again})
