@@ -246,6 +246,9 @@ def test_stances_by_hand():
     # Half the diagonals of length + width and length - width: 0.424 m and 0.141 m.
     assert across.feet == ((1, 4), (4, 1), (-4, -1), (-1, -4))
     assert (across.length, across.width) == pytest.approx((5 * 2**0.5, 3 * 2**0.5))
+    # Half of 5 cells, rounded to even from where each way lies: not alike, but mirror images.
+    assert [way.places for way in across.ways] == [(), ((-3, -2),), ((-2, -3),)]
+    assert list(across.ways.values()) == [[(1, 4), (-4, -1)], [(1, 4)], [(4, 1)]]
 
 
 @pytest.mark.parametrize("resolution", [0.02, 0.03, 0.04, 0.1])
