@@ -19,7 +19,6 @@ from torch.utils._pytree import tree_map
 from benchmarks import meter
 from benchmarks.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
 from torchelev import aging, drift, fusion, grid, overlap, pipeline, raycast, sensor
-from torchelev.raycast import PolarGrid
 from torchelev.state import MapState, Measurement, map_layers
 from torchelev.storage import as_bytes, as_mask
 
@@ -152,7 +151,7 @@ def rays(seconds: float, track: Track) -> dict[str, Any]:
     """
     cfg = full_config()
     assert cfg.raycast
-    within = PolarGrid.of(cfg.grid, cfg.raycast).ranges * cfg.grid.resolution
+    within = raycast.PolarGrid.of(cfg.grid, cfg.raycast).ranges * cfg.grid.resolution
     drives = {length: Drive(cfg, BPEARL, scans=4, reach=RAYS[0]) for length in RAYS}
     for length, drive in track(drives.items()):
         generator = torch.Generator().manual_seed(0)

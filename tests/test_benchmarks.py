@@ -88,7 +88,7 @@ def eager(monkeypatch):
 
 def test_long_run_writes_every_block(tmp_path, monkeypatch, capsys, eager):
     monkeypatch.setattr(long_run, "CASES", {"two robots": (2, 64, 400, 4)})
-    monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda n, kind, *start: ThreadPoolExecutor(n, "", *start))
+    monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))
     monkeypatch.setattr(sys, "argv", ["long_run", "--out", str(tmp_path), "--threads", "1"])
     long_run.main()
     values = json.loads((tmp_path / "long_run.json").read_text())["two robots"]
@@ -101,11 +101,12 @@ def test_long_run_writes_every_block(tmp_path, monkeypatch, capsys, eager):
 def test_long_run_sees_growth():
     steady = {"updates": 400, "ms": [9.0, 3.0, 3.1, 3.0] * 3, "resident_bytes": [10**8] * 12, "graphs": [1] * 12}
     steady |= {"old_ms": [3.0, 6.0, 3.1], "new_ms": [3.0, 6.1, 3.0]}
-    slower = steady | {"new_ms": [2.8, 5.6, 2.7]}
+    slower = steady | {"ms": [3.0 + 0.1 * k for k in range(12)]}
+    older = steady | {"new_ms": [2.8, 5.6, 2.7]}
     larger = steady | {"resident_bytes": [10**8 + 10**6 * k for k in range(12)]}
     again = steady | {"graphs": [1] * 6 + [2] * 6}
-    rows = long_run.verdicts({"steady": steady, "slower": slower, "larger": larger, "again": again})
-    assert [row[-1] for row in rows] == ["none grows", "GROWS", "GROWS", "GROWS"]
+    rows = long_run.verdicts({"steady": steady, "slower": slower, "older": older, "larger": larger, "again": again})
+    assert [row[-1] for row in rows] == ["none grows", "GROWS", "GROWS", "GROWS", "GROWS"]
 
 
 def test_drives_of_a_long_run_vary_in_length_and_place():

@@ -122,7 +122,7 @@ def _highest_step(footing: Footing, stance: Stance, scales: Scales) -> Float[Ten
 
 def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> list[Float[Tensor, "B H W"]]:
     """Return the step [m] on the way from each start, found once for all places that any of them may lie on."""
-    low, high = ([end(values) for values in zip(*starts, strict=True)] for end in (min, max))
+    low, high = ([bound(values) for values in zip(*starts, strict=True)] for bound in (min, max))
 
     def at(values: Tensor, rim: int, place: Cells = (0, 0)) -> Tensor:
         for dim in (0, 1):
