@@ -103,7 +103,8 @@ def test_locate_agrees_with_the_reference(seed, cells):
     for n in range(50):
         cell = reference.cell_of(*xy[0, n], corner, 0.1, cells)
         assert bool(inside[0, n]) == (cell is not None)
-        assert slot[0, n] == (0 if cell is None else cell[0] * cells[1] + cell[1])
+        i, j = cell or np.clip(np.floor(xy[0, n] / 0.1) - corner, 0, np.array(cells) - 1)
+        assert slot[0, n] == i * cells[1] + j
 
 
 def test_point_cells_sum_and_take():

@@ -8,8 +8,8 @@ from conftest import off_borders, pose, random_state, seen_from, small_map
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev import RaycastConfig, SensorConfig
-from torchelev.raycast import believed, clear_seen_through, rays_of, turn
+from torchelev import GridConfig, RaycastConfig, SensorConfig
+from torchelev.raycast import PolarGrid, believed, clear_seen_through, rays_of, turn
 
 CELLS, RESOLUTION = (40, 30), 0.1
 PLACES = [(0.0, 0.0), (0.55, -0.33), (-1.93, 0.04), (-2.6, 0.3)]  # in the middle, off it, at the rim, outside
@@ -338,6 +338,15 @@ def test_turn_is_an_azimuth(x, y):
 def test_turn_grows_with_the_azimuth():
     angle = torch.linspace(0, 2 * np.pi, 100_001, dtype=torch.float64)[:-1]
     assert (turn(angle.cos(), angle.sin()).diff() > 0).all()
+
+
+def test_widths_are_the_most_bins_within_three_quarters_of_a_cell():
+    polar = PolarGrid.of(GridConfig(resolution=0.1, length_x=4.0, length_y=3.0), RaycastConfig())
+    got = polar.widths(torch.arange(polar.ranges + 1.0).repeat(2, 3, 1))
+    assert got.shape == (2, 3, polar.ranges + 1) and (got == got[0, 0]).all()
+    for k, width in enumerate(got[0, 0].tolist()):
+        bins = 0.75 * polar.azimuths / (2 * np.pi * max(k, 0.5))
+        assert width == max(1, 2 ** np.ceil(np.log2(bins))), k  # doubled until it is as wide
 
 
 # A person walks away, in whole updates --------------------------------------------------------------------------------

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, cells_of, center_offsets, lattice_offset
+from torchelev.masks import as_factor, lifted, masked
 from torchelev.state import MapState, Measurement, count, tally
-
-NOWHERE = 1e6  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +38,7 @@ class DriftConfig:
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Average (B, M) over what the mask keeps; 0 where it keeps nothing."""
     # In float64: a float32 sum of more than 4096 points the compiler writes in another way, in another graph.
-    total = torch.where(mask, values, 0.0).sum(1, dtype=torch.float64)
+    total = masked(values, mask).sum(1, dtype=torch.float64)
     return (total / count(mask).clamp(min=1)).to(values.dtype)
 
 
@@ -60,7 +59,7 @@ def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConf
     gx, gy = state.gradient_x.detach(), state.gradient_y.detach()
     at_origin = state.elevation - gx * x - gy * y
     # Cells that do not suit get a height that no point is near.
-    ground, gx, gy = cells.take(torch.where(suits, at_origin, NOWHERE), gx, gy)
+    ground, gx, gy = cells.take(lifted(at_origin, ~suits), gx, gy)
     error = pz - (ground + gx * px + gy * py)
     counts = cells.inside & (error.abs() <= cfg.max_error)
     mean = masked_mean(error, counts)
@@ -71,7 +70,7 @@ def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConf
     correction = torch.where(applies, cfg.gain * mean, 0.0)
     shift = correction[:, None, None]
     state = state._replace(
-        elevation=state.elevation + shift * state.validity,
-        upper_bound=state.upper_bound + shift * state.bounded,
+        elevation=state.elevation + shift * as_factor(state.validity),
+        upper_bound=state.upper_bound + shift * as_factor(state.bounded),
     )
     return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

@@ -12,6 +12,7 @@ from torchelev.disputed import Shown, ratio, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
+from torchelev.masks import as_factor, masked
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, realize, realize_all
 
@@ -91,7 +92,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     guess = guess_heights(scan, prior, grid, cfg)
     scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
     state, taken = merge(state, prior, scanned, grid, cfg)
-    points_used = torch.where(taken, scanned.kept, 0.0).sum(1).to(torch.int64)
+    points_used = masked(scanned.kept, taken).sum(1).to(torch.int64)
     return tally(
         state,
         points_used=points_used,
@@ -234,9 +235,9 @@ def merge(
     found = hit & ~agree & (~prior.known | (support < 0))
     taken = realize(agree | found)
 
-    information = ratio(agree, prior.variance) + 1.0 / scan.variance
+    information = ratio(as_factor(agree), prior.variance) + 1.0 / scan.variance
     fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
-    outvoted = torch.where(hit, prior.variance + cfg.outlier_variance * scan.kept, prior.variance)
+    outvoted = prior.variance + cfg.outlier_variance * scan.kept
     posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)
     fresh = torch.where(prior.known, -support, scan.votes - scan.dissent)
     support = torch.where(hit, torch.where(found, fresh, support).clamp(0, cfg.max_support), prior.support)
@@ -250,7 +251,7 @@ def merge(
         torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         state.validity | hit_now,
-        torch.where(hit_now, 0.0, state.time),
+        masked(state.time, ~hit_now),
     )
     stored = state._replace(elevation=elevation, variance=variance, support=support, validity=validity, time=time)
     return stored, taken

@@ -81,16 +81,16 @@ def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[T
 def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig) -> tuple[Tensor, Tensor]:
     """Return the flat cell number, int64, of each place (x, y), both (B, ...), and whether it lies in the window.
 
-    x and y count from a lattice corner that lies at `offset` in the window. Outside, the number is 0.
+    x and y count from a lattice corner that lies at `offset` in the window. Outside, the number is the nearest cell's.
     """
     first = torch.round(offset / grid.resolution).view(-1, 2, *[1] * (x.ndim - 1))
     # Divide before adding whole cells: the result is then the same wherever the window is.
     i = torch.floor(x / grid.resolution) + first[:, 0]
     j = torch.floor(y / grid.resolution) + first[:, 1]
-    inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
+    near_i, near_j = i.clamp(0, grid.height - 1), j.clamp(0, grid.width - 1)
     # In integers: float32 counts no farther than 2^24 cells.
-    i, j = (torch.where(inside, k, 0.0).to(torch.int32) for k in (i, j))
-    return (i * grid.width + j).to(torch.int64), inside
+    slot = near_i.to(torch.int32) * grid.width + near_j.to(torch.int32)
+    return slot.to(torch.int64), (i == near_i) & (j == near_j)
 
 
 def cells_of(m: Measurement, offset: Float[Tensor, "B 2"], grid: GridConfig) -> PointCells:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate
+from torchelev.masks import NOWHERE, lifted, masked
 from torchelev.operators import polar_minimum, running_minimum
 from torchelev.state import MapState, Measurement, count, tally
 from torchelev.storage import realize, realize_all
@@ -65,10 +66,11 @@ class PolarGrid(NamedTuple):
 
     def widths(self, k: Tensor) -> Tensor:
         """Return how many azimuth bins an entry of `polar_minimum` covers at range k, a whole number of bins."""
-        width = torch.ones_like(k)
+        row = torch.arange(self.ranges + 1, device=k.device, dtype=k.dtype)
+        width = torch.ones_like(row)
         for level, rows in enumerate(self.widen):
-            width = torch.add(width, k < rows, alpha=2.0**level)
-        return width
+            width = torch.add(width, row < rows, alpha=2.0**level)
+        return realize(width).index_select(0, k.to(torch.int32).flatten()).view_as(k)
 
 
 def turn(x: Tensor, y: Tensor) -> Tensor:
@@ -80,9 +82,15 @@ def turn(x: Tensor, y: Tensor) -> Tensor:
     high = torch.maximum(ax, ay)
     t = torch.minimum(ax, ay) / high.clamp(min=1e-30)
     eighth = t * (0.125 + 0.0434 * (1 - t))  # atan(t) / 2 pi
-    quarter = torch.where(ay > ax, 0.25 - eighth, eighth)
-    half = torch.where(x < 0, 0.5 - quarter, quarter)
-    return torch.where(y < 0, 1 - half, half)
+    quarter = mirrored(eighth, 0.25, ax - ay)
+    half = mirrored(quarter, 0.5, x)
+    return mirrored(half, 1.0, y)
+
+
+def mirrored(share: Tensor, whole: float, side: Tensor) -> Tensor:
+    """Return whole - share where `side` is negative, else the share; both are no larger than the whole."""
+    half = torch.copysign(share.new_full((), whole / 2), side)
+    return (share + (half - whole / 2)).abs()
 
 
 class Rays(NamedTuple):
@@ -136,7 +144,7 @@ def ends_well(
     share = (room / along).amin(-1).clamp(0, 1)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
-    floor = realize(torch.where(well_supported(state, cfg, grid.resolution), lowest, 1e6)).flatten(1).gather(1, slot)
+    floor = realize(lifted(lowest, ~well_supported(state, cfg, grid.resolution))).flatten(1).gather(1, slot)
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
     return inside & (height >= floor) | rays.overhang
 
@@ -144,7 +152,7 @@ def ends_well(
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
     """Tell which known cells are believed: enough points agree, or on a neighbouring cell of like height."""
     enough = state.validity & (state.support >= cfg.min_support)
-    _, above, _, left, right, _, below, _ = neighbours(torch.where(enough, state.elevation, torch.inf), torch.inf)
+    _, above, _, left, right, _, below, _ = neighbours(lifted(state.elevation, ~enough), NOWHERE)
     unlike = functools.reduce(torch.minimum, [(h - state.elevation).abs() for h in (above, left, right, below)])
     return enough | (state.validity & (unlike <= resolution))
 
@@ -229,7 +237,7 @@ def look_up(
     # Realized, or the compiler would gather twice, for the masks and for the heights.
     slope = realize(read(table.flatten(1), flat(k, a, polar.azimuths)))
     found = slope < NO_RAY
-    slope = torch.where(found, slope, 0.0)
+    slope = masked(slope, found)
     gx, gy = state.gradient_x, state.gradient_y
     along = (slope - torch.addcmul(gx * x, gy, y) / rho).abs()
     incidence = along / ((1 + slope.square()) * (1 + gx.square() + gy.square())).sqrt()

@@ -130,5 +130,6 @@ def tally(state: MapState, **counts: Tensor) -> MapState:
 
 def count(mask: Tensor) -> Tensor:
     """Count what is true in each environment: (B, ...) bool -> (B,) int64."""
-    # Compiled code counts in 32 bits faster, and no map has so many cells or points.
-    return realize(mask).flatten(1).sum(1, dtype=torch.int32).to(torch.int64)
+    # Compiled code counts in 32 bits faster, eager code in 64; no map has more cells or points than 32 bits hold.
+    bits = torch.int32 if torch.compiler.is_compiling() else torch.int64
+    return realize(mask).flatten(1).sum(1, dtype=bits).to(torch.int64)

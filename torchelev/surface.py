@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.masks import as_factor, masked
 from torchelev.operators import padded
 from torchelev.state import MapState
 from torchelev.windows import window_moments
@@ -38,10 +39,10 @@ class Ground(NamedTuple):
 
 def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], rim: int) -> Ground:
     """Put a rim around the known heights, once for all the windows."""
-    known = validity.to(elevation.dtype)
+    known = as_factor(validity).to(elevation.dtype)
     number = known.sum((1, 2), keepdim=True).clamp(min=1)
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
-    heights = torch.where(validity, elevation, 0.0)
+    heights = torch.where(validity, elevation, 0.0)  # what is not known may be NaN
     datum = (heights.sum((1, 2), keepdim=True) / number).detach()
     layers = padded(torch.stack([known, (heights - datum) * known]), rim, 0.0)
     return Ground(layers[0], layers[1], rim)
@@ -91,6 +92,6 @@ def normals(state: MapState, ground: Ground, grid: GridConfig, cfg: SurfaceConfi
     """
     plane = fit_plane(ground, cfg.radius, grid.resolution)
     return state._replace(
-        gradient_x=plane.gradient_x * state.validity,
-        gradient_y=plane.gradient_y * state.validity,
+        gradient_x=masked(plane.gradient_x, state.validity),
+        gradient_y=masked(plane.gradient_y, state.validity),
     )

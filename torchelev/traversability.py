@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.masks import NOWHERE, masked
 from torchelev.robot import RobotConfig
 from torchelev.state import MapState
 from torchelev.surface import Ground, fit_plane
@@ -87,10 +88,9 @@ def learned_rating(state: MapState, grid: GridConfig, cfg: LearnedTraversability
 
 
 def height_range(ground: Ground, radius: int) -> Tensor:
-    """Return the height difference of the highest and the lowest known cell of each window [m]; -inf without any."""
-    known = ground.known > 0
-    signed = (torch.where(known, z, -torch.inf) for z in (ground.height, -ground.height))
-    highest, minus_lowest = window_maximum(list(signed), ground.rim, radius)
+    """Return how much higher the highest known cell of each window is than the lowest [m]; negative without any."""
+    sunk = NOWHERE * (ground.known - 1)  # where nothing is known
+    highest, minus_lowest = window_maximum([sunk + ground.height, sunk - ground.height], ground.rim, radius)
     return highest + minus_lowest
 
 
@@ -113,4 +113,4 @@ def traversability(state: MapState, ground: Ground, grid: GridConfig, cfg: Trave
     roughness = plane.residual.clamp(min=1e-12).sqrt()
     worst = torch.maximum(slope / cfg.critical_slope, step / cfg.critical_step)
     worst = torch.maximum(worst, roughness / cfg.critical_roughness)
-    return state._replace(traversability=(1 - worst).clamp(min=0) * state.validity)
+    return state._replace(traversability=masked((1 - worst).clamp(min=0), state.validity))

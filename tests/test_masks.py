@@ -1,0 +1,34 @@
+"""Masks in arithmetic, against choosing element by element."""
+
+import pytest
+import torch
+
+from torchelev.masks import NOWHERE, as_factor, lifted, masked
+
+DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
+
+
+@pytest.fixture(params=DTYPES)
+def values(request):
+    return torch.randn(3, 5, 7, generator=torch.Generator().manual_seed(0)).to(request.param)
+
+
+MASK = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(1)) > 0.5
+
+
+@pytest.mark.parametrize("mask", [MASK, MASK[:1], MASK.transpose(0, 1).contiguous().transpose(0, 1)])
+def test_masked_and_lifted_choose_to_the_bit(values, mask):
+    assert torch.equal(masked(values, mask), torch.where(mask, values, 0.0))
+    assert masked(values, mask).dtype == lifted(values, mask).dtype == values.dtype
+    assert torch.equal(lifted(values, mask)[~mask.expand(3, 5, 7)], values[~mask.expand(3, 5, 7)])
+    assert (lifted(values, mask)[mask.expand(3, 5, 7)] > NOWHERE - 300).all()
+
+
+def test_float16_holds_nowhere():
+    assert torch.isfinite(torch.tensor(NOWHERE, dtype=torch.float16))
+
+
+def test_gradients_are_those_of_a_choice():
+    values = torch.randn(3, 5, 7, dtype=torch.float64, requires_grad=True)
+    (masked(values, MASK) + lifted(values, MASK) * as_factor(~MASK)).sum().backward()
+    assert torch.equal(values.grad, torch.ones_like(values))
