@@ -260,6 +260,17 @@ def test_random_garbage_never_poisons_the_map(seed, dtype):
         assert (emap.variance > 0).all() and (emap.variance <= emap.cfg.fusion.max_variance).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_maps_of_half_precision_take_in_no_points(dtype):
+    emap = small_map(B).to(dtype)
+    before = snapshot(emap)
+    for take_in in (emap.update, emap.measure):
+        with pytest.raises(TypeError, match=f"map: must be float32 or float64.*got {dtype}; call .float"):
+            take_in(torch.zeros(B, 5, 3), pose(num_envs=B))
+    assert differences(before, emap.state) == []
+    emap.float().update(torch.zeros(B, 5, 3), pose(num_envs=B))
+
+
 @given(st.integers(0, 10_000))
 def test_every_point_is_counted_once(seed):
     rng = np.random.default_rng(seed)

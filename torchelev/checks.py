@@ -98,6 +98,13 @@ def _check_rigid(name: str, pose: Tensor) -> None:
     )
 
 
+def require_full_precision(dtype: torch.dtype) -> None:
+    """Refuse to fuse into a map of half precision, which holds neither a cell's number nor a millimetre's variance."""
+    good = dtype in (torch.float32, torch.float64)
+    mend = "call .float() on it; points may be of half precision"
+    require(good, "map", "must be float32 or float64 to take in points", dtype, mend, TypeError)
+
+
 def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype, always: bool) -> Tensor:
     """Return dt as (B,) [s]."""
     if isinstance(dt, Tensor):

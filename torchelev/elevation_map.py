@@ -204,6 +204,7 @@ class ElevationMap(nn.Module):
         self, points: Any, T_map_sensor: Any, T_map_base: Any, dt: Any, variance: Any
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor | None]:
         B, device, always = self.num_envs, self.device, self.check_values
+        checks.require_full_precision(self.elevation.dtype)
         cloud = checks.check_points(points, B, device)
         S = cloud.shape[1]
         shape = (B, S, 4, 4) if points.ndim == 4 else (B, 4, 4)
