@@ -3,19 +3,22 @@
     python -m benchmarks.long_run        # 100,000 updates of one robot, 10,000 of 256: about 20 minutes
 
 The robots drive on and on, and no two scans of a round have the same number of points. The result is written after
-each hundredth of a run, so that Ctrl-C loses nothing; growth within a process cannot be resumed in another. In the end
-the process is timed in turn with a new one, which a shared machine's good and bad minutes hit alike.
+each hundredth of a run, so that Ctrl-C loses nothing; growth within a process cannot be resumed in another.
+
+A shared machine's good and bad minutes last longer than what is sought, and hit alike two processes that are timed in
+turn: after each hundredth, one that does a twentieth of the updates, and in the end a new one.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import json
 import math
 import statistics
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -34,7 +37,8 @@ CASES = {"one robot": (1, 250, BPEARL, 100_000), "256 robots": (256, 64, MANY_PO
 Case = tuple[int, int, int, int]  # robots, cells along each side, points, updates
 BLOCKS = 100
 ROUNDS = 30  # of this process and a new one, in turn
-GROWTH = 1.05  # of the last quarter over what was before, and of this process over a new one
+REFERENCE = 20  # updates of this process to one of the other
+GROWTH = 1.05  # of the last quarter over the first, and of this process over a new one
 RESULTS = Path("benchmarks/results")
 
 
@@ -86,31 +90,45 @@ def new_milliseconds(case: Case, threads: int, updates: int) -> float:
     return milliseconds(started(case, threads), updates)
 
 
+@contextlib.contextmanager
+def new_process(case: Case) -> Iterator[Callable[[int], float]]:
+    """Start a case in a new process; give what times so many of its updates [ms]."""
+    threads, spawn = torch.get_num_threads(), get_context("spawn")  # a fork would inherit what this one has become
+    with ProcessPoolExecutor(1, spawn) as new:
+
+        def time(updates: int) -> float:
+            return new.submit(new_milliseconds, case, threads, updates).result()
+
+        time(1)
+        yield time
+
+
 def beside_new(case: Case, timer: bench.Timer, updates: int) -> dict[str, list[float]]:
     """Time so many updates of this process and of a new one in turn [ms]."""
     times: dict[str, list[float]] = {"old_ms": [], "new_ms": []}
-    threads, spawn = torch.get_num_threads(), get_context("spawn")  # a fork would inherit what this one has become
-    with ProcessPoolExecutor(1, spawn) as new:
+    with new_process(case) as time_new:
         for _ in range(ROUNDS):
-            times["new_ms"].append(new.submit(new_milliseconds, case, threads, updates).result())
+            times["new_ms"].append(time_new(updates))
             times["old_ms"].append(milliseconds(timer, updates))
     return times
 
 
 def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) -> None:
-    """Run in blocks; save each block's time per update, and memory and graphs after it, and the end beside the new."""
+    """Run in blocks; save the time per update, memory and graphs of each, and the end beside a new process."""
     robots, side, points, _ = case = CASES[name]
     drive, timer = start(case)
     size = max(1, updates // BLOCKS)
     values: dict[str, Any] = {"robots": robots, "points": points, "cells": side**2, "block": size}
-    values |= {"ms": [], "resident_bytes": [], "graphs": []}
-    for _ in tqdm(range(math.ceil(updates / size)), desc=name, disable=None):
-        values["ms"].append(milliseconds(timer, size))
-        values["resident_bytes"].append(resident_bytes())
-        values["graphs"].append(counters["stats"]["unique_graphs"])
-        values["updates"] = size * len(values["ms"])
-        values["known_share"] = float(drive.emap.validity.float().mean())
-        save(values)
+    values |= {"ms": [], "reference_ms": [], "resident_bytes": [], "graphs": []}
+    with new_process(case) as time_reference:
+        for _ in tqdm(range(math.ceil(updates / size)), desc=name, disable=None):
+            values["ms"].append(milliseconds(timer, size))
+            values["reference_ms"].append(time_reference(max(1, size // REFERENCE)))
+            values["resident_bytes"].append(resident_bytes())
+            values["graphs"].append(counters["stats"]["unique_graphs"])
+            values["updates"] = size * len(values["ms"])
+            values["known_share"] = float(drive.emap.validity.float().mean())
+            save(values)
     save(values | beside_new(case, timer, max(1, size // 10)))
 
 
@@ -120,19 +138,21 @@ def growth(series: list[float]) -> float:
     return statistics.median(series[-part:]) / statistics.median(series[:part])
 
 
+def ratios(times: list[float], others: list[float]) -> list[float]:
+    """Divide times by those taken in turn with them."""
+    return [time / other for time, other in zip(times, others, strict=True)]
+
+
 def verdicts(result: dict[str, Any]) -> list[list[str]]:
     """Tabulate growth of time and memory, and the graphs compiled."""
     rows = []
     for name, values in result.items():
         time, memory = growth(values["ms"]), growth(values["resident_bytes"])
-        part = max(1, len(values["ms"]) // 4)
-        fastest = [min(values["ms"][:-part] or values["ms"]), min(values["ms"][-part:])]
-        pairs = zip(values.get("old_ms", []), values.get("new_ms", []), strict=True)
-        beside = statistics.median([old / new for old, new in pairs] or [math.nan])
+        paired = growth(ratios(values["ms"], values["reference_ms"]))
+        beside = statistics.median(ratios(values.get("old_ms", []), values.get("new_ms", [])) or [math.nan])
         graphs = values["graphs"][-1]
-        grown = max(fastest[1] / fastest[0], beside, memory)
-        holds = grown <= GROWTH and graphs == values["graphs"][0]
-        figures = [f"{time:.2f}", f"{fastest[1] / fastest[0]:.2f}", f"{beside:.2f}", f"{memory:.3f}", f"{graphs}"]
+        holds = max(paired, beside, memory) <= GROWTH and graphs == values["graphs"][0]
+        figures = [f"{time:.2f}", f"{paired:.2f}", f"{beside:.2f}", f"{memory:.3f}", f"{graphs}"]
         verdict = "none grows" if holds else "GROWS"
         whole = len(values["ms"]) >= 10 and beside > 0
         rows.append([name, f"{values['updates']:,}", *figures, verdict if whole else "too short"])
@@ -141,7 +161,8 @@ def verdicts(result: dict[str, Any]) -> list[list[str]]:
 
 def table(result: dict[str, Any]) -> str:
     """Tabulate the cases."""
-    head = ["case", "updates", "median time", "shortest time", "beside a new one", "memory", "graphs compiled", ""]
+    beside = ["time over a reference's", "time over a new process's"]
+    head = ["case", "updates", "time alone", *beside, "memory", "graphs compiled", ""]
     return markdown_table(head, verdicts(result))
 
 
@@ -156,13 +177,14 @@ def plot(result: dict[str, Any], path: Path) -> None:
     for ax, (name, values) in zip(axes.flat, result.items(), strict=True):
         updates = [values["block"] * (k + 1) for k in range(len(values["ms"]))]
         ax.plot(updates, values["ms"], label="time")
+        ax.plot(updates, values["reference_ms"], color="C0", alpha=0.35, label="time of a reference")
         ax.set(xlabel="updates", ylabel="time per update [ms]", title=name)
         ax.set_ylim(bottom=0)
         memory = ax.twinx()
         memory.plot(updates, [b / 1e6 for b in values["resident_bytes"]], color="C1", label="memory")
         memory.set_ylabel("memory of the process [MB]")
         memory.set_ylim(0, 1.3e-6 * max(values["resident_bytes"]))
-        ax.legend(handles=[ax.lines[0], memory.lines[0]], fontsize=8, loc="lower right")
+        ax.legend(handles=[*ax.lines, *memory.lines], fontsize=8, loc="lower right")
     figure.savefig(path, dpi=90)
 
 
