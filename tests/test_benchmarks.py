@@ -4,7 +4,9 @@ import copy
 import json
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -109,6 +111,32 @@ def test_long_run_sees_growth():
     cases = [steady, worse_machine, slower, older, larger, again]
     rows = long_run.verdicts({str(number): values for number, values in enumerate(cases)})
     assert [row[-1] for row in rows] == ["none grows"] * 2 + ["GROWS"] * 4
+
+
+class Slowing:
+    """In place of a timer: the more updates it timed, the longer one takes."""
+
+    def __init__(self, growth):
+        self.growth, self.done = growth, 0
+
+    def timeit(self, updates):
+        self.done += updates
+        return SimpleNamespace(mean=1e-3 * (1 + self.growth * self.done))
+
+
+@pytest.mark.parametrize("growth, verdict", [(0.0, "none grows"), (1e-4, "GROWS")])
+def test_long_run_sees_what_its_updates_slow(monkeypatch, growth, verdict):
+    """By a fifth in 2,000 updates; each process has its own count, and the reference's hardly grows."""
+    own, saved = threading.local(), []
+    drive = SimpleNamespace(emap=SimpleNamespace(validity=torch.ones(1)))
+    monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))
+    monkeypatch.setattr(long_run, "start", lambda case: (drive, Slowing(growth)))
+    monkeypatch.setattr(long_run, "started", lambda case, threads: vars(own).setdefault("timer", Slowing(growth)))
+    monkeypatch.setattr(long_run, "resident_bytes", lambda: 10**8)
+    long_run.run_case("one robot", 2000, lambda values: saved.append(copy.deepcopy(values)))
+    ((_, _, _, over_reference, over_new, *_, said),) = long_run.verdicts({"one robot": saved[-1]})
+    assert len(saved) == long_run.BLOCKS + 1 and said == verdict
+    assert (float(over_reference) > long_run.GROWTH) == (float(over_new) > long_run.GROWTH) == (growth > 0)
 
 
 def test_drives_of_a_long_run_vary_in_length_and_place():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import reference
 import torch
-from conftest import off_borders, pose, random_poses, random_state, small_map
+from conftest import off_borders, pose, random_poses, random_state, scan, small_map
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -286,3 +286,11 @@ def test_noise_is_no_step():
         ignored += emap.statistics.rejected_edge.item()
     assert ignored == 0
     assert abs(emap.layer("elevation").mean().item()) < 5e-4
+
+
+def test_the_time_of_cells_never_hit_may_be_infinite():
+    emap = small_map(1)
+    emap.time.fill_(torch.inf)
+    cloud, T = scan(0, 1, 60)
+    emap.update(cloud, T, T, 0.1)
+    assert not emap.time.isnan().any() and (emap.time == 0).sum() == emap.validity.sum() > 0

@@ -267,6 +267,9 @@ def test_maps_of_half_precision_take_in_no_points(dtype):
     for take_in in (emap.update, emap.measure):
         with pytest.raises(TypeError, match=f"map: must be float32 or float64.*got {dtype}; call .float"):
             take_in(torch.zeros(B, 5, 3), pose(num_envs=B))
+    measurement = small_map(B).measure(torch.zeros(B, 5, 3), pose(num_envs=B))
+    with pytest.raises(TypeError, match="map: must be float32 or float64"):
+        emap(emap.state, measurement)
     assert differences(before, emap.state) == []
     emap.float().update(torch.zeros(B, 5, 3), pose(num_envs=B))
 

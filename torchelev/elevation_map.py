@@ -194,6 +194,7 @@ class ElevationMap(nn.Module):
 
     def forward(self, state: MapState, measurement: Measurement) -> MapState:
         """Fuse a measurement into a state and return the new one; touches no buffer (paper, Fig. 2)."""
+        checks.require_full_precision(state.elevation.dtype)
         return fuse_measurement(state, measurement, self.cfg, self._weights)
 
     @property

@@ -251,7 +251,7 @@ def merge(
         torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         state.validity | hit_now,
-        masked(state.time, ~hit_now),
+        torch.where(hit_now, 0.0, state.time),
     )
     stored = state._replace(elevation=elevation, variance=variance, support=support, validity=validity, time=time)
     return stored, taken

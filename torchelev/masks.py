@@ -14,7 +14,7 @@ def as_factor(mask: Tensor) -> Tensor:
 
 
 def masked(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the values where the mask is true, else 0. All values are finite."""
+    """Return the values where the mask is true, else 0. All must be finite: of others NaN would be left."""
     return values * as_factor(mask)
 
 

@@ -88,7 +88,7 @@ def turn(x: Tensor, y: Tensor) -> Tensor:
 
 
 def mirrored(share: Tensor, whole: float, side: Tensor) -> Tensor:
-    """Return whole - share where `side` is negative, else the share; both are no larger than the whole."""
+    """Return whole - share where `side` is negative, -0.0 too, else the share, which lies in [0, whole]."""
     half = torch.copysign(share.new_full((), whole / 2), side)
     return (share + (half - whole / 2)).abs()
 
