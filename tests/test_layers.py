@@ -58,6 +58,14 @@ def test_sample_of_bad_places_is_not_valid(dtype):
     assert emap.sample(xy[:, :0])[0].shape == (2, 0)
 
 
+@pytest.mark.parametrize("mode", ["bilinear", "nearest"])
+def test_maps_of_half_precision_are_sampled(mode):
+    emap = filled(known=1.0, dtype=torch.float32).half()
+    values, valid = emap.sample(emap.cell_centers().flatten(1, 2), mode=mode)
+    assert values.dtype == torch.float16 and valid.all()
+    torch.testing.assert_close(values, emap.elevation.flatten(1), atol=2e-3, rtol=0)
+
+
 def test_sample_does_not_bleed_from_unknown_cells():
     """What an unknown cell holds reaches neither values nor gradients."""
     emap = filled(known=0.5)

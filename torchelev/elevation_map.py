@@ -39,8 +39,8 @@ class ElevationMap(nn.Module):
         device: where they live; `.to()` moves them.
         check_values: also check pose matrices, tensor `dt` and ids on devices other than the CPU, which makes the host
             wait for the device.
-        chunk: update at most so many environments at a time, for less memory and the same result. None: all on a GPU;
-            on a CPU as many as fit into its caches, which is faster too.
+        chunk: update at most so many environments at a time, for less memory and, to rounding, the same result.
+            None: all on a GPU; on a CPU as many as fit into its caches, which is faster too.
         head: a trained head to take, itself and not a copy, in place of the weights that the config names.
 
     Raises ValueError or TypeError for bad arguments, naming the argument, the rule, what came and the mend.

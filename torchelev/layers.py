@@ -83,7 +83,8 @@ def sample_layers(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: Gri
 
 def _corners(uv: Tensor, grid: GridConfig, mode: str) -> Corners:
     finite = torch.isfinite(uv).all(-1, keepdim=True)
-    u, v = torch.where(finite, uv.clamp(-1e6, 1e6), -1e6).unbind(-1)
+    far = min(1e6, torch.finfo(uv.dtype).max)
+    u, v = torch.where(finite, uv.clamp(-far, far), -far).unbind(-1)
     if mode == "nearest":
         i, j = (torch.floor(w)[:, None] for w in (u, v))
         weight = torch.ones_like(i)
