@@ -294,3 +294,16 @@ def test_the_time_of_cells_never_hit_may_be_infinite():
     cloud, T = scan(0, 1, 60)
     emap.update(cloud, T, T, 0.1)
     assert not emap.time.isnan().any() and (emap.time == 0).sum() == emap.validity.sum() > 0
+
+
+def test_an_infinite_outlier_variance_is_the_largest():
+    """Of cells that a scan disagrees with; the others keep theirs."""
+    maps = [
+        small_map(1, fusion=FusionConfig(outlier_variance=value)) for value in (np.inf, FusionConfig().max_variance)
+    ]
+    for emap in maps:
+        for seed, height in ((0, 0.0), (1, 0.5)):
+            cloud, T = scan(seed, 1, 20)
+            cloud[..., 2] += height
+            emap.update(cloud, T, T, 0.1)
+    assert maps[0].variance.isfinite().all() and torch.equal(maps[0].variance, maps[1].variance)

@@ -237,7 +237,8 @@ def merge(
 
     information = ratio(as_factor(agree), prior.variance) + 1.0 / scan.variance
     fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
-    outvoted = prior.variance + cfg.outlier_variance * scan.kept
+    # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
+    outvoted = prior.variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
     posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)
     fresh = torch.where(prior.known, -support, scan.votes - scan.dissent)
     support = torch.where(hit, torch.where(found, fresh, support).clamp(0, cfg.max_support), prior.support)
