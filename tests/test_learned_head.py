@@ -162,9 +162,10 @@ def test_a_head_may_be_given(cfg):
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
 def test_maps_of_other_precision(cfg, dtype):
-    emap = ElevationMap(cfg, num_envs=1)
+    emap = ElevationMap(cfg, num_envs=1).to(torch.promote_types(dtype, torch.float32))
     look(emap)
     rating = emap.to(dtype).rate()
+    assert emap.state.traversability.isfinite().all() and emap.state.traversability.dtype == dtype
     assert all(part.isfinite().all() and part.dtype == dtype for part in rating)
 
 

@@ -17,6 +17,7 @@ from torchelev.errors import require
 
 FARTHEST = 1e9  # [m] farther, a float64 counts cells wrongly
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+FULL_PRECISION = FLOATS[2:]
 Config = TypeVar("Config")
 
 
@@ -74,7 +75,7 @@ def check_points(points: object, num_envs: int, device: torch.device) -> Tensor:
 
 def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.device, always: bool) -> Tensor:
     """Return a rigid transform of this shape, which may lack the sensor dimension."""
-    value = check_tensor(name, pose, device, (torch.float32, torch.float64))
+    value = check_tensor(name, pose, device, FULL_PRECISION)
     rule = f"expected {shape} on {device}"
     require(tuple(value.shape) == shape, name, rule, tuple(value.shape), "give one 4 x 4 matrix for each")
     if readable(value, always):
@@ -100,9 +101,8 @@ def _check_rigid(name: str, pose: Tensor) -> None:
 
 def require_full_precision(dtype: torch.dtype) -> None:
     """Refuse to fuse into a map of half precision, which holds neither a cell's number nor a millimetre's variance."""
-    good = dtype in (torch.float32, torch.float64)
     mend = "call .float() on it; points may be of half precision"
-    require(good, "map", "must be float32 or float64 to take in points", dtype, mend, TypeError)
+    require(dtype in FULL_PRECISION, "map", "must be float32 or float64 to take in points", dtype, mend, TypeError)
 
 
 def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype, always: bool) -> Tensor:
