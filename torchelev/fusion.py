@@ -12,7 +12,7 @@ from torchelev.disputed import Shown, ratio, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
-from torchelev.masks import as_factor, masked
+from torchelev.masks import as_factor, chosen, masked
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, realize, realize_all
 
@@ -123,7 +123,7 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     step, untrusted = torch.zeros_like(trusted), ~trusted & (number > 1)
     if (edges := cfg.edges) is not None:
         step = trusted & edges.holds_step(number, number - agreeing)
-    height = torch.where(trusted, prior.elevation, mean).detach()
+    height = chosen(trusted, prior.elevation, mean).detach()
     shown = Shown(mean, number.detach(), prior.elevation.detach(), as_bytes(prior.known))
     limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
     masks = as_bytes(step | untrusted), as_bytes(step)
@@ -135,7 +135,7 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
     """Average the points that lie within the gate around the guess and on its side; tell which the side ignores."""
     height_at, gate_at, side_at = scan.cells.take(guess.height, guess.gate_variance, guess.side)
     kept, ignored = on_side(scan, height_at, gate_at, side_at, cfg)
-    weight = torch.where(kept, scan.weight, 0.0)
+    weight = masked(scan.weight, kept)
     # Around the guess, so that float32 keeps millimetres at any altitude.
     columns = (weight, weight * (scan.z - height_at), kept, ignored, guess.near & ~ignored)
     information, moment, kept_number, edge, agreeing = scan.sums(*columns)
@@ -152,7 +152,7 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
         kept=kept_number,
         votes=votes,
         dissent=guess.number - votes,
-        agreeing=torch.where(lower_part, votes, agreeing),
+        agreeing=chosen(lower_part, votes, agreeing),
     )
     return cells, ignored
 
@@ -168,7 +168,7 @@ def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionCo
     return Scan(
         z=z,
         spread=m.variance + (cfg.relief * grid.resolution) ** 2,
-        weight=torch.where(used, 1.0 / m.variance, 0.0),
+        weight=masked(1.0 / m.variance, used),
         used=used,
         ray=list(ray.unbind(-1)),
         passed=passed_center(from_center, ray),
@@ -230,18 +230,18 @@ def merge(
     hit, innovation = scan.kept > 0, scan.height - prior.elevation
     limit = prior.gate_variance + scan.variance + (cfg.relief * grid.resolution) ** 2
     agree = realize(prior.known & hit & (innovation.square() <= cfg.gate**2 * limit))
-    votes = torch.where(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
+    votes = chosen(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
     found = hit & ~agree & (~prior.known | (support < 0))
     taken = realize(agree | found)
 
     information = ratio(as_factor(agree), prior.variance) + 1.0 / scan.variance
-    fused = prior.elevation + torch.where(taken, innovation / (information * scan.variance), 0.0)
+    fused = prior.elevation + masked(innovation / (information * scan.variance), taken)
     # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
     outvoted = prior.variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
     posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)
-    fresh = torch.where(prior.known, -support, scan.votes - scan.dissent)
-    support = torch.where(hit, torch.where(found, fresh, support).clamp(0, cfg.max_support), prior.support)
+    fresh = chosen(prior.known, -support, scan.votes - scan.dissent)
+    support = chosen(hit, chosen(found, fresh, support).clamp(0, cfg.max_support), prior.support)
 
     def store(cells: Tensor) -> Tensor:
         return cells.view(state.elevation.shape)
@@ -249,7 +249,7 @@ def merge(
     hit_now = store(taken)
     elevation, variance, support, validity, time = realize_all(
         store(fused),
-        torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
+        chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         state.validity | hit_now,
         torch.where(hit_now, 0.0, state.time),

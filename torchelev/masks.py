@@ -20,6 +20,14 @@ def masked(values: Tensor, mask: Tensor) -> Tensor:
     return values * as_factor(mask)
 
 
+def chosen(mask: Tensor, values: Tensor, others: Tensor | float) -> Tensor:
+    """Return the values where the mask is true, else the others. All must be finite, or NaN would be left."""
+    others = others if isinstance(others, Tensor) else values.new_full((), others)
+    if torch.compiler.is_compiling():
+        return torch.where(mask, values, others)
+    return torch.lerp(others, values, as_bytes(mask).to(values.dtype))  # exact at weights of 0 and 1
+
+
 def lifted(heights: Tensor, mask: Tensor) -> Tensor:
     """Return the heights [m], NOWHERE higher where the mask is true."""
     return torch.add(heights, as_factor(mask), alpha=NOWHERE)

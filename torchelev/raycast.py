@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate
-from torchelev.masks import NOWHERE, lifted, masked
+from torchelev.masks import NOWHERE, chosen, lifted, masked
 from torchelev.operators import polar_minimum, running_minimum
 from torchelev.state import MapState, Measurement, count, tally
 from torchelev.storage import realize, realize_all
@@ -139,8 +139,9 @@ def ends_well(
     start = rays.origin[:, None, :2] + offset
     size = torch.stack([start.new_full((), n * grid.resolution) for n in (grid.height, grid.width)])
     inner = 0.5 * grid.resolution  # half a cell inside, so that rounding leaves no ray outside
-    room = torch.where(rays.xy > 0, size - inner - start, inner - start)
-    along = torch.where(rays.xy.abs() > 1e-9, rays.xy, torch.where(rays.xy > 0, 1e-9, -1e-9))
+    ahead = rays.xy > 0
+    room = chosen(ahead, size - inner - start, inner - start)
+    along = chosen(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))
     share = (room / along).amin(-1).clamp(0, 1)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
@@ -180,13 +181,13 @@ def horizon(
     x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(realize_all(angle.cos(), angle.sin())))
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     recent = state.validity & (state.time <= cfg.min_time)
-    below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_RAY)
-    fall = torch.where(inside, read(realize(below_sensor).flatten(1), slot), NO_RAY * step) / rho
+    below_sensor = chosen(recent, rays.origin[:, 2, None, None] - lowest, NO_RAY)
+    fall = chosen(inside, read(realize(below_sensor).flatten(1), slot), NO_RAY * step) / rho
     steepest = running_minimum(fall, from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths))
-    return torch.where(k >= 0, limit, NO_RAY)
+    return chosen(k >= 0, limit, NO_RAY)
 
 
 # The polar table ------------------------------------------------------------------------------------------------------
@@ -200,7 +201,7 @@ def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig)
     # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
-    index = flat(torch.where(casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
+    index = flat(chosen(casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
     return polar_minimum(index, rays.slope.detach(), polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
 
 
@@ -233,7 +234,7 @@ def look_up(
     k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
     width = polar.widths(k)
     a = torch.floor(turn(x, y) * polar.azimuths - 0.5 * (width - 1))
-    a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
+    a = chosen(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
     # Realized, or the compiler would gather twice, for the masks and for the heights.
     slope = realize(read(table.flatten(1), flat(k, a, polar.azimuths)))
     found = slope < NO_RAY
@@ -265,7 +266,7 @@ def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> Ma
     gone = state.validity & ray.found & below & (state.time > cfg.min_time) & (ray.incidence > cfg.min_incidence)
     validity = state.validity & ~gone
     bounds = ray.found & ~validity
-    lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
-    upper_bound = torch.where(bounds, lower, state.upper_bound)
+    lower = chosen(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
+    upper_bound = chosen(bounds, lower, state.upper_bound)
     validity, bounded, upper_bound = realize_all(validity, (state.bounded & ~state.validity) | bounds, upper_bound)
     return state._replace(validity=validity, bounded=bounded, upper_bound=upper_bound)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.masks import as_factor, masked
+from torchelev.masks import as_factor, chosen, masked
 from torchelev.operators import padded
 from torchelev.state import MapState
 from torchelev.windows import window_moments
@@ -79,8 +79,8 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     regular = det > 1e-4
     # Both are far above these limits unless they are zero but for rounding.
     safe_det, safe_spread = det.clamp(min=1e-4), spread.clamp(min=1e-2)
-    gu = torch.where(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
-    gv = torch.where(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
+    gu = chosen(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
+    gv = chosen(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
     residual = less(less(less(s_zz * share, mz, mz), gu, uz), gv, vz).clamp(min=0)
     return Plane(gu / resolution, gv / resolution, residual)
 
