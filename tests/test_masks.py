@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchelev.masks import NOWHERE, as_factor, lifted, masked
+from torchelev.masks import NOWHERE, as_factor, chosen, lifted, masked
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 
@@ -24,6 +24,15 @@ def test_masked_and_lifted_choose_to_the_bit(values, mask):
     assert (lifted(values, mask)[mask.expand(3, 5, 7)] > NOWHERE - 300).all()
 
 
+@pytest.mark.parametrize("mask", [MASK, MASK[:1], MASK.transpose(0, 1).contiguous().transpose(0, 1)])
+def test_chosen_chooses_to_the_bit(values, mask):
+    others = 1e4 * values.flip(0)
+    assert torch.equal(chosen(mask, values, others), torch.where(mask, values, others))
+    assert torch.equal(chosen(mask, values, others[0]), torch.where(mask, values, others[0]))
+    assert torch.equal(chosen(mask, values, 0.1), torch.where(mask, values, 0.1))
+    assert chosen(mask, values, 0.1).dtype == values.dtype
+
+
 def test_float16_holds_nowhere():
     assert torch.isfinite(torch.tensor(NOWHERE, dtype=torch.float16))
 
@@ -32,3 +41,7 @@ def test_gradients_are_those_of_a_choice():
     values = torch.randn(3, 5, 7, dtype=torch.float64, requires_grad=True)
     (masked(values, MASK) + lifted(values, MASK) * as_factor(~MASK)).sum().backward()
     assert torch.equal(values.grad, torch.ones_like(values))
+    others = values.detach().clone().requires_grad_()
+    chosen(MASK, values, 3 * others).sum().backward()
+    assert torch.equal(values.grad, 1.0 + MASK)
+    assert torch.equal(others.grad, 3.0 * ~MASK)

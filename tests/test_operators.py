@@ -90,8 +90,13 @@ LAYERS = [torch.zeros(2, 4), torch.ones(2, 4), torch.zeros(2, 4), torch.ones(2, 
         ("polar_minimum", (torch.tensor([[0, 11]]), torch.ones(1, 2), 4, [3, 1], 8, 9.0)),
         ("cell_sums", (torch.tensor([[0, 1], [1, 1]]), torch.ones(3, 2, 2), 2)),
         ("moved", ([TABLE, TABLE > 0.5], torch.tensor([[1, 0], [0, -2]]), [1.0, 0.0])),
+        ("moved", ([TABLE[:1]], torch.tensor([[0, 0]]), [1.0])),
         ("settle", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, EdgeConfig().numbers)),
         ("settle", (*MARKED, SLOT, POINTS, torch.zeros(2, 4), LAYERS, 2, 3.0, 0.01, [])),
+        ("realize", ([TABLE, SLOT],)),
+        ("harmonic", ((TABLE > 0.5).float(), TABLE, 1e-3, 4)),
+        ("lowest_of_border", (TABLE, TABLE > 0.5)),
+        ("nearest_known", (TABLE > 0.5,)),
     ],
 )
 def test_operators_are_registered_right(operator, arguments):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.custom_op import custom_op
 from torchelev.edges import EdgeConfig, side_of_step
 
 if TYPE_CHECKING:
@@ -110,10 +111,9 @@ def robust_mean(points: Disputed) -> Tensor:
     return height
 
 
-@torch.library.custom_op(
-    "torchelev::settle",
-    mutates_args=(),
-    schema="(Tensor cells, Tensor steps, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, "
+@custom_op(
+    "settle",
+    "(Tensor cells, Tensor steps, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, "
     "float gate, float relief, float[] edges) -> (Tensor, Tensor)",
 )
 def settle(
@@ -149,6 +149,6 @@ def settle(
     return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
 
 
-@settle.register_fake
+@torch.library.register_fake("torchelev::settle")
 def _(cells: Tensor, steps: Tensor, slot: Tensor, columns: list[Tensor], height: Tensor, *others: Any) -> Any:
     return torch.empty_like(height), torch.empty_like(height)

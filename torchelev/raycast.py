@@ -183,7 +183,7 @@ def horizon(
     recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = chosen(recent, rays.origin[:, 2, None, None] - lowest, NO_RAY)
     fall = chosen(inside, read(realize(below_sensor).flatten(1), slot), NO_RAY * step) / rho
-    steepest = running_minimum(fall, from_end=False)
+    steepest = running_minimum(fall.detach(), from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths))

@@ -7,18 +7,20 @@ import functools
 import torch
 from torch import Tensor
 
+from torchelev.custom_op import custom_op
 
-@torch.library.custom_op("torchelev::realize", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
+
+@custom_op("realize", "(Tensor[] values) -> Tensor[]")
 def _realize(values: list[Tensor]) -> list[Tensor]:
     return [value.clone() for value in values]
 
 
-@_realize.register_fake
+@torch.library.register_fake("torchelev::realize")
 def _(values: list[Tensor]) -> list[Tensor]:
     return [torch.empty_like(value) for value in values]
 
 
-_realize.register_autograd(lambda ctx, grads: (grads,))
+torch.library.register_autograd("torchelev::realize", lambda ctx, grads: (grads,))
 
 
 def realize(value: Tensor) -> Tensor:

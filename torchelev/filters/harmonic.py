@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.custom_op import custom_op
 from torchelev.operators import padded
 
 DAMPING = 0.8  # of a Jacobi sweep
@@ -103,7 +104,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum((1, 2), keepdim=True)
 
 
-@torch.library.custom_op("torchelev::harmonic", mutates_args=())
+@custom_op("harmonic")
 def harmonic(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
     """Solve A u = right for (B, H, W) by preconditioned conjugate gradients, until u is right to about `tolerance`.
 
@@ -136,7 +137,7 @@ def quotient(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(positive, a / torch.where(positive, b, 1.0), 0.0)
 
 
-@harmonic.register_fake
+@torch.library.register_fake("torchelev::harmonic")
 def _(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
     return torch.empty_like(right, memory_format=torch.contiguous_format)
 
@@ -154,4 +155,4 @@ def _keep(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.tolerance, ctx.iterations = inputs[2:]
 
 
-harmonic.register_autograd(_backward, setup_context=_keep)
+torch.library.register_autograd("torchelev::harmonic", _backward, setup_context=_keep)

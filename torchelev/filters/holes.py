@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.custom_op import custom_op
+
 
 def _stops(device: torch.device) -> bool:
     return device.type == "cpu"
@@ -82,7 +84,7 @@ def parts_of(cells: Cells) -> Tensor:
     return join(torch.cat(starts), torch.cat(ends), len(own))
 
 
-@torch.library.custom_op("torchelev::lowest_of_border", mutates_args=())
+@custom_op("lowest_of_border")
 def lowest_of_border(values: Tensor, known: Tensor) -> Tensor:
     """Return for each unknown cell of (B, H, W) the number i * W + j of the lowest border cell of its hole.
 
@@ -109,7 +111,7 @@ def lowest_of_border(values: Tensor, known: Tensor) -> Tensor:
     return answer.view(B, H + 2, W + 2)[:, 1:-1, 1:-1].contiguous()
 
 
-@lowest_of_border.register_fake
+@torch.library.register_fake("torchelev::lowest_of_border")
 def _(values: Tensor, known: Tensor) -> Tensor:
     return torch.empty_like(known, dtype=torch.int64, memory_format=torch.contiguous_format)
 
@@ -128,7 +130,7 @@ def _nearest_along_rows(known: Tensor) -> Tensor:
     return torch.stack([(row - nearest).square(), nearest])
 
 
-@torch.library.custom_op("torchelev::nearest_known", mutates_args=())
+@custom_op("nearest_known")
 def nearest_known(known: Tensor) -> Tensor:
     """Return for each cell of (B, H, W) the number i * W + j of the nearest known cell; H * W where none is known.
 
@@ -150,6 +152,6 @@ def nearest_known(known: Tensor) -> Tensor:
     return torch.where(found, best % size, size)
 
 
-@nearest_known.register_fake
+@torch.library.register_fake("torchelev::nearest_known")
 def _(known: Tensor) -> Tensor:
     return torch.empty_like(known, dtype=torch.int64, memory_format=torch.contiguous_format)
