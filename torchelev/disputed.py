@@ -102,13 +102,15 @@ def robust_mean(points: Disputed) -> Tensor:
     From the mean on, twice: the mean under the weights w / (1 + r^2 / sigma^2)^2 of the residuals r, which leave an
     outlier out.
     """
-    height = torch.zeros_like(points.mean)
-    for _ in range(2):
-        residual = points.z - points.at_points(height)
-        reduced = points.weight / (1.0 + residual.square() / points.spread).square()
-        moment, total = points.sum(torch.stack([reduced * residual, reduced])).unbind(0)
-        height = height + ratio(moment, total)
-    return height
+    height = reduced_mean(points, points.z)
+    return height + reduced_mean(points, points.z - points.at_points(height))
+
+
+def reduced_mean(points: Disputed, residual: Tensor) -> Tensor:
+    """Return each cell's mean (K,) of the residuals (P,) [m], those far from zero reduced in weight."""
+    reduced = points.weight / (1.0 + residual.square() / points.spread).square()
+    moment, total = points.sum(torch.stack([reduced * residual, reduced])).unbind(0)
+    return ratio(moment, total)
 
 
 @custom_op(
