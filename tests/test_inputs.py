@@ -53,7 +53,8 @@ BAD_POSES = {
     "mirrored": (broken(r22=-1.0), ValueError, "mirror"),
     "zero": (torch.zeros(B, 4, 4), ValueError, "rigid"),
     "far": (broken(r03=1e30), ValueError, "within 1e\\+09 m"),
-    "last row": (broken(r30=0.5), ValueError, "last row"),
+    "last row": (broken(r30=0.5), ValueError, "last row.*got 0.5 0 0 1"),
+    "transposed": (broken(r03=0.5).mT, ValueError, "last row.*got 0.5 0 1 1"),
     "nan": (broken(r03=float("nan")), ValueError, "finite"),
     "inf": (broken(r13=float("inf")), ValueError, "finite"),
     "nan rotation": (broken(r12=float("nan")), ValueError, "finite"),
@@ -99,6 +100,13 @@ def test_update_refuses_and_changes_nothing(emap, case, method):
             good = dict(points=torch.zeros(B, N, 3), T_map_sensor=pose(num_envs=B))
             emap.measure(**{**good, name: value})
     assert differences(before, snapshot(emap)) == []
+
+
+def test_mend_of_a_transposed_pose(emap):
+    with pytest.raises(ValueError, match="; transpose it"):
+        call(emap, T_map_base=pose(num_envs=B).mT)
+    with pytest.raises(ValueError, match="; use torchelev.frames.transform"):
+        call(emap, T_map_base=broken(r30=0.5))
 
 
 def test_sensors_need_a_pose_each(emap):

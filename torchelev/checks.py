@@ -92,7 +92,15 @@ def _check_rigid(name: str, pose: Tensor) -> None:
     error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
     require(bool(error < 1e-3), name, "must be rigid (R R^T = 1)", f"an error of {error:.3g}", mend)
     require(bool((np.linalg.det(rotation) > 0).all()), name, "must not mirror", "determinant -1", mend)
-    require(bool((matrix[:, 3] == (0, 0, 0, 1)).all()), name, "must have the last row 0 0 0 1", "another", mend)
+    last = matrix[:, 3]
+    transposed = bool((matrix[:, :, 3] == (0, 0, 0, 1)).all())
+    require(
+        bool((last == (0, 0, 0, 1)).all()),
+        name,
+        "must have the last row 0 0 0 1",
+        " ".join(f"{x:g}" for x in last[np.abs(last - (0, 0, 0, 1)).sum(1).argmax()]),
+        "transpose it: the position is the last column" if transposed else mend,
+    )
     far = np.abs(position).max(initial=0.0)
     require(
         bool(far <= FARTHEST), name, f"must lie within {FARTHEST:g} m", f"{far:.3g} m", "check its units and source"
