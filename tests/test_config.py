@@ -84,8 +84,14 @@ def test_edges_take_their_own_config_alone():
 
 @pytest.mark.parametrize("name", ["gate", "scan_variance_floor", "max_variance"])
 def test_fusion_refuses(name):
-    with pytest.raises(ValueError, match=f"fusion.{name}"):
+    with pytest.raises(ValueError, match=rf"fusion\.{name}: must be positive"):
         FusionConfig(**{name: 0.0})
+
+
+@pytest.mark.parametrize("name", ["scan_variance_floor", "max_variance"])
+def test_variances_are_finite(name):
+    with pytest.raises(ValueError, match=rf"fusion\.{name}: must be finite"):
+        FusionConfig(**{name: float("inf")})
 
 
 @pytest.mark.parametrize("bad", [dict(refinements=1), dict(min_points=2.5), dict(min_extreme=0), dict(min_share=0.0)])
@@ -95,7 +101,8 @@ def test_edges_refuse(bad):
 
 
 @pytest.mark.parametrize(
-    "bad", [dict(min_time=-1.0), dict(min_incidence=1.0), dict(min_incidence=-0.1), dict(max_range=-1.0)]
+    "bad",
+    [dict(min_time=-1.0), dict(min_incidence=1.0), dict(min_incidence=-0.1), dict(max_range=-1.0), dict(gate=0.0)],
 )
 def test_raycast_refuses(bad):
     with pytest.raises(ValueError, match=f"raycast.{next(iter(bad))}"):

@@ -296,6 +296,18 @@ def test_the_time_of_cells_never_hit_may_be_infinite():
     assert not emap.time.isnan().any() and (emap.time == 0).sum() == emap.validity.sum() > 0
 
 
+def test_points_that_are_ignored_may_have_any_variance():
+    """Even one whose inverse is infinite."""
+    cloud, T = scan(0, 2, 60)
+    cloud[:, ::3] = torch.nan
+    maps = [small_map(2), small_map(2)]
+    for emap, small in zip(maps, (1e-39, 1e-4), strict=True):
+        emap.update(cloud, T, T, 0.1, variance=torch.where(cloud[..., 0].isnan(), small, 1e-4))
+    assert maps[0].validity.any()
+    for layers in zip(*(emap.state[:-1] for emap in maps), strict=True):
+        torch.testing.assert_close(*layers, rtol=0, atol=0)
+
+
 def test_an_infinite_outlier_variance_is_the_largest():
     """Of cells that a scan disagrees with; the others keep theirs."""
     maps = [

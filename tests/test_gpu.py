@@ -7,23 +7,31 @@ from conftest import pose, random_poses, small_config
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchelev import BodyConfig, ElevationMap, SensorConfig
+from torchelev import BodyConfig, ElevationMap, SensorConfig, disputed, operators
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+OPERATORS = [
+    operators.cell_sums,
+    operators.padded,
+    operators.running_minimum,
+    operators.polar_minimum,
+    disputed.settle,
+]
 
 
 def forbid_reading(monkeypatch):
-    """Make what copies values from the host raise; those of tensors on "meta" can't be read anyway."""
+    """Make what reads or copies values raise: the operators' own code on "meta", and constants made on the host."""
+    for operator in OPERATORS:
+        monkeypatch.setattr(operator, "_abstract_fn", operator._init_fn)
     for constructor in ("tensor", "as_tensor", "from_numpy"):  # copies a constant, while the host waits
         monkeypatch.setattr(torch, constructor, None)
 
 
 class OneDevice(TorchDispatchMode):
-    """Refuses operations between devices, for which the host waits; of custom operators runs the own code on "meta"."""
+    """Refuses operations between devices, for which the host waits."""
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        run = getattr(function, "__wrapped__", function)
-        result = run(*args, **(kwargs or {}))
+        result = function(*args, **(kwargs or {}))
         tensors = [t for t in tree_leaves((args, kwargs, result)) if isinstance(t, torch.Tensor)]
         devices = {t.device.type for t in tensors if t.ndim > 0}
         assert len(devices) <= 1, f"{function} mixes {devices}"

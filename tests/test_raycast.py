@@ -1,5 +1,7 @@
 """Visibility cleanup and the upper bound: the polar table against marching along every ray."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import reference
@@ -222,6 +224,13 @@ def test_a_ray_below_ground_hit_of_late_is_not_believed():
     hits = np.array([[1.5, 0.05, -1.5], [1.5, 0.06, -1.5]])
     after = cast(emap, state, hits, T)
     assert torch.equal(after.validity, state.validity) and not after.bounded.any()
+
+
+def test_an_infinite_gate_contradicts_no_ray():
+    emap, state, T, hits = ghost_in_view()
+    wide, infinite = (cast(emap, state, hits, T, replace(EVERY, gate=gate)) for gate in (1e4, np.inf))
+    assert (infinite.validity != state.validity).any() and infinite.bounded.any()
+    assert torch.equal(infinite.validity, wide.validity) and torch.equal(infinite.upper_bound, wide.upper_bound)
 
 
 def test_bounds_only_sink_until_the_cell_is_measured():

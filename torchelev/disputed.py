@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.custom_op import custom_op
 from torchelev.edges import EdgeConfig, side_of_step
 
 if TYPE_CHECKING:
@@ -45,11 +44,11 @@ class Disputed:
         if self.picks_out(cells.device):
             marked = cells.flatten()
             self.cells = marked.nonzero().squeeze(1)
-            chosen = marked.index_select(0, slot).nonzero().squeeze(1)
+            picked = marked.index_select(0, slot).nonzero().squeeze(1)
             number = torch.empty(cells.numel(), dtype=torch.int64)
             number[self.cells] = torch.arange(len(self.cells))
-            self.owner = number.index_select(0, slot.index_select(0, chosen))
-            columns = [column.index_select(0, chosen) for column in columns]
+            self.owner = number.index_select(0, slot.index_select(0, picked))
+            columns = [column.index_select(0, picked) for column in columns]
         else:
             self.cells, self.owner = torch.arange(cells.numel(), device=cells.device), slot
         self.mean = self.of(mean)
@@ -113,9 +112,10 @@ def reduced_mean(points: Disputed, residual: Tensor) -> Tensor:
     return ratio(moment, total)
 
 
-@custom_op(
-    "settle",
-    "(Tensor cells, Tensor steps, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, "
+@torch.library.custom_op(
+    "torchelev::settle",
+    mutates_args=(),
+    schema="(Tensor cells, Tensor steps, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, "
     "float gate, float relief, float[] edges) -> (Tensor, Tensor)",
 )
 def settle(
@@ -151,6 +151,6 @@ def settle(
     return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
 
 
-@torch.library.register_fake("torchelev::settle")
+@settle.register_fake
 def _(cells: Tensor, steps: Tensor, slot: Tensor, columns: list[Tensor], height: Tensor, *others: Any) -> Any:
     return torch.empty_like(height), torch.empty_like(height)

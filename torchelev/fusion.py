@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -40,6 +41,9 @@ class FusionConfig:
             require(
                 getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
             )
+        for name in ("scan_variance_floor", "max_variance"):
+            finite, mend = math.isfinite(getattr(self, name)), "give a large number such as 1e6"
+            require(finite, f"fusion.{name}", "must be finite", getattr(self, name), mend)
 
 
 class Scan(NamedTuple):
@@ -135,7 +139,7 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
     """Average the points that lie within the gate around the guess and on its side; tell which the side ignores."""
     height_at, gate_at, side_at = scan.cells.take(guess.height, guess.gate_variance, guess.side)
     kept, ignored = on_side(scan, height_at, gate_at, side_at, cfg)
-    weight = masked(scan.weight, kept)
+    weight = torch.where(kept, scan.weight, 0.0)
     # Around the guess, so that float32 keeps millimetres at any altitude.
     columns = (weight, weight * (scan.z - height_at), kept, ignored, guess.near & ~ignored)
     information, moment, kept_number, edge, agreeing = scan.sums(*columns)
@@ -168,7 +172,7 @@ def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionCo
     return Scan(
         z=z,
         spread=m.variance + (cfg.relief * grid.resolution) ** 2,
-        weight=masked(1.0 / m.variance, used),
+        weight=torch.where(used, 1.0 / m.variance, 0.0),
         used=used,
         ray=list(ray.unbind(-1)),
         passed=passed_center(from_center, ray),
@@ -249,7 +253,7 @@ def merge(
     hit_now = store(taken)
     elevation, variance, support, validity, time = realize_all(
         store(fused),
-        chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
+        torch.where(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         state.validity | hit_now,
         torch.where(hit_now, 0.0, state.time),

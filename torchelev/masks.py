@@ -21,7 +21,7 @@ def masked(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def chosen(mask: Tensor, values: Tensor, others: Tensor | float) -> Tensor:
-    """Return the values where the mask is true, else the others. All must be finite, or NaN would be left."""
+    """Return the values where the mask is true, else the others. Finite ones, or NaN would be left."""
     others = others if isinstance(others, Tensor) else values.new_full((), others)
     if torch.compiler.is_compiling():
         return torch.where(mask, values, others)

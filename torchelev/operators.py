@@ -13,10 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.custom_op import custom_op
 
-
-@custom_op("moved", "(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]")
+@torch.library.custom_op(
+    "torchelev::moved", mutates_args=(), schema="(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]"
+)
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
     H, W = layers[0].shape[1:]
@@ -30,12 +30,12 @@ def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tens
     ]
 
 
-@torch.library.register_fake("torchelev::moved")
+@moved.register_fake
 def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     return [torch.empty_like(layer) for layer in layers]
 
 
-@custom_op("cell_sums")
+@torch.library.custom_op("torchelev::cell_sums", mutates_args=())
 def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor:
     """Sum values (K, B, M) by the slots `index` (B, M) in [0, size): -> (K, B, size). Slots never mix environments."""
     # One row per column and environment: rows run in parallel, and each stays in the cache.
@@ -43,7 +43,7 @@ def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor:
     return zeros.scatter_add_(2, index.expand(values.shape), values)
 
 
-@torch.library.register_fake("torchelev::cell_sums")
+@cell_sums.register_fake
 def _(index: Tensor, values: Tensor, size: int) -> Tensor:
     return values.new_empty(values.shape[0], values.shape[1], size)
 
@@ -57,16 +57,16 @@ def _keep_index(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.save_for_backward(inputs[0])
 
 
-torch.library.register_autograd("torchelev::cell_sums", _cell_sums_backward, setup_context=_keep_index)
+cell_sums.register_autograd(_cell_sums_backward, setup_context=_keep_index)
 
 
-@custom_op("padded")
+@torch.library.custom_op("torchelev::padded", mutates_args=())
 def padded(values: Tensor, radius: int, fill: float) -> Tensor:
     """Put a rim of `radius` cells around (..., H, W)."""
     return F.pad(values, [radius] * 4, value=fill)
 
 
-@torch.library.register_fake("torchelev::padded")
+@padded.register_fake
 def _(values: Tensor, radius: int, fill: float) -> Tensor:
     return values.new_empty(*values.shape[:-2], values.shape[-2] + 2 * radius, values.shape[-1] + 2 * radius)
 
@@ -80,7 +80,7 @@ def _keep_radius(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.radius = inputs[1]
 
 
-torch.library.register_autograd("torchelev::padded", _padded_backward, setup_context=_keep_radius)
+padded.register_autograd(_padded_backward, setup_context=_keep_radius)
 
 
 def _scan_rows(rows: Sequence[Tensor]) -> None:
@@ -103,7 +103,7 @@ def _scan(table: Tensor, from_end: bool) -> None:
     torch.minimum(inner, before.unsqueeze(2).clone(), out=inner)
 
 
-@custom_op("running_minimum")
+@torch.library.custom_op("torchelev::running_minimum", mutates_args=())
 def running_minimum(table: Tensor, from_end: bool) -> Tensor:
     """Return the running minimum along dimension 1, a multiple of 8: over j <= k, or over j >= k from the end."""
     table = table.clone()
@@ -111,14 +111,15 @@ def running_minimum(table: Tensor, from_end: bool) -> Tensor:
     return table
 
 
-@torch.library.register_fake("torchelev::running_minimum")
+@running_minimum.register_fake
 def _(table: Tensor, from_end: bool) -> Tensor:
     return torch.empty_like(table)
 
 
-@custom_op(
-    "polar_minimum",
-    "(Tensor index, Tensor values, SymInt azimuths, SymInt[] widen, SymInt ranges, float blank) -> Tensor",
+@torch.library.custom_op(
+    "torchelev::polar_minimum",
+    mutates_args=(),
+    schema="(Tensor index, Tensor values, SymInt azimuths, SymInt[] widen, SymInt ranges, float blank) -> Tensor",
 )
 def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
     """Return the table (B, R, azimuths) of the lowest value at or beyond each range and near each azimuth.
@@ -143,6 +144,6 @@ def _table_rows(ranges: int) -> int:
     return 8 * (ranges // 8 + 1)
 
 
-@torch.library.register_fake("torchelev::polar_minimum")
+@polar_minimum.register_fake
 def _(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
     return values.new_empty(index.shape[0], _table_rows(ranges), azimuths)

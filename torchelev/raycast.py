@@ -44,6 +44,7 @@ class RaycastConfig:
         cosine = 0 <= self.min_incidence < 1
         require(cosine, "raycast.min_incidence", "must lie in [0, 1)", self.min_incidence, "give a cosine such as 0.1")
         reach = self.max_range is None or self.max_range > 0
+        require(self.gate > 0, "raycast.gate", "must be positive", self.gate, "give standard deviations, such as 3")
         require(reach, "raycast.max_range", "must be positive", self.max_range, "give metres, or None")
 
 
@@ -141,7 +142,7 @@ def ends_well(
     inner = 0.5 * grid.resolution  # half a cell inside, so that rounding leaves no ray outside
     ahead = rays.xy > 0
     room = chosen(ahead, size - inner - start, inner - start)
-    along = chosen(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))
+    along = chosen(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never zero
     share = (room / along).amin(-1).clamp(0, 1)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
@@ -160,7 +161,8 @@ def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bo
 
 def height_margin(state: MapState, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B H W"]:
     """Return how far below a cell's elevation a ray must pass to contradict it [m]; half a cell allows for relief."""
-    return cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()
+    # An infinite gate must leave finite heights.
+    return (cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()).clamp(max=NOWHERE)
 
 
 def horizon(
@@ -183,7 +185,7 @@ def horizon(
     recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = chosen(recent, rays.origin[:, 2, None, None] - lowest, NO_RAY)
     fall = chosen(inside, read(realize(below_sensor).flatten(1), slot), NO_RAY * step) / rho
-    steepest = running_minimum(fall.detach(), from_end=False)
+    steepest = running_minimum(fall, from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths))
@@ -266,7 +268,7 @@ def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> Ma
     gone = state.validity & ray.found & below & (state.time > cfg.min_time) & (ray.incidence > cfg.min_incidence)
     validity = state.validity & ~gone
     bounds = ray.found & ~validity
-    lower = chosen(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
-    upper_bound = chosen(bounds, lower, state.upper_bound)
+    lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
+    upper_bound = torch.where(bounds, lower, state.upper_bound)
     validity, bounded, upper_bound = realize_all(validity, (state.bounded & ~state.validity) | bounds, upper_bound)
     return state._replace(validity=validity, bounded=bounded, upper_bound=upper_bound)

@@ -7,20 +7,18 @@ import functools
 import torch
 from torch import Tensor
 
-from torchelev.custom_op import custom_op
 
-
-@custom_op("realize", "(Tensor[] values) -> Tensor[]")
+@torch.library.custom_op("torchelev::realize", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
 def _realize(values: list[Tensor]) -> list[Tensor]:
     return [value.clone() for value in values]
 
 
-@torch.library.register_fake("torchelev::realize")
+@_realize.register_fake
 def _(values: list[Tensor]) -> list[Tensor]:
     return [torch.empty_like(value) for value in values]
 
 
-torch.library.register_autograd("torchelev::realize", lambda ctx, grads: (grads,))
+_realize.register_autograd(lambda ctx, grads: (grads,))
 
 
 def realize(value: Tensor) -> Tensor:

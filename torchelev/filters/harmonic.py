@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.custom_op import custom_op
 from torchelev.operators import padded
 
 DAMPING = 0.8  # of a Jacobi sweep
@@ -104,7 +103,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum((1, 2), keepdim=True)
 
 
-@custom_op("harmonic")
+@torch.library.custom_op("torchelev::harmonic", mutates_args=())
 def harmonic(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
     """Solve A u = right for (B, H, W) by preconditioned conjugate gradients, until u is right to about `tolerance`.
 
@@ -137,7 +136,7 @@ def quotient(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(positive, a / torch.where(positive, b, 1.0), 0.0)
 
 
-@torch.library.register_fake("torchelev::harmonic")
+@harmonic.register_fake
 def _(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
     return torch.empty_like(right, memory_format=torch.contiguous_format)
 
@@ -155,4 +154,4 @@ def _keep(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.tolerance, ctx.iterations = inputs[2:]
 
 
-torch.library.register_autograd("torchelev::harmonic", _backward, setup_context=_keep)
+harmonic.register_autograd(_backward, setup_context=_keep)

@@ -13,8 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.custom_op import custom_op
-
 
 def _stops(device: torch.device) -> bool:
     return device.type == "cpu"
@@ -84,7 +82,7 @@ def parts_of(cells: Cells) -> Tensor:
     return join(torch.cat(starts), torch.cat(ends), len(own))
 
 
-@custom_op("lowest_of_border")
+@torch.library.custom_op("torchelev::lowest_of_border", mutates_args=())
 def lowest_of_border(values: Tensor, known: Tensor) -> Tensor:
     """Return for each unknown cell of (B, H, W) the number i * W + j of the lowest border cell of its hole.
 
@@ -111,7 +109,7 @@ def lowest_of_border(values: Tensor, known: Tensor) -> Tensor:
     return answer.view(B, H + 2, W + 2)[:, 1:-1, 1:-1].contiguous()
 
 
-@torch.library.register_fake("torchelev::lowest_of_border")
+@lowest_of_border.register_fake
 def _(values: Tensor, known: Tensor) -> Tensor:
     return torch.empty_like(known, dtype=torch.int64, memory_format=torch.contiguous_format)
 
@@ -130,7 +128,7 @@ def _nearest_along_rows(known: Tensor) -> Tensor:
     return torch.stack([(row - nearest).square(), nearest])
 
 
-@custom_op("nearest_known")
+@torch.library.custom_op("torchelev::nearest_known", mutates_args=())
 def nearest_known(known: Tensor) -> Tensor:
     """Return for each cell of (B, H, W) the number i * W + j of the nearest known cell; H * W where none is known.
 
@@ -152,6 +150,6 @@ def nearest_known(known: Tensor) -> Tensor:
     return torch.where(found, best % size, size)
 
 
-@torch.library.register_fake("torchelev::nearest_known")
+@nearest_known.register_fake
 def _(known: Tensor) -> Tensor:
     return torch.empty_like(known, dtype=torch.int64, memory_format=torch.contiguous_format)
