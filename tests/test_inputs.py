@@ -6,9 +6,10 @@ import torch
 from conftest import differences, floats_finite, nans, pose, random_clouds, random_poses, small_map, snapshot
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils._pytree import tree_leaves
 
-from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig
-from torchelev.state import Statistics
+from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig, checks
+from torchelev.state import Statistics, map_layers
 
 B, N = 2, 30
 META = torch.device("meta")
@@ -53,9 +54,9 @@ BAD_POSES = {
     "mirrored": (broken(r22=-1.0), ValueError, "mirror"),
     "zero": (torch.zeros(B, 4, 4), ValueError, "rigid"),
     "far": (broken(r03=1e30), ValueError, "within 1e\\+09 m"),
-    "last row": (broken(r30=0.5), ValueError, "last row.*got 0.5 0 0 1"),
-    "transposed": (broken(r03=0.5).mT, ValueError, "last row.*got 0.5 0 1 1"),
-    "nan": (broken(r03=float("nan")), ValueError, "finite"),
+    "last row": (broken(r30=0.5), ValueError, "last row.*got 0.5 0 0 1 in environment 1"),
+    "transposed": (broken(r03=0.5).mT, ValueError, "last row.*got 0 0 1 1 in environment 0, 1"),
+    "nan": (broken(r03=float("nan")), ValueError, "finite, got NaN or inf in environment 1"),
     "inf": (broken(r13=float("inf")), ValueError, "finite"),
     "nan rotation": (broken(r12=float("nan")), ValueError, "finite"),
 }
@@ -100,6 +101,45 @@ def test_update_refuses_and_changes_nothing(emap, case, method):
             good = dict(points=torch.zeros(B, N, 3), T_map_sensor=pose(num_envs=B))
             emap.measure(**{**good, name: value})
     assert differences(before, snapshot(emap)) == []
+
+
+UNSOUND = {"NaN": torch.nan, "infinite": torch.inf, "far": 1e30}
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("of", ["sensor", "base", "both"])
+def test_one_bad_pose_that_was_not_read_leaves_one_robot_out(of, compiled, monkeypatch):
+    """As on a GPU, where the host does not wait to read it."""
+    monkeypatch.setattr(checks, "readable", lambda *_: False)
+    maps, good = [mapped(), mapped()], pose(num_envs=B)
+    before = map_layers(torch.clone, maps[0].state)
+    cloud, far = torch.zeros(B, N, 3) - 1, pose((3.0, 0.0, 1.0), num_envs=B)
+    bad = {name: torch.cat([far[:1], torch.full((1, 4, 4), value)]) for name, value in UNSOUND.items()}
+    maps[1].update(cloud, far, far, 0.1)
+    if compiled:
+        maps[0].compile()
+    for T in bad.values():
+        for layer, value in zip(tree_leaves(maps[0].state), tree_leaves(before), strict=True):
+            layer.copy_(value)
+        maps[0].update(cloud, good if of == "base" else T, good if of == "sensor" else T, 0.1)
+        after, alone = maps[0].state, maps[1].state
+        assert maps[0].statistics.rejected_invalid.tolist() == [0, N]
+        assert torch.equal(after.corner[1], before.corner[1]) and after.base_height[1] == before.base_height[1]
+        assert torch.equal(after.elevation[1], before.elevation[1])
+        assert all(value.isfinite().all() for value in tree_leaves(after) if value.is_floating_point())
+        if of == "both":
+            torch.testing.assert_close(after.elevation[0], alone.elevation[0], rtol=0, atol=1e-6)
+            assert torch.equal(after.corner[0], alone.corner[0]) and torch.equal(after.validity[0], alone.validity[0])
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -1.0])
+def test_no_time_passes_in_one_bad_dt_that_was_not_read(bad, monkeypatch):
+    monkeypatch.setattr(checks, "readable", lambda *_: False)
+    maps = [mapped(), mapped()]
+    for emap, dt in zip(maps, (bad, 0.0), strict=True):
+        call(emap, dt=torch.tensor([0.1, dt]))
+    for values in zip(*(tree_leaves(emap.state) for emap in maps), strict=True):
+        assert torch.equal(*values)
 
 
 def test_mend_of_a_transposed_pose(emap):

@@ -85,8 +85,17 @@ def test_huge_coordinates_are_out_of_range(point, dtype):
 def test_variances_of_the_user_replace_the_model():
     emap = small_map(1)
     cloud = torch.tensor([[[0.0, 0.1, -1.0], [0.1, 0.0, -1.0], [0.1, 0.1, -1.0]]])
-    m = emap.measure(cloud, pose(), None, 0.0, variance=torch.tensor([[0.5, float("nan"), -1.0]]))
-    assert m.variance[0, 0] == 0.5 and (m.variance > 0).all()  # nonsense does not poison the map
+    m = emap.measure(cloud, pose(), None, 0.0, variance=torch.tensor([[0.5, 0.2, 1e-6]]))
+    assert torch.equal(m.variance, torch.tensor([[0.5, 0.2, 1e-6]])) and m.used.all()
+
+
+@pytest.mark.parametrize("variance", [torch.nan, torch.inf, -torch.inf, -1.0, 0.0, 1e-39])
+def test_points_without_a_variance_are_ignored(variance):
+    """1e-39 has no inverse that float32 holds."""
+    cloud = torch.tensor([[[0.0, 0.1, -1.0], [0.1, 0.0, -1.0]]])
+    m = small_map(1).measure(cloud, pose(), None, 0.0, variance=torch.tensor([[0.5, variance]]))
+    assert m.used.tolist() == m.casts.tolist() == [[True, False]] and m.rejected_invalid.item() == 1
+    assert (m.variance > 0).all()  # whatever it is multiplied with
 
 
 def test_a_variance_orders_the_weight_of_points():

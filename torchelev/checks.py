@@ -32,7 +32,7 @@ def check_tensor(
     value: object,
     device: torch.device,
     dtypes: tuple[torch.dtype, ...],
-    convert: str = "convert it with .to(dtype)",
+    convert: str | None = None,
 ) -> Tensor:
     """Refuse what is no tensor, or lies elsewhere, or has another dtype, which `convert` says how to mend."""
     if isinstance(value, Tensor) and value.dtype in dtypes and _same(value.device, device):
@@ -41,6 +41,7 @@ def check_tensor(
     require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
     assert isinstance(value, Tensor)
     kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
+    convert = convert or f"convert it with .to({dtypes[-2 if len(dtypes) > 1 else 0]})"
     require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, convert, TypeError)
     came = f"{tuple(value.shape)} on {value.device}"
     require(_same(value.device, device), name, f"must be on {device}", came, "move it with .to(emap.device)")
@@ -85,26 +86,37 @@ def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.de
 
 def _check_rigid(name: str, pose: Tensor) -> None:
     # In NumPy, whose calls cost a fifth of torch's: for one robot they are what a check costs.
-    matrix = pose.detach().cpu().double().numpy().reshape(-1, 4, 4)
+    shape = (len(pose) if pose.ndim > 2 else 1, math.prod(pose.shape[1:-2]), 4, 4)
+    matrix = pose.detach().cpu().double().numpy().reshape(shape)
+
+    def refuse_where(bad: np.ndarray, rule: str, came: str, mend: str) -> None:
+        if bad.any():
+            require(False, name, rule, came + _environments(bad), mend)
+
+    finite = np.isfinite(matrix).all((2, 3))
+    mend = "leave such an environment out by points of NaN, with any other pose"
+    refuse_where(~finite, "must be finite", "NaN or inf", mend)
     mend = "use torchelev.frames.transform(position, quat_wxyz)"
-    require(bool(np.isfinite(matrix).all()), name, "must be finite", "NaN or inf", mend)
-    rotation, position = matrix[:, :3, :3], matrix[:, :3, 3]
-    error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
-    require(bool(error < 1e-3), name, "must be rigid (R R^T = 1)", f"an error of {error:.3g}", mend)
-    require(bool((np.linalg.det(rotation) > 0).all()), name, "must not mirror", "determinant -1", mend)
-    last = matrix[:, 3]
-    transposed = bool((matrix[:, :, 3] == (0, 0, 0, 1)).all())
-    require(
-        bool((last == (0, 0, 0, 1)).all()),
-        name,
-        "must have the last row 0 0 0 1",
-        " ".join(f"{x:g}" for x in last[np.abs(last - (0, 0, 0, 1)).sum(1).argmax()]),
-        "transpose it: the position is the last column" if transposed else mend,
-    )
-    far = np.abs(position).max(initial=0.0)
-    require(
-        bool(far <= FARTHEST), name, f"must lie within {FARTHEST:g} m", f"{far:.3g} m", "check its units and source"
-    )
+    rotation, position = matrix[..., :3, :3], matrix[..., :3, 3]
+    error = np.abs(rotation @ rotation.swapaxes(2, 3) - np.eye(3)).max((2, 3))
+    refuse_where(error >= 1e-3, "must be rigid (R R^T = 1)", f"an error of {error.max(initial=0.0):.3g}", mend)
+    refuse_where(np.linalg.det(rotation) <= 0, "must not mirror", "determinant -1", mend)
+    other = (matrix[:, :, 3] != (0, 0, 0, 1)).any(2)
+    if other.any():
+        transposed = bool((matrix[..., 3] == (0, 0, 0, 1)).all())
+        mend = "transpose it: the position is the last column" if transposed else mend
+        row = " ".join(f"{x:g}" for x in matrix[other][0, 3])
+        refuse_where(other, "must have the last row 0 0 0 1", row, mend)
+    far = np.abs(position).max(2, initial=0.0)
+    came = f"{far.max(initial=0.0):.3g} m"
+    refuse_where(far > FARTHEST, f"must lie within {FARTHEST:g} m", came, "check its units and source")
+
+
+def _environments(bad: np.ndarray) -> str:
+    """Name the environments with a bad pose, of (B, S); nothing where there is but one."""
+    which = np.flatnonzero(bad.any(1))
+    more = f" and {len(which) - 3} more" if len(which) > 3 else ""
+    return f" in environment {', '.join(map(str, which[:3]))}{more}" if len(bad) > 1 else ""
 
 
 def require_full_precision(dtype: torch.dtype) -> None:

@@ -38,7 +38,8 @@ class ElevationMap(nn.Module):
         num_envs: B, how many maps.
         device: where they live; `.to()` moves them.
         check_values: also check pose matrices, tensor `dt` and ids on devices other than the CPU, which makes the host
-            wait for the device.
+            wait for the device. Otherwise an environment there whose pose is not finite takes in no points and its
+            window stays, and no time passes in a bad `dt`.
         chunk: update at most so many environments at a time, for less memory and, to rounding, the same result.
             None: all on a GPU; on a CPU as many as fit into its caches, which is faster too.
         head: a trained head to take, itself and not a copy, in place of the weights that the config names.
@@ -151,7 +152,8 @@ class ElevationMap(nn.Module):
             T_map_sensor: takes sensor-frame points into the map frame; float64 far from the origin.
             T_map_base: the robot; the window follows it. None: the window stays, overlap and body box are skipped.
             dt: time since that environment's last update [s]; 0, the default, for a further sensor of the same instant.
-            variance: of each point's height [m^2], in place of the noise model.
+            variance: of each point's height [m^2], in place of the noise model; a point whose variance is not positive
+                and finite is ignored.
 
         Raises ValueError or TypeError before anything changed.
         """

@@ -127,7 +127,8 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     """
     if m.base is None:
         return state
-    corner = window_corner(m.base[:, :2], m.anchor, grid)
+    moves = torch.isfinite(m.base).all(1)
+    corner = torch.where(moves[:, None], window_corner(m.base[:, :2], m.anchor, grid), state.corner)
     # A shift of a whole window blanks everything; the clamp keeps the index arithmetic small.
     shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
     corner, shift = realize_all(corner, shift)
@@ -140,7 +141,8 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     values = moved(layers, shift, blanks) if few else gathered(layers, shift, blanks, grid)
     values = [as_mask(value) if mask else value for value, mask in zip(values, masks, strict=True)]
     fields: dict[str, Any] = dict(zip(names, values, strict=True))
-    return state._replace(corner=corner, base_height=m.base[:, 2], **fields)
+    base_height = torch.where(moves, m.base[:, 2], state.base_height)
+    return state._replace(corner=corner, base_height=base_height, **fields)
 
 
 def window_center(corner: Int[Tensor, "B 2"], grid: GridConfig) -> Float[Tensor, "B 2"]:

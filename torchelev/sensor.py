@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchelev.checks import FARTHEST
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.state import Measurement, count
@@ -94,6 +95,11 @@ def turned(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) 
     ]
 
 
+def sound(pose: Float[Tensor, "B ... 4 4"]) -> Bool[Tensor, "B"]:
+    """Tell which environments' poses may become cell numbers: those that are finite, and within FARTHEST."""
+    return (pose.abs() <= FARTHEST).flatten(1).all(1)
+
+
 def measure(
     points: Float[Tensor, "B S N 3"],
     T_map_sensor: Float[Tensor, "B S 4 4"],
@@ -107,8 +113,14 @@ def measure(
     """Turn sensor-frame points into a measurement (paper, Sec. II-A "transform" and II-C).
 
     Noise: sigma_p^2 = alpha_d * d^2 + floor with d the distance from the sensor, or the caller's variances.
-    Gates: not finite, distance, body box, exclusion ramp. An ignored point has used = False.
+    Gates: not finite, distance, body box, exclusion ramp. An ignored point has used = False. A point is not finite
+    either whose variance is not positive and finite, or one of whose environment's poses is not `sound`.
     """
+    # Where the host may not read poses, and refuse them, one robot's NaN would become an index, and an error of all.
+    good = sound(T_map_sensor) if T_map_base is None else sound(T_map_sensor) & sound(T_map_base)
+    good, T_map_sensor = realize_all(good, torch.where(good[:, None, None, None], T_map_sensor, 0.0))
+    if T_map_base is not None:
+        T_map_base = realize(torch.where(good[:, None, None], T_map_base, 0.0))
     position = T_map_sensor[..., :3, 3]
     base_position = None if T_map_base is None else T_map_base[:, :3, 3]
     anchor = anchor_of(position[:, 0] if base_position is None else base_position, grid.resolution)
@@ -116,7 +128,10 @@ def measure(
     base = None if base_position is None else relative_to(base_position, anchor, grid.resolution, dtype)
 
     x, y, z = points.to(dtype).unbind(-1)
-    finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
+    finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z) & good[:, None, None]
+    if variance is not None:
+        variance = variance.to(dtype)
+        finite = finite & torch.isfinite(variance) & (variance >= torch.finfo(dtype).tiny)  # has a finite inverse
     # Zeroed before any product: 0 * NaN would poison sums and gradients, and so would the square of 1e30.
     small = finite & (torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= cfg.max_distance)
     x, y, z = (torch.where(small, c, 0.0) for c in (x, y, z))
@@ -132,8 +147,7 @@ def measure(
     if variance is None:
         sigma2 = (cfg.noise_factor * square + cfg.noise_floor).flatten(1)
     else:
-        given = variance.to(dtype).flatten(1)
-        sigma2 = torch.where(torch.isfinite(given) & (given > 0), given, 1.0)
+        sigma2 = torch.where(finite, variance.flatten(1), 1.0)
     body = torch.zeros_like(valid)
     if cfg.body is not None and base is not None and T_map_base is not None:
         body = valid & inside_body(in_map, T_map_base, base, cfg.body)
@@ -148,8 +162,8 @@ def measure(
         used=used,
         casts=casts,
         origin=origin,
-        base=base,
-        dt=dt.to(dtype),
+        base=base if base is None else realize(torch.where(good[:, None], base, torch.nan)),
+        dt=realize(dt.to(dtype).nan_to_num(0.0, 0.0).clamp(min=0)),
         rejected_invalid=count(~finite),
         rejected_range=count(finite & ~valid),
         rejected_body=count(body),

@@ -65,7 +65,7 @@ class Measurement(NamedTuple):
     used: Bool[Tensor, "B M"]  # measures the ground
     casts: Bool[Tensor, "B M"]  # its ray clears and bounds (points rejected as overhang do)
     origin: Float[Tensor, "B S 3"]  # [m] the sensors
-    base: Float[Tensor, "B 3"] | None  # [m] the robot; None: the window stays
+    base: Float[Tensor, "B 3"] | None  # [m] the robot; None, or NaN in one environment: the window stays
     dt: Float[Tensor, "B"]  # [s]
     rejected_invalid: Int[Tensor, "B"]
     rejected_range: Int[Tensor, "B"]
