@@ -95,7 +95,7 @@ def test_points_without_a_variance_are_ignored(variance):
     cloud = torch.tensor([[[0.0, 0.1, -1.0], [0.1, 0.0, -1.0]]])
     m = small_map(1).measure(cloud, pose(), None, 0.0, variance=torch.tensor([[0.5, variance]]))
     assert m.used.tolist() == m.casts.tolist() == [[True, False]] and m.rejected_invalid.item() == 1
-    assert (m.variance > 0).all()  # whatever it is multiplied with
+    assert m.variance[0, 0] == 0.5 and (m.variance > 0).all()  # nonsense does not poison the map
 
 
 def test_a_variance_orders_the_weight_of_points():

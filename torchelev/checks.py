@@ -7,6 +7,7 @@ host wait for the device, so they run for CPU tensors and, on request, for other
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
@@ -41,7 +42,7 @@ def check_tensor(
     require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
     assert isinstance(value, Tensor)
     kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
-    convert = convert or f"convert it with .to({dtypes[-2 if len(dtypes) > 1 else 0]})"
+    convert = convert or f"convert it with .to({torch.float32 if torch.float32 in dtypes else dtypes[0]})"
     require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, convert, TypeError)
     came = f"{tuple(value.shape)} on {value.device}"
     require(_same(value.device, device), name, f"must be on {device}", came, "move it with .to(emap.device)")
@@ -85,36 +86,33 @@ def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.de
 
 
 def _check_rigid(name: str, pose: Tensor) -> None:
-    # In NumPy, whose calls cost a fifth of torch's: for one robot they are what a check costs.
-    shape = (len(pose) if pose.ndim > 2 else 1, math.prod(pose.shape[1:-2]), 4, 4)
-    matrix = pose.detach().cpu().double().numpy().reshape(shape)
+    # In NumPy, whose calls cost a fifth of torch's: for one robot they are what a check costs. What an error says is
+    # made when there is one.
+    matrix = pose.detach().cpu().double().numpy()
+    matrix = matrix if pose.ndim > 2 else matrix[None]
 
-    def refuse_where(bad: np.ndarray, rule: str, came: str, mend: str) -> None:
+    def refuse(bad: np.ndarray, rule: str, came: Callable[[], str], mend: str) -> None:
         if bad.any():
-            require(False, name, rule, came + _environments(bad), mend)
+            require(False, name, rule, came() + _environments(bad), mend)
 
-    finite = np.isfinite(matrix).all((2, 3))
     mend = "leave such an environment out by points of NaN, with any other pose"
-    refuse_where(~finite, "must be finite", "NaN or inf", mend)
+    refuse(~np.isfinite(matrix), "must be finite", lambda: "NaN or inf", mend)
     mend = "use torchelev.frames.transform(position, quat_wxyz)"
-    rotation, position = matrix[..., :3, :3], matrix[..., :3, 3]
-    error = np.abs(rotation @ rotation.swapaxes(2, 3) - np.eye(3)).max((2, 3))
-    refuse_where(error >= 1e-3, "must be rigid (R R^T = 1)", f"an error of {error.max(initial=0.0):.3g}", mend)
-    refuse_where(np.linalg.det(rotation) <= 0, "must not mirror", "determinant -1", mend)
-    other = (matrix[:, :, 3] != (0, 0, 0, 1)).any(2)
-    if other.any():
-        transposed = bool((matrix[..., 3] == (0, 0, 0, 1)).all())
-        mend = "transpose it: the position is the last column" if transposed else mend
-        row = " ".join(f"{x:g}" for x in matrix[other][0, 3])
-        refuse_where(other, "must have the last row 0 0 0 1", row, mend)
-    far = np.abs(position).max(2, initial=0.0)
-    came = f"{far.max(initial=0.0):.3g} m"
-    refuse_where(far > FARTHEST, f"must lie within {FARTHEST:g} m", came, "check its units and source")
+    rotation, position, last = matrix[..., :3, :3], np.abs(matrix[..., :3, 3]), matrix[..., 3, :]
+    error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3))
+    refuse(error >= 1e-3, "must be rigid (R R^T = 1)", lambda: f"an error of {error.max():.3g}", mend)
+    refuse(np.linalg.det(rotation) <= 0, "must not mirror", lambda: "determinant -1", mend)
+    other = last != (0, 0, 0, 1)
+    if other.any() and (matrix[..., 3] == (0, 0, 0, 1)).all():
+        mend = "transpose it: the position is the last column"
+    refuse(other, "must have the last row 0 0 0 1", lambda: " ".join(f"{x:g}" for x in last[other.any(-1)][0]), mend)
+    mend = "check its units and source"
+    refuse(position > FARTHEST, f"must lie within {FARTHEST:g} m", lambda: f"{position.max():.3g} m", mend)
 
 
 def _environments(bad: np.ndarray) -> str:
-    """Name the environments with a bad pose, of (B, S); nothing where there is but one."""
-    which = np.flatnonzero(bad.any(1))
+    """Name the environments, first of the dimensions, in which something is bad; nothing where there is but one."""
+    which = np.flatnonzero(bad.reshape(len(bad), -1).any(1))
     more = f" and {len(which) - 3} more" if len(which) > 3 else ""
     return f" in environment {', '.join(map(str, which[:3]))}{more}" if len(bad) > 1 else ""
 

@@ -95,9 +95,26 @@ def turned(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) 
     ]
 
 
-def sound(pose: Float[Tensor, "B ... 4 4"]) -> Bool[Tensor, "B"]:
-    """Tell which environments' poses may become cell numbers: those that are finite, and within FARTHEST."""
+def sound_poses(T_map_sensor: Tensor, T_map_base: Tensor | None) -> tuple[Bool[Tensor, "B"], Tensor, Tensor | None]:
+    """Tell which environments' poses are finite and within FARTHEST; return them with zeros in place of the others.
+
+    Where the host may not read poses, and refuse them, one robot's NaN would become an index, and an error of all.
+    """
+    sound = near(T_map_sensor) if T_map_base is None else near(T_map_sensor) & near(T_map_base)
+    sound, T_map_sensor = realize_all(sound, torch.where(sound[:, None, None, None], T_map_sensor, 0.0))
+    if T_map_base is not None:
+        T_map_base = realize(torch.where(sound[:, None, None], T_map_base, 0.0))
+    return sound, T_map_sensor, T_map_base
+
+
+def near(pose: Float[Tensor, "B ... 4 4"]) -> Bool[Tensor, "B"]:
+    """Tell which environments' poses may become cell numbers; NaN may not."""
     return (pose.abs() <= FARTHEST).flatten(1).all(1)
+
+
+def has_inverse(variance: Tensor) -> Tensor:
+    """Tell which variances are positive and finite, and their inverses finite too."""
+    return torch.isfinite(variance) & (variance >= torch.finfo(variance.dtype).tiny)
 
 
 def measure(
@@ -114,24 +131,19 @@ def measure(
 
     Noise: sigma_p^2 = alpha_d * d^2 + floor with d the distance from the sensor, or the caller's variances.
     Gates: not finite, distance, body box, exclusion ramp. An ignored point has used = False. A point is not finite
-    either whose variance is not positive and finite, or one of whose environment's poses is not `sound`.
+    either whose variance `has_inverse` refuses, or one of whose environment's poses `sound_poses` does.
     """
-    # Where the host may not read poses, and refuse them, one robot's NaN would become an index, and an error of all.
-    good = sound(T_map_sensor) if T_map_base is None else sound(T_map_sensor) & sound(T_map_base)
-    good, T_map_sensor = realize_all(good, torch.where(good[:, None, None, None], T_map_sensor, 0.0))
-    if T_map_base is not None:
-        T_map_base = realize(torch.where(good[:, None, None], T_map_base, 0.0))
+    sound, T_map_sensor, T_map_base = sound_poses(T_map_sensor, T_map_base)
     position = T_map_sensor[..., :3, 3]
-    base_position = None if T_map_base is None else T_map_base[:, :3, 3]
-    anchor = anchor_of(position[:, 0] if base_position is None else base_position, grid.resolution)
+    anchor = anchor_of(position[:, 0] if T_map_base is None else T_map_base[:, :3, 3], grid.resolution)
     origin = relative_to(position, anchor, grid.resolution, dtype)
-    base = None if base_position is None else relative_to(base_position, anchor, grid.resolution, dtype)
+    base = None if T_map_base is None else relative_to(T_map_base[:, :3, 3], anchor, grid.resolution, dtype)
 
     x, y, z = points.to(dtype).unbind(-1)
-    finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z) & good[:, None, None]
+    finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z) & sound[:, None, None]
     if variance is not None:
         variance = variance.to(dtype)
-        finite = finite & torch.isfinite(variance) & (variance >= torch.finfo(dtype).tiny)  # has a finite inverse
+        finite = finite & has_inverse(variance)
     # Zeroed before any product: 0 * NaN would poison sums and gradients, and so would the square of 1e30.
     small = finite & (torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= cfg.max_distance)
     x, y, z = (torch.where(small, c, 0.0) for c in (x, y, z))
@@ -148,10 +160,9 @@ def measure(
         sigma2 = (cfg.noise_factor * square + cfg.noise_floor).flatten(1)
     else:
         sigma2 = torch.where(finite, variance.flatten(1), 1.0)
-    body = torch.zeros_like(valid)
+    body = overhang = torch.zeros_like(valid)
     if cfg.body is not None and base is not None and T_map_base is not None:
         body = valid & inside_body(in_map, T_map_base, base, cfg.body)
-    overhang = torch.zeros_like(valid)
     if cfg.exclusion is not None:
         overhang = valid & ~body & above_ramp(relative, cfg.exclusion)
     sigma2, used, casts = realize_all(sigma2, valid & ~body & ~overhang, valid & ~body)
@@ -162,7 +173,7 @@ def measure(
         used=used,
         casts=casts,
         origin=origin,
-        base=base if base is None else realize(torch.where(good[:, None], base, torch.nan)),
+        base=base if base is None else realize(torch.where(sound[:, None], base, torch.nan)),
         dt=realize(dt.to(dtype).nan_to_num(0.0, 0.0).clamp(min=0)),
         rejected_invalid=count(~finite),
         rejected_range=count(finite & ~valid),
