@@ -38,8 +38,13 @@ def alone(emap: ElevationMap) -> Callable[[], Any]:
     net, robot, state = TraversabilityNet.from_pretrained().requires_grad_(False), RobotConfig(), emap.state
     layers = state.elevation, state.validity, state.variance, state.upper_bound, state.bounded
     compiled = torch.compile(lambda *given: net(*given, resolution=emap.cfg.grid.resolution, robot=robot))
-    compiled(*layers)
-    return lambda: compiled(*layers)
+
+    def run() -> None:
+        with torch.no_grad():
+            compiled(*layers)
+
+    run()
+    return run
 
 
 def table(rows: dict[str, Any]) -> str:

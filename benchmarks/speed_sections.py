@@ -18,7 +18,7 @@ from torch.utils._pytree import tree_map
 
 from benchmarks import meter
 from benchmarks.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
-from torchelev import aging, drift, fusion, grid, overlap, pipeline, raycast, sensor
+from torchelev import aging, compilation, drift, fusion, grid, overlap, pipeline, raycast, sensor
 from torchelev.state import MapState, Measurement, map_layers
 from torchelev.storage import as_bytes, as_mask
 
@@ -33,7 +33,7 @@ Track = Callable[[Iterable], Iterable]  # shows progress
 def fresh_compiler() -> None:
     """Forget compiled updates: the one for a second number of robots would be made for any number."""
     torch._dynamo.reset()
-    pipeline.graphs_of.cache_clear()
+    compilation.graphs_of.cache_clear()
 
 
 def points(seconds: float, track: Track) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def compiled_alone(stage: Callable[[MapState, Measurement], Any], inputs: list[A
         masks = tree_map(lambda t: as_mask(t) if isinstance(t, Tensor) and t.dtype == torch.uint8 else t, values)
         return mask_bytes(stage(*masks))
 
-    compiled = torch.compile(pipeline.own_code(on_bytes), fullgraph=True, options=pipeline.compiler_options())
+    compiled = torch.compile(compilation.own_code(on_bytes), fullgraph=True, options=compilation.compiler_options())
     values = [mask_bytes(value) for value in inputs]
 
     def run() -> None:
@@ -104,7 +104,8 @@ def compiled_alone(stage: Callable[[MapState, Measurement], Any], inputs: list[A
             for value in values:
                 compiled(value)
 
-    run()
+    with compilation.short_kernels():
+        run()
     return run
 
 

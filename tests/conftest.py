@@ -8,8 +8,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
 
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig, pipeline
-from torchelev.pipeline import graphs_of
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, compilation
+from torchelev.compilation import graphs_of
 from torchelev.state import MapState, Statistics, blank_state
 
 settings.register_profile(
@@ -34,11 +34,11 @@ def _one_thread():
 @pytest.fixture
 def compile_with(monkeypatch):
     """Let emap.compile() use another backend of the compiler, with the guards of the real one."""
-    compiler, options = torch.compile, pipeline.compiler_options()
+    compiler, options = torch.compile, compilation.compiler_options()
     guards = {name: value for name, value in options.items() if name == "guard_filter_fn"}
 
     def use(backend):
-        monkeypatch.setattr(pipeline, "compiler_options", lambda: guards)
+        monkeypatch.setattr(compilation, "compiler_options", lambda: guards)
         monkeypatch.setattr(torch, "compile", functools.partial(compiler, backend=backend))
         graphs_of.cache_clear()
         torch._dynamo.reset()

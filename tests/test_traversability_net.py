@@ -298,7 +298,7 @@ def test_flat_ground_is_seen_as_flat():
     scales = in_cells(ROBOT, CELLS)
     z, known = torch.full((1, 15, 15), 3.0, dtype=torch.float64), torch.ones(1, 15, 15) > 0
     ground = complete(z, known, torch.zeros_like(z), z, ~known, scales)
-    seen = features(ground, extremes(ground, scales), scales, CELLS, ROBOT)
+    seen = torch.stack(features(ground, extremes(ground, scales), scales, CELLS, ROBOT), 1)
     middle = seen[0, :, seen.shape[2] // 2, seen.shape[3] // 2]
     torch.testing.assert_close(middle[:5], torch.ones(5, dtype=torch.float64))  # shares of known cells
     torch.testing.assert_close(middle[5:], torch.zeros(13, dtype=torch.float64), atol=1e-12, rtol=0)

@@ -11,13 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from torchelev import checks
+from torchelev.compilation import compiled_update
 from torchelev.config import ElevationMapConfig, differing_fields
 from torchelev.errors import require
 from torchelev.filters.chain import FilterChain
 from torchelev.grid import cell_centers, window_center
 from torchelev.initialize import METHODS, initialize
 from torchelev.layers import LAYERS, Layer, sample_layer
-from torchelev.pipeline import compiled_update, fuse_measurement, rate_surface, update_in_place, write
+from torchelev.pipeline import fuse_measurement, rate_surface, update_in_place, write
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
 from torchelev.storage import keep_freed_memory
@@ -225,8 +226,8 @@ class ElevationMap(nn.Module):
     def compile(self) -> None:  # type: ignore[override]
         """Make `update` run compiled. The first update compiles for about a minute, which needs a C++ compiler.
 
-        Maps of equal configs share one graph, and so do scans of any length. Another number of environments or
-        sensors, or a base pose that comes or goes, makes another.
+        Maps of equal configs share one graph, and so do scans of any length. Another number of sensors, or a base pose
+        that comes or goes, makes another; so do the first few numbers of environments, of which the last is for any.
         """
         self._compiled = True
 

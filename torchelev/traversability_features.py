@@ -161,7 +161,7 @@ def _slope(height: Tensor, distance: int, rim: int) -> Tensor:
 
 def features(
     ground: Surface, extreme: Extremes, scales: Scales, resolution: float, robot: RobotConfig
-) -> Float[Tensor, "B F h w"]:
+) -> list[Float[Tensor, "B h w"]]:
     """Return what is seen around every cell that feet may stand on; 0 where nothing is known in reach."""
     rim = scales.margin - scales.stood_on
     step, steep = 1 / robot.step_height, (1 / (resolution * math.tan(robot.max_slope))) ** 2
@@ -170,15 +170,12 @@ def features(
     heights = [above - below for above, below in itertools.pairwise(inner)]
     for (highest, lowest), mean in ((extreme.near, inner[1]), (extreme.far, inner[2])):
         heights += [highest - mean, mean - lowest]
-    return torch.stack(
-        [
-            shifted(ground.known, rim),
-            *(shifted(share, rim) for share in ground.shares),
-            *(squashed(height * step) * extreme.complete for height in heights),
-            *(squashed(slope) * extreme.complete for slope in slopes),
-            squashed(shifted(ground.variance, rim) * (1 / NOISE**2)),
-            squashed(shifted(ground.hidden, rim) * step),
-            shifted(ground.bounded, rim),
-        ],
-        1,
-    )
+    return [
+        shifted(ground.known, rim),
+        *(shifted(share, rim) for share in ground.shares),
+        *(squashed(height * step) * extreme.complete for height in heights),
+        *(squashed(slope) * extreme.complete for slope in slopes),
+        squashed(shifted(ground.variance, rim) * (1 / NOISE**2)),
+        squashed(shifted(ground.hidden, rim) * step),
+        shifted(ground.bounded, rim),
+    ]

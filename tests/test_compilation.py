@@ -9,8 +9,8 @@ from torch._dynamo.testing import CompileCounter
 
 import torchelev
 from torchelev import SensorConfig
+from torchelev.compilation import KERNEL_ARGUMENTS, announced_compilation, graphs_of
 from torchelev.layers import LAYERS
-from torchelev.pipeline import graphs_of
 
 
 def core(emap):
@@ -120,19 +120,31 @@ def test_inputs_of_every_kind_have_their_own_graphs(compile_with):
             assert_close(maps[0].state, maps[1].state)
 
 
-def test_the_first_compiled_update_says_what_it_costs(compile_with, capsys):
-    compile_with("eager")
-    emap = small_map(2)
-    emap.compile()
-    for k in range(2):
-        cloud, T = scan(k, 2)
+def test_an_update_that_compiles_says_what_it_costs(compile_with, capsys):
+    counter = CompileCounter()
+    compile_with(counter)
+    for number, num_envs in enumerate((2, 2, 3, 5, 1, 7, 2)):
+        emap = small_map(num_envs)
+        emap.compile()
+        cloud, T = scan(number, num_envs)
+        before = counter.frame_count
         emap.update(cloud, T, T, 0.1)
-    assert capsys.readouterr().err.count("compiling the update") == 1
-    other = small_map(3)
-    other.compile()
-    cloud, T = scan(0, 3)
-    other.update(cloud, T, T, 0.1)
-    assert capsys.readouterr().err.count("compiling the update") == 1  # another number of environments
+        assert capsys.readouterr().err.count("compiling the update") == counter.frame_count - before
+    assert counter.frame_count == 4  # of 2, of 2 to 4, of 5 and more, of 1
+
+
+def test_the_compiler_frees_memory_in_between_and_is_left_as_it_was(capsys):
+    from torch._dynamo.callback import callback_handler
+    from torch._inductor.codegen.cpp import CppScheduling
+
+    usual = CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
+    with pytest.raises(RuntimeError), announced_compilation():
+        assert usual > CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM == KERNEL_ARGUMENTS
+        torch.compile(lambda x: x + 1, backend="eager")(torch.ones(2))
+        raise RuntimeError
+    assert usual == CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
+    assert "failed" in capsys.readouterr().err
+    assert not callback_handler.start_callbacks
 
 
 @pytest.mark.parametrize("sensors", [None, 2])
