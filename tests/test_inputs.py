@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 import torch
-from conftest import differences, floats_finite, nans, pose, random_clouds, random_poses, small_map, snapshot
+from conftest import (
+    differences,
+    floats_finite,
+    nans,
+    pose,
+    random_clouds,
+    random_poses,
+    scan,
+    small_config,
+    small_map,
+    snapshot,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._pytree import tree_leaves
@@ -348,3 +359,23 @@ def test_a_map_of_nans_stays_blank(emap):
     fresh.update(nans(B), pose(num_envs=B), None, 0.0)
     assert not fresh.validity.any() and not fresh.bounded.any()
     assert fresh.statistics.rejected_invalid.tolist() == [4, 4]
+
+
+@pytest.mark.parametrize("number", [np.int64, np.uint8, np.int32])
+def test_numbers_of_numpy_count(number):
+    emap = ElevationMap(small_config(), num_envs=number(2), chunk=number(1))
+    assert (emap.num_envs, emap.chunk) == (2, 1) and type(emap.num_envs) is int
+    for dt in (np.float32(0.5), np.float64(0.5), number(1)):
+        emap.reset()
+        cloud, T = scan(0)
+        emap.update(cloud, T, T)
+        emap.update(cloud * torch.nan, T, T, dt)
+        assert emap.layer("time").nan_to_num(-1).amax() == float(dt)
+
+
+@pytest.mark.parametrize("number", [True, np.bool_(True), 2.0, np.float32(2), "2", 0, np.int64(0)])
+def test_what_is_no_number_of_environments_is_refused(number):
+    with pytest.raises(ValueError, match="num_envs: must be a positive int, got"):
+        ElevationMap(small_config(), num_envs=number)
+    with pytest.raises(ValueError, match="chunk: must be a positive int, got .*or None"):
+        ElevationMap(small_config(), chunk=number)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.checks import FLOATS, readable, require_indices
-from torchelev.errors import require, require_positive
+from torchelev.errors import require, require_count, require_positive
 from torchelev.windows import AROUND, neighbours
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ def cost_to_go(
     """
     _check_grids(cost, goal)
     require_positive(resolution=resolution)
-    whole = rounds is None or (type(rounds) is int and rounds >= 1)
-    require(whole, "rounds", "must be a positive int or None", repr(rounds), "give 16")
+    if rounds is not None:
+        require_count("rounds", rounds, "give 16, or None")
     look = readable(cost)
     limit = rounds or (cost.shape[1] * cost.shape[2] + 1 if look else ROUNDS)
     if look:
@@ -147,8 +147,7 @@ def descend(
 
     Stays where no goal can be reached. Raises ValueError for shapes that do not fit and, on a CPU, cells outside.
     """
-    whole = type(max_cells) is int and max_cells >= 1
-    require(whole, "max_cells", "must be a positive int", repr(max_cells), "give 500")
+    require_count("max_cells", max_cells, "give 500")
     B, H, W = cost.shape
     fits = tuple(value.shape) == (B, H, W)
     require(fits, "value", f"expected {(B, H, W)}", tuple(value.shape), "give what cost_to_go returns")

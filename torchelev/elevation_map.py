@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchelev import checks
 from torchelev.compilation import compiled_update
 from torchelev.config import ElevationMapConfig, differing_fields
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 from torchelev.filters.chain import FilterChain
 from torchelev.grid import cell_centers, window_center
 from torchelev.initialize import METHODS, initialize
@@ -67,17 +67,17 @@ class ElevationMap(nn.Module):
         require(
             config, "cfg", "must be an ElevationMapConfig", type(cfg).__name__, "wrap grid=GridConfig(...)", TypeError
         )
-        whole = type(num_envs) is int and num_envs >= 1
-        require(whole, "num_envs", "must be a positive int", repr(num_envs), "give the number of maps")
-        some = chunk is None or (type(chunk) is int and chunk >= 1)
-        require(some, "chunk", "must be a positive int or None", repr(chunk), "give a number of environments")
-        self.cfg, self.num_envs, self.check_values, self.chunk = cfg, num_envs, check_values, chunk
+        require_count("num_envs", num_envs, "give the number of maps")
+        if chunk is not None:
+            require_count("chunk", chunk, "give a number of environments, or None")
+        self.cfg, self.num_envs, self.check_values = cfg, int(num_envs), check_values
+        self.chunk = None if chunk is None else int(chunk)
         self._compiled = False
         self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
         self.head = make_head(cfg.traversability, cfg.grid, head)
         self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
         self._filtered: dict[str, Layer] = {}  # what filters made of the stored state
-        state = blank_state(cfg.grid, num_envs, device, torch.float32)
+        state = blank_state(cfg.grid, self.num_envs, device, torch.float32)
         for name, value in state._asdict().items():
             if name != "statistics":
                 self.register_buffer(name, value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from numbers import Real
+from numbers import Integral, Real
 
 
 def message(argument: str, rule: str, came: object, mend: str) -> str:
@@ -17,6 +17,13 @@ def require(
     """Raise `error` with a full message unless the rule holds."""
     if not holds:
         raise error(message(argument, rule, came, mend))
+
+
+def require_count(name: str, value: object, mend: str, least: int = 1) -> None:
+    """Refuse what is no whole number, Python's or NumPy's, of at least so many."""
+    good = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
+    rule = f"must be an int of at least {least}" if least > 1 else "must be a positive int"
+    require(good, name, rule, repr(value), mend)
 
 
 def require_positive(**values: object) -> None:

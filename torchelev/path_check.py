@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.checks import FLOATS, check_pose, check_tensor, given_or_default, readable
 from torchelev.elevation_map import ElevationMap
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 from torchelev.footprint import FootprintCheck, FootprintConfig, check_footprint
 from torchelev.scan_patterns import heading
 from torchelev.state import MapState
@@ -61,7 +61,7 @@ def check_path(
     cfg = given_or_default(FootprintConfig, cfg)
     given = _as_xy_yaw(emap, poses)
     footprint = _check_polygon(emap, footprint, cfg.max_extent)
-    require(type(samples) is int and samples >= 1, "samples", "must be a positive int", repr(samples), "give 8")
+    require_count("samples", samples, "give 8")
     shift, turn = given[:, 1:, :2] - given[:, :-1, :2], _shorter_way(given[:, 1:, 2:] - given[:, :-1, 2:])
     reach = torch.linalg.vector_norm(footprint, dim=-1).amax()
     way = torch.linalg.vector_norm(shift, dim=-1) + reach * turn[..., 0].abs()  # of no vertex is it longer

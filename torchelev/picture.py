@@ -15,7 +15,7 @@ from matplotlib.colors import Colormap, to_rgb
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from torchelev.errors import require, require_positive
+from torchelev.errors import require, require_count, require_positive
 from torchelev.plot import UNKNOWN_COLOR, Panel, limits
 
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
@@ -56,7 +56,7 @@ def save_image(
     shape = np.shape(values)
     require(len(shape) == 2 and min(shape) > 0, "values", "expected (H, W)", shape, "give one environment's layer")
     require_positive(resolution=resolution)
-    require(type(scale) is int and scale >= 1, "scale", "must be a positive int", repr(scale), "give pixels per cell")
+    require_count("scale", scale, "give pixels per cell")
     known = cmap in matplotlib.colormaps
     require(known, "cmap", "must name a colour map of matplotlib", repr(cmap), "see matplotlib.colormaps")
     if vmin is not None and vmax is not None:

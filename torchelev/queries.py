@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchelev.checks import FLOATS, check_tensor, check_xy, readable
 from torchelev.elevation_map import ElevationMap
-from torchelev.errors import require, whole_cells
+from torchelev.errors import require, require_count, whole_cells
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -58,8 +58,7 @@ def height_profile(
     start, end = (check_xy(name, xy, emap.num_envs, emap.device).double() for name, xy in both)
     mend = "give each line a start and an end"
     require(start.shape == end.shape, "end", f"expected {tuple(start.shape)}", tuple(end.shape), mend)
-    whole = type(num_points) is int and num_points >= 2
-    require(whole, "num_points", "must be an int of at least 2", repr(num_points), "give 2 for the ends alone")
+    require_count("num_points", num_points, "give 2 for the ends alone", least=2)
     finite = torch.isfinite(start + end).all(-1, keepdim=True)
     start, way = torch.where(finite, start, torch.nan), torch.where(finite, end - start, 0.0)
     share = torch.arange(num_points, device=emap.device, dtype=torch.float64) / (num_points - 1)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchelev import checks
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
@@ -64,8 +64,7 @@ class PerEnvironment(nn.Module):
         shares = [float(share) for share, _ in kinds]
         fits = min(shares, default=-1.0) >= 0 and abs(sum(shares) - 1) < 1e-6
         require(fits, "cfg", "must have shares that sum to 1", shares, "give pairs (share, config)")
-        positive = type(num_envs) is int and num_envs >= 1
-        require(positive, "num_envs", "must be a positive int", repr(num_envs), "give the number of environments")
+        require_count("num_envs", num_envs, "give the number of environments")
         self.cfg, self.num_envs, self.seed = cfg, num_envs, seed
         self.names = [field.name for field in fields(kinds[0][1])]
         ranges = torch.tensor([[limits(getattr(kind, name)) for name in self.names] for _, kind in kinds])

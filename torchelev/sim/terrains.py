@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.checks import require_indices
-from torchelev.errors import require, whole_cells
+from torchelev.errors import require, require_count, whole_cells
 from torchelev.sim.heightfield import HeightField
 from torchelev.sim.terrain_shapes import SHAPES, TABLE
 
@@ -117,8 +117,7 @@ def terrain_grid(
     `make_terrain` for the other arguments. Raises ValueError as it does, and without kinds or levels.
     """
     require(len(kinds) > 0, "kinds", "must not be empty", list(kinds), "name some terrains")
-    whole = type(num_levels) is int and num_levels >= 1
-    require(whole, "num_levels", "must be a positive int", repr(num_levels), "give the number of difficulties")
+    require_count("num_levels", num_levels, "give the number of difficulties")
     levels = torch.linspace(0, 1, num_levels) if num_levels > 1 else torch.ones(1)
     kind_ids = torch.arange(len(kinds)).repeat(num_levels)
     tiles = _tiles(tuple(kinds), kind_ids, levels.repeat_interleave(len(kinds)), length, resolution, seed, device)
