@@ -34,7 +34,7 @@ def measure(seconds: float) -> dict[str, Any]:
 
 
 def alone(emap: ElevationMap) -> Callable[[], Any]:
-    """Return the learned rating of a map as a compiled call."""
+    """Return the learned rating of a map as a compiled call, as a user would make it who needs no gradients."""
     net, robot, state = TraversabilityNet.from_pretrained().requires_grad_(False), RobotConfig(), emap.state
     layers = state.elevation, state.validity, state.variance, state.upper_bound, state.bounded
     compiled = torch.compile(lambda *given: net(*given, resolution=emap.cfg.grid.resolution, robot=robot))

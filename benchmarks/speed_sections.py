@@ -33,7 +33,7 @@ Track = Callable[[Iterable], Iterable]  # shows progress
 def fresh_compiler() -> None:
     """Forget compiled updates: the one for a second number of robots would be made for any number."""
     torch._dynamo.reset()
-    compilation.graphs_of.cache_clear()
+    compilation.graph_of.cache_clear()
 
 
 def points(seconds: float, track: Track) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def compiled_alone(stage: Callable[[MapState, Measurement], Any], inputs: list[A
         masks = tree_map(lambda t: as_mask(t) if isinstance(t, Tensor) and t.dtype == torch.uint8 else t, values)
         return mask_bytes(stage(*masks))
 
-    compiled = torch.compile(compilation.own_code(on_bytes), fullgraph=True, options=compilation.compiler_options())
+    compiled = compilation.compiled(on_bytes)
     values = [mask_bytes(value) for value in inputs]
 
     def run() -> None:
@@ -104,8 +104,7 @@ def compiled_alone(stage: Callable[[MapState, Measurement], Any], inputs: list[A
             for value in values:
                 compiled(value)
 
-    with compilation.short_kernels():
-        run()
+    run()
     return run
 
 

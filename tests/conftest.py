@@ -1,6 +1,5 @@
 """What the tests share: small configs, poses, clouds, random states, and how two states are compared."""
 
-import functools
 import math
 
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 from hypothesis import HealthCheck, Phase, settings
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, compilation
-from torchelev.compilation import graphs_of
+from torchelev.compilation import graph_of
 from torchelev.state import MapState, Statistics, blank_state
 
 settings.register_profile(
@@ -34,17 +33,14 @@ def _one_thread():
 @pytest.fixture
 def compile_with(monkeypatch):
     """Let emap.compile() use another backend of the compiler, with the guards of the real one."""
-    compiler, options = torch.compile, compilation.compiler_options()
-    guards = {name: value for name, value in options.items() if name == "guard_filter_fn"}
 
     def use(backend):
-        monkeypatch.setattr(compilation, "compiler_options", lambda: guards)
-        monkeypatch.setattr(torch, "compile", functools.partial(compiler, backend=backend))
-        graphs_of.cache_clear()
+        monkeypatch.setattr(compilation, "inductor", backend)
+        graph_of.cache_clear()
         torch._dynamo.reset()
 
     yield use
-    graphs_of.cache_clear()
+    graph_of.cache_clear()
     torch._dynamo.reset()
 
 

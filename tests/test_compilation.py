@@ -5,11 +5,13 @@ import itertools
 import pytest
 import torch
 from conftest import assert_close, differences, mapped, scan, small_config, small_map, snapshot
+from torch._dynamo.callback import callback_handler
 from torch._dynamo.testing import CompileCounter
+from torch._inductor.codegen.cpp import CppScheduling
 
 import torchelev
 from torchelev import SensorConfig
-from torchelev.compilation import KERNEL_ARGUMENTS, announced_compilation, graphs_of
+from torchelev.compilation import KERNEL_ARGUMENTS, announced_compilation, compiled, graph_of
 from torchelev.layers import LAYERS
 
 
@@ -133,15 +135,29 @@ def test_an_update_that_compiles_says_what_it_costs(compile_with, capsys):
     assert counter.frame_count == 4  # of 2, of 2 to 4, of 5 and more, of 1
 
 
-def test_the_compiler_frees_memory_in_between_and_is_left_as_it_was(capsys):
-    from torch._dynamo.callback import callback_handler
-    from torch._inductor.codegen.cpp import CppScheduling
+def test_what_is_compiled_anew_says_so(compile_with, capsys):
+    compile_with("eager")
+    emap = small_map(2)
+    emap.compile()
+    cloud, T = scan(0, 2)
+    for _ in range(2):
+        torch._dynamo.reset()
+        emap.update(cloud, T, T, 0.1)
+        assert capsys.readouterr().err.count("compiling the update") == 1
+    assert not callback_handler.start_callbacks
 
-    usual = CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
-    with pytest.raises(RuntimeError), announced_compilation():
-        assert usual > CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM == KERNEL_ARGUMENTS
-        torch.compile(lambda x: x + 1, backend="eager")(torch.ones(2))
-        raise RuntimeError
+
+def test_the_compiler_is_left_as_it_was(monkeypatch, capsys):
+    seen, usual = [], CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
+
+    def fails(*_):
+        seen.append(CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM)
+        raise ArithmeticError("of the compiler")
+
+    monkeypatch.setattr("torch._inductor.compile", fails)
+    with pytest.raises(Exception, match="of the compiler"), announced_compilation():
+        compiled(lambda x: x + 1)(torch.ones(2))
+    assert seen == [KERNEL_ARGUMENTS] and usual > KERNEL_ARGUMENTS
     assert usual == CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
     assert "failed" in capsys.readouterr().err
     assert not callback_handler.start_callbacks
@@ -199,8 +215,8 @@ def test_maps_of_equal_configs_share_one_graph(compile_with):
 
 
 def test_equal_configs_share_the_compiled_update():
-    assert graphs_of(small_config(), (), 1) is graphs_of(small_config(), (), 1)
-    assert graphs_of(small_config(), (), 1) is not graphs_of(small_config(drift=None), (), 1)
+    assert graph_of(small_config(), (), 1) is graph_of(small_config(), (), 1)
+    assert graph_of(small_config(), (), 1) is not graph_of(small_config(drift=None), (), 1)
 
 
 def test_no_recompilation_for_new_values():

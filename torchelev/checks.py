@@ -99,7 +99,7 @@ def _check_rigid(name: str, pose: Tensor) -> None:
     mend = "leave such an environment out by points of NaN, with any other pose"
     refuse(~np.isfinite(matrix), "must be finite", lambda: "NaN or inf", mend)
     mend = "use torchelev.frames.transform(position, quat_wxyz)"
-    rotation, position, last = matrix[..., :3, :3], np.abs(matrix[..., :3, 3]), matrix[..., 3, :]
+    rotation, distance, last = matrix[..., :3, :3], np.abs(matrix[..., :3, 3]), matrix[..., 3, :]
     error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3))
     refuse(error >= 1e-3, "must be rigid (R R^T = 1)", lambda: f"an error of {error.max():.3g}", mend)
     refuse(np.linalg.det(rotation) <= 0, "must not mirror", lambda: "determinant -1", mend)
@@ -108,7 +108,7 @@ def _check_rigid(name: str, pose: Tensor) -> None:
         mend = "transpose it: the position is the last column"
     refuse(other, "must have the last row 0 0 0 1", lambda: " ".join(f"{x:g}" for x in last[other.any(-1)][0]), mend)
     mend = "check its units and source"
-    refuse(position > FARTHEST, f"must lie within {FARTHEST:g} m", lambda: f"{position.max():.3g} m", mend)
+    refuse(distance > FARTHEST, f"must lie within {FARTHEST:g} m", lambda: f"{distance.max():.3g} m", mend)
 
 
 def _environments(bad: np.ndarray) -> str:

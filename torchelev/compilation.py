@@ -20,21 +20,20 @@ from torchelev.state import MapState
 from torchelev.storage import as_bytes, as_mask
 from torchelev.traversability_net import Weights
 
+KERNEL_ARGUMENTS = 16  # measured: 12 to 24 do as well
 
-def compiler_options() -> dict[str, Any]:
-    """Return options of torch.compile that pay off here, as far as this torch knows them."""
-    from torch._inductor import config  # takes a second to import, which only compiling needs
 
-    options: dict[str, Any] = {}
+def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., Any]:
+    """Compile by torch's compiler, with what pays off here, as far as this torch knows it."""
+    from torch._inductor import compile, config  # takes a second to import, which only compiling needs
+
+    # Other names, as its cache does not see `short_kernels` and else would give what it made without.
+    options: dict[str, Any] = {"cpp.descriptive_names": "inductor_node"}
     if hasattr(config.cpp, "enable_tiling_heuristics"):
         # The compiler gives up vectorisation on many gathers, which pays off in the loops over points.
         options["cpp.enable_tiling_heuristics"] = False
-    if hasattr(torch.compiler, "skip_guard_on_globals_unsafe"):
-        options["guard_filter_fn"] = guards_on_arguments
-    return options
-
-
-KERNEL_ARGUMENTS = 16  # measured: 12 to 24 do as well
+    with short_kernels():
+        return compile(graph, inputs, options)
 
 
 @contextlib.contextmanager
@@ -48,13 +47,33 @@ def short_kernels() -> Iterator[None]:
 
     name = "MAX_FUSED_KERNEL_ARGS_NUM"
     usual = getattr(CppScheduling, name, None)
-    if usual is not None:
-        setattr(CppScheduling, name, KERNEL_ARGUMENTS)
+    setattr(CppScheduling, name, KERNEL_ARGUMENTS)
     try:
         yield
     finally:
-        if usual is not None:
-            setattr(CppScheduling, name, usual)
+        setattr(CppScheduling, name, usual)
+
+
+_number = itertools.count()
+
+
+def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function with a code object of its own.
+
+    The compiler finds its graphs by code object and guards. Functions that differ by what they enclose alone, which no
+    guard looks at here, would be given each other's graphs; and of one code object it keeps no more than eight.
+    """
+    assert isinstance(function, FunctionType)
+    code = function.__code__.replace(co_name=f"{function.__name__}_{next(_number)}")
+    return FunctionType(code, function.__globals__, code.co_name, function.__defaults__, function.__closure__)
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function as one compiled graph; call what it returns under `announced_compilation`."""
+    options: dict[str, Any] = {}
+    if hasattr(torch.compiler, "skip_guard_on_globals_unsafe"):
+        options["guard_filter_fn"] = guards_on_arguments
+    return torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
 
 
 def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
@@ -80,34 +99,20 @@ def announced_compilation() -> Iterator[None]:
     callback_handler.register_start_callback(announce)
     end = "failed"
     try:
-        with short_kernels():
-            yield
+        yield
         if starts:
             end = f"done in {time.perf_counter() - starts[0]:.0f} s. Later processes find it in the compiler's cache."
     finally:
-        callback_handler.remove_start_callback(announce)
+        if announce in callback_handler.start_callbacks:  # a reset of the compiler clears them
+            callback_handler.remove_start_callback(announce)
         if starts:
             print(end, file=sys.stderr, flush=True)
-
-
-_number = itertools.count()
-
-
-def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function with a code object of its own.
-
-    The compiler finds its graphs by code object and guards. Functions that differ by what they enclose alone, which no
-    guard looks at here, would be given each other's graphs; and of one code object it keeps no more than eight.
-    """
-    assert isinstance(function, FunctionType)
-    code = function.__code__.replace(co_name=f"{function.__name__}_{next(_number)}")
-    return FunctionType(code, function.__globals__, code.co_name, function.__defaults__, function.__closure__)
 
 
 def compiled_update(
     stored: MapState, points: Tensor, *others: Any, cfg: ElevationMapConfig, weights: Weights | None = None
 ) -> None:
-    """Do what `update_in_place` does, compiled: any number of points, and of environments from the second on."""
+    """Do what `update_in_place` does, compiled, for any number of points."""
     if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
         update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
@@ -116,21 +121,19 @@ def compiled_update(
         if values is not None:
             torch._dynamo.maybe_mark_dynamic(values, 2)
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
-    graph, known_sizes = graphs_of(cfg, kinds, points.shape[1])
-    with contextlib.nullcontext() if points.shape[0] in known_sizes else announced_compilation():
-        graph(with_masks(stored, as_bytes), *inputs, weights=weights)
-    known_sizes.add(points.shape[0])
+    with announced_compilation():
+        graph_of(cfg, kinds, points.shape[1])(with_masks(stored, as_bytes), *inputs, weights=weights)
 
 
 @functools.cache
-def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> tuple[Callable[..., None], set[int]]:
-    """Return what compiles and keeps the updates of one kind of inputs, and a set for the sizes of batch it knows."""
+def graph_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Callable[..., None]:
+    """Return what compiles and keeps the updates of one kind of inputs, for any number of environments."""
 
     def in_place(stored: MapState, *others: Any, weights: Weights | None) -> None:
         """Update; masks come as bytes, see `as_bytes`. Writing within the graph saves a copy of every layer."""
         write(stored, with_masks(update(with_masks(stored, as_mask), *others, cfg=cfg, weights=weights), as_bytes))
 
-    return torch.compile(own_code(in_place), fullgraph=True, options=compiler_options()), set()
+    return compiled(in_place)
 
 
 def packed(value: Tensor) -> Tensor:

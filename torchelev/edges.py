@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 from torchelev.windows import around
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ class EdgeConfig:
 
     def __post_init__(self) -> None:
         for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
-            value, rule = getattr(self, name), f"must be a whole number of at least {least}"
-            require(isinstance(value, int) and value >= least, f"fusion.edges.{name}", rule, value, "see its default")
+            require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
         require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
 
     @property

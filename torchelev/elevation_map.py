@@ -227,7 +227,8 @@ class ElevationMap(nn.Module):
         """Make `update` run compiled. The first update compiles for about a minute, which needs a C++ compiler.
 
         Maps of equal configs share one graph, and so do scans of any length. Another number of sensors, or a base pose
-        that comes or goes, makes another; so do the first few numbers of environments, of which the last is for any.
+        that comes or goes, makes another. So do, of environments, one alone, the first number, the next, which is for
+        all, and on a CPU another one where few (up to 4) become many.
         """
         self._compiled = True
 

@@ -53,11 +53,13 @@ def _mixed(
     weight: Float[Tensor, "O C"], layers: Sequence[Tensor], bias: Float[Tensor, "O"] | None = None
 ) -> Float[Tensor, "B O H W"]:
     """Mix channels (B, H, W), cell by cell."""
-    if torch.compiler.is_compiling() and weight.device.type == "cpu":  # a third of the time of so slim a product
-        rows = [functools.reduce(torch.add, map(torch.mul, row.unbind(), layers)) for row in weight.unbind()]
-        rows = rows if bias is None else list(map(torch.add, rows, bias.unbind()))
+    if torch.compiler.is_compiling() and weight.device.type == "cpu" and not torch.is_grad_enabled():
+        # In one pass: a third of the time that a product of so slim matrices takes.
+        pairs = [zip(row.unbind(), layers, strict=True) for row in weight.unbind()]
+        rows = [functools.reduce(torch.add, (share * layer for share, layer in row)) for row in pairs]
+        rows = rows if bias is None else [row + part for row, part in zip(rows, bias.unbind(), strict=True)]
         return torch.stack(rows, 1)
-    values = torch.stack(list(layers), 1)
+    values = torch.stack(tuple(layers), 1)
     mixed = torch.bmm(weight.expand(len(values), -1, -1), values.flatten(2)).unflatten(2, values.shape[2:])
     return mixed if bias is None else mixed + bias[:, None, None]
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchelev.errors import require, require_positive
+from torchelev.errors import require_count, require_positive
 from torchelev.filters import opencv
 from torchelev.filters.extrema import blank, highest_of_windows, lowered
 from torchelev.filters.harmonic import four_sum, harmonic
@@ -45,7 +45,7 @@ def inpaint_minimum(layer: Layer, *, iterations: int | None = None) -> Layer:
         return opencv.lowest_of_holes(layer)
     if iterations is None:
         return _taken(values, lowest_of_border(values.detach(), known))
-    _require_count(iterations, "give None for holes of any size")
+    require_count("iterations", iterations, "give None for holes of any size")
     highest = lowered(-values, as_bytes(known).to(values.dtype))
     for _ in range(iterations):
         highest = _highest_around(highest, known)
@@ -58,11 +58,6 @@ def _taken(values: Tensor, source: Tensor) -> Layer:
     found = source < values[0].numel()
     taken = values.flatten(1).gather(1, source.flatten(1).clamp(max=values[0].numel() - 1))
     return taken.view_as(values), found
-
-
-def _require_count(iterations: object, mend: str) -> None:
-    whole = isinstance(iterations, int) and not isinstance(iterations, bool) and iterations >= 1
-    require(whole, "iterations", "must be a whole number of at least 1", iterations, mend)
 
 
 def _highest_around(values: Tensor, known: Tensor) -> Tensor:
@@ -98,7 +93,7 @@ def inpaint_diffusion(layer: Layer, *, tolerance: float = 1e-3, iterations: int 
     """
     values, known = layer
     require_positive(tolerance=tolerance)
-    _require_count(iterations, "give 40")
+    require_count("iterations", iterations, "give 40")
     weight = as_bytes(known).to(values.dtype)
     # From the map's mean, so that float32 keeps its millimetres.
     datum = mean_of_known(values, weight)

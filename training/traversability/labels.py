@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
 from training.traversability.stances import STANDS, ground_around, stances
@@ -83,4 +83,4 @@ def _check(field: HeightField, tile_ids: Tensor, xy: Tensor, robots: Sequence[Ro
     there = bool(((tile_ids >= 0) & (tile_ids < field.num_tiles)).all())
     require(there, "tile_ids", f"must be from 0 to {field.num_tiles - 1}", tile_ids.tolist(), "name tiles of the field")
     require(bool(xy.isfinite().all()), "xy", "must be finite", "NaN or inf", "leave such places out")
-    require(type(headings) is int and headings >= 1, "headings", "must be a positive int", repr(headings), "give 8")
+    require_count("headings", headings, "give 8")
