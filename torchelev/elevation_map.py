@@ -67,11 +67,9 @@ class ElevationMap(nn.Module):
         require(
             config, "cfg", "must be an ElevationMapConfig", type(cfg).__name__, "wrap grid=GridConfig(...)", TypeError
         )
-        require_count("num_envs", num_envs, "give the number of maps")
-        if chunk is not None:
-            require_count("chunk", chunk, "give a number of environments, or None")
-        self.cfg, self.num_envs, self.check_values = cfg, int(num_envs), check_values
-        self.chunk = None if chunk is None else int(chunk)
+        self.num_envs = require_count("num_envs", num_envs, "give the number of maps")
+        self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
+        self.cfg, self.check_values = cfg, check_values
         self._compiled = False
         self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
         self.head = make_head(cfg.traversability, cfg.grid, head)

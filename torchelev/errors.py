@@ -19,11 +19,12 @@ def require(
         raise error(message(argument, rule, came, mend))
 
 
-def require_count(name: str, value: object, mend: str, least: int = 1) -> None:
-    """Refuse what is no whole number, Python's or NumPy's, of at least so many."""
+def require_count(name: str, value: object, mend: str, least: int = 1) -> int:
+    """Return a whole number, Python's or NumPy's, of at least so many as an int; refuse all else."""
     good = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
     rule = f"must be an int of at least {least}" if least > 1 else "must be a positive int"
     require(good, name, rule, repr(value), mend)
+    return int(value)  # type: ignore[call-overload]
 
 
 def require_positive(**values: object) -> None:

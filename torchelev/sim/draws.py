@@ -64,8 +64,8 @@ class PerEnvironment(nn.Module):
         shares = [float(share) for share, _ in kinds]
         fits = min(shares, default=-1.0) >= 0 and abs(sum(shares) - 1) < 1e-6
         require(fits, "cfg", "must have shares that sum to 1", shares, "give pairs (share, config)")
-        require_count("num_envs", num_envs, "give the number of environments")
-        self.cfg, self.num_envs, self.seed = cfg, num_envs, seed
+        self.num_envs = require_count("num_envs", num_envs, "give the number of environments")
+        self.cfg, self.seed = cfg, seed
         self.names = [field.name for field in fields(kinds[0][1])]
         ranges = torch.tensor([[limits(getattr(kind, name)) for name in self.names] for _, kind in kinds])
         self._in_use = {name for name, r in zip(self.names, ranges.unbind(1), strict=True) if bool((r != 0).any())}

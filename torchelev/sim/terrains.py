@@ -117,7 +117,7 @@ def terrain_grid(
     `make_terrain` for the other arguments. Raises ValueError as it does, and without kinds or levels.
     """
     require(len(kinds) > 0, "kinds", "must not be empty", list(kinds), "name some terrains")
-    require_count("num_levels", num_levels, "give the number of difficulties")
+    num_levels = require_count("num_levels", num_levels, "give the number of difficulties")
     levels = torch.linspace(0, 1, num_levels) if num_levels > 1 else torch.ones(1)
     kind_ids = torch.arange(len(kinds)).repeat(num_levels)
     tiles = _tiles(tuple(kinds), kind_ids, levels.repeat_interleave(len(kinds)), length, resolution, seed, device)
