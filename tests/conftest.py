@@ -8,7 +8,7 @@ import torch
 from hypothesis import HealthCheck, Phase, settings
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, compilation
-from torchelev.compilation import graph_of
+from torchelev.compilation import graphs_of
 from torchelev.state import MapState, Statistics, blank_state
 
 settings.register_profile(
@@ -36,11 +36,11 @@ def compile_with(monkeypatch):
 
     def use(backend):
         monkeypatch.setattr(compilation, "inductor", backend)
-        graph_of.cache_clear()
+        graphs_of.cache_clear()
         torch._dynamo.reset()
 
     yield use
-    graph_of.cache_clear()
+    graphs_of.cache_clear()
     torch._dynamo.reset()
 
 

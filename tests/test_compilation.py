@@ -11,7 +11,7 @@ from torch._inductor.codegen.cpp import CppScheduling
 
 import torchelev
 from torchelev import SensorConfig
-from torchelev.compilation import KERNEL_ARGUMENTS, announced_compilation, compiled, graph_of
+from torchelev.compilation import KERNEL_ARGUMENTS, Graphs, announced_compilation, compiled, graphs_of
 from torchelev.layers import LAYERS
 
 
@@ -65,6 +65,9 @@ def test_gradients_through_the_compiled_core():
     torch.testing.assert_close(*results)
 
 
+PARTS = len(Graphs._fields)  # of an update, a graph each
+
+
 def graphs():
     """How many graphs were compiled so far."""
     return torch._dynamo.utils.counters["stats"]["unique_graphs"]
@@ -90,7 +93,7 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
             }
             rounded = floats | {"drift_error", "drift_correction"}
             assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
-    assert graphs() == before + 1
+    assert graphs() == before + PARTS
 
 
 PLAIN = {"drift": None, "raycast": None, "overlap": None, "traversability": None}  # quick to trace
@@ -131,8 +134,8 @@ def test_an_update_that_compiles_says_what_it_costs(compile_with, capsys):
         cloud, T = scan(number, num_envs)
         before = counter.frame_count
         emap.update(cloud, T, T, 0.1)
-        assert capsys.readouterr().err.count("compiling the update") == counter.frame_count - before
-    assert counter.frame_count == 4  # of 2, of 2 to 4, of 5 and more, of 1
+        assert capsys.readouterr().err.count("compiling the update") == (counter.frame_count > before)
+    assert counter.frame_count == 3 * PARTS  # of 2, of 2 and more, of 1
 
 
 def test_what_is_compiled_anew_says_so(compile_with, capsys):
@@ -166,7 +169,7 @@ def test_the_compiler_is_left_as_it_was(monkeypatch, capsys):
 @pytest.mark.parametrize("sensors", [None, 2])
 @pytest.mark.parametrize("with_variance", [False, True])
 def test_a_new_number_of_points_compiles_nothing(compile_with, sensors, with_variance):
-    """One graph for every number of points from 2 on, with the statistics and the map of the eager update."""
+    """The same graphs for every number of points from 2 on, with the statistics and the map of the eager update."""
     counter = CompileCounter()
     compile_with(counter)
     eager, compiled = small_map(2, drift=None), small_map(2, drift=None)
@@ -181,7 +184,7 @@ def test_a_new_number_of_points_compiles_nothing(compile_with, sensors, with_var
         for emap in (eager, compiled):
             emap.update(cloud, T_sensor, T, 0.1, variance=variance if with_variance else None)
         assert differences(eager.state, compiled.state) == [], number
-        assert counter.frame_count == 1, number
+        assert counter.frame_count == PARTS, number
 
 
 @pytest.mark.parametrize("sensors", [None, 2])
@@ -211,12 +214,12 @@ def test_maps_of_equal_configs_share_one_graph(compile_with):
         emap.compile()
         cloud, T = scan(k, 2, 300 + k)
         emap.update(cloud, T, T, 0.1)
-    assert counter.frame_count == 1
+    assert counter.frame_count == PARTS
 
 
 def test_equal_configs_share_the_compiled_update():
-    assert graph_of(small_config(), (), 1) is graph_of(small_config(), (), 1)
-    assert graph_of(small_config(), (), 1) is not graph_of(small_config(drift=None), (), 1)
+    assert graphs_of(small_config(), (), 1) is graphs_of(small_config(), (), 1)
+    assert graphs_of(small_config(), (), 1) is not graphs_of(small_config(drift=None), (), 1)
 
 
 def test_no_recompilation_for_new_values():

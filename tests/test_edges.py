@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchelev.disputed import Disputed, settle
+from torchelev.disputed import NO_HEIGHT, Disputed, settle
 from torchelev.edges import EdgeConfig, ends_of_step, lie_behind, values_around
 from torchelev.windows import AROUND, around
 
@@ -64,14 +64,14 @@ def one_cell(z, weight, step=0, passed=0, seen=None, known=None):
     z, weight = torch.tensor([z]), torch.tensor([weight])
     cells, zeros = torch.zeros(1, 9), torch.zeros_like(z)
     marked = cells.to(torch.uint8).index_fill(1, torch.tensor([4]), 1)
-    shown = [cells.clone(), cells.clone(), cells.clone(), torch.zeros_like(marked)]
-    neighbours = [(0, 1, seen or {}), (2, 3, known or {}), (0, 1, {4: (z * weight).sum() / weight.sum()})]
-    for heights, there, values in neighbours:
+    scan, seen_before = torch.full_like(cells, NO_HEIGHT), torch.full_like(cells, NO_HEIGHT)
+    mean = {4: (z * weight).sum() / weight.sum()}
+    for layer, values in ((scan, (seen or {}) | mean), (seen_before, known or {})):
         for cell, height in values.items():
-            shown[heights][0, cell], shown[there][0, cell] = height, 1
+            layer[0, cell] = height
     columns = [z, zeros + 1e-4, weight, (zeros + passed).to(torch.uint8), zeros + 1.0, zeros]
     slot, settings = (zeros + 4).to(torch.int64), (3, 3.0, 0.01, EdgeConfig().numbers)
-    results = settle(marked, step * marked, slot, columns, cells, shown, *settings)
+    results = settle(marked + step * marked, slot, columns, cells, [scan, seen_before], *settings)
     return [result[0, 4].item() for result in results]
 
 

@@ -9,14 +9,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
-from torchelev.pipeline import update, update_in_place, write
-from torchelev.state import MapState
+from torchelev.pipeline import move_along, take_heights, take_rays, update_in_place
+from torchelev.sensor import measure
+from torchelev.state import MapState, Measurement, map_layers
 from torchelev.storage import as_bytes, as_mask
 from torchelev.traversability_net import Weights
 
@@ -29,6 +30,10 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
 
     # Other names, as its cache does not see `short_kernels` and else would give what it made without.
     options: dict[str, Any] = {"cpp.descriptive_names": "inductor_node"}
+    if all(value.device.type == "cpu" for value in inputs if isinstance(value, Tensor)):
+        # What is read so often, or takes so many operations, is stored unasked. The usual 4 and 30, which other devices
+        # keep, store all sums over a window.
+        options |= {"realize_reads_threshold": 20, "realize_opcount_threshold": 120}
     if hasattr(config.cpp, "enable_tiling_heuristics"):
         # The compiler gives up vectorisation on many gathers, which pays off in the loops over points.
         options["cpp.enable_tiling_heuristics"] = False
@@ -117,23 +122,66 @@ def compiled_update(
         update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
     inputs = [None if value is None else packed(value) for value in (points, *others)]
-    for values in (inputs[0], inputs[-1]):
-        if values is not None:
-            torch._dynamo.maybe_mark_dynamic(values, 2)
+    mark_dynamic(2, inputs[0], inputs[-1])
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     with announced_compilation():
-        graph_of(cfg, kinds, points.shape[1])(with_masks(stored, as_bytes), *inputs, weights=weights)
+        graphs = graphs_of(cfg, kinds, points.shape[1])
+        stored = with_masks(stored, as_bytes)
+        m = graphs.move_along(stored, *inputs)
+        mark_dynamic(1, m.points, m.variance, m.used, m.casts)
+        graphs.take_heights(stored, m)
+        graphs.take_rays(stored, m, weights)
+
+
+class Graphs(NamedTuple):
+    """The parts of an update, compiled: what one stores on its way is free again before the next.
+
+    Each writes what it changes into the stored state, which saves a copy of every layer. Masks come and go as bytes,
+    see `as_bytes`.
+    """
+
+    move_along: Callable[..., Measurement]
+    take_heights: Callable[..., None]
+    take_rays: Callable[..., None]
 
 
 @functools.cache
-def graph_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Callable[..., None]:
+def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
     """Return what compiles and keeps the updates of one kind of inputs, for any number of environments."""
 
-    def in_place(stored: MapState, *others: Any, weights: Weights | None) -> None:
-        """Update; masks come as bytes, see `as_bytes`. Writing within the graph saves a copy of every layer."""
-        write(stored, with_masks(update(with_masks(stored, as_mask), *others, cfg=cfg, weights=weights), as_bytes))
+    def first(stored: MapState, points: Tensor, *others: Any) -> Measurement:
+        T_map_sensor, T_map_base, dt, variance = others
+        dtype = stored.elevation.dtype
+        m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, dtype)
+        state = with_masks(stored, as_mask)
+        write_changes(stored, state, move_along(state, m, cfg))
+        return with_masks(m, as_bytes)
 
-    return compiled(in_place)
+    def second(stored: MapState, m: Measurement) -> None:
+        state = with_masks(stored, as_mask)
+        write_changes(stored, state, take_heights(state, with_masks(m, as_mask), cfg))
+
+    def third(stored: MapState, m: Measurement, weights: Weights | None) -> None:
+        state = with_masks(stored, as_mask)
+        write_changes(stored, state, take_rays(state, with_masks(m, as_mask), cfg, weights))
+
+    return Graphs(compiled(first), compiled(second), compiled(third))
+
+
+def write_changes(stored: MapState, old: MapState, new: MapState) -> None:
+    """Write what is new into the stored state's own tensors, masks as bytes."""
+
+    def write(stored: Tensor, old: Tensor, new: Tensor) -> Tensor:
+        return stored if new is old else stored.copy_(as_bytes(new) if new.dtype == torch.bool else new)
+
+    map_layers(write, stored, old, new)
+
+
+def mark_dynamic(dim: int, *values: Tensor | None) -> None:
+    """Let the size along a dimension differ from call to call."""
+    for value in values:
+        if value is not None:
+            torch._dynamo.maybe_mark_dynamic(value, dim)
 
 
 def packed(value: Tensor) -> Tensor:
@@ -141,6 +189,11 @@ def packed(value: Tensor) -> Tensor:
     return value.reshape(-1).view(value.shape)
 
 
-def with_masks(state: MapState, convert: Callable[[Tensor], Tensor]) -> MapState:
-    """Return the state with its masks converted."""
-    return state._replace(validity=convert(state.validity), bounded=convert(state.bounded))
+Values = TypeVar("Values", MapState, Measurement)
+
+
+def with_masks(values: Values, convert: Callable[[Tensor], Tensor]) -> Values:
+    """Return a state or a measurement with its masks converted."""
+    if isinstance(values, MapState):
+        return values._replace(validity=convert(values.validity), bounded=convert(values.bounded))
+    return values._replace(used=convert(values.used), casts=convert(values.casts))

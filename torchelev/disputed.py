@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int, UInt8
 
 
-class Shown(NamedTuple):
-    """What the scan and the map show of each cell, (B, C)."""
+NO_HEIGHT = -1e30  # [m] below all heights
 
-    mean: Float[Tensor, "B C"]  # [m] of the scan's points
-    number: Float[Tensor, "B C"]  # of the scan's points
-    elevation: Float[Tensor, "B C"]  # [m]
-    known: UInt8[Tensor, "B C"]
+
+class Shown(NamedTuple):
+    """The height that the scan and the map show of each cell, (B, C) [m]; NO_HEIGHT where they show none."""
+
+    scan: Float[Tensor, "B C"]  # mean of the points
+    map: Float[Tensor, "B C"]
 
 
 class Disputed:
@@ -115,12 +116,11 @@ def reduced_mean(points: Disputed, residual: Tensor) -> Tensor:
 @torch.library.custom_op(
     "torchelev::settle",
     mutates_args=(),
-    schema="(Tensor cells, Tensor steps, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, "
-    "float gate, float relief, float[] edges) -> (Tensor, Tensor)",
+    schema="(Tensor cells, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, float gate, "
+    "float relief, float[] edges) -> (Tensor, Tensor)",
 )
 def settle(
     cells: UInt8[Tensor, "B C"],
-    steps: UInt8[Tensor, "B C"],
     slot: Int[Tensor, "B M"],
     columns: list[Tensor],
     height: Float[Tensor, "B C"],
@@ -132,19 +132,20 @@ def settle(
 ) -> tuple[Float[Tensor, "B C"], Float[Tensor, "B C"]]:
     """Settle the disputed cells: return the heights [m] and the side of each cell: of a step +1 top, -1 ground, else 0.
 
-    A disputed cell gets the robust mean of its points, or, if it is one of `steps` or too many of its points are far
-    from that mean, the height of one end of the step. The other cells keep their `height`. `columns` (B, M) are those
-    of `Disputed`, the weight zero where a point is not used, `shown` those of `Shown`. `width` counts cells along y,
-    `relief` is in [m], `edges` is `EdgeConfig.numbers`, or empty if steps do not matter.
+    `cells` is 0 where nothing is disputed, 2 where the cell holds a step, else 1. A disputed cell gets the robust mean
+    of its points, or, if it holds a step or too many of its points are far from that mean, the height of one end of the
+    step. The other cells keep their `height`. `columns` (B, M) are those of `Disputed`, the weight zero where a point
+    is not used, `shown` those of `Shown`. `width` counts cells along y, `relief` is in [m], `edges` is
+    `EdgeConfig.numbers`, or empty if steps do not matter.
     """
-    points = Disputed(cells, slot, columns, Shown(*shown).mean)
+    points = Disputed(cells, slot, columns, Shown(*shown).scan)
     settled, side = robust_mean(points), torch.zeros_like(points.mean)
     if edges:
         cfg = EdgeConfig.of(*edges)
         residual = points.z - points.at_points(settled)
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-        step = cfg.holds_step(number, number - close) | (points.of(steps) > 0)
+        step = cfg.holds_step(number, number - close) | (points.of(cells) > 1)
         if points.some(step):
             which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
             settled, side = torch.where(step, end, settled), torch.where(step, which, side)
@@ -152,5 +153,5 @@ def settle(
 
 
 @settle.register_fake
-def _(cells: Tensor, steps: Tensor, slot: Tensor, columns: list[Tensor], height: Tensor, *others: Any) -> Any:
+def _(cells: Tensor, slot: Tensor, columns: list[Tensor], height: Tensor, *others: Any) -> Any:
     return torch.empty_like(height), torch.empty_like(height)

@@ -64,11 +64,10 @@ def side_of_step(points: Disputed, shown: Shown, width: int, relief: float, cfg:
     number_low, number_passed, x, y = points.sum(torch.stack(columns)).unbind(0)
     # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
     di, dj = around(x.device)
-    exists, (mean, number, elevation, known) = values_around(list(shown), points.cells, di, dj, width)
+    exists, (in_scan, in_map) = values_around(list(shown), points.cells, di, dj, width)
     middle, top_height = points.mean + 0.5 * top, points.mean + top - relief
-    in_scan = exists & (number > 0) & (mean >= middle[:, None])
-    in_map = exists & (known > 0) & (elevation >= top_height[:, None]) & lie_behind(x, y, di, dj)
-    elsewhere = (in_scan | in_map).any(1)
+    behind = (in_map >= top_height[:, None]) & lie_behind(x, y, di, dj)
+    elsewhere = (exists & ((in_scan >= middle[:, None]) | behind)).any(1)
     ground = (number_passed > cfg.min_passed * number_low) & elsewhere
     return torch.where(ground, -1.0, 1.0).to(x.dtype), torch.where(ground, bottom, top)
 

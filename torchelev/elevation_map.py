@@ -224,9 +224,9 @@ class ElevationMap(nn.Module):
     def compile(self) -> None:  # type: ignore[override]
         """Make `update` run compiled. The first update compiles for about a minute, which needs a C++ compiler.
 
-        Maps of equal configs share one graph, and so do scans of any length. Another number of sensors, or a base pose
-        that comes or goes, makes another. So do, of environments, one alone, the first number, the next, which is for
-        all, and on a CPU another one where few (up to 4) become many.
+        Maps of equal configs share the graphs, and so do scans of any length. Another number of sensors, or a base pose
+        that comes or goes, makes others. So do, of environments, one alone, the first number, and the next, whose
+        graphs are for all. An update is three graphs, each of which writes its part of the new state.
         """
         self._compiled = True
 

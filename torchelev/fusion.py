@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.disputed import Shown, ratio, settle
+from torchelev.disputed import NO_HEIGHT, Shown, ratio, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
@@ -71,7 +71,6 @@ class Prior(NamedTuple):
 
     elevation: Float[Tensor, "B C"]
     variance: Float[Tensor, "B C"]
-    gate_variance: Float[Tensor, "B C"]
     known: Bool[Tensor, "B C"]
     support: Float[Tensor, "B C"]
 
@@ -92,7 +91,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     a height that most points agree on wins, whether or not an outlier came first. A scan that disagrees raises the
     variance, as in the paper, and founds the cell anew once the votes are used up.
     """
-    scan, prior = gather_scan(state, m, grid, cfg), gather_prior(state, cfg)
+    scan, prior = gather_scan(state, m, grid, cfg), gather_prior(state)
     guess = guess_heights(scan, prior, grid, cfg)
     scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
     state, taken = merge(state, prior, scanned, grid, cfg)
@@ -110,17 +109,20 @@ class Guess(NamedTuple):
     """What a cell's height is about, before the points that count are chosen. Without a gradient."""
 
     height: Float[Tensor, "B C"]  # [m]
-    gate_variance: Float[Tensor, "B C"]  # [m^2] of the height; zero where the scan's own points give it
     side: Float[Tensor, "B C"]  # of a step: +1 top, -1 ground, 0 no step
+    trusted: Bool[Tensor, "B C"]  # it is the cell's elevation, else the scan's own points give it
     number: Float[Tensor, "B C"]  # of the scan's points
     near: Bool[Tensor, "B M"]  # points that agree with the cell's elevation
+    gate_at: Float[Tensor, "B M"]  # [m^2] of the elevation of each point's cell
 
 
 def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Guess:
     """Trust a cell's elevation where most points agree with it, else the robust mean, and at a step one of its ends."""
-    elevation_at, variance_at = scan.cells.take(prior.elevation, prior.gate_variance)
-    near = realize(agrees(scan, elevation_at, variance_at, cfg))
+    elevation_at, variance_at = scan.cells.take(prior.elevation, prior.variance)
+    gate_at = gate_variance(variance_at, cfg)
+    near, gate_at = realize_all(agrees(scan, elevation_at, gate_at, cfg), gate_at)
     number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
+    number = realize(number.clamp(min=0))  # a copy of its own, or all four sums would be held as long as this one
     mean = ratio(moment, weight).detach()
     trusted = prior.known & (2 * agreeing >= number)
     # A single point is its cell's robust mean, and most cells of a sparse scan have one.
@@ -128,17 +130,18 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     if (edges := cfg.edges) is not None:
         step = trusted & edges.holds_step(number, number - agreeing)
     height = chosen(trusted, prior.elevation, mean).detach()
-    shown = Shown(mean, number.detach(), prior.elevation.detach(), as_bytes(prior.known))
+    shown = Shown(chosen(number > 0, mean, NO_HEIGHT), chosen(prior.known, prior.elevation.detach(), NO_HEIGHT))
     limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
-    masks = as_bytes(step | untrusted), as_bytes(step)
-    height, side = settle(*masks, scan.cells.slot, scan.columns(), height, list(shown), *limits)
-    return Guess(height, prior.gate_variance * trusted, side, number, near)
+    cells = as_bytes(untrusted) + 2 * as_bytes(step)
+    height, side = settle(cells, scan.cells.slot, scan.columns(), height, list(shown), *limits)
+    return Guess(height, side, trusted, number, near, gate_at)
 
 
 def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> tuple[ScanOfCells, Tensor]:
     """Average the points that lie within the gate around the guess and on its side; tell which the side ignores."""
-    height_at, gate_at, side_at = scan.cells.take(guess.height, guess.gate_variance, guess.side)
-    kept, ignored = on_side(scan, height_at, gate_at, side_at, cfg)
+    height_at, side_at, trusted_at = scan.cells.take(guess.height, guess.side, as_bytes(guess.trusted))
+    # The scan's own height has no variance of its own.
+    kept, ignored = on_side(scan, height_at, guess.gate_at * trusted_at, side_at, cfg)
     weight = torch.where(kept, scan.weight, 0.0)
     # Around the guess, so that float32 keeps millimetres at any altitude.
     columns = (weight, weight * (scan.z - height_at), kept, ignored, guess.near & ~ignored)
@@ -190,16 +193,19 @@ def passed_center(from_center: Tensor, ray: Tensor) -> Tensor:
     return along > across.abs()
 
 
-def gather_prior(state: MapState, cfg: FusionConfig) -> Prior:
+def gather_prior(state: MapState) -> Prior:
     """Flatten what the update reads of the map."""
-    known, variance = state.validity.flatten(1), state.variance.flatten(1)
     return Prior(
         elevation=state.elevation.flatten(1),
-        variance=torch.where(known, variance, 1.0),
-        gate_variance=variance.clamp(max=cfg.max_gate_std**2).detach(),
-        known=known,
+        variance=state.variance.flatten(1),
+        known=state.validity.flatten(1),
         support=state.support.flatten(1),
     )
+
+
+def gate_variance(variance: Tensor, cfg: FusionConfig) -> Tensor:
+    """Return the variance [m^2] that an elevation of this variance widens its gate by."""
+    return variance.clamp(max=cfg.max_gate_std**2).detach()
 
 
 def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
@@ -232,17 +238,18 @@ def merge(
 ) -> tuple[MapState, Tensor]:
     """Take the scan's heights into the cells, or count them as votes against. Returns also where they were taken."""
     hit, innovation = scan.kept > 0, scan.height - prior.elevation
-    limit = prior.gate_variance + scan.variance + (cfg.relief * grid.resolution) ** 2
+    limit = gate_variance(prior.variance, cfg) + scan.variance + (cfg.relief * grid.resolution) ** 2
     agree = realize(prior.known & hit & (innovation.square() <= cfg.gate**2 * limit))
     votes = chosen(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
     found = hit & ~agree & (~prior.known | (support < 0))
     taken = realize(agree | found)
 
-    information = ratio(as_factor(agree), prior.variance) + 1.0 / scan.variance
+    variance = torch.where(prior.known, prior.variance, 1.0)
+    information = ratio(as_factor(agree), variance) + 1.0 / scan.variance
     fused = prior.elevation + masked(innovation / (information * scan.variance), taken)
     # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
-    outvoted = prior.variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
+    outvoted = variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
     posterior = torch.where(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)
     fresh = chosen(prior.known, -support, scan.votes - scan.dissent)
     support = chosen(hit, chosen(found, fresh, support).clamp(0, cfg.max_support), prior.support)

@@ -134,9 +134,10 @@ def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int]
     table = table.unflatten(1, (size, azimuths))
     table[:, ranges] = blank
     _scan(table, from_end=True)
-    for level, rows in enumerate(widen):
-        near = table[:, :rows]
-        torch.minimum(near, near.roll(-(2**level), 2), out=near)
+    for half in table.chunk(2):  # of the environments, as each takes a copy, the largest of an update's values
+        for level, rows in enumerate(widen):
+            near = half[:, :rows]
+            torch.minimum(near, near.roll(-(2**level), 2), out=near)
     return table
 
 

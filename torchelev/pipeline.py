@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -25,17 +23,31 @@ def fuse_measurement(
     state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None
 ) -> MapState:
     """Run the stages in order (paper, Fig. 2). Pure: it changes none of its arguments. `weights` are the head's."""
-    grid = cfg.grid
+    state = move_along(state, m, cfg)
+    state = take_heights(state, m, cfg)
+    return take_rays(state, m, cfg, weights)
+
+
+def move_along(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+    """Move the window with the robot, and let time pass."""
     state = start_tally(state, m)
-    state = recenter(state, m, grid)
-    state = age(state, m, cfg.aging)
+    state = recenter(state, m, cfg.grid)
+    return age(state, m, cfg.aging)
+
+
+def take_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+    """Compensate the height drift, and fuse the points' heights."""
     if cfg.drift is not None:
-        state = compensate(state, m, grid, cfg.drift, (cfg.traversability or TraversabilityConfig).drift_gate)
-    state = fuse(state, m, grid, cfg.fusion)
+        state = compensate(state, m, cfg.grid, cfg.drift, (cfg.traversability or TraversabilityConfig).drift_gate)
+    return fuse(state, m, cfg.grid, cfg.fusion)
+
+
+def take_rays(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
+    """Clear what is gone or another floor, and rate what is left."""
     if cfg.raycast is not None:
-        state = clear_seen_through(state, m, grid, cfg.raycast)
+        state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
     if cfg.overlap is not None:
-        state = clear_other_floors(state, m, grid, cfg.overlap)
+        state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
     state = rate_surface(state, cfg, weights)
     return tally(state, cells_bounded=count(state.bounded & ~state.validity))
 
@@ -61,8 +73,8 @@ def start_tally(state: MapState, m: Measurement) -> MapState:
     return tally(state, **(zeros | {name: getattr(m, name) for name in gates}))
 
 
-def update(
-    state: MapState,
+def update_in_place(
+    stored: MapState,
     points: Tensor,
     T_map_sensor: Tensor,
     T_map_base: Tensor | None,
@@ -71,15 +83,10 @@ def update(
     *,
     cfg: ElevationMapConfig,
     weights: Weights | None = None,
-) -> MapState:
-    """Measure and fuse; points come as (B, S, N, 3)."""
-    m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, state.elevation.dtype)
-    return fuse_measurement(state, m, cfg, weights)
-
-
-def update_in_place(stored: MapState, *inputs: Any, cfg: ElevationMapConfig, weights: Weights | None = None) -> None:
-    """Measure, fuse, and write the new values into the stored state's own tensors."""
-    write(stored, update(stored, *inputs, cfg=cfg, weights=weights))
+) -> None:
+    """Measure, fuse, and write the new values into the stored state's own tensors; points come as (B, S, N, 3)."""
+    m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, stored.elevation.dtype)
+    write(stored, fuse_measurement(stored, m, cfg, weights))
 
 
 def write(stored: MapState, new: MapState) -> None:

@@ -188,7 +188,7 @@ def horizon(
     steepest = running_minimum(fall, from_end=False)
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
-    limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths))
+    limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
     return chosen(k >= 0, limit, NO_RAY)
 
 
@@ -204,18 +204,21 @@ def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig)
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
     index = flat(chosen(casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
-    return polar_minimum(index, rays.slope.detach(), polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
+    return polar_minimum(
+        index.to(torch.int64), rays.slope.detach(), polar.azimuths, list(polar.widen), polar.ranges, NO_RAY
+    )
 
 
 def flat(row: Tensor, column: Tensor, width: int) -> Tensor:
-    """Return the flat index of whole numbers, in integers: float32 counts no farther than 2^24."""
-    return (row.to(torch.int32) * width + column.to(torch.int32)).to(torch.int64)
+    """Return the flat index of whole numbers, int32: float32 counts no farther than 2^24."""
+    return row.to(torch.int32) * width + column.to(torch.int32)
 
 
 def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
     """Give each entry the value at its index."""
-    # Realized while it has two dimensions: flattened first, the compiler would divide to find row and column.
-    return values.gather(1, realize(index).flatten(1)).view_as(index)
+    # Realized while it has two dimensions: flattened first, the compiler would divide to find row and column. And as
+    # int32, half of what an index of int64 would take to store.
+    return values.gather(1, realize(index).flatten(1).to(torch.int64)).view_as(index)
 
 
 class RayOverCell(NamedTuple):

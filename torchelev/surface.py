@@ -29,6 +29,9 @@ class SurfaceConfig:
         require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
 
 
+FAR_UP = 1e30  # [m] above all heights
+
+
 class Ground(NamedTuple):
     """The known heights, with a rim around the map that windows may reach into; nothing is known there."""
 
@@ -44,8 +47,10 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
     heights = torch.where(validity, elevation, 0.0)  # what is not known may be NaN
     datum = (heights.sum((1, 2), keepdim=True) / number).detach()
-    layers = padded(torch.stack([known, (heights - datum) * known]), rim, 0.0)
-    return Ground(layers[0], layers[1], rim)
+    # One layer tells both, which is less to store and to read than two.
+    layer = padded(chosen(validity, heights - datum, FAR_UP), rim, FAR_UP)
+    known = as_factor(layer < FAR_UP).to(layer.dtype)
+    return Ground(known, layer * known, rim)
 
 
 class Plane(NamedTuple):

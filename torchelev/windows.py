@@ -59,7 +59,9 @@ def window_moments(layers: list[tuple[Tensor, int]], rim: int, radius: int) -> l
     order, 0 to 2, all moments (B, H, W) with a + b <= order: (0, 0), (0, 1), ... (1, 0), ... The rim is at least the
     radius.
     """
-    lines = realize_all(*(line for v, order in layers for line in _line_sums(v, rim, radius, -2, order)))
+    lines = [line for v, order in layers for line in _line_sums(v, rim, radius, -2, order)]
+    if radius > 1:  # three values are summed anew at each reading in less time than their sum is stored and read
+        lines = realize_all(*lines)
     orders = [order - a for _, order in layers for a in range(order + 1)]
     return [
         moment for line, order in zip(lines, orders, strict=True) for moment in _line_sums(line, rim, radius, -1, order)
