@@ -68,6 +68,17 @@ def test_lone_cell_is_level_and_a_line_slopes_along_itself():
     assert plane.gradient_y[0, 3, 0] == 0
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_maps_of_half_precision_know_the_same_ground(dtype):
+    """Heights to rounding; what is unknown stays finite, and zero."""
+    state = random_state(np.random.default_rng(5), small_map(1, (9, 8)).cfg.grid, 2)
+    full, half = (known_ground(state.elevation.to(kind), state.validity, 2) for kind in (torch.float32, dtype))
+    assert half.known.dtype == half.height.dtype == dtype and 0 < full.known.mean() < 1
+    torch.testing.assert_close(half.known.float(), full.known)
+    torch.testing.assert_close(half.height.float(), full.height, atol=0.05, rtol=0)
+    assert (half.height[half.known == 0] == 0).all()
+
+
 def test_a_slope_seen_by_a_sensor_has_its_normal():
     emap = small_map(1, (10, 10))
     x, y = np.meshgrid(np.arange(-0.49, 0.5, 0.02), np.arange(-0.49, 0.5, 0.02), indexing="ij")

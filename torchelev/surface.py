@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.masks import as_factor, chosen, masked
+from torchelev.masks import NOWHERE, as_factor, chosen, masked
 from torchelev.operators import padded
 from torchelev.state import MapState
 from torchelev.windows import window_moments
@@ -29,9 +29,6 @@ class SurfaceConfig:
         require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
 
 
-FAR_UP = 1e30  # [m] above all heights
-
-
 class Ground(NamedTuple):
     """The known heights, with a rim around the map that windows may reach into; nothing is known there."""
 
@@ -48,8 +45,8 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
     heights = torch.where(validity, elevation, 0.0)  # what is not known may be NaN
     datum = (heights.sum((1, 2), keepdim=True) / number).detach()
     # One layer tells both, which is less to store and to read than two.
-    layer = padded(chosen(validity, heights - datum, FAR_UP), rim, FAR_UP)
-    known = as_factor(layer < FAR_UP).to(layer.dtype)
+    layer = padded(chosen(validity, heights - datum, NOWHERE), rim, NOWHERE)
+    known = as_factor(layer < NOWHERE).to(layer.dtype)
     return Ground(known, layer * known, rim)
 
 
