@@ -1,4 +1,4 @@
-"""Compilation: one graph, the same results, shared where inputs are alike and apart where they are not."""
+"""Compilation: few graphs, the same results, shared where inputs are alike and apart where they are not."""
 
 import itertools
 
@@ -73,7 +73,7 @@ def graphs():
     return torch._dynamo.utils.counters["stats"]["unique_graphs"]
 
 
-def test_compiled_update_equals_eager_and_shares_its_graph():
+def test_compiled_update_equals_eager_and_shares_its_graphs():
     """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice."""
     torch._dynamo.reset()
     before = graphs()
@@ -94,6 +94,45 @@ def test_compiled_update_equals_eager_and_shares_its_graph():
             rounded = floats | {"drift_error", "drift_correction"}
             assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
     assert graphs() == before + PARTS
+
+
+def test_compiled_update_equals_eager_without_what_may_be_left_out():
+    """By the real compiler too: one robot, two sensors, variances, no base pose, no drift, no overlap."""
+    torch._dynamo.reset()
+    maps = [small_map(1, drift=None, overlap=None) for _ in range(2)]
+    maps[1].compile()
+    for k in range(3):
+        cloud, T = scan(k, 1, 60)
+        clouds, poses = cloud.unflatten(1, (2, -1)), T[:, None].repeat(1, 2, 1, 1)
+        for emap in maps:
+            emap.update(clouds, poses, None, 0.3, variance=clouds[..., 0].abs() * 1e-3 + 1e-4)
+        # The roughness of ground that few cells tell is the root of a rounding error.
+        assert_close(maps[0].state, maps[1].state, 1e-5, skip=["traversability"])
+        torch.testing.assert_close(maps[1].state.traversability, maps[0].state.traversability, atol=1e-3, rtol=0)
+    assert maps[0].validity.any() and maps[0].bounded.any()
+
+
+def test_an_update_that_is_stopped_leaves_a_sound_map(compile_with, monkeypatch):
+    """By an error of the second graph: the window has moved, nothing was taken in, and the next scan is."""
+    compile_with("eager")
+    emap, eager = small_map(2), small_map(2)
+    emap.compile()
+    cloud, T = scan(0)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("torchelev.compilation.graphs_of", lambda *key: graphs_of(*key)._replace(take_heights=stopped))
+        with pytest.raises(KeyboardInterrupt):
+            emap.update(cloud, T, T, 0.3)
+    assert not emap.validity.any()
+    eager.update(cloud[:, :0], T, T, 0.3)  # as a scan without points
+    for k, number in enumerate((200, 300)):
+        cloud, T = scan(k + 1, 2, number)
+        for one in (emap, eager):
+            one.update(cloud, T, T, 0.3)
+    assert_close(eager.state, emap.state, 1e-5)
 
 
 PLAIN = {"drift": None, "raycast": None, "overlap": None, "traversability": None}  # quick to trace
@@ -206,7 +245,7 @@ def test_clouds_of_no_or_one_point_run_eagerly(compile_with, sensors):
     assert compiled.validity.any() and counter.frame_count == 0
 
 
-def test_maps_of_equal_configs_share_one_graph(compile_with):
+def test_maps_of_equal_configs_share_their_graphs(compile_with):
     counter = CompileCounter()
     compile_with(counter)
     maps = small_map(2), small_map(2)

@@ -21,7 +21,7 @@ def test_running_minimum(seed, num_envs, blocks, columns, from_end):
     np.testing.assert_array_equal(passed, table)
 
 
-@given(st.integers(0, 10_000), st.integers(1, 2), st.integers(0, 40))
+@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(0, 40))
 def test_polar_minimum(seed, num_envs, num_values):
     """Range bins 0 and 1 look at 4 azimuths, 2 and 3 at two, the others at one; out of reach there is nothing."""
     rng, ranges, azimuths, blank = np.random.default_rng(seed), 8, 6, 9.0

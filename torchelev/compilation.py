@@ -31,8 +31,8 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
     # Other names, as its cache does not see `short_kernels` and else would give what it made without.
     options: dict[str, Any] = {"cpp.descriptive_names": "inductor_node"}
     if all(value.device.type == "cpu" for value in inputs if isinstance(value, Tensor)):
-        # What is read so often, or takes so many operations, is stored unasked. The usual 4 and 30, which other devices
-        # keep, store all sums over a window.
+        # What is read so often, or takes so many operations, is stored unasked. The usual limits, which other devices
+        # keep, are so low that all sums over a window are stored.
         options |= {"realize_reads_threshold": 20, "realize_opcount_threshold": 120}
     if hasattr(config.cpp, "enable_tiling_heuristics"):
         # The compiler gives up vectorisation on many gathers, which pays off in the loops over points.
@@ -136,8 +136,8 @@ def compiled_update(
 class Graphs(NamedTuple):
     """The parts of an update, compiled: what one stores on its way is free again before the next.
 
-    Each writes what it changes into the stored state, which saves a copy of every layer. Masks come and go as bytes,
-    see `as_bytes`.
+    Each writes what it changes into the stored state, which saves a copy of every layer; what stops a later one leaves
+    an update without its points or rays. Masks come and go as bytes, see `as_bytes`.
     """
 
     move_along: Callable[..., Measurement]

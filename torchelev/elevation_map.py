@@ -226,7 +226,9 @@ class ElevationMap(nn.Module):
 
         Maps of equal configs share the graphs, and so do scans of any length. Another number of sensors, or a base pose
         that comes or goes, makes others. So do, of environments, one alone, the first number, and the next, whose
-        graphs are for all. An update is three graphs, each of which writes its part of the new state.
+        graphs are for all. An update is three graphs, each of which writes its part of the new state: if it is stopped,
+        by Ctrl-C or for want of memory, the window may have moved without the scan's points being taken in, or those
+        without its rays. Such a map is sound; go on with the next scan.
         """
         self._compiled = True
 

@@ -110,7 +110,7 @@ class Guess(NamedTuple):
 
     height: Float[Tensor, "B C"]  # [m]
     side: Float[Tensor, "B C"]  # of a step: +1 top, -1 ground, 0 no step
-    trusted: Bool[Tensor, "B C"]  # it is the cell's elevation, else the scan's own points give it
+    trusted: Bool[Tensor, "B C"]  # most points agree with the cell's elevation, whose variance then widens the gate
     number: Float[Tensor, "B C"]  # of the scan's points
     near: Bool[Tensor, "B M"]  # points that agree with the cell's elevation
     gate_at: Float[Tensor, "B M"]  # [m^2] of the elevation of each point's cell
@@ -140,7 +140,6 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
 def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> tuple[ScanOfCells, Tensor]:
     """Average the points that lie within the gate around the guess and on its side; tell which the side ignores."""
     height_at, side_at, trusted_at = scan.cells.take(guess.height, guess.side, as_bytes(guess.trusted))
-    # The scan's own height has no variance of its own.
     kept, ignored = on_side(scan, height_at, guess.gate_at * trusted_at, side_at, cfg)
     weight = torch.where(kept, scan.weight, 0.0)
     # Around the guess, so that float32 keeps millimetres at any altitude.

@@ -1,7 +1,7 @@
 """Operations that the compiler makes 5 to 30 times slower on a CPU: as custom operators they stay as they are.
 
-It would turn sums per cell into atomic additions, test at every read of a border whether it lies outside, gather where
-a window could be copied, and compute every term of a running minimum again for every reader.
+It would turn sums per cell into atomic additions, test at every read of a border whether it lies outside, and compute
+every term of a running minimum again for every reader. `moved`, for eager code, reads the shifts on the host.
 """
 
 from __future__ import annotations

@@ -216,8 +216,8 @@ def flat(row: Tensor, column: Tensor, width: int) -> Tensor:
 
 def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
     """Give each entry the value at its index."""
-    # Realized while it has two dimensions: flattened first, the compiler would divide to find row and column. And as
-    # int32, half of what an index of int64 would take to store.
+    # Realized while it has two dimensions: flattened first, the compiler would divide to find row and column. `flat` is
+    # still int32 here, half of what int64 would take to store.
     return values.gather(1, realize(index).flatten(1).to(torch.int64)).view_as(index)
 
 

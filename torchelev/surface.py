@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.masks import NOWHERE, as_factor, chosen, masked
+from torchelev.masks import as_factor, chosen, masked
 from torchelev.operators import padded
 from torchelev.state import MapState
 from torchelev.windows import window_moments
@@ -45,8 +45,9 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
     heights = torch.where(validity, elevation, 0.0)  # what is not known may be NaN
     datum = (heights.sum((1, 2), keepdim=True) / number).detach()
     # One layer tells both, which is less to store and to read than two.
-    layer = padded(chosen(validity, heights - datum, NOWHERE), rim, NOWHERE)
-    known = as_factor(layer < NOWHERE).to(layer.dtype)
+    nowhere = 0.5 * torch.finfo(heights.dtype).max  # differences to it are finite
+    layer = padded(chosen(validity, heights - datum, nowhere), rim, nowhere)
+    known = as_factor(layer < nowhere).to(layer.dtype)
     return Ground(known, layer * known, rim)
 
 
