@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchelev.disputed import NO_HEIGHT, Disputed, settle
+from torchelev.disputed import NO_HEIGHT, Disputed, Shown, settle
 from torchelev.edges import EdgeConfig, ends_of_step, lie_behind, values_around
 from torchelev.windows import AROUND, around
 
@@ -70,8 +70,8 @@ def one_cell(z, weight, step=0, passed=0, seen=None, known=None):
         for cell, height in values.items():
             layer[0, cell] = height
     columns = [z, zeros + 1e-4, weight, (zeros + passed).to(torch.uint8), zeros + 1.0, zeros]
-    slot, settings = (zeros + 4).to(torch.int64), (3, 3.0, 0.01, EdgeConfig().numbers)
-    results = settle(marked + step * marked, slot, columns, cells, [scan, seen_before], *settings)
+    points = Disputed(marked + step * marked, (zeros + 4).to(torch.int64), columns, scan)
+    results = settle(points, cells, Shown(scan, seen_before), 3, 3.0, 0.01, EdgeConfig())
     return [result[0, 4].item() for result in results]
 
 

@@ -7,7 +7,7 @@ from conftest import pose, random_poses, small_config
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchelev import BodyConfig, ElevationMap, SensorConfig, disputed, operators
+from torchelev import BodyConfig, ElevationMap, SensorConfig, operators
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 OPERATORS = [
@@ -15,7 +15,6 @@ OPERATORS = [
     operators.padded,
     operators.running_minimum,
     operators.polar_minimum,
-    disputed.settle,
 ]
 
 

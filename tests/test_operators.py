@@ -6,7 +6,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.edges import EdgeConfig
 from torchelev.operators import cell_sums, moved, padded, polar_minimum, running_minimum
 
 
@@ -78,7 +77,6 @@ MARKED = torch.tensor([[0, 2, 0, 0], [1, 0, 0, 0]], dtype=torch.uint8)
 SLOT = torch.tensor([[1, 1, 2], [0, 3, 0]])
 POINTS = [torch.rand(2, 3, generator=torch.Generator().manual_seed(k)) + 0.1 for k in range(6)]  # see Disputed
 POINTS[3] = (POINTS[3] > 0.5).to(torch.uint8)
-SHOWN = [torch.zeros(2, 4), torch.zeros(2, 4)]
 
 
 @pytest.mark.parametrize(
@@ -91,8 +89,9 @@ SHOWN = [torch.zeros(2, 4), torch.zeros(2, 4)]
         ("cell_sums", (torch.tensor([[0, 1], [1, 1]]), torch.ones(3, 2, 2), 2)),
         ("moved", ([TABLE, TABLE > 0.5], torch.tensor([[1, 0], [0, -2]]), [1.0, 0.0])),
         ("moved", ([TABLE[:1]], torch.tensor([[0, 0]]), [1.0])),
-        ("settle", (MARKED, SLOT, POINTS, torch.zeros(2, 4), SHOWN, 2, 3.0, 0.01, EdgeConfig().numbers)),
-        ("settle", (MARKED, SLOT, POINTS, torch.zeros(2, 4), SHOWN, 2, 3.0, 0.01, [])),
+        ("pick_out", (MARKED, SLOT, POINTS)),
+        ("pick_out", (MARKED[1:], SLOT[1:], [POINTS[3][1:]])),
+        ("pick_out", (torch.zeros_like(MARKED), SLOT, POINTS)),
         ("realize", ([TABLE, SLOT],)),
         ("harmonic", ((TABLE > 0.5).float(), TABLE, 1e-3, 4)),
         ("lowest_of_border", (TABLE, TABLE > 0.5)),

@@ -157,15 +157,14 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
         write_changes(stored, state, move_along(state, m, cfg))
         return with_masks(m, as_bytes)
 
-    def second(stored: MapState, m: Measurement) -> None:
-        state = with_masks(stored, as_mask)
-        write_changes(stored, state, take_heights(state, with_masks(m, as_mask), cfg))
+    def later(stages: Callable[..., MapState]) -> Callable[..., None]:
+        def part(stored: MapState, m: Measurement, *weights: Weights | None) -> None:
+            state = with_masks(stored, as_mask)
+            write_changes(stored, state, stages(state, with_masks(m, as_mask), cfg, *weights))
 
-    def third(stored: MapState, m: Measurement, weights: Weights | None) -> None:
-        state = with_masks(stored, as_mask)
-        write_changes(stored, state, take_rays(state, with_masks(m, as_mask), cfg, weights))
+        return compiled(part)
 
-    return Graphs(compiled(first), compiled(second), compiled(third))
+    return Graphs(compiled(first), later(take_heights), later(take_rays))
 
 
 def write_changes(stored: MapState, old: MapState, new: MapState) -> None:

@@ -7,7 +7,7 @@ gradient: a height is a guess around which `fusion` averages.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,6 +28,32 @@ class Shown(NamedTuple):
     map: Float[Tensor, "B C"]
 
 
+@torch.library.custom_op(
+    "torchelev::pick_out", mutates_args=(), schema="(Tensor cells, Tensor slot, Tensor[] columns) -> Tensor[]"
+)
+def pick_out(cells: UInt8[Tensor, "B C"], slot: Int[Tensor, "B M"], columns: list[Tensor]) -> list[Tensor]:
+    """Pick out the cells that are not zero, and their points.
+
+    Returns these cells (K,), numbered across environments, and of each point in one of them (P,) which of the K it is,
+    and the point's values of each column (B, M). A custom operator, as the compiler must not look into what depends on
+    the data; it compiles what follows for any K and P.
+    """
+    disputed = cells.flatten().nonzero().squeeze(1)
+    picked = cells.gather(1, slot).flatten().nonzero().squeeze(1)
+    cell = slot.flatten().index_select(0, picked) + picked // slot.shape[1] * cells.shape[1]
+    number = torch.empty(cells.numel(), dtype=torch.int32)
+    number[disputed] = torch.arange(len(disputed), dtype=torch.int32)
+    owner = number.index_select(0, cell).to(torch.int64)
+    return [disputed, owner, *(column.flatten().index_select(0, picked) for column in columns)]
+
+
+@pick_out.register_fake
+def _(cells: Tensor, slot: Tensor, columns: list[Tensor]) -> list[Tensor]:
+    number = torch.library.get_ctx()
+    K, P = number.new_dynamic_size(), number.new_dynamic_size()
+    return [slot.new_empty(K), slot.new_empty(P), *(column.new_empty(P) for column in columns)]
+
+
 class Disputed:
     """K disputed cells, numbered across environments, and their P points; on a GPU all cells and all points."""
 
@@ -38,20 +64,17 @@ class Disputed:
         columns: list[Tensor],
         mean: Float[Tensor, "B C"],
     ) -> None:
-        """Pick out the cells that are not zero, and of their points z, spread, weight, passed, ray x and ray y."""
+        """Pick out the cells that are not 0, and of their points z, spread, weight, passed, ray x and ray y.
+
+        A cell of 2 is marked as a step. `mean` is that of the cell's points [m].
+        """
         self.marked = cells
-        first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
-        slot, columns = (slot + first).flatten(), [column.flatten() for column in columns]
         if self.picks_out(cells.device):
-            marked = cells.flatten()
-            self.cells = marked.nonzero().squeeze(1)
-            picked = marked.index_select(0, slot).nonzero().squeeze(1)
-            number = torch.empty(cells.numel(), dtype=torch.int64)
-            number[self.cells] = torch.arange(len(self.cells))
-            self.owner = number.index_select(0, slot.index_select(0, picked))
-            columns = [column.index_select(0, picked) for column in columns]
+            self.cells, self.owner, *columns = pick_out(cells, slot, columns)
         else:
-            self.cells, self.owner = torch.arange(cells.numel(), device=cells.device), slot
+            first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
+            self.cells = torch.arange(cells.numel(), device=cells.device)
+            self.owner, columns = (slot + first).flatten(), [column.flatten() for column in columns]
         self.mean = self.of(mean)
         z, self.spread, self.weight, self.passed, *self.ray = columns
         self.z = z - self.at_points(self.mean)  # [m] above the mean of the cell's points
@@ -81,12 +104,12 @@ class Disputed:
         return layer.flatten().index_select(0, self.cells)
 
     def some(self, mask: Tensor) -> bool:
-        """Tell whether anything is true; of a GPU, which would have to wait to tell, assume so."""
-        return not self.picks_out(mask.device) or bool(mask.any())
+        """Tell whether anything is true; of a GPU, which would have to wait to tell, and of compiled code assume so."""
+        return torch.compiler.is_compiling() or not self.picks_out(mask.device) or bool(mask.any())
 
     def put(self, layer: Tensor, values: Tensor) -> Tensor:
         """Return a layer (B, C) with values (K,) put into the disputed cells."""
-        if len(self.cells) == layer.numel():  # a GPU's K counts the other cells too
+        if not self.picks_out(layer.device):  # K counts the other cells too
             return torch.where(self.marked > 0, values.view_as(layer), layer)
         return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 
@@ -113,45 +136,29 @@ def reduced_mean(points: Disputed, residual: Tensor) -> Tensor:
     return ratio(moment, total)
 
 
-@torch.library.custom_op(
-    "torchelev::settle",
-    mutates_args=(),
-    schema="(Tensor cells, Tensor slot, Tensor[] columns, Tensor height, Tensor[] shown, SymInt width, float gate, "
-    "float relief, float[] edges) -> (Tensor, Tensor)",
-)
 def settle(
-    cells: UInt8[Tensor, "B C"],
-    slot: Int[Tensor, "B M"],
-    columns: list[Tensor],
+    points: Disputed,
     height: Float[Tensor, "B C"],
-    shown: list[Tensor],
+    shown: Shown,
     width: int,
     gate: float,
     relief: float,
-    edges: list[float],
-) -> tuple[Float[Tensor, "B C"], Float[Tensor, "B C"]]:
+    edges: EdgeConfig | None,
+) -> tuple[Float[Tensor, "B C"], Int[Tensor, "B C"]]:
     """Settle the disputed cells: return the heights [m] and the side of each cell: of a step +1 top, -1 ground, else 0.
 
-    `cells` is 0 where nothing is disputed, 2 where the cell holds a step, else 1. A disputed cell gets the robust mean
-    of its points, or, if it holds a step or too many of its points are far from that mean, the height of one end of the
-    step. The other cells keep their `height`. `columns` (B, M) are those of `Disputed`, the weight zero where a point
-    is not used, `shown` those of `Shown`. `width` counts cells along y, `relief` is in [m], `edges` is
-    `EdgeConfig.numbers`, or empty if steps do not matter.
+    A disputed cell gets the robust mean of its points, or, if it is marked as a step or too many of its points are far
+    from that mean, the height of one end of the step. The other cells keep their `height`. `width` counts cells along
+    y, `relief` is in [m].
     """
-    points = Disputed(cells, slot, columns, Shown(*shown).scan)
     settled, side = robust_mean(points), torch.zeros_like(points.mean)
-    if edges:
-        cfg = EdgeConfig.of(*edges)
+    if edges is not None:
         residual = points.z - points.at_points(settled)
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-        step = cfg.holds_step(number, number - close) | (points.of(cells) > 1)
+        step = edges.holds_step(number, number - close) | (points.of(points.marked) > 1)
         if points.some(step):
-            which, end = side_of_step(points, Shown(*shown), width, relief, cfg)
+            which, end = side_of_step(points, shown, width, relief, edges)
             settled, side = torch.where(step, end, settled), torch.where(step, which, side)
-    return points.put(height, points.mean + settled), points.put(torch.zeros_like(height), side)
-
-
-@settle.register_fake
-def _(cells: Tensor, slot: Tensor, columns: list[Tensor], height: Tensor, *others: Any) -> Any:
-    return torch.empty_like(height), torch.empty_like(height)
+    nowhere = torch.zeros_like(height, dtype=torch.int8)
+    return points.put(height, points.mean + settled), points.put(nowhere, side.to(torch.int8))

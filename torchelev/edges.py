@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require, require_count
+from torchelev.storage import realize
 from torchelev.windows import around
 
 if TYPE_CHECKING:
@@ -33,18 +33,6 @@ class EdgeConfig:
         for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
             require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
         require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
-
-    @property
-    def numbers(self) -> list[float]:
-        """The settings in their order, for operators, which take no config."""
-        return [float(getattr(self, name)) for name in self.__dataclass_fields__]
-
-    @classmethod
-    @functools.cache  # every update asks
-    def of(cls, *numbers: float) -> EdgeConfig:
-        """Return the config of these settings."""
-        kinds = {name: type(value) for name, value in vars(cls()).items()}
-        return cls(**{name: kind(number) for (name, kind), number in zip(kinds.items(), numbers, strict=True)})
 
     def holds_step(self, number: Tensor, far: Tensor) -> Tensor:
         """Tell which cells hold a step, by the number of their points and of those far from the estimate."""
@@ -97,7 +85,7 @@ def further_up(points: Disputed, z: Tensor, past: Tensor, most: Tensor, height: 
     for _ in range(rounds):
         moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
         further = moment / total  # NaN where no point lies past the height, which compares as false
-        height = torch.where(most >= further, further, height)
+        height = realize(torch.where(most >= further, further, height))  # so that all rounds have the same code
     return height
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.disputed import NO_HEIGHT, Shown, ratio, settle
+from torchelev.disputed import NO_HEIGHT, Disputed, Shown, ratio, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
@@ -18,7 +18,7 @@ from torchelev.state import BLANK, MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, realize, realize_all
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class Guess(NamedTuple):
     """What a cell's height is about, before the points that count are chosen. Without a gradient."""
 
     height: Float[Tensor, "B C"]  # [m]
-    side: Float[Tensor, "B C"]  # of a step: +1 top, -1 ground, 0 no step
+    side: Int[Tensor, "B C"]  # of a step: +1 top, -1 ground, 0 no step
     trusted: Bool[Tensor, "B C"]  # most points agree with the cell's elevation, whose variance then widens the gate
     number: Float[Tensor, "B C"]  # of the scan's points
     near: Bool[Tensor, "B M"]  # points that agree with the cell's elevation
@@ -131,9 +131,9 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
         step = trusted & edges.holds_step(number, number - agreeing)
     height = chosen(trusted, prior.elevation, mean).detach()
     shown = Shown(chosen(number > 0, mean, NO_HEIGHT), chosen(prior.known, prior.elevation.detach(), NO_HEIGHT))
-    limits = (grid.width, cfg.gate, cfg.relief * grid.resolution, edges.numbers if edges is not None else [])
     cells = as_bytes(untrusted) + 2 * as_bytes(step)
-    height, side = settle(cells, scan.cells.slot, scan.columns(), height, list(shown), *limits)
+    points = Disputed(cells, scan.cells.slot, scan.columns(), shown.scan)
+    height, side = settle(points, height, shown, grid.width, cfg.gate, cfg.relief * grid.resolution, edges)
     return Guess(height, side, trusted, number, near, gate_at)
 
 

@@ -79,7 +79,7 @@ def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[T
 
 
 def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig) -> tuple[Tensor, Tensor]:
-    """Return the flat cell number, int64, of each place (x, y), both (B, ...), and whether it lies in the window.
+    """Return the flat cell number, int32, of each place (x, y), both (B, ...), and whether it lies in the window.
 
     x and y count from a lattice corner that lies at `offset` in the window. Outside, the number is the nearest cell's.
     """
@@ -90,13 +90,13 @@ def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig)
     near_i, near_j = i.clamp(0, grid.height - 1), j.clamp(0, grid.width - 1)
     # In integers: float32 counts no farther than 2^24 cells.
     slot = near_i.to(torch.int32) * grid.width + near_j.to(torch.int32)
-    return slot.to(torch.int64), (i == near_i) & (j == near_j)
+    return slot, (i == near_i) & (j == near_j)
 
 
 def cells_of(m: Measurement, offset: Float[Tensor, "B 2"], grid: GridConfig) -> PointCells:
     """Find the cell of each point that measures the ground."""
     slot, inside = locate(m.points[..., 0], m.points[..., 1], offset, grid)
-    slot, inside = realize_all(slot, inside & m.used)
+    slot, inside = realize_all(slot.to(torch.int64), inside & m.used)
     return PointCells(slot, inside, grid.num_cells)
 
 

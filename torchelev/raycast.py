@@ -146,7 +146,9 @@ def ends_well(
     share = (room / along).amin(-1).clamp(0, 1)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
-    floor = realize(lifted(lowest, ~well_supported(state, cfg, grid.resolution))).flatten(1).gather(1, slot)
+    floor = (
+        realize(lifted(lowest, ~well_supported(state, cfg, grid.resolution))).flatten(1).gather(1, slot.to(torch.int64))
+    )
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
     return inside & (height >= floor) | rays.overhang
 
