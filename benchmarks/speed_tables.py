@@ -8,7 +8,7 @@ from benchmarks.report import markdown_table
 from benchmarks.workload import BPEARL, SENSORS
 
 TARGETS = {6276: 2.5, 43074: 6.0, 407040: 20.0}  # [ms] one robot
-EAGER = 4.0  # times the compiled update
+EAGER = 4  # times these, of an update that is not compiled
 MANY = 45.0  # [ms] 256 robots
 FLAT = 1.15  # the time per robot may not rise by more, from 256 robots on
 MEMORY = 1.5  # times what state, points and polar table need on paper
@@ -34,7 +34,8 @@ def verdicts(result: dict[str, Any]) -> str:
         for n, limit in TARGETS.items():
             check(f"one robot, {n:,} points", full[n]["median"], limit, "{:.1f} ms")
         for n, row in eager.items():
-            check(f"eager, {n:,} points", row["median"] / full[n]["median"], EAGER, "{:.1f} x compiled")
+            times = row["median"] / full[n]["median"]
+            check(f"eager, {n:,} points ({times:.1f} x compiled)", row["median"], EAGER * TARGETS[n], "{:.1f} ms")
         check("growth with points", result["points"]["exponent_from_43074"], GROWTH["points"], "exponent {:.2f}")
         check("graphs compiled for 8 numbers of points (for one: 3)", result["points"]["graphs"], 3, "{:.0f}")
     if "robots" in result:
