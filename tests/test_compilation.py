@@ -10,8 +10,9 @@ from torch._dynamo.testing import CompileCounter
 from torch._inductor.codegen.cpp import CppScheduling
 
 import torchelev
-from torchelev import SensorConfig
+from torchelev import SensorConfig, fusion
 from torchelev.compilation import KERNEL_ARGUMENTS, Graphs, announced_compilation, compiled, graphs_of
+from torchelev.disputed import settle
 from torchelev.layers import LAYERS
 
 
@@ -73,17 +74,34 @@ def graphs():
     return torch._dynamo.utils.counters["stats"]["unique_graphs"]
 
 
-def test_compiled_update_equals_eager_and_shares_its_graphs():
-    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice."""
+def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
+    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice.
+
+    Nor for another number of disputed cells: none, single ones, and tops and grounds of steps.
+    """
     torch._dynamo.reset()
+    sides = []
+
+    def spy(points, *others):
+        height, side = settle(points, *others)
+        if not torch.compiler.is_compiling():
+            sides.append([len(points.cells), int((side > 0).sum()), int((side < 0).sum())])
+        return height, side
+
+    monkeypatch.setattr(fusion, "settle", spy)
     before = graphs()
     maps = {name: small_map(2) for name in ("eager", "compiled", "twin")}
     maps["compiled"].compile()
     maps["twin"].compile()
-    for k, number in enumerate((300, 290, 5000, 200)):
+    for k, number in enumerate((300, 290, 5000, 200, 6000, 100)):
         cloud, T = scan(k, 2, number)
         cloud = cloud[:, :150] if number == 200 else cloud
         T = T[:1].expand(2, 4, 4) if number == 200 else T
+        if number == 6000:  # a block of heights in every cell
+            T = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+            generator = torch.Generator().manual_seed(0)
+            cloud = torch.rand(2, 6000, 3, generator=generator) * torch.tensor([0.3, 0.3, 0.6]) - 0.15
+        cloud = cloud * torch.nan if number == 100 else cloud
         for emap in maps.values():
             emap.update(cloud, T, T, 0.3)
         for name in ("compiled", "twin"):
@@ -94,6 +112,20 @@ def test_compiled_update_equals_eager_and_shares_its_graphs():
             rounded = floats | {"drift_error", "drift_correction"}
             assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
     assert graphs() == before + PARTS
+    disputed, tops, grounds = zip(*sides, strict=True)
+    assert 0 in disputed and max(disputed) > 10 and max(tops) > 0 and max(grounds) > 0
+
+
+def test_the_core_exports():
+    emap, (cloud, T) = mapped(), scan(5)
+
+    class Core(torch.nn.Module):
+        def forward(self, points, T, dt):
+            return emap(emap.state, emap.measure(points, T, T, dt)).elevation
+
+    inputs = (cloud, T, torch.full((2,), 0.1))
+    exported = torch.export.export(Core(), inputs, strict=False).module()
+    torch.testing.assert_close(exported(*inputs), Core()(*inputs))
 
 
 def test_compiled_update_equals_eager_without_what_may_be_left_out():

@@ -78,14 +78,14 @@ EDGES = [EdgeConfig(), EdgeConfig(min_extreme=1, refinements=2), EdgeConfig(min_
 )
 def test_agrees_with_the_reference_at_steps(seed, num_points, sensors, edges, picks_out, altitude):
     """On a CPU, which picks the disputed cells out, and as on a GPU, which goes through all cells."""
-    with patch.object(Disputed, "picks_out", lambda self, device: picks_out):
+    with patch.object(Disputed, "picks_out", lambda self, values: picks_out):
         compare_with_reference(seed, num_points, sensors, FusionConfig(edges=edges), altitude)
 
 
 @pytest.mark.parametrize("picks_out", [True, False])
 def test_nothing_disputed(monkeypatch, picks_out):
     """Other cells keep their heights: with no points at all, and where all points agree with the map."""
-    monkeypatch.setattr(Disputed, "picks_out", lambda self, device: picks_out)
+    monkeypatch.setattr(Disputed, "picks_out", lambda self, values: picks_out)
     emap = small_map(1, CELLS)
     emap.update(torch.empty(1, 0, 3), pose((0.0, 0.0, 1.0)))
     assert not emap.validity.any()

@@ -86,7 +86,15 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
 
     Checking these hundreds took a third of a millisecond.
     """
-    return [not guard.is_global and "cfg" not in guard.name and "__dict__" not in guard.name for guard in guards]
+    fixed = ("cfg", "stages", "__dict__")
+    return [not guard.is_global and not any(name in guard.name for name in fixed) for guard in guards]
+
+
+def sizes_of_data() -> contextlib.AbstractContextManager[None]:
+    """Let the compiler take in operators whose results have sizes that depend on data; torch 2.10 does it by itself."""
+    if torch.__version__ >= "2.10":
+        return contextlib.nullcontext()
+    return torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True)
 
 
 @contextlib.contextmanager
@@ -104,7 +112,8 @@ def announced_compilation() -> Iterator[None]:
     callback_handler.register_start_callback(announce)
     end = "failed"
     try:
-        yield
+        with sizes_of_data():
+            yield
         if starts:
             end = f"done in {time.perf_counter() - starts[0]:.0f} s. Later processes find it in the compiler's cache."
     finally:
@@ -157,14 +166,14 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
         write_changes(stored, state, move_along(state, m, cfg))
         return with_masks(m, as_bytes)
 
-    def later(stages: Callable[..., MapState]) -> Callable[..., None]:
-        def part(stored: MapState, m: Measurement, *weights: Weights | None) -> None:
+    def in_place(stages: Callable[..., MapState]) -> Callable[..., None]:
+        def run(stored: MapState, m: Measurement, *weights: Weights | None) -> None:
             state = with_masks(stored, as_mask)
             write_changes(stored, state, stages(state, with_masks(m, as_mask), cfg, *weights))
 
-        return compiled(part)
+        return compiled(run)
 
-    return Graphs(compiled(first), later(take_heights), later(take_rays))
+    return Graphs(compiled(first), in_place(take_heights), in_place(take_rays))
 
 
 def write_changes(stored: MapState, old: MapState, new: MapState) -> None:

@@ -34,9 +34,9 @@ class Shown(NamedTuple):
 def pick_out(cells: UInt8[Tensor, "B C"], slot: Int[Tensor, "B M"], columns: list[Tensor]) -> list[Tensor]:
     """Pick out the cells that are not zero, and their points.
 
-    Returns these cells (K,), numbered across environments, and of each point in one of them (P,) which of the K it is,
-    and the point's values of each column (B, M). A custom operator, as the compiler must not look into what depends on
-    the data; it compiles what follows for any K and P.
+    Returns these cells (K,), numbered across environments, and of each point in one of them (P,) the place of its cell
+    among these K, and the point's value of each column (B, M). A custom operator, as the compiler must not look into
+    what depends on the data; it compiles what follows for any K and P.
     """
     disputed = cells.flatten().nonzero().squeeze(1)
     picked = cells.gather(1, slot).flatten().nonzero().squeeze(1)
@@ -49,8 +49,8 @@ def pick_out(cells: UInt8[Tensor, "B C"], slot: Int[Tensor, "B M"], columns: lis
 
 @pick_out.register_fake
 def _(cells: Tensor, slot: Tensor, columns: list[Tensor]) -> list[Tensor]:
-    number = torch.library.get_ctx()
-    K, P = number.new_dynamic_size(), number.new_dynamic_size()
+    context = torch.library.get_ctx()
+    K, P = context.new_dynamic_size(), context.new_dynamic_size()
     return [slot.new_empty(K), slot.new_empty(P), *(column.new_empty(P) for column in columns)]
 
 
@@ -69,7 +69,7 @@ class Disputed:
         A cell of 2 is marked as a step. `mean` is that of the cell's points [m].
         """
         self.marked = cells
-        if self.picks_out(cells.device):
+        if self.picks_out(cells):
             self.cells, self.owner, *columns = pick_out(cells, slot, columns)
         else:
             first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
@@ -81,18 +81,18 @@ class Disputed:
         self.used = (self.weight > 0).to(z.dtype)
 
     @staticmethod
-    def picks_out(device: torch.device) -> bool:
-        """Tell whether the host may learn how many cells are disputed without waiting for the device."""
-        return device.type == "cpu"
+    def picks_out(values: Tensor) -> bool:
+        """Tell whether the host may learn how many cells are disputed: of a CPU, unless its tensors hold no data."""
+        return values.device.type == "cpu" and (torch.compiler.is_compiling() or type(values) is Tensor)
 
     def sum(self, values: Tensor) -> Tensor:
         """Sum the points' values (..., P) per cell: -> (..., K)."""
-        total = values.new_zeros(*values.shape[:-1], len(self.cells))
+        total = values.new_zeros(*values.shape[:-1], self.cells.shape[0])
         return total.scatter_add_(-1, self.owner.expand(values.shape), values)
 
     def highest(self, values: Tensor) -> Tensor:
         """Return the highest of the points' values (..., P) per cell: -> (..., K)."""
-        highest = values.new_full((*values.shape[:-1], len(self.cells)), -torch.inf)
+        highest = values.new_full((*values.shape[:-1], self.cells.shape[0]), -torch.inf)
         return highest.scatter_reduce_(-1, self.owner.expand(values.shape), values, "amax")
 
     def at_points(self, values: Tensor) -> Tensor:
@@ -104,12 +104,12 @@ class Disputed:
         return layer.flatten().index_select(0, self.cells)
 
     def some(self, mask: Tensor) -> bool:
-        """Tell whether anything is true; of a GPU, which would have to wait to tell, and of compiled code assume so."""
-        return torch.compiler.is_compiling() or not self.picks_out(mask.device) or bool(mask.any())
+        """Tell whether anything is true; assume so where the host would have to wait, and in compiled code."""
+        return torch.compiler.is_compiling() or not self.picks_out(mask) or bool(mask.any())
 
     def put(self, layer: Tensor, values: Tensor) -> Tensor:
         """Return a layer (B, C) with values (K,) put into the disputed cells."""
-        if not self.picks_out(layer.device):  # K counts the other cells too
+        if not self.picks_out(layer):  # K counts the other cells too
             return torch.where(self.marked > 0, values.view_as(layer), layer)
         return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 

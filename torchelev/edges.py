@@ -85,7 +85,8 @@ def further_up(points: Disputed, z: Tensor, past: Tensor, most: Tensor, height: 
     for _ in range(rounds):
         moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
         further = moment / total  # NaN where no point lies past the height, which compares as false
-        height = realize(torch.where(most >= further, further, height))  # so that all rounds have the same code
+        # Stored, or each round would compute all those before it anew.
+        height = realize(torch.where(most >= further, further, height))
     return height
 
 

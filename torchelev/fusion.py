@@ -249,7 +249,7 @@ def merge(
     fused = prior.elevation + masked(innovation / (information * scan.variance), taken)
     # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
     outvoted = variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
-    posterior = chosen(taken, 1.0 / information, outvoted).clamp(max=cfg.max_variance)
+    posterior = chosen(taken, (1.0 / information).clamp(max=cfg.max_variance), outvoted.clamp(max=cfg.max_variance))
     fresh = chosen(prior.known, -support, scan.votes - scan.dissent)
     support = chosen(hit, chosen(found, fresh, support).clamp(0, cfg.max_support), prior.support)
 
