@@ -116,6 +116,16 @@ def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
     assert 0 in disputed and max(disputed) > 10 and max(tops) > 0 and max(grounds) > 0
 
 
+def test_an_older_torch_is_refused(monkeypatch):
+    monkeypatch.setattr(torch, "__version__", torch.torch_version.TorchVersion("2.9.1"))
+    emap = small_map(1)
+    with pytest.raises(RuntimeError, match=r"torch.*2\.10 or later.*2\.9\.1.*upgrade"):
+        emap.compile()
+    cloud, T = scan(0, 1)
+    emap.update(cloud, T)
+    assert emap.validity.any()
+
+
 def test_the_core_exports():
     emap, (cloud, T) = mapped(), scan(5)
 

@@ -90,13 +90,6 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
     return [not guard.is_global and not any(name in guard.name for name in fixed) for guard in guards]
 
 
-def sizes_of_data() -> contextlib.AbstractContextManager[None]:
-    """Let the compiler take in operators whose results have sizes that depend on data; torch 2.10 does it by itself."""
-    if torch.__version__ >= "2.10":
-        return contextlib.nullcontext()
-    return torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True)
-
-
 @contextlib.contextmanager
 def announced_compilation() -> Iterator[None]:
     """Say on stderr what is going on for a minute, and what it cost, if anything is compiled."""
@@ -112,8 +105,7 @@ def announced_compilation() -> Iterator[None]:
     callback_handler.register_start_callback(announce)
     end = "failed"
     try:
-        with sizes_of_data():
-            yield
+        yield
         if starts:
             end = f"done in {time.perf_counter() - starts[0]:.0f} s. Later processes find it in the compiler's cache."
     finally:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require, require_count
-from torchelev.storage import realize
 from torchelev.windows import around
 
 if TYPE_CHECKING:
@@ -85,8 +84,7 @@ def further_up(points: Disputed, z: Tensor, past: Tensor, most: Tensor, height: 
     for _ in range(rounds):
         moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
         further = moment / total  # NaN where no point lies past the height, which compares as false
-        # Stored, or each round would compute all those before it anew.
-        height = realize(torch.where(most >= further, further, height))
+        height = torch.where(most >= further, further, height)
     return height
 
 

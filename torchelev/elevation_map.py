@@ -228,8 +228,11 @@ class ElevationMap(nn.Module):
         that comes or goes, makes others. So do, of environments, one alone, the first number, and the next, whose
         graphs are for all. An update is three graphs, each of which writes its part of the new state: if it is stopped,
         by Ctrl-C or for want of memory, the window may have moved without the scan's points being taken in, or those
-        without its rays. Such a map is sound; go on with the next scan.
+        without its rays. Such a map is sound; go on with the next scan. Raises RuntimeError before torch 2.10, whose
+        compiler cannot.
         """
+        new, mend = torch.__version__ >= "2.10", "upgrade it, or leave updates uncompiled"
+        require(new, "torch", "must be 2.10 or later to compile updates", torch.__version__, mend, RuntimeError)
         self._compiled = True
 
     def extra_repr(self) -> str:
