@@ -190,10 +190,10 @@ def packed(value: Tensor) -> Tensor:
 
 
 Values = TypeVar("Values", MapState, Measurement)
+MASKS = ("validity", "bounded", "used", "casts")  # of a state, and of a measurement
 
 
 def with_masks(values: Values, convert: Callable[[Tensor], Tensor]) -> Values:
     """Return a state or a measurement with its masks converted."""
-    if isinstance(values, MapState):
-        return values._replace(validity=convert(values.validity), bounded=convert(values.bounded))
-    return values._replace(used=convert(values.used), casts=convert(values.casts))
+    masks = {name: convert(getattr(values, name)) for name in MASKS if name in values._fields}
+    return type(values)(**(values._asdict() | masks))  # what `_replace` makes, torch 2.11 cannot return from a graph
