@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require, require_count
+from torchelev.storage import realize, realize_all
 from torchelev.windows import around
 
 if TYPE_CHECKING:
@@ -63,33 +64,32 @@ def ends_of_step(points: Disputed, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
     """Return the heights (K,) of the step's top and bottom [m] above the mean.
 
     The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
-    top of a wall's face. The bottom is the top of the step upside down, and takes two. Up to `margin` standard
-    deviations short of a level lies past it. A level that fewer than `min_extreme` points reach, give or take a
-    standard deviation, is an outlier's.
+    top of a wall's face. The bottom is the top of the step upside down, and takes two.
     """
-    z, noise = torch.stack([points.z, -points.z]), points.spread.sqrt()
+    return top_of_step(points, points.z, cfg, cfg.refinements), -top_of_step(points, -points.z, cfg, 2)
+
+
+def top_of_step(points: Disputed, z: Tensor, cfg: EdgeConfig, rounds: int) -> Tensor:
+    """Move heights (K,) from 0 to the mean of the points at or past them, so many times; `z` (P,) are the points'.
+
+    Up to `margin` standard deviations short of a height lies past it. A level that fewer than `min_extreme` points
+    reach, give or take a standard deviation, is an outlier's, and no height lies above it.
+    """
+    noise = points.spread.sqrt()
+    # Stored, all of it, so that rounds have the same code, which is then compiled once.
+    z, past = realize_all(z, z + cfg.margin * noise)
     most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), cfg.min_extreme)
-    past = z + cfg.margin * noise
-    height = further_up(points, z, past, most, torch.zeros_like(most), 2)
-    top = further_up(points, z[:1], past[:1], most[:1], height[:1], cfg.refinements - 2)
-    return top[0], -height[1]
-
-
-def further_up(points: Disputed, z: Tensor, past: Tensor, most: Tensor, height: Tensor, rounds: int) -> Tensor:
-    """Move heights (n, K) to the mean of the points at or past them, so many times, but nowhere above `most`.
-
-    Each point has its height `z` and counts as past all that is no higher than `past`, both (n, P).
-    """
-    columns = torch.stack([points.weight * z, points.weight.expand_as(z)])
+    columns = torch.stack([points.weight * z, points.weight])
+    most, height = realize_all(most, torch.zeros_like(most))
     for _ in range(rounds):
         moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
         further = moment / total  # NaN where no point lies past the height, which compares as false
-        height = torch.where(most >= further, further, height)
+        height = realize(torch.where(most >= further, further, height))
     return height
 
 
 def level_reached(points: Disputed, reached: Tensor, number: int) -> Tensor:
-    """Return the highest level (2, K) that so many of a cell's points reach; `reached` (2, P) is how high each does."""
+    """Return the highest level (K,) that so many of a cell's points reach; `reached` (P,) is how high each does."""
     level = points.highest(reached)
     for _ in range(number - 1):
         at = points.at_points(level)
