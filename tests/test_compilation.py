@@ -298,6 +298,19 @@ def test_maps_of_equal_configs_share_their_graphs(compile_with):
     assert counter.frame_count == PARTS
 
 
+def test_inference_mode_shares_the_graphs(compile_with):
+    """Training steps environments in inference mode, and tries them outside."""
+    counter = CompileCounter()
+    compile_with(counter)
+    emap = small_map(2)
+    emap.compile()
+    for k, mode in enumerate((False, True, False)):
+        cloud, T = scan(k, 2)
+        with torch.inference_mode(mode):
+            emap.update(cloud + 0.0, T + 0.0, T, 0.1)
+    assert counter.frame_count == PARTS and emap.validity.any()
+
+
 def test_equal_configs_share_the_compiled_update():
     kinds = ((torch.float32, torch.device("cpu")),)
     assert graphs_of(small_config(), kinds, 1) is graphs_of(small_config(), kinds, 1)

@@ -238,6 +238,24 @@ def test_inference_mode_then_reset_outside():
     assert emap.validity.any()
 
 
+def test_a_map_made_in_inference_mode_can_be_updated_outside():
+    with torch.inference_mode():
+        emap = small_map(2)
+    cloud, T = scan(0)
+    emap.update(cloud, T, T, 0.1)
+    assert emap.validity.any()
+
+
+def test_an_update_stops_a_backward_pass_through_the_values_before():
+    """Else its gradient would be that of the new values, unseen."""
+    emap, weight = mapped(2), torch.ones(2, 1, 1, requires_grad=True)
+    loss = (weight * emap.elevation).sum()
+    cloud, T = scan(1)
+    emap.update(cloud, T, T, 0.1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
 def test_buffers_keep_their_place_in_memory():
     """Whoever holds a buffer, such as a CUDA graph, sees the map change."""
     emap = small_map(2)

@@ -198,8 +198,13 @@ def mark_dynamic(dim: int, *values: Tensor | None) -> None:
 
 
 def packed(value: Tensor) -> Tensor:
-    """Return the values with the strides of a new tensor; a slice or an expansion would get other graphs."""
-    return value.reshape(-1).view(value.shape)
+    """Return the values with the strides of a new tensor, and as a normal one.
+
+    A slice, an expansion, or what was made in inference mode would get other graphs.
+    """
+    with torch.inference_mode(False), torch.no_grad():
+        value = value.reshape(-1).view(value.shape)
+        return value.clone() if value.is_inference() else value
 
 
 Values = TypeVar("Values", MapState, Measurement)
