@@ -71,12 +71,15 @@ def stages(seconds: float, track: Track) -> dict[str, Any]:
     def transform(state: MapState, m: Measurement) -> Measurement:
         return sensor.measure(cloud[:, None], T[:, None], T, drive.dt, None, g, cfg.sensor, torch.float32)
 
+    def cells(state: MapState, m: Measurement) -> grid.PointCells:
+        return grid.cells_of(state, m, g)
+
     all_stages: dict[str, Callable[[MapState, Measurement], Any]] = {
         "point transform, gates, noise": transform,
         "recenter": lambda state, m: grid.recenter(state, m, g),
         "age": lambda state, m: aging.age(state, m, cfg.aging),
-        "drift compensation": lambda state, m: drift.compensate(state, m, g, cfg.drift, 0.5),
-        "height update": lambda state, m: fusion.fuse(state, m, g, cfg.fusion),
+        "drift compensation": lambda state, m: drift.compensate(state, m, cells(state, m), g, cfg.drift, 0.5),
+        "height update": lambda state, m: fusion.fuse(state, m, cells(state, m), g, cfg.fusion),
         "ray casting": lambda state, m: raycast.clear_seen_through(state, m, g, cfg.raycast),
         "overlap clearance": lambda state, m: overlap.clear_other_floors(state, m, g, cfg.overlap),
         "normals and traversability": lambda state, m: pipeline.rate_surface(state, cfg),

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from torchelev import DriftConfig, SensorConfig
 from torchelev.drift import compensate
+from torchelev.grid import cells_of
 
 SIGMA2 = 1e-4
 
@@ -26,7 +27,8 @@ def test_agrees_with_the_reference(seed, offset, gain, min_points):
     points = [terrain(rng, 150, (7, 6), roughness=0.1) + [0, 0, offset] for _ in range(2)]
     T = pose((0.1, 0.2, 1.0), num_envs=2)
     m = emap.measure(seen_from(T, torch.from_numpy(np.stack(points))), T, None, 0.1)
-    after = compensate(state, m, emap.cfg.grid, cfg, 0.5)
+    grid = emap.cfg.grid
+    after = compensate(state, m, cells_of(state, m, grid), grid, cfg, 0.5)
     for b in range(2):
         layers = {name: getattr(state, name)[b].numpy() for name in state._fields[2:-1]}
         used = [p for p, u in zip(points[b], m.used[b], strict=True) if u]
@@ -85,8 +87,10 @@ def test_the_config_overrules_the_gate_of_the_head():
     emap.update(flat_cloud(0.0), pose(), None, 0.1)
     state = emap.state._replace(traversability=torch.full_like(emap.state.traversability, 0.6))
     m = emap.measure(flat_cloud(0.05), pose(), None, 0.1)
+    grid = emap.cfg.grid
+    cells = cells_of(state, m, grid)
     for of_config, of_head, counts in ((None, 0.6, True), (None, 0.61, False), (0.6, 0.9, True), (0.61, 0.1, False)):
-        after = compensate(state, m, emap.cfg.grid, DriftConfig(min_traversability=of_config), of_head)
+        after = compensate(state, m, cells, grid, DriftConfig(min_traversability=of_config), of_head)
         assert (after.statistics.drift_points.item() > 0) == counts
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from torchelev import EdgeConfig, FusionConfig, SensorConfig
 from torchelev.disputed import Disputed
 from torchelev.fusion import fuse
+from torchelev.grid import cells_of
 
 SEEDS = st.integers(0, 10_000)
 CELLS = (6, 5)
@@ -107,7 +108,8 @@ def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0):
     in_map[..., 2] += altitude
     cloud = (torch.from_numpy(in_map) - T[:, :, None, :3, 3]) @ T[:, :, :3, :3]
     m = emap.measure(cloud, T, None, 0.1)
-    after = fuse(state, m, emap.cfg.grid, cfg)
+    grid = emap.cfg.grid
+    after = fuse(state, m, cells_of(state, m, grid), grid, cfg)
     for b in range(2):
         points = in_map[b].reshape(-1, 3)
         origins = np.repeat(T[b, :, :3, 3].numpy(), num_points, 0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchelev.masks import NOWHERE, as_factor, chosen, lifted, masked
+from torchelev.masks import NOWHERE, as_factor, chosen, lifted, masked, masked_any
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 
@@ -22,6 +22,15 @@ def test_masked_and_lifted_choose_to_the_bit(values, mask):
     assert masked(values, mask).dtype == lifted(values, mask).dtype == values.dtype
     assert torch.equal(lifted(values, mask)[~mask.expand(3, 5, 7)], values[~mask.expand(3, 5, 7)])
     assert (lifted(values, mask)[mask.expand(3, 5, 7)] > NOWHERE - 300).all()
+
+
+@pytest.mark.parametrize("other", [torch.nan, torch.inf, -torch.inf])
+def test_masked_any_leaves_nothing_of_other_values(values, other):
+    values = torch.where(MASK, values, other).requires_grad_()
+    kept = masked_any(values, MASK)
+    assert torch.equal(kept, torch.where(MASK, values, 0.0))
+    kept.sum().backward()
+    assert torch.equal(values.grad, MASK.to(values.dtype))
 
 
 @pytest.mark.parametrize("mask", [MASK, MASK[:1], MASK.transpose(0, 1).contiguous().transpose(0, 1)])

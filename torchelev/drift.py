@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.grid import GridConfig, cells_of, center_offsets, lattice_offset
+from torchelev.grid import GridConfig, PointCells, center_offsets
 from torchelev.masks import as_factor, lifted, masked
 from torchelev.state import MapState, Measurement, count, tally
 
@@ -42,7 +42,9 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     return (total / count(mask).clamp(min=1)).to(values.dtype)
 
 
-def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig, head_gate: float) -> MapState:
+def compensate(
+    state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: DriftConfig, head_gate: float
+) -> MapState:
     """Add the mean height error over certain, flat cells to elevation and upper bound (paper, Sec. II-D).
 
     e = (1 / n) * sum (p_z - h), h the height at the point of its cell's plane, over points whose cell is known,
@@ -51,7 +53,6 @@ def compensate(state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConf
     rated `head_gate` or more.
     """
     px, py, pz = m.points.unbind(-1)
-    cells = cells_of(m, lattice_offset(state, m, grid), grid)
     gate = head_gate if cfg.min_traversability is None else cfg.min_traversability
     suits = state.validity & (state.traversability >= gate) & (state.variance <= cfg.max_variance)
     # On a slope the height within a cell depends on where in the cell the point lies.

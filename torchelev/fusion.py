@@ -12,7 +12,7 @@ from torch import Tensor
 from torchelev.disputed import NO_HEIGHT, Disputed, Shown, ratio, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require
-from torchelev.grid import GridConfig, PointCells, cells_of, lattice_offset
+from torchelev.grid import GridConfig, PointCells
 from torchelev.masks import as_factor, chosen, masked
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, realize, realize_all
@@ -75,7 +75,7 @@ class Prior(NamedTuple):
     support: Float[Tensor, "B C"]
 
 
-def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -> MapState:
+def fuse(state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> MapState:
     """Fuse the scan into the map (paper, Sec. II-C).
 
     Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of
@@ -91,7 +91,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -
     a height that most points agree on wins, whether or not an outlier came first. A scan that disagrees raises the
     variance, as in the paper, and founds the cell anew once the votes are used up.
     """
-    scan, prior = gather_scan(state, m, grid, cfg), gather_prior(state)
+    scan, prior = gather_scan(m, cells, grid, cfg), gather_prior(state)
     guess = guess_heights(scan, prior, grid, cfg)
     scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
     state, taken = merge(state, prior, scanned, grid, cfg)
@@ -163,11 +163,9 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
     return cells, ignored
 
 
-def gather_scan(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig) -> Scan:
-    """Find each point's cell, and whether its ray passed over the cell's centre."""
-    xy, z = m.points[..., :2], m.points[..., 2]
-    cells = cells_of(m, lattice_offset(state, m, grid), grid)
-    used = cells.inside
+def gather_scan(m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> Scan:
+    """Find what the update needs of each point, and whether its ray passed over the cell's centre."""
+    xy, z, used = m.points[..., :2], m.points[..., 2], cells.inside
     from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
     sensors = m.origin.shape[1]
     ray = (xy.unflatten(1, (sensors, -1)) - m.origin[:, :, None, :2]).flatten(1, 2)
@@ -244,11 +242,10 @@ def merge(
     found = hit & ~agree & (~prior.known | (support < 0))
     taken = realize(agree | found)
 
-    variance = torch.where(prior.known, prior.variance, 1.0)
-    information = ratio(as_factor(agree), variance) + 1.0 / scan.variance
+    information = ratio(as_factor(agree), prior.variance) + 1.0 / scan.variance
     fused = prior.elevation + masked(innovation / (information * scan.variance), taken)
     # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
-    outvoted = variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
+    outvoted = prior.variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
     posterior = chosen(taken, (1.0 / information).clamp(max=cfg.max_variance), outvoted.clamp(max=cfg.max_variance))
     fresh = chosen(prior.known, -support, scan.votes - scan.dissent)
     support = chosen(hit, chosen(found, fresh, support).clamp(0, cfg.max_support), prior.support)
@@ -262,7 +259,7 @@ def merge(
         chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         state.validity | hit_now,
-        torch.where(hit_now, 0.0, state.time),
+        torch.where(hit_now, 0.0, state.time),  # which an infinite dt makes infinite
     )
     stored = state._replace(elevation=elevation, variance=variance, support=support, validity=validity, time=time)
     return stored, taken

@@ -93,9 +93,9 @@ def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig)
     return slot, (i == near_i) & (j == near_j)
 
 
-def cells_of(m: Measurement, offset: Float[Tensor, "B 2"], grid: GridConfig) -> PointCells:
+def cells_of(state: MapState, m: Measurement, grid: GridConfig) -> PointCells:
     """Find the cell of each point that measures the ground."""
-    slot, inside = locate(m.points[..., 0], m.points[..., 1], offset, grid)
+    slot, inside = locate(m.points[..., 0], m.points[..., 1], lattice_offset(state, m, grid), grid)
     slot, inside = realize_all(slot.to(torch.int64), inside & m.used)
     return PointCells(slot, inside, grid.num_cells)
 

@@ -20,6 +20,13 @@ def masked(values: Tensor, mask: Tensor) -> Tensor:
     return values * as_factor(mask)
 
 
+def masked_any(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the values where the mask is true, which are finite, else 0; of the others any may be NaN."""
+    if torch.compiler.is_compiling():
+        return torch.where(mask, values, 0.0)
+    return masked(values.nan_to_num(0.0, 0.0, 0.0), mask)
+
+
 def chosen(mask: Tensor, values: Tensor, others: Tensor | float) -> Tensor:
     """Return the values where the mask is true, else the others. Finite ones, or NaN would be left."""
     others = others if isinstance(others, Tensor) else values.new_full((), others)

@@ -9,7 +9,7 @@ from torchelev.aging import age
 from torchelev.config import ElevationMapConfig
 from torchelev.drift import compensate
 from torchelev.fusion import fuse
-from torchelev.grid import recenter
+from torchelev.grid import cells_of, recenter
 from torchelev.overlap import clear_other_floors
 from torchelev.raycast import clear_seen_through
 from torchelev.sensor import measure
@@ -37,9 +37,11 @@ def move_along(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapS
 
 def take_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
     """Compensate the height drift, and fuse the points' heights."""
+    cells = cells_of(state, m, cfg.grid)
     if cfg.drift is not None:
-        state = compensate(state, m, cfg.grid, cfg.drift, (cfg.traversability or TraversabilityConfig).drift_gate)
-    return fuse(state, m, cfg.grid, cfg.fusion)
+        gate = (cfg.traversability or TraversabilityConfig).drift_gate
+        state = compensate(state, m, cells, cfg.grid, cfg.drift, gate)
+    return fuse(state, m, cells, cfg.grid, cfg.fusion)
 
 
 def take_rays(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:

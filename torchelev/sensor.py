@@ -90,9 +90,8 @@ def relative_to(position: Float[Tensor, "B ... 3"], anchor: Tensor, resolution: 
 
 def turned(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     """Return the rows of R p. Written out: a matrix product may round otherwise for another batch size."""
-    return [
-        rotation[..., k, 0, None] * x + rotation[..., k, 1, None] * y + rotation[..., k, 2, None] * z for k in range(3)
-    ]
+    entries = rotation.flatten(-2).unsqueeze(-2).unbind(-1)
+    return [a * x + b * y + c * z for a, b, c in (entries[:3], entries[3:6], entries[6:])]
 
 
 def sound_poses(T_map_sensor: Tensor, T_map_base: Tensor | None) -> tuple[Bool[Tensor, "B"], Tensor, Tensor | None]:
@@ -140,12 +139,13 @@ def measure(
     base = None if T_map_base is None else relative_to(T_map_base[:, :3, 3], anchor, grid.resolution, dtype)
 
     x, y, z = points.to(dtype).unbind(-1)
-    finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z) & sound[:, None, None]
+    largest = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())  # NaN where a coordinate is
+    finite = (largest < torch.inf) & sound[:, None, None]
     if variance is not None:
         variance = variance.to(dtype)
         finite = finite & has_inverse(variance)
     # Zeroed before any product: 0 * NaN would poison sums and gradients, and so would the square of 1e30.
-    small = finite & (torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= cfg.max_distance)
+    small = finite & (largest <= cfg.max_distance)
     x, y, z = (torch.where(small, c, 0.0) for c in (x, y, z))
     square = x * x + y * y + z * z
     valid = small & (square >= cfg.min_distance**2) & (square <= cfg.max_distance**2)

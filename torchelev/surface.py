@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.masks import as_factor, chosen, masked
+from torchelev.masks import as_factor, chosen, masked, masked_any
 from torchelev.operators import padded
 from torchelev.state import MapState
 from torchelev.windows import window_moments
@@ -42,7 +42,7 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
     known = as_factor(validity).to(elevation.dtype)
     number = known.sum((1, 2), keepdim=True).clamp(min=1)
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
-    heights = torch.where(validity, elevation, 0.0)  # what is not known may be NaN
+    heights = masked_any(elevation, validity)  # what is not known may be NaN
     datum = (heights.sum((1, 2), keepdim=True) / number).detach()
     # One layer tells both, which is less to store and to read than two.
     nowhere = 0.5 * torch.finfo(heights.dtype).max  # differences to it are finite
