@@ -75,10 +75,19 @@ def test_a_float32_map_measures_like_a_float64_map(seed):
     torch.testing.assert_close(single.points.double(), double.points, atol=2e-6, rtol=0)
 
 
-@pytest.mark.parametrize("point, dtype", [((0, 0, 1e30), torch.float32), ((-1e38, 1e38, 1e38), torch.float32)])
-def test_huge_coordinates_are_out_of_range(point, dtype):
-    emap = small_map(1)
-    m = emap.measure(torch.tensor([[point]], dtype=dtype), pose(), None, 0.0)
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("value", [1e30, -1e30, 3e38, torch.nan, torch.inf, -torch.inf])
+def test_coordinates_without_an_end_are_left_out(axis, value):
+    """Huge ones are out of range; none is left to become infinite in a product."""
+    cloud = torch.tensor([[[0.1, -0.2, 0.3]]])
+    cloud[..., axis] = value
+    m = small_map(1).measure(cloud, pose(), None, 0.0)
+    assert (m.rejected_range.item(), m.rejected_invalid.item()) == ((1, 0) if abs(value) < torch.inf else (0, 1))
+    assert not m.used.any() and m.points.isfinite().all() and m.variance.isfinite().all()
+
+
+def test_huge_coordinates_together_are_out_of_range():
+    m = small_map(1).measure(torch.tensor([[[-1e38, 1e38, 1e38]]]), pose(), None, 0.0)
     assert m.rejected_range.item() == 1 and not m.used.any() and m.points.isfinite().all()
 
 
