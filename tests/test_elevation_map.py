@@ -30,6 +30,7 @@ from torchelev import (
     ElevationMap,
     ElevationMapConfig,
     GridConfig,
+    LearnedTraversabilityConfig,
     SensorConfig,
 )
 from torchelev.layers import LAYERS
@@ -238,17 +239,22 @@ def test_inference_mode_then_reset_outside():
     assert emap.validity.any()
 
 
-def test_a_map_made_in_inference_mode_can_be_updated_outside():
+def test_a_map_made_in_inference_mode_can_be_used_outside():
     with torch.inference_mode():
-        emap = small_map(2)
+        emap = small_map(2, traversability=LearnedTraversabilityConfig())
+    assert not any(b.is_inference() for b in emap.state_dict().values() if isinstance(b, torch.Tensor))
     cloud, T = scan(0)
     emap.update(cloud, T, T, 0.1)
     assert emap.validity.any()
+    emap.reset()
+    assert not emap.validity.any()
 
 
-def test_an_update_stops_a_backward_pass_through_the_values_before():
+@pytest.mark.parametrize("chunk", [None, 1])
+def test_an_update_stops_a_backward_pass_through_the_values_before(chunk):
     """Else its gradient would be that of the new values, unseen."""
-    emap, weight = mapped(2), torch.ones(2, 1, 1, requires_grad=True)
+    emap, weight = small_map(2), torch.ones(2, 1, 1, requires_grad=True)
+    emap.chunk = chunk
     loss = (weight * emap.elevation).sum()
     cloud, T = scan(1)
     emap.update(cloud, T, T, 0.1)

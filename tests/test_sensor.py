@@ -77,7 +77,7 @@ def test_a_float32_map_measures_like_a_float64_map(seed):
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("value", [1e30, -1e30, 3e38, torch.nan, torch.inf, -torch.inf])
-def test_coordinates_without_an_end_are_left_out(axis, value):
+def test_huge_and_infinite_coordinates_are_left_out(axis, value):
     """Huge ones are out of range; none is left to become infinite in a product."""
     cloud = torch.tensor([[[0.1, -0.2, 0.3]]])
     cloud[..., axis] = value

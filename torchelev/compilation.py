@@ -6,7 +6,6 @@ import contextlib
 import functools
 import itertools
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FunctionType
@@ -147,16 +146,6 @@ class Graphs(NamedTuple):
     take_rays: Callable[..., None]
 
 
-def try_vector_instructions() -> None:
-    """Let torch's compiler try what vectors the CPU has, by compiling for each, while the update is traced.
-
-    A tenth of the first update: it would wait for each trial, and keeps what came out.
-    """
-    from torch._inductor import codecache, cpp_builder, cpu_vec_isa  # noqa: F401  (all that the thread imports)
-
-    threading.Thread(target=cpu_vec_isa.valid_vec_isa_list, daemon=True).start()
-
-
 @functools.cache
 def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
     """Return what compiles and keeps the updates of one kind of inputs, for any number of environments."""
@@ -176,8 +165,6 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
 
         return compiled(run)
 
-    if kinds[0][1].type == "cpu":
-        try_vector_instructions()
     return Graphs(compiled(first), in_place(take_heights), in_place(take_rays))
 
 

@@ -76,7 +76,7 @@ def top_of_step(points: Disputed, z: Tensor, cfg: EdgeConfig, rounds: int) -> Te
     reach, give or take a standard deviation, is an outlier's, and no height lies above it.
     """
     noise = points.spread.sqrt()
-    # Stored, all of it, so that rounds have the same code, which is then compiled once.
+    # What rounds read is stored, or the first would compute it itself: so all have one code, which is compiled once.
     z, past = realize_all(z, z + cfg.margin * noise)
     most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), cfg.min_extreme)
     columns = torch.stack([points.weight * z, points.weight])

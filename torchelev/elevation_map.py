@@ -72,10 +72,11 @@ class ElevationMap(nn.Module):
         self.cfg, self.check_values = cfg, check_values
         self._compiled = False
         self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
-        self.head = make_head(cfg.traversability, cfg.grid, head)
         self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
         self._filtered: dict[str, Layer] = {}  # what filters made of the stored state
-        state = blank_state(cfg.grid, self.num_envs, device, torch.float32)
+        with torch.inference_mode(False):  # else no later call outside of that mode could write into it
+            self.head = make_head(cfg.traversability, cfg.grid, head)
+            state = blank_state(cfg.grid, self.num_envs, device, torch.float32)
         for name, value in state._asdict().items():
             if name != "statistics":
                 self.register_buffer(name, value)

@@ -259,7 +259,7 @@ def merge(
         chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         state.validity | hit_now,
-        torch.where(hit_now, 0.0, state.time),  # which an infinite dt makes infinite
+        torch.where(hit_now, 0.0, state.time),  # not multiplied: it may be infinite
     )
     stored = state._replace(elevation=elevation, variance=variance, support=support, validity=validity, time=time)
     return stored, taken

@@ -273,7 +273,7 @@ def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> Ma
     gone = state.validity & ray.found & below & (state.time > cfg.min_time) & (ray.incidence > cfg.min_incidence)
     validity = state.validity & ~gone
     bounds = ray.found & ~validity
-    lower = chosen(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
-    upper_bound = chosen(bounds, lower, state.upper_bound)
+    lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
+    upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
     validity, bounded, upper_bound = realize_all(validity, (state.bounded & ~state.validity) | bounds, upper_bound)
     return state._replace(validity=validity, bounded=bounded, upper_bound=upper_bound)
