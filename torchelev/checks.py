@@ -96,7 +96,7 @@ def _check_rigid(name: str, pose: Tensor) -> None:
         if bad.any():
             require(False, name, rule, came() + _environments(bad), mend)
 
-    mend = "leave such an environment out by points of NaN, with any other pose"
+    mend = "give any rigid pose where there is none, with points of NaN if it is to take none in"
     refuse(~np.isfinite(matrix), "must be finite", lambda: "NaN or inf", mend)
     mend = "use torchelev.frames.transform(position, quat_wxyz)"
     rotation, distance, last = matrix[..., :3, :3], np.abs(matrix[..., :3, 3]), matrix[..., 3, :]
@@ -131,9 +131,10 @@ def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype
         fits = tuple(value.shape) in ((), (num_envs,))
         require(fits, "dt", f"expected a number or ({num_envs},)", tuple(value.shape), "give one dt per environment")
         if readable(value, always):
-            given = value.detach().double().cpu().numpy()
-            good = bool(((given >= 0) & (given < math.inf)).all())
-            require(good, "dt", "must be finite and not negative", value.tolist(), "give seconds since the last update")
+            given = np.atleast_1d(value.detach().double().cpu().numpy())
+            bad = ~((given >= 0) & (given < math.inf))
+            came = f"{given[bad][0]:g}{_environments(bad)}" if bad.any() else ""
+            require(not bad.any(), "dt", "must be finite and not negative", came, "give seconds since the last update")
         return value.to(dtype).expand(num_envs)
     number = isinstance(dt, (float, Real)) and not isinstance(dt, bool)  # a float is told ten times as fast
     require(number, "dt", "must be a number or a tensor", type(dt).__name__, "give seconds", TypeError)
