@@ -129,7 +129,9 @@ def random_state(rng, grid, num_envs=1, known=0.6, dtype=torch.float64):
         bounded=draw(0, 1) < 0.5,
         gradient_x=torch.where(validity, draw(-0.3, 0.3), 0.0),
         gradient_y=torch.where(validity, draw(-0.3, 0.3), 0.0),
+        has_normal=validity.clone(),
         traversability=torch.where(validity, draw(0, 1), 0.0),
+        rated=validity.clone(),
     )
 
 

@@ -312,24 +312,36 @@ def window(validity, i, j, radius):
 
 
 def fit_plane(elevation, validity, i, j, radius, resolution):
-    """Least-squares plane through the known cells around a cell: gradient x, gradient y, mean squared residual.
+    """Least-squares plane through the known cells around a cell: does it exist, its gradient, mean squared residual.
 
     Cells on one line leave the gradient across it open; the shortest gradient is taken.
     """
     cells = window(validity, i, j, radius)
     if not cells:
-        return 0.0, 0.0, 0.0
+        return False, 0.0, 0.0, 0.0
     xy = np.array([((a - i) * resolution, (b - j) * resolution) for a, b in cells])
     z = np.array([elevation[c] for c in cells])
     A, b = xy - xy.mean(0), z - z.mean()
     gradient = np.linalg.lstsq(A, b, rcond=1e-6)[0]
-    return gradient[0], gradient[1], float(np.mean((b - A @ gradient) ** 2))
+    return spans_plane(cells, radius), gradient[0], gradient[1], float(np.mean((b - A @ gradient) ** 2))
+
+
+def spans_plane(cells, radius):
+    """Do cells spread across the line that fits them best: as two full rows, and by 0.4 of a full window, or more?"""
+    across = np.linalg.eigvalsh(np.cov(np.array(cells, float).T, bias=True))[0]
+    full = np.mean(np.arange(-radius, radius + 1.0) ** 2)
+    return across >= max(0.25, 0.16 * full) - 1e-3
 
 
 def traversability(elevation, validity, i, j, resolution, *, radius, critical_slope, critical_step, critical_roughness):
-    """1 - max(slope / critical, step / critical, roughness / critical), not below 0; `radius` in metres."""
+    """1 - max(slope / critical, step / critical, roughness / critical), not below 0; `radius` in metres.
+
+    None where the cells of the window do not span a plane.
+    """
     cells = max(1, round(radius / resolution))
-    gx, gy, residual = fit_plane(elevation, validity, i, j, cells, resolution)
+    spans, gx, gy, residual = fit_plane(elevation, validity, i, j, cells, resolution)
+    if not spans:
+        return None
     heights = [elevation[c] for c in window(validity, i, j, cells)]
     explained = 2 * cells * resolution * (abs(gx) + abs(gy))
     slope, step = math.atan(math.hypot(gx, gy)), max(0.0, max(heights) - min(heights) - explained)

@@ -24,6 +24,7 @@ def ground_map(traversability=1.0, known=True, num_envs=1, dtype=torch.float64):
     emap = small_map(num_envs, CELLS, RESOLUTION, dtype)
     emap.corner.copy_(CORNER[:num_envs])
     emap.traversability.copy_(torch.as_tensor(traversability))
+    emap.rated.fill_(True)
     emap.validity.copy_(torch.as_tensor(known))
     return emap
 
@@ -114,6 +115,7 @@ def test_maps_of_one_row_and_one_cell():
         emap = small_map(1, cells, RESOLUTION)
         emap.validity.fill_(True)
         emap.traversability.fill_(0.75)
+        emap.rated.fill_(True)
         safe, mean, unknown, unsafe = only(check_footprint(emap, rectangle(0, 0, 0.02, 0.02), LOOSE))
         assert (safe, mean, unsafe) == (True, 0.75, 0.0) and 0 <= unknown < 1
 

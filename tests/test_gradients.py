@@ -29,7 +29,9 @@ def scene(seed=0, per_cell=3, unknown=(0, 0)):
         variance=torch.full((1, *CELLS), 1e-4, dtype=torch.float64),
         validity=known,
         support=torch.full((1, *CELLS), 5.0, dtype=torch.float64),
+        has_normal=known,
         traversability=torch.ones(1, *CELLS, dtype=torch.float64),
+        rated=known,
     )
     return emap, state, cloud[None], T
 

@@ -1,6 +1,7 @@
 """Local planes and sums over regions, against least squares and loops."""
 
 import numpy as np
+import reference
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -42,7 +43,9 @@ def test_local_planes_are_those_of_least_squares(seed, radius):
         g = np.linalg.lstsq(A, z[window][inside], rcond=None)[0] if inside.sum() >= 3 else np.zeros(3)
         rms = np.sqrt(np.mean((A @ g - z[window][inside]) ** 2)) if inside.any() else 0
         steepness = np.hypot(g[0], g[1])
-        limits = known[i, j], inside.sum() >= (radius + 1) ** 2, steepness < 0.7, rms < 0.01 * np.hypot(1, steepness)
+        enough = inside.sum() >= (radius + 1) ** 2
+        enough = enough and reference.spans_plane(reference.window(known, i, j, radius), radius)
+        limits = known[i, j], enough, steepness < 0.7, rms < 0.01 * np.hypot(1, steepness)
         assert local.planar[0, i, j] == all(limits)
         if all(limits):
             np.testing.assert_allclose(local.gradient_x[0, i, j], g[0], atol=1e-7)

@@ -37,6 +37,7 @@ def test_it_reads_the_learned_heads_confidence(tmp_path):
     emap = ElevationMap(ElevationMapConfig(grid=grid, traversability=learned))
     emap.validity.fill_(True)
     emap.traversability.fill_(1.0)
+    emap.rated.fill_(True)
     confidence = emap.rate().confidence
     assert (confidence < 0.99).any() and torch.equal(traversal_cost(emap), traversal_cost(emap, confidence=confidence))
 

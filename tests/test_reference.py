@@ -244,13 +244,13 @@ def test_clear_other_floors():
 def test_fit_plane():
     known = np.ones((3, 3), bool)
     i, j = np.indices((3, 3))
-    gx, gy, residual = reference.fit_plane(0.2 * i - 0.1 * j, known, 1, 1, 1, 0.1)
-    assert (gx, gy, residual) == pytest.approx((2.0, -1.0, 0.0))
+    spans, gx, gy, residual = reference.fit_plane(0.2 * i - 0.1 * j, known, 1, 1, 1, 0.1)
+    assert spans and (gx, gy, residual) == pytest.approx((2.0, -1.0, 0.0))
     # One line of cells along y: the gradient along it, none across.
-    assert reference.fit_plane(0.2 * i - 0.1 * j, i == 1, 1, 1, 1, 0.1) == pytest.approx((0.0, -1.0, 0.0))
+    assert reference.fit_plane(0.2 * i - 0.1 * j, i == 1, 1, 1, 1, 0.1) == pytest.approx((False, 0.0, -1.0, 0.0))
     # A lone peak in the middle: level; mean square of (8/9, -1/9 eight times) = 8/81.
     peak = np.where((i == 1) & (j == 1), 1.0, 0.0)
-    assert reference.fit_plane(peak, known, 1, 1, 1, 0.1) == pytest.approx((0.0, 0.0, 8 / 81))
+    assert reference.fit_plane(peak, known, 1, 1, 1, 0.1) == pytest.approx((True, 0.0, 0.0, 8 / 81))
 
 
 def test_traversability():

@@ -32,7 +32,8 @@ def ground_map(height, num_envs=1, corner=CORNER, cells=(30, 30), dtype=torch.fl
     emap.corner.copy_(torch.tensor(corner))
     x, y = emap.cell_centers().unbind(-1)
     emap.elevation.copy_(height(x, y))
-    emap.validity.fill_(True)
+    for mask in (emap.validity, emap.has_normal, emap.rated):
+        mask.fill_(True)
     for name, value in layers.items():
         getattr(emap, name).copy_(value)
     return emap

@@ -26,8 +26,9 @@ def test_fit_plane_agrees_with_the_reference(seed, radius, known, dtype):
     for b, i, j in np.ndindex(2, 7, 6):
         if state.validity[b, i, j]:
             elevation, validity = state.elevation[b].double().numpy(), state.validity[b].numpy()
-            expected = reference.fit_plane(elevation, validity, i, j, radius, 0.1)
-            got = [float(value[b, i, j]) for value in plane]
+            spans, *expected = reference.fit_plane(elevation, validity, i, j, radius, 0.1)
+            assert bool(plane.spans[b, i, j]) == spans
+            got = [float(value[b, i, j]) for value in plane[1:]]
             np.testing.assert_allclose(got, expected, **tolerance)
 
 
@@ -52,20 +53,55 @@ def test_normals_of_a_plane(gx, gy, altitude):
 def test_normals_are_unit_vectors_that_point_up(seed):
     emap = small_map(2)
     state = rate_surface(random_state(np.random.default_rng(seed), emap.cfg.grid, 2), emap.cfg)
-    n = torch.stack([emap.layer(f"normal_{axis}", state=state) for axis in "xyz"], -1)[state.validity]
+    n = torch.stack([emap.layer(f"normal_{axis}", state=state) for axis in "xyz"], -1)
+    n = n[state.validity & state.has_normal]
     torch.testing.assert_close(n.norm(dim=-1), torch.ones(len(n), dtype=n.dtype))
     assert (n[:, 2] > 0).all()
 
 
-def test_lone_cell_is_level_and_a_line_slopes_along_itself():
-    validity = torch.zeros(1, 5, 5, dtype=torch.bool)
-    validity[0, 0, 4] = validity[0, 2:5, 0] = True
-    elevation = torch.zeros(1, 5, 5)
-    elevation[0, 0, 4], elevation[0, 2:5, 0] = 7.0, torch.tensor([0.0, 0.1, 0.2])
-    plane = fit_plane(known_ground(elevation, validity, 2), 1, 0.1)
-    assert plane.gradient_x[0, 0, 4] == 0 and plane.gradient_y[0, 0, 4] == 0
-    torch.testing.assert_close(plane.gradient_x[0, 3, 0], torch.tensor(1.0), atol=1e-4, rtol=0)
-    assert plane.gradient_y[0, 3, 0] == 0
+def known_cells(rows):
+    """A window of known cells, drawn with #."""
+    return torch.tensor([[cell == "#" for cell in row] for row in rows])[None]
+
+
+@pytest.mark.parametrize(
+    "rows, radius, spans",
+    [
+        (["...", ".#.", "..."], 1, False),  # a lone cell
+        (["...", "###", "..."], 1, False),  # a line
+        (["##.", ".##", "..."], 1, False),  # the cells that one line passes through
+        (["...", ".##", ".#."], 1, False),  # so do these
+        (["...", ".##", ".##"], 1, True),
+        (["...", "###", "###"], 1, True),
+        ([".....", ".....", "#####", ".....", "....."], 2, False),
+        ([".....", ".....", "#####", "#####", "....."], 2, False),  # may be one line of points and its noise
+        ([".....", "#####", "#####", "#####", "....."], 2, True),
+        ([".....", ".....", "..#..", ".....", "#...#"], 2, True),  # few, but far apart
+        (["#....", ".#...", "..#..", "...#.", "....#"], 2, False),
+    ],
+)
+def test_which_cells_span_a_plane(rows, radius, spans):
+    known = known_cells(rows)
+    plane = fit_plane(known_ground(torch.zeros(known.shape), known, radius), radius, 0.1)
+    assert bool(plane.spans[0, radius, radius]) == spans
+    assert reference.spans_plane(reference.window(known[0].numpy(), radius, radius, radius), radius) == spans
+
+
+def test_cells_that_span_no_plane_have_neither_normal_nor_rating():
+    """Contour rows 20 cm apart on a 50 degree slope: they look level along themselves."""
+    emap = small_map(1, (30, 30))
+    x, _ = emap.cell_centers()[0].unbind(-1)
+    rows = (torch.arange(30) % 5 == 0)[:, None].expand(30, 30)
+    state = emap.state._replace(elevation=-1.19 * x[None].float(), validity=rows[None].clone())
+    state = rate_surface(state, emap.cfg)
+    emap._store(state)
+    for name in ("traversability", "normal_x", "normal_y", "normal_z"):
+        assert emap.layer(name).isnan().all()
+        values, valid = emap.sample(emap.cell_centers().flatten(1, 2), layer=name)
+        assert not valid.any() and (values == 0).all()
+    assert (state.traversability == 0).all() and (state.gradient_y == 0).all()
+    assert torch.equal(emap.layer("elevation").isfinite(), rows[None])
+    assert (emap.rate().confidence == 0).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

@@ -21,12 +21,15 @@ def test_agrees_with_the_reference(seed, radius, known, forgiving):
     cfg = TraversabilityConfig(radius=radius, critical_step=0.2 * forgiving, critical_roughness=0.05 * forgiving)
     grid = small_map(1, (7, 6)).cfg.grid
     state = random_state(np.random.default_rng(seed), grid, 2, known)
-    got = rate_surface(state, small_config((7, 6), traversability=cfg)).traversability
+    after = rate_surface(state, small_config((7, 6), traversability=cfg))
+    got = after.traversability
     for b, i, j in np.ndindex(2, 7, 6):
         expected = 0.0
         if state.validity[b, i, j]:
             elevation, validity = state.elevation[b].numpy(), state.validity[b].numpy()
-            expected = reference.traversability(elevation, validity, i, j, 0.1, **dataclasses.asdict(cfg))
+            rated = reference.traversability(elevation, validity, i, j, 0.1, **dataclasses.asdict(cfg))
+            assert bool(after.rated[b, i, j]) == (rated is not None)
+            expected = rated or 0.0
         assert float(got[b, i, j]) == pytest.approx(expected, abs=1e-4)  # the square roots are clamped
 
 

@@ -195,7 +195,7 @@ def packed(value: Tensor) -> Tensor:
 
 
 Values = TypeVar("Values", MapState, Measurement)
-MASKS = ("validity", "bounded", "used", "casts")  # of a state, and of a measurement
+MASKS = ("validity", "bounded", "has_normal", "rated", "used", "casts")  # of a state, and of a measurement
 
 
 def with_masks(values: Values, convert: Callable[[Tensor], Tensor]) -> Values:

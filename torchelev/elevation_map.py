@@ -288,8 +288,9 @@ class ElevationMap(nn.Module):
 
         elevation, upper_bound [m]; variance [m^2]; time [s] since the last hit; traversability, 0 to 1, the better;
         normal_x, normal_y, normal_z of unit length; validity, 1 where the elevation is known, else 0. The upper bound
-        equals the elevation where that is known; elsewhere the ground lies no higher, as rays passed above it. A
-        filter runs when its layer is read, with those it needs, and again only after something was stored.
+        equals the elevation where that is known; elsewhere the ground lies no higher, as rays passed above it. Normals
+        and the analytic traversability are unknown, too, where the known cells around do not span a plane. A filter
+        runs when its layer is read, with those it needs, and again only after something was stored.
         Raises KeyError for an unknown name.
         """
         values, known = self._read(name, state)
@@ -305,9 +306,7 @@ class ElevationMap(nn.Module):
             return self._filter(name, state)
         mend = f"there are {', '.join(self.layers)}"
         require(name in LAYERS, "layer", "must be a layer's name", repr(name), mend, KeyError)
-        values, known = LAYERS[name](self.state if state is None else state)
-        unrated = name == "traversability" and self.cfg.traversability is None
-        return values, torch.zeros_like(known) if unrated else known
+        return LAYERS[name](self.state if state is None else state)
 
     def _filter(self, name: str, state: MapState | None) -> Layer:
         if state is not None:
@@ -320,15 +319,16 @@ class ElevationMap(nn.Module):
 
         The learned head rates unknown cells too. Its confidence is the probability that "traversability is at least one
         half" is right, of ground such as it was trained on: far from all that is known both are that ground's average.
-        `layer("validity")` tells what is known. The analytic head gives 0 to unknown cells, confidence 1 to known ones.
+        `layer("validity")` tells what is known. The analytic head gives 0 to cells that it cannot rate, confidence 1 to
+        others.
         Differentiable in the state and in the weights of `head`. Raises ValueError if traversability is switched off.
         """
         state, cfg = self.state if state is None else state, self.cfg.traversability
         require(cfg is not None, "cfg.traversability", "must not be None", None, "give a TraversabilityConfig")
         if isinstance(cfg, LearnedTraversabilityConfig) and self.head is not None:
             return learned_rating(state, self.cfg.grid, cfg, self.head.weights)
-        rated = rate_surface(state, self.cfg).traversability
-        return Rating(rated, state.validity.to(rated.dtype))
+        rated = rate_surface(state, self.cfg)
+        return Rating(rated.traversability, rated.rated.to(rated.traversability.dtype))
 
     def sample(
         self,

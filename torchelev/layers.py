@@ -25,7 +25,7 @@ def normal_component(gx: Tensor, gy: Tensor, axis: int) -> Tensor:
 
 
 def _normal(state: MapState, axis: int) -> Layer:
-    return normal_component(state.gradient_x, state.gradient_y, axis), state.validity
+    return normal_component(state.gradient_x, state.gradient_y, axis), state.validity & state.has_normal
 
 
 def _upper_bound(state: MapState) -> Layer:
@@ -42,7 +42,7 @@ LAYERS: dict[str, Callable[[MapState], Layer]] = {
     "validity": _validity,
     "time": lambda state: (state.time, state.validity),
     "upper_bound": _upper_bound,
-    "traversability": lambda state: (state.traversability, state.validity),
+    "traversability": lambda state: (state.traversability, state.validity & state.rated),
     "normal_x": lambda state: _normal(state, 0),
     "normal_y": lambda state: _normal(state, 1),
     "normal_z": lambda state: _normal(state, 2),

@@ -19,10 +19,12 @@ from torchelev import checks
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.pipeline import rate_surface
 from torchelev.state import MapState, Statistics
 from torchelev.traversability_net import TraversabilityNet
 
-FORMAT, VERSION = "torchelev map", 1
+FORMAT, VERSION = "torchelev map", 2
+NEW_LAYERS = {"has_normal", "rated"}  # since version 2
 DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
 
 
@@ -70,7 +72,10 @@ def load_map(
     for name, value in _head(emap).items():
         found = _array(path, arrays, f"head_{name}", tuple(value.shape))
         value.copy_(torch.from_numpy(found))
-    emap._store(_state(path, arrays, emap.state, ids))
+    state = _state(path, arrays, emap.state, ids, header["version"])
+    if header["version"] < VERSION:
+        state = rate_surface(state, emap.cfg, emap._weights)
+    emap._store(state)
     return emap
 
 
@@ -137,10 +142,16 @@ def _ids(env_ids: Sequence[int] | Tensor | None, num_envs: int) -> Tensor:
     return ids.to(torch.int64)
 
 
-def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Tensor) -> MapState:
-    """Return the chosen environments of the arrays, each of the shape that it has in `like`."""
+def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Tensor, version: int) -> MapState:
+    """Return the chosen environments of the arrays, each of the shape that it has in `like`.
+
+    Layers that files of version 1 do not have are blank.
+    """
     B, values = len(arrays["corner"]), {}
     for name, blank in _tensors(like).items():
+        if version < VERSION and name in NEW_LAYERS:
+            values[name] = blank[:1].expand(len(ids), *blank.shape[1:])
+            continue
         values[name] = torch.from_numpy(_array(path, arrays, name, (B, *blank.shape[1:])))[ids]
     statistics = Statistics(*(values.pop(f"last_{name}") for name in Statistics._fields))
     return MapState(statistics=statistics, **values)

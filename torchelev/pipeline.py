@@ -65,7 +65,8 @@ def rate_surface(state: MapState, cfg: ElevationMapConfig, weights: Weights | No
     if isinstance(head, TraversabilityConfig):
         return traversability(state, ground, cfg.grid, head)
     assert weights is not None
-    return state._replace(traversability=learned_rating(state, cfg.grid, head, weights).traversability)
+    rating = learned_rating(state, cfg.grid, head, weights)
+    return state._replace(traversability=rating.traversability, rated=state.validity)
 
 
 def start_tally(state: MapState, m: Measurement) -> MapState:

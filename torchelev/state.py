@@ -49,7 +49,9 @@ class MapState(NamedTuple):
     bounded: Bool[Tensor, "B H W"]  # upper_bound is known
     gradient_x: Float[Tensor, "B H W"]  # dz/dx
     gradient_y: Float[Tensor, "B H W"]  # dz/dy
+    has_normal: Bool[Tensor, "B H W"]  # the known neighbours span a plane; elsewhere the gradient is 0
     traversability: Float[Tensor, "B H W"]  # in [0, 1]
+    rated: Bool[Tensor, "B H W"]  # the known cells of the head's window span a plane; elsewhere traversability is 0
     statistics: Statistics
 
 
@@ -90,7 +92,7 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
     zero = torch.zeros(num_envs, device=device, dtype=torch.int64)
     corner = torch.stack([zero + cells for cells in blank_corner(grid)], -1)
     heights = {"drift_error", "drift_correction"}
-    masks = {"validity", "bounded"}
+    masks = {"validity", "bounded", "has_normal", "rated"}
     layers = MapState._fields[2:-1]
     values = {name: (mask if name in masks else layer + BLANK.get(name, 0.0)).clone() for name in layers}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))

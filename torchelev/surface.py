@@ -13,6 +13,7 @@ from torchelev.grid import GridConfig
 from torchelev.masks import as_factor, chosen, masked, masked_any
 from torchelev.operators import padded
 from torchelev.state import MapState
+from torchelev.storage import realize
 from torchelev.windows import window_moments
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
 class Plane(NamedTuple):
     """Least-squares plane through the known cells of a window, for every cell."""
 
+    spans: Bool[Tensor, "B H W"]  # the known cells span a plane; elsewhere gradient and residual tell nothing
+
     gradient_x: Float[Tensor, "B H W"]
     gradient_y: Float[Tensor, "B H W"]
     residual: Float[Tensor, "B H W"]  # [m^2] mean squared distance in z
@@ -67,8 +70,8 @@ def less(value: Tensor, x: Tensor, y: Tensor) -> Tensor:
 def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     """Fit z = c + g_x x + g_y y by least squares to the known cells within `radius` cells of each cell.
 
-    Only known cells enter, so a plane comes out right at the border of the known area. Where they lie on one line, the
-    gradient along the line; a lone cell is level.
+    Only known cells enter, so a plane comes out right at the border of the known area. Cells that do not span a plane
+    (`spans_plane`) have some finite gradient.
     """
     z = ground.height
     moments = window_moments([(ground.known, 2), (z, 1), (z.square(), 0)], ground.rim, radius)
@@ -85,16 +88,39 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     gu = chosen(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
     gv = chosen(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
     residual = less(less(less(s_zz * share, mz, mz), gu, uz), gv, vz).clamp(min=0)
-    return Plane(gu / resolution, gv / resolution, residual)
+    return Plane(spans_plane(uu, uv, vv, radius), gu / resolution, gv / resolution, residual)
+
+
+def spans_plane(uu: Tensor, uv: Tensor, vv: Tensor, radius: int) -> Bool[Tensor, "B H W"]:
+    """Tell where the known cells of a window spread in two directions, by the covariance of their places [cells^2].
+
+    Its smaller eigenvalue, the variance across the line that fits them best, must reach `min_spread`: then
+    C - min_spread I has no negative eigenvalue.
+    """
+    u, v = uu - min_spread(radius), vv - min_spread(radius)
+    return (u >= 0) & (v >= 0) & (u * v >= uv * uv)
+
+
+def min_spread(radius: int) -> float:
+    """Return the variance [cells^2] across their line from which known cells span a plane.
+
+    At least that of two full rows of cells, 1/4: the cells that a line of points passes through stay below it, and
+    their heights tell the slope along the line alone. And 0.4 times the standard deviation of a full window,
+    r (r + 1) / 3 in variance: a narrower band can be one line of points and its noise, whose slope is the ray's.
+    """
+    rounding = 1e-3
+    return max(0.25, 0.4**2 * radius * (radius + 1) / 3) - rounding
 
 
 def normals(state: MapState, ground: Ground, grid: GridConfig, cfg: SurfaceConfig) -> MapState:
-    """Store the gradient of every known cell, from the plane through its neighbours (paper, Sec. II-A).
+    """Store the gradient of every known cell whose neighbours span a plane (paper, Sec. II-A).
 
     The unit normal n = (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2) is made when it is read.
     """
     plane = fit_plane(ground, cfg.radius, grid.resolution)
+    has_normal = realize(state.validity & plane.spans)
     return state._replace(
-        gradient_x=masked(plane.gradient_x, state.validity),
-        gradient_y=masked(plane.gradient_y, state.validity),
+        gradient_x=masked(plane.gradient_x, has_normal),
+        gradient_y=masked(plane.gradient_y, has_normal),
+        has_normal=has_normal,
     )

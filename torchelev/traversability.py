@@ -17,6 +17,7 @@ from torchelev.grid import GridConfig
 from torchelev.masks import NOWHERE, masked
 from torchelev.robot import RobotConfig
 from torchelev.state import MapState
+from torchelev.storage import realize
 from torchelev.surface import Ground, fit_plane
 from torchelev.traversability_net import Rating, TraversabilityNet, Weights, rate
 from torchelev.windows import window_maximum
@@ -95,12 +96,12 @@ def height_range(ground: Ground, radius: int) -> Tensor:
 
 
 def rate_all(state: MapState) -> MapState:
-    """Rate every cell as traversable: without a head, all known cells count in drift compensation."""
-    return state._replace(traversability=torch.ones_like(state.traversability))
+    """Rate no cell: without a head, all known cells count in drift compensation."""
+    return state._replace(traversability=torch.ones_like(state.traversability), rated=torch.zeros_like(state.rated))
 
 
 def traversability(state: MapState, ground: Ground, grid: GridConfig, cfg: TraversabilityConfig) -> MapState:
-    """Rate every known cell by the worst of slope, step and roughness.
+    """Rate every known cell whose window spans a plane, by the worst of slope, step and roughness.
 
     t = 1 - max(slope / critical, step / critical, roughness / critical), not below 0. The step is the height range of
     the window less what its own plane explains.
@@ -113,4 +114,5 @@ def traversability(state: MapState, ground: Ground, grid: GridConfig, cfg: Trave
     roughness = plane.residual.clamp(min=1e-12).sqrt()
     worst = torch.maximum(slope / cfg.critical_slope, step / cfg.critical_step)
     worst = torch.maximum(worst, roughness / cfg.critical_roughness)
-    return state._replace(traversability=masked((1 - worst).clamp(min=0), state.validity))
+    rated = realize(state.validity & plane.spans)
+    return state._replace(traversability=masked((1 - worst).clamp(min=0), rated), rated=rated)

@@ -38,24 +38,25 @@ def root(square: Tensor) -> Tensor:
 
 
 def plane_around(layer: Layer, resolution: float, radius: float) -> Plane:
-    """Fit the least-squares plane of the known cells within `radius` [m] of each cell."""
+    """Fit the least-squares plane of the known cells within `radius` [m] of each cell; `spans` is of known cells."""
     cells = radius_cells(radius, resolution)
-    return fit_plane(known_ground(*layer, cells), cells, resolution)
+    plane = fit_plane(known_ground(*layer, cells), cells, resolution)
+    return plane._replace(spans=plane.spans & layer[1])
 
 
 @register
 def slope(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """Return the inclination [rad] of the plane z = c + g_x x + g_y y around each cell: atan(sqrt(g_x^2 + g_y^2)).
 
-    At least 1e-6, as where a cell is alone in its window; the slope along the line where all its neighbours lie on one.
+    At least 1e-6. Unknown where the known cells of the window do not span a plane: see `surface.spans_plane`.
     """
     plane = plane_around(layer, resolution, radius)
-    return torch.atan(root(plane.gradient_x.square() + plane.gradient_y.square())), layer[1]
+    return torch.atan(root(plane.gradient_x.square() + plane.gradient_y.square())), plane.spans
 
 
 def _normal(layer: Layer, resolution: float, radius: float, axis: int) -> Layer:
-    gx, gy, _ = plane_around(layer, resolution, radius)
-    return normal_component(gx, gy, axis), layer[1]
+    plane = plane_around(layer, resolution, radius)
+    return normal_component(plane.gradient_x, plane.gradient_y, axis), plane.spans
 
 
 @register
@@ -80,9 +81,11 @@ def normal_z(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
 def roughness(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """Return the standard deviation [m] of the heights around the plane around each cell.
 
-    sqrt(mean (z - c - g_x x - g_y y)^2), the distance in z, over all known cells of the window.
+    sqrt(mean (z - c - g_x x - g_y y)^2), the distance in z, over all known cells of the window. Unknown where these do
+    not span a plane.
     """
-    return root(plane_around(layer, resolution, radius).residual), layer[1]
+    plane = plane_around(layer, resolution, radius)
+    return root(plane.residual), plane.spans
 
 
 @register
@@ -113,7 +116,7 @@ def step_height(layer: Layer, *, resolution: float, radius: float = 0.1, less_sl
     if less_slope:
         plane = plane_around(layer, resolution, radius)
         explained = 2 * cells * resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())
-        height = (height - explained).clamp(min=0)
+        return (height - explained).clamp(min=0), plane.spans
     return height, known
 
 
@@ -157,8 +160,8 @@ def curvature(layer: Layer, *, resolution: float, radius: float = 0.15) -> Layer
 
     The kappa of the least-squares fit z = c + g_x x + g_y y + kappa (x^2 + y^2) / 2 to the window's known cells. Where
     all are known that is half the Laplacian of the best quadratic, the mean curvature of level ground, and exact on
-    every quadratic; where some are unknown, exact on paraboloids of revolution. 0 where the known cells do not tell,
-    as where they lie in a corner of less than a quarter of the window.
+    every quadratic; where some are unknown, exact on paraboloids of revolution. Unknown where the known cells do not
+    tell, as where they lie in a corner of less than a quarter of the window.
     """
     values, known = layer
     r = radius_cells(radius, resolution)
@@ -178,7 +181,7 @@ def curvature(layer: Layer, *, resolution: float, radius: float = 0.15) -> Layer
     spread = less(less(ss, p, us), q, vs)
     tells = as_bytes(spread > 0.004).to(spread.dtype)  # of a full window 0.18 to 0.45
     bend = less(less(sz, p, uz), q, vz) * tells / (spread * tells + (1 - tells))
-    return 2 * bend / (r * resolution) ** 2, known
+    return 2 * bend / (r * resolution) ** 2, known & (tells > 0)
 
 
 def require_critical(**values: float) -> None:

@@ -44,7 +44,7 @@ def local_planes(
 ) -> LocalPlanes:
     """Fit a plane to the window of each cell, and tell which cells lie on one and which neighbours share it.
 
-    A window counts from as many known cells as one has in a corner of the map: they never lie on one line.
+    A window counts where its known cells span a plane, and are as many as a window has in a corner of the map.
     """
     ground = known_ground(elevation, known, radius)
     plane = fit_plane(ground, radius, resolution)
@@ -52,7 +52,7 @@ def local_planes(
     gx, gy = plane.gradient_x, plane.gradient_y
     steepness = torch.addcmul(gx * gx, gy, gy)
     smooth = plane.residual <= limits.roughness**2 * (1 + steepness)  # a distance from the plane, not in z
-    planar = known & (number >= (radius + 1) ** 2) & (steepness <= limits.slope**2) & smooth
+    planar = known & plane.spans & (number >= (radius + 1) ** 2) & (steepness <= limits.slope**2) & smooth
     height = ground.height[:, radius:-radius, radius:-radius]
     joined_x, joined_y = (_joined(planar, height, (gx, gy), axis, resolution, limits) for axis in (0, 1))
     return LocalPlanes(gx, gy, planar, joined_x, joined_y)
