@@ -61,7 +61,7 @@ def mapped(heights: Float[Tensor, "H W"], head: Any) -> ElevationMap:
     emap = ElevationMap(ElevationMapConfig(grid=GRID, traversability=head))
     for _ in range(SCANS):
         z = heights + NOISE * torch.randn(heights.shape, generator=generator) - 1.0
-        emap.update(torch.stack([x, y, z], -1).view(1, -1, 3), torch.eye(4)[None], torch.eye(4)[None])
+        emap.update(torch.stack([x, y, z], -1).view(1, -1, 3), torch.eye(4)[None], torch.eye(4)[None], dt=0.0)
     return emap
 
 

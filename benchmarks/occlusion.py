@@ -140,7 +140,7 @@ def refined(number: int = 24) -> Rows:
     emap, scene, lidar = ElevationMap(), boxes(), Lidar(rings=96, fov_low_deg=-75.0)
     for y in (0.0, 1.5, 3.0):
         T = pose(torch.tensor([[0.0, y, 1.0]], dtype=torch.float64), torch.zeros(1))
-        emap.update(lidar.cast(scene, T[0])[None], T)
+        emap.update(lidar.cast(scene, T[0])[None], T, dt=0.0)
     rows = []
     for goal in GOALS:
         way = plan(emap, torch.zeros(1, 2), torch.tensor([goal]))

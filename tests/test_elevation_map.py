@@ -80,7 +80,7 @@ def test_everything_exported_exists():
 def test_elevation_is_absolute():
     """Map frame: not relative to the robot, whatever its height."""
     emap = small_map(1)
-    emap.update(torch.tensor([[[0.05, 0.05, -0.7]]]), pose((0, 0, 20.7)), pose((0, 0, 20.7)))
+    emap.update(torch.tensor([[[0.05, 0.05, -0.7]]]), pose((0, 0, 20.7)), pose((0, 0, 20.7)), dt=0.0)
     assert emap.layer("elevation")[emap.validity].item() == pytest.approx(20.0, abs=1e-5)
     assert emap.layer("elevation")[0, 6, 5].item() == pytest.approx(20.0, abs=1e-5)
 
@@ -148,7 +148,7 @@ def test_each_sensor_stands_where_its_pose_says():
     T = torch.cat([pose((-0.5, 0, 1.0)), pose((0.5, 0, 2.0), yaw=np.pi)])[None]
     cloud = torch.zeros(1, 2, 1, 3)
     cloud[0, 0], cloud[0, 1] = torch.tensor([0.03, 0.03, -1.0]), torch.tensor([0.03, 0.03, -1.5])
-    emap.update(cloud, T)
+    emap.update(cloud, T, dt=0.0)
     known = emap.validity[0].nonzero().tolist()
     assert known == [[5, 10], [14, 9]]
     torch.testing.assert_close(emap.elevation[0, 5, 10], torch.tensor(0.0), atol=1e-6, rtol=0)
@@ -431,7 +431,7 @@ def test_a_map_on_the_meta_device():
     emap = ElevationMap(small_config(), num_envs=2, device="meta")
     assert emap.device.type == "meta" and emap.layer("elevation").shape == (2, 12, 10)
     with pytest.raises(ValueError, match="points: must be on meta"):
-        emap.update(*scan(0))
+        emap.update(*scan(0), dt=0.0)
     cloud, T = (v.to("meta") for v in scan(0))
     emap.update(cloud, T, T, 0.1)
 

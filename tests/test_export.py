@@ -23,7 +23,7 @@ def emap():
     pose = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     pose[1, :3, 3] = torch.tensor([10.0, 20.0, 3.0])
     cloud = torch.cat([torch.full_like(points, torch.nan), points])
-    emap.update(cloud, pose, pose)
+    emap.update(cloud, pose, pose, dt=0.0)
     return emap
 
 

@@ -88,11 +88,11 @@ def test_nothing_disputed(monkeypatch, picks_out):
     """Other cells keep their heights: with no points at all, and where all points agree with the map."""
     monkeypatch.setattr(Disputed, "picks_out", lambda self, values: picks_out)
     emap = small_map(1, CELLS)
-    emap.update(torch.empty(1, 0, 3), pose((0.0, 0.0, 1.0)))
+    emap.update(torch.empty(1, 0, 3), pose((0.0, 0.0, 1.0)), dt=0.0)
     assert not emap.validity.any()
     flat = torch.tensor([[[x, y, -1.0] for x in (-0.15, 0.05) for y in (-0.15, 0.05)]]).repeat(1, 5, 1)
     for _ in range(2):
-        emap.update(flat, pose((0.0, 0.0, 1.0)))
+        emap.update(flat, pose((0.0, 0.0, 1.0)), dt=0.0)
     assert emap.elevation[emap.validity].tolist() == pytest.approx([0.0] * 4, abs=1e-6)
     assert emap.statistics.points_used.item() == 20
 

@@ -84,7 +84,7 @@ BAD = {
     "dt: inf": ("dt", float("inf"), ValueError, "negative.*got inf"),
     "dt: text": ("dt", "0.1", TypeError, "number.*got str"),
     "dt: bool": ("dt", True, TypeError, "number.*got bool"),
-    "dt: None": ("dt", None, TypeError, "number.*got NoneType"),
+    "dt: None": ("dt", None, TypeError, "required, got none"),
     "dt: negative tensor": ("dt", torch.tensor([0.1, -0.1]), ValueError, "negative.*got -0.1 in environment 1"),
     "dt: negative scalar": ("dt", torch.tensor(-0.1), ValueError, "negative.*got -0.1"),
     "dt: nan tensor": ("dt", torch.tensor([0.1, torch.nan]), ValueError, "negative.*got nan in environment 1"),
@@ -110,9 +110,23 @@ def test_update_refuses_and_changes_nothing(emap, case, method):
         if method == "update":
             call(emap, **{name: value})
         else:
-            good = dict(points=torch.zeros(B, N, 3), T_map_sensor=pose(num_envs=B))
+            good = dict(points=torch.zeros(B, N, 3), T_map_sensor=pose(num_envs=B), dt=0.1)
             emap.measure(**{**good, name: value})
     assert differences(before, snapshot(emap)) == []
+
+
+@pytest.mark.parametrize("method", ["update", "measure"])
+def test_dt_is_required(emap, method):
+    """Without it visibility clean-up and ageing are off; the base may be left out all the same."""
+    call, cloud, T, before = getattr(emap, method), torch.zeros(B, N, 3), pose(num_envs=B), snapshot(emap)
+    for poses in ([T], [T, T]):
+        with pytest.raises(TypeError, match="^dt: is required, .*0.0 for a further sensor of the same instant"):
+            call(cloud, *poses)
+    assert differences(before, snapshot(emap)) == []
+    for arguments in (dict(dt=0.1), dict(T_map_base=T, dt=0.1)):
+        call(cloud, T, **arguments)
+    for arguments in ((T, 0.1), (None, 0.1)):
+        call(cloud, T, *arguments)
 
 
 UNSOUND = {"NaN": torch.nan, "infinite": torch.inf, "far": 1e30}
@@ -267,7 +281,7 @@ def test_one_bad_coordinate_is_enough(coordinate, value):
     emap = small_map(B)
     cloud = torch.zeros(B, 3, 3) - 0.5
     cloud[1, 1, coordinate] = value
-    emap.update(cloud, pose(num_envs=B))
+    emap.update(cloud, pose(num_envs=B), dt=0.0)
     assert emap.statistics.points_used.tolist() == [3, 2] and floats_finite(emap.state) == []
 
 
@@ -327,11 +341,11 @@ def test_maps_of_half_precision_take_in_no_points(dtype):
     for take_in in (emap.update, emap.measure):
         with pytest.raises(TypeError, match=f"map: must be float32 or float64.*got {dtype}; call .float"):
             take_in(torch.zeros(B, 5, 3), pose(num_envs=B))
-    measurement = small_map(B).measure(torch.zeros(B, 5, 3), pose(num_envs=B))
+    measurement = small_map(B).measure(torch.zeros(B, 5, 3), pose(num_envs=B), dt=0.0)
     with pytest.raises(TypeError, match="map: must be float32 or float64"):
         emap(emap.state, measurement)
     assert differences(before, emap.state) == []
-    emap.float().update(torch.zeros(B, 5, 3), pose(num_envs=B))
+    emap.float().update(torch.zeros(B, 5, 3), pose(num_envs=B), dt=0.0)
 
 
 @given(st.integers(0, 10_000))
@@ -369,7 +383,7 @@ def test_numbers_of_numpy_count(number):
     for dt in (np.float32(0.5), np.float64(0.5), number(1)):
         emap.reset()
         cloud, T = scan(0)
-        emap.update(cloud, T, T)
+        emap.update(cloud, T, T, dt=0.0)
         emap.update(cloud * torch.nan, T, T, dt)
         assert emap.layer("time").nan_to_num(-1).amax() == float(dt)
 

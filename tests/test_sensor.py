@@ -110,7 +110,7 @@ def test_points_without_a_variance_are_ignored(variance):
 def test_a_variance_orders_the_weight_of_points():
     emap = small_map(1, (1, 1), 1.0)
     cloud = torch.tensor([[[0.0, 0.1, -1.0], [0.1, 0.0, -0.9]]])
-    emap.update(cloud, pose(), variance=torch.tensor([[0.01, 0.03]]))
+    emap.update(cloud, pose(), dt=0.0, variance=torch.tensor([[0.01, 0.03]]))
     assert emap.layer("elevation").item() == pytest.approx(0.025, abs=1e-6)  # (3 * 0 + 1 * 0.1) / 4
 
 

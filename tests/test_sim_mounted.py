@@ -129,7 +129,7 @@ def test_depth_image():
 def test_feeds_a_map():
     emap, sensor, T = ElevationMap(), MountedSensor(DepthCamera(width=60, height=60), mount()), pose((0.0, 0.0, 0.5))
     field = HeightField(torch.full((1, 50, 50), 0.125), 0.1)
-    emap.update(sensor(field, zeros(1), T, step=0), sensor.T_map_sensor(T), T)
+    emap.update(sensor(field, zeros(1), T, step=0), sensor.T_map_sensor(T), T, dt=0.0)
     known = emap.layer("elevation")[emap.layer("validity") > 0]
     assert len(known) > 300
     torch.testing.assert_close(known, torch.full_like(known, 0.125), atol=1e-4, rtol=0)

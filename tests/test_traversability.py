@@ -55,7 +55,8 @@ def test_height_range(seed, radius):
 
 def test_a_map_without_the_head_knows_no_traversability():
     emap = small_map(1, traversability=None)
-    emap.update(torch.from_numpy(terrain(np.random.default_rng(0), 200))[None] - torch.tensor([0, 0, 1]), pose())
+    cloud = torch.from_numpy(terrain(np.random.default_rng(0), 200))[None] - torch.tensor([0, 0, 1])
+    emap.update(cloud, pose(), dt=0.0)
     assert emap.layer("elevation").isfinite().any()
     assert emap.layer("traversability").isnan().all()
 

@@ -79,7 +79,7 @@ def test_a_cells_true_place_is_the_one_relative_to_the_robot():
     emap = blank_map(0.1, 4.0, 1)
     T_map_base = pose((10.0, 0.0, 3.0))
     T_tile_base = pose((1.0, 2.0, 0.0), yaw=math.pi / 2)
-    emap.update(torch.full((1, 1, 3), torch.nan), T_map_base, T_map_base)
+    emap.update(torch.full((1, 1, 3), torch.nan), T_map_base, T_map_base, dt=0.0)
     places = tile_places(emap, T_tile_base @ torch.linalg.inv(T_map_base))[0].view(-1, 2)
     cells = emap.cell_centers()[0].view(-1, 2)
     at = int(((cells - torch.tensor([11.05, 0.05])).norm(dim=1)).argmin())
@@ -102,7 +102,7 @@ def test_cells_beyond_the_tile_are_not_rated():
     field, robot = flat_tile_with_a_box(), RobotConfig()
     emap = blank_map(0.1, 4.0, 1)
     T = pose((LENGTH / 2, 0.0, 0.0))
-    emap.update(torch.full((1, 1, 3), torch.nan), T, T)
+    emap.update(torch.full((1, 1, 3), torch.nan), T, T, dt=0.0)
     emap.state.validity.fill_(True)
     rated = label_cells(emap, pose((0.0, 0.0, 0.0)), field, robot, 2, ("box",)).rated
     x = emap.cell_centers()[..., 0]

@@ -126,6 +126,8 @@ def require_full_precision(dtype: torch.dtype) -> None:
 
 def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype, always: bool) -> Tensor:
     """Return dt as (B,) [s]."""
+    hint = "give the seconds since the last update, or 0.0 for a further sensor of the same instant"
+    require(dt is not None, "dt", "is required", "none", hint, TypeError)
     if isinstance(dt, Tensor):
         value = check_tensor("dt", dt, device, FLOATS)
         fits = tuple(value.shape) in ((), (num_envs,))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import torch
 from torch import Tensor, nn
@@ -136,12 +136,27 @@ class ElevationMap(nn.Module):
 
     # Writing --------------------------------------------------------------------------------------------------------
 
+    # Overloads, so that type checkers ask for dt: it follows an argument that may be left out.
+    @overload
+    def update(
+        self,
+        points: Tensor,
+        T_map_sensor: Tensor,
+        T_map_base: Tensor | None,
+        dt: float | Tensor,
+        *,
+        variance: Tensor | None = None,
+    ) -> None: ...
+    @overload
+    def update(
+        self, points: Tensor, T_map_sensor: Tensor, *, dt: float | Tensor, variance: Tensor | None = None
+    ) -> None: ...
     def update(
         self,
         points: Float[Tensor, "B *S N 3"],
         T_map_sensor: Float[Tensor, "B *S 4 4"],
         T_map_base: Float[Tensor, "B 4 4"] | None = None,
-        dt: float | Float[Tensor, "B"] = 0.0,
+        dt: float | Float[Tensor, "B"] | None = None,
         *,
         variance: Float[Tensor, "B *S N"] | None = None,
     ) -> None:
@@ -151,11 +166,12 @@ class ElevationMap(nn.Module):
             points: sensor-frame points [m]; NaN or inf points are ignored, so pad ragged clouds with NaN.
             T_map_sensor: takes sensor-frame points into the map frame; float64 far from the origin.
             T_map_base: the robot; the window follows it. None: the window stays, overlap and body box are skipped.
-            dt: time since that environment's last update [s]; 0, the default, for a further sensor of the same instant.
+            dt: time since that environment's last update [s], required; 0.0 for a further sensor of the same instant.
+                Visibility clean-up and ageing need it.
             variance: of each point's height [m^2], in place of the noise model; a point whose variance is not positive
                 and finite is ignored.
 
-        Raises ValueError or TypeError before anything changed.
+        Raises ValueError or TypeError before anything changed; TypeError without dt.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
         if self.device.type == "cpu":
@@ -182,12 +198,26 @@ class ElevationMap(nn.Module):
         size = math.ceil(self.num_envs / parts)
         return [slice(first, first + size) for first in range(0, self.num_envs, size)]
 
+    @overload
+    def measure(
+        self,
+        points: Tensor,
+        T_map_sensor: Tensor,
+        T_map_base: Tensor | None,
+        dt: float | Tensor,
+        *,
+        variance: Tensor | None = None,
+    ) -> Measurement: ...
+    @overload
+    def measure(
+        self, points: Tensor, T_map_sensor: Tensor, *, dt: float | Tensor, variance: Tensor | None = None
+    ) -> Measurement: ...
     def measure(
         self,
         points: Float[Tensor, "B *S N 3"],
         T_map_sensor: Float[Tensor, "B *S 4 4"],
         T_map_base: Float[Tensor, "B 4 4"] | None = None,
-        dt: float | Float[Tensor, "B"] = 0.0,
+        dt: float | Float[Tensor, "B"] | None = None,
         *,
         variance: Float[Tensor, "B *S N"] | None = None,
     ) -> Measurement:
