@@ -12,10 +12,10 @@ from torch import Tensor
 
 from envs.terrain_nav.gym import TerrainNavVectorEnv
 from envs.terrain_nav.task import ASIDE, TerrainNav
-from torchelev.gym.rsl_rl import TorchVecEnv
+from torchelev.gym.rsl_rl import GymVecEnv
 
 
-class RslRlTerrainNav(TorchVecEnv):
+class RslRlTerrainNav(GymVecEnv):
     """A `TerrainNav` for `rsl_rl.runners.OnPolicyRunner` (rsl-rl-lib 5.4 and 5.5).
 
     Observation groups: "policy" and "map" for the actor, "policy" and "truth" for the critic. `extras` holds

@@ -1,9 +1,9 @@
-"""Any torch vector environment of gymnasium as rsl-rl steps it: a `VecEnv` with TensorDict observations.
+"""Any vector environment of gymnasium as rsl-rl steps it: a `VecEnv` with TensorDict observations.
 
-With a map for an environment of tensors that has none, and rsl-rl's runner:
+With a map for an environment that has none, and rsl-rl's runner:
 
     env = VectorElevationMapObservation(env, points=..., T_map_sensor=..., T_map_base=..., dt=0.02)
-    env = TorchVecEnv(env, max_episode_length=1000)
+    env = GymVecEnv(env, max_episode_length=1000)
     OnPolicyRunner(env, train_cfg, device=env.device).learn(500)
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -25,8 +26,8 @@ except ImportError as error:
     raise ImportError("torchelev.gym.rsl_rl: needs rsl-rl-lib; install it with pip install 'torchelev[rl]'") from error
 
 
-class TorchVecEnv(VecEnv):
-    """Step a gymnasium `VectorEnv` of tensors with `rsl_rl.runners.OnPolicyRunner` (rsl-rl-lib 5.4 and 5.5).
+class GymVecEnv(VecEnv):
+    """Step a gymnasium `VectorEnv`, of tensors or arrays, with rsl-rl's `OnPolicyRunner` (rsl-rl-lib 5.4 and 5.5).
 
     Each entry of a Dict observation is an observation group (B, ...) in float32; any other observation is the group
     "policy". What is returned shares no memory with the environment, as PPO keeps observations across steps.
@@ -39,22 +40,22 @@ class TorchVecEnv(VecEnv):
     A subclass whose environment changes between steps, such as by a checkpoint, overrides `get_observations`.
 
     Args:
-        env: a vector environment that takes and gives tensors, in `AutoresetMode.SAME_STEP`, with a Box (A,) of
-            actions. It may be wrapped, such as by `VectorElevationMapObservation`. It is reset at once.
+        env: a vector environment in `AutoresetMode.SAME_STEP`, with a Box (A,) of actions: tensors if its observations
+            are tensors, else arrays. It may be wrapped, as by `VectorElevationMapObservation`. It is reset at once.
         max_episode_length: steps after which the environment truncates. None: the unwrapped environment's
             `max_episode_length`, or its `spec.max_episode_steps`.
         cfg: what rsl-rl logs as the environment's config.
         seed: of the reset.
 
     Raises:
-        TypeError: for what is no `VectorEnv`, or gives no tensors.
+        TypeError: for what is no `VectorEnv`, or gives neither tensors nor arrays.
         ValueError: for another autoreset mode, other actions, nested observations, or an unknown length of episodes.
     """
 
     def __init__(
         self, env: VectorEnv, *, max_episode_length: int | None = None, cfg: Any = None, seed: int | None = None
     ) -> None:
-        hint = "wrap single ones in gymnasium.vector.SyncVectorEnv and NumpyToTorch"
+        hint = "wrap single ones in gymnasium.vector.SyncVectorEnv"
         require(isinstance(env, VectorEnv), "env", "must be a VectorEnv", type(env).__name__, hint, TypeError)
         mode, hint = env.metadata.get("autoreset_mode", "none"), "make it with autoreset_mode=AutoresetMode.SAME_STEP"
         require(mode is AutoresetMode.SAME_STEP, "env", "must reset within the step that ends an episode", mode, hint)
@@ -67,7 +68,8 @@ class TorchVecEnv(VecEnv):
         self._observation, _ = env.reset(seed=seed)
         groups = _groups(self._observation)
         _check(groups, self.num_envs)
-        self.device = next(iter(groups.values())).device
+        first = next(iter(groups.values()))
+        self._is_torch, self.device = isinstance(first, Tensor), torch.as_tensor(first).device
         self._steps = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
 
     @property
@@ -100,14 +102,15 @@ class TorchVecEnv(VecEnv):
         Returns:
             What the next actions are chosen by, rewards (B,), ended episodes (B,) int64, extras.
         """
-        self._observation, rewards, terminated, truncated, infos = self.env.step(actions)
-        terminated, truncated = terminated.bool(), truncated.bool()
+        given = actions if self._is_torch else actions.cpu().numpy()
+        self._observation, *flags, infos = self.env.step(given)
+        rewards, terminated, truncated = (torch.as_tensor(value, device=self.device) for value in flags)
         done = terminated | truncated
         self._steps.copy_(torch.where(done, 0, self._steps + 1))  # in place: see CONTRIBUTING.md on inference mode
         extras = {"time_outs": (truncated & ~terminated).float()}
         if "log" in infos:
             extras["log"] = infos["log"]
-        return self.group(self._observation), rewards.float(), done.long(), extras
+        return self.group(self._observation), rewards.to(torch.float32, copy=True), done.long(), extras
 
     def close(self) -> None:
         """Close the environment."""
@@ -115,7 +118,8 @@ class TorchVecEnv(VecEnv):
 
     def group(self, observation: Any) -> TensorDict:
         """Return an observation of the environment as groups of new float32 tensors."""
-        new = {name: value.to(torch.float32, copy=True) for name, value in _groups(observation).items()}
+        tensors = {name: torch.as_tensor(value) for name, value in _groups(observation).items()}
+        new = {name: value.to(torch.float32, copy=True) for name, value in tensors.items()}
         return TensorDict(new, batch_size=[self.num_envs], device=self.device)
 
 
@@ -124,12 +128,12 @@ def _groups(observation: Any) -> dict[str, Any]:
 
 
 def _check(groups: dict[str, Any], num_envs: int) -> None:
-    hint = "wrap the environment in gymnasium.wrappers.vector.NumpyToTorch"
     for name, value in groups.items():
         argument = f"observation {name!r}"
         nested = isinstance(value, dict | tuple)
         require(not nested, argument, "must be one tensor", type(value).__name__, "flatten it by a wrapper")
-        require(isinstance(value, Tensor), argument, "must be a tensor", type(value).__name__, hint, TypeError)
+        is_array, kind = isinstance(value, Tensor | np.ndarray), type(value).__name__
+        require(is_array, argument, "must be a tensor or an array", kind, "convert it by a wrapper", TypeError)
         shape = tuple(value.shape)
         require(shape[:1] == (num_envs,), argument, f"expected ({num_envs}, ...)", shape, "give a row per environment")
 
