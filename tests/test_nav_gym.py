@@ -76,6 +76,36 @@ def test_an_ended_episode_begins_anew_in_the_next_step():
         assert (env.unwrapped.task.episode_length == (0 if begins else step % 6)).all()
 
 
+@pytest.mark.parametrize("limit, length", [(None, 5), (3, 3), (9, 5)])
+def test_an_ended_episode_begins_anew_in_the_same_step(limit, length):
+    options = dict(max_episode_steps=limit, autoreset_mode=AutoresetMode.SAME_STEP)
+    env = gymnasium.make_vec(ID, num_envs=3, cfg=CFG, **options)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP and env.unwrapped.max_episode_length == length
+    assert gymnasium.make_vec(ID, num_envs=1, cfg=CFG).metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    seen, _ = env.reset(seed=4)
+    for step in range(1, 11):
+        goal = seen["policy"][:, 2]
+        seen, reward, terminated, truncated, info = env.step(torch.tensor([[0.0, 1.0]] * 3))
+        assert bool(truncated.all()) == (step % length == 0) and not bool(terminated.any())
+        assert env.unwrapped.episode_length_buf.tolist() == [step % length] * 3 and bool((reward != 0).all())
+        final = info["final_obs"]["policy"]
+        assert torch.equal(info["_final_obs"], truncated)
+        assert torch.equal(final, seen["policy"]) == (step % length != 0), "where it ended, and where it began"
+        assert bool(((final[:, 2] - goal).abs() < 0.1).all()), "a step from the goal's distance before"
+
+
+def test_refuses_an_autoreset_mode():
+    with pytest.raises(ValueError, match="autoreset_mode: must be NEXT_STEP or SAME_STEP, got AutoresetMode.DISABLED"):
+        gymnasium.make_vec(ID, num_envs=1, cfg=CFG, autoreset_mode=AutoresetMode.DISABLED)
+
+
+def test_the_critic_s_observation_is_in_the_space():
+    env = gymnasium.make_vec(ID, num_envs=3, cfg=CFG, critic=True)
+    seen, _ = env.reset(seed=4)
+    assert set(seen) == set(env.observation_space) == {"policy", "map", "truth"}
+    assert seen["truth"].shape == env.observation_space["truth"].shape
+
+
 def test_a_limit_of_steps_and_a_reset_of_some():
     env = gymnasium.make_vec(ID, num_envs=3, cfg=CFG, perception="blind", max_episode_steps=3)
     env.reset(seed=4)

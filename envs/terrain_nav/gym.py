@@ -13,12 +13,13 @@ from torch import Tensor
 
 from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.task import NUM_ACTIONS, TerrainNav
+from torchelev.errors import require
 
 MOST_SEED = 2**31
 
 
-def _spaces(task: TerrainNav) -> tuple[spaces.Dict, spaces.Box]:
-    shapes = {name: value.shape[1:] for name, value in task.observe(critic=False).items()}
+def _spaces(task: TerrainNav, critic: bool = False) -> tuple[spaces.Dict, spaces.Box]:
+    shapes = {name: value.shape[1:] for name, value in task.observe(critic).items()}
     seen = {name: spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in shapes.items()}
     return spaces.Dict(seen), spaces.Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32)
 
@@ -81,7 +82,9 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
     """Many robots, tensors in and out: `gymnasium.make_vec("torchelev/TerrainNav-v0", num_envs=N)`.
 
     An environment whose episode ended begins the next one in the following step, whose action it ignores
-    (`AutoresetMode.NEXT_STEP`).
+    (`AutoresetMode.NEXT_STEP`). In SAME_STEP it begins in the step that ends the last one; `final_obs` of `info` is
+    then where the robots ended, by the maps of one look before. With `critic` observations have "truth". A `task` takes
+    the place of `num_envs`, `cfg`, `perception`, `device` and `compiled`, and is seeded already.
     """
 
     metadata: dict[str, Any] = {
@@ -100,14 +103,36 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         perception: str = "map",
         device: str = "cpu",
         compiled: bool = False,
+        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+        critic: bool = False,
+        task: TerrainNav | None = None,
     ) -> None:
-        self.num_envs, self.render_mode, self.max_episode_steps = num_envs, render_mode, max_episode_steps
-        self.task = TerrainNav(cfg, num_envs, device, perception, compiled=compiled)
-        self.single_observation_space, self.single_action_space = _spaces(self.task)
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
-        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
-        self._ended = torch.zeros(num_envs, dtype=torch.bool, device=self.task.device)
-        self._seeded = False
+        modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+        is_known = autoreset_mode in modes
+        require(is_known, "autoreset_mode", "must be NEXT_STEP or SAME_STEP", autoreset_mode, "choose one of them")
+        self.task = TerrainNav(cfg, num_envs, device, perception, compiled=compiled) if task is None else task
+        self.num_envs, self.render_mode, self.max_episode_steps = self.task.num_envs, render_mode, max_episode_steps
+        self.metadata, self.critic = {**self.metadata, "autoreset_mode": autoreset_mode}, critic
+        self.single_observation_space, self.single_action_space = _spaces(self.task, critic)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
+        self._ended = torch.zeros(self.num_envs, dtype=torch.bool, device=self.task.device)
+        self._seeded = task is not None
+
+    @property
+    def max_episode_length(self) -> int:
+        """Steps after which an episode is truncated."""
+        own = self.task.cfg.max_episode_length
+        return own if self.max_episode_steps is None else min(own, self.max_episode_steps)
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Steps of the running episodes (B,); can be set."""
+        return self.task.episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        self.task.episode_length.copy_(value)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -126,19 +151,24 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         """Move, or begin the next episode where the last one ended, and look."""
         began, task = self._ended, self.task
         outcome = task.advance(torch.as_tensor(actions, device=task.device))
-        task.reset(began)
-        task.sense()
         truncated = outcome.truncated
         if self.max_episode_steps is not None:
             truncated = truncated | (task.episode_length >= self.max_episode_steps) & ~outcome.terminated
         terminated, truncated = outcome.terminated & ~began, truncated & ~began
-        self._ended = terminated | truncated
-        info = {"distance": task.distance}
-        info |= {name: getattr(outcome, name) & ~began for name in ("success", "fallen", "stuck")}
+        info: dict[str, Any] = {name: getattr(outcome, name) & ~began for name in ("success", "fallen", "stuck")}
+        ended = terminated | truncated
+        if self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP:
+            info |= {"final_obs": self._observe(), "_final_obs": ended}
+            task.reset(ended)
+        else:
+            task.reset(began)
+            self._ended = ended
+        task.sense()
+        info |= {"distance": task.distance, "log": {f"/{name}": share for name, share in task.shares.items()}}
         return self._observe(), torch.where(began, 0.0, outcome.reward), terminated, truncated, info
 
     def _observe(self) -> dict[str, Tensor]:
-        return self.task.observe(critic=False)
+        return self.task.observe(self.critic)
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """Return a picture of each of the first four environments."""

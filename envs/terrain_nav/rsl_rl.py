@@ -1,19 +1,21 @@
-"""TerrainNav as rsl-rl steps it: a `VecEnv` that resets its environments itself, with TensorDict observations."""
+"""TerrainNav as rsl-rl steps it, and its mirror image."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import torch
+from gymnasium.vector import AutoresetMode
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.terrain_nav.task import ASIDE, NUM_ACTIONS, TerrainNav
+from envs.terrain_nav.gym import TerrainNavVectorEnv
+from envs.terrain_nav.task import ASIDE, TerrainNav
+from torchelev.gym.rsl_rl import GymVecEnv
 
 
-class RslRlTerrainNav(VecEnv):
+class RslRlTerrainNav(GymVecEnv):
     """A `TerrainNav` for `rsl_rl.runners.OnPolicyRunner` (rsl-rl-lib 5.4 and 5.5).
 
     Observation groups: "policy" and "map" for the actor, "policy" and "truth" for the critic. `extras` holds
@@ -22,31 +24,12 @@ class RslRlTerrainNav(VecEnv):
 
     def __init__(self, task: TerrainNav) -> None:
         self.task = task
-        self.num_envs, self.num_actions, self.device = task.num_envs, NUM_ACTIONS, task.device
-        self.max_episode_length = task.cfg.max_episode_length
-        self.cfg = dataclasses.asdict(task.cfg)
-
-    @property
-    def episode_length_buf(self) -> Tensor:
-        """Steps of the running episodes (B,)."""
-        return self.task.episode_length
-
-    @episode_length_buf.setter
-    def episode_length_buf(self, value: Tensor) -> None:
-        self.task.episode_length.copy_(value)
+        env = TerrainNavVectorEnv(task=task, autoreset_mode=AutoresetMode.SAME_STEP, critic=True)
+        super().__init__(env, cfg=dataclasses.asdict(task.cfg))
 
     def get_observations(self) -> TensorDict:
-        """Return the present observations."""
-        return TensorDict(self.task.observe(), batch_size=[self.num_envs], device=self.device)
-
-    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """Move, begin new episodes where one ended, look, and return what the next action is chosen by."""
-        outcome = self.task.advance(actions)
-        self.task.reset(outcome.done)
-        self.task.sense()
-        log = {f"/{name}": share for name, share in self.task.shares.items()}
-        extras = {"time_outs": outcome.truncated.float(), "log": log}
-        return self.get_observations(), outcome.reward, outcome.done.long(), extras
+        """Return the present observations, read anew: a resume changes the task between two steps."""
+        return self.group(self.task.observe())
 
 
 def mirror(

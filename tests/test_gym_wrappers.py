@@ -15,10 +15,10 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from gymnasium.wrappers import Autoreset
 from test_gpu import OPERATORS, OneDevice
 
-import envs.observation_wrapper
-from envs.map_feed import READ
-from envs.observation_wrapper import ElevationMapObservation, VectorElevationMapObservation
+import torchelev.gym.wrappers
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
+from torchelev.gym import ElevationMapObservation, VectorElevationMapObservation
+from torchelev.gym.feed import DEFAULT_READ
 
 CONFIG = small_config((24, 24))
 DT = 0.5  # [s]
@@ -99,7 +99,7 @@ def expected_map(index, episode, count):
     for step in range(count + 1):
         T = torch.from_numpy(pose_of(step))[None]
         points = torch.from_numpy(cloud_of(index, episode, step))[None]
-        emap.update(points, T, T, DT if step else 0.0)
+        emap.update(points, T, T, dt=DT if step else 0.0)
     return emap
 
 
@@ -109,7 +109,7 @@ def assert_map(wrapper, values, row, index, episode, count):
     for name in LAYERS:
         given, wanted = wrapper.emap.layer(name)[row], expected.layer(name)[0]
         torch.testing.assert_close(given, wanted, rtol=0, atol=1e-6, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}")
-    wanted = READ(expected, torch.from_numpy(pose_of(count))[None])[0]
+    wanted = DEFAULT_READ(expected, torch.from_numpy(pose_of(count))[None])[0]
     torch.testing.assert_close(torch.as_tensor(values), wanted, rtol=0, atol=1e-6)
     assert 0.2 < wanted[1].mean() < 1  # some is known and some is not, or nothing is compared
 
@@ -562,7 +562,7 @@ def example():
     """The names of the module's example, after it ran as its docstring says."""
     pytest.importorskip("mujoco")
     pytest.importorskip("imageio")  # which gymnasium's MuJoCo environments import
-    (test,) = doctest.DocTestFinder(recurse=False).find(envs.observation_wrapper)
+    (test,) = doctest.DocTestFinder(recurse=False).find(torchelev.gym.wrappers)
     result = doctest.DocTestRunner().run(test, clear_globs=False)
     assert result.attempted > 10 and result.failed == 0
     return test.globs

@@ -5,7 +5,7 @@ and adds what `read` makes of the map to the observation. MuJoCo's Ant with a de
 
 >>> import gymnasium, mujoco
 >>> import numpy as np
->>> from envs.observation_wrapper import ElevationMapObservation
+>>> from torchelev.gym import ElevationMapObservation
 >>> from torchelev import ElevationMapConfig, GridConfig
 >>> from torchelev.sim import DepthCamera, mount
 >>> rays = DepthCamera(width=32, height=24).directions.numpy()
@@ -49,9 +49,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from envs.map_feed import MapFeed, as_tensor
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.errors import require
+from torchelev.gym.feed import MapFeed, as_tensor
 
 
 class _MapObservation(RecordConstructorArgs):
@@ -59,7 +59,7 @@ class _MapObservation(RecordConstructorArgs):
 
     _wraps: type  # the kind of environment
     _wrapper: type  # its gymnasium wrapper
-    _mend: str  # for the other kind
+    _hint: str  # for the other kind
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class _MapObservation(RecordConstructorArgs):
         key: str = "map",
     ) -> None:
         kind = self._wraps.__name__
-        require(isinstance(env, self._wraps), "env", f"must be a {kind}", type(env).__name__, self._mend, TypeError)
+        require(isinstance(env, self._wraps), "env", f"must be a {kind}", type(env).__name__, self._hint, TypeError)
         sources = {"points": points, "depth": depth, "intrinsics": intrinsics}
         poses = {"T_map_sensor": T_map_sensor, "T_map_base": T_map_base, "dt": dt}
         maps = {"read": read, "cfg": cfg, "device": device}
@@ -133,11 +133,11 @@ class ElevationMapObservation(_MapObservation, gymnasium.Wrapper):
         device: of the map.
         key: of the map in the observation.
 
-    Raises ValueError or TypeError for what is missing or does not fit, naming the argument, the rule, what came and
-    the mend.
+    Raises:
+        ValueError, TypeError: for what is missing or does not fit, naming the argument, the rule and the fix.
     """
 
-    _wraps, _wrapper, _mend = gymnasium.Env, gymnasium.Wrapper, "use VectorElevationMapObservation for a VectorEnv"
+    _wraps, _wrapper, _hint = gymnasium.Env, gymnasium.Wrapper, "use VectorElevationMapObservation for a VectorEnv"
 
     def _extend_spaces(self, box: spaces.Box) -> None:
         self.observation_space = self._extended(self.env.observation_space, box)
@@ -168,14 +168,14 @@ class VectorElevationMapObservation(_MapObservation, VectorWrapper):
     mode `reset(options={"reset_mask": ...})`, which leaves the other maps as they are.
     """
 
-    _wraps, _wrapper, _mend = VectorEnv, VectorWrapper, "use ElevationMapObservation for a single Env"
+    _wraps, _wrapper, _hint = VectorEnv, VectorWrapper, "use ElevationMapObservation for a single Env"
 
     def _extend_spaces(self, box: spaces.Box) -> None:
-        modes = [mode.name for mode in AutoresetMode]
-        came = self.env.metadata.get("autoreset_mode", "none")
-        known = came in AutoresetMode.__members__.values()
-        require(known, 'env.metadata["autoreset_mode"]', "must be an AutoresetMode", came, f"set {' or '.join(modes)}")
-        self._mode, self._last = came, self._feed.read_blank()
+        hint = f"set {' or '.join(mode.name for mode in AutoresetMode)}"
+        actual = self.env.metadata.get("autoreset_mode", "none")
+        known = actual in AutoresetMode.__members__.values()
+        require(known, 'env.metadata["autoreset_mode"]', "must be an AutoresetMode", actual, hint)
+        self._mode, self._last = actual, self._feed.read_blank()
         self.single_observation_space = self._extended(self.env.single_observation_space, box)
         self.observation_space = self._extended(self.env.observation_space, batch_space(box, self.num_envs))
 
