@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.transforms import is_transforming
 
 FARTHEST = 1e9  # [m] farther, a float64 counts cells wrongly
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -24,8 +25,8 @@ Config = TypeVar("Config")
 
 
 def readable(value: Tensor, always: bool = False) -> bool:
-    """Tell whether a value may be read now: not while compiling, and not from tensors that hold no data."""
-    plain = type(value) in (Tensor, torch.nn.Parameter)
+    """Tell whether a value may be read now: not while compiling or transforming, nor from tensors without data."""
+    plain = type(value) in (Tensor, torch.nn.Parameter) and not is_transforming()
     return plain and not torch.compiler.is_compiling() and (always or value.device.type == "cpu")
 
 

@@ -22,6 +22,7 @@ from torchelev.pipeline import fuse_measurement, rate_surface, update_in_place, 
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
 from torchelev.storage import keep_freed_memory
+from torchelev.transforms import require_reverse_mode
 from torchelev.traversability import LearnedTraversabilityConfig, learned_rating, make_head
 from torchelev.traversability_net import Rating, TraversabilityNet, Weights
 
@@ -228,7 +229,11 @@ class ElevationMap(nn.Module):
     def forward(self, state: MapState, measurement: Measurement) -> MapState:
         """Fuse a measurement into a state and return the new one; touches no buffer (paper, Fig. 2)."""
         checks.require_full_precision(state.elevation.dtype)
-        return fuse_measurement(state, measurement, self.cfg, self._weights)
+        require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
+        new = fuse_measurement(state, measurement, self.cfg, self._weights)
+        # What no stage changed is still the caller's tensor, which an update or a reset may overwrite.
+        given = {id(value) for value in (*state[:-1], *state.statistics, *measurement)}
+        return map_layers(lambda value: value.clone() if id(value) in given else value, new)
 
     @property
     def _weights(self) -> Weights | None:
@@ -239,6 +244,7 @@ class ElevationMap(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor | None]:
         B, device, always = self.num_envs, self.device, self.check_values
         checks.require_full_precision(self.elevation.dtype)
+        require_reverse_mode((points, T_map_sensor, T_map_base, dt, variance))
         cloud = checks.check_points(points, B, device)
         S = cloud.shape[1]
         shape = (B, S, 4, 4) if points.ndim == 4 else (B, 4, 4)

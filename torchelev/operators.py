@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.transforms import with_gradient
+
 
 @torch.library.custom_op(
     "torchelev::moved", mutates_args=(), schema="(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]"
@@ -36,14 +38,14 @@ def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
 
 
 @torch.library.custom_op("torchelev::cell_sums", mutates_args=())
-def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor:
+def _cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor:
     """Sum values (K, B, M) by the slots `index` (B, M) in [0, size): -> (K, B, size). Slots never mix environments."""
     # One row per column and environment: rows run in parallel, and each stays in the cache.
     zeros = values.new_zeros(values.shape[0], values.shape[1], size)
     return zeros.scatter_add_(2, index.expand(values.shape), values)
 
 
-@cell_sums.register_fake
+@_cell_sums.register_fake
 def _(index: Tensor, values: Tensor, size: int) -> Tensor:
     return values.new_empty(values.shape[0], values.shape[1], size)
 
@@ -57,16 +59,16 @@ def _keep_index(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.save_for_backward(inputs[0])
 
 
-cell_sums.register_autograd(_cell_sums_backward, setup_context=_keep_index)
+cell_sums = with_gradient(_cell_sums, _keep_index, _cell_sums_backward)
 
 
 @torch.library.custom_op("torchelev::padded", mutates_args=())
-def padded(values: Tensor, radius: int, fill: float) -> Tensor:
+def _padded(values: Tensor, radius: int, fill: float) -> Tensor:
     """Put a rim of `radius` cells around (..., H, W)."""
     return F.pad(values, [radius] * 4, value=fill)
 
 
-@padded.register_fake
+@_padded.register_fake
 def _(values: Tensor, radius: int, fill: float) -> Tensor:
     return values.new_empty(*values.shape[:-2], values.shape[-2] + 2 * radius, values.shape[-1] + 2 * radius)
 
@@ -80,7 +82,7 @@ def _keep_radius(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.radius = inputs[1]
 
 
-padded.register_autograd(_padded_backward, setup_context=_keep_radius)
+padded = with_gradient(_padded, _keep_radius, _padded_backward)
 
 
 def _scan_rows(rows: Sequence[Tensor]) -> None:
@@ -121,7 +123,7 @@ def _(table: Tensor, from_end: bool) -> Tensor:
     mutates_args=(),
     schema="(Tensor index, Tensor values, SymInt azimuths, SymInt[] widen, SymInt ranges, float blank) -> Tensor",
 )
-def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
+def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
     """Return the table (B, R, azimuths) of the lowest value at or beyond each range and near each azimuth.
 
     `index` (B, N) is range * azimuths + azimuth of each value (B, N); range = `ranges` drops it. Every level w of
@@ -145,6 +147,28 @@ def _table_rows(ranges: int) -> int:
     return 8 * (ranges // 8 + 1)
 
 
-@polar_minimum.register_fake
+@_polar_minimum.register_fake
 def _(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
     return values.new_empty(index.shape[0], _table_rows(ranges), azimuths)
+
+
+def _keep_rays(ctx, inputs: tuple, output: Tensor) -> None:
+    index, values, *ctx.sizes = inputs
+    ctx.save_for_backward(index, values)
+
+
+def _polar_minimum_backward(ctx, grad: Tensor) -> tuple[None, Tensor, None, None, None, None]:
+    """Route the gradient of each entry to the ray whose value it holds; of equal ones to the first."""
+    index, values = ctx.saved_tensors
+    azimuths, widen, ranges, _ = ctx.sizes
+    # The same table of the values' ranks, which are whole numbers that no two rays share, names that ray.
+    order = values.argsort(dim=1, stable=True)
+    number = values.shape[1]
+    rank = torch.empty_like(values, dtype=torch.float64)
+    rank = rank.scatter(1, order, torch.arange(number, device=values.device, dtype=torch.float64).expand(order.shape))
+    lowest = _polar_minimum(index, rank, azimuths, widen, ranges, float(number)).flatten(1).to(torch.int64)
+    by_rank = grad.new_zeros(grad.shape[0], number + 1).scatter_add(1, lowest, grad.flatten(1))
+    return None, by_rank[:, :number].gather(1, rank.to(torch.int64)), None, None, None, None
+
+
+polar_minimum = with_gradient(_polar_minimum, _keep_rays, _polar_minimum_backward)

@@ -187,7 +187,7 @@ def horizon(
     recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = chosen(recent, rays.origin[:, 2, None, None] - lowest, NO_RAY)
     fall = chosen(inside, read(realize(below_sensor).flatten(1), slot), NO_RAY * step) / rho
-    steepest = running_minimum(fall, from_end=False)
+    steepest = running_minimum(fall.detach(), from_end=False)  # compared with, and so without a gradient
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
@@ -206,9 +206,7 @@ def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig)
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
     index = flat(chosen(casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
-    return polar_minimum(
-        index.to(torch.int64), rays.slope.detach(), polar.azimuths, list(polar.widen), polar.ranges, NO_RAY
-    )
+    return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
 
 
 def flat(row: Tensor, column: Tensor, width: int) -> Tensor:
