@@ -144,7 +144,7 @@ def refined(number: int = 24) -> Rows:
     rows = []
     for goal in GOALS:
         way = plan(emap, torch.zeros(1, 2), torch.tensor([goal]))
-        last = int((way.xy[0] != way.xy[0, -1]).any(-1).sum())
+        last = int(way.count[0]) - 1
         before = way.xy[:, torch.linspace(0, last, number).round().long()]
         ways = {"planned": before, "refined": refine(emap, before)}
         costs = {name: round(float(piece_costs(emap, xy, samples=50).sum()), 3) for name, xy in ways.items()}

@@ -17,6 +17,7 @@ from torchelev.path_check import check_path
 
 SEEDS = st.integers(0, 10_000)
 FOOTPRINT = torch.tensor([[0.25, 0.125], [-0.25, 0.125], [-0.25, -0.125], [0.25, -0.125]]).double()
+NOWHERE = torch.full((2, 3, 2), math.nan)  # where no robot stands
 
 
 def path(*poses):
@@ -102,7 +103,7 @@ def test_each_place_is_a_footprint(seed, samples):
     emap = random_map(seed, known=0.95)
     poses = random_path(rng, emap)
     cfg = FootprintConfig(min_traversability=0.4, max_unsafe=0.4, max_unknown=0.2)
-    check = check_path(emap, poses, FOOTPRINT, cfg, samples=samples + 3)
+    check = check_path(emap, poses, FOOTPRINT, cfg, samples=samples + 3, standing=NOWHERE)
     torch.testing.assert_close(check.poses[:, :: samples + 3], poses, rtol=0, atol=1e-12)
     number = check.poses.shape[1]
     for b in range(2):

@@ -171,7 +171,7 @@ def slow_cost(state, b, i, j, cfg, resolution, confidence):
 
 def slow_inclination(state, b, i, j, reach, resolution):
     H, W = state.validity.shape[1:]
-    aslant, angles = max(1, round(reach / math.sqrt(2))), []
+    aslant, angles, axes = max(1, round(reach / math.sqrt(2))), [], set()
     for di, dj in [(a, c) for a in (-1, 0, 1) for c in (-1, 0, 1) if (a, c) != (0, 0)]:
         n = aslant if di and dj else reach
         k, m = i + n * di, j + n * dj
@@ -179,7 +179,10 @@ def slow_inclination(state, b, i, j, reach, resolution):
             other = float((state.elevation if state.validity[b, k, m] else state.upper_bound)[b, k, m])
             step = abs(other - float(state.upper_bound[b, i, j]))
             angles.append(math.atan(step / (n * math.hypot(di, dj) * resolution)))
-    return max(angles, default=None)
+            axes.add(frozenset([(di, dj), (-di, -dj)]))
+    pairs = ([(1, 0), (0, 1)], [(1, 1), (1, -1)])  # perpendicular
+    spans = any(all(frozenset([(i, j), (-i, -j)]) in axes for i, j in pair) for pair in pairs)
+    return max(angles) if spans else None
 
 
 @given(SEEDS)

@@ -15,12 +15,12 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.grid import GridConfig
 from torchelev.polygons import PolygonCells, convex_hull, polygon_cells
+from torchelev.standing import FARTHEST, standing_cells
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-FARTHEST = 2.0**30  # [cells] from the window; farther, a number of cells may not fit an integer
 ROUNDING = 1e-3  # [cells] by which a polygon may extend too far
 
 
@@ -58,7 +58,7 @@ class FootprintCheck(NamedTuple):
 
     safe: Bool[Tensor, "B P"]
     traversability: Float[Tensor, "B P"]  # mean over the known cells, 0 where none is
-    unknown: Float[Tensor, "B P"]  # share of cells that are unknown or outside of the window
+    unknown: Float[Tensor, "B P"]  # share of cells that are unknown or outside of the window, and not `assumed`
     unsafe: Float[Tensor, "B P"]  # share of cells that are known to be unsafe
 
 
@@ -69,6 +69,7 @@ class _Ground(NamedTuple):
     values: Float[Tensor, "B P S S"]  # 0 where not known
     known: Bool[Tensor, "B P S S"]  # in the polygon, and known
     unsafe: Bool[Tensor, "B P S S"]
+    assumed: Bool[Tensor, "B P S S"]  # in the polygon, unknown, and under the robot where it stands now
 
 
 def check_footprint(
@@ -76,12 +77,14 @@ def check_footprint(
     polygons: Float[Tensor, "B P V 2"],
     cfg: FootprintConfig | None = None,
     *,
+    standing: Float[Tensor, "B V 2"] | None = None,
     state: MapState | None = None,
 ) -> FootprintCheck:
     """Check whether footprints lie on ground that carries the robot.
 
     Safe means: the mean traversability is high enough, and the shares of unsafe and of unknown cells are low enough, by
-    the config. A polygon below which nothing is known is never safe. The mean is differentiable in the state.
+    the config. Known means that the layer has a value: ground of known elevation but unknown traversability is unknown.
+    A polygon below which nothing is known is safe only where the robot stands. The mean is differentiable in the state.
 
     Args:
         emap: the maps.
@@ -89,6 +92,9 @@ def check_footprint(
             repeating their last one. The cells whose centres lie inside count (even-odd rule); of a polygon too small
             or too narrow to hold a centre, those that its boundary passes.
         cfg: the thresholds.
+        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`): unknown cells
+            under them are assumed to carry the robot. They count neither as unknown nor towards the mean; known cells
+            count as everywhere. None, or NaN: nothing is assumed.
         state: of the maps; None: their own.
 
     The paper's open code offers planners such a check. It cuts polygons off at the window's border and asks nothing of
@@ -100,16 +106,17 @@ def check_footprint(
     wait, they are not safe and nothing is known of them, unless the map has `check_values`.
     """
     cfg = given_or_default(FootprintConfig, cfg)
-    ground = _ground(emap, polygons, cfg, state)
+    ground = _ground(emap, polygons, cfg, state, standing)
     values = ground.values
-    masks = (ground.cells.inside, ground.known, ground.unsafe)
-    counted, known, unsafe = (mask.flatten(-2).sum(-1, dtype=torch.int32) for mask in masks)
+    masks = (ground.cells.inside, ground.known, ground.unsafe, ground.assumed)
+    counted, known, unsafe, assumed = (mask.flatten(-2).sum(-1, dtype=torch.int32) for mask in masks)
     mean = values.flatten(-2).sum(-1) / known.clamp(min=1).to(values.dtype)
     number = counted.clamp(min=1).double()
-    share_unknown = torch.where(counted > 0, (counted - known) / number, 1.0).to(values.dtype)
+    share_unknown = torch.where(counted > 0, (counted - known - assumed) / number, 1.0).to(values.dtype)
     share_unsafe = (unsafe / number).to(values.dtype)
-    few = (share_unsafe <= cfg.max_unsafe) & (share_unknown <= cfg.max_unknown) & (known > 0)
-    return FootprintCheck(few & (mean >= cfg.min_traversability), mean, share_unknown, share_unsafe)
+    few = (share_unsafe <= cfg.max_unsafe) & (share_unknown <= cfg.max_unknown)
+    good = torch.where(known > 0, mean >= cfg.min_traversability, assumed > 0)
+    return FootprintCheck(few & good, mean, share_unknown, share_unsafe)
 
 
 def unsafe_area(
@@ -135,7 +142,13 @@ def unsafe_area(
     ]
 
 
-def _ground(emap: ElevationMap, polygons: Tensor, cfg: FootprintConfig, state: MapState | None) -> _Ground:
+def _ground(
+    emap: ElevationMap,
+    polygons: Tensor,
+    cfg: FootprintConfig,
+    state: MapState | None,
+    standing: Tensor | None = None,
+) -> _Ground:
     """Check the inputs and read the cells below the polygons."""
     rated = cfg.layer != "traversability" or emap.cfg.traversability is not None
     mend = "give ElevationMapConfig a TraversabilityConfig, or FootprintConfig another layer"
@@ -144,8 +157,12 @@ def _ground(emap: ElevationMap, polygons: Tensor, cfg: FootprintConfig, state: M
     uv, fits = _locate(emap, polygons, cfg, (emap.state if state is None else state).corner)
     cells = polygon_cells(torch.where(fits[..., None, None], uv, 0.0), cfg.cells(emap.cfg.grid) + 1)
     cells = cells._replace(inside=cells.inside & fits[..., None, None])
+    assumed = torch.zeros_like(cells.inside)
+    if standing is not None:
+        below = standing_cells(emap, standing, state) & ~known
+        assumed = _gather(values, below, cells, emap.cfg.grid)[1]
     values, known = _gather(values, known, cells, emap.cfg.grid)
-    return _Ground(cells, values, known, known & (values < cfg.unsafe_traversability))
+    return _Ground(cells, values, known, known & (values < cfg.unsafe_traversability), assumed)
 
 
 def _locate(emap: ElevationMap, polygons: Tensor, cfg: FootprintConfig, corner: Tensor) -> tuple[Tensor, Tensor]:

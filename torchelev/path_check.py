@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_pose, check_tensor, given_or_default, readable
+from torchelev.checks import given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
 from torchelev.footprint import FootprintCheck, FootprintConfig, check_footprint
-from torchelev.scan_patterns import heading
+from torchelev.standing import as_xy_yaw, at_poses, check_polygon
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def check_path(
     cfg: FootprintConfig | None = None,
     *,
     samples: int = 8,
+    standing: Float[Tensor, "B V 2"] | None = None,
     state: MapState | None = None,
 ) -> PathCheck:
     """Check the footprint at poses and between them, as `check_footprint` does.
@@ -52,6 +53,9 @@ def check_path(
         footprint: a polygon [m], base frame, convex or not.
         cfg: the thresholds.
         samples: how many footprints a segment has. More are needed the farther the poses lie apart.
+        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`): unknown ground
+            under them is assumed to carry the robot, as in `plan`. None: the footprint at the first pose. For a path
+            that begins elsewhere, give where the robot is, or NaN to assume nothing.
         state: of the maps; None: their own.
 
     Raises ValueError or TypeError for inputs that do not fit. Poses that are not finite or too far apart for `samples`
@@ -59,47 +63,30 @@ def check_path(
     the map has `check_values`.
     """
     cfg = given_or_default(FootprintConfig, cfg)
-    given = _as_xy_yaw(emap, poses)
-    footprint = _check_polygon(emap, footprint, cfg.max_extent)
+    given, polygon = as_xy_yaw(emap, poses), check_polygon(emap, footprint)
+    if readable(footprint, emap.check_values):
+        _refuse_wide(polygon, cfg.max_extent)
     require_count("samples", samples, "give 8")
     shift, turn = given[:, 1:, :2] - given[:, :-1, :2], _shorter_way(given[:, 1:, 2:] - given[:, :-1, 2:])
-    reach = torch.linalg.vector_norm(footprint, dim=-1).amax()
+    reach = torch.linalg.vector_norm(polygon, dim=-1).amax()
     way = torch.linalg.vector_norm(shift, dim=-1) + reach * turn[..., 0].abs()  # of no vertex is it longer
     step = way / (samples * emap.cfg.grid.resolution)
     if readable(poses, emap.check_values):
         _refuse(given, step, samples)
     places = _interpolate(given, torch.cat([shift, turn], -1), samples)
-    footprints = check_footprint(emap, _place(footprint, places), cfg, state=state)
+    polygons = at_poses(polygon, places)
+    standing = polygons[:, 0] if standing is None else standing
+    footprints = check_footprint(emap, polygons, cfg, standing=standing, state=state)
     near = (step <= 1 + ROUNDING).repeat_interleave(samples, 1)
     safe = footprints.safe & torch.cat([near.new_ones(len(near), 1), near], 1)
     return PathCheck(safe.all(1), _first_unsafe(safe, samples), places, footprints._replace(safe=safe))
 
 
-def _as_xy_yaw(emap: ElevationMap, poses: object) -> Float[Tensor, "B T 3"]:
-    """Check the poses and return them in float64."""
-    value = check_tensor("poses", poses, emap.device, FLOATS)
-    shape = tuple(value.shape)
-    fits = shape[:1] == (emap.num_envs,) and len(shape) > 1 and shape[1] >= 1 and shape[2:] in ((3,), (4, 4))
-    rule = f"expected ({emap.num_envs}, T, 3) or ({emap.num_envs}, T, 4, 4) with T >= 1"
-    require(fits, "poses", rule, shape, "give x, y, yaw, or 4 x 4 matrices")
-    if value.ndim == 3:
-        return value.detach().double()
-    T_map_base = check_pose("poses", value, shape, emap.device, emap.check_values).detach().double()
-    x, y = heading(T_map_base.flatten(0, 1)).unbind(-1)
-    return torch.cat([T_map_base[..., :2, 3], torch.atan2(y, x).view(*shape[:2], 1)], -1)
-
-
-def _check_polygon(emap: ElevationMap, footprint: object, most: float) -> Float[Tensor, "V 2"]:
-    value = check_tensor("footprint", footprint, emap.device, FLOATS)
-    fits = value.ndim == 2 and value.shape[0] >= 3 and value.shape[1] == 2
-    require(fits, "footprint", "expected (V, 2) with V >= 3", tuple(value.shape), "give its corners, base frame")
-    if readable(value, emap.check_values):
-        finite = bool(torch.isfinite(value).all())
-        require(finite, "footprint", "must be finite", "NaN or inf", "leave those vertices out")
-        widest = float(torch.pdist(value.detach().double()).max())
-        rule = f"must be no wider than max_extent = {most:g} m at any heading"
-        require(widest <= most * (1 + 1e-6), "footprint", rule, f"{widest:.6g} m", "enlarge it in FootprintConfig")
-    return value.detach().double()
+def _refuse_wide(footprint: Tensor, max_extent: float) -> None:
+    """Refuse a footprint that may not fit `max_extent` at some heading; this reads its values."""
+    widest = float(torch.pdist(footprint).max())
+    rule = f"must be no wider than max_extent = {max_extent:g} m at any heading"
+    require(widest <= max_extent * (1 + 1e-6), "footprint", rule, f"{widest:.6g} m", "enlarge it in FootprintConfig")
 
 
 def _refuse(given: Tensor, step: Tensor, samples: int) -> None:
@@ -122,14 +109,6 @@ def _interpolate(given: Tensor, change: Tensor, samples: int) -> Float[Tensor, "
     # Zero times NaN would reach the pose before.
     between = given[:, :-1, None] + share * torch.nan_to_num(change, 0.0, 0.0, 0.0)[:, :, None]
     return torch.cat([between.flatten(1, 2), given[:, -1:]], 1)
-
-
-def _place(footprint: Float[Tensor, "V 2"], places: Float[Tensor, "B M 3"]) -> Float[Tensor, "B M V 2"]:
-    """Return the footprint at each place, map frame."""
-    position, yaw = places[..., None, :2], places[..., 2:]
-    ahead = torch.stack([yaw.cos(), yaw.sin()], -1)
-    left = torch.stack([-yaw.sin(), yaw.cos()], -1)
-    return position + footprint[:, :1] * ahead + footprint[:, 1:] * left
 
 
 def _first_unsafe(safe: Bool[Tensor, "B M"], samples: int) -> Int[Tensor, "B"]:

@@ -10,21 +10,50 @@ from torch import Tensor
 from torchelev.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.cost_to_go import cost_to_go, descend
 from torchelev.elevation_map import ElevationMap
-from torchelev.errors import require
+from torchelev.errors import require, require_positive
+from torchelev.path_reason import Reason, at, find_reason
+from torchelev.standing import standing_cells
 from torchelev.state import MapState
-from torchelev.traversal_cost import TraversalCostConfig, traversal_cost
+from torchelev.traversal_cost import TraversalCostConfig, disc, traversal_cost
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
 class Path(NamedTuple):
-    """A way of at most K cells on each of B maps."""
+    """A path of at most K cells on each of B maps."""
 
-    xy: Float[Tensor, "B K 2"]  # [m] map frame, from the start on; the last place is repeated, the start if no way is
+    xy: Float[Tensor, "B K 2"]  # [m] map frame, from the start on; the last waypoint is repeated
     cost: Float[Tensor, "B"]  # [m] of easy ground that cost as much; inf if there is no way
     length: Float[Tensor, "B"]  # [m]
     reached: Bool[Tensor, "B"]  # it ends at the goal
+    count: Int[Tensor, "B"]  # type: ignore[assignment]  # waypoints before the repeats; 0 if the start is outside
+    reason: Int[Tensor, "B"]  # why it is not reached: a `Reason`; `explain` puts it into words
+
+    def poses(self, chord: float = 0.4) -> Float[Tensor, "B K 3"]:
+        """Return x, y [m] and yaw [rad] of each waypoint, as `check_path` takes them.
+
+        The yaw is the direction from `chord` / 2 [m] behind to as far ahead along the path, as far as it goes: single
+        cells turn by 45 degrees at a time. The last waypoint's pose is repeated like its place. The yaw is 0 where
+        there is only one waypoint. How the robot turns from where it looks now to the first yaw is not part of it.
+
+        Raises ValueError unless `chord` is positive.
+        """
+        require_positive(chord=chord)
+        steps = torch.linalg.vector_norm(self.xy[:, 1:] - self.xy[:, :-1], dim=-1)
+        along = torch.nn.functional.pad(steps.cumsum(1), (1, 0))
+        last = (self.count - 1).clamp(min=0)[:, None]
+        ahead = torch.searchsorted(along, along + chord / 2).minimum(last)
+        behind = (torch.searchsorted(along, along - chord / 2, right=True) - 1).clamp(min=0)
+        to, since = (self.xy.gather(1, k[..., None].expand(-1, -1, 2)) for k in (ahead, behind))
+        x, y = (to - since).unbind(-1)
+        poses = torch.cat([self.xy, torch.atan2(y, x)[..., None]], -1)
+        waypoint = torch.arange(self.xy.shape[1], device=last.device).minimum(last)
+        return poses.gather(1, waypoint[..., None].expand(-1, -1, 3))
+
+    def explain(self) -> list[str]:
+        """Return each `reason` as a sentence. The host waits for the device."""
+        return [Reason(code).sentence for code in self.reason.tolist()]
 
 
 def plan(
@@ -36,11 +65,13 @@ def plan(
     confidence: Float[Tensor, "B H W"] | None = None,
     max_cells: int | None = None,
     rounds: int | None = None,
+    standing: Float[Tensor, "B V 2"] | None = None,
     state: MapState | None = None,
 ) -> Path:
     """Find the cheapest way over each map from cell to cell, by `traversal_cost`.
 
-    The start's cell is passable, as is unknown ground around it (`stand_radius`).
+    The start's cell is passable, even if it is rated impassable: a robot may leave such ground, and `check_path` tells
+    of it. Unknown ground under the robot where it stands now is passable too (see `torchelev.standing`).
 
     Args:
         emap: the maps.
@@ -51,6 +82,8 @@ def plan(
         max_cells: K, of the longest way; None: twice the cells along x and y together. Of a longer way the first K
             cells come back, and `reached` is False.
         rounds: as of `cost_to_go`.
+        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`): give the same to
+            `check_path`. None: a disc of `stand_radius` around the start.
         state: of the maps; None: their own.
 
     Raises ValueError or TypeError for wrong shapes, dtypes and devices. Places outside of the window or not finite are
@@ -58,16 +91,22 @@ def plan(
     """
     cfg, grid = given_or_default(TraversalCostConfig, cfg), emap.cfg.grid
     current = emap.state if state is None else state
-    (start, starts), (goal, ends) = (
-        _cell(emap, *place, current) for place in (("start_xy", start_xy), ("goal_xy", goal_xy))
-    )
+    start, starts = _cell(emap, "start_xy", start_xy, current)
+    goal, goals = _cell(emap, "goal_xy", goal_xy, current)
     longest = 2 * (grid.height + grid.width) if max_cells is None else max_cells
-    cost = traversal_cost(emap, cfg, confidence=confidence, start=start, state=state)
-    value = cost_to_go(cost, _mark(goal, starts & ends, cost), resolution=grid.resolution, rounds=rounds)
+    cost = traversal_cost(emap, cfg, confidence=confidence, start=start, standing=standing, state=state)
+    target = disc(goal, cost, 0.0) & (starts & goals)[:, None, None]
+    value = cost_to_go(cost, target, resolution=grid.resolution, rounds=rounds)
     way = descend(value, cost, start, resolution=grid.resolution, max_cells=longest)
-    at_start = value.flatten(1).gather(1, (start[:, :1] * grid.width + start[:, 1:]))[:, 0]
+    reached = way.reached & starts
+    rated = emap._read("traversability", state)[1]
+    radius = cfg.stand_radius / grid.resolution
+    below = disc(start, cost, radius) if standing is None else standing_cells(emap, standing, state)
+    reason = find_reason(cost, value, rated, below, ((start, starts), (goal, goals)), reached)
     xy = (way.cells + current.corner[:, None]).double().add(0.5) * grid.resolution
-    return Path(xy, torch.where(starts, at_start, torch.inf), way.length, way.reached & starts)
+    moves = (way.cells[:, 1:] != way.cells[:, :-1]).any(-1).sum(1)
+    count = torch.where(starts, moves + 1, 0)
+    return Path(xy, torch.where(starts, at(value, start), torch.inf), way.length, reached, count, reason)
 
 
 def _cell(emap: ElevationMap, name: str, xy: object, state: MapState) -> tuple[Tensor, Tensor]:
@@ -83,9 +122,3 @@ def _cell(emap: ElevationMap, name: str, xy: object, state: MapState) -> tuple[T
         mend = f"windows are {grid.length_x:g} x {grid.length_y:g} m around emap.center; give a place in between"
         require(bool(inside.all()), name, "must lie in the window", came, mend)
     return torch.where(inside[:, None], cell, 0.0).to(torch.int64), inside
-
-
-def _mark(cell: Int[Tensor, "B 2"], there: Bool[Tensor, "B"], like: Tensor) -> Bool[Tensor, "B H W"]:
-    """Return a mask of one cell of each map, or of none."""
-    i, j = (torch.arange(size, device=like.device) for size in like.shape[1:])
-    return (i[None, :, None] == cell[:, 0, None, None]) & (j == cell[:, 1, None, None]) & there[:, None, None]

@@ -14,6 +14,7 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.layers import Layer
 from torchelev.operators import padded
+from torchelev.standing import standing_cells
 from torchelev.state import MapState
 from torchelev.windows import AROUND, shifted, window_maximum
 
@@ -33,7 +34,7 @@ class TraversalCostConfig:
     inclination_distance: float = 0.3  # [m] over which the inclination is taken: half of what the feet span
     weight_inclination: float = 1.0  # of unknown ground at max_inclination
     inflation_radius: float = 0.0  # [m] by which what is impassable grows; 0 for ratings that count the robot's size
-    stand_radius: float = 0.4  # [m] around a path's start unknown ground is passable: the robot stands on it
+    stand_radius: float = 0.4  # [m] around a path's start the robot stands, if no `standing` footprint is given
 
     def __post_init__(self) -> None:
         whole = isinstance(self.cross_unknown, bool)
@@ -55,15 +56,18 @@ def traversal_cost(
     *,
     confidence: Float[Tensor, "B H W"] | None = None,
     start: Int[Tensor, "B 2"] | None = None,
+    standing: Float[Tensor, "B V 2"] | None = None,
     state: MapState | None = None,
 ) -> Float[Tensor, "B H W"]:
     """Return what each cell costs for each metre of way: at least 1, inf where it is impassable.
 
     With traversability t, its confidence q and the inclination a of the upper bound (`inclination`), of ground that is
 
-        known:        1 + w_t (1 - t)      + w_c (1 - q)   impassable where t < min_traversability
-        only bounded: 1 + w_a a / max_a    + w_c           impassable where a > max_inclination
-        neither:      impassable
+        rated:             1 + w_t (1 - t)      + w_c (1 - q)   impassable where t < min_traversability
+        known or bounded:  1 + w_a a / max_a    + w_c           impassable where a > max_inclination, or is unknown
+        neither:           impassable
+
+    Ground of known elevation but unknown traversability is not rated: its elevation is its upper bound.
 
     Behind an edge, rays that passed over it bound the unseen ground. The nearer the robot, the steeper they look down,
     and ground that they still do not meet falls more steeply than they: a steep bound means a drop, a gentle one
@@ -73,7 +77,9 @@ def traversal_cost(
         emap: the maps.
         cfg: thresholds and weights.
         confidence: of the traversability, 0 to 1; None: the learned head's own, else 1.
-        start: cell (i, j) on which each robot stands: it is passable, as is unknown ground within `stand_radius`.
+        start: cell (i, j) on which each robot stands: it is passable, even if it is rated impassable.
+        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`): unrated ground
+            under them is passable. None: within `stand_radius` of `start`.
         state: of the maps; None: their own.
 
     Raises ValueError or TypeError for a confidence that does not fit, and a map whose traversability is switched off.
@@ -90,7 +96,8 @@ def traversal_cost(
         fits = tuple(confidence.shape) == shape
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
     rated, bound = emap._read("traversability", state), emap._read("upper_bound", state)
-    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start)
+    ground = None if standing is None else standing_cells(emap, standing, state)
+    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, ground)
 
 
 def cost_of_layers(
@@ -100,10 +107,12 @@ def cost_of_layers(
     cfg: TraversalCostConfig,
     confidence: Tensor | None = None,
     start: Int[Tensor, "B 2"] | None = None,
+    standing: Bool[Tensor, "B H W"] | None = None,
 ) -> Float[Tensor, "B H W"]:
     """Return `traversal_cost` of layers: the traversability, and the upper bound, which is the elevation where known.
 
-    Each is values and where they are known, (B, H, W) both. What a layer holds where it is not known does not count.
+    `standing` marks the cells on which the robots stand now. Each layer is values and where they are known, (B, H, W)
+    both. What a layer holds where it is not known does not count.
     """
     t, known = rated
     doubt = torch.zeros_like(t) if confidence is None else 1 - confidence.to(t.dtype).nan_to_num(0.0).clamp(0, 1)
@@ -115,20 +124,22 @@ def cost_of_layers(
         gentle = tells & ~known & (angle <= cfg.max_inclination)
         cost = torch.where(gentle, guess, cost)
     cells = round(cfg.inflation_radius / resolution)
-    if start is None:
-        return _inflated(cost, cells)
-    away = _squared_distance(start, cost)
-    # Before what is impassable grows: unknown ground below the robot must not cage it.
-    cost = _opened(cost, ~known & (away <= (cfg.stand_radius / resolution) ** 2), cfg)
-    return _opened(_inflated(cost, cells), away == 0, cfg)
+    if standing is None and start is not None:
+        standing = disc(start, cost, cfg.stand_radius / resolution)
+    if standing is not None:
+        # Before what is impassable grows: unknown ground below the robot must not cage it.
+        cost = _opened(cost, ~known & standing, cfg)
+    cost = _inflated(cost, cells)
+    return cost if start is None else _opened(cost, disc(start, cost, 0.0), cfg)
 
 
 def inclination(bound: Layer, resolution: float, distance: float) -> Layer:
     """Return how steeply a surface rises or falls around each cell [rad], and where it is known.
 
     atan max_k |u_k - u| / d_k over eight places, `distance` [m] away along x, y and the diagonals to the nearest cell,
-    as far as they are known. Known where the cell and one of those are. Over the span of its feet a robot crosses a
-    step of some height as it does a slope; a steeper place in between does not count.
+    as far as they are known. Known where the cell is, and those along two perpendicular directions: one direction says
+    nothing of the slope across it. Over the span of its feet a robot crosses a step of some height as it does a slope;
+    a steeper place in between does not count.
     """
     known = bound[1]
     values = torch.where(known, bound[0], 0.0)
@@ -136,14 +147,21 @@ def inclination(bound: Layer, resolution: float, distance: float) -> Layer:
     aslant = max(1, round(reach / math.sqrt(2)))
     offsets = [(i * n, j * n) for i, j in AROUND for n in [aslant if i and j else reach]]
     height, there = (padded(layer, reach, 0.0) for layer in (values, known.to(values.dtype)))
-    steepest, found = torch.zeros_like(values), torch.zeros_like(known)
-    for i, j in offsets:
+    steepest = torch.zeros_like(values)
+    axes = {axis: torch.zeros_like(known) for axis in ((1, 0), (0, 1), (1, 1), (1, -1))}
+    for (i, j), axis in zip(offsets, map(_axis, AROUND), strict=True):
         step = shifted(height, reach, i, j) - values
         other = shifted(there, reach, i, j)
         steepest = torch.maximum(steepest, step.abs() * other / (math.hypot(i, j) * resolution))
-        found = found | (other > 0)
-    found = found & known
+        axes[axis] = axes[axis] | (other > 0)
+    found = known & ((axes[1, 0] & axes[0, 1]) | (axes[1, 1] & axes[1, -1]))
     return torch.where(found, torch.atan(steepest), 0.0), found
+
+
+def _axis(step: tuple[int, int]) -> tuple[int, int]:
+    """Return the direction of a step, without its sign."""
+    i, j = step
+    return (i, j) if (i, j) > (0, 0) else (-i, -j)
 
 
 def _inflated(cost: Tensor, radius: int) -> Float[Tensor, "B H W"]:
@@ -155,11 +173,11 @@ def _inflated(cost: Tensor, radius: int) -> Float[Tensor, "B H W"]:
     return torch.where(near > 0, torch.inf, cost)
 
 
-def _squared_distance(start: Int[Tensor, "B 2"], like: Tensor) -> Int[Tensor, "B H W"]:
-    """Return the squared distance [cells^2] of each cell from `start`."""
-    i = torch.arange(like.shape[1], device=like.device)[None, :, None] - start[:, 0, None, None]
-    j = torch.arange(like.shape[2], device=like.device)[None, None, :] - start[:, 1, None, None]
-    return i.square() + j.square()
+def disc(center: Int[Tensor, "B 2"], like: Tensor, radius: float) -> Bool[Tensor, "B H W"]:
+    """Mark the cells (i, j) within `radius` [cells] of each map's `center`."""
+    i = torch.arange(like.shape[1], device=like.device)[None, :, None] - center[:, 0, None, None]
+    j = torch.arange(like.shape[2], device=like.device)[None, None, :] - center[:, 1, None, None]
+    return i.square() + j.square() <= radius**2
 
 
 def _opened(cost: Tensor, cells: Bool[Tensor, "B H W"], cfg: TraversalCostConfig) -> Float[Tensor, "B H W"]:
