@@ -47,7 +47,7 @@ def test_refuses(position, quat, named):
 
 def test_takes_numpy_and_lists():
     half = 0.5**0.5
-    expected = transform(torch.tensor([[1.0, 2, 3]]).double(), torch.tensor([[half, 0, 0, half]]).double())
+    expected = transform(torch.tensor([[1.0, 2, 3]]).double(), torch.tensor([[half, 0, 0, half]], dtype=torch.float64))
     for give in (np.asarray, list):
         assert torch.equal(transform(give([[1, 2, 3]]), give([[half, 0, 0, half]])), expected)
     single = transform(np.ones(3, np.float32), np.array([1, 0, 0, 0], np.float32))

@@ -262,8 +262,8 @@ def test_refuses_a_header_of_other_types(path, changes, message):
         load_map(path)
 
 
-@pytest.mark.parametrize("values", [np.full((2, 12, 10), "a"), np.ones((2, 12, 10), complex), np.ones((2, 12, 10), bool)])
+@pytest.mark.parametrize("values", ["a", 1j, True])
 def test_refuses_arrays_of_other_kinds(path, values):
-    rewrite(path, variance=values)
+    rewrite(path, variance=np.full((2, 12, 10), values))
     with pytest.raises(ValueError, match=r"map\.npz, variance: expected numbers of kind 'f'"):
         load_map(path)

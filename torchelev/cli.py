@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev import __version__
-from torchelev.io import MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
+from torchelev.io import FileLayout, MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
 from torchelev.io.config_file import load_config
 from torchelev.io.report import hints, summary, warnings
 from torchelev.output_files import require_writable
@@ -116,6 +116,11 @@ def main() -> None:
 @click.option("--extrinsics", metavar="FILE|NUMBERS", help="T_base_sensor: file or quoted text, 12 numbers (3x4).")
 @click.option("--poses-of", type=click.Choice(["sensor", "base"]), default="sensor", show_default=True,
               help="Whose poses the file has; 'base' needs --extrinsics.")  # fmt: skip
+@click.option("--bin-layout", metavar="LAYOUT", help="Of .bin: float32x5, float64x4, ...  [default: float32x4]")
+@click.option("--quaternions", type=click.Choice(["xyzw", "wxyz"]), help="Their order in a TUM file.  [default: xyzw]")
+@click.option("--time-unit", type=click.Choice(["s", "ms", "us", "ns"]), help="Of a TUM file's times.  [default: s]")
+@click.option("--pcd-frame", type=click.Choice(["sensor", "viewpoint"]),
+              help="Frame of PCD points: the sensor's, or that in which VIEWPOINT gives its pose.")  # fmt: skip
 def map_command(**options: Any) -> None:
     """Map, and turn what went wrong into one line and an exit code."""
     try:
@@ -159,12 +164,17 @@ def run_map(
     sensor_height: float | None,
     extrinsics: str | None,
     poses_of: str,
+    bin_layout: str | None,
+    quaternions: Literal["xyzw", "wxyz"] | None,
+    time_unit: Literal["s", "ms", "us", "ns"] | None,
+    pcd_frame: Literal["sensor", "viewpoint"] | None,
 ) -> int:
     """Do what `map` says; return the exit code. Raises ValueError for bad input."""
     mount = None if extrinsics is None else read_transform(extrinsics)
     check_options(mount, sensor_height, poses_of, dt)
     options = MapOptions(T_base_sensor=mount, sensor_height=sensor_height, fixed=fixed)
-    scans = open_recording(recording, poses, intrinsics, dt)
+    layout = FileLayout(bin=bin_layout, quaternions=quaternions, time_unit=time_unit, pcd_frame=pcd_frame)
+    scans = open_recording(recording, poses, intrinsics, dt, layout)
     scans = scans.moved(mount) if poses_of == "base" and mount is not None else scans
     emap = new_map(load_config(config, resolution, size), device, options)
     prefix, run = output_prefix(out, emap), MappingRun(emap)
