@@ -315,6 +315,117 @@ def test_a_wrong_frame_is_pointed_out(run, recording, tmp_path):
     assert "no point fell into the map: check that poses take sensor points into a z-up map frame" in err
 
 
+def test_a_second_map_in_the_recordings_folder_takes_the_same_scans(run, recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(recording)
+    for scans in (recording / "scans", recording):
+        for _ in range(2):
+            code, out, err = run("map", ".", "--size", 4)
+            assert code == 0 and "4 of 4" in out, err
+        for path in scans.glob("*.bin"):  # the second time round, beside the maps
+            path.rename(recording / path.name)
+
+
+def test_the_folder_scans_wins(run, recording):
+    np.save(recording / "other.npy", np.zeros((5, 3)))
+    (recording / "more").mkdir()
+    np.save(recording / "more" / "other.npy", np.zeros((5, 3)))
+    code, out, err = run("map", recording, "--size", 4)
+    assert code == 0 and "4 of 4, 80,000 points" in out, err
+
+
+def test_maps_of_depth_images_beside_them(run, tmp_path):
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((60, 80), 2000, np.uint16))
+    write_poses(tmp_path / "poses.txt", np.array([[0.0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])[None])
+    (tmp_path / "camera.yaml").write_text("{fx: 60, fy: 60, cx: 39.5, cy: 29.5}")
+    for _ in range(2):
+        code, out, err = run("map", ".", "--intrinsics", "camera.yaml", "--size", 4)
+        assert code == 0 and "1 of 1" in out, err
+
+
+def test_a_dangling_link_is_no_gap(run, recording):
+    path = recording / "scans" / "000001.bin"
+    path.unlink()
+    path.symlink_to("gone.bin")
+    poses = sensor_poses()[[0, 2, 3]]  # as many as files that can be read
+    write_poses(recording / "poses.txt", poses)
+    code, _, err = run("map", recording)
+    assert code == 2 and "000001.bin: a link to a file that does not exist" in err
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".png", ".ply"])
+@pytest.mark.parametrize("blocked", ["folder", "device"])
+def test_outputs_are_checked_before_mapping(run, recording, tmp_path, monkeypatch, suffix, blocked):
+    monkeypatch.setattr("torchelev.cli.fuse_all", lambda *args: pytest.fail("mapped"))
+    path = tmp_path / f"map{suffix}"
+    path.mkdir() if blocked == "folder" else path.symlink_to("/dev/full")
+    code, _, err = run("map", recording)
+    assert code == 2 and err.count("\n") == 1 and f"map{suffix}: cannot be written (it is a {blocked}" in err
+    assert run("map", recording, "--out", "/dev/full")[0] == 2
+
+
+def test_the_size_limit_is_checked_before_mapping(recording, tmp_path):
+    (tmp_path / "map.npz").write_bytes(b"older")
+    command = f"ulimit -f 20; exec {sys.executable} -m torchelev map {recording} --out {tmp_path / 'map'}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "the size limit of files (ulimit -f) is 0.0205 MB" in done.stderr
+    assert (tmp_path / "map.npz").read_bytes() == b"older"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive", "map.npz"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".png", ".ply"])
+def test_what_cannot_be_written_is_kept_elsewhere(run, recording, tmp_path, monkeypatch, suffix):
+    from torchelev import output_files
+
+    assert run("map", recording, "--size", 4)[0] == 0
+    older = (tmp_path / f"map{suffix}").read_bytes()
+    rename, kept_at = os.replace, tmp_path / "kept"
+
+    def full_disk(source, target):
+        if str(target) == str(tmp_path / f"map{suffix}"):
+            raise OSError(28, "No space left on device")
+        rename(source, target)
+
+    kept_at.mkdir()
+    monkeypatch.setattr(output_files.os, "replace", full_disk)
+    monkeypatch.setattr("tempfile.tempdir", str(kept_at))
+    code, out, err = run("map", recording, "--size", 5)
+    (kept,) = kept_at.glob(f"*/map{suffix}")
+    assert code == 2 and f"map{suffix}: cannot be written (No space left on device)" in err
+    assert f"kept in {kept}" in err and str(kept) in out
+    assert (tmp_path / f"map{suffix}").read_bytes() == older and kept.stat().st_size > 1000
+    assert not [path for path in tmp_path.iterdir() if path.suffix == ".tmp"]
+    assert load_npz(kept if suffix == ".npz" else tmp_path / "map.npz").layers["elevation"].shape == (50, 50)
+
+
+def test_what_was_mapped_before_any_error_is_kept(run, recording, tmp_path, monkeypatch):
+    read = Recording.__getitem__
+
+    def get(self, k):
+        if k == 2:
+            raise MemoryError("no memory")
+        return read(self, k)
+
+    monkeypatch.setattr(Recording, "__getitem__", get)
+    with pytest.raises(MemoryError):
+        main(["map", str(recording), "--size", "4"], standalone_mode=False)
+    assert np.isfinite(load_npz(tmp_path / "map.partial.npz").layers["elevation"]).any()
+
+
+def test_out_may_have_the_suffix_of_an_output(run, recording, tmp_path):
+    assert run("map", recording, "--size", 2, "--out", "course.npz")[0] == 0
+    assert sorted(path.name for path in tmp_path.glob("course*")) == ["course.npz", "course.ply", "course.png"]
+
+
+def test_layouts_by_option(run, recording, tmp_path):
+    for path in (recording / "scans").iterdir():
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        np.column_stack([points, np.arange(len(points)) % 32]).astype(np.float32).tofile(path)
+    code, _, err = run("map", recording, "--size", 8)
+    assert code == 2 and "000000.bin: does not look like KITTI's" in err and "nothing was mapped yet" in err
+    assert run("map", recording, "--size", 8, "--bin-layout", "float32x5")[0] == 0
+    assert value_at(load_npz(tmp_path / "map.npz"), 2.5, 1.5) == pytest.approx(0.4, abs=0.01)
+
+
 def test_help_tells_a_newcomer_what_to_give(run):
     code, out, _ = run("map", "--help")
     assert code == 0

@@ -45,6 +45,18 @@ def test_refuses(position, quat, named):
         transform(position, quat)
 
 
+def test_takes_numpy_and_lists():
+    half = 0.5**0.5
+    expected = transform(torch.tensor([[1.0, 2, 3]]).double(), torch.tensor([[half, 0, 0, half]], dtype=torch.float64))
+    for give in (np.asarray, list):
+        assert torch.equal(transform(give([[1, 2, 3]]), give([[half, 0, 0, half]])), expected)
+    single = transform(np.ones(3, np.float32), np.array([1, 0, 0, 0], np.float32))
+    assert single.dtype == torch.float32
+    assert transform([0, 0, 1], [1, 0, 0, 0]).is_floating_point()
+    with pytest.raises(ValueError, match="position: must be numbers"):
+        transform(["a", "b", "c"], [1, 0, 0, 0])
+
+
 def test_refuses_nan():
     with pytest.raises(ValueError, match="quat_wxyz"):
         transform(torch.zeros(3), torch.full((4,), torch.nan))

@@ -20,7 +20,7 @@ from torchelev import (
     RaycastConfig,
     SensorConfig,
 )
-from torchelev.export import load_map, save_map, save_npz
+from torchelev.export import load_map, load_npz, save_map, save_npz
 from torchelev.filters import FilterConfig, register
 from torchelev.map_file import FORMAT, VERSION, read_npz
 from torchelev.state import MapState, Statistics
@@ -225,3 +225,45 @@ def test_a_save_that_fails_leaves_the_older_file(path, monkeypatch):
     with pytest.raises(OSError, match="no space"):
         save_map(path, emap)
     assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("save, load", [(save_map, load_map), (save_npz, load_npz)])
+def test_a_damaged_file_is_a_value_error_that_names_it(tmp_path, save, load):
+    """Truncations and flipped bits all over the file; what cannot be noticed may load."""
+    path, rng = tmp_path / "map.npz", np.random.default_rng(0)
+    save(path, mapped())
+    whole, refused = path.read_bytes(), 0
+    damaged = [whole[:cut] for cut in rng.integers(0, len(whole), 60)]
+    for place in rng.integers(0, len(whole), 300):
+        damaged.append(whole[:place] + bytes([whole[place] ^ (1 << int(rng.integers(8)))]) + whole[place + 1 :])
+    for content in damaged:
+        path.write_bytes(content)
+        try:
+            load(path)
+        except ValueError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > 0.8 * len(damaged)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(head={"cells": 3}), r"map\.npz: "),
+        (dict(head=3), r"map\.npz: "),
+        (dict(config=[1]), r"map\.npz: "),
+        (dict(config={"grid": 3}), r"map\.npz: "),
+        (dict(dtype=["float32"]), r"map\.npz: must be of float16"),
+    ],
+)
+def test_refuses_a_header_of_other_types(path, changes, message):
+    rewrite_header(path, **changes)
+    with pytest.raises(ValueError, match=message):
+        load_map(path)
+
+
+@pytest.mark.parametrize("values", ["a", 1j, True])
+def test_refuses_arrays_of_other_kinds(path, values):
+    rewrite(path, variance=np.full((2, 12, 10), values))
+    with pytest.raises(ValueError, match=r"map\.npz, variance: expected numbers of kind 'f'"):
+        load_map(path)

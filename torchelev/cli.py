@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
 import sys
+import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev import __version__
-from torchelev.io import MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
+from torchelev.io import FileLayout, MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
 from torchelev.io.config_file import load_config
 from torchelev.io.report import hints, summary, warnings
+from torchelev.output_files import require_writable
 
 if TYPE_CHECKING:
     from torchelev.config import ElevationMapConfig
     from torchelev.elevation_map import ElevationMap
 
 BAD_INPUT, INTERRUPTED = 2, 130
+SUFFIXES = (".npz", ".png", ".ply")
+MESH_BYTES = 50  # per cell of a `.ply`: a vertex of 24 and two triangles of 13
 
 MAP_HELP = """Map RECORDING, a folder of scans with poses, and write the map.
 
@@ -113,6 +116,11 @@ def main() -> None:
 @click.option("--extrinsics", metavar="FILE|NUMBERS", help="T_base_sensor: file or quoted text, 12 numbers (3x4).")
 @click.option("--poses-of", type=click.Choice(["sensor", "base"]), default="sensor", show_default=True,
               help="Whose poses the file has; 'base' needs --extrinsics.")  # fmt: skip
+@click.option("--bin-layout", metavar="LAYOUT", help="Of .bin: float32x5, float64x4, ...  [default: float32x4]")
+@click.option("--quaternions", type=click.Choice(["xyzw", "wxyz"]), help="Their order in a TUM file.  [default: xyzw]")
+@click.option("--time-unit", type=click.Choice(["s", "ms", "us", "ns"]), help="Of a TUM file's times.  [default: s]")
+@click.option("--pcd-frame", type=click.Choice(["sensor", "viewpoint"]),
+              help="Frame of PCD points: the sensor's, or that in which VIEWPOINT gives its pose.")  # fmt: skip
 def map_command(**options: Any) -> None:
     """Map, and turn what went wrong into one line and an exit code."""
     try:
@@ -156,15 +164,20 @@ def run_map(
     sensor_height: float | None,
     extrinsics: str | None,
     poses_of: str,
+    bin_layout: str | None,
+    quaternions: Literal["xyzw", "wxyz"] | None,
+    time_unit: Literal["s", "ms", "us", "ns"] | None,
+    pcd_frame: Literal["sensor", "viewpoint"] | None,
 ) -> int:
     """Do what `map` says; return the exit code. Raises ValueError for bad input."""
     mount = None if extrinsics is None else read_transform(extrinsics)
     check_options(mount, sensor_height, poses_of, dt)
     options = MapOptions(T_base_sensor=mount, sensor_height=sensor_height, fixed=fixed)
-    scans = open_recording(recording, poses, intrinsics, dt)
+    layout = FileLayout(bin=bin_layout, quaternions=quaternions, time_unit=time_unit, pcd_frame=pcd_frame)
+    scans = open_recording(recording, poses, intrinsics, dt, layout)
     scans = scans.moved(mount) if poses_of == "base" and mount is not None else scans
     emap = new_map(load_config(config, resolution, size), device, options)
-    prefix, run = output_prefix(out), MappingRun(emap)
+    prefix, run = output_prefix(out, emap), MappingRun(emap)
     return finish(run, len(scans), prefix, fuse_all(run, scans, options), options)
 
 
@@ -198,21 +211,36 @@ def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> Ele
         raise ValueError(f"--device {device}: {reason}; use cpu, or a torch built for that device") from error
 
 
-def output_prefix(out: str) -> Path:
-    """PREFIX as given, or `map` in a folder. Raises ValueError now, not after hours of mapping, if it cannot be."""
+def output_prefix(out: str, emap: ElevationMap) -> Path:
+    """PREFIX as given, less a suffix of its files, or `map` in a folder.
+
+    Raises ValueError or WriteError now, not after hours of mapping, if a map of this size cannot be written there.
+    """
+    import matplotlib  # noqa: F401  # what writing needs is missed now
+    import plyfile  # noqa: F401
+
     path = Path(out)
     prefix = path / "map" if path.is_dir() or out.endswith(("/", "\\")) else path
+    prefix = prefix.with_suffix("") if prefix.suffix in SUFFIXES else prefix
     try:
         prefix.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"--out {out}: cannot make the folder {prefix.parent} ({error.strerror})") from error
-    if not os.access(prefix.parent, os.W_OK):
-        raise ValueError(f"--out {out}: may not write into {prefix.parent}")
+    if prefix.exists() and not prefix.is_file():
+        raise ValueError(f"--out {out}: is a device or a pipe; give a folder, or the start of a file's name")
+    cells = emap.cfg.grid.height * emap.cfg.grid.width
+    for path, per_cell in zip(output_paths(prefix), (4 * len(emap.layers), 0, MESH_BYTES), strict=True):
+        require_writable(path, per_cell * cells)
     return prefix
 
 
+def output_paths(prefix: Path) -> list[Path]:
+    """PREFIX with each suffix."""
+    return [prefix.with_name(prefix.name + suffix) for suffix in SUFFIXES]
+
+
 def fuse_all(run: MappingRun, scans: Recording, options: MapOptions) -> BaseException | None:
-    """Fuse scan after scan; return what stopped it before the end, a Ctrl-C or a file that cannot be read."""
+    """Fuse scan after scan; return what stopped it before the end, so that what was mapped can be written first."""
     bases = base_poses(scans.T_map_sensor, options.T_base_sensor, options.sensor_height)
     sensors = scans.T_map_sensor[:, :3, 3]
     middle = (sensors.min(axis=0) + sensors.max(axis=0)) / 2
@@ -222,14 +250,14 @@ def fuse_all(run: MappingRun, scans: Recording, options: MapOptions) -> BaseExce
         for k, frame in enumerate(_progress(scans)):
             with whole_scans():
                 run.add(frame, None if options.fixed else bases[k])
-    except (KeyboardInterrupt, RecordingError) as reason:
+    except (KeyboardInterrupt, Exception) as reason:
         return reason
     return None
 
 
 @contextmanager
 def whole_scans() -> Iterator[None]:
-    """Hold a Ctrl-C back until the block is done: a map that is stored by half is no map."""
+    """Hold a Ctrl-C back until the block is done: a scan that is fused by half is no map, nor is half a file."""
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread alone
         yield
         return
@@ -251,40 +279,75 @@ def _progress(scans: Recording) -> Iterator:
 
 
 def finish(run: MappingRun, total: int, prefix: Path, stopped: BaseException | None, options: MapOptions) -> int:
-    """Write and report what there is; return the exit code."""
+    """Write and report what there is; return the exit code, or raise what stopped the mapping."""
     kept = f"kept the map of {run.num_scans} of {total} scans" if run.num_scans else "nothing was mapped yet"
-    if isinstance(stopped, RecordingError):
+    if isinstance(stopped, Exception):
         prefix = prefix.with_name(f"{prefix.name}.partial")  # an earlier, whole map stays
+    failed: list[str] = []
     if run.num_scans:
-        files = write_outputs(run, prefix)
+        try:
+            with whole_scans():
+                files, failed = write_outputs(run, prefix)
+        except KeyboardInterrupt as reason:
+            stopped = stopped or reason
         click.echo("\n".join(summary(run, total) + hints(run, options.fixed, options.knows_base)))
         click.echo("wrote     " + "  ".join(map(str, files)))
+    for line in failed:
+        click.echo(f"Error: {line}", err=True)
     if isinstance(stopped, KeyboardInterrupt):
         click.echo(f"interrupted: {kept}", err=True)
         return INTERRUPTED
-    if stopped is not None:
+    if isinstance(stopped, RecordingError | OSError):
         raise OneLineError(f"{stopped}; {kept}")
+    if stopped is not None:
+        click.echo(f"stopped by an error: {kept}", err=True)
+        raise stopped
+    if failed:
+        return BAD_INPUT
     for line in warnings(run):
         click.echo(f"warning: {line}", err=True)
     return 0
 
 
-def write_outputs(run: MappingRun, prefix: Path) -> list[Path]:
-    """Write the map's `.npz`, `.png` and `.ply`; return their paths."""
+def write_outputs(run: MappingRun, prefix: Path) -> tuple[list[Path], list[str]]:
+    """Write the map's `.npz`, `.png` and `.ply`, where one fails in another folder; return paths, and what failed."""
+    from torchelev import export
+
+    writers = (lambda path: export.save_npz(path, run.emap), lambda path: save_picture(path, run, prefix.name),
+               lambda path: export.save_mesh(path, run.emap))  # fmt: skip
+    files, failed = [], []
+    for path, write in zip(output_paths(prefix), writers, strict=True):
+        try:
+            write(path)
+            files.append(path)
+        except (OSError, ModuleNotFoundError) as error:  # one that fails must not take the others with it
+            kept = keep_elsewhere(path.name, write) if isinstance(error, OSError) else None
+            files += [] if kept is None else [kept]
+            failed.append(f"{error}; " + ("not kept" if kept is None else f"kept in {kept}"))
+    return files, failed
+
+
+def keep_elsewhere(name: str, write: Callable[[Path], object]) -> Path | None:
+    """Write a file into the first of the usual folders that takes it; return its path, None if none does."""
+    for base in (Path(tempfile.gettempdir()), Path.cwd(), Path.home(), Path("/dev/shm")):
+        try:
+            folder = Path(tempfile.mkdtemp(prefix="torchelev-", dir=base))
+        except OSError:
+            continue
+        try:
+            write(folder / name)
+            return folder / name
+        except OSError:
+            folder.rmdir()
+    return None
+
+
+def save_picture(path: Path, run: MappingRun, title: str) -> None:
+    """Draw the layers that tell most, and the sensor's path."""
     from torchelev import export
     from torchelev.io.report import map_panels
     from torchelev.plot import save_layers
 
-    npz, png, ply = (prefix.with_name(prefix.name + suffix) for suffix in (".npz", ".png", ".ply"))
-    export.save_npz(npz, run.emap)
     saved = export.take(run.emap)
-    path_xy = np.array(run.sensor_xy)
-    save_layers(
-        png,
-        map_panels(saved.layers, tuple(run.emap.filters.inputs)),
-        extent=saved.extent,
-        path_xy=path_xy,
-        title=prefix.name,
-    )
-    export.save_mesh(ply, run.emap)
-    return [npz, png, ply]
+    panels = map_panels(saved.layers, tuple(run.emap.filters.inputs))
+    save_layers(path, panels, extent=saved.extent, path_xy=np.array(run.sensor_xy), title=title)

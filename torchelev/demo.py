@@ -20,6 +20,7 @@ from tqdm import tqdm
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.grid import GridConfig
+from torchelev.output_files import MARK, atomic_file, require_writable
 from torchelev.sim import Box, DepthCamera, Scene, Trajectory, mount, outliers, range_noise, walk
 from torchelev.sim.scenes import block, steps, waves
 
@@ -150,7 +151,10 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
         out: the picture to write.
         seconds: of simulated time to walk; None: the whole course (about 30 s).
         progress: show a progress bar.
+
+    Raises WriteError, before the walk, if the picture cannot be written.
     """
+    require_writable(out)
     torch.manual_seed(0)
     scene, generator = course(), torch.Generator().manual_seed(0)
     path = walk(scene, ROUTE, speed=SPEED, dt=DT, T_base_sensor=T_BASE_CAMERA)
@@ -203,7 +207,10 @@ def draw(out: str | Path, emap: ElevationMap, scene: Scene, walked: Tensor, t: f
     for name, x, y in LANDMARKS:
         box = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
         figure.axes[0].text(x, y, name, color="white", fontsize=7, ha="center", va="center", bbox=box)
-    figure.savefig(out, dpi=110, bbox_inches="tight", pad_inches=0.1)
+    kind = Path(out).suffix.removeprefix(".") or "png"
+    metadata = {"Software": MARK} if kind == "png" else None
+    with atomic_file(out) as file:
+        figure.savefig(file, format=kind, metadata=metadata, dpi=110, bbox_inches="tight", pad_inches=0.1)
 
 
 def make_panels(emap: ElevationMap, truth: Tensor) -> list[Panel]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from torchelev.errors import require
 from torchelev.map_file import as_array, load_map, read_npz, save_map
+from torchelev.output_files import MARK, atomic_file
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
@@ -34,6 +35,8 @@ __all__ = [
 
 AXES = "layer[i, j]: i grows with +x, j with +y of the map frame; cell centre = center + (i + 0.5 - H/2) * resolution"
 FACTS = ("resolution", "center", "axes", "config")  # what an .npz holds beside the layers
+
+MEND = "write it with save_npz"
 
 
 class SavedMap(NamedTuple):
@@ -83,18 +86,26 @@ def save_npz(path: str | Path, emap: ElevationMap, env: int = 0) -> None:
     require(not clash, "layers", rule, ", ".join(clash), "rename the filter's layer")
     config = np.array(json.dumps(saved.config))
     arrays: dict[str, Any] = dict(saved.layers, resolution=saved.resolution, center=saved.center, axes=AXES)
-    with Path(path).open("wb") as file:  # a file object: numpy appends .npz to names that lack it
+    with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
         np.savez_compressed(file, config=config, **arrays)
 
 
 def load_npz(path: str | Path) -> SavedMap:
     """Read what `save_npz` wrote. Raises ValueError if the file holds no map."""
-    arrays = read_npz(path, "write it with save_npz")
+    arrays = read_npz(path, MEND)
     missing = set(FACTS) - set(arrays)
     if missing:
-        raise ValueError(f"{path}: no map, {', '.join(sorted(missing))} missing; write it with save_npz")
+        raise ValueError(f"{path}: no map, {', '.join(sorted(missing))} missing; {MEND}")
     facts = {name: arrays.pop(name) for name in FACTS}
-    resolution, config = float(facts["resolution"]), json.loads(str(facts["config"]))
+    shapes = {array.shape for array in arrays.values()}
+    require(len(shapes) == 1 and len(next(iter(shapes))) == 2, str(path), "must hold layers (H, W)", shapes, MEND)
+    try:
+        resolution, config = float(facts["resolution"]), json.loads(str(facts["config"]))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: damaged resolution or config ({error}); {MEND}") from error
+    center = facts["center"]
+    good = isinstance(config, dict) and resolution > 0 and center.shape == (3,) and center.dtype.kind == "f"
+    require(good, str(path), "must have a resolution, a center (3,) and a config", "others", MEND)
     return SavedMap(arrays, resolution, facts["center"], config, str(facts["axes"]))
 
 
@@ -168,4 +179,5 @@ def _write_ply(path: str | Path, vertices: NDArray, triangles: NDArray | None = 
         face = np.zeros(len(triangles), dtype=[("vertex_indices", "i4", (3,))])
         face["vertex_indices"] = triangles
         elements.append(plyfile.PlyElement.describe(face, "face"))
-    plyfile.PlyData(elements).write(str(path))
+    with atomic_file(path) as file:
+        plyfile.PlyData(elements, comments=[f"written by {MARK}"]).write(file)

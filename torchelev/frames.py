@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchelev.errors import require
@@ -13,11 +15,17 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-def transform(position: Float[Tensor, "B 3"], quat_wxyz: Float[Tensor, "B 4"]) -> Float[Tensor, "B 4 4"]:
+def transform(
+    position: Float[Tensor, "B 3"] | ArrayLike, quat_wxyz: Float[Tensor, "B 4"] | ArrayLike
+) -> Float[Tensor, "B 4 4"]:
     """Return T_a_b (..., 4, 4) of a frame b at `position` [m], turned by the unit quaternion (w, x, y, z).
+
+    NumPy arrays and lists are taken too, and give a tensor in CPU memory: of the arrays' precision, of float64 for
+    lists and whole numbers.
 
     Raises ValueError for shapes that do not fit and, for CPU tensors, for a quaternion that is not normalised.
     """
+    position, quat_wxyz = _floats("position", position), _floats("quat_wxyz", quat_wxyz)
     came = f"{tuple(position.shape)} and {tuple(quat_wxyz.shape)}"
     fits = position.shape[-1:] == (3,) and quat_wxyz.shape == (*position.shape[:-1], 4)
     require(fits, "position, quat_wxyz", "must be (..., 3) and (..., 4)", came, "give one quaternion per position")
@@ -33,3 +41,12 @@ def transform(position: Float[Tensor, "B 3"], quat_wxyz: Float[Tensor, "B 4"]) -
         [torch.zeros_like(w), torch.zeros_like(w), torch.zeros_like(w), torch.ones_like(w)],
     ]
     return torch.stack([torch.stack(torch.broadcast_tensors(*row), -1) for row in rows], -2)
+
+
+def _floats(name: str, values: Tensor | ArrayLike) -> Tensor:
+    """Return a tensor as it is, all else as a floating-point tensor of its own."""
+    if isinstance(values, Tensor):
+        return values
+    array = np.array(values)
+    require(array.dtype.kind in "fiu", name, "must be numbers", array.dtype, "give a tensor or a NumPy array")
+    return torch.from_numpy(array if array.dtype.kind == "f" else array.astype(np.float64))

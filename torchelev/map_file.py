@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ from torchelev import checks
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.output_files import atomic_file
 from torchelev.pipeline import rate_surface
 from torchelev.state import MapState, Statistics
 from torchelev.traversability_net import TraversabilityNet
@@ -33,21 +32,16 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
 
     The file is an `.npz` without pickled objects: `header` (JSON: format, version, dtype, config), each field of
     `MapState` by its name, and each of `Statistics` as `last_<name>`; NaN-free, as the map holds them; and the learned
-    head's weights, if there is one, as `head_<name>`.
+    head's weights, if there is one, as `head_<name>`. Raises WriteError, an OSError, if the file cannot be written; an
+    older one is whole then.
     """
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
     header |= {"head": None if emap.head is None else emap.head.config}
     arrays: dict[str, Any] = {name: as_array(value) for name, value in _tensors(emap.state).items()}
     arrays |= {f"head_{name}": as_array(value) for name, value in _head(emap).items()}
-    text, path = np.array(json.dumps(header)), Path(path)
-    unfinished = path.with_name(f"{path.name}.tmp")
-    try:
-        with unfinished.open("wb") as file:  # a file object: numpy appends .npz to names that lack it
-            np.savez_compressed(file, header=text, **arrays)
-        os.replace(unfinished, path)  # whatever fails before leaves an older map whole
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
 
 def load_map(
@@ -66,11 +60,11 @@ def load_map(
     try:
         head = None if header.get("head") is None else TraversabilityNet(**header["head"]).requires_grad_(False)
         emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, head=head)
-    except ValueError as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
     emap = emap.to(DTYPES[header["dtype"]])
     for name, value in _head(emap).items():
-        found = _array(path, arrays, f"head_{name}", tuple(value.shape))
+        found = _array(path, arrays, f"head_{name}", value, tuple(value.shape))
         value.copy_(torch.from_numpy(found))
     state = _state(path, arrays, emap.state, ids, header["version"])
     if header["version"] < VERSION:
@@ -98,8 +92,9 @@ def read_npz(path: str | Path, mend: str) -> dict[str, NDArray]:
         try:
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
-        except (zipfile.BadZipFile, zlib.error, ValueError, EOFError) as error:
-            raise ValueError(f"{path}: damaged, or no .npz file ({error}); {mend}") from error
+        except Exception as error:  # what zipfile, zlib and numpy raise depends on which byte is damaged
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise ValueError(f"{path}: damaged, or no .npz file ({reason}); {mend}") from error
 
 
 def _tensors(state: MapState) -> dict[str, Tensor]:
@@ -122,13 +117,14 @@ def _header(path: str | Path, arrays: dict[str, NDArray]) -> dict[str, Any]:
     known = isinstance(version, int) and 1 <= version <= VERSION
     require(known, str(path), f"must be of format version 1 to {VERSION}", version, "read it with a newer torchelev")
     kinds = ", ".join(DTYPES)
-    require(header.get("dtype") in DTYPES, str(path), f"must be of {kinds}", header.get("dtype"), "save it again")
+    require(str(header.get("dtype")) in DTYPES, str(path), f"must be of {kinds}", header.get("dtype"), "save it again")
     return header
 
 
 def _num_envs(path: str | Path, arrays: dict[str, NDArray]) -> int:
     corner = arrays.get("corner")
-    require(corner is not None and corner.ndim == 2, str(path), "must have a corner (B, 2)", "none", "save it again")
+    fits = corner is not None and corner.ndim == 2 and len(corner) > 0
+    require(fits, str(path), "must have a corner (B, 2)", "none", "save it again")
     assert corner is not None
     return len(corner)
 
@@ -152,13 +148,18 @@ def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Te
         if version < VERSION and name in NEW_LAYERS:
             values[name] = blank[:1].expand(len(ids), *blank.shape[1:])
             continue
-        values[name] = torch.from_numpy(_array(path, arrays, name, (B, *blank.shape[1:])))[ids]
+        values[name] = torch.from_numpy(_array(path, arrays, name, blank, (B, *blank.shape[1:])))[ids]
     statistics = Statistics(*(values.pop(f"last_{name}") for name in Statistics._fields))
     return MapState(statistics=statistics, **values)
 
 
-def _array(path: str | Path, arrays: dict[str, NDArray], name: str, shape: tuple[int, ...]) -> NDArray:
-    """Return an array of the file, which must have this shape."""
+def _array(
+    path: str | Path, arrays: dict[str, NDArray], name: str, like: Tensor, shape: tuple[int, ...]
+) -> NDArray:
+    """Return an array of the file, which must have this shape, numbers of the kind in `like`."""
     require(name in arrays, str(path), f"must have {name}", "none", "save it again")
-    require(arrays[name].shape == shape, f"{path}, {name}", f"expected {shape}", arrays[name].shape, "save it again")
-    return arrays[name]
+    array, where = arrays[name], f"{path}, {name}"
+    require(array.shape == shape, where, f"expected {shape}", array.shape, "save it again")
+    kind = "f" if like.is_floating_point() else "b" if like.dtype == torch.bool else "i"
+    require(array.dtype.kind == kind, where, f"expected numbers of kind '{kind}'", array.dtype, "save it again")
+    return array

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from torchelev.errors import require, require_count, require_positive
-from torchelev.plot import UNKNOWN_COLOR, Panel, limits
+from torchelev.output_files import atomic_file
+from torchelev.plot import UNKNOWN_COLOR, Panel, limits, png_info
 
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 # Sizes in pixels.
@@ -70,7 +71,8 @@ def save_image(
         picture = _beside(picture, _color_bar(colors, f"{low:.3g} {unit}", f"{high:.3g} {unit}", picture.height))
     if scale_bar:
         picture = _below(picture, _scale_bar(shape[0] * resolution, scale / resolution))
-    picture.save(path, format="png", optimize=True)
+    with atomic_file(path) as file:
+        picture.save(file, format="png", optimize=True, pnginfo=png_info())
 
 
 def round_length(longest: float) -> float:

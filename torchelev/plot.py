@@ -18,6 +18,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from torchelev.output_files import MARK, atomic_file
 
 UNKNOWN_COLOR = "#d9d9d9"
 MAX_BYTES = 300_000
@@ -53,7 +56,8 @@ def save_layers(
     drawn over every panel, its last point as a dot. Raises ValueError if there is no panel or one is not 2-D.
     """
     figure = draw_layers(panels, extent=extent, path_xy=path_xy, title=title)
-    Path(path).write_bytes(_small_png(figure))
+    with atomic_file(path) as file:
+        file.write(_small_png(figure))
 
 
 def draw_layers(
@@ -143,6 +147,13 @@ def _label_outer(axes, columns: int) -> None:
             ax.tick_params(labelbottom=True)
 
 
+def png_info() -> PngInfo:
+    """Return the entry that tells whose picture a PNG is."""
+    info = PngInfo()
+    info.add_text("Software", MARK)
+    return info
+
+
 def _small_png(figure: Figure) -> bytes:
     """PNG below `MAX_BYTES`: in full colour if that fits, else with a palette (bands in the bars), then coarser."""
     for dpi, colors in ((110, None), (90, None), (100, 256), (75, 256), (55, 256)):
@@ -150,7 +161,7 @@ def _small_png(figure: Figure) -> bytes:
         figure.savefig(raw, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.1)
         picture = Image.open(raw).convert("RGB")
         picture = picture.quantize(colors, dither=Image.Dither.NONE) if colors else picture
-        picture.save(small, format="png", optimize=True)
+        picture.save(small, format="png", optimize=True, pnginfo=png_info())
         if small.tell() < MAX_BYTES:
             break
     return small.getvalue()

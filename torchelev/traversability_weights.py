@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import message, require
+from torchelev.output_files import atomic_file
 from torchelev.robot import RobotConfig
 from torchelev.traversability_features import NUM_FEATURES
 
@@ -110,7 +111,8 @@ def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotCon
 
 def write_weights(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
     """Write a head's config and weights."""
-    torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, path)
+    with atomic_file(path) as file:
+        torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, file)
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

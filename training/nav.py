@@ -13,6 +13,7 @@ import torch
 from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.config import PERCEPTION
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
+from torchelev.output_files import atomic_file
 from training.nav_evaluate import evaluate, picture
 from training.nav_export import export
 from training.runner import CHECKPOINT, ResumableRunner
@@ -124,7 +125,8 @@ def finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) ->
     picture(policy, task_config(held_out=True), out / "episode.png", runner.device)
     export(runner, out)
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
-    (out / "result.json").write_text(json.dumps({"training": training, "evaluation": result}, indent=1) + "\n")
+    with atomic_file(out / "result.json") as file:
+        file.write((json.dumps({"training": training, "evaluation": result}, indent=1) + "\n").encode())
     click.echo(f"Wrote result.json, episode.png, policy.pt and policy.onnx to {out}.")
     return result
 

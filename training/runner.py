@@ -15,6 +15,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tqdm import tqdm
 
 from torchelev.errors import require
+from torchelev.output_files import atomic_file
 
 CHECKPOINT = "checkpoint.pt"
 LOGGED = ("tot_timesteps", "tot_time", "rewbuffer", "lenbuffer", "cur_reward_sum", "cur_episode_length")
@@ -82,9 +83,8 @@ class ResumableRunner(OnPolicyRunner):
 
     def _save_whole(self, folder: Path) -> None:
         whole = self.alg.save() | {"iter": self.current_learning_iteration, "infos": self._snapshot()}
-        target = self._own(folder / CHECKPOINT)
-        torch.save(whole, target.with_suffix(".tmp"))
-        os.replace(target.with_suffix(".tmp"), target)  # a kill meanwhile leaves the older one
+        with atomic_file(self._own(folder / CHECKPOINT)) as file:
+            torch.save(whole, file)
 
     def _own(self, path: Path) -> Path:
         """Return this process's checkpoint beside the first one's."""

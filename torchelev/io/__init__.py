@@ -7,11 +7,13 @@ they are read (``pip install 'torchelev[io]'``).
 from torchelev.io.clouds import read_cloud
 from torchelev.io.depth import Intrinsics, read_depth, read_intrinsics
 from torchelev.io.errors import RecordingError
+from torchelev.io.layout import FileLayout
 from torchelev.io.mapping import MappingRun, base_poses
 from torchelev.io.poses import Poses, read_poses, read_transform
 from torchelev.io.recording import Frame, Recording, open_recording
 
 __all__ = [
+    "FileLayout",
     "Frame",
     "Intrinsics",
     "MappingRun",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
+from torchelev.io.layout import ORDERS, FileLayout, quaternion_order, seconds
 
 KITTI_COLUMNS, TUM_COLUMNS = 12, 8
 # Files rounded to three decimals are off by 0.001 or so; a matrix further off than this is something else.
@@ -25,19 +26,22 @@ class Poses(NamedTuple):
     times: NDArray[np.float64] | None  # (T,) [s]
 
 
-def read_poses(path: str | Path) -> Poses:
+def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:
     """Read a KITTI or TUM file. Blank lines and lines that start with '#' do not count; commas are spaces.
 
-    Rotations are replaced by the nearest rotation matrix, since files rounded to a few decimals exist. Raises
-    RecordingError with the line number where a line is no pose.
+    Rotations are replaced by the nearest rotation matrix, since files rounded to a few decimals exist. `layout` says
+    the order of quaternions and the unit of times. Raises RecordingError with the line number where a line is no pose,
+    and for quaternions that look like w x y z.
     """
-    path = Path(path)
+    path, layout = Path(path), layout or FileLayout()
     numbers, rows = _read_rows(path)
     if rows.shape[1] == KITTI_COLUMNS:
         matrices = rows.reshape(-1, 3, 4)
         return Poses(_rigid(path, numbers, matrices[:, :, :3], matrices[:, :, 3]), None)
-    rotations = _from_quaternions(path, numbers, rows[:, 4:])
-    return Poses(_rigid(path, numbers, rotations, rows[:, 1:4]), rows[:, 0])
+    comments = "\n".join(line.partition("#")[2] for line in _text(path).splitlines())
+    order = quaternion_order(path, comments, rows[:, 4:], layout.quaternions)
+    rotations = _from_quaternions(path, numbers, rows[:, 4:][:, ORDERS[order]])
+    return Poses(_rigid(path, numbers, rotations, rows[:, 1:4]), seconds(path, rows[:, 0], layout.time_unit))
 
 
 def _read_rows(path: Path) -> tuple[list[int], NDArray[np.float64]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, overload
 
@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from torchelev.io.clouds import CLOUD_READERS, known_formats, read_cloud
 from torchelev.io.depth import Intrinsics, check_size, read_depth, read_intrinsics
 from torchelev.io.errors import RecordingError
+from torchelev.io.layout import FileLayout, require_plausible_steps
 from torchelev.io.poses import Poses, read_poses
+from torchelev.output_files import is_own_output
 
 # Files that lie beside scans and are none; anything else that we cannot read is reported, not skipped.
 BESIDE_SCANS = {"", ".txt", ".csv", ".json", ".yaml", ".yml", ".md", ".log", ".png", ".jpg", ".jpeg"}
 POSE_FILES = ("poses.txt", "groundtruth.txt")
+SCANS_FOLDER = "scans"  # wins over scans beside it
 TIME_TOLERANCE = 0.02  # [s] between a scan named by its time and its pose, as TUM's own tools allow
 
 
@@ -63,30 +66,37 @@ def open_recording(
     poses: str | Path | None = None,
     intrinsics: str | Path | None = None,
     dt: float | None = None,
+    layout: FileLayout | None = None,
 ) -> Recording:
     """Open a folder of scans, or of depth PNGs if `intrinsics` is given.
 
-    `folder` holds the scans or one sub-folder that does. `poses` defaults to a `poses.txt` there or one folder up.
+    `folder` holds `scans/`, the scans themselves or one sub-folder that does; maps and pictures that this package wrote
+    are no scans. `poses` defaults to a `poses.txt` there or one folder up.
     Scans in the order of their names (numbers by value) take the poses in the order of their lines; a file with more
     poses than scans is indexed by the scans' numbers, and scans named by their time take the pose nearest in time, at
-    most 20 ms off. `dt` [s] is the time between scans; None takes it from the poses' times, or 0.1. Raises
-    RecordingError if a scan has no pose, a file cannot be read or there is nothing to read.
+    most 20 ms off. `dt` [s] is the time between scans; None takes it from the poses' times, or 0.1. `layout` says what
+    files do not say of themselves. Raises RecordingError if a scan has no pose, a file cannot be read or looks like
+    another layout, or there is nothing to read.
     """
+    layout = layout or FileLayout()
     camera = None if intrinsics is None else read_intrinsics(intrinsics)
     files = find_scans(Path(folder), depth=camera is not None)
     pose_file = Path(poses) if poses is not None else _find_poses(Path(folder))
-    matrices, times = _assign(files, pose_file, read_poses(pose_file))
-    read = read_cloud if camera is None else lambda path: _depth_points(path, camera)
+    matrices, times = _assign(files, pose_file, read_poses(pose_file, layout))
+
+    def read(path: Path) -> NDArray:
+        return read_cloud(path, layout) if camera is None else _depth_points(path, camera)
+
     return Recording(files, matrices, _steps(files, pose_file, times, dt), read)
 
 
 def find_scans(folder: Path, depth: bool = False) -> list[Path]:
-    """Scans of `folder`, or of its one sub-folder that has some, in natural order (scan_2 before scan_10)."""
+    """Scans of `folder`/scans, of `folder` or of its one sub-folder with some, in natural order (2 before 10)."""
     if not folder.is_dir():
         problem = "is a file, not a folder" if folder.exists() else "no such folder"
         raise RecordingError(folder, problem, "give the folder that holds the scans")
-    for place in (folder, *_subfolders(folder, depth)):
-        files = [path for path in place.iterdir() if path.is_file() and not path.name.startswith(".")]
+    for place in _places(folder, depth):
+        files = [path for path in place.iterdir() if _is_candidate(path)]
         scans = [path for path in files if _is_scan(path, depth)]
         if scans:
             _refuse_others(scans, [] if depth else files)
@@ -97,6 +107,25 @@ def find_scans(folder: Path, depth: bool = False) -> list[Path]:
     found = sorted({path.suffix or path.name for path in folder.rglob("*") if path.is_file()})
     problem = f"holds no scan, only {' '.join(found[:8])}" if found else "holds no scan"
     raise RecordingError(folder, problem, f"expected files of one format among {wanted}")
+
+
+def _places(folder: Path, depth: bool) -> Iterator[Path]:
+    """Where scans may be, by precedence."""
+    own = folder / SCANS_FOLDER
+    if own.is_dir() and any(_is_scan(path, depth) for path in own.iterdir()):
+        yield own
+    yield folder
+    yield from _subfolders(folder, depth)
+
+
+def _is_candidate(path: Path) -> bool:
+    """Tell whether a path is a file that may be a scan. Raises RecordingError for a link that leads nowhere."""
+    if path.name.startswith("."):
+        return False
+    is_data = path.suffix.lower() in CLOUD_READERS or path.suffix.lower() == ".png"
+    if is_data and path.is_symlink() and not path.exists():
+        raise RecordingError(path, "a link to a file that does not exist", "copy the file, or remove link and pose")
+    return path.is_file() and not is_own_output(path)
 
 
 def _subfolders(folder: Path, depth: bool) -> list[Path]:
@@ -110,7 +139,7 @@ def _subfolders(folder: Path, depth: bool) -> list[Path]:
 
 def _is_scan(path: Path, depth: bool) -> bool:
     suffixes = {".png"} if depth else CLOUD_READERS.keys()
-    return path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
+    return path.suffix.lower() in suffixes and _is_candidate(path)
 
 
 def _refuse_unreadable(files: list[Path], depth: bool) -> None:
@@ -199,6 +228,8 @@ def _steps(files: list[Path], pose_file: Path, times: NDArray | None, dt: float 
     if (steps < 0).any():
         scan = files[int((steps < 0).argmax())].name
         raise RecordingError(pose_file, f"the pose of scan {scan} is older than that of the scan before it", "sort it")
+    if dt is None and times is not None:
+        require_plausible_steps(pose_file, steps)
     return steps
 
 

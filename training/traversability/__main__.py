@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from torchelev.output_files import atomic_file
 from torchelev.robot import RobotConfig
 from training.traversability.data import data_set
 from training.traversability.evaluate import evaluate, table
@@ -77,7 +78,8 @@ def finish(
     net = trainer.net.eval()
     net.save(out / "weights.pt")
     result = evaluate({out.name: net}, data, num_batches, cfg, paper_weights)
-    (out / "result.json").write_text(json.dumps({"training": trainer.settings, **result}, indent=1) + "\n")
+    with atomic_file(out / "result.json") as file:
+        file.write((json.dumps({"training": trainer.settings, **result}, indent=1) + "\n").encode())
     click.echo(table(result))
     others = {name: score for name, score in baselines(paper_weights).items() if name in SHOWN}
     held_out = data_set(data, "held_out", num_batches, 0, cfg, KINDS, 0.04)

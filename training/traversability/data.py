@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +16,7 @@ from tqdm import tqdm
 
 from torchelev import ElevationMap
 from torchelev.errors import require
+from torchelev.output_files import atomic_file
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
 from training.traversability.labels import stand
@@ -156,9 +156,8 @@ def data_set(
 
 def save_atomically(values: dict[str, Any], path: Path) -> None:
     """Write a file by `torch.save`, so that a kill meanwhile leaves the older one."""
-    unfinished = path.with_suffix(f".tmp{os.getpid()}")  # another process may make the same
-    torch.save(values, unfinished)
-    os.replace(unfinished, path)
+    with atomic_file(path) as file:
+        torch.save(values, file)
 
 
 def _load(path: Path, settings: dict[str, Any]) -> MappedTerrain:
