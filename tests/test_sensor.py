@@ -164,17 +164,62 @@ def test_depth_to_points_takes_intrinsics_for_each_image():
     torch.testing.assert_close(points[1, :, 0], points[0, :, 0] / 2)
 
 
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64])
+def test_integer_depth_takes_a_scale(dtype):
+    units = torch.tensor([[[0, 1, 90], [100, 120, 127]]], dtype=dtype)
+    K = torch.tensor([[2.5, 0, 1.2], [0, 2.5, 0.4], [0, 0, 1]], dtype=torch.float64)
+    points = depth_to_points(units, K, scale=0.01)
+    assert points.dtype == torch.float32
+    metres = units.to(torch.float64) * 0.01
+    torch.testing.assert_close(points.double(), depth_to_points(metres, K), equal_nan=True, atol=1e-6, rtol=0)
+    with pytest.raises(ValueError, match=r"scale: is required for integer depth, got None; .*0\.001"):
+        depth_to_points(units, K)
+
+
+def test_a_scale_of_floats_counts():
+    depth = torch.tensor([[1500.0, 2000.0]])
+    metres = depth_to_points(depth / 1000, torch.eye(3))
+    torch.testing.assert_close(depth_to_points(depth, torch.eye(3), scale=0.001), metres)
+
+
+@pytest.mark.parametrize("along", ["z", "ray"])
+def test_opengl_cameras_look_along_minus_z(along):
+    """A camera that looks straight down has no rotation in OpenGL's axes, and half a turn about x in optical ones."""
+    depth, K = torch.rand(2, 3, 4, dtype=torch.float64) + 0.5, torch.eye(3, dtype=torch.float64)
+    K[0, 2] = 1.3
+    optical, opengl = (depth_to_points(depth, K, along, frame=frame) for frame in ("optical", "opengl"))
+    torch.testing.assert_close(opengl, optical * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    emap = small_map(2, dtype=torch.float64)
+    m = emap.measure(opengl, pose(num_envs=2), None, dt=0.0)
+    turned = emap.measure(optical, pose(roll=np.pi, num_envs=2), None, dt=0.0)
+    torch.testing.assert_close(m.points, turned.points)
+    assert (m.points[..., 2] < 1).all() and m.casts.all()
+
+
 @pytest.mark.parametrize(
-    "arguments, named",
+    "arguments, options, message",
     [
-        ((torch.ones(4, 4), torch.eye(3), "x"), "along"),
-        ((torch.ones(4), torch.eye(3)), "depth"),
-        ((torch.ones(4, 4), torch.eye(4)), "intrinsics"),
+        ((torch.ones(4, 4), torch.eye(3), "x"), {}, "along"),
+        ((torch.ones(4), torch.eye(3)), {}, "depth"),
+        ((torch.ones(2, 4, 5, 1), torch.eye(3)), {}, r"depth: expected .*, got \(2, 4, 5, 1\); .*squeeze"),
+        ((torch.ones(4, 5, 1), torch.eye(3)), {}, "depth: expected"),
+        ((torch.ones(4, 4), torch.eye(4)), {}, "intrinsics"),
+        ((torch.ones(2, 1, 4, 5), torch.eye(3).repeat(2, 1, 1)), {}, r"intrinsics: expected .*\(2, 1, 3, 3\)"),
+        ((torch.ones(2, 4, 5), torch.eye(3).repeat(3, 1, 1)), {}, "intrinsics"),
+        ((torch.ones(4, 5), torch.eye(3)[None]), {}, "intrinsics"),
+        ((torch.ones(4, 4), torch.eye(3)), dict(frame="gl"), "frame"),
+        ((torch.ones(4, 4), torch.eye(3)), dict(scale=0.0), "scale"),
+        ((torch.ones(4, 4), torch.eye(3)), dict(scale=torch.nan), "scale"),
     ],
 )
-def test_depth_to_points_refuses(arguments, named):
-    with pytest.raises(ValueError, match=named):
-        depth_to_points(*arguments)
+def test_depth_to_points_refuses(arguments, options, message):
+    with pytest.raises(ValueError, match=message):
+        depth_to_points(*arguments, **options)
+
+
+def test_depth_to_points_refuses_masks():
+    with pytest.raises(TypeError, match="depth: must be floats or integers"):
+        depth_to_points(torch.ones(4, 4, dtype=torch.bool), torch.eye(3), scale=1.0)
 
 
 @given(SEEDS, st.sampled_from([torch.float32, torch.float64]), st.floats(0.2, 2.0))
@@ -191,12 +236,57 @@ def test_voxel_filter_agrees_with_the_reference(seed, dtype, size):
         assert max(nearest) < 1e-5
 
 
+@given(SEEDS, st.integers(1, 80))
+def test_voxel_filter_keeps_the_nearest_voxels(seed, max_points):
+    cloud = random_cloud(np.random.default_rng(seed), (2, 60), torch.float64)
+    filtered = voxel_filter(cloud, 0.7, max_points)
+    assert filtered.shape == (2, max_points, 3)
+    for b in range(2):
+        means = sorted(reference.voxel_means(cloud[b].numpy(), 0.7).values(), key=np.linalg.norm)[:max_points]
+        np.testing.assert_allclose(filtered[b, : len(means)], means, atol=1e-9)
+        assert filtered[b, len(means) :].isnan().all()
+
+
+def test_voxel_filter_favours_no_side():
+    """Of a ring of points around the sensor, those left are as many ahead as behind."""
+    angle = torch.arange(400) * (2 * torch.pi / 400) + 0.001
+    r = torch.linspace(1, 4, 20)[:, None]
+    cloud = torch.stack([r * angle.cos(), r * angle.sin(), torch.full_like(r * angle, -0.5)], -1).view(1, -1, 3)
+    kept = voxel_filter(cloud, 0.1, 1000)[0]
+    assert kept.isfinite().all() and abs((kept[:, 0] > 0).double().mean() - 0.5) < 0.02
+    assert kept.norm(dim=-1).diff().min() > -1e-6
+
+
+def test_voxel_filter_in_half_precision_tells_far_from_near():
+    """Squares of 300 m do not fit float16."""
+    cloud = torch.tensor([[[400.0, 0, 0], [300.0, 0, 0]]], dtype=torch.float16)
+    assert voxel_filter(cloud, 1.0, 1)[0, 0, 0] == 300
+
+
 def test_voxel_filter_pads_or_drops_to_max_points():
-    cloud = torch.tensor([[[0.0, 0, 0], [5.0, 0, 0], [9.0, 0, 0]]])
-    assert voxel_filter(cloud, 1.0, 2)[0, :, 0].tolist() == [0, 5]
+    cloud = torch.tensor([[[9.0, 0, 0], [-5.0, 0, 0], [0.0, 0, 0]]])
+    assert voxel_filter(cloud, 1.0, 2)[0, :, 0].tolist() == [0, -5]
     assert voxel_filter(cloud, 1.0, 5)[0, :, 0].isnan().tolist() == [False, False, False, True, True]
-    with pytest.raises(ValueError, match="size"):
-        voxel_filter(cloud, 0.0)
+
+
+@pytest.mark.parametrize(
+    "arguments, error, named",
+    [
+        ((torch.ones(1, 2, 3), 0.0), ValueError, "size"),
+        ((torch.ones(1, 2, 3), 1.0, 0), ValueError, "max_points"),
+        ((torch.ones(1, 2, 3), 1.0, 2.5), ValueError, "max_points"),
+        ((torch.ones(2, 3), 1.0), ValueError, "points"),
+        ((torch.ones(1, 2, 3, dtype=torch.int32), 1.0), TypeError, "points"),
+    ],
+)
+def test_voxel_filter_refuses(arguments, error, named):
+    with pytest.raises(error, match=named):
+        voxel_filter(*arguments)
+
+
+def test_gradient_of_voxel_filter():
+    cloud = torch.rand(1, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: voxel_filter(p, 0.6, 4), (cloud,))
 
 
 def test_an_off_axis_sensor_pose():

@@ -57,7 +57,7 @@ def compensate(
     suits = state.validity & (state.traversability >= gate) & (state.variance <= cfg.max_variance)
     # On a slope the height within a cell depends on where in the cell the point lies.
     x, y = center_offsets(state, m, grid)
-    gx, gy = state.gradient_x.detach(), state.gradient_y.detach()
+    gx, gy = state.gradient_x, state.gradient_y
     at_origin = state.elevation - gx * x - gy * y
     # Cells that do not suit get a height that no point is near.
     ground, gx, gy = cells.take(lifted(at_origin, ~suits), gx, gy)

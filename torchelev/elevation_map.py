@@ -98,13 +98,13 @@ class ElevationMap(nn.Module):
         """The maps' buffers as one value. They change with the next update; clone what you keep."""
         buffers = cast("dict[str, Tensor]", self._buffers)  # reading attributes takes five times as long
         layers = {name: buffers[name] for name in MapState._fields[:-1]}
-        return MapState(**layers, statistics=self.statistics)
+        statistics = Statistics(*(buffers[f"last_{name}"] for name in Statistics._fields))
+        return MapState(**layers, statistics=statistics)
 
     @property
     def statistics(self) -> Statistics:
-        """What the last update did, as (B,) tensors."""
-        buffers = cast("dict[str, Tensor]", self._buffers)
-        return Statistics(*(buffers[f"last_{name}"] for name in Statistics._fields))
+        """What the last update did, as fresh (B,) tensors."""
+        return Statistics(*(value.clone() for value in self.state.statistics))
 
     def _store(self, state: MapState) -> None:
         # Copied, not rebound: see the rules on deepcopy and inference mode in CONTRIBUTING.md.
@@ -227,7 +227,11 @@ class ElevationMap(nn.Module):
         return measure(*inputs, self.cfg.grid, self.cfg.sensor, self.elevation.dtype)
 
     def forward(self, state: MapState, measurement: Measurement) -> MapState:
-        """Fuse a measurement into a state and return the new one; touches no buffer (paper, Fig. 2)."""
+        """Fuse a measurement into a state and return the new one; touches no buffer (paper, Fig. 2).
+
+        The returned tensors share no memory with the arguments. Differentiable in both by reverse mode, also under
+        `torch.func.grad`, `vjp` and `jacrev`. Raises NotImplementedError under `torch.func.jvp` and `vmap`.
+        """
         checks.require_full_precision(state.elevation.dtype)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
         new = fuse_measurement(state, measurement, self.cfg, self._weights)

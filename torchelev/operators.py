@@ -167,7 +167,7 @@ def _polar_minimum_backward(ctx, grad: Tensor) -> tuple[None, Tensor, None, None
     rank = torch.empty_like(values, dtype=torch.float64)
     rank = rank.scatter(1, order, torch.arange(number, device=values.device, dtype=torch.float64).expand(order.shape))
     lowest = _polar_minimum(index, rank, azimuths, widen, ranges, float(number)).flatten(1).to(torch.int64)
-    by_rank = grad.new_zeros(grad.shape[0], number + 1).scatter_add(1, lowest, grad.flatten(1))
+    by_rank = grad.new_zeros(grad.shape[0], number + 1).scatter_add(1, lowest, grad.reshape(lowest.shape))
     return None, by_rank[:, :number].gather(1, rank.to(torch.int64)), None, None, None, None
 
 
