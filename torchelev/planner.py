@@ -35,7 +35,8 @@ class Path(NamedTuple):
 
         The yaw is the direction from `chord` / 2 [m] behind to as far ahead along the path, as far as it goes: single
         cells turn by 45 degrees at a time. The last waypoint's pose is repeated like its place. The yaw is 0 where
-        there is only one waypoint. How the robot turns from where it looks now to the first yaw is not part of it.
+        there is only one waypoint. How the robot turns from where it looks now to the first yaw is not part of it. Ask
+        `reached` first: where it is False, `check_path` checks the poses up to where the path ends.
 
         Raises ValueError unless `chord` is positive.
         """
