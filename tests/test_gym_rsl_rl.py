@@ -166,6 +166,7 @@ class OfArrays(gymnasium.Env):
         return np.array([self.episode, 0.0]), {}
 
     def step(self, action):
+        assert isinstance(action, np.ndarray)
         self.count += 1
         return np.array([self.episode, self.count], float), 1.0 + action[0], False, self.count >= self.length, {}
 

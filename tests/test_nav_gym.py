@@ -94,6 +94,12 @@ def test_an_ended_episode_begins_anew_in_the_same_step(limit, length):
         assert bool(((final[:, 2] - goal).abs() < 0.1).all()), "a step from the goal's distance before"
 
 
+def test_final_observations_can_be_left_out():
+    env = gymnasium.make_vec(ID, num_envs=1, cfg=CFG, autoreset_mode=AutoresetMode.SAME_STEP, final_obs=False)
+    env.reset(seed=4)
+    assert "final_obs" not in env.step(torch.zeros(1, 2))[-1]
+
+
 def test_refuses_an_autoreset_mode():
     with pytest.raises(ValueError, match="autoreset_mode: must be NEXT_STEP or SAME_STEP, got AutoresetMode.DISABLED"):
         gymnasium.make_vec(ID, num_envs=1, cfg=CFG, autoreset_mode=AutoresetMode.DISABLED)

@@ -84,7 +84,8 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
     An environment whose episode ended begins the next one in the following step, whose action it ignores
     (`AutoresetMode.NEXT_STEP`). In SAME_STEP it begins in the step that ends the last one; `final_obs` of `info` is
     then where the robots ended, by the maps of one look before. With `critic` observations have "truth". A `task` takes
-    the place of `num_envs`, `cfg`, `perception`, `device` and `compiled`, and is seeded already.
+    the place of `num_envs`, `cfg`, `perception`, `device` and `compiled`, and is seeded already. `final_obs=False`
+    saves reading the maps twice in each step.
     """
 
     metadata: dict[str, Any] = {
@@ -106,6 +107,7 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         critic: bool = False,
         task: TerrainNav | None = None,
+        final_obs: bool = True,
     ) -> None:
         modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
         is_known = autoreset_mode in modes
@@ -113,6 +115,7 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         self.task = TerrainNav(cfg, num_envs, device, perception, compiled=compiled) if task is None else task
         self.num_envs, self.render_mode, self.max_episode_steps = self.task.num_envs, render_mode, max_episode_steps
         self.metadata, self.critic = {**self.metadata, "autoreset_mode": autoreset_mode}, critic
+        self.final_obs = final_obs
         self.single_observation_space, self.single_action_space = _spaces(self.task, critic)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
@@ -158,7 +161,7 @@ class TerrainNavVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         info: dict[str, Any] = {name: getattr(outcome, name) & ~began for name in ("success", "fallen", "stuck")}
         ended = terminated | truncated
         if self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP:
-            info |= {"final_obs": self._observe(), "_final_obs": ended}
+            info |= {"final_obs": self._observe(), "_final_obs": ended} if self.final_obs else {}
             task.reset(ended)
         else:
             task.reset(began)

@@ -24,7 +24,7 @@ class RslRlTerrainNav(GymVecEnv):
 
     def __init__(self, task: TerrainNav) -> None:
         self.task = task
-        env = TerrainNavVectorEnv(task=task, autoreset_mode=AutoresetMode.SAME_STEP, critic=True)
+        env = TerrainNavVectorEnv(task=task, autoreset_mode=AutoresetMode.SAME_STEP, critic=True, final_obs=False)
         super().__init__(env, cfg=dataclasses.asdict(task.cfg))
 
     def get_observations(self) -> TensorDict:
