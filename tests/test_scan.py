@@ -706,7 +706,8 @@ def test_an_image_shows_ratings_where_they_are_known(monkeypatch):
     monkeypatch.setitem(LAYERS, "traversability", lambda state: (state.traversability, rated))
     image = MapImage(length_x=0.4, length_y=0.2, resolution=0.1, alignment="world", mode="nearest")(emap, pose(BASE))
     assert image.shape == (1, 4, 4, 2) and (image[0, 1] == 1).all()
-    assert torch.equal(image[0, 3], torch.tensor([0.0, 0.0, 0.6, 0.6]).double()[:, None].expand(4, 2))
+    expected = torch.tensor([0.0, 0.0, 0.6, 0.6], dtype=torch.float64)[:, None].expand(4, 2)
+    torch.testing.assert_close(image[0, 3], expected)
 
 
 @pytest.mark.parametrize("mode", MODES)
