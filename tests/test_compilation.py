@@ -10,7 +10,7 @@ from torch._dynamo.testing import CompileCounter
 from torch._inductor.codegen.cpp import CppScheduling
 
 import torchelev
-from torchelev import SensorConfig, fusion
+from torchelev import ElevationMap, SensorConfig, fusion
 from torchelev.compilation import KERNEL_ARGUMENTS, Graphs, announced_compilation, compiled, graphs_of
 from torchelev.disputed import settle
 from torchelev.layers import LAYERS
@@ -329,3 +329,33 @@ def test_no_recompilation_for_new_values():
         cloud, T = scan(k)
         compiled(snapshot(emap), cloud, T, T, torch.full((2,), 0.1 * k))
     assert counter.frame_count == 1
+
+
+@pytest.mark.parametrize("sensors, base, variance", [(1, True, False), (2, False, True)])
+@pytest.mark.parametrize("num_envs, chunk", [(2, None), (5, 2), (1, None)])
+def test_warm_maps_compile_nothing_more_and_are_untouched(compile_with, sensors, base, variance, num_envs, chunk):
+    counter = CompileCounter()
+    compile_with(counter)
+    emap = ElevationMap(small_config(), num_envs=num_envs, chunk=chunk)
+    cloud = torch.randn(num_envs, sensors, 50, 3, generator=torch.Generator().manual_seed(0))
+    T = torch.eye(4, dtype=torch.float64).repeat(num_envs, sensors, 1, 1)
+    given = dict(variance=torch.full(cloud.shape[:-1], 0.01) if variance else None)
+    emap.update(cloud, T, T[:, 0] if base else None, dt=0.1, **given)
+    before = snapshot(emap)
+    emap.warm_up(50, sensors, base=base, variance=variance)
+    assert counter.frame_count == 0, "a map that is not compiled has nothing to warm up"
+    emap.compile()
+    emap.warm_up(50, sensors, base=base, variance=variance)
+    assert counter.frame_count >= PARTS
+    assert differences(before, emap.state) == []
+    count = counter.frame_count
+    for points in (cloud, cloud[:, :, :40]):
+        values = None if not variance else given["variance"][:, :, : points.shape[2]]
+        emap.update(points, T, T[:, 0] if base else None, dt=0.1, variance=values)
+    assert counter.frame_count == count
+
+
+@pytest.mark.parametrize("numbers, name", [((0,), "num_points"), ((5, 0), "num_sensors"), ((2.5,), "num_points")])
+def test_warm_up_refuses_what_no_update_takes(numbers, name):
+    with pytest.raises((ValueError, TypeError), match=name):
+        mapped().warm_up(*numbers)

@@ -16,6 +16,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torchelev import ElevationMap, checks
 from torchelev.fill import FILLS, MODES, inpaint
+from torchelev.layers import LAYERS
 from torchelev.map_image import CHANNELS, MapImage
 from torchelev.scan import PRESETS, HeightScan
 from torchelev.scan_patterns import ALIGNMENTS, heading, steps
@@ -102,7 +103,7 @@ def test_minimum_leaves_out_the_fourth_cell_and_unknown_ones():
     assert at(scan(emap, pose(BASE))[0], 0) == near(0.5)
     emap.validity[0, i : i + 2, j] = False
     values, valid = scan(emap, pose(BASE))
-    assert not valid.any() and at(values, 0) == near(0.0)
+    assert not valid.any() and at(dataclasses.replace(scan, fill="base")(emap, pose(BASE))[0], 0) == near(0.0)
 
 
 def test_legged_gym_is_isaac_lab_transposed():
@@ -144,12 +145,54 @@ def test_presets_clip_before_or_after_the_scale():
     assert [float(HeightScan.preset(name)(emap, T)[0][0, 5]) for name in PRESETS] == [-1.0, pytest.approx(-0.6), -5.0]
 
 
-def test_presets_have_their_own_values_for_a_miss():
+def test_presets_can_read_what_their_originals_read_of_a_miss():
     """Isaac Lab clips -inf to -1, mjlab reads 5 m / 5; legged_gym never misses, so flat ground."""
     emap = ground_map(flat, validity=False)
     for name, miss in zip(PRESETS, (-1.0, 1.0, 0.0), strict=True):
-        values, valid = HeightScan.preset(name)(emap, pose(BASE))
+        values, valid = HeightScan.preset(name, fill="original")(emap, pose(BASE))
         assert (values == miss).all() and not valid.any()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("standing", [None, 0.3, 0.8])
+def test_an_empty_map_reads_as_flat_ground_under_a_standing_robot(name, standing):
+    settings = {} if standing is None else dict(standing_height=standing)
+    height = 0.5 if standing is None else standing
+    scan, T = HeightScan.preset(name, **settings), pose((0.3, -0.2, height))
+    values, valid = scan(ground_map(flat, validity=False), T)
+    torch.testing.assert_close(values, scan(ground_map(flat), T)[0])
+    assert not valid.any() and values[0, 0] == values[0, 5]
+    # Higher up nothing says where the ground is: as of a robot that stands.
+    torch.testing.assert_close(scan(ground_map(flat, validity=False), pose((0.3, -0.2, 7.0)))[0], values)
+
+
+@pytest.mark.parametrize("scan", [*(HeightScan.preset(name) for name in PRESETS), HeightScan.grid()])
+@pytest.mark.parametrize("altitude", [0.0, -300.0])
+def test_flat_ground_continues_over_all_that_is_unknown(scan, altitude):
+    """Only ground 0.5 m ahead is known, at any height: all of the pattern reads as there, the blind spot too."""
+    emap = ground_map(lambda x, y: torch.full_like(x, altitude))
+    expected = scan(emap, pose((0.3, -0.2, altitude + 0.62)))[0]
+    emap.validity[:, :20] = emap.validity[:, 22:] = False
+    values, valid = scan(emap, pose((0.3, -0.2, altitude + 0.62)))
+    assert 0 < valid.sum() < 60
+    torch.testing.assert_close(values, expected, atol=1e-9, rtol=0)
+
+
+def test_far_from_what_is_known_the_ground_is_that_under_the_base():
+    """Ground at 0 around the base, a step of 0.4 m far ahead; behind, it is as under the base and not a mean of all."""
+    emap = ground_map(lambda x, y: 0.4 * (x > 0.9).double(), corner=(-97, -97), cells=(200, 200))
+    emap.validity[:, :95] = False
+    values, valid = HeightScan.points([(-6.0, 0.0), (-0.6, 0.0), (3.0, 0.0)], alignment="world")(emap, pose(BASE))
+    assert valid.tolist() == [[False, False, True]] and at(values, 0, 1, 2) == near(0.7, 0.7, 0.3)
+
+
+def test_what_lies_above_the_base_is_not_the_ground_under_it():
+    """All that is known is a wall, higher than the base, 0.5 m away."""
+    emap = ground_map(lambda x, y: torch.full_like(x, 1.5))
+    emap.validity[:, :20] = emap.validity[:, 21:] = False
+    values, valid = HeightScan.isaac_lab(alignment="world", standing_height=0.6)(emap, pose((0.3, -0.2, 0.7)))
+    behind = values.view(11, 17)[:, 0]
+    torch.testing.assert_close(behind, torch.full_like(behind, 0.1))
 
 
 def test_noise_comes_where_the_originals_have_it():
@@ -165,7 +208,7 @@ def test_noise_comes_where_the_originals_have_it():
     assert at(read["isaac_lab"](emap, above, noise=high)[0], 3) == near(1.0)
     assert at(read["legged_gym"](emap, above, noise=high)[0], 3) == near(5.5)
     blank = ground_map(flat, validity=False)
-    assert [at(read[n](blank, T, noise=high)[0], 3)[0] for n in PRESETS] == [-1.0, pytest.approx(1.02), 0.5]
+    assert [at(read[n](blank, T, noise=high)[0], 3)[0] for n in PRESETS] == pytest.approx([0.1, 0.12, 0.5])
 
 
 def test_noise_is_off_unless_asked_for():
@@ -288,6 +331,35 @@ def loop_inpaint(layer, known, rings):
     return layer, known
 
 
+def loop_levels(layer, known, u, v):
+    """What a place, in cells from the corner, reads of blocks of 1, 2, 4, ... cells a side, None where nothing."""
+    read = []
+    while True:
+        value, good = reference.sample(layer, known, u, v, (0, 0), 1.0, "bilinear")
+        read.append(value if good else None)
+        if max(layer.shape) == 1:
+            return read
+        u, v, size = u / 2, v / 2, [(n + 1) // 2 for n in layer.shape]
+        blocks, some = np.zeros(size), np.zeros(size, bool)
+        for i in range(size[0]):
+            for j in range(size[1]):
+                window = np.s_[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
+                some[i, j] = known[window].any()
+                blocks[i, j] = layer[window][known[window]].mean() if some[i, j] else 0.0
+        layer, known = blocks, some
+
+
+def loop_ground(layer, known, x, y, base, corner, half):
+    """The ground at a place, continued from what is known of 0.1 m cells; None on an empty map."""
+    rows, columns = (max(0, n // 2 - cells - 5) for n, cells in zip(layer.shape, half, strict=True))
+    part = np.s_[rows : layer.shape[0] - rows, columns : layer.shape[1] - columns]
+    layer, known, corner = layer[part], known[part], (corner[0] + rows, corner[1] + columns)
+    near = loop_levels(layer, known, x / 0.1 - corner[0], y / 0.1 - corner[1])[:4]  # up to 0.8 m
+    under = loop_levels(layer, known, base[0] / 0.1 - corner[0], base[1] / 0.1 - corner[1])
+    under = [value for value in under if value is not None and value < base[2]]
+    return next((value for value in [*near, *under] if value is not None), None)
+
+
 def loop_scan(scan, emap, T, feet, b):
     """One environment's values, point by point."""
     corner, layers = emap.corner[b].tolist(), {n: v[b].numpy() for n, v in emap.state._asdict().items() if n in KEPT}
@@ -307,9 +379,13 @@ def loop_scan(scan, emap, T, feet, b):
             ground, good = lowest, True
         if not good and scan.fill == "upper_bound":
             ground, good = loop_sample(bound, known | layers["bounded"], x, y, corner, scan.mode)
+        if not good and scan.fill == "ground":
+            half = scan._pattern.cells(emap.cfg.grid)
+            value = loop_ground(h, known, x, y, T[b, :3, 3].tolist(), corner, half)
+            ground, good = (0.0, False) if value is None else (value, True)
         if not good and scan.fill == "inpaint":
             ground, good = loop_sample(*filled, x, y, corner, scan.mode)
-        value = z - ground - scan.nominal_height if good else 0.0 if isinstance(scan.fill, str) else scan.fill
+        value = z - ground - scan.nominal_height if good else 0.2 if isinstance(scan.fill, str) else scan.fill
         values.append(value if scan.clip is None else min(max(value, -scan.clip), scan.clip))
     return np.array(values) * scan.scale, np.array([good for _, good in read])
 
@@ -346,6 +422,7 @@ def test_scans_agree_with_loops(seed, alignment, mode, fill, at_feet):
     emap, rng = random_map(seed)
     T = random_base(emap, rng)
     settings = dict(alignment=alignment, mode=mode, fill=fill, nominal_height=0.4, inpaint_rings=2, scale=2.0, clip=0.5)
+    settings |= dict(standing_height=0.6)
     feet = None
     if at_feet:
         scan = HeightScan.feet(num_feet=2, rings=[(0.0, 1), (0.15, 5)], reach=0.3, **settings)
@@ -366,7 +443,7 @@ def test_the_random_maps_have_every_kind_of_cell():
     reads = {fill: dataclasses.replace(scan, fill=fill, inpaint_rings=1)(emap, T) for fill in FILLS}
     valid = reads["base"][1]
     assert 0.3 < valid.double().mean() < 0.8 and all(torch.equal(valid, v) for _, v in reads.values())
-    for fill in FILLS[1:]:
+    for fill in set(FILLS) - {"base"}:
         differs = reads[fill][0] != reads["base"][0]
         assert differs.any() and not (differs & valid).any()
     assert (reads["upper_bound"][0] == 0).any() and (reads["inpaint"][0] == 0).any(), "some have no answer"
@@ -383,6 +460,7 @@ def test_fills_by_hand():
     # Cell centres: (0.15, 0.05) known, (0.35, 0.05) bounded, (0.45, 0.05) and (0.95, 0.05) not.
     xy = [(-0.15, 0.25), (0.05, 0.25), (0.15, 0.25), (0.65, 0.25)]
     expected = {
+        "ground": (0.195, 0.195, 0.22),  # the last: as under the base, at y = -0.2
         "base": (0.0, 0.0, 0.0),
         "lowest": (0.195,) * 3,
         "upper_bound": (-0.05, 0.0, 0.0),
@@ -622,11 +700,22 @@ def test_what_an_image_does_not_know_is_0():
     assert (channels[:, 3:] != 0).all()
 
 
+def test_an_image_shows_ratings_where_they_are_known(monkeypatch):
+    """Elevations may be known where ratings are not."""
+    emap = ground_map(plane, traversability=0.6)
+    rated = emap.cell_centers()[..., 0] > 0.3
+    monkeypatch.setitem(LAYERS, "traversability", lambda state: (state.traversability, rated))
+    image = MapImage(length_x=0.4, length_y=0.2, resolution=0.1, alignment="world", mode="nearest")(emap, pose(BASE))
+    assert image.shape == (1, 4, 4, 2) and (image[0, 1] == 1).all()
+    expected = torch.tensor([0.0, 0.0, 0.6, 0.6], dtype=torch.float64)[:, None].expand(4, 2)
+    torch.testing.assert_close(image[0, 3], expected)
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_images_are_scans_of_a_grid(mode):
     emap, rng = random_map(7)
     T = random_base(emap, rng)
-    pixels = HeightScan.grid(length_x=0.5, length_y=0.3, resolution=0.1, mode=mode)
+    pixels = HeightScan.grid(length_x=0.5, length_y=0.3, resolution=0.1, mode=mode, fill="base")
     image = MapImage(length_x=0.6, length_y=0.4, resolution=0.1, layers=("validity", "elevation"), mode=mode)
     channels = image(emap, T)
     values, valid = pixels(emap, T)
@@ -672,10 +761,12 @@ GOOD = dict(xy=[(0.0, 0.1)])
         (lambda: HeightScan.preset("isaac"), "preset: must be one of isaac_lab, mjlab, legged_gym, got 'isaac'; use"),
         (lambda: HeightScan.points(**GOOD, alignment="body"), "alignment: must be one of yaw, base, world, got 'body'"),
         (lambda: HeightScan.points(**GOOD, mode="linear"), "mode: must be one of bilinear, nearest, minimum, got"),
-        (lambda: HeightScan.points(**GOOD, fill="zero"), "fill: must be a number or one of base, lowest"),
-        (lambda: HeightScan.points(**GOOD, fill=None), "fill: must be a number or one of base, lowest"),
+        (lambda: HeightScan.points(**GOOD, fill="zero"), "fill: must be a number or one of ground, base, lowest"),
+        (lambda: HeightScan.points(**GOOD, fill=None), "fill: must be a number or one of ground, base, lowest"),
         (lambda: HeightScan.points(**GOOD, fill=math.inf), "fill: must be finite where nothing clips, got inf"),
         (lambda: HeightScan.points(**GOOD, fill=math.nan, clip=1.0), "fill: must be finite"),
+        (lambda: HeightScan.points(**GOOD, original="original"), "original: must be a number or one of ground, base"),
+        (lambda: HeightScan.points(**GOOD, standing_height=math.nan), "standing_height: must be a finite number"),
         (lambda: HeightScan.points(**GOOD, clip=0.0), "clip: must be a positive number, got 0.0"),
         (lambda: HeightScan.points(**GOOD, noise=-0.1), "noise: must be a finite, not negative number, got -0.1"),
         (lambda: HeightScan.points(**GOOD, scale=math.nan), "scale: must be a finite number, got nan"),

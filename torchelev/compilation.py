@@ -9,17 +9,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FunctionType
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
+from torchelev.errors import require_count
 from torchelev.pipeline import move_along, take_heights, take_rays, update_in_place
 from torchelev.sensor import measure
-from torchelev.state import MapState, Measurement, map_layers
+from torchelev.state import MapState, Measurement, blank_state, map_layers
 from torchelev.storage import as_bytes, as_mask
 from torchelev.traversability_net import Weights
+
+if TYPE_CHECKING:
+    from torchelev.elevation_map import ElevationMap
 
 KERNEL_ARGUMENTS = 16  # measured: 12 to 24 do as well
 
@@ -132,6 +136,37 @@ def compiled_update(
         mark_dynamic(1, m.points, m.variance, m.used, m.casts)
         graphs.take_heights(stored, m)
         graphs.take_rays(stored, m, weights)
+
+
+def compile_ahead(
+    emap: ElevationMap,
+    num_points: int,
+    num_sensors: int,
+    base: bool,
+    variance: bool,
+    dtype: torch.dtype,
+    pose_dtype: torch.dtype,
+) -> None:
+    """Run compiled updates of each size that the map divides its environments into, on a blank state of their own."""
+    N = require_count("num_points", num_points, "give the number of points of each sensor")
+    S = require_count("num_sensors", num_sensors, "give the number of sensors")
+    B, device = emap.num_envs, emap.device
+    with torch.inference_mode(False), torch.no_grad():
+        points = torch.full((1, 1, 1, 1), torch.nan, dtype=dtype, device=device).expand(B, S, N, 3)
+        T = torch.eye(4, dtype=pose_dtype, device=device).expand(B, S, 4, 4)
+        variances = torch.ones((1, 1, 1), dtype=dtype, device=device).expand(B, S, N) if variance else None
+        given = emap._check_inputs(points, T, T[:, 0] if base else None, 0.0, variances)
+        if not emap._compiled:
+            return
+        ends = [chunk.indices(B)[:2] for chunk in emap._chunks()]
+        sizes = dict.fromkeys(end - start for start, end in ends)  # the last chunk may be smaller
+        scratch = blank_state(emap.cfg.grid, max(sizes), device, emap.elevation.dtype)
+    weights = None if emap.head is None else emap.head.weights.detached()
+    with torch.inference_mode():
+        for size in sizes:
+            state = map_layers(lambda layer, n=size: layer[:n], scratch)
+            inputs: list[Any] = [None if value is None else value[:size] for value in given]
+            compiled_update(state, *inputs, cfg=emap._stages, weights=weights)
 
 
 class Graphs(NamedTuple):

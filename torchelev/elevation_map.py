@@ -11,13 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from torchelev import checks
-from torchelev.compilation import compiled_update
+from torchelev.compilation import compile_ahead, compiled_update
 from torchelev.config import ElevationMapConfig, differing_fields
 from torchelev.errors import require, require_count
 from torchelev.filters.chain import FilterChain
 from torchelev.grid import cell_centers, window_center
 from torchelev.initialize import METHODS, initialize
 from torchelev.layers import LAYERS, Layer, sample_layer
+from torchelev.pace import Pace, paced
 from torchelev.pipeline import fuse_measurement, rate_surface, update_in_place, write
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
@@ -72,6 +73,7 @@ class ElevationMap(nn.Module):
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
         self.cfg, self.check_values = cfg, check_values
         self._compiled = False
+        self._pace = Pace()
         self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
         self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
         self._filtered: dict[str, Layer] = {}  # what filters made of the stored state
@@ -152,6 +154,7 @@ class ElevationMap(nn.Module):
     def update(
         self, points: Tensor, T_map_sensor: Tensor, *, dt: float | Tensor, variance: Tensor | None = None
     ) -> None: ...
+    @paced
     def update(
         self,
         points: Float[Tensor, "B *S N 3"],
@@ -276,6 +279,33 @@ class ElevationMap(nn.Module):
         new, mend = torch.__version__ >= "2.10", "upgrade it, or leave updates uncompiled"
         require(new, "torch", "must be 2.10 or later to compile updates", torch.__version__, mend, RuntimeError)
         self._compiled = True
+
+    def warm_up(
+        self,
+        num_points: int,
+        num_sensors: int = 1,
+        *,
+        base: bool = True,
+        variance: bool = False,
+        dtype: torch.dtype = torch.float32,
+        pose_dtype: torch.dtype = torch.float64,
+    ) -> None:
+        """Compile the updates that follow without touching the map, its statistics or what its filters keep.
+
+        Call it after `compile`, with what `update` will be given; else that compiles in its turn. A map that is not
+        compiled has nothing to warm up: the arguments are checked, and nothing is done.
+
+        Args:
+            num_points: N of each sensor; updates of other numbers from 2 on share the graphs.
+            num_sensors: S.
+            base: whether updates come with `T_map_base`.
+            variance: whether they come with `variance`.
+            dtype: of the points, and of their variance.
+            pose_dtype: of `T_map_sensor` and `T_map_base`.
+
+        Raises ValueError or TypeError for arguments that no update takes.
+        """
+        compile_ahead(self, num_points, num_sensors, base, variance, dtype, pose_dtype)
 
     def extra_repr(self) -> str:
         """Say how many maps there are, and how large."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.ground import continue_ground
 from torchelev.layers import LAYERS, Layer, sample_layers
 from torchelev.operators import padded
 from torchelev.state import MapState
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 MODES = ("bilinear", "nearest", "minimum")
-FILLS = ("base", "lowest", "upper_bound", "inpaint")
+FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint")
+ORIGINAL = "original"
 
 
 def require_mode(mode: object) -> None:
@@ -29,14 +31,14 @@ def require_mode(mode: object) -> None:
     require(mode in MODES, "mode", f"must be one of {', '.join(MODES)}", repr(mode), "use bilinear")
 
 
-def require_fill(fill: object, clip: float | None) -> None:
-    """Refuse what is neither a policy's name nor a number; inf may only stand where it is clipped."""
+def require_fill(name: str, fill: object, names: Sequence[str], clip: float | None) -> None:
+    """Refuse what is neither a rule's name nor a number; inf may only stand where it is clipped."""
     number = isinstance(fill, int | float) and not isinstance(fill, bool)
-    named = isinstance(fill, str) and fill in FILLS
-    require(number or named, "fill", f"must be a number or one of {', '.join(FILLS)}", repr(fill), "use base")
+    named = isinstance(fill, str) and fill in names
+    require(number or named, name, f"must be a number or one of {', '.join(names)}", repr(fill), "use ground")
     if isinstance(fill, int | float):
         bounded = math.isfinite(fill) or (clip is not None and not math.isnan(fill))
-        require(bounded, "fill", "must be finite where nothing clips", fill, "give metres, or clip")
+        require(bounded, name, "must be finite where nothing clips", fill, "give metres, or clip")
 
 
 def read_points(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridConfig, mode: str) -> list[Layer]:
@@ -64,19 +66,22 @@ def fill_unknown(
     fill: str | float,
     state: MapState,
     uv: Float[Tensor, "B M 2"],
+    base: tuple[Float[Tensor, "B 1 2"], Float[Tensor, "B 1"]],
     read: Layer,
     grid: GridConfig,
     mode: str,
     half: tuple[int, int],
     rings: int,
 ) -> Layer:
-    """Complete heights that were read (B, M) by a policy: heights, and where the map or the policy knows one.
+    """Complete heights that were read (B, M) by a rule: heights, and where the map or the rule knows one.
 
-    "base" and numbers know no ground. `half`: how many cells along x and y from the window's centre the points may
-    lie. `rings`: how far to inpaint.
+    "base" and numbers know no ground. `base`: where it is, in cells from the window's corner, and its height [m].
+    `half`: how many cells along x and y from the window's centre the points may lie. `rings`: how far to inpaint.
     """
     heights, known = read
-    if fill == "lowest":
+    if fill == "ground":
+        ground, found = continue_ground((state.elevation, state.validity), uv, *base, grid, half)
+    elif fill == "lowest":
         ground, found = lowest(heights, known)
     elif fill == "upper_bound":
         ((ground, found),) = read_points([LAYERS["upper_bound"](state)], uv, grid, mode)

@@ -14,8 +14,8 @@ from torchelev import checks
 from torchelev import scan_patterns as patterns
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive, whole_cells
-from torchelev.fill import fill_unknown, read_points, require_fill, require_mode
-from torchelev.scan_patterns import Pattern, Points, centered, steps
+from torchelev.fill import FILLS, ORIGINAL, fill_unknown, read_points, require_fill, require_mode
+from torchelev.scan_patterns import Pattern, Points, centered, grid_coordinates, steps
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -33,10 +33,18 @@ class HeightScan:
     below; `dataclasses.replace` changes one.
 
     `alignment`: "yaw" turns the pattern with the base's heading (`scan_patterns.heading`); "base" turns it in full and
-    drops its height; "world" only moves it. `mode`: see `fill.read_points`. `fill`, where nothing is known: "base", 0
-    before noise, as of flat ground `nominal_height` below z; "lowest", the lowest known ground under the environment's
-    points; "upper_bound", the ground's bound by rays; "inpaint", means of known neighbours; or a number, in place of
-    z - elevation - nominal_height. Where a named one has no answer, "base" is taken.
+    drops its height; "world" only moves it. `mode`: see `fill.read_points`.
+
+    `fill`, where nothing is known:
+    - "ground", the default: the known ground continues. A point reads the mean of what is known near it, farther away
+      flat ground as high as under the base, and on an empty map flat ground `standing_height` below z: what the
+      simulator's scan reads there. See `ground.continue_ground`.
+    - "original": what the preset's original reads where a ray hits nothing, a wall or a pit. Few policies saw that in
+      training, where rays hit the terrain; a blind spot or a fresh map then looks like nothing they know.
+    - "base": flat ground `standing_height` below z; "lowest": the lowest known ground under the environment's points;
+      "upper_bound": the ground's bound by rays; "inpaint": means of known neighbours. Where one of these has no
+      answer, "base" is taken.
+    - a number: in place of z - elevation - nominal_height.
 
     Raises ValueError for settings out of range.
     """
@@ -47,7 +55,9 @@ class HeightScan:
     nominal_height: float = 0.0  # [m] of z over the ground; elsewhere called the offset
     clip: float | None = None  # [m] values lie within +-clip before they are scaled
     scale: float = 1.0
-    fill: str | float = "base"
+    fill: str | float = "ground"
+    original: str | float = "base"  # what fill="original" stands for: another rule, or a number
+    standing_height: float | None = None  # [m] of z over flat ground, where the map knows none; None: nominal_height
     inpaint_rings: int = 5  # cells that "inpaint" reaches into what is unknown
     noise: float = 0.0  # [m] half the width of the uniform noise that a call may ask for
     noise_after_clip: bool = False
@@ -60,7 +70,12 @@ class HeightScan:
         require_mode(self.mode)
         if self.clip is not None:
             require_positive(clip=self.clip)
-        require_fill(self.fill, self.clip)
+        require_fill("fill", self.fill, (*FILLS, ORIGINAL), self.clip)
+        require_fill("original", self.original, FILLS, self.clip)
+        standing = self.standing_height
+        good = standing is None or (isinstance(standing, int | float) and math.isfinite(standing))
+        rule, hint = "must be a finite number or None", "give the base's height over the ground where the robot stands"
+        require(good, "standing_height", rule, repr(standing), hint)
         for name in ("nominal_height", "scale", "noise", "reach", "num_feet", "inpaint_rings"):
             value, signed = getattr(self, name), name in ("nominal_height", "scale")
             kinds = int if name in ("num_feet", "inpaint_rings") else int | float
@@ -83,12 +98,14 @@ class HeightScan:
     ) -> HeightScan:
         """Build Isaac Lab's `height_scan`: clip(z - h - 0.5, +-1), x fastest: `values.view(B, 11, 17)`.
 
-        Its pattern is arange(-l / 2, l / 2 + 1e-9, resolution): 1.1 m at 0.04 m are 28 points, the last at 0.53 m. A
-        ray that hits nothing reads inf, which clips to -1. The noise is U(+-0.1 m), before the clip.
+        Its pattern is arange(-l / 2, l / 2 + 1e-9, resolution): 1.1 m at 0.04 m are 28 points, the last at 0.53 m. Its
+        scan of flat ground reads the base's height less 0.5 m; on an empty map this one reads `standing_height`, 0.5 m
+        by default, less 0.5 m. A ray that hits nothing reads inf there, which clips to -1 as of a wall; so does
+        `fill="original"`. The noise is U(+-0.1 m), before the clip.
         """
         require_positive(length_x=length_x, length_y=length_y, resolution=resolution)
         x, y = (steps(length, resolution, 1e-9) for length in (length_x, length_y))
-        preset: dict[str, Any] = dict(nominal_height=0.5, clip=1.0, noise=0.1, fill=-math.inf)
+        preset: dict[str, Any] = dict(nominal_height=0.5, clip=1.0, noise=0.1, original=-math.inf)
         return cls(pattern=patterns.x_fastest(x, y), **(preset | settings))
 
     @classmethod
@@ -98,12 +115,14 @@ class HeightScan:
         """Build mjlab's `height_scan`: (z - h) / 5, x fastest: `values.view(B, 11, 17)`.
 
         Its pattern is arange(-l / 2, l / 2 + resolution / 2, resolution), whose last point may lie farther out: 1.1 m
-        at 0.04 m are 29 points, the last at 0.57 m. A ray that hits nothing reads its longest, 5 m. The noise is
-        U(+-0.1 m), before the scale.
+        at 0.04 m are 29 points, the last at 0.57 m. Its scan of flat ground reads the base's height / 5; on an empty
+        map this one reads `standing_height` / 5, with 0.5 m by default: give your robot's. A ray that hits nothing
+        reads its longest there, 5 m, so 1.0 as of a pit; so does `fill="original"`. The noise is U(+-0.1 m), before the
+        scale.
         """
         require_positive(length_x=length_x, length_y=length_y, resolution=resolution)
         x, y = (steps(length, resolution, resolution * 0.5) for length in (length_x, length_y))
-        preset: dict[str, Any] = dict(scale=1 / 5, noise=0.1, fill=5.0)
+        preset: dict[str, Any] = dict(scale=1 / 5, noise=0.1, original=5.0, standing_height=0.5)
         return cls(pattern=patterns.x_fastest(x, y), **(preset | settings))
 
     @classmethod
@@ -118,8 +137,9 @@ class HeightScan:
 
         `x` and `y` [m] are its measured_points_x and _y. It reads the lowest of three corners of its height field, 10
         cm apart by default; here they are cells, one `resolution` apart; `mode="bilinear"` reads the ground itself. It
-        clamps indices, so that it misses nothing: unknown ground is read as flat. The noise is U(+-0.1 m) after the
-        clip, so that values reach +-5.5.
+        clamps indices, so that it misses nothing; `fill="original"` reads unknown ground as 0, as of flat ground. On an
+        empty map the default reads 5 (`standing_height` - 0.5 m), with 0.5 m by default. The noise is U(+-0.1 m) after
+        the clip, so that values reach +-5.5.
         """
         preset: dict[str, Any] = dict(mode="minimum", nominal_height=0.5, clip=1.0, scale=5.0, noise=0.1)
         return cls(pattern=patterns.y_fastest(x, y), **(preset | dict(noise_after_clip=True) | settings))
@@ -203,10 +223,17 @@ class HeightScan:
         ((elevation, valid),) = read_points([(state.elevation, state.validity)], uv, grid, self.mode)
         valid, half = valid & finite, self._pattern.cells(grid)
         read = (elevation, valid)
-        ground, known = fill_unknown(self.fill, state, uv, read, grid, self.mode, half, self.inpaint_rings)
-        missing = 0.0 if isinstance(self.fill, str) else self.fill
+        fill = self.original if self.fill == ORIGINAL else self.fill
+        xyz = T_map_base[:, None, :3, 3]
+        base = grid_coordinates(xyz, state.corner, grid.resolution, uv.dtype), xyz[..., 2].to(uv.dtype)
+        ground, known = fill_unknown(fill, state, uv, base, read, grid, self.mode, half, self.inpaint_rings)
+        missing = self._standing - self.nominal_height if isinstance(fill, str) else fill
         value = torch.where(known & finite, z - ground - self.nominal_height, missing)
         return self._finish(value, u), valid
+
+    @property
+    def _standing(self) -> float:
+        return self.nominal_height if self.standing_height is None else self.standing_height
 
     def _finish(self, value: Tensor, u: Tensor | None) -> Tensor:
         """Apply noise, clip and scale."""

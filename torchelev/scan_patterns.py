@@ -85,6 +85,13 @@ def heading(T_map_base: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 2"]:
     return forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
 
 
+def grid_coordinates(
+    xyz: Float[Tensor, "B K 3"], corner: Int[Tensor, "B 2"], resolution: float, dtype: torch.dtype
+) -> Float[Tensor, "B K 2"]:
+    """Return places, map frame [m], in cells from the window's corner; differenced in float64."""
+    return (xyz[..., :2].double() / resolution - corner[:, None]).to(dtype)
+
+
 @dataclass(frozen=True)
 class Pattern:
     """Points that move with a robot. Their constants lie on the device of the map, from the first call there on."""
@@ -144,7 +151,7 @@ class Pattern:
 
         Middles are differenced in float64, so that float32 keeps the rest exact far from the origin.
         """
-        start = (middle[..., :2].double() / resolution - corner[:, None]).to(dtype)
+        start = grid_coordinates(middle, corner, resolution, dtype)
         offset = self.on(T_map_base.device, dtype) / resolution
         if self.alignment == "world":
             return (start[:, :, None] + offset).flatten(1, 2)

@@ -1,0 +1,72 @@
+"""Says once when updates on a CPU take many times as long as they did: threads that wait for busy cores."""
+
+from __future__ import annotations
+
+import functools
+import statistics
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec
+
+import torch
+
+RECENT = 9  # updates whose median counts; less than half of them may compile
+SLOWER = 5.0  # times the best median
+IN_A_ROW = 5  # updates with such a median
+
+_warned = False
+P = ParamSpec("P")
+
+
+class Pace:
+    """How long updates take, apart for each order of the number of points and each number of threads."""
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.clock = clock
+        self.recent: dict[tuple[int, int], deque[float]] = {}
+        self.best: dict[tuple[int, int], float] = {}
+        self.slow = 0
+
+    def note(self, seconds: float, num_points: int) -> None:
+        """Take in one update; warn, once in a process, if updates have become many times slower."""
+        kind = num_points.bit_length(), torch.get_num_threads()
+        recent = self.recent.setdefault(kind, deque(maxlen=RECENT))
+        recent.append(seconds)
+        if len(recent) < RECENT:
+            return
+        median = statistics.median(recent)
+        best = self.best[kind] = min(median, self.best.get(kind, median))
+        self.slow = self.slow + 1 if median > SLOWER * best else 0
+        if self.slow >= IN_A_ROW:
+            _warn(median, best)
+
+
+def _warn(median: float, best: float) -> None:
+    global _warned
+    if _warned:
+        return
+    _warned = True
+    warnings.warn(
+        f"update: the last {RECENT} updates took {1e3 * median:.3g} ms (median), {median / best:.0f} times the best, "
+        f"{1e3 * best:.3g} ms. The likely cause: other processes are busy on the same cores, and OpenMP's threads spin "
+        "while they wait for each other. Set OMP_WAIT_POLICY=PASSIVE in the environment before torch is imported, or "
+        f"call torch.set_num_threads with the number of free cores (now {torch.get_num_threads()}).",
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
+
+def paced(update: Callable[Concatenate[Any, P], None]) -> Callable[Concatenate[Any, P], None]:
+    """Let a map's `update` note how long it takes on a CPU. On a GPU, where it returns early, nothing is noted."""
+
+    @functools.wraps(update)
+    def timed(emap: Any, /, *args: P.args, **kwargs: P.kwargs) -> None:
+        start = emap._pace.clock()
+        update(emap, *args, **kwargs)
+        points: Any = args[0] if args else kwargs["points"]
+        if points.device.type == "cpu":
+            emap._pace.note(emap._pace.clock() - start, points.numel() // 3)
+
+    return timed
