@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchelev import checks
 from torchelev.compilation import compile_ahead, compiled_update
 from torchelev.config import ElevationMapConfig, differing_fields
+from torchelev.diagnosis import diagnose
 from torchelev.errors import require, require_count
 from torchelev.filters.chain import FilterChain
 from torchelev.grid import cell_centers, window_center
@@ -20,6 +21,7 @@ from torchelev.initialize import METHODS, initialize
 from torchelev.layers import LAYERS, Layer, sample_layer
 from torchelev.pace import Pace, paced
 from torchelev.pipeline import fuse_measurement, rate_surface, update_in_place, write
+from torchelev.recent import Recent
 from torchelev.sensor import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
 from torchelev.storage import keep_freed_memory
@@ -74,6 +76,7 @@ class ElevationMap(nn.Module):
         self.cfg, self.check_values = cfg, check_values
         self._compiled = False
         self._pace = Pace()
+        self._recent = Recent()
         self._stages = dataclasses.replace(cfg, filters=())  # of what an update does; compiled ones are found by it
         self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
         self._filtered: dict[str, Layer] = {}  # what filters made of the stored state
@@ -178,6 +181,7 @@ class ElevationMap(nn.Module):
         Raises ValueError or TypeError before anything changed; TypeError without dt.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
+        self._recent.add(*inputs[:4])
         if self.device.type == "cpu":
             keep_freed_memory()
         run = compiled_update if self._compiled else update_in_place
@@ -323,6 +327,7 @@ class ElevationMap(nn.Module):
         if env_ids is not None:
             env_ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
         self._filtered.clear()
+        self._recent.forget()
         with torch.no_grad():
             forget(self.state, self.cfg.grid, env_ids, mask)
 
@@ -348,6 +353,15 @@ class ElevationMap(nn.Module):
         """The windows' centres [m], map frame, float64; z is the base's last height."""
         xy = window_center(self.corner, self.cfg.grid)
         return torch.cat([xy, self.base_height.double()[:, None]], -1)
+
+    def diagnose(self) -> list[str]:
+        """Return sentences on what looks wrong, worst first: what was seen, the likely cause, and what to do.
+
+        Empty when all is well, or when nothing tells. It looks at a few of the updates since the last `reset`, of the
+        first environments, and waits for the device; nothing else does. For it a map keeps copies of some of the last
+        inputs, thinned to 3,000 points. Updates inside a `torch.compile` of your own are not looked at.
+        """
+        return diagnose(self.cfg, self.state, self._recent.looks)
 
     def cell_centers(self) -> Float[Tensor, "B H W 2"]:
         """Return the cell centres [m], map frame, float64."""

@@ -1,0 +1,54 @@
+"""A few recent inputs of `update`, thinned, for `ElevationMap.diagnose`."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+KEPT = 8  # inputs
+STRIDE = 4  # after the first KEPT updates every fourth is kept, so that a robot moves between the first and the last
+ENVS = 4  # the first environments: a wrong convention is wrong in all of them
+POINTS = 3000  # of each sensor, evenly spaced
+
+
+class Look(NamedTuple):
+    """One update's inputs, thinned."""
+
+    number: int  # of the update
+    points: Tensor  # (E, S, n, 3) [m] sensor frame
+    T_map_sensor: Tensor  # (E, S, 4, 4)
+    T_map_base: Tensor | None  # (E, 4, 4)
+    dt: Tensor  # (E,) [s]
+
+
+class Recent:
+    """The last few looks. They are copies: a caller may write into its own tensors, and memory stays bounded.
+
+    Nothing is read back from the device before somebody asks. Updates within a `torch.compile` of the caller's own
+    leave no trace here.
+    """
+
+    def __init__(self) -> None:
+        self.looks: deque[Look] = deque(maxlen=KEPT)
+        self.updates = 0
+
+    def forget(self) -> None:
+        """Drop everything: after a reset, other poses may lie in another map frame."""
+        self.looks.clear()
+        self.updates = 0
+
+    def add(self, points: Tensor, T_map_sensor: Tensor, T_map_base: Tensor | None, dt: Tensor) -> None:
+        """Take a look at an update's checked inputs, points (B, S, N, 3)."""
+        if torch.compiler.is_compiling():
+            return
+        if self.updates < KEPT or self.updates % STRIDE == 0:
+            step = max(1, -(-points.shape[2] // POINTS))
+            with torch.inference_mode(False), torch.no_grad():  # normal tensors, which deepcopy takes
+                values = [points[:ENVS, :, ::step], T_map_sensor[:ENVS], dt[:ENVS]]
+                cloud, sensor, seconds = (value.detach().clone() for value in values)
+                base = None if T_map_base is None else T_map_base[:ENVS].detach().clone()
+            self.looks.append(Look(self.updates, cloud, sensor, base, seconds))
+        self.updates += 1
