@@ -107,3 +107,17 @@ def test_what_cannot_be_written_is_known_before(tmp_path, monkeypatch):
     with pytest.raises(WriteError, match=r"ulimit -f\) is 0.005 MB"):
         require_writable(tmp_path / "map.npz", 5001)
     assert os.listdir(tmp_path) == []
+
+
+def test_damaged_weights_are_a_value_error_that_names_the_file(tmp_path):
+    path, rng = tmp_path / "weights.pt", np.random.default_rng(0)
+    TraversabilityNet.from_pretrained().save(path)
+    whole = path.read_bytes()
+    for k in range(120):
+        place = int(rng.integers(0, len(whole) if k % 2 else 400))
+        flipped = bytes([whole[place] ^ (1 << int(rng.integers(8)))])
+        path.write_bytes(whole[:place] + (flipped + whole[place + 1 :] if k % 3 else b""))
+        try:
+            TraversabilityNet.from_pretrained(path)
+        except ValueError as error:
+            assert str(path) in str(error)

@@ -34,7 +34,8 @@ MESH_BYTES = 50  # per cell of a `.ply`: a vertex of 24 and two triangles of 13
 MAP_HELP = """Map RECORDING, a folder of scans with poses, and write the map.
 
 \b
-RECORDING holds one file per scan, in the order of their names:
+RECORDING, or scans/ in it, holds one file per scan, in the order of their
+names; maps that were written there before are no scans:
   .bin (KITTI: float32 x y z intensity)  .npy  .npz  .ply  .pcd
 or depth images (.png, uint16 millimetres) if --intrinsics is given.
 Points are in metres in the sensor's frame (x right, y down, z forward
@@ -52,6 +53,10 @@ Example: a folder drive/ with scans/000000.bin ... and poses.txt
   python -m torchelev map drive
   python -m torchelev map drive/scans --poses drive/poses.txt \\
       --resolution 0.05 --size 30 --device cuda --out maps/drive
+
+\b
+--bin-layout, --quaternions, --time-unit and --pcd-frame say what files do
+not: one that looks like another layout is refused.
 
 \b
 It writes PREFIX.npz (every layer and the geometry, for numpy),

@@ -113,3 +113,19 @@ def test_a_transposed_cloud_is_refused(tmp_path):
     np.save(tmp_path / "0.npy", np.zeros((3, 500), np.float32))
     with pytest.raises(RecordingError, match="transposed"):
         read_cloud(tmp_path / "0.npy")
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_damaged_cloud_is_a_recording_error(tmp_path, points, name):
+    """Flipped bits, most of them in the header; what cannot be noticed may be read."""
+    path, rng = tmp_path / name, np.random.default_rng(1)
+    WRITERS[name](path, points)
+    whole = path.read_bytes()
+    for k in range(80):
+        place = int(rng.integers(0, len(whole) if k % 4 == 0 else min(len(whole), 400)))
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ (1 << int(rng.integers(8)))]) + whole[place + 1 :])
+        try:
+            read_cloud(path)
+        except RecordingError as error:
+            assert name in str(error)
