@@ -456,16 +456,22 @@ def stays_above_recent(origin, hit, layers, corner, resolution, *, min_time, gat
     return True
 
 
-def clear_seen_through(layers, lowest, direction, min_time, min_incidence):
-    """validity, bounded and upper bound after rays: remove if p_z < h - sigma, not hit of late, |r . n| > alpha_n."""
+def clear_seen_through(layers, lowest, direction, resolution, *, min_time, min_incidence, gate):
+    """validity, bounded and upper bound after rays: remove if p_z < h - sigma, not hit of late, |r . n| > alpha_n.
+
+    Whatever the normal, also if p_z < h - gate * sqrt(sigma^2 + (cell / 2)^2) - |gradient| * cell / 2.
+    """
     validity, bounded, bound = (layers[n].copy() for n in ("validity", "bounded", "upper_bound"))
     for c in np.ndindex(validity.shape):
         if not math.isfinite(lowest[c]):
             continue
-        normal = np.array([-layers["gradient_x"][c], -layers["gradient_y"][c], 1.0])
+        gx, gy, half = layers["gradient_x"][c], layers["gradient_y"][c], resolution / 2
+        normal = np.array([-gx, -gy, 1.0])
         incidence = abs(direction[c] @ normal) / np.linalg.norm(normal)
-        below = lowest[c] < layers["elevation"][c] - math.sqrt(layers["variance"][c])
-        if validity[c] and below and layers["time"][c] > min_time and incidence > min_incidence:
+        depth = layers["elevation"][c] - lowest[c]
+        far = depth > gate * math.hypot(math.sqrt(layers["variance"][c]), half) + math.hypot(gx, gy) * half
+        below = depth > math.sqrt(layers["variance"][c])
+        if validity[c] and below and layers["time"][c] > min_time and (far or incidence > min_incidence):
             validity[c] = bounded[c] = False
         if not validity[c]:
             bound[c] = min(bound[c], lowest[c]) if bounded[c] else lowest[c]

@@ -28,7 +28,7 @@ LIVELY = dict(
     sensor=SensorConfig(body=BodyConfig(lower=(-0.1, -0.1, -2), upper=(0.1, 0.1, 2))),
     raycast=RaycastConfig(min_time=0.05, min_incidence=0.05),
     drift=DriftConfig(min_points=5),
-    overlap=OverlapConfig(radius=0.5, height=1.2),
+    overlap=OverlapConfig(radius=0.5, height=1.2, base_height=2.0),
 )
 
 

@@ -52,7 +52,8 @@ def marched(state, hits, T):
     lowest, _ = marched_heights(state, hits, T)
     layers = {n: getattr(state, n)[0].numpy() for n in state._fields[2:-1]}
     straight_down = np.tile([0.0, 0.0, -1.0], (*CELLS, 1))  # every ray is steep enough
-    return reference.clear_seen_through(layers, lowest, straight_down, EVERY.min_time, EVERY.min_incidence)[0]
+    rule = dict(min_time=EVERY.min_time, min_incidence=EVERY.min_incidence, gate=EVERY.gate)
+    return reference.clear_seen_through(layers, lowest, straight_down, RESOLUTION, **rule)[0]
 
 
 # Against marching -----------------------------------------------------------------------------------------------------
@@ -153,9 +154,11 @@ def test_a_ghost_goes_and_leaves_a_bound():
         (dict(time=0.6), EVERY, 9),
         (dict(variance=1.0), EVERY, 0),  # h - sigma lies below the rays
         (dict(elevation=-0.2), EVERY, 0),  # rays pass above
-        ({}, RaycastConfig(min_incidence=0.8), 0),  # |r . n| of these flat rays is below
+        ({}, RaycastConfig(min_incidence=0.8, gate=15.0), 0),  # |r . n| of these flat rays is below
+        ({}, RaycastConfig(min_incidence=0.8, gate=0.1), 9),  # but they pass far below
+        (dict(gradient_y=20.0), RaycastConfig(min_incidence=0.8, gate=0.1), 0),  # a face along the rays explains that
         ({}, RaycastConfig(min_incidence=0.1), 9),
-        (dict(gradient_x=3.0), RaycastConfig(min_incidence=0.8), 9),  # the same rays, on a face turned to them
+        (dict(gradient_x=3.0), RaycastConfig(min_incidence=0.8, gate=15.0), 9),  # on a face turned to them
         ({}, RaycastConfig(max_range=0.8, min_incidence=0.0), 0),
     ],
 )
@@ -176,13 +179,28 @@ def test_incidence_is_that_of_the_paper(slope, gradient):
     emap = wide_map()
     state = ghosts(emap)
     height = torch.zeros_like(state.elevation)
-    height[0, 20, 15] = 3.0
+    height[0, 20, 15] = slope * 1.5 + 0.1  # 10 cm above the rays, which relief and noise explain
     state = state._replace(elevation=height, gradient_x=torch.full_like(height, gradient))
     T = pose((-1.95, 0.05, slope * 3.5))
     hits = np.repeat([[-1.95 + 3.5, 0.05, 0.0]], 3, 0)
     for threshold, number in ((incidence * 0.99, 1), (min(0.999, incidence * 1.01), 0)):
         after = cast(emap, state, hits, T, RaycastConfig(min_time=0.5, min_incidence=threshold))
         assert cleared(state, after) == number
+
+
+@pytest.mark.parametrize("gradient", [0.0, 5.0, -7.0])  # per metre of its height: the steepest that a fit gives
+@pytest.mark.parametrize("height", [0.4, 0.9])
+def test_a_column_goes_whatever_its_own_tilt(gradient, height):
+    """One cell that is left of a ghost tilts its own normal, here across the rays: those pass far below its top."""
+    emap = wide_map()
+    state, elevation = ghosts(emap), torch.zeros(1, *CELLS, dtype=torch.float64)
+    elevation[0, 20, 15] = height
+    tilt = torch.zeros_like(elevation)
+    tilt[0, 20, 15] = gradient * height
+    state = state._replace(elevation=elevation, gradient_y=tilt)
+    hits = np.repeat([[0.5, 0.05, 0.0]], 3, 0)
+    T, cfg = pose((-1.95, 0.05, 0.3)), RaycastConfig(min_time=0.5, min_incidence=0.3)
+    assert cleared(state, cast(emap, state, hits, T, cfg)) == 1
 
 
 @pytest.mark.parametrize("noise, number", [(0.01, 1), (0.2, 0)])

@@ -1,5 +1,6 @@
 """The slow reference itself, on cases computed by hand."""
 
+import functools
 import math
 
 import numpy as np
@@ -223,11 +224,17 @@ def test_clear_seen_through():
     layers["bounded"] = np.array([[False, False, False, True, True]])
     layers["upper_bound"][0, 3] = 0.5
     lowest, down = np.array([[1.0, 1.0, 1.0, 1.0, math.inf]]), np.tile([0.6, 0.0, -0.8], (1, 5, 1))
-    validity, bounded, bound = reference.clear_seen_through(layers, lowest, down, 1.0, 0.7)
+    rule = dict(min_time=1.0, min_incidence=0.7, gate=4.0)
+    validity, bounded, bound = reference.clear_seen_through(layers, lowest, down, 0.6, **rule)
     assert validity.tolist() == [[False, True, True, False, True]]
     assert bounded.tolist() == [[True, False, False, True, False]]
     assert bound[0, 0] == 1.0 and bound[0, 3] == 0.5
-    assert reference.clear_seen_through(layers, lowest, down, 1.0, 0.9)[0][0, 0], "a grazing ray"
+    rule["min_incidence"] = 0.9
+    assert reference.clear_seen_through(layers, lowest, down, 0.6, **rule)[0][0, 0], "a grazing ray, 1 m below"
+    rule["gate"] = 3.0
+    assert not reference.clear_seen_through(layers, lowest, down, 0.6, **rule)[0][0, 0], "0.9 m explain no 1 m"
+    layers["gradient_y"][:] = 0.4
+    assert reference.clear_seen_through(layers, lowest, down, 0.6, **rule)[0][0, 0], "with 0.12 m of slope they do"
 
 
 def test_clear_other_floors():
@@ -236,9 +243,23 @@ def test_clear_other_floors():
         upper_bound=np.array([[3.0, 0.0, 3.0]]),
         validity=np.array([[True, True, True]]),
         bounded=np.array([[True, True, True]]),
+        time=np.array([[9.0, 9.0, 9.0]]),
     )
-    validity, bounded, cleared = reference.clear_other_floors(layers, (0.5, 0.5, 0.0), (0, 0), 1.0, 1.5, 2.0)
+    rule = dict(radius=1.5, height=2.0, base_height=0.5, max_base_height=2.0)
+    clear = functools.partial(reference.clear_other_floors, layers, corner=(0, 0), resolution=1.0, **rule)
+    validity, bounded, cleared = clear((0.5, 0.5, 0.0))
     assert validity.tolist() == [[True, False, True]] and bounded.tolist() == [[False, False, True]] and cleared == 1
+    layers["time"][0, 1] = 0.0  # hit now, 1 m away: 3 m are within 2 m + 1 m * 2 / 1.5
+    assert clear((0.5, 0.5, 0.0))[0].all()
+    layers["elevation"][0] = [0.0, -1.4, 9.0]
+    layers["time"][0, 1] = 9.0
+    assert clear((0.5, 0.5, 1.8))[0][0, 1], "the robot counts as 0.5 m above the ground at 0"
+    layers["elevation"][0, 1] = -1.6
+    assert not clear((0.5, 0.5, 1.8))[0][0, 1]
+    layers["elevation"][0, 1] = 0.0
+    assert clear((0.5, 0.5, 1.8))[2] == 0 and clear((0.5, 0.5, 2.1))[2] == 2, "farther than 2 m below is no ground"
+    layers["time"][0, 0] = 0.0
+    assert clear((0.5, 0.5, 2.1))[2] == 0, "unless it is hit now: then the robot flies"
 
 
 def test_fit_plane():

@@ -261,17 +261,28 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     for s in range(m.origin.shape[1]):
         rays = rays_of(m, s)
         table = lowest_slopes(rays, believed(state, m, rays, grid, cfg), polar, grid)
-        state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), cfg)
+        state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), grid, cfg)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
 
 
-def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> MapState:
+def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: RaycastConfig) -> MapState:
     """Apply the lowest ray of one sensor to every cell."""
-    below = ray.height < state.elevation - state.variance.sqrt()
-    gone = state.validity & ray.found & below & (state.time > cfg.min_time) & (ray.incidence > cfg.min_incidence)
+    depth = state.elevation - ray.height
+    seen_through = passes_far_below(state, depth, grid, cfg) | (ray.incidence > cfg.min_incidence)
+    gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
     validity = state.validity & ~gone
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
     validity, bounded, upper_bound = realize_all(validity, (state.bounded & ~state.validity) | bounds, upper_bound)
     return state._replace(validity=validity, bounded=bounded, upper_bound=upper_bound)
+
+
+def passes_far_below(state: MapState, depth: Tensor, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B H W"]:
+    """Tell where a ray passes so far below a cell that no grazing ray over its plane could, whatever the normal.
+
+    depth > gate * sqrt(sigma^2 + (resolution / 2)^2) + |gradient| * resolution / 2: the noise, the relief within the
+    cell, and what its plane rises from the centre to the border.
+    """
+    rise = (state.gradient_x.square() + state.gradient_y.square()).sqrt() * (0.5 * grid.resolution)
+    return depth > height_margin(state, grid, cfg) + rise
