@@ -70,6 +70,7 @@ def test_updates_are_timed_by_the_maps_clock():
 
 def test_updates_elsewhere_are_not_timed():
     emap, (cloud, _) = mapped(), scan(5)
+    emap._pace = Pace()
     elsewhere = torch.empty(cloud.shape, device="meta")
     pace.paced(lambda *_: None)(emap, elsewhere)
     assert not emap._pace.recent
