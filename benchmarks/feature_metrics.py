@@ -170,8 +170,9 @@ def overhang_cells(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figur
 
     Overhang cells: hit by exact returns of bar or ceiling that lay above the default ramp, by none that lay below it.
     `overhang [%]`: share of them more than 10 cm above the ground in the map after any frame.
-    `bar at the end [%]`, `ceiling at the end [%]`: of the known cells under it, those more than 10 cm too high in the
-    last map, whether or not it was below the ramp from somewhere (the bar was, from afar).
+    `bar at the end [%]`, `ceiling at the end [%]`: of the known cells that it reaches into, those more than 10 cm too
+    high in the last map: what the picture shows, whether or not it was below the ramp from somewhere. The bar, 0.35 m
+    above the sensor, is below it from more than 1.5 m away; its end at y > 0.65 is never nearer than that.
     `obstacle mapped [%]`: of the cells wholly on the low obstacle's top that an exact return had hit, those within 3 cm
     of it, in the last map before the robot is under the bar or at the end, whichever has fewer.
     """
@@ -194,7 +195,7 @@ def overhang_cells(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figur
     emap = fuse(recording, cfg, watch)
     cells = cells_of(emap, recording)
     high, known = cells.error > 0.1, cells.error.isfinite()
-    under = [box.covers(cells.xy[..., 0], cells.xy[..., 1]) & known for box in recording.scene.boxes[:2]]
+    under = [on_wall(box, cells.xy, GRID.resolution / 2) & known for box in recording.scene.boxes[:2]]
     return {
         "overhang [%]": 100 * share(ever, within),
         "bar at the end [%]": 100 * share(high, under[0]),

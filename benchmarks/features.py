@@ -46,6 +46,7 @@ class Feature:
     measure: Callable[[Recording, ElevationMapConfig], tuple[Figures, ElevationMap]]
     off: str  # dotted name of the setting that is set to None
     bars: dict[str, tuple[str, float]]  # metric -> ("<=" or ">=", limit)
+    shown: tuple[str, ...] = ()  # metrics in the picture besides the first of the bars
 
 
 LEFT = {"left [%]": ("<=", 1.0)}
@@ -65,7 +66,10 @@ FEATURES = (
     Feature(
         "cleanup: static, 1 % too long", partial(rec.record_static, WRONG), metrics.wrongly_removed, "raycast", REMOVED
     ),
-    Feature("exclusion area", rec.record_overhang, metrics.overhang_cells, "sensor.exclusion", OVERHANG),
+    Feature(
+        "exclusion area", rec.record_overhang, metrics.overhang_cells, "sensor.exclusion", OVERHANG,
+        shown=("bar at the end [%]", "ceiling at the end [%]"),
+    ),  # fmt: skip
     Feature("edges", rec.record_walls, metrics.wall_tops, "fusion.edges", WALLS),
     Feature("overlap clearance: up", partial(rec.record_floors, True), metrics.other_floor, "overlap", FLOOR),
     Feature("overlap clearance: down", partial(rec.record_floors, False), metrics.other_floor, "overlap", FLOOR),
@@ -153,6 +157,12 @@ def limits(*layers: torch.Tensor) -> tuple[float, float]:
     return min(float(z.quantile(0.001)) for z in known) - 0.02, max(float(z.quantile(0.999)) for z in known) + 0.02
 
 
+def titled(figures: Figures, shown: tuple[str, ...]) -> str:
+    """Write some figures in short."""
+    parts = [(figures[metric], *metric.rstrip("]").partition(" [")) for metric in shown]
+    return ", ".join(f"{what.removesuffix(' at the end')} {value:.1f} {unit}" for value, what, _, unit in parts)
+
+
 def draw_row(figure, row, outcome: Outcome) -> None:
     """Draw truth, on, off and baseline of one feature."""
     xy = outcome.maps["on"].cell_centers()[0]
@@ -163,15 +173,14 @@ def draw_row(figure, row, outcome: Outcome) -> None:
     corner, end = xy[0, 0] - GRID.resolution / 2, xy[-1, -1] + GRID.resolution / 2
     extent = (float(corner[0]), float(end[0]), float(corner[1]), float(end[1]))
     path = torch.stack([frame.T_map_base[0, :2, 3] for frame in outcome.recording.frames])
-    first = next(iter(outcome.feature.bars))
+    shown = (next(iter(outcome.feature.bars)), *outcome.feature.shown)
     for ax, (name, values) in zip(row, layers.items(), strict=True):
         image = ax.imshow(values.T, origin="lower", extent=extent, vmin=low, vmax=high, interpolation="nearest")
         ax.set_facecolor("#d9d9d9")
         ax.plot(path[:, 0], path[:, 1], color="crimson", linewidth=0.8)
         ax.set(xlim=(-4, 4.5), ylim=(-3.2, 3.2))
         figures = outcome.figures.get(name)
-        what, _, unit = first.rstrip("]").partition(" [")
-        ax.set_title(f"{name}: {what} {figures[first]:.1f} {unit}" if figures else name, fontsize=9)
+        ax.set_title(f"{name}: {titled(figures, shown)}" if figures else name, fontsize=9 if len(shown) == 1 else 7)
     row[0].set_ylabel(f"{outcome.feature.name}\ny [m]", fontsize=9)
     figure.colorbar(image, ax=list(row), pad=0.01).set_label(f"{layer.replace('_', ' ')} [m]", fontsize=8)
 

@@ -225,7 +225,7 @@ def packed(value: Tensor) -> Tensor:
     A slice, an expansion, or what was made in inference mode would get other graphs.
     """
     with torch.inference_mode(False), torch.no_grad():
-        value = value.reshape(-1).view(value.shape)
+        value = value.contiguous().reshape(-1).view(value.shape)  # constants expanded in full would else stay so
         return value.clone() if value.is_inference() else value
 
 
