@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torchelev import __version__
 from torchelev.io import MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
 from torchelev.io.config_file import load_config
-from torchelev.io.report import hints, summary, warnings
+from torchelev.io.report import hints, summary
 
 if TYPE_CHECKING:
     from torchelev.config import ElevationMapConfig
@@ -264,7 +264,7 @@ def finish(run: MappingRun, total: int, prefix: Path, stopped: BaseException | N
         return INTERRUPTED
     if stopped is not None:
         raise OneLineError(f"{stopped}; {kept}")
-    for line in warnings(run):
+    for line in run.emap.diagnose():
         click.echo(f"warning: {line}", err=True)
     return 0
 
