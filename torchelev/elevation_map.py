@@ -131,6 +131,7 @@ class ElevationMap(nn.Module):
         mend = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", mend)
         self._filtered.clear()
+        self._recent.forget()
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _apply(self, *args: Any, **kwargs: Any) -> ElevationMap:
