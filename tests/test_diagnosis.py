@@ -152,6 +152,16 @@ def test_reset_forgets_what_was_seen(walked):
     assert emap.diagnose() == []
 
 
+@pytest.mark.parametrize("how", ["mask", "env_ids"])
+def test_a_reset_of_some_forgets_theirs_alone(walked, how):
+    emap = ElevationMap(CFG, num_envs=2)
+    p, T, base = walked[0]
+    emap.update(torch.cat([p, 1000 * p]), T.repeat(2, 1, 1), base.repeat(2, 1, 1), dt=DT)
+    for env, found in ((0, True), (1, False)):
+        emap.reset(**{how: torch.tensor([env]) if how == "env_ids" else torch.arange(2) == env})
+        assert bool(emap.diagnose()) == found
+
+
 def test_second_environment_is_looked_at(walked):
     emap = ElevationMap(CFG, num_envs=2)
     for p, T, base in walked[:3]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torchelev.config import ElevationMapConfig
 from torchelev.grid import cell_centers
 from torchelev.pose_hypotheses import Fit, Scan, explain
-from torchelev.recent import ENVS, Look
+from torchelev.recent import ENVS, Look, Recent
 from torchelev.sensor import measure
 from torchelev.state import MapState
 
@@ -82,11 +82,10 @@ class Evidence:
         return np.array([T[:3, 3] for T in poses])
 
 
-def diagnose(cfg: ElevationMapConfig, state: MapState, looks: Sequence[Look]) -> list[str]:
+def diagnose(cfg: ElevationMapConfig, state: MapState, recent: Recent) -> list[str]:
     """Return what looks wrong, worst first, each once."""
-    if not looks:
-        return []
-    everything = [evidence(cfg, state, looks, env) for env in range(min(ENVS, len(state.elevation)))]
+    looks = [(env, recent.looks_at(env)) for env in range(min(ENVS, len(state.elevation)))]
+    everything = [evidence(cfg, state, seen, env) for env, seen in looks if seen]
     found = ((rule(seen) for seen in everything) for rule in RULES)
     sentences = [next((text for text in texts if text), None) for texts in found]
     return [text for text in sentences if text]
