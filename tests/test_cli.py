@@ -145,7 +145,7 @@ def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
     assert saved.center[2] == pytest.approx(0, abs=1e-6)
     # A base 4 m below the ground: everything near belongs to another floor.
     code, _, err = run("map", recording, "--size", 4, "--sensor-height", HEIGHT + 4)
-    assert code == 0 and "every cell was cleared again: check --sensor-height" in err
+    assert code == 0 and "and 0 are left, as other floors: check T_map_base" in err
     assert not np.isfinite(load_npz(tmp_path / "map.npz").layers["elevation"]).any()
 
 
@@ -228,7 +228,7 @@ def test_poses_that_contradict_each_other_are_warned_of(run, recording):
     poses[1::2, 11 if poses.shape[1] == 12 else 3] += 1.0
     np.savetxt(recording / "poses.txt", poses)
     code, _, err = run("map", recording, "--size", 4)
-    assert code == 0 and "of the points contradict the map: check that the map's z points up" in err
+    assert code == 0 and "of the points contradict the map; check that poses belong to their scans" in err
 
 
 @pytest.mark.parametrize(
@@ -312,7 +312,17 @@ def test_a_wrong_frame_is_pointed_out(run, recording, tmp_path):
     write_poses(recording / "poses.txt", poses)
     code, out, err = run("map", recording, "--size", 8)
     assert code == 0 and "overhang 12,000" in out
-    assert "no point fell into the map: check that poses take sensor points into a z-up map frame" in err
+    assert "the sensor is mounted upside down, which T_map_sensor does not say" in err
+
+
+def test_millimetres_are_told_to_be_units(run, recording):
+    for path in (recording / "scans").iterdir():
+        points = 1000 * np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
+        vertices = np.array([tuple(p) for p in points], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+        plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(path.with_suffix(".ply"))
+        path.unlink()
+    code, _, err = run("map", recording, "--size", 8)
+    assert code == 0 and "as of millimetres: check units" in err and "pose" not in err
 
 
 def test_a_second_map_in_the_recordings_folder_takes_the_same_scans(run, recording, tmp_path, monkeypatch):

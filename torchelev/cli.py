@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torchelev import __version__
 from torchelev.io import FileLayout, MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
 from torchelev.io.config_file import load_config
-from torchelev.io.report import hints, summary, warnings
+from torchelev.io.report import hints, summary
 from torchelev.output_files import require_writable
 
 if TYPE_CHECKING:
@@ -309,7 +309,7 @@ def finish(run: MappingRun, total: int, prefix: Path, stopped: BaseException | N
         raise stopped
     if failed:
         return BAD_INPUT
-    for line in warnings(run):
+    for line in run.emap.diagnose():
         click.echo(f"warning: {line}", err=True)
     return 0
 

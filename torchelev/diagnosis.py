@@ -15,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.config import ElevationMapConfig
+from torchelev.grid import cell_centers
 from torchelev.pose_hypotheses import Fit, Scan, explain
-from torchelev.recent import ENVS, Look
+from torchelev.recent import ENVS, Look, Recent
 from torchelev.sensor import measure
 from torchelev.state import MapState
 
@@ -43,6 +44,7 @@ class Evidence:
     used: list[NDArray]  # which points of a look passed the sensor's gates
     statistics: dict[str, float]  # of the last update
     num_known: int  # cells
+    num_near: int  # known cells where overlap clearance works
     center: NDArray  # (2,) [m] of the window
 
     @cached_property
@@ -50,17 +52,23 @@ class Evidence:
         """How many points there were."""
         return sum(len(cloud) for clouds in self.points for cloud in clouds)
 
+    def in_map(self, k: int) -> NDArray:
+        """Return the points (n, 3) [m] of look k that passed the sensor's gates, in the map frame."""
+        clouds = [cloud @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(self.points[k], self.poses[k], strict=True)]
+        return np.concatenate(clouds)[self.used[k]]
+
     @cached_property
     def scans(self) -> list[Scan]:
         """The finite points with their poses."""
-        pairs = [(k, *pair) for k in range(len(self.numbers)) for pair in zip(self.points[k], self.poses[k])]  # noqa: B905
+        looks = enumerate(zip(self.points, self.poses, strict=True))
+        pairs = [(k, cloud, T) for k, look in looks for cloud, T in zip(*look, strict=True)]
         finite = [(k, cloud[np.isfinite(cloud).all(1)], T) for k, cloud, T in pairs if np.isfinite(T).all()]
         return [Scan(cloud, T, k) for k, cloud, T in finite if len(cloud)]
 
     @cached_property
     def explained(self) -> tuple[Fit, list[str]]:
         """Whether the poses fit, and the mistakes that would explain why not."""
-        return explain(self.scans) if self.scans and not millimetres(self) else (Fit(np.nan, np.nan), [])
+        return explain(self.scans) if self.scans and not millimetres(self) else (Fit(np.nan, np.nan, np.nan), [])
 
     @cached_property
     def distances(self) -> NDArray:
@@ -74,11 +82,10 @@ class Evidence:
         return np.array([T[:3, 3] for T in poses])
 
 
-def diagnose(cfg: ElevationMapConfig, state: MapState, looks: Sequence[Look]) -> list[str]:
+def diagnose(cfg: ElevationMapConfig, state: MapState, recent: Recent) -> list[str]:
     """Return what looks wrong, worst first, each once."""
-    if not looks:
-        return []
-    everything = [evidence(cfg, state, looks, env) for env in range(min(ENVS, len(state.elevation)))]
+    looks = [(env, recent.looks_at(env)) for env in range(min(ENVS, len(state.elevation)))]
+    everything = [evidence(cfg, state, seen, env) for env, seen in looks if seen]
     found = ((rule(seen) for seen in everything) for rule in RULES)
     sentences = [next((text for text in texts if text), None) for texts in found]
     return [text for text in sentences if text]
@@ -106,8 +113,16 @@ def evidence(cfg: ElevationMapConfig, state: MapState, looks: Sequence[Look], en
         used=used,
         statistics={name: float(value[env]) for name, value in state.statistics._asdict().items()},
         num_known=int(state.validity[env].sum()),
+        num_near=_known_near(cfg, state, looks[-1], env),
         center=corner + [grid.length_x / 2, grid.length_y / 2],
     )
+
+
+def _known_near(cfg: ElevationMapConfig, state: MapState, look: Look, env: int) -> int:
+    if look.T_map_base is None or cfg.overlap is None:
+        return 0
+    away = cell_centers(state.corner, cfg.grid)[env] - look.T_map_base[env, :2, 3]
+    return int((state.validity[env] & (away.norm(dim=-1) <= cfg.overlap.radius)).sum())
 
 
 def millimetres(seen: Evidence) -> str | None:
@@ -117,7 +132,7 @@ def millimetres(seen: Evidence) -> str | None:
     median = float(np.median(seen.distances))
     if median < max(250.0, 2 * seen.cfg.sensor.max_distance):
         return None
-    return f"points: half of them are more than {median:,.0f} m away; they look like millimetres: multiply them by 0.001"
+    return f"points: the median distance is {median:,.0f} m, as of millimetres: check units, and multiply them by 0.001"
 
 
 def wrong_poses(seen: Evidence) -> str | None:
@@ -143,18 +158,28 @@ def rejected(seen: Evidence) -> str | None:
         left = seen.num_points - (0 if name == "invalid" else seen.gates["invalid"])
         if left >= FEW and seen.gates[name] >= 0.95 * left:
             return f"points: {seen.gates[name]:,} of {left:,} {reason}"
-    return None
+    used = sum(int(mask.sum()) for mask in seen.used)
+    if used >= 0.01 * seen.num_points or seen.gates["invalid"] > 0.9 * seen.num_points:
+        return None
+    shares = ", ".join(f"{number:,} {name}" for name, number in seen.gates.items() if number)
+    return f"points: the sensor's gates let {used:,} of {seen.num_points:,} pass ({shares}); check poses and sensor=..."
 
 
 def out_of_reach(seen: Evidence) -> str | None:
-    """The window lies where no points fall."""
-    outside, used = seen.statistics["rejected_outside"], seen.statistics["points_used"]
-    if outside < FEW or outside < 0.95 * (outside + used + seen.statistics["rejected_outlier"]):
+    """The window lies where no points fall, in any look."""
+    half = np.array([seen.cfg.grid.length_x, seen.cfg.grid.length_y]) / 2
+    shares, away = [], 0.0
+    for k, base in enumerate(seen.bases):
+        points, center = seen.in_map(k)[:, :2], seen.center if base is None else base[:2, 3]
+        if len(points) >= FEW:
+            shares.append(float((np.abs(points - center) > half).any(1).mean()))
+            away = float(np.linalg.norm(seen.poses[k][0][:2, 3] - center))
+    if not shares or min(shares) < 0.95:
         return None
-    away = float(np.linalg.norm(seen.scans[-1].T[:2, 3] - seen.center)) if seen.scans else np.nan
     hint = "give T_map_base, which the window follows" if seen.bases[-1] is None else "check T_map_base"
-    hint = hint if away > seen.cfg.grid.length_x / 2 else "enlarge grid.length_x and grid.length_y"
-    return f"window: {outside:,.0f} points fell beside it, and its centre is {away:.1f} m from the sensor; {hint}"
+    hint = hint if away > half.max() else "enlarge grid.length_x and grid.length_y"
+    share = f"{100 * shares[-1]:.0f} % of the points fall beside it"
+    return f"window: {share}, and its centre is {away:.1f} m from the sensor; {hint}"
 
 
 def contradicted(seen: Evidence) -> str | None:
@@ -168,14 +193,14 @@ def contradicted(seen: Evidence) -> str | None:
 
 
 def cleared(seen: Evidence) -> str | None:
-    """One stage clears as many cells as are left, in an update that takes points in."""
-    numbers = {
-        "cleared_other_floors": "as other floors than the robot's: check T_map_base, and overlap.height",
-        "cleared_seen_through": "as rays pass below them: check the poses' heights, and raycast",
+    """One stage clears most of what it works on, in an update that takes points in."""
+    stages = {
+        "cleared_other_floors": (4 * seen.num_near, "as other floors: check T_map_base, and overlap.height"),
+        "cleared_seen_through": (seen.num_known, "as rays pass below them: check the poses' heights, and raycast"),
     }
-    for name, reason in numbers.items():
+    for name, (left, reason) in stages.items():
         number = seen.statistics[name]
-        if number >= FEW and number > seen.num_known:
+        if number >= FEW and left < number:
             return f"map: {number:,.0f} cells were cleared and {seen.num_known:,} are left, {reason}"
     return None
 
@@ -201,16 +226,14 @@ def own_legs(seen: Evidence) -> str | None:
         return None
     number = int(np.median(counts))
     return (
-        f"points: about {number} in each scan stay within 0.4 m of the robot while it moves, as of its own legs or body; "
-        "give sensor.body=BodyConfig(...) and T_map_base, or a larger sensor.min_distance"
+        f"points: about {number} in each scan stay within 0.4 m of the robot while it moves, as of its own legs or "
+        "body; give sensor.body=BodyConfig(...) and T_map_base, or a larger sensor.min_distance"
     )
 
 
 def _beside_base(seen: Evidence, k: int) -> int:
     """Count points used that lie within 0.4 m of the base's axis, at its height; without a base, near the sensor."""
-    clouds = [cloud @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(seen.points[k], seen.poses[k], strict=True)]
-    points = np.concatenate(clouds)[seen.used[k]]
-    base = seen.bases[k]
+    points, base = seen.in_map(k), seen.bases[k]
     if base is None:
         return int((np.linalg.norm(points - seen.poses[k][0][:3, 3], axis=1) < 0.35).sum())
     x, y, z = ((points - base[:3, 3]) @ base[:3, :3]).T

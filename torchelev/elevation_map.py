@@ -134,6 +134,7 @@ class ElevationMap(nn.Module):
         mend = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", mend)
         self._filtered.clear()
+        self._recent.forget()
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _apply(self, *args: Any, **kwargs: Any) -> ElevationMap:
@@ -327,7 +328,7 @@ class ElevationMap(nn.Module):
         if env_ids is not None:
             env_ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
         self._filtered.clear()
-        self._recent.forget()
+        self._recent.forget(env_ids, mask)
         with torch.no_grad():
             forget(self.state, self.cfg.grid, env_ids, mask)
 
@@ -361,7 +362,7 @@ class ElevationMap(nn.Module):
         first environments, and waits for the device; nothing else does. For it a map keeps copies of some of the last
         inputs, thinned to 3,000 points. Updates inside a `torch.compile` of your own are not looked at.
         """
-        return diagnose(self.cfg, self.state, self._recent.looks)
+        return diagnose(self.cfg, self.state, self._recent)
 
     def cell_centers(self) -> Float[Tensor, "B H W 2"]:
         """Return the cell centres [m], map frame, float64."""

@@ -1,6 +1,7 @@
 """Which mistake in the poses or points would explain what a sensor saw: each is undone, and the result compared.
 
-A set of scans fits if the largest plane in each is level, lies below the sensor, and the scans agree where they overlap.
+A set of scans fits if the largest plane in each is level, lies below the sensor, and the scans agree where they
+overlap.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ class Fit(NamedTuple):
 
     level: float  # cosine between the planes' normals and the vertical, median
     agreement: float  # share of the common cells in which scans have the same height
+    bounce: float  # [m] standard deviation of the sensor's height over the planes
 
     @property
     def score(self) -> float:
@@ -51,7 +53,7 @@ class Fit(NamedTuple):
     @property
     def is_sound(self) -> bool:
         """Tell whether nothing speaks against it."""
-        return self.level > 0.8 and not self.agreement < 0.75
+        return self.level > 0.8 and not self.agreement < 0.75 and self.bounce < 0.3
 
     @property
     def is_wrong(self) -> bool:
@@ -77,16 +79,18 @@ def largest_plane(points: NDArray) -> Plane | None:
 
 def fit(scans: list[Scan], planes: list[Plane | None], undo: Callable[[Scan], tuple[NDArray, NDArray]]) -> Fit:
     """Judge the scans after a mistake was undone; `undo` gives the right pose, and the sensor's place in the points."""
-    levels, cells = [], []
+    levels, heights, cells = [], [], []
     for scan, plane in zip(scans, planes, strict=True):
         T, place = undo(scan)
         if plane is not None:
             height = float(plane.normal @ place) - plane.offset
+            heights.append(abs(height))
             up = float(T[2, :3] @ plane.normal) * np.sign(height)
             levels.append(up if abs(height) > 0.05 else -1.0)  # a sensor within the ground
         near = scan.points[np.linalg.norm(scan.points - place, axis=1) < REACH]
         cells.append(_heights(near @ T[:3, :3].T + T[:3, 3], scan.step))
-    return Fit(float(np.median(levels)) if levels else np.nan, _agreement(cells))
+    level, bounce = (float(np.median(levels)), float(np.std(heights))) if levels else (np.nan, np.nan)
+    return Fit(level, _agreement(cells), bounce)
 
 
 def _heights(points: NDArray, step: int) -> dict[tuple[int, int], float]:
@@ -150,25 +154,22 @@ def inverted(scan: Scan) -> tuple[NDArray, NDArray]:
     return rigid(R, -R @ scan.T[:3, 3]), np.zeros(3)
 
 
-# What to write, and how to undo it. The likelier of two that fit equally well comes first.
+# What to say, and how to undo it.
 MISTAKES: dict[str, Callable[[Scan], tuple[NDArray, NDArray]]] = {
-    "the points are in the map frame already, so that the pose is applied twice: give sensor-frame points, or the "
-    "transform from the points' frame": in_map_already,
-    "T_map_sensor is inverted: it must take sensor-frame points into the map frame; give torch.linalg.inv of it": inverted,
-    "the rotation in T_map_sensor is transposed: give its inverse with the same position": _turned(lambda R: R.T),
-    "the points have optical axes (x right, y down, z forward), the pose has x forward and z up: multiply the pose by "
-    "the rotation from optical axes": _turned(lambda R: R @ OPTICAL),
-    "the pose has optical axes (z forward), the points have x forward and z up: multiply the pose by the inverse of the "
-    "rotation from optical axes": _turned(lambda R: R @ OPTICAL.T),
-    "the sensor is mounted upside down, which T_map_sensor does not say: multiply the pose by diag(1, -1, -1, 1)": _turned(
-        lambda R: R * [1.0, -1.0, -1.0]
-    ),
-    "a quaternion in the order x y z w was read as w x y z: reorder it": _turned(
-        lambda R: rotation(np.roll(quaternion(R), 1))
-    ),
-    "a quaternion in the order w x y z was read as x y z w: reorder it": _turned(
-        lambda R: rotation(np.roll(quaternion(R), -1))
-    ),
+    "the points are in the map frame already, so that the pose is applied twice: "
+    "give sensor-frame points, or the transform from the points' frame": in_map_already,
+    "T_map_sensor is inverted: give its inverse, which takes sensor-frame points into the map frame": inverted,
+    "the rotation in T_map_sensor is transposed: transpose it, and keep the position": _turned(lambda R: R.T),
+    "the points have optical axes (x right, y down, z forward), the pose has z up: "
+    "multiply the pose by the rotation from optical axes": _turned(lambda R: R @ OPTICAL),
+    "the pose has optical axes (z forward), the points have z up: "
+    "multiply the pose by the inverse of the rotation from optical axes": _turned(lambda R: R @ OPTICAL.T),
+    "the sensor is mounted upside down, which T_map_sensor does not say: "
+    "multiply it by diag(1, -1, -1, 1)": _turned(lambda R: R * [1.0, -1.0, -1.0]),
+    "a quaternion in the order x y z w was read as w x y z: "
+    "reorder it": _turned(lambda R: rotation(np.roll(quaternion(R), 1))),
+    "a quaternion in the order w x y z was read as x y z w: "
+    "reorder it": _turned(lambda R: rotation(np.roll(quaternion(R), -1))),
 }  # fmt: skip
 
 

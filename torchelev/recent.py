@@ -34,11 +34,26 @@ class Recent:
     def __init__(self) -> None:
         self.looks: deque[Look] = deque(maxlen=KEPT)
         self.updates = 0
+        self.since: Tensor | None = None  # (ENVS,) number of the first look that counts; None: all do
 
-    def forget(self) -> None:
-        """Drop everything: after a reset, other poses may lie in another map frame."""
-        self.looks.clear()
-        self.updates = 0
+    def forget(self, env_ids: Tensor | None = None, mask: Tensor | None = None) -> None:
+        """Drop what was seen in all or some environments: after a reset, poses may lie in another map frame."""
+        if (env_ids is None and mask is None) or torch.compiler.is_compiling():
+            self.looks.clear()
+            self.updates, self.since = 0, None
+            return
+        with torch.inference_mode(False), torch.no_grad():
+            if env_ids is not None:
+                mask = (env_ids[:, None] == torch.arange(ENVS, device=env_ids.device)).any(0)
+            assert mask is not None
+            since = torch.zeros(ENVS, dtype=torch.int64, device=mask.device) if self.since is None else self.since
+            reset = torch.nn.functional.pad(mask[:ENVS], (0, max(0, ENVS - len(mask))))
+            self.since = since.masked_fill(reset, self.updates)
+
+    def looks_at(self, env: int) -> list[Look]:
+        """Return the looks since an environment's last reset; reads back from the device."""
+        first = 0 if self.since is None else int(self.since[env])
+        return [look for look in self.looks if look.number >= first]
 
     def add(self, points: Tensor, T_map_sensor: Tensor, T_map_base: Tensor | None, dt: Tensor) -> None:
         """Take a look at an update's checked inputs, points (B, S, N, 3)."""

@@ -44,24 +44,6 @@ def hints(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]:
     return lines
 
 
-def warnings(run: MappingRun) -> list[str]:
-    """Say what most likely went wrong, where little was mapped or much contradicts it."""
-    used = run.counts["points_used"]
-    if used < 0.01 * run.num_points or used == 0:
-        few = "no point" if used == 0 else f"only {used:,} of {run.num_points:,} points"
-        return [f"{few} fell into the map: check that poses take sensor points into a z-up map frame"]
-    against = run.counts["rejected_outlier"] / (used + run.counts["rejected_outlier"])
-    if against > 0.15:
-        advice = "check that the map's z points up (KITTI odometry's own does not), and quaternions, x y z w"
-        return [f"{100 * against:.0f} % of the points contradict the map: {advice}"]
-    coverage = float(run.emap.layer("validity")[0].mean())
-    if coverage == 0:
-        return ["every cell was cleared again: check --sensor-height or --extrinsics, and overlap in the config"]
-    if coverage < 1e-3:
-        return [f"only {100 * coverage:.2g} % of the window is known: check the poses, and --size and --resolution"]
-    return []
-
-
 def map_panels(layers: dict[str, NDArray], filters: Sequence[str] = ()) -> list[Panel]:
     """The four layers (H, W) that tell most, and those of filters.
 
