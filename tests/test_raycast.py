@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev import GridConfig, RaycastConfig, SensorConfig
-from torchelev.raycast import PolarGrid, believed, clear_seen_through, rays_of, turn
+from torchelev.raycast import BREADTH, PolarGrid, believed, clear_seen_through, rays_of, turn
 
 CELLS, RESOLUTION = (40, 30), 0.1
 PLACES = [(0.0, 0.0), (0.55, -0.33), (-1.93, 0.04), (-2.6, 0.3)]  # in the middle, off it, at the rim, outside
@@ -102,7 +102,7 @@ def ghosts(emap, seed=0):
 def test_cleared_cells_agree_with_marching(place):
     """Ghosts that rays pass below. Rays that end on the floor of a ghost's cell are left out: they are not believed.
 
-    Measured: up to 10 % of the cells that marching clears stay, up to two cells more go.
+    Measured: up to 10 % of the cells that marching clears stay, up to four cells more go, where rays pass beside them.
     """
     emap, T = wide_map(), pose((*place, 1.0))
     state, hits = ghosts(emap), floor_hits(T)
@@ -112,7 +112,7 @@ def test_cleared_cells_agree_with_marching(place):
     cleared, got = ~marched(state, hits, T), ~after.validity[0].numpy()
     assert not (got & (state.elevation[0].numpy() == 0)).any(), "the floor stays"
     assert cleared.sum() > 20
-    assert (got & ~cleared).sum() <= max(2, 0.03 * cleared.sum()) and (cleared & ~got).sum() <= 0.15 * cleared.sum()
+    assert (got & ~cleared).sum() <= max(4, 0.04 * cleared.sum()) and (cleared & ~got).sum() <= 0.15 * cleared.sum()
     assert after.statistics.cleared_seen_through.item() == got.sum()
 
 
@@ -367,13 +367,30 @@ def test_turn_grows_with_the_azimuth():
     assert (turn(angle.cos(), angle.sin()).diff() > 0).all()
 
 
-def test_widths_are_the_most_bins_within_three_quarters_of_a_cell():
+def test_widths_are_the_bins_of_a_cell_and_an_eighth():
     polar = PolarGrid.of(GridConfig(resolution=0.1, length_x=4.0, length_y=3.0), RaycastConfig())
     got = polar.widths(torch.arange(polar.ranges + 1.0).repeat(2, 3, 1))
     assert got.shape == (2, 3, polar.ranges + 1) and (got == got[0, 0]).all()
     for k, width in enumerate(got[0, 0].tolist()):
-        bins = 0.75 * polar.azimuths / (2 * np.pi * max(k, 0.5))
+        bins = BREADTH * polar.azimuths / (2 * np.pi * max(k, 0.5))
         assert width == max(1, 2 ** np.ceil(np.log2(bins))), k  # doubled until it is as wide
+
+
+@pytest.mark.parametrize("spacing", [1.0, 1.3])
+def test_a_still_sensor_misses_no_cell_that_its_rays_cross(spacing):
+    """Columns of rays, `spacing` cells apart where the ghost stood: each cell that holds a ray's path goes."""
+    emap = wide_map()
+    state, T = ghosts(emap), pose((-1.93, 0.03, 1.0))
+    elevation = torch.zeros_like(state.elevation)
+    elevation[0, 25] = 0.8
+    state = state._replace(elevation=elevation)
+    column = np.arange(-7, 8) * spacing * RESOLUTION  # [m] to the left, where x = 0.55
+    y = 0.03 + column * (1.9 + 1.93) / (0.55 + 1.93)
+    hits = np.repeat(np.column_stack([np.full(15, 1.9), y, np.zeros(15)])[np.abs(y) < 1.4], 3, 0)
+    after = cast(emap, state, hits, T)
+    corner = state.corner[0].tolist()
+    crossed = [reference.cell_of(0.55, 0.03 + c, corner, RESOLUTION, CELLS)[1] for c in column[np.abs(y) < 1.4]]
+    assert len(crossed) > 5 and not after.validity[0, 25, crossed].any()
 
 
 # A person walks away, in whole updates --------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 NO_RAY = 1e4  # a slope above every ray's
+BREADTH = 1.125  # [cells] a ray so near passes over a cell: with less, rays of a still sensor would miss some for ever
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,7 @@ class PolarGrid(NamedTuple):
 
     ranges: int
     azimuths: int
-    widen: tuple[int, ...]  # up to which range 3/4 of a cell are wider than 1, 2, 4, ... azimuth bins
+    widen: tuple[int, ...]  # up to which range BREADTH cells are wider than 1, 2, 4, ... azimuth bins
 
     @classmethod
     def of(cls, grid: GridConfig, cfg: RaycastConfig) -> PolarGrid:
@@ -61,7 +62,7 @@ class PolarGrid(NamedTuple):
         reach = math.ceil((cfg.max_range or 0.55 * math.hypot(grid.length_x, grid.length_y)) / grid.resolution)
         # 8 % to spare, of which the approximated azimuth below takes 3: it widens some bins.
         azimuths = 2 * math.ceil(max(16.0, 1.08 * 2 * math.pi * reach) / 2)
-        width = 0.75 * azimuths / (2 * math.pi)  # in azimuth bins, of 3/4 of a cell at a range of one cell
+        width = BREADTH * azimuths / (2 * math.pi)  # in azimuth bins, at a range of one cell
         levels = math.ceil(math.log2(2 * width))  # the sensor's own cell has a range of half a cell
         return cls(reach, azimuths, tuple(math.ceil(width / 2**k) for k in range(levels)))
 
@@ -232,7 +233,7 @@ class RayOverCell(NamedTuple):
 def look_up(
     state: MapState, m: Measurement, origin: Tensor, table: Tensor, polar: PolarGrid, grid: GridConfig
 ) -> RayOverCell:
-    """Gather the lowest ray over the middle of each cell, three quarters of it or more."""
+    """Gather the lowest ray over each cell, or less than a cell beside it."""
     x, y = center_offsets(state, m, grid)
     x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
     rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
@@ -255,6 +256,8 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
 
     A known cell goes if a ray's height over it is below h - sigma, it was not hit for `min_time`, and |r . n| > alpha_n
     (eq. 3 and 4), with n the cell's normal and r the direction of the lowest ray, the only one that the table keeps.
+    Eq. 4 keeps grazing rays from eroding smooth ground; a ray that `passes_far_below` does not graze, and needs none:
+    what is left of a ghost tilts its own normal, by which it would stay for ever.
     The upper bound of an unknown cell is the lowest ray height over it so far.
     """
     polar, known = PolarGrid.of(grid, cfg), state.validity
