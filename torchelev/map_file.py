@@ -22,7 +22,8 @@ from torchelev.errors import require
 from torchelev.state import MapState, Statistics
 from torchelev.traversability_net import TraversabilityNet
 
-FORMAT, VERSION = "torchelev map", 1
+FORMAT, VERSION = "torchelev map", 2
+SINCE_2 = ("challenger", "challenger_support")  # blank in files of version 1
 DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
 
 
@@ -70,6 +71,8 @@ def load_map(
     for name, value in _head(emap).items():
         found = _array(path, arrays, f"head_{name}", tuple(value.shape))
         value.copy_(torch.from_numpy(found))
+    if header["version"] < 2:
+        arrays |= {name: np.zeros_like(arrays["elevation"]) for name in SINCE_2 if "elevation" in arrays}
     emap._store(_state(path, arrays, emap.state, ids))
     return emap
 

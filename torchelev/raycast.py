@@ -263,17 +263,24 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     for s in range(m.origin.shape[1]):
         rays = rays_of(m, s)
         table = lowest_slopes(rays, believed(state, m, rays, grid, cfg), polar, grid)
-        state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), cfg)
+        state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), grid, cfg)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
 
 
-def clear_and_bound(state: MapState, ray: RayOverCell, cfg: RaycastConfig) -> MapState:
+def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: RaycastConfig) -> MapState:
     """Apply the lowest ray of one sensor to every cell."""
     below = ray.height < state.elevation - state.variance.sqrt()
     gone = state.validity & ray.found & below & (state.time > cfg.min_time) & (ray.incidence > cfg.min_incidence)
     validity = state.validity & ~gone
+    # A ray below a challenger, or within a cell above it, shows that nothing stands there: outliers stop no other ray.
+    passed = (ray.found & (ray.height < state.challenger + grid.resolution)) | ~validity
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
-    validity, bounded, upper_bound = realize_all(validity, (state.bounded & ~state.validity) | bounds, upper_bound)
-    return state._replace(validity=validity, bounded=bounded, upper_bound=upper_bound)
+    challenger_support = masked(state.challenger_support, ~passed)
+    validity, bounded, upper_bound, challenger_support = realize_all(
+        validity, (state.bounded & ~state.validity) | bounds, upper_bound, challenger_support
+    )
+    return state._replace(
+        validity=validity, bounded=bounded, upper_bound=upper_bound, challenger_support=challenger_support
+    )
