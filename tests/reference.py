@@ -198,7 +198,20 @@ def scan_height(cell, points, relief, shown, *, gate, max_gate_std, edges):
     for_cell = sum(n and not w for n, w in zip(near, wrong, strict=True))
     if side > 0 and height < cell["elevation"] and cell["support"] >= edges["min_settled"]:
         for_cell = len(kept) + sum(wrong)
-    return height, kept, sum(wrong), for_cell
+    above = cell["known"] and 2 * sum(near) < len(points) and guess > cell["elevation"]
+    return height, kept, sum(wrong), for_cell, guess if above else None
+
+
+def challenge(cell, number, guess, sigma2, gate, min_above, max_above_per_scan):
+    """The challenger and its support after a scan of so many points around `guess`, None if not above the elevation."""
+    challenger, support, votes = cell["challenger"], cell["challenger_support"], min(number, max_above_per_scan)
+    if guess is None:
+        return challenger, max(support - votes, 0.0)
+    if support > 0 and abs(guess - challenger) <= gate * math.sqrt(sigma2):
+        return challenger, support + votes
+    if support > 0 and guess > challenger:
+        return challenger, support
+    return guess, votes
 
 
 def fuse_cell(
@@ -212,13 +225,16 @@ def fuse_cell(
     scan_variance_floor,
     outlier_variance,
     max_support,
+    min_above,
+    max_above_per_scan,
     max_variance,
     edges,
     shown=(-math.inf, {}),
 ):
     """One cell and the points of one scan: the cell after it, and the numbers of points used and ignored at a step.
 
-    `cell` has elevation, variance, known, support, time; each point z, variance, ray, beyond. `relief` counts cells,
+    `cell` has elevation, variance, known, support, challenger, challenger_support and time;
+    each point z, variance, ray, beyond. `relief` counts cells,
     `shown` are the highest mean height of the points in the eight cells around, and the heights of those cells.
     """
     after, relief = dict(cell), relief * resolution
@@ -226,11 +242,15 @@ def fuse_cell(
     if not points:
         return after, 0, 0
     settings = dict(gate=gate, max_gate_std=max_gate_std, edges=edges)
-    height, kept, ignored, for_cell = scan_height(cell, points, relief, shown, **settings)
+    height, kept, ignored, for_cell, guess = scan_height(cell, points, relief, shown, **settings)
+    R = max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor) if kept else 1e12
+    gate_variance = min(cell["variance"], max_gate_std**2)
+    sigma2 = gate_variance + R + relief**2
+    challenger, challengers = challenge(cell, len(points), guess, sigma2, gate, min_above, max_above_per_scan)
+    risen = guess is not None and challengers >= min_above
+    after |= dict(challenger=challenger, challenger_support=min(challengers, min_above))
     if not kept:
         return after, 0, ignored
-    R = max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor)
-    gate_variance = min(cell["variance"], max_gate_std**2)
     distance = abs(height - cell["elevation"])
     agree = cell["known"] and distance <= gate * math.sqrt(gate_variance + R + relief**2)
     votes = len(kept) + ignored
@@ -239,9 +259,10 @@ def fuse_cell(
     if agree:
         h, variance = kalman(cell["elevation"], cell["variance"], [(height, R)])
         after |= dict(elevation=h, variance=min(variance, max_variance), time=0.0)
-    elif not cell["known"] or support < 0:
+    elif not cell["known"] or support < 0 or risen:
         after |= dict(elevation=height, variance=min(R, max_variance), known=True, time=0.0)
-        support = -support if cell["known"] else margin
+        after["challenger_support"] = 0.0
+        support = -support if cell["known"] and not risen else margin
     else:
         after["variance"] = min(cell["variance"] + outlier_variance * len(kept), max_variance)
         return after | dict(support=min(max(support, 0), max_support)), 0, ignored

@@ -41,6 +41,9 @@ def test_agrees_with_the_reference(seed, offset, gain, min_points):
         assert float(after.statistics.drift_correction[b]) == pytest.approx(correction, abs=1e-9)
         shift = (after.elevation[b] - state.elevation[b])[state.validity[b]]
         torch.testing.assert_close(shift, torch.full_like(shift, correction))
+        risen = state.challenger_support[b] > 0
+        moved = (after.challenger[b] - state.challenger[b])[risen]
+        torch.testing.assert_close(moved, torch.full_like(moved, correction))
         bound = (after.upper_bound[b] - state.upper_bound[b])[state.bounded[b]]
         torch.testing.assert_close(bound, torch.full_like(bound, correction))
     assert torch.equal(after.validity, state.validity) and torch.equal(after.variance, state.variance)

@@ -18,6 +18,7 @@ from torchelev.grid import cells_of
 
 SEEDS = st.integers(0, 10_000)
 CELLS = (6, 5)
+FUSED = ("elevation", "variance", "support", "challenger", "challenger_support", "time")
 
 
 def steps_and_outliers(rng, num_points):
@@ -46,7 +47,7 @@ def reference_fuse(state, points, variances, used, origins, b, cfg):
         inside = [a for a in around if 0 <= a[0] < shape[0] and 0 <= a[1] < shape[1]]
         known = {(a[0] - c[0], a[1] - c[1]): float(state.elevation[b][a]) for a in inside if state.validity[b][a]}
         shown = max(means.get(a, -np.inf) for a in inside), known
-        cell = {n: float(getattr(state, n)[b][c]) for n in ("elevation", "variance", "support", "time")}
+        cell = {n: float(getattr(state, n)[b][c]) for n in FUSED}
         cell["known"] = bool(state.validity[b][c])
         settings = dict(dataclasses.asdict(cfg), shown=shown)
         results[c] = reference.fuse_cell(cell, by_cell.get(c, []), 0.1, **settings)
@@ -115,7 +116,7 @@ def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0):
         origins = np.repeat(T[b, :, :3, 3].numpy(), num_points, 0)
         results = reference_fuse(state, points, m.variance[b].tolist(), m.used[b].tolist(), origins, b, cfg)
         for c, (cell, _, _) in results.items():
-            got = {n: float(getattr(after, n)[b][c]) for n in ("elevation", "variance", "support", "time")}
+            got = {n: float(getattr(after, n)[b][c]) for n in FUSED}
             assert got == pytest.approx({n: cell[n] for n in got}, abs=1e-9), c
             assert bool(after.validity[b][c]) == cell["known"]
         assert after.statistics.points_used[b] == sum(used for _, used, _ in results.values())
@@ -231,6 +232,43 @@ def test_float32_keeps_millimetres_at_altitude():
     for _ in range(5):
         emap.update(torch.tensor([[[0.5, 0.5, -1.0], [0.4, 0.5, -1.002]]]), pose((0, 0, 4001.0)), dt=0.1)
     assert float(emap.layer("elevation").double()) == pytest.approx(4000.0 - 0.001, abs=5e-4)
+
+
+# New obstacles --------------------------------------------------------------------------------------------------------
+
+
+def settled(**fusion):
+    emap = one_cell(**fusion)
+    for _ in range(100):
+        scan_of(emap, [0.0, 0.001], 1e-4)
+    return emap
+
+
+@pytest.mark.parametrize("points, scans", [(1, 5), (2, 3), (20, 3)])
+def test_points_that_agree_win_in_a_few_scans(points, scans):
+    """However settled the cell is, but never by a single bad scan."""
+    emap = settled()
+    for _ in range(scans):
+        assert float(emap.elevation) < 0.01
+        scan_of(emap, [0.3] * points, 1e-4)
+    assert float(emap.elevation) == pytest.approx(0.3)
+
+
+def test_points_that_scatter_lose():
+    """Even where nothing else is hit, for as many as the cell's support."""
+    emap = settled()
+    for height in np.linspace(0.2, 2.0, 19):
+        scan_of(emap, [height], 1e-4)
+        scan_of(emap, [2.2 - height], 1e-4)
+    assert float(emap.elevation) < 0.01
+
+
+def test_ground_that_is_still_hit_takes_a_challengers_points_off():
+    emap = settled()
+    for _ in range(20):
+        scan_of(emap, [0.3], 1e-4)
+        scan_of(emap, [0.0], 1e-4)
+    assert float(emap.elevation) < 0.01
 
 
 # Edges ----------------------------------------------------------------------------------------------------------------

@@ -207,6 +207,14 @@ def test_refuses_arrays_that_do_not_fit(path, changes, message):
         load_map(path)
 
 
+def test_reads_a_file_of_version_1(path):
+    """From before cells had challengers."""
+    rewrite_header(path, version=1)
+    rewrite(path, challenger=None, challenger_support=None)
+    emap = load_map(path)
+    assert emap.validity.any() and not emap.challenger.any() and not emap.challenger_support.any()
+
+
 @pytest.mark.parametrize("env_ids", [[2], [-1], [], [[0]], [0.0], torch.tensor([True, False])])
 def test_refuses_environments_that_do_not_exist(path, env_ids):
     with pytest.raises(ValueError, match="env_ids"):

@@ -417,3 +417,23 @@ def test_a_person_who_left_is_cleared_within_seconds(moves, remain):
             assert (emap.layer("elevation") > 0.6).sum() == 9
     layer = emap.layer("elevation")
     assert (layer > 0.05).sum() <= remain and layer.isfinite().float().mean() > 0.85
+
+
+@pytest.mark.parametrize("challenger, stays", [(0.3, True), (0.9, False)])
+def test_a_ray_below_a_challenger_refutes_it(challenger, stays):
+    """Rays from 1 m height to the ground 2 m ahead pass over the cell half way at 0.5 m."""
+    emap = small_map(1, (40, 5), 0.1, drift=None)
+    T = pose((-1.0, 0.05, 1.0))
+    ground = torch.tensor([[[2.0, y, -1.0] for y in (-0.05, 0.0, 0.05) for _ in range(4)]])
+    emap.update(ground, T, dt=0.1)
+    state = emap.state
+    emap._store(
+        state._replace(
+            validity=torch.ones_like(state.validity),
+            support=torch.full_like(state.support, 60.0),
+            challenger=torch.full_like(state.challenger, challenger),
+            challenger_support=torch.full_like(state.challenger_support, 4.0),
+        )
+    )
+    emap.update(ground, T, dt=0.1)
+    assert (emap.challenger_support[0, 20, 2].item() == 4.0) == stays

@@ -101,12 +101,15 @@ def test_drift():
 
 
 FUSION = dict(gate=3.0, max_gate_std=1.0, relief=0.0, scan_variance_floor=1e-9, outlier_variance=0.5, max_support=9)
-FUSION |= dict(max_variance=100.0, edges=None)
+FUSION |= dict(min_above=5, max_above_per_scan=2, max_variance=100.0, edges=None)
 EDGES = dict(min_points=4, min_share=0.5, min_passed=0.5, refinements=2, margin=0.5, min_extreme=2, min_settled=1)
 
 
 def cell(**values):
-    return dict(elevation=0.0, variance=1.0, known=True, support=2, time=5.0) | values
+    return (
+        dict(elevation=0.0, variance=1.0, known=True, support=2, challenger=0.0, challenger_support=0, time=5.0)
+        | values
+    )
 
 
 def points(*heights, variance=1.0, beyond=False):

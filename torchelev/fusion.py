@@ -31,13 +31,15 @@ class FusionConfig:
     scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
     outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
     max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
+    min_above: float = 5.0  # points of one height above a cell that found it anew, however settled it is
+    max_above_per_scan: float = 2.0  # of those points, how many one scan adds: a single bad scan is no obstacle
     max_variance: float = 1.0  # [m^2]
     edges: EdgeConfig | None = EdgeConfig()
 
     def __post_init__(self) -> None:
         fits, mend = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"
         require(fits, "fusion.edges", "must be an EdgeConfig or None", repr(self.edges), mend, TypeError)
-        for name in ("gate", "max_gate_std", "scan_variance_floor", "max_variance"):
+        for name in ("gate", "max_gate_std", "scan_variance_floor", "min_above", "max_above_per_scan", "max_variance"):
             require(
                 getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
             )
@@ -73,6 +75,8 @@ class Prior(NamedTuple):
     variance: Float[Tensor, "B C"]
     known: Bool[Tensor, "B C"]
     support: Float[Tensor, "B C"]
+    challenger: Float[Tensor, "B C"]
+    challenger_support: Float[Tensor, "B C"]
 
 
 def fuse(state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> MapState:
@@ -89,7 +93,8 @@ def fuse(state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, c
 
     A cell keeps count of the points that agreed with it, less those that did not (majority vote of Boyer and Moore):
     a height that most points agree on wins, whether or not an outlier came first. A scan that disagrees raises the
-    variance, as in the paper, and founds the cell anew once the votes are used up.
+    variance, as in the paper, and founds the cell anew once the votes are used up, or once enough points above it agree
+    with each other (`challenge`): a new obstacle shows soon, however long the ground before it was seen.
     """
     scan, prior = gather_scan(m, cells, grid, cfg), gather_prior(state)
     guess = guess_heights(scan, prior, grid, cfg)
@@ -149,6 +154,7 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
     # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
     settled = prior.support >= (cfg.edges.min_settled if cfg.edges is not None else 0.0)
     lower_part = (guess.side > 0) & (height < prior.elevation) & settled
+    above = prior.known & ~guess.trusted & (guess.height > prior.elevation)
     # Points on the face of a wall speak for its top.
     votes = kept_number + edge
     cells = ScanOfCells(
@@ -159,6 +165,8 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
         votes=votes,
         dissent=guess.number - votes,
         agreeing=chosen(lower_part, votes, agreeing),
+        guess=guess.height,
+        rise=guess.number * (2.0 * as_factor(above) - 1.0),
     )
     return cells, ignored
 
@@ -197,6 +205,8 @@ def gather_prior(state: MapState) -> Prior:
         variance=state.variance.flatten(1),
         known=state.validity.flatten(1),
         support=state.support.flatten(1),
+        challenger=state.challenger.flatten(1),
+        challenger_support=state.challenger_support.flatten(1),
     )
 
 
@@ -228,6 +238,8 @@ class ScanOfCells(NamedTuple):
     votes: Float[Tensor, "B C"]  # speak for the height
     dissent: Float[Tensor, "B C"]  # speak against it
     agreeing: Float[Tensor, "B C"]  # speak for the cell's elevation
+    guess: Float[Tensor, "B C"]  # [m] what its points are about, without a gradient
+    rise: Float[Tensor, "B C"]  # all points; negative unless most contradict the cell's elevation from above
 
 
 def merge(
@@ -239,7 +251,9 @@ def merge(
     agree = realize(prior.known & hit & (innovation.square() <= cfg.gate**2 * limit))
     votes = chosen(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
-    found = hit & ~agree & (~prior.known | (support < 0))
+    challenger, challenger_support = challenge(prior, scan, limit, cfg)
+    risen = (scan.rise > 0) & (challenger_support >= cfg.min_above)
+    found = hit & ~agree & (~prior.known | (support < 0) | risen)
     taken = realize(agree | found)
 
     information = ratio(as_factor(agree), prior.variance) + 1.0 / scan.variance
@@ -247,19 +261,48 @@ def merge(
     # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
     outvoted = prior.variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
     posterior = chosen(taken, (1.0 / information).clamp(max=cfg.max_variance), outvoted.clamp(max=cfg.max_variance))
-    fresh = chosen(prior.known, -support, scan.votes - scan.dissent)
+    fresh = chosen(prior.known & ~risen, -support, scan.votes - scan.dissent)
     support = chosen(hit, chosen(found, fresh, support).clamp(0, cfg.max_support), prior.support)
 
     def store(cells: Tensor) -> Tensor:
         return cells.view(state.elevation.shape)
 
     hit_now = store(taken)
-    elevation, variance, support, validity, time = realize_all(
+    elevation, variance, support, challenger, challenger_support, validity, time = realize_all(
         store(fused),
         chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
+        store(challenger),
+        store(masked(challenger_support.clamp(0, cfg.min_above), ~found)),
         state.validity | hit_now,
         torch.where(hit_now, 0.0, state.time),  # not multiplied: it may be infinite
     )
-    stored = state._replace(elevation=elevation, variance=variance, support=support, validity=validity, time=time)
+    stored = state._replace(
+        elevation=elevation,
+        variance=variance,
+        support=support,
+        challenger=challenger,
+        challenger_support=challenger_support,
+        validity=validity,
+        time=time,
+    )
     return stored, taken
+
+
+def challenge(prior: Prior, scan: ScanOfCells, limit: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
+    """Let points above the elevation agree with each other: return the challenger's height [m] and its support.
+
+    The challenger is the lowest height that contradicted the elevation from above, and what lies within the gate of it
+    supports it. Higher points count neither way, as those of one face do not agree; a lower one replaces it. A scan
+    that does not contradict the elevation takes its points off. With 6 % of the points above the ground, and one in
+    seven of those near the challenger, chance founds a cell anew in fewer than one scan of 10^8. A blind spot, which
+    only outliers hit, is settled by `clear_seen_through`: rays that pass below the challenger refute it.
+    """
+    votes = scan.rise.clamp(-cfg.max_above_per_scan, cfg.max_above_per_scan)
+    above, exists = scan.rise > 0, prior.challenger_support > 0
+    difference = scan.guess - prior.challenger
+    near = difference.square() <= cfg.gate**2 * limit.detach()
+    replaced = above & ~(exists & (near | (difference > 0)))
+    challenger = chosen(replaced, scan.guess, prior.challenger)
+    kept = masked(prior.challenger_support, ~replaced)
+    return challenger, (kept + masked(votes, near | ~above | replaced)).clamp(min=0)

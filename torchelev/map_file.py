@@ -23,7 +23,7 @@ from torchelev.state import MapState, Statistics
 from torchelev.traversability_net import TraversabilityNet
 
 FORMAT, VERSION = "torchelev map", 2
-NEW_LAYERS = {"has_normal", "rated"}  # since version 2
+NEW_LAYERS = {"has_normal", "rated", "challenger", "challenger_support"}  # since version 2
 DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
 
 

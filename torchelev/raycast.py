@@ -274,11 +274,18 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     seen_through = passes_far_below(state, depth, grid, cfg) | (ray.incidence > cfg.min_incidence)
     gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
     validity = state.validity & ~gone
+    # A ray below a challenger, or within a cell above it, shows that nothing stands there: outliers stop no other ray.
+    passed = (ray.found & (ray.height < state.challenger + grid.resolution)) | ~validity
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
-    validity, bounded, upper_bound = realize_all(validity, (state.bounded & ~state.validity) | bounds, upper_bound)
-    return state._replace(validity=validity, bounded=bounded, upper_bound=upper_bound)
+    challenger_support = masked(state.challenger_support, ~passed)
+    validity, bounded, upper_bound, challenger_support = realize_all(
+        validity, (state.bounded & ~state.validity) | bounds, upper_bound, challenger_support
+    )
+    return state._replace(
+        validity=validity, bounded=bounded, upper_bound=upper_bound, challenger_support=challenger_support
+    )
 
 
 def passes_far_below(state: MapState, depth: Tensor, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B H W"]:
