@@ -124,8 +124,6 @@ def random_state(rng, grid, num_envs=1, known=0.6, dtype=torch.float64):
         variance=torch.where(validity, draw(1e-5, 1e-2), 1.0),
         validity=validity,
         support=torch.where(validity, torch.floor(draw(0, 20)), 0.0),
-        challenger=torch.where(validity, draw(-0.3, 0.6), 0.0),
-        challenger_support=torch.where(validity, torch.floor(draw(0, 6)), 0.0),
         time=draw(0, 2),
         upper_bound=draw(-0.3, 0.6),
         bounded=draw(0, 1) < 0.5,
@@ -134,6 +132,8 @@ def random_state(rng, grid, num_envs=1, known=0.6, dtype=torch.float64):
         has_normal=validity.clone(),
         traversability=torch.where(validity, draw(0, 1), 0.0),
         rated=validity.clone(),
+        challenger=torch.where(validity, draw(-0.3, 0.6), 0.0),
+        challenger_support=torch.where(validity, torch.floor(draw(0, 6)), 0.0),
     )
 
 

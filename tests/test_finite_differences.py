@@ -9,7 +9,8 @@ from torchelev import DriftConfig, LearnedTraversabilityConfig, TraversabilityCo
 from torchelev.state import MapState
 
 CELLS = (6, 5)
-LAYERS = [name for name in MapState._fields[:-1] if name not in ("corner", "validity", "bounded")]
+MASKS = ("corner", "validity", "bounded", "has_normal", "rated")  # no numbers, or whole ones
+LAYERS = [name for name in MapState._fields[:-1] if name not in MASKS]
 NUMBERS = ["drift_error", "drift_correction"]
 LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 HEADS = {"analytic": TraversabilityConfig(), "learned": LearnedTraversabilityConfig(), "none": None}

@@ -11,10 +11,10 @@ from torchelev import BodyConfig, ElevationMap, SensorConfig, operators
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 OPERATORS = [
-    operators.cell_sums,
-    operators.padded,
+    operators._cell_sums,
+    operators._padded,
     operators.running_minimum,
-    operators.polar_minimum,
+    operators._polar_minimum,
 ]
 
 

@@ -176,9 +176,11 @@ def test_translation_by_whole_cells_commutes(seed, cells, climb):
         corner=expected.corner + torch.tensor([cells]),
         base_height=expected.base_height + climb,
         elevation=torch.where(expected.validity, expected.elevation + climb, 0.0),
+        challenger=torch.where(expected.challenger_support > 0, expected.challenger + climb, 0.0),
         upper_bound=expected.upper_bound + climb,
     )
-    got = there.state._replace(elevation=torch.where(there.validity, there.elevation, 0.0))
+    challenger = torch.where(there.challenger_support > 0, there.challenger, 0.0)
+    got = there.state._replace(elevation=torch.where(there.validity, there.elevation, 0.0), challenger=challenger)
     assert_close(got, expected, 2e-5)
     torch.testing.assert_close(
         there.cell_centers(), here.cell_centers() + torch.tensor(cells).double() * 0.1, atol=1e-9, rtol=0

@@ -129,6 +129,7 @@ def test_checks_agree_with_a_map_where_the_robot_stands_on_good_ground(seed):
     standing = polygons[:, 0]
     below = standing_cells(emap, standing) & ~emap.validity
     filled.validity |= below
+    filled.rated |= below
     filled.traversability[below] = 1.0
     cfg = FootprintConfig(min_traversability=0.0, max_unknown=0.4, max_unsafe=0.4)
     check, expected = check_footprint(emap, polygons, cfg, standing=standing), check_footprint(filled, polygons, cfg)

@@ -79,7 +79,9 @@ class Prior(NamedTuple):
     challenger_support: Float[Tensor, "B C"]
 
 
-def fuse(state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> MapState:
+def fuse(
+    state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig, has_rays: bool = True
+) -> MapState:
     """Fuse the scan into the map (paper, Sec. II-C).
 
     Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of
@@ -99,7 +101,7 @@ def fuse(state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, c
     scan, prior = gather_scan(m, cells, grid, cfg), gather_prior(state)
     guess = guess_heights(scan, prior, grid, cfg)
     scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
-    state, taken = merge(state, prior, scanned, grid, cfg)
+    state, taken = merge(state, prior, scanned, grid, cfg, has_rays)
     points_used = masked(scanned.kept, taken).sum(1).to(torch.int64)
     return tally(
         state,
@@ -243,7 +245,7 @@ class ScanOfCells(NamedTuple):
 
 
 def merge(
-    state: MapState, prior: Prior, scan: ScanOfCells, grid: GridConfig, cfg: FusionConfig
+    state: MapState, prior: Prior, scan: ScanOfCells, grid: GridConfig, cfg: FusionConfig, has_rays: bool
 ) -> tuple[MapState, Tensor]:
     """Take the scan's heights into the cells, or count them as votes against. Returns also where they were taken."""
     hit, innovation = scan.kept > 0, scan.height - prior.elevation
@@ -252,7 +254,8 @@ def merge(
     votes = chosen(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
     challenger, challenger_support = challenge(prior, scan, limit, cfg)
-    risen = (scan.rise > 0) & (challenger_support >= cfg.min_above)
+    # Without rays nothing tells outliers in a blind spot from an obstacle.
+    risen = (scan.rise > 0) & (challenger_support >= cfg.min_above) if has_rays else torch.zeros_like(hit)
     found = hit & ~agree & (~prior.known | (support < 0) | risen)
     taken = realize(agree | found)
 

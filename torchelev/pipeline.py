@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-
 import torch
 from torch import Tensor
 
@@ -44,10 +41,7 @@ def take_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> Ma
     if cfg.drift is not None:
         gate = (cfg.traversability or TraversabilityConfig).drift_gate
         state = compensate(state, m, cells, cfg.grid, cfg.drift, gate)
-    # Without rays nothing tells outliers in a blind spot from an obstacle.
-    trusting = cfg.raycast is not None
-    fusion = cfg.fusion if trusting else dataclasses.replace(cfg.fusion, min_above=math.inf)
-    return fuse(state, m, cells, cfg.grid, fusion)
+    return fuse(state, m, cells, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
 
 
 def take_rays(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:

@@ -62,6 +62,9 @@ def with_gradient(operator: Any, keep: Callable[..., None], backward: Callable[.
     )
 
     def call(*arguments: Any) -> Tensor:
-        return function.apply(*arguments) if is_transforming() else operator(*arguments)
+        if not is_transforming():
+            return operator(*arguments)
+        batched = any(isinstance(value, Tensor) and _is_batched(value) for value in arguments)
+        return operator(*arguments) if batched else function.apply(*arguments)
 
     return call
