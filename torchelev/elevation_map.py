@@ -244,8 +244,9 @@ class ElevationMap(nn.Module):
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
         new = fuse_measurement(state, measurement, self.cfg, self._weights)
         # What no stage changed is still the caller's tensor, which an update or a reset may overwrite.
-        given = {id(value) for value in (*state[:-1], *state.statistics, *measurement)}
-        return map_layers(lambda value: value.clone() if id(value) in given else value, new)
+        given = (*state[:-1], *state.statistics, *measurement)
+        # Not by `id`, on whose values the compiler would make its graphs depend.
+        return map_layers(lambda value: value.clone() if any(value is other for other in given) else value, new)
 
     @property
     def _weights(self) -> Weights | None:
