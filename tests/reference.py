@@ -202,13 +202,18 @@ def scan_height(cell, points, relief, shown, *, gate, max_gate_std, edges):
     return height, kept, sum(wrong), for_cell, guess if above else None
 
 
-def challenge(cell, number, guess, sigma2, gate, min_above, max_above_per_scan):
-    """The challenger and its support after a scan of so many points around `guess`, None if not above the elevation."""
+def challenge(cell, number, guess, sigma2, gate, challengers, min_above, max_above_per_scan):
+    """The challenger and its support after a scan of so many points around `guess`, None if not above the elevation.
+
+    Four `challengers` or more in the 3 x 3 window, at whatever heights, are one obstacle's.
+    """
     challenger, support, votes = cell["challenger"], cell["challenger_support"], min(number, max_above_per_scan)
     if guess is None:
         return challenger, max(support - votes, 0.0)
     if support > 0 and abs(guess - challenger) <= gate * math.sqrt(sigma2):
         return challenger, support + votes
+    if challengers >= 4:
+        return challenger if 0 < support and guess > challenger else guess, support + votes
     if support > 0 and guess > challenger:
         return challenger, support
     return guess, votes
@@ -230,12 +235,16 @@ def fuse_cell(
     max_variance,
     edges,
     shown=(-math.inf, {}),
+    challengers=0,
+    settled=-math.inf,
 ):
     """One cell and the points of one scan: the cell after it, and the numbers of points used and ignored at a step.
 
     `cell` has elevation, variance, known, support, challenger, challenger_support and time;
     each point z, variance, ray, beyond. `relief` counts cells,
-    `shown` are the highest mean height of the points in the eight cells around, and the heights of those cells.
+    `shown` are the highest mean height of the points in the eight cells around, and the heights of those cells,
+    `challengers` how many there are in the 3 x 3 window, and `settled` its highest elevation of at least half of
+    `max_support`.
     """
     after, relief = dict(cell), relief * resolution
     after["variance"] = min(cell["variance"], max_variance) if cell["known"] else 1.0
@@ -246,9 +255,11 @@ def fuse_cell(
     R = max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor) if kept else 1e12
     gate_variance = min(cell["variance"], max_gate_std**2)
     sigma2 = gate_variance + R + relief**2
-    challenger, challengers = challenge(cell, len(points), guess, sigma2, gate, min_above, max_above_per_scan)
-    risen = guess is not None and challengers >= min_above
-    after |= dict(challenger=challenger, challenger_support=min(challengers, min_above))
+    if guess is not None and settled >= guess - gate * math.sqrt(sigma2):
+        guess = None  # the edge of a step that is known
+    challenger, votes = challenge(cell, len(points), guess, sigma2, gate, challengers, min_above, max_above_per_scan)
+    risen = guess is not None and votes >= min_above
+    after |= dict(challenger=challenger, challenger_support=min(votes, min_above))
     if not kept:
         return after, 0, ignored
     distance = abs(height - cell["elevation"])

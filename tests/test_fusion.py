@@ -49,7 +49,10 @@ def reference_fuse(state, points, variances, used, origins, b, cfg):
         shown = max(means.get(a, -np.inf) for a in inside), known
         cell = {n: float(getattr(state, n)[b][c]) for n in FUSED}
         cell["known"] = bool(state.validity[b][c])
-        settings = dict(dataclasses.asdict(cfg), shown=shown)
+        window = [tuple(float(getattr(state, n)[b][a]) for n in FUSED) for a in [c, *inside] if state.validity[b][a]]
+        settled = max((v[0] for v in window if v[2] >= cfg.max_support / 2), default=-np.inf)
+        challengers = sum(float(state.challenger_support[b][a]) > 0 for a in [c, *inside])
+        settings = dict(dataclasses.asdict(cfg), shown=shown, settled=settled, challengers=challengers)
         results[c] = reference.fuse_cell(cell, by_cell.get(c, []), 0.1, **settings)
     return results
 
@@ -261,6 +264,40 @@ def test_points_that_scatter_lose():
         scan_of(emap, [height], 1e-4)
         scan_of(emap, [2.2 - height], 1e-4)
     assert float(emap.elevation) < 0.01
+
+
+def scan_cells(emap, heights):
+    """Fuse a point in the middle of each cell (3, 3), none where NaN."""
+    x, y = np.meshgrid((-0.5, 0.5, 1.5), (-0.5, 0.5, 1.5), indexing="ij")
+    cloud = torch.from_numpy(np.stack([x, y, np.asarray(heights, dtype=float) - 5.0], -1).reshape(1, 9, 3))
+    emap.update(cloud, pose((0.0, 0.0, 5.0)), dt=0.0, variance=torch.full((1, 9), 1e-4, dtype=torch.float64))
+
+
+def settled_cells(heights):
+    emap = small_map(1, (3, 3), 1.0, drift=None, fusion=FusionConfig(relief=0.01), dtype=torch.float64)
+    for _ in range(100):
+        scan_cells(emap, heights)
+    return emap
+
+
+@pytest.mark.parametrize("columns, wins", [(2, True), (1, False)])
+def test_a_face_that_shows_at_all_heights_wins_where_cells_beside_it_rise_too(columns, wins):
+    emap = settled_cells(np.zeros((3, 3)))
+    face = np.zeros((3, 3))
+    for height in (0.5, 0.9, 1.3, 1.7, 2.1, 2.5):
+        face[:, :columns] = height
+        scan_cells(emap, face)
+    assert bool(emap.elevation[0, 1, 0] > 0.4) == wins
+    assert float(emap.elevation[0, :, columns:].max()) < 0.01
+
+
+@pytest.mark.parametrize("step, flips", [(0.3, False), (0.0, True)])
+def test_the_edge_of_a_known_step_stays_where_it_was(step, flips):
+    """A few scans from another view hit its top in the cell before it; without the step they are a new obstacle."""
+    emap = settled_cells([[0.0, 0.0, step]] * 3)
+    for _ in range(8):
+        scan_cells(emap, [[0.0, 0.3, step]] * 3)
+    assert bool(emap.elevation[0, 1, 1] > 0.2) == flips
 
 
 def test_ground_that_is_still_hit_takes_a_challengers_points_off():

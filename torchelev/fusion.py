@@ -14,11 +14,15 @@ from torchelev.edges import EdgeConfig
 from torchelev.errors import require
 from torchelev.grid import GridConfig, PointCells
 from torchelev.masks import as_factor, chosen, masked
+from torchelev.operators import padded
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, realize, realize_all
+from torchelev.windows import window_maximum, window_moments
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
+
+MIN_CHALLENGERS = 4  # in the 3 x 3 window: so many stand on one obstacle, whose face shows at all heights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +257,9 @@ def merge(
     agree = realize(prior.known & hit & (innovation.square() <= cfg.gate**2 * limit))
     votes = chosen(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
-    challenger, challenger_support = challenge(prior, scan, limit, cfg)
+    around = shown_around(state, prior, cfg)
+    scan = scan._replace(rise=chosen(at_known_step(scan, around, limit, cfg), -scan.rise.abs(), scan.rise))
+    challenger, challenger_support = challenge(prior, scan, around.challengers, limit, cfg)
     # Without rays nothing tells outliers in a blind spot from an obstacle.
     risen = (scan.rise > 0) & (challenger_support >= cfg.min_above) if has_rays else torch.zeros_like(hit)
     found = hit & ~agree & (~prior.known | (support < 0) | risen)
@@ -292,20 +298,52 @@ def merge(
     return stored, taken
 
 
-def challenge(prior: Prior, scan: ScanOfCells, limit: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
+class Around(NamedTuple):
+    """What the map shows in the 3 x 3 window around each cell."""
+
+    challengers: Float[Tensor, "B C"]  # how many
+    settled: Float[Tensor, "B C"]  # [m] highest of the settled elevations, NO_HEIGHT without
+
+
+def shown_around(state: MapState, prior: Prior, cfg: FusionConfig) -> Around:
+    """Look at the cells around each cell, and at itself: before the scan, so that its own outliers vouch for none."""
+
+    def rimmed(cells: Tensor, fill: float) -> Tensor:
+        return padded(cells.view(state.elevation.shape), 1, fill)
+
+    exists = (prior.challenger_support > 0).to(prior.elevation.dtype)
+    settled = prior.known & (prior.support >= 0.5 * cfg.max_support)
+    (number,) = window_moments([(rimmed(exists, 0.0), 0)], 1, 1)
+    (top,) = window_maximum([rimmed(chosen(settled, prior.elevation.detach(), NO_HEIGHT), NO_HEIGHT)], 1, 1)
+    return Around(number.flatten(1), top.flatten(1))
+
+
+def at_known_step(scan: ScanOfCells, around: Around, limit: Tensor, cfg: FusionConfig) -> Bool[Tensor, "B C"]:
+    """Tell where a settled cell beside it stands as high as the points: another view of a step, which is not new.
+
+    There the majority vote decides alone. The cells of a new obstacle are not settled until most of them show.
+    """
+    return around.settled >= scan.guess - cfg.gate * limit.detach().sqrt()
+
+
+def challenge(
+    prior: Prior, scan: ScanOfCells, challengers: Tensor, limit: Tensor, cfg: FusionConfig
+) -> tuple[Tensor, Tensor]:
     """Let points above the elevation agree with each other: return the challenger's height [m] and its support.
 
     The challenger is the lowest height that contradicted the elevation from above, and what lies within the gate of it
-    supports it. Higher points count neither way, as those of one face do not agree; a lower one replaces it. A scan
-    that does not contradict the elevation takes its points off. With 6 % of the points above the ground, and one in
-    seven of those near the challenger, chance founds a cell anew in fewer than one scan of 10^8. A blind spot, which
-    only outliers hit, is settled by `clear_seen_through`: rays that pass below the challenger refute it.
+    supports it, or all that lies above where `MIN_CHALLENGERS` challengers stand together. Other higher points count
+    neither way; a lower one replaces it. A scan that does not contradict the elevation takes its points off. With 6 %
+    of the points above the ground, at 0.5 to 10 points a cell, chance gives a cell three scans in a row, and three
+    challengers beside it, in fewer than one scan of 10^7. A blind spot, which only outliers hit, is settled by
+    `clear_seen_through`: rays that pass below the challenger refute it.
     """
     votes = scan.rise.clamp(-cfg.max_above_per_scan, cfg.max_above_per_scan)
     above, exists = scan.rise > 0, prior.challenger_support > 0
+    backed = above & (challengers >= MIN_CHALLENGERS)
     difference = scan.guess - prior.challenger
     near = difference.square() <= cfg.gate**2 * limit.detach()
     replaced = above & ~(exists & (near | (difference > 0)))
     challenger = chosen(replaced, scan.guess, prior.challenger)
-    kept = masked(prior.challenger_support, ~replaced)
-    return challenger, (kept + masked(votes, near | ~above | replaced)).clamp(min=0)
+    kept = masked(prior.challenger_support, ~replaced | backed)
+    return challenger, (kept + masked(votes, near | ~above | replaced | backed)).clamp(min=0)
