@@ -1,0 +1,179 @@
+"""How soon a new obstacle shows, and whether one that left does: `python -m benchmarks.changes`
+
+Robots stand still on rough ground, each with its own ground and noise, all in one batch. Obstacles: after 60 s of empty
+ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells that it hit
+show it, 0.15 m above the ground or higher. Ghosts: a person crosses the view four times; counted are the cells that
+stay more than 0.1 m above the ground 3 s after. Writes benchmarks/results/changes.json.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from benchmarks.report import markdown_table, write_json
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.sim import Boxes, DepthCamera, HeightField, Lidar, MountedSensor, mount, noise
+from torchelev.sim.scenes import waves
+
+RESULTS = Path(__file__).parent / "results"
+GRID = GridConfig(resolution=0.04, length_x=8.0, length_y=8.0)
+BASE, MAST = 0.6, 0.3  # [m] the base above the ground, the sensor above the base
+CAMERA = DepthCamera(width=64, height=48, max_range=6.0)
+SENSORS = {
+    "camera 64 x 48": MountedSensor(CAMERA, mount(28.6, z=MAST)),
+    "camera 120 x 90": MountedSensor(DepthCamera(width=120, height=90, max_range=6.0), mount(28.6, z=MAST)),
+    "lidar 16": MountedSensor(Lidar(rings=16, azimuths=720, fov_low_deg=-30, fov_high_deg=5), mount(0.0, z=MAST)),
+    "lidar 32": MountedSensor(Lidar(rings=32, azimuths=720), mount(0.0, z=MAST)),
+}
+OBSTACLES = {"box": (0.15, 0.15, 0.15), "person": (0.15, 0.25, 0.85), "wall": (0.1, 1.0, 0.5)}  # [m] half sizes
+PERSON = OBSTACLES["person"]
+AHEAD = 2.5  # [m]
+SETTLED = 600  # scans of empty ground, at 10 Hz
+WATCHED = 40  # scans of the obstacle
+SHARES = (1.0, 0.6, 0.15)  # of the points that come back
+HERTZ = (5, 10, 50)
+CROSSINGS, SECONDS, AFTER = 4, 5.0, 3.0  # how often, how long each [s], and when the ghosts are counted [s]
+
+
+class World:
+    """B robots that stand still, each on ground of its own, and what their sensors and maps see of it."""
+
+    def __init__(self, sensor: MountedSensor, seeds: int, compiled: bool) -> None:
+        places = torch.linspace(-6.0, 6.0, 301, dtype=torch.float64)
+        x, y = torch.meshgrid(places, places, indexing="ij")
+        ground = torch.stack([waves(seed, amplitude=0.03)[0](x, y) for seed in range(seeds)]).float()
+        self.sensor, self.seeds = sensor, seeds
+        self.field, self.tiles = HeightField(ground, resolution=0.04), torch.arange(seeds)
+        self.T_map_base = torch.eye(4, dtype=torch.float64).repeat(seeds, 1, 1)
+        self.T_map_base[:, 2, 3] = ground[:, 150, 150] + BASE
+        self.T_map_sensor = sensor.T_map_sensor(self.T_map_base)
+        self.generator = torch.Generator().manual_seed(0)
+        self.emap = ElevationMap(ElevationMapConfig(grid=GRID), seeds)
+        if compiled:
+            self.emap.compile()
+
+    def scan(self, boxes: Boxes | None, dt: float, share: float = 1.0) -> Tensor:
+        """Fuse one scan and return its points (B, N, 3), map frame."""
+        points = self.sensor(self.field, self.tiles, self.T_map_base, boxes)
+        points = noise.dropout(noise.noisy(points, self.generator), self.generator, share=1 - share)
+        self.emap.update(points, self.T_map_sensor, self.T_map_base, dt=dt)
+        T = self.T_map_sensor.float()
+        return points @ T[:, :3, :3].mT + T[:, None, :3, 3]
+
+    def above_ground(self) -> Tensor:
+        """Return how far each cell's elevation lies above the ground (B, H, W) [m], NaN where it is unknown."""
+        centers = self.emap.cell_centers().flatten(1, 2)
+        truth = self.field.height(self.tiles, centers).view_as(self.emap.elevation)
+        return torch.where(self.emap.validity, self.emap.elevation - truth, math.nan)
+
+    def box(self, x: Tensor, y: Tensor, half: tuple[float, float, float]) -> Boxes:
+        """Return an upright box in each environment, standing at (x, y) (B,) [m]."""
+        T = torch.eye(4).repeat(self.seeds, 1, 1, 1)
+        T[:, 0, 0, 3], T[:, 0, 1, 3], T[:, 0, 2, 3] = x, y, half[2]
+        return Boxes(T, torch.tensor(half).expand(self.seeds, 1, 3))
+
+
+def obstacle_scans(
+    sensor: MountedSensor, obstacle: str, share: float, seeds: int, settled: int, compiled: bool
+) -> dict[str, Any]:
+    """Return how many scans pass until half of the cells hit show the obstacle, and how many points hit each."""
+    world = World(sensor, seeds, compiled)
+    for _ in range(settled):
+        world.scan(None, 0.1, share)
+    half = OBSTACLES[obstacle]
+    boxes = world.box(torch.full((seeds,), AHEAD + half[0]), torch.zeros(seeds), half)
+    hit, shown, points = torch.zeros_like(world.emap.validity), [], []
+    for _ in range(WATCHED):
+        number = hits(world, world.scan(boxes, 0.1, share), half)
+        hit |= number > 0
+        points.append(float(number.sum() / hit.sum().clamp(min=1)))
+        shows = hit & (world.above_ground() > 0.15)
+        shown.append((shows.sum((1, 2)) / hit.sum((1, 2)).clamp(min=1)).tolist())
+    enough = [[share >= 0.5 for share in column] for column in zip(*shown, strict=True)]
+    scans = sorted(column.index(True) + 1 if True in column else WATCHED + 1 for column in enough)
+    return {"median": scans[len(scans) // 2], "most": scans[-1], "points": sum(points) / len(points)}
+
+
+def hits(world: World, points: Tensor, half: tuple[float, float, float]) -> Tensor:
+    """Count each cell's points (B, H, W) on the obstacle: within its borders, and 5 cm or more above the ground."""
+    xy, z = points[..., :2].nan_to_num(), points[..., 2]
+    on = z > world.field.height(world.tiles, xy) + 0.05
+    on &= ((xy - torch.tensor([AHEAD + half[0], 0.0])).abs() < torch.tensor(half[:2]) + 0.1).all(-1)
+    first = world.emap.cell_centers()[:, None, 0, 0]
+    i, j = ((xy - first) / GRID.resolution).round().long().unbind(-1)
+    slot = (i * GRID.width + j).clamp(0, GRID.height * GRID.width - 1)
+    number = torch.zeros(len(xy), GRID.height * GRID.width).scatter_add(1, slot, on.float())
+    return number.view_as(world.emap.elevation)
+
+
+def crossing(world: World, dt: float) -> Iterator[Boxes]:
+    """Yield a person who crosses in front of each sensor, each time at another distance, speed and angle."""
+    for _ in range(CROSSINGS):
+        near, slant = (torch.rand(2, world.seeds, generator=world.generator) * torch.tensor([[1.8], [1.0]])).unbind(0)
+        speed = 1.3 + 0.4 * torch.rand(world.seeds, generator=world.generator)
+        side = torch.sign(torch.rand(world.seeds, generator=world.generator) - 0.5)
+        for k in range(round(SECONDS / dt)):
+            along = speed * (k * dt - SECONDS / 2)
+            yield world.box(1.2 + near + (slant - 0.5) * along, side * along, PERSON)
+
+
+def ghosts(sensor: MountedSensor, hertz: int, seeds: int, compiled: bool) -> dict[str, Any]:
+    """Return how many cells stay above the ground after crossings: in all environments, and in how many of them."""
+    world, dt = World(sensor, seeds, compiled), 1 / hertz
+    for boxes in crossing(world, dt):
+        world.scan(boxes, dt)
+    gone = world.box(torch.zeros(seeds), torch.zeros(seeds), (0.0, 0.0, 0.0))
+    for _ in range(round(AFTER * hertz)):
+        world.scan(gone, dt)
+    left = (world.above_ground() > 0.1).sum((1, 2))
+    return {"cells": int(left.sum()), "environments": int((left > 0).sum()), "of": seeds}
+
+
+def tables(result: dict[str, Any]) -> str:
+    """Tabulate both."""
+    scans = [
+        [name, f"{row['points']:.1f}", str(row["median"]), str(row["most"])]
+        for name, row in result["obstacles"].items()
+    ]
+    left = [
+        [name, str(row["cells"]), f"{row['environments']} of {row['of']}"] for name, row in result["ghosts"].items()
+    ]
+    return "\n\n".join(
+        [
+            markdown_table(["obstacle", "points a cell", "scans to half, median", "most"], scans),
+            markdown_table(["sensor", "cells left", "environments with any"], left),
+        ]
+    )
+
+
+@click.command()
+@click.option("--seeds", default=50, show_default=True, help="Environments: grounds, people and noises.")
+@click.option("--settled", default=SETTLED, show_default=True, help="Scans of empty ground before an obstacle.")
+@click.option("--only", type=click.Choice(["obstacles", "ghosts"]), help="Measure one of the two.")
+@click.option("--compiled/--eager", default=True, show_default=True, help="Compile the map's updates.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Where to write.")
+def main(seeds: int, settled: int, only: str | None, compiled: bool, out: Path) -> None:
+    """Count scans until new obstacles show, and what stays of people who left."""
+    torch.set_num_threads(2)
+    result: dict[str, Any] = {"obstacles": {}, "ghosts": {}}
+    new = [(name, share) for name in OBSTACLES for share in SHARES] if only != "ghosts" else []
+    for name, share in tqdm(new, "obstacles"):
+        row = obstacle_scans(SENSORS["camera 64 x 48"], name, share, seeds, settled, compiled)
+        result["obstacles"][f"{name}, {share:.0%} of the points"] = row
+    gone = [(name, hertz) for name in SENSORS for hertz in HERTZ] if only != "obstacles" else []
+    for name, hertz in tqdm(gone, "ghosts"):
+        result["ghosts"][f"{name} at {hertz} Hz"] = ghosts(SENSORS[name], hertz, seeds, compiled)
+    write_json(out / "changes.json", result)
+    click.echo(tables(result))
+
+
+if __name__ == "__main__":
+    main()
