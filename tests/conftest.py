@@ -133,7 +133,7 @@ def random_state(rng, grid, num_envs=1, known=0.6, dtype=torch.float64):
         traversability=torch.where(validity, draw(0, 1), 0.0),
         rated=validity.clone(),
         challenger=torch.where(validity, draw(-0.3, 0.6), 0.0),
-        challenger_support=torch.where(validity, torch.floor(draw(0, 6)), 0.0),
+        challenger_support=torch.where(validity, torch.floor(draw(0, 6)), 0.0).to(torch.uint8),
     )
 
 

@@ -254,7 +254,8 @@ def fuse_cell(
     height, kept, ignored, for_cell, guess = scan_height(cell, points, relief, shown, **settings)
     R = max(1 / sum(1 / p["variance"] for p in kept), scan_variance_floor) if kept else 1e12
     gate_variance = min(cell["variance"], max_gate_std**2)
-    sigma2 = gate_variance + R + relief**2
+    of_all = max(1 / sum(1 / p["variance"] for p in points), scan_variance_floor)
+    sigma2 = gate_variance + of_all + relief**2
     if guess is not None and settled >= guess - gate * math.sqrt(sigma2):
         guess = None  # the edge of a step that is known
     challenger, votes = challenge(cell, len(points), guess, sigma2, gate, challengers, min_above, max_above_per_scan)

@@ -432,8 +432,8 @@ def test_a_ray_below_a_challenger_refutes_it(challenger, stays):
             validity=torch.ones_like(state.validity),
             support=torch.full_like(state.support, 60.0),
             challenger=torch.full_like(state.challenger, challenger),
-            challenger_support=torch.full_like(state.challenger_support, 4.0),
+            challenger_support=torch.full_like(state.challenger_support, 4),
         )
     )
     emap.update(ground, T, dt=0.1)
-    assert (emap.challenger_support[0, 20, 2].item() == 4.0) == stays
+    assert (emap.challenger_support[0, 20, 2].item() == 4) == stays

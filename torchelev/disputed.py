@@ -41,9 +41,7 @@ def pick_out(cells: UInt8[Tensor, "B C"], slot: Int[Tensor, "B M"], columns: lis
     disputed = cells.flatten().nonzero().squeeze(1)
     picked = cells.gather(1, slot).flatten().nonzero().squeeze(1)
     cell = slot.flatten().index_select(0, picked) + picked // slot.shape[1] * cells.shape[1]
-    number = torch.empty(cells.numel(), dtype=torch.int32)
-    number[disputed] = torch.arange(len(disputed), dtype=torch.int32)
-    owner = number.index_select(0, cell).to(torch.int64)
+    owner = torch.searchsorted(disputed, cell)
     return [disputed, owner, *(column.flatten().index_select(0, picked) for column in columns)]
 
 
@@ -54,8 +52,61 @@ def _(cells: Tensor, slot: Tensor, columns: list[Tensor]) -> list[Tensor]:
     return [slot.new_empty(K), slot.new_empty(P), *(column.new_empty(P) for column in columns)]
 
 
-class Disputed:
-    """K disputed cells, numbered across environments, and their P points; on a GPU all cells and all points."""
+@torch.library.custom_op("torchelev::pick_cells", mutates_args=())
+def pick_cells(cells: Tensor) -> Tensor:
+    """Return which cells (B, C) are not zero (K,), numbered across environments."""
+    return cells.flatten().nonzero().squeeze(1)
+
+
+@pick_cells.register_fake
+def _(cells: Tensor) -> Tensor:
+    return cells.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int64)
+
+
+@torch.library.custom_op(
+    "torchelev::put_in", mutates_args=(), schema="(Tensor[] layers, Tensor cells, Tensor[] values) -> Tensor[]"
+)
+def put_in(layers: list[Tensor], cells: Tensor, values: list[Tensor]) -> list[Tensor]:
+    """Return layers (B, C) with values (K,) at cells. An operator, as the compiler would put it off to the last."""
+    pairs = zip(layers, values, strict=True)
+    return [layer.flatten().index_copy(0, cells, value).view_as(layer) for layer, value in pairs]
+
+
+@put_in.register_fake
+def _(layers: list[Tensor], cells: Tensor, values: list[Tensor]) -> list[Tensor]:
+    return [torch.empty_like(layer) for layer in layers]
+
+
+class Picked:
+    """K cells that are marked, numbered across environments; on a GPU all cells."""
+
+    def __init__(self, marked: UInt8[Tensor, "B C"]) -> None:
+        self.marked = marked
+        self.cells = pick_cells(marked) if self.picks_out(marked) else self.all(marked)
+
+    @staticmethod
+    def all(marked: Tensor) -> Tensor:
+        """Number all cells."""
+        return torch.arange(marked.numel(), device=marked.device)
+
+    @staticmethod
+    def picks_out(values: Tensor) -> bool:
+        """Tell whether the host may learn how many cells are picked: of a CPU, unless its tensors hold no data."""
+        return values.device.type == "cpu" and (torch.compiler.is_compiling() or type(values) is Tensor)
+
+    def of(self, layer: Tensor) -> Tensor:
+        """Read a layer (B, C) at the picked cells: -> (K,)."""
+        return layer.flatten().index_select(0, self.cells)
+
+    def put(self, layer: Tensor, values: Tensor) -> Tensor:
+        """Return a layer (B, C) with values (K,) put into the picked cells."""
+        if not self.picks_out(layer):  # K counts the other cells too
+            return torch.where(self.marked > 0, values.view_as(layer), layer)
+        return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
+
+
+class Disputed(Picked):
+    """K disputed cells and their P points; on a GPU all cells and all points."""
 
     def __init__(
         self,
@@ -73,17 +124,12 @@ class Disputed:
             self.cells, self.owner, *columns = pick_out(cells, slot, columns)
         else:
             first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
-            self.cells = torch.arange(cells.numel(), device=cells.device)
+            self.cells = self.all(cells)
             self.owner, columns = (slot + first).flatten(), [column.flatten() for column in columns]
         self.mean = self.of(mean)
         z, self.spread, self.weight, self.passed, *self.ray = columns
         self.z = z - self.at_points(self.mean)  # [m] above the mean of the cell's points
         self.used = (self.weight > 0).to(z.dtype)
-
-    @staticmethod
-    def picks_out(values: Tensor) -> bool:
-        """Tell whether the host may learn how many cells are disputed: of a CPU, unless its tensors hold no data."""
-        return values.device.type == "cpu" and (torch.compiler.is_compiling() or type(values) is Tensor)
 
     def sum(self, values: Tensor) -> Tensor:
         """Sum the points' values (..., P) per cell: -> (..., K)."""
@@ -99,19 +145,9 @@ class Disputed:
         """Give each point its cell's value: (..., K) -> (..., P)."""
         return values.index_select(-1, self.owner)
 
-    def of(self, layer: Tensor) -> Tensor:
-        """Read a layer (B, C) at the disputed cells: -> (K,)."""
-        return layer.flatten().index_select(0, self.cells)
-
     def some(self, mask: Tensor) -> bool:
         """Tell whether anything is true; assume so where the host would have to wait, and in compiled code."""
         return torch.compiler.is_compiling() or not self.picks_out(mask) or bool(mask.any())
-
-    def put(self, layer: Tensor, values: Tensor) -> Tensor:
-        """Return a layer (B, C) with values (K,) put into the disputed cells."""
-        if not self.picks_out(layer):  # K counts the other cells too
-            return torch.where(self.marked > 0, values.view_as(layer), layer)
-        return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:

@@ -72,7 +72,7 @@ def compensate(
     shift = correction[:, None, None]
     state = state._replace(
         elevation=state.elevation + shift * as_factor(state.validity),
-        challenger=state.challenger + shift * as_factor(state.challenger_support > 0),
+        challenger=state.challenger + shift.detach() * as_factor(state.challenger_support > 0),
         upper_bound=state.upper_bound + shift * as_factor(state.bounded),
     )
     return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

@@ -9,20 +9,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.disputed import NO_HEIGHT, Disputed, Shown, ratio, settle
+from torchelev.challenge import Challenge, challenge_from_above
+from torchelev.disputed import NO_HEIGHT, Disputed, Picked, Shown, ratio, settle
 from torchelev.edges import EdgeConfig
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 from torchelev.grid import GridConfig, PointCells
 from torchelev.masks import as_factor, chosen, masked
-from torchelev.operators import padded
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, realize, realize_all
-from torchelev.windows import window_maximum, window_moments
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-
-MIN_CHALLENGERS = 4  # in the 3 x 3 window: so many stand on one obstacle, whose face shows at all heights
+    from jaxtyping import Bool, Float, Int, UInt8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,18 +32,21 @@ class FusionConfig:
     scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
     outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
     max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
-    min_above: float = 5.0  # points of one height above a cell that found it anew, however settled it is
-    max_above_per_scan: float = 2.0  # of those points, how many one scan adds: a single bad scan is no obstacle
+    min_above: int = 5  # points of one height above a cell that found it anew, however settled it is
+    max_above_per_scan: int = 2  # of those points, how many one scan adds: a single bad scan is no obstacle
     max_variance: float = 1.0  # [m^2]
     edges: EdgeConfig | None = EdgeConfig()
 
     def __post_init__(self) -> None:
         fits, mend = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"
         require(fits, "fusion.edges", "must be an EdgeConfig or None", repr(self.edges), mend, TypeError)
-        for name in ("gate", "max_gate_std", "scan_variance_floor", "min_above", "max_above_per_scan", "max_variance"):
+        for name in ("gate", "max_gate_std", "scan_variance_floor", "max_variance"):
             require(
                 getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
             )
+        for name in ("min_above", "max_above_per_scan"):
+            number = require_count(f"fusion.{name}", getattr(self, name), "see its default")
+            require(number <= 255, f"fusion.{name}", "must be at most 255 points", number, "see its default")
         for name in ("scan_variance_floor", "max_variance"):
             finite, mend = math.isfinite(getattr(self, name)), "give a large number such as 1e6"
             require(finite, f"fusion.{name}", "must be finite", getattr(self, name), mend)
@@ -80,7 +80,7 @@ class Prior(NamedTuple):
     known: Bool[Tensor, "B C"]
     support: Float[Tensor, "B C"]
     challenger: Float[Tensor, "B C"]
-    challenger_support: Float[Tensor, "B C"]
+    challenger_support: UInt8[Tensor, "B C"]
 
 
 def fuse(
@@ -104,8 +104,11 @@ def fuse(
     """
     scan, prior = gather_scan(m, cells, grid, cfg), gather_prior(state)
     guess = guess_heights(scan, prior, grid, cfg)
+    challenge = challenge_from_above(prior, guess, grid.width, cfg.relief * grid.resolution, cfg)
+    if not has_rays:  # nothing else tells outliers in a blind spot from an obstacle
+        challenge = challenge._replace(won=torch.zeros_like(challenge.won))
     scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
-    state, taken = merge(state, prior, scanned, grid, cfg, has_rays)
+    state, taken = merge(state, prior, scanned, challenge, grid, cfg)
     points_used = masked(scanned.kept, taken).sum(1).to(torch.int64)
     return tally(
         state,
@@ -123,8 +126,10 @@ class Guess(NamedTuple):
     side: Int[Tensor, "B C"]  # of a step: +1 top, -1 ground, 0 no step
     trusted: Bool[Tensor, "B C"]  # most points agree with the cell's elevation, whose variance then widens the gate
     number: Float[Tensor, "B C"]  # of the scan's points
+    variance: Float[Tensor, "B C"]  # [m^2] of their mean, 1e12 without any
     near: Bool[Tensor, "B M"]  # points that agree with the cell's elevation
     gate_at: Float[Tensor, "B M"]  # [m^2] of the elevation of each point's cell
+    doubtful: Picked  # cells with points most of which contradict the elevation, or with a challenger
 
 
 def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Guess:
@@ -135,17 +140,19 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
     number = realize(number.clamp(min=0))  # a copy of its own, or all four sums would be held as long as this one
     mean = ratio(moment, weight).detach()
-    trusted = prior.known & (2 * agreeing >= number)
+    trusted = realize(prior.known & (2 * agreeing >= number))  # or the sums would be held for it
     # A single point is its cell's robust mean, and most cells of a sparse scan have one.
     step, untrusted = torch.zeros_like(trusted), ~trusted & (number > 1)
     if (edges := cfg.edges) is not None:
         step = trusted & edges.holds_step(number, number - agreeing)
     height = chosen(trusted, prior.elevation, mean).detach()
     shown = Shown(chosen(number > 0, mean, NO_HEIGHT), chosen(prior.known, prior.elevation.detach(), NO_HEIGHT))
+    doubtful = Picked(as_bytes((number > 0) & ((prior.known & ~trusted) | (prior.challenger_support > 0))))
     cells = as_bytes(untrusted) + 2 * as_bytes(step)
     points = Disputed(cells, scan.cells.slot, scan.columns(), shown.scan)
     height, side = settle(points, height, shown, grid.width, cfg.gate, cfg.relief * grid.resolution, edges)
-    return Guess(height, side, trusted, number, near, gate_at)
+    variance = (1.0 / weight.detach().clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor)
+    return Guess(height, side, trusted, number, variance, near, gate_at, doubtful)
 
 
 def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> tuple[ScanOfCells, Tensor]:
@@ -160,7 +167,6 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
     # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
     settled = prior.support >= (cfg.edges.min_settled if cfg.edges is not None else 0.0)
     lower_part = (guess.side > 0) & (height < prior.elevation) & settled
-    above = prior.known & ~guess.trusted & (guess.height > prior.elevation)
     # Points on the face of a wall speak for its top.
     votes = kept_number + edge
     cells = ScanOfCells(
@@ -171,8 +177,6 @@ def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> 
         votes=votes,
         dissent=guess.number - votes,
         agreeing=chosen(lower_part, votes, agreeing),
-        guess=guess.height,
-        rise=guess.number * (2.0 * as_factor(above) - 1.0),
     )
     return cells, ignored
 
@@ -211,7 +215,7 @@ def gather_prior(state: MapState) -> Prior:
         variance=state.variance.flatten(1),
         known=state.validity.flatten(1),
         support=state.support.flatten(1),
-        challenger=state.challenger.flatten(1),
+        challenger=state.challenger.detach().flatten(1),
         challenger_support=state.challenger_support.flatten(1),
     )
 
@@ -244,12 +248,10 @@ class ScanOfCells(NamedTuple):
     votes: Float[Tensor, "B C"]  # speak for the height
     dissent: Float[Tensor, "B C"]  # speak against it
     agreeing: Float[Tensor, "B C"]  # speak for the cell's elevation
-    guess: Float[Tensor, "B C"]  # [m] what its points are about, without a gradient
-    rise: Float[Tensor, "B C"]  # all points; negative unless most contradict the cell's elevation from above
 
 
 def merge(
-    state: MapState, prior: Prior, scan: ScanOfCells, grid: GridConfig, cfg: FusionConfig, has_rays: bool
+    state: MapState, prior: Prior, scan: ScanOfCells, challenge: Challenge, grid: GridConfig, cfg: FusionConfig
 ) -> tuple[MapState, Tensor]:
     """Take the scan's heights into the cells, or count them as votes against. Returns also where they were taken."""
     hit, innovation = scan.kept > 0, scan.height - prior.elevation
@@ -257,20 +259,15 @@ def merge(
     agree = realize(prior.known & hit & (innovation.square() <= cfg.gate**2 * limit))
     votes = chosen(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
-    around = shown_around(state, prior, cfg)
-    scan = scan._replace(rise=chosen(at_known_step(scan, around, limit, cfg), -scan.rise.abs(), scan.rise))
-    challenger, challenger_support = challenge(prior, scan, around.challengers, limit, cfg)
-    # Without rays nothing tells outliers in a blind spot from an obstacle.
-    risen = (scan.rise > 0) & (challenger_support >= cfg.min_above) if has_rays else torch.zeros_like(hit)
-    found = hit & ~agree & (~prior.known | (support < 0) | risen)
-    taken = realize(agree | found)
+    found = hit & ~agree & (~prior.known | (support < 0) | challenge.won)
+    found, taken = realize_all(found, agree | found)
 
     information = ratio(as_factor(agree), prior.variance) + 1.0 / scan.variance
     fused = prior.elevation + masked(innovation / (information * scan.variance), taken)
     # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
     outvoted = prior.variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
     posterior = chosen(taken, (1.0 / information).clamp(max=cfg.max_variance), outvoted.clamp(max=cfg.max_variance))
-    fresh = chosen(prior.known & ~risen, -support, scan.votes - scan.dissent)
+    fresh = chosen(prior.known & ~challenge.won, -support, scan.votes - scan.dissent)
     support = chosen(hit, chosen(found, fresh, support).clamp(0, cfg.max_support), prior.support)
 
     def store(cells: Tensor) -> Tensor:
@@ -281,8 +278,8 @@ def merge(
         store(fused),
         chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
-        store(challenger),
-        store(masked(challenger_support.clamp(0, cfg.min_above), ~found)),
+        store(challenge.height),
+        store(torch.where(found, 0, challenge.support.to(torch.int32)).to(torch.uint8)),
         state.validity | hit_now,
         torch.where(hit_now, 0.0, state.time),  # not multiplied: it may be infinite
     )
@@ -296,54 +293,3 @@ def merge(
         time=time,
     )
     return stored, taken
-
-
-class Around(NamedTuple):
-    """What the map shows in the 3 x 3 window around each cell."""
-
-    challengers: Float[Tensor, "B C"]  # how many
-    settled: Float[Tensor, "B C"]  # [m] highest of the settled elevations, NO_HEIGHT without
-
-
-def shown_around(state: MapState, prior: Prior, cfg: FusionConfig) -> Around:
-    """Look at the cells around each cell, and at itself: before the scan, so that its own outliers vouch for none."""
-
-    def rimmed(cells: Tensor, fill: float) -> Tensor:
-        return padded(cells.view(state.elevation.shape), 1, fill)
-
-    exists = (prior.challenger_support > 0).to(prior.elevation.dtype)
-    settled = prior.known & (prior.support >= 0.5 * cfg.max_support)
-    (number,) = window_moments([(rimmed(exists, 0.0), 0)], 1, 1)
-    (top,) = window_maximum([rimmed(chosen(settled, prior.elevation.detach(), NO_HEIGHT), NO_HEIGHT)], 1, 1)
-    return Around(number.flatten(1), top.flatten(1))
-
-
-def at_known_step(scan: ScanOfCells, around: Around, limit: Tensor, cfg: FusionConfig) -> Bool[Tensor, "B C"]:
-    """Tell where a settled cell beside it stands as high as the points: another view of a step, which is not new.
-
-    There the majority vote decides alone. The cells of a new obstacle are not settled until most of them show.
-    """
-    return around.settled >= scan.guess - cfg.gate * limit.detach().sqrt()
-
-
-def challenge(
-    prior: Prior, scan: ScanOfCells, challengers: Tensor, limit: Tensor, cfg: FusionConfig
-) -> tuple[Tensor, Tensor]:
-    """Let points above the elevation agree with each other: return the challenger's height [m] and its support.
-
-    The challenger is the lowest height that contradicted the elevation from above, and what lies within the gate of it
-    supports it, or all that lies above where `MIN_CHALLENGERS` challengers stand together. Other higher points count
-    neither way; a lower one replaces it. A scan that does not contradict the elevation takes its points off. With 6 %
-    of the points above the ground, at 0.5 to 10 points a cell, chance gives a cell three scans in a row, and three
-    challengers beside it, in fewer than one scan of 10^7. A blind spot, which only outliers hit, is settled by
-    `clear_seen_through`: rays that pass below the challenger refute it.
-    """
-    votes = scan.rise.clamp(-cfg.max_above_per_scan, cfg.max_above_per_scan)
-    above, exists = scan.rise > 0, prior.challenger_support > 0
-    backed = above & (challengers >= MIN_CHALLENGERS)
-    difference = scan.guess - prior.challenger
-    near = difference.square() <= cfg.gate**2 * limit.detach()
-    replaced = above & ~(exists & (near | (difference > 0)))
-    challenger = chosen(replaced, scan.guess, prior.challenger)
-    kept = masked(prior.challenger_support, ~replaced | backed)
-    return challenger, (kept + masked(votes, near | ~above | replaced | backed)).clamp(min=0)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchelev.errors import require_positive, whole_cells
 from torchelev.operators import cell_sums, moved
-from torchelev.state import BLANK, MapState, Measurement
-from torchelev.storage import as_bytes, as_mask, realize, realize_all
+from torchelev.state import BLANK, MapState, Measurement, layer_names
+from torchelev.storage import as_bits, from_bits, realize, realize_all
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -111,7 +111,8 @@ def gathered(layers: list[Tensor], shift: Int[Tensor, "B 2"], blanks: list[float
     i = torch.arange(grid.height, device=shift.device)[None, :, None] + shift[:, 0, None, None]
     j = torch.arange(grid.width, device=shift.device)[None, None, :] + shift[:, 1, None, None]
     entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
-    index = (i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)).flatten(1)
+    index = i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)
+    index = realize(index.to(torch.int32)).flatten(1).to(torch.int64)  # half of what int64 would take to store
     values = [layer.flatten(1).gather(1, index).view_as(layer) for layer in realize_all(*layers)]
     # Bytes become numbers here: among these, compiled code chooses so much faster that all of it takes half as long.
     blanked = [torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)]
@@ -132,17 +133,15 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     # A shift of a whole window blanks everything; the clamp keeps the index arithmetic small.
     shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
     corner, shift = realize_all(corner, shift)
-    names = MapState._fields[2:-1]
-    layers, blanks = [getattr(state, name) for name in names], [BLANK.get(name, 0.0) for name in names]
-    masks = [layer.dtype == torch.bool for layer in layers]
-    layers = [as_bytes(layer) if mask else layer for layer, mask in zip(layers, masks, strict=True)]
+    masks, names = layer_names(state)
+    layers = [*(getattr(state, name) for name in names), as_bits([getattr(state, name) for name in masks])]
+    blanks = [*(BLANK.get(name, 0.0) for name in names), 0.0]
     # Copying takes an eighth of the time of gathering that is not compiled, but has no gradient, and the host must know
     # the shifts.
     eager = not torch.compiler.is_compiling() and not torch.is_grad_enabled()
     few = eager and shift.shape[0] <= 4 and shift.device.type == "cpu"
-    values = moved(layers, shift, blanks) if few else gathered(layers, shift, blanks, grid)
-    values = [as_mask(value) if mask else value for value, mask in zip(values, masks, strict=True)]
-    fields: dict[str, Any] = dict(zip(names, values, strict=True))
+    *values, bits = moved(layers, shift, blanks) if few else gathered(layers, shift, blanks, grid)
+    fields: dict[str, Any] = dict(zip((*names, *masks), (*values, *from_bits(bits, len(masks))), strict=True))
     base_height = torch.where(moves, m.base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **fields)
 

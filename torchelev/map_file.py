@@ -153,13 +153,11 @@ def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Te
     return MapState(statistics=statistics, **values)
 
 
-def _array(
-    path: str | Path, arrays: dict[str, NDArray], name: str, like: Tensor, shape: tuple[int, ...]
-) -> NDArray:
+def _array(path: str | Path, arrays: dict[str, NDArray], name: str, like: Tensor, shape: tuple[int, ...]) -> NDArray:
     """Return an array of the file, which must have this shape, numbers of the kind in `like`."""
     require(name in arrays, str(path), f"must have {name}", "none", "save it again")
     array, where = arrays[name], f"{path}, {name}"
     require(array.shape == shape, where, f"expected {shape}", array.shape, "save it again")
-    kind = "f" if like.is_floating_point() else "b" if like.dtype == torch.bool else "i"
+    kind = "f" if like.is_floating_point() else {torch.bool: "b", torch.uint8: "u"}.get(like.dtype, "i")
     require(array.dtype.kind == kind, where, f"expected numbers of kind '{kind}'", array.dtype, "save it again")
     return array

@@ -136,11 +136,16 @@ def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int
     table = table.unflatten(1, (size, azimuths))
     table[:, ranges] = blank
     _scan(table, from_end=True)
+    _widen(table, widen)
+    return table
+
+
+def _widen(table: Tensor, widen: list[int]) -> None:
+    """Make each entry of the first widen[w] rows the minimum of itself and the entry 2^w on, for each level w in turn."""
     for half in table.chunk(2):  # of the environments, as each takes a copy, the largest of an update's values
         for level, rows in enumerate(widen):
             near = half[:, :rows]
             torch.minimum(near, near.roll(-(2**level), 2), out=near)
-    return table
 
 
 def _table_rows(ranges: int) -> int:

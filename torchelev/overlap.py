@@ -79,7 +79,7 @@ def ground_below(
     furniture or a wall, and where the latter are higher by half of `height`, and thus a bridge over what was known.
     """
     below = known & (height <= 0)
-    weight = torch.where(below, (distance.square() + STANCE**2) ** -2, 0.0)
+    weight = torch.where(below, (distance.square() + STANCE**2).square().reciprocal(), 0.0)
     within, of_known = weighted_mean(height, torch.where(height >= -cfg.max_base_height, weight, 0.0))
     seen, of_hit = weighted_mean(height, torch.where(hit, weight, 0.0))
     stands = (within > 0.5 * weight.sum((1, 2), keepdim=True)) & ((seen == 0) | (of_hit <= of_known + 0.5 * cfg.height))

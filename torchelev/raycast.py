@@ -67,7 +67,7 @@ class PolarGrid(NamedTuple):
         return cls(reach, azimuths, tuple(math.ceil(width / 2**k) for k in range(levels)))
 
     def widths(self, k: Tensor) -> Tensor:
-        """Return how many azimuth bins an entry of `polar_minimum` covers at range k, a whole number of bins."""
+        """Return how many azimuth bins a cell at range k is taken to cover, a power of two."""
         row = torch.arange(self.ranges + 1, device=k.device, dtype=k.dtype)
         width = torch.ones_like(row)
         for level, rows in enumerate(self.widen):
@@ -201,13 +201,13 @@ def horizon(
 def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
     """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least a cell farther.
 
-    At short range, where a cell spans several azimuth bins, an entry is the minimum over 2, 4, ... of them.
+    At short range, where a cell spans several azimuth bins, an entry is the minimum over half of them.
     """
     # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
     index = flat(chosen(casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
-    return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
+    return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen[1:]), polar.ranges, NO_RAY)
 
 
 def flat(row: Tensor, column: Tensor, width: int) -> Tensor:
@@ -241,8 +241,12 @@ def look_up(
     width = polar.widths(k)
     a = torch.floor(turn(x, y) * polar.azimuths - 0.5 * (width - 1))
     a = chosen(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
-    # Realized, or the compiler would gather twice, for the masks and for the heights.
-    slope = realize(read(table.flatten(1), flat(k, a, polar.azimuths)))
+    # Its two halves, as widening the whole table once more would take longer than to read twice.
+    b = a + torch.floor(0.5 * width)
+    b = chosen(b < polar.azimuths, b, b - polar.azimuths)
+    slopes = table.flatten(1)
+    lowest = torch.minimum(*(read(slopes, flat(k, place, polar.azimuths)) for place in (a, b)))
+    slope = realize(lowest)  # or the compiler would gather anew for the masks and for the heights
     found = slope < NO_RAY
     slope = masked(slope, found)
     gx, gy = state.gradient_x, state.gradient_y
@@ -275,11 +279,11 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
     validity = state.validity & ~gone
     # A ray below a challenger, or within a cell above it, shows that nothing stands there: outliers stop no other ray.
-    passed = (ray.found & (ray.height < state.challenger + grid.resolution)) | ~validity
+    passed = realize((ray.found & (ray.height < state.challenger + grid.resolution)) | ~validity)
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
-    challenger_support = masked(state.challenger_support, ~passed)
+    challenger_support = torch.where(passed, 0, state.challenger_support.to(torch.int32)).to(torch.uint8)
     validity, bounded, upper_bound, challenger_support = realize_all(
         validity, (state.bounded & ~state.validity) | bounds, upper_bound, challenger_support
     )

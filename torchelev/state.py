@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.storage import realize
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float, Int, UInt8
 
     from torchelev.grid import GridConfig
 
@@ -45,7 +45,7 @@ class MapState(NamedTuple):
     validity: Bool[Tensor, "B H W"]  # elevation is known
     support: Float[Tensor, "B H W"]  # points that agree, less points that disagree
     challenger: Float[Tensor, "B H W"]  # [m] lowest of the heights that contradict the elevation from above
-    challenger_support: Float[Tensor, "B H W"]  # points that do so, less points that do not
+    challenger_support: UInt8[Tensor, "B H W"]  # points that do so, less points that do not
     time: Float[Tensor, "B H W"]  # [s] since the last hit
     upper_bound: Float[Tensor, "B H W"]  # [m] of cells that are not known
     bounded: Bool[Tensor, "B H W"]  # upper_bound is known
@@ -89,14 +89,15 @@ def blank_corner(grid: GridConfig) -> tuple[int, int]:
 def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dtype: torch.dtype) -> MapState:
     """Return B maps of which nothing is known, centred on the map frame's origin."""
     layer = torch.zeros(num_envs, grid.height, grid.width, device=device, dtype=dtype)
-    mask = torch.zeros_like(layer, dtype=torch.bool)
     number = torch.zeros(num_envs, device=device, dtype=dtype)
     zero = torch.zeros(num_envs, device=device, dtype=torch.int64)
     corner = torch.stack([zero + cells for cells in blank_corner(grid)], -1)
     heights = {"drift_error", "drift_correction"}
-    masks = {"validity", "bounded", "has_normal", "rated"}
+    kinds = dict.fromkeys(("validity", "bounded", "has_normal", "rated"), torch.bool) | {
+        "challenger_support": torch.uint8
+    }
     layers = MapState._fields[2:-1]
-    values = {name: (mask if name in masks else layer + BLANK.get(name, 0.0)).clone() for name in layers}
+    values = {name: (layer + BLANK.get(name, 0.0)).to(kinds.get(name, dtype)) for name in layers}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))
     return MapState(corner=corner, base_height=number, statistics=statistics, **values)
 
@@ -118,6 +119,13 @@ def _fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | N
         values.masked_fill_(mask.view(-1, *[1] * (values.ndim - 1)), blank)
     else:
         values.fill_(blank)
+
+
+def layer_names(state: MapState) -> tuple[list[str], list[str]]:
+    """Return the names of the layers (B, H, W) that are masks, and of those that are numbers."""
+    names = MapState._fields[2:-1]
+    masks = [name for name in names if getattr(state, name).dtype == torch.bool]
+    return masks, [name for name in names if name not in masks]
 
 
 def map_layers(function: Callable[..., Tensor], *states: MapState) -> MapState:

@@ -60,6 +60,16 @@ def as_mask(stored: Tensor) -> Tensor:
     return stored.to(torch.int32) > 0 if torch.compiler.is_compiling() else stored.view(torch.bool)
 
 
+def as_bits(masks: list[Tensor]) -> Tensor:
+    """Return up to eight masks as the bits of one uint8."""
+    return functools.reduce(torch.add, (mask.to(torch.int32) << k for k, mask in enumerate(masks))).to(torch.uint8)
+
+
+def from_bits(bits: Tensor, number: int) -> list[Tensor]:
+    """Return the masks that `as_bits` packed."""
+    return [(bits.to(torch.int32) & (1 << k)) > 0 for k in range(number)]
+
+
 @functools.cache
 def keep_freed_memory() -> None:
     """Let glibc keep up to 64 MB that a CPU's updates free. Does nothing to other allocators.
