@@ -68,11 +68,12 @@ class PolarGrid(NamedTuple):
 
     def widths(self, k: Tensor) -> Tensor:
         """Return how many azimuth bins a cell at range k is taken to cover, a power of two."""
-        row = torch.arange(self.ranges + 1, device=k.device, dtype=k.dtype)
+        # The compiler would compute a table's entries anew for every cell, and check every index.
+        row = k if torch.compiler.is_compiling() else torch.arange(self.ranges + 1, device=k.device, dtype=k.dtype)
         width = torch.ones_like(row)
         for level, rows in enumerate(self.widen):
             width = torch.add(width, row < rows, alpha=2.0**level)
-        return realize(width).index_select(0, k.to(torch.int32).flatten()).view_as(k)
+        return width if row is k else width.index_select(0, k.to(torch.int32).flatten()).view_as(k)
 
 
 def turn(x: Tensor, y: Tensor) -> Tensor:
@@ -217,9 +218,10 @@ def flat(row: Tensor, column: Tensor, width: int) -> Tensor:
 
 def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
     """Give each entry the value at its index."""
-    # Realized while it has two dimensions: flattened first, the compiler would divide to find row and column. `flat` is
-    # still int32 here, half of what int64 would take to store.
-    return values.gather(1, realize(index).flatten(1).to(torch.int64)).view_as(index)
+    if torch.compiler.is_compiling():  # a flat index it would store, or divide to find row and column
+        environment = torch.arange(len(index), device=index.device, dtype=index.dtype)[:, None, None]
+        return torch.ops.aten._unsafe_index(values, [environment, index])
+    return values.gather(1, index.flatten(1).to(torch.int64)).view_as(index)
 
 
 class RayOverCell(NamedTuple):

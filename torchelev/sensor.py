@@ -166,6 +166,7 @@ def measure(
     if cfg.exclusion is not None:
         overhang = valid & ~body & above_ramp(relative, cfg.exclusion)
     sigma2, used, casts = realize_all(sigma2, valid & ~body & ~overhang, valid & ~body)
+    number_finite, number_valid, number_casts, number_used = (count(mask) for mask in (finite, valid, casts, used))
     return Measurement(
         anchor=anchor,
         points=in_map,
@@ -175,10 +176,10 @@ def measure(
         origin=origin,
         base=base if base is None else realize(torch.where(sound[:, None], base, torch.nan)),
         dt=realize(dt.to(dtype).nan_to_num(0.0, 0.0).clamp(min=0)),
-        rejected_invalid=count(~finite),
-        rejected_range=count(finite & ~valid),
-        rejected_body=count(body),
-        rejected_overhang=count(overhang),
+        rejected_invalid=finite.shape[1] - number_finite,
+        rejected_range=number_finite - number_valid,
+        rejected_body=number_valid - number_casts,
+        rejected_overhang=number_casts - number_used,
     )
 
 
