@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.errors import require_positive, whole_cells
 from torchelev.operators import cell_sums, moved
 from torchelev.state import BLANK, MapState, Measurement, layer_names
-from torchelev.storage import as_bits, from_bits, realize, realize_all
+from torchelev.storage import as_bits, from_bits, read, realize, realize_all
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -112,8 +112,7 @@ def gathered(layers: list[Tensor], shift: Int[Tensor, "B 2"], blanks: list[float
     j = torch.arange(grid.width, device=shift.device)[None, None, :] + shift[:, 1, None, None]
     entering = (i < 0) | (i >= grid.height) | (j < 0) | (j >= grid.width)
     index = i.clamp(0, grid.height - 1) * grid.width + j.clamp(0, grid.width - 1)
-    index = realize(index.to(torch.int32)).flatten(1).to(torch.int64)  # half of what int64 would take to store
-    values = [layer.flatten(1).gather(1, index).view_as(layer) for layer in realize_all(*layers)]
+    values = [read(layer.flatten(1), index) for layer in realize_all(*layers)]
     # Bytes become numbers here: among these, compiled code chooses so much faster that all of it takes half as long.
     blanked = [torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)]
     blanked = [value.to(layer.dtype) for value, layer in zip(blanked, layers, strict=True)]

@@ -141,7 +141,7 @@ def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int
 
 
 def _widen(table: Tensor, widen: list[int]) -> None:
-    """Make each entry of the first widen[w] rows the minimum of itself and the entry 2^w on, for each level w in turn."""
+    """Make each entry of the first widen[w] rows the minimum of itself and the entry 2^w on, level by level."""
     for half in table.chunk(2):  # of the environments, as each takes a copy, the largest of an update's values
         for level, rows in enumerate(widen):
             near = half[:, :rows]

@@ -20,11 +20,11 @@ from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate
 from torchelev.masks import NOWHERE, chosen, lifted, masked
 from torchelev.operators import polar_minimum, running_minimum
 from torchelev.state import MapState, Measurement, count, tally
-from torchelev.storage import realize, realize_all
+from torchelev.storage import read, realize, realize_all
 from torchelev.windows import neighbours
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float
 
 NO_RAY = 1e4  # a slope above every ray's
 BREADTH = 1.125  # [cells] a ray so near passes over a cell: with less, rays of a still sensor would miss some for ever
@@ -214,14 +214,6 @@ def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig)
 def flat(row: Tensor, column: Tensor, width: int) -> Tensor:
     """Return the flat index of whole numbers, int32: float32 counts no farther than 2^24."""
     return row.to(torch.int32) * width + column.to(torch.int32)
-
-
-def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
-    """Give each entry the value at its index."""
-    if torch.compiler.is_compiling():  # a flat index it would store, or divide to find row and column
-        environment = torch.arange(len(index), device=index.device, dtype=index.dtype)[:, None, None]
-        return torch.ops.aten._unsafe_index(values, [environment, index])
-    return values.gather(1, index.flatten(1).to(torch.int64)).view_as(index)
 
 
 class RayOverCell(NamedTuple):

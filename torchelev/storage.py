@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import functools
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 
 @torch.library.custom_op("torchelev::realize", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
@@ -58,6 +62,14 @@ def as_bytes(mask: Tensor) -> Tensor:
 def as_mask(stored: Tensor) -> Tensor:
     """Return what `as_bytes` stored. Compiled code compares integers eight times as fast as bytes."""
     return stored.to(torch.int32) > 0 if torch.compiler.is_compiling() else stored.view(torch.bool)
+
+
+def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
+    """Give each entry the value at its index."""
+    if torch.compiler.is_compiling():  # a flat index it would store, or divide to find row and column
+        environment = torch.arange(len(index), device=index.device, dtype=index.dtype)[:, None, None]
+        return torch.ops.aten._unsafe_index(values, [environment, index])
+    return values.gather(1, index.flatten(1).to(torch.int64)).view_as(index)
 
 
 def as_bits(masks: list[Tensor]) -> Tensor:
