@@ -9,8 +9,8 @@ from torchelev import DriftConfig, LearnedTraversabilityConfig, TraversabilityCo
 from torchelev.state import MapState
 
 CELLS = (6, 5)
-MASKS = ("corner", "validity", "bounded", "has_normal", "rated")  # no numbers, or whole ones
-LAYERS = [name for name in MapState._fields[:-1] if name not in MASKS]
+MASKS = ("corner", "validity", "bounded", "has_normal", "rated", "challenger_support")  # no numbers, or whole ones
+LAYERS = [name for name in MapState._fields[:-1] if name not in (*MASKS, "challenger")]  # which has no gradient
 NUMBERS = ["drift_error", "drift_correction"]
 LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 HEADS = {"analytic": TraversabilityConfig(), "learned": LearnedTraversabilityConfig(), "none": None}

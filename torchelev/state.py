@@ -44,7 +44,7 @@ class MapState(NamedTuple):
     variance: Float[Tensor, "B H W"]  # [m^2]
     validity: Bool[Tensor, "B H W"]  # elevation is known
     support: Float[Tensor, "B H W"]  # points that agree, less points that disagree
-    challenger: Float[Tensor, "B H W"]  # [m] lowest of the heights that contradict the elevation from above
+    challenger: Float[Tensor, "B H W"]  # [m] lowest height that contradicts the elevation from above; no gradient
     challenger_support: UInt8[Tensor, "B H W"]  # points that do so, less points that do not
     time: Float[Tensor, "B H W"]  # [s] since the last hit
     upper_bound: Float[Tensor, "B H W"]  # [m] of cells that are not known
