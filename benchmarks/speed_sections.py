@@ -96,11 +96,10 @@ def compiled_alone(stage: Callable[[MapState, Measurement], Any], inputs: list[A
     """Compile a stage on its own, for one input after the other; masks come and go as bytes, as in the whole update."""
 
     def on_bytes(values: Any) -> Any:
-        masks = tree_map(lambda t: as_mask(t) if isinstance(t, Tensor) and t.dtype == torch.uint8 else t, values)
-        return mask_bytes(stage(*masks))
+        return mask_bytes(stage(*(compilation.with_masks(value, as_mask) for value in values)))
 
     compiled = compilation.compiled(on_bytes)
-    values = [mask_bytes(value) for value in inputs]
+    values = [tuple(compilation.with_masks(part, as_bytes) for part in value) for value in inputs]
 
     def run() -> None:
         with torch.no_grad():
