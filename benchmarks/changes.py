@@ -8,6 +8,7 @@ stay more than 0.1 m above the ground 3 s after. Writes benchmarks/results/chang
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.report import markdown_table, write_json
+from benchmarks.report import commit, markdown_table, write_json
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.sim import Boxes, DepthCamera, HeightField, Lidar, MountedSensor, mount, noise
 from torchelev.sim.scenes import waves
@@ -38,7 +39,7 @@ PERSON = OBSTACLES["person"]
 AHEAD = 2.5  # [m]
 SETTLED = 600  # scans of empty ground, at 10 Hz
 WATCHED = 40  # scans of the obstacle
-SHARES = (1.0, 0.6, 0.15)  # of the points that come back
+SHARES = {"box": (0.6, 0.15), "person": (0.15, 0.035), "wall": (0.15, 0.035)}  # of the points: some 2, or 0.5, a cell
 HERTZ = (5, 10, 50)
 CROSSINGS, SECONDS, AFTER = 4, 5.0, 3.0  # how often, how long each [s], and when the ghosts are counted [s]
 
@@ -140,7 +141,11 @@ def ghosts(sensor: MountedSensor, hertz: int, seeds: int, compiled: bool) -> dic
 def tables(result: dict[str, Any]) -> str:
     """Tabulate both."""
     scans = [
-        [name, f"{row['points']:.1f}", str(row["median"]), str(row["most"])]
+        [
+            name,
+            f"{row['points']:.1f}",
+            *(str(row[k]) if row[k] <= WATCHED else f"> {WATCHED}" for k in ("median", "most")),
+        ]
         for name, row in result["obstacles"].items()
     ]
     left = [
@@ -158,20 +163,28 @@ def tables(result: dict[str, Any]) -> str:
 @click.option("--seeds", default=50, show_default=True, help="Environments: grounds, people and noises.")
 @click.option("--settled", default=SETTLED, show_default=True, help="Scans of empty ground before an obstacle.")
 @click.option("--only", type=click.Choice(["obstacles", "ghosts"]), help="Measure one of the two.")
+@click.option("--hertz", type=int, multiple=True, default=HERTZ, show_default=True, help="Rates of the ghosts' scans.")
 @click.option("--compiled/--eager", default=True, show_default=True, help="Compile the map's updates.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Where to write.")
-def main(seeds: int, settled: int, only: str | None, compiled: bool, out: Path) -> None:
-    """Count scans until new obstacles show, and what stays of people who left."""
+def main(seeds: int, settled: int, only: str | None, hertz: tuple[int, ...], compiled: bool, out: Path) -> None:
+    """Count scans until new obstacles show, and what stays of people who left.
+
+    Each row is written at once; rows that are not measured stay as they were.
+    """
     torch.set_num_threads(2)
-    result: dict[str, Any] = {"obstacles": {}, "ghosts": {}}
-    new = [(name, share) for name in OBSTACLES for share in SHARES] if only != "ghosts" else []
+    path = out / "changes.json"
+    result = json.loads(path.read_text()) if path.exists() else {}
+    result = {name: result.get(name, {}) for name in ("obstacles", "ghosts")}
+    how = {"seeds": seeds, "settled": settled, "commit": commit()}
+    new = [(name, share) for name in OBSTACLES for share in SHARES[name]] if only != "ghosts" else []
     for name, share in tqdm(new, "obstacles"):
-        row = obstacle_scans(SENSORS["camera 64 x 48"], name, share, seeds, settled, compiled)
-        result["obstacles"][f"{name}, {share:.0%} of the points"] = row
-    gone = [(name, hertz) for name in SENSORS for hertz in HERTZ] if only != "obstacles" else []
-    for name, hertz in tqdm(gone, "ghosts"):
-        result["ghosts"][f"{name} at {hertz} Hz"] = ghosts(SENSORS[name], hertz, seeds, compiled)
-    write_json(out / "changes.json", result)
+        row = obstacle_scans(SENSORS["camera 120 x 90"], name, share, seeds, settled, compiled)
+        result["obstacles"][f"{name}, {share:.1%} of the points"] = row | how
+        write_json(path, result)
+    gone = [(name, rate) for name in SENSORS for rate in hertz] if only != "obstacles" else []
+    for name, rate in tqdm(gone, "ghosts"):
+        result["ghosts"][f"{name} at {rate} Hz"] = ghosts(SENSORS[name], rate, seeds, compiled) | how
+        write_json(path, result)
     click.echo(tables(result))
 
 

@@ -92,6 +92,13 @@ POINTS[3] = (POINTS[3] > 0.5).to(torch.uint8)
         ("pick_out", (MARKED, SLOT, POINTS)),
         ("pick_out", (MARKED[1:], SLOT[1:], [POINTS[3][1:]])),
         ("pick_out", (torch.zeros_like(MARKED), SLOT, POINTS)),
+        ("pick_cells", (MARKED,)),
+        ("pick_cells", (torch.zeros_like(MARKED),)),
+        (
+            "put_in",
+            ([MARKED, MARKED.float()], torch.tensor([1, 4]), [torch.tensor([7, 8], dtype=torch.uint8), torch.ones(2)]),
+        ),
+        ("put_in", ([MARKED], torch.zeros(0, dtype=torch.int64), [torch.zeros(0, dtype=torch.uint8)])),
         ("realize", ([TABLE, SLOT],)),
         ("harmonic", ((TABLE > 0.5).float(), TABLE, 1e-3, 4)),
         ("lowest_of_border", (TABLE, TABLE > 0.5)),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from torchelev.fusion import FusionConfig, Guess, Prior
 
-MIN_CHALLENGERS = 4  # in the 3 x 3 window: so many stand on one obstacle, whose face shows at all heights
+MIN_CHALLENGERS = 4  # of the 3 x 3 cells that have a challenger; then points at any height above support it
 
 
 class Challenge(NamedTuple):

@@ -96,8 +96,17 @@ def evidence(cfg: ElevationMapConfig, state: MapState, looks: Sequence[Look], en
     gates, used = dict.fromkeys(GATES, 0), []
     for look in looks:
         base = None if look.T_map_base is None else look.T_map_base[env, None]
-        inputs = (look.points[env, None], look.T_map_sensor[env, None], base, look.dt[env, None], None)
-        m = measure(*inputs, cfg.grid, cfg.sensor, torch.float32)
+        variance = None if look.variance is None else look.variance[env, None]
+        m = measure(
+            look.points[env, None],
+            look.T_map_sensor[env, None],
+            base,
+            look.dt[env, None],
+            variance,
+            cfg.grid,
+            cfg.sensor,
+            torch.float32,
+        )
         gates = {name: number + int(getattr(m, f"rejected_{name}")) for name, number in gates.items()}
         used.append(m.used[0].cpu().numpy())
     grid = cfg.grid

@@ -67,7 +67,10 @@ def _(cells: Tensor) -> Tensor:
     "torchelev::put_in", mutates_args=(), schema="(Tensor[] layers, Tensor cells, Tensor[] values) -> Tensor[]"
 )
 def put_in(layers: list[Tensor], cells: Tensor, values: list[Tensor]) -> list[Tensor]:
-    """Return layers (B, C) with values (K,) at cells. An operator, as the compiler would put it off to the last."""
+    """Return layers (B, C) with values (K,) at cells.
+
+    An operator, as the compiler would put it off to the end of the update and hold until then all that it reads.
+    """
     pairs = zip(layers, values, strict=True)
     return [layer.flatten().index_copy(0, cells, value).view_as(layer) for layer, value in pairs]
 

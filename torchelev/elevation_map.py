@@ -139,6 +139,7 @@ class ElevationMap(nn.Module):
 
     def _apply(self, *args: Any, **kwargs: Any) -> ElevationMap:
         self._filtered.clear()
+        self._recent.forget()
         return super()._apply(*args, **kwargs)
 
     # Writing --------------------------------------------------------------------------------------------------------
@@ -182,7 +183,7 @@ class ElevationMap(nn.Module):
         Raises ValueError or TypeError before anything changed; TypeError without dt.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
-        self._recent.add(*inputs[:4])
+        self._recent.add(*inputs)
         if self.device.type == "cpu":
             keep_freed_memory()
         run = compiled_update if self._compiled else update_in_place

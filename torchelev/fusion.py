@@ -32,7 +32,7 @@ class FusionConfig:
     scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
     outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
     max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
-    min_above: int = 5  # points of one height above a cell that found it anew, however settled it is
+    min_above: int = 5  # points above a cell, `challenge.py`, that found it anew, however settled it is
     max_above_per_scan: int = 2  # of those points, how many one scan adds: a single bad scan is no obstacle
     max_variance: float = 1.0  # [m^2]
     edges: EdgeConfig | None = EdgeConfig()
@@ -104,9 +104,10 @@ def fuse(
     """
     scan, prior = gather_scan(m, cells, grid, cfg), gather_prior(state)
     guess = guess_heights(scan, prior, grid, cfg)
-    challenge = challenge_from_above(prior, guess, grid.width, cfg.relief * grid.resolution, cfg)
-    if not has_rays:  # nothing else tells outliers in a blind spot from an obstacle
-        challenge = challenge._replace(won=torch.zeros_like(challenge.won))
+    if has_rays:  # nothing else tells outliers in a blind spot from an obstacle
+        challenge = challenge_from_above(prior, guess, grid.width, cfg.relief * grid.resolution, cfg)
+    else:
+        challenge = Challenge(prior.challenger, prior.challenger_support, torch.zeros_like(prior.known))
     scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
     state, taken = merge(state, prior, scanned, challenge, grid, cfg)
     points_used = masked(scanned.kept, taken).sum(1).to(torch.int64)

@@ -133,6 +133,7 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
     corner, shift = realize_all(corner, shift)
     masks, names = layer_names(state)
+    # All masks move as the bits of one layer.
     layers = [*(getattr(state, name) for name in names), as_bits([getattr(state, name) for name in masks])]
     blanks = [*(BLANK.get(name, 0.0) for name in names), 0.0]
     # Copying takes an eighth of the time of gathering that is not compiled, but has no gradient, and the host must know

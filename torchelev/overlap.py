@@ -64,8 +64,11 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     slope = torch.where(hit, distance * (cfg.height / cfg.radius), 0.0)
     other = near & state.validity & is_outside(height, floor, slope)
     other_bound = near & state.bounded & is_outside((state.upper_bound - base).detach(), floor, 0.0)
-    validity, bounded = realize_all(state.validity & ~other, state.bounded & ~(other | other_bound))
-    state = state._replace(validity=validity, bounded=bounded)
+    challenger_support = torch.where(other, 0, state.challenger_support.to(torch.int32)).to(torch.uint8)
+    validity, bounded, challenger_support = realize_all(
+        state.validity & ~other, state.bounded & ~(other | other_bound), challenger_support
+    )
+    state = state._replace(validity=validity, bounded=bounded, challenger_support=challenger_support)
     return tally(state, cleared_other_floors=count(other))
 
 

@@ -68,7 +68,7 @@ class PolarGrid(NamedTuple):
 
     def widths(self, k: Tensor) -> Tensor:
         """Return how many azimuth bins a cell at range k is taken to cover, a power of two."""
-        # The compiler would compute a table's entries anew for every cell, and check every index.
+        # Compiled it is computed for each cell, else for each range and looked up: each is the faster there.
         row = k if torch.compiler.is_compiling() else torch.arange(self.ranges + 1, device=k.device, dtype=k.dtype)
         width = torch.ones_like(row)
         for level, rows in enumerate(self.widen):

@@ -22,6 +22,7 @@ class Look(NamedTuple):
     T_map_sensor: Tensor  # (E, S, 4, 4)
     T_map_base: Tensor | None  # (E, 4, 4)
     dt: Tensor  # (E,) [s]
+    variance: Tensor | None  # (E, S, n) [m^2]
 
 
 class Recent:
@@ -55,7 +56,9 @@ class Recent:
         first = 0 if self.since is None else int(self.since[env])
         return [look for look in self.looks if look.number >= first]
 
-    def add(self, points: Tensor, T_map_sensor: Tensor, T_map_base: Tensor | None, dt: Tensor) -> None:
+    def add(
+        self, points: Tensor, T_map_sensor: Tensor, T_map_base: Tensor | None, dt: Tensor, variance: Tensor | None
+    ) -> None:
         """Take a look at an update's checked inputs, points (B, S, N, 3)."""
         if torch.compiler.is_compiling():
             return
@@ -65,5 +68,6 @@ class Recent:
                 values = [points[:ENVS, :, ::step], T_map_sensor[:ENVS], dt[:ENVS]]
                 cloud, sensor, seconds = (value.detach().clone() for value in values)
                 base = None if T_map_base is None else T_map_base[:ENVS].detach().clone()
-            self.looks.append(Look(self.updates, cloud, sensor, base, seconds))
+                own = None if variance is None else variance[:ENVS, :, ::step].detach().clone()
+            self.looks.append(Look(self.updates, cloud, sensor, base, seconds, own))
         self.updates += 1

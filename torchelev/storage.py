@@ -1,4 +1,4 @@
-"""What the compiler is to store, and how. Eager code stores every value, and none of this changes it."""
+"""What the compiler is to store, and how; masks as bytes or bits. Eager code stores every value anyway."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Int, Shaped
 
 
 @torch.library.custom_op("torchelev::realize", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
@@ -64,7 +64,7 @@ def as_mask(stored: Tensor) -> Tensor:
     return stored.to(torch.int32) > 0 if torch.compiler.is_compiling() else stored.view(torch.bool)
 
 
-def read(values: Float[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Float[Tensor, "B I J"]:
+def read(values: Shaped[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Shaped[Tensor, "B I J"]:
     """Give each entry the value at its index."""
     if torch.compiler.is_compiling():  # a flat index it would store, or divide to find row and column
         environment = torch.arange(len(index), device=index.device, dtype=index.dtype)[:, None, None]

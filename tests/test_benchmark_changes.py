@@ -1,0 +1,64 @@
+"""The benchmark of obstacles that come and people who go: what it counts, and what it writes."""
+
+import json
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+from benchmarks import changes
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(changes, "WATCHED", 3)
+    monkeypatch.setattr(changes, "SECONDS", 0.4)
+    monkeypatch.setattr(changes, "CROSSINGS", 1)
+    monkeypatch.setattr(changes, "AFTER", 0.4)
+
+
+def world(seeds=2):
+    return changes.World(changes.SENSORS["camera 64 x 48"], seeds, compiled=False)
+
+
+def test_hits_are_counted_on_the_obstacle_alone():
+    here = world(1)
+    half = changes.OBSTACLES["box"]
+    at = torch.tensor([changes.AHEAD + 0.01, 0.02, 0.0])
+    ground = float(here.field.height(here.tiles, at[None, None, :2]))
+    on, below, beside = ([at[0], y, ground + z] for y, z in ((0.02, 0.2), (0.02, 0.02), (1.0, 0.2)))
+    nothing = [torch.nan] * 3
+    number = changes.hits(here, torch.tensor([[on, on, below, beside, nothing]]), half)
+    assert number.sum() == 2 and number.max() == 2
+    center = here.emap.cell_centers()[number > 0][0]
+    assert (center - at[:2]).abs().max() <= changes.GRID.resolution / 2
+
+
+def test_an_obstacle_shows_and_settled_ground_delays_it(small):
+    row = changes.obstacle_scans(changes.SENSORS["camera 64 x 48"], "wall", 1.0, seeds=2, settled=1, compiled=False)
+    assert row["median"] <= 3 and row["points"] > 0.5
+    assert world().above_ground().isnan().all()
+
+
+def test_ghosts_are_what_stays_above_the_ground(small, monkeypatch):
+    row = changes.ghosts(changes.SENSORS["camera 64 x 48"], 10, seeds=2, compiled=False)
+    assert row["of"] == 2 and row["environments"] <= 2
+    monkeypatch.setattr(changes, "AFTER", 0.0)  # while the person still stands there
+    monkeypatch.setattr(changes, "SECONDS", 2.0)
+    monkeypatch.setattr(
+        changes,
+        "crossing",
+        lambda w, dt: (w.box(torch.full((2,), 2.5), torch.zeros(2), changes.PERSON) for _ in range(5)),
+    )
+    assert changes.ghosts(changes.SENSORS["camera 64 x 48"], 10, seeds=2, compiled=False)["environments"] == 2
+
+
+def test_the_command_writes_and_tabulates(small, monkeypatch, tmp_path):
+    monkeypatch.setattr(changes, "obstacle_scans", lambda *given: {"median": 3, "most": 4, "points": 0.5})
+    monkeypatch.setattr(changes, "ghosts", lambda *given: {"cells": 0, "environments": 0, "of": 50})
+    result = CliRunner().invoke(changes.main, ["--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert "| box, 60.0% of the points | 0.5 | 3 | > 3 |" in result.output
+    assert len(json.loads((tmp_path / "changes.json").read_text())["ghosts"]) == len(changes.SENSORS) * len(
+        changes.HERTZ
+    )
