@@ -18,7 +18,7 @@ from benchmarks.report import markdown_table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-SPEED = "speed-2-x-amd-epyc-2-threads"
+SPEED = "speed-2-x-intel-r-xeon-r-processor-2-threads"
 SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
 
 
@@ -125,9 +125,17 @@ def block() -> str:
     return steps.table(load("block")["profiles"])
 
 
+def changes() -> str:
+    """Tabulate how soon obstacles show, and what stays of people who left."""
+    from benchmarks import changes as scenes
+
+    return scenes.tables(load("changes"))
+
+
 TABLES = {
     "accuracy": accuracy,
     "features": features,
+    "changes": changes,
     "real": real,
     "speed": speed,
     "long_run": long_run,
