@@ -62,6 +62,13 @@ def speed() -> str:
     return f"{speed_tables.report(load(SPEED))}\n\n{picture}"
 
 
+def loop() -> str:
+    """Tabulate a 50 Hz loop, idle and beside a busy process."""
+    from benchmarks import loop as loops
+
+    return loops.table(load("loop")["rows"])
+
+
 def long_run() -> str:
     """Tabulate growth over long runs."""
     cases = {name: values for name, values in load("long_run").items() if name in long_runs.CASES}
@@ -125,19 +132,12 @@ def block() -> str:
     return steps.table(load("block")["profiles"])
 
 
-def changes() -> str:
-    """Tabulate how soon obstacles show, and what stays of people who left."""
-    from benchmarks import changes as scenes
-
-    return scenes.tables(load("changes"))
-
-
 TABLES = {
     "accuracy": accuracy,
     "features": features,
-    "changes": changes,
     "real": real,
     "speed": speed,
+    "loop": loop,
     "long_run": long_run,
     "nav": nav,
     "sight": sight,

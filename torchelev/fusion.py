@@ -107,7 +107,8 @@ def fuse(
     if has_rays:  # nothing else tells outliers in a blind spot from an obstacle
         challenge = challenge_from_above(prior, guess, grid.width, cfg.relief * grid.resolution, cfg)
     else:
-        challenge = Challenge(prior.challenger, prior.challenger_support, torch.zeros_like(prior.known))
+        unchanged = prior.challenger.clone(), prior.challenger_support.clone()
+        challenge = Challenge(*unchanged, torch.zeros_like(prior.known))
     scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
     state, taken = merge(state, prior, scanned, challenge, grid, cfg)
     points_used = masked(scanned.kept, taken).sum(1).to(torch.int64)
