@@ -19,7 +19,8 @@ def test_a_loop_keeps_its_rate_and_does_not_catch_up():
     times = loop.loop(step, 5, period=0.02)
     assert times[1] >= 0.05
     gaps = [b - a for a, b in zip(starts, starts[1:], strict=False)]
-    assert gaps[1] >= 0.05 and starts[4] - starts[2] >= 0.035, "after a late update the rate is kept, not exceeded"
+    due = starts[1] + times[1]  # of the call after the late one, which may itself start a little late
+    assert gaps[1] >= 0.05 and starts[4] - due >= 0.0399, "after a late update the rate is kept, not exceeded"
 
 
 def test_figures_by_hand():

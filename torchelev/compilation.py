@@ -18,7 +18,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.errors import require_count
 from torchelev.pipeline import move_along, take_heights, take_rays, update_in_place
 from torchelev.sensor import measure
-from torchelev.state import MapState, Measurement, blank_state, map_layers
+from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.storage import as_bytes, as_mask
 from torchelev.traversability_net import Weights
 
@@ -233,10 +233,9 @@ def packed(value: Tensor) -> Tensor:
 
 
 Values = TypeVar("Values", MapState, Measurement)
-MASKS = ("validity", "bounded", "has_normal", "rated", "used", "casts")  # of a state, and of a measurement
 
 
 def with_masks(values: Values, convert: Callable[[Tensor], Tensor]) -> Values:
     """Return a state or a measurement with its masks converted."""
-    masks = {name: convert(getattr(values, name)) for name in MASKS if name in values._fields}
+    masks = {name: convert(getattr(values, name)) for name in (*MASKS, "used", "casts") if name in values._fields}
     return type(values)(**(values._asdict() | masks))  # what `_replace` makes, torch 2.11 cannot return from a graph

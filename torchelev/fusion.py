@@ -14,7 +14,7 @@ from torchelev.disputed import NO_HEIGHT, Disputed, Picked, Shown, ratio, settle
 from torchelev.edges import EdgeConfig
 from torchelev.errors import require, require_count
 from torchelev.grid import GridConfig, PointCells
-from torchelev.masks import as_factor, chosen, masked
+from torchelev.masks import as_factor, chosen, masked, zeroed
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 from torchelev.storage import as_bytes, realize, realize_all
 
@@ -281,7 +281,7 @@ def merge(
         chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         store(challenge.height),
-        store(torch.where(found, 0, challenge.support.to(torch.int32)).to(torch.uint8)),
+        store(zeroed(challenge.support, found)),
         state.validity | hit_now,
         torch.where(hit_now, 0.0, state.time),  # not multiplied: it may be infinite
     )

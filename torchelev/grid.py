@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require_positive, whole_cells
 from torchelev.operators import cell_sums, moved
-from torchelev.state import BLANK, MapState, Measurement, layer_names
+from torchelev.state import BLANK, LAYERS, MASKS, MapState, Measurement
 from torchelev.storage import as_bits, from_bits, read, realize, realize_all
 
 if TYPE_CHECKING:
@@ -132,16 +132,16 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     # A shift of a whole window blanks everything; the clamp keeps the index arithmetic small.
     shift = (corner - state.corner).clamp(-max(grid.height, grid.width), max(grid.height, grid.width))
     corner, shift = realize_all(corner, shift)
-    masks, names = layer_names(state)
+    names = [name for name in LAYERS if name not in MASKS]
     # All masks move as the bits of one layer.
-    layers = [*(getattr(state, name) for name in names), as_bits([getattr(state, name) for name in masks])]
+    layers = [*(getattr(state, name) for name in names), as_bits([getattr(state, name) for name in MASKS])]
     blanks = [*(BLANK.get(name, 0.0) for name in names), 0.0]
     # Copying takes an eighth of the time of gathering that is not compiled, but has no gradient, and the host must know
     # the shifts.
     eager = not torch.compiler.is_compiling() and not torch.is_grad_enabled()
     few = eager and shift.shape[0] <= 4 and shift.device.type == "cpu"
     *values, bits = moved(layers, shift, blanks) if few else gathered(layers, shift, blanks, grid)
-    fields: dict[str, Any] = dict(zip((*names, *masks), (*values, *from_bits(bits, len(masks))), strict=True))
+    fields: dict[str, Any] = dict(zip((*names, *MASKS), (*values, *from_bits(bits, len(MASKS))), strict=True))
     base_height = torch.where(moves, m.base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **fields)
 

@@ -35,6 +35,11 @@ def chosen(mask: Tensor, values: Tensor, others: Tensor | float) -> Tensor:
     return torch.lerp(others, values, as_bytes(mask).to(values.dtype))  # exact at weights of 0 and 1
 
 
+def zeroed(counts: Tensor, mask: Tensor) -> Tensor:
+    """Return counts in uint8, 0 where the mask is true. Compiled code chooses integers faster than bytes."""
+    return torch.where(mask, 0, counts.to(torch.int32)).to(torch.uint8)
+
+
 def lifted(heights: Tensor, mask: Tensor) -> Tensor:
     """Return the heights [m], NOWHERE higher where the mask is true."""
     return torch.add(heights, as_factor(mask), alpha=NOWHERE)

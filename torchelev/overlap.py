@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets
+from torchelev.masks import zeroed
 from torchelev.state import MapState, Measurement, count, tally
 from torchelev.storage import realize_all
 
@@ -64,7 +65,7 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     slope = torch.where(hit, distance * (cfg.height / cfg.radius), 0.0)
     other = near & state.validity & is_outside(height, floor, slope)
     other_bound = near & state.bounded & is_outside((state.upper_bound - base).detach(), floor, 0.0)
-    challenger_support = torch.where(other, 0, state.challenger_support.to(torch.int32)).to(torch.uint8)
+    challenger_support = zeroed(state.challenger_support, other)
     validity, bounded, challenger_support = realize_all(
         state.validity & ~other, state.bounded & ~(other | other_bound), challenger_support
     )

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig, center_offsets, lattice_offset, locate
-from torchelev.masks import NOWHERE, chosen, lifted, masked
+from torchelev.masks import NOWHERE, chosen, lifted, masked, zeroed
 from torchelev.operators import polar_minimum, running_minimum
 from torchelev.state import MapState, Measurement, count, tally
 from torchelev.storage import read, realize, realize_all
@@ -277,7 +277,7 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
-    challenger_support = torch.where(passed, 0, state.challenger_support.to(torch.int32)).to(torch.uint8)
+    challenger_support = zeroed(state.challenger_support, passed)
     validity, bounded, upper_bound, challenger_support = realize_all(
         validity, (state.bounded & ~state.validity) | bounds, upper_bound, challenger_support
     )

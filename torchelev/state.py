@@ -77,6 +77,8 @@ class Measurement(NamedTuple):
     rejected_overhang: Int[Tensor, "B"]
 
 
+LAYERS = MapState._fields[2:-1]  # (B, H, W)
+MASKS = ("validity", "bounded", "has_normal", "rated")  # layers that are true or false
 # What an unknown cell holds, by layer; everything else is zero.
 BLANK = {"variance": 1.0}
 
@@ -93,11 +95,8 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
     zero = torch.zeros(num_envs, device=device, dtype=torch.int64)
     corner = torch.stack([zero + cells for cells in blank_corner(grid)], -1)
     heights = {"drift_error", "drift_correction"}
-    kinds = dict.fromkeys(("validity", "bounded", "has_normal", "rated"), torch.bool) | {
-        "challenger_support": torch.uint8
-    }
-    layers = MapState._fields[2:-1]
-    values = {name: (layer + BLANK.get(name, 0.0)).to(kinds.get(name, dtype)) for name in layers}
+    kinds = dict.fromkeys(MASKS, torch.bool) | {"challenger_support": torch.uint8}
+    values = {name: (layer + BLANK.get(name, 0.0)).to(kinds.get(name, dtype)) for name in LAYERS}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))
     return MapState(corner=corner, base_height=number, statistics=statistics, **values)
 
@@ -119,13 +118,6 @@ def _fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | N
         values.masked_fill_(mask.view(-1, *[1] * (values.ndim - 1)), blank)
     else:
         values.fill_(blank)
-
-
-def layer_names(state: MapState) -> tuple[list[str], list[str]]:
-    """Return the names of the layers (B, H, W) that are masks, and of those that are numbers."""
-    names = MapState._fields[2:-1]
-    masks = [name for name in names if getattr(state, name).dtype == torch.bool]
-    return masks, [name for name in names if name not in masks]
 
 
 def map_layers(function: Callable[..., Tensor], *states: MapState) -> MapState:
