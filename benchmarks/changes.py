@@ -1,8 +1,8 @@
 """How soon a new obstacle shows, and whether one that left does: `python -m benchmarks.changes`
 
 Robots stand still on rough ground, each with its own ground and noise, all in one batch. Obstacles: after 60 s of empty
-ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells that it hit
-show it, 0.15 m above the ground or higher. Ghosts: a person crosses the view four times; counted are the cells that
+ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells that it
+covers and points hit show it, 0.15 m above the ground or higher. Ghosts: a person crosses the view four times; counted are the cells that
 stay more than 0.1 m above the ground 3 s after. Writes benchmarks/results/changes.json.
 """
 
@@ -75,6 +75,11 @@ class World:
         truth = self.field.height(self.tiles, centers).view_as(self.emap.elevation)
         return torch.where(self.emap.validity, self.emap.elevation - truth, math.nan)
 
+    def ahead(self, half: tuple[float, float, float]) -> Boxes:
+        """Return an obstacle ahead of each sensor, somewhere within a cell."""
+        x, y = (torch.rand(2, self.seeds, generator=self.generator) - 0.5) * GRID.resolution
+        return self.box(AHEAD + half[0] + x, y, half)
+
     def box(self, x: Tensor, y: Tensor, half: tuple[float, float, float]) -> Boxes:
         """Return an upright box in each environment, standing at (x, y) (B,) [m]."""
         T = torch.eye(4).repeat(self.seeds, 1, 1, 1)
@@ -89,11 +94,10 @@ def obstacle_scans(
     world = World(sensor, seeds, compiled)
     for _ in range(settled):
         world.scan(None, 0.1, share)
-    half = OBSTACLES[obstacle]
-    boxes = world.box(torch.full((seeds,), AHEAD + half[0]), torch.zeros(seeds), half)
+    boxes = world.ahead(OBSTACLES[obstacle])
     hit, shown, points = torch.zeros_like(world.emap.validity), [], []
     for _ in range(WATCHED):
-        number = hits(world, world.scan(boxes, 0.1, share), half)
+        number = hits(world, world.scan(boxes, 0.1, share), boxes)
         hit |= number > 0
         points.append(float(number.sum() / hit.sum().clamp(min=1)))
         shows = hit & (world.above_ground() > 0.15)
@@ -103,16 +107,18 @@ def obstacle_scans(
     return {"median": scans[len(scans) // 2], "most": scans[-1], "points": sum(points) / len(points)}
 
 
-def hits(world: World, points: Tensor, half: tuple[float, float, float]) -> Tensor:
-    """Count each cell's points (B, H, W) on the obstacle: within its borders, and 5 cm or more above the ground."""
+def hits(world: World, points: Tensor, boxes: Boxes) -> Tensor:
+    """Count the points (B, H, W) in each cell whose centre the obstacle covers, 5 cm or more above the ground."""
     xy, z = points[..., :2].nan_to_num(), points[..., 2]
     on = z > world.field.height(world.tiles, xy) + 0.05
-    on &= ((xy - torch.tensor([AHEAD + half[0], 0.0])).abs() < torch.tensor(half[:2]) + 0.1).all(-1)
-    first = world.emap.cell_centers()[:, None, 0, 0]
-    i, j = ((xy - first) / GRID.resolution).round().long().unbind(-1)
-    slot = (i * GRID.width + j).clamp(0, GRID.height * GRID.width - 1)
+    centers = world.emap.cell_centers()
+    i, j = ((xy - centers[:, None, 0, 0]) / GRID.resolution).round().long().unbind(-1)
+    on &= (i >= 0) & (i < GRID.height) & (j >= 0) & (j < GRID.width)
+    slot = torch.where(on, i * GRID.width + j, 0)
     number = torch.zeros(len(xy), GRID.height * GRID.width).scatter_add(1, slot, on.float())
-    return number.view_as(world.emap.elevation)
+    place, half = boxes.T_map_box[:, 0, :2, 3], boxes.half_size[:, 0, :2]
+    covered = ((centers - place[:, None, None]).abs() <= half[:, None, None]).all(-1)
+    return number.view_as(world.emap.elevation) * covered
 
 
 def crossing(world: World, dt: float) -> Iterator[Boxes]:

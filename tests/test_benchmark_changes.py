@@ -21,14 +21,14 @@ def world(seeds=2):
     return changes.World(changes.SENSORS["camera 64 x 48"], seeds, compiled=False)
 
 
-def test_hits_are_counted_on_the_obstacle_alone():
+def test_hits_are_counted_in_the_cells_that_the_obstacle_covers():
     here = world(1)
-    half = changes.OBSTACLES["box"]
-    at = torch.tensor([changes.AHEAD + 0.01, 0.02, 0.0])
+    boxes = here.box(torch.tensor([2.65]), torch.zeros(1), changes.OBSTACLES["box"])
+    at = torch.tensor([2.55, 0.02, 0.0])
     ground = float(here.field.height(here.tiles, at[None, None, :2]))
-    on, below, beside = ([at[0], y, ground + z] for y, z in ((0.02, 0.2), (0.02, 0.02), (1.0, 0.2)))
-    nothing = [torch.nan] * 3
-    number = changes.hits(here, torch.tensor([[on, on, below, beside, nothing]]), half)
+    places = (at[0], 0.02, 0.2), (at[0], 0.02, 0.02), (at[0], 1.0, 0.2), (2.51, 0.02, 0.2)  # the last cell's centre: 2.5
+    on, below, beside, before = ([x, y, ground + z] for x, y, z in places)
+    number = changes.hits(here, torch.tensor([[on, on, below, beside, before, [torch.nan] * 3]]), boxes)
     assert number.sum() == 2 and number.max() == 2
     center = here.emap.cell_centers()[number > 0][0]
     assert (center - at[:2]).abs().max() <= changes.GRID.resolution / 2

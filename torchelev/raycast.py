@@ -221,6 +221,7 @@ class RayOverCell(NamedTuple):
 
     found: Bool[Tensor, "B H W"]
     height: Float[Tensor, "B H W"]  # [m] over the cell's centre
+    fall: Float[Tensor, "B H W"]  # [m] how far it falls over a cell's length, or rises
     incidence: Float[Tensor, "B H W"]  # |r . n|
 
 
@@ -246,7 +247,7 @@ def look_up(
     gx, gy = state.gradient_x, state.gradient_y
     along = (slope - torch.addcmul(gx * x, gy, y) / rho).abs()
     incidence = along / ((1 + slope.square()) * (1 + gx.square() + gy.square())).sqrt()
-    return RayOverCell(found, z_s + slope * rho, incidence)
+    return RayOverCell(found, z_s + slope * rho, slope.abs() * grid.resolution, incidence)
 
 
 def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig) -> MapState:
@@ -272,8 +273,9 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     seen_through = passes_far_below(state, depth, grid, cfg) | (ray.incidence > cfg.min_incidence)
     gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
     validity = state.validity & ~gone
-    # A ray below a challenger, or within a cell above it, shows that nothing stands there: outliers stop no other ray.
-    passed = realize((ray.found & (ray.height < state.challenger + grid.resolution)) | ~validity)
+    # A ray below a challenger shows that nothing stands there: outliers stop no other ray. Within a cell a ray falls as
+    # far as `fall`; those that end on an obstacle's top, two cells behind or farther, pass higher.
+    passed = realize((ray.found & (ray.height < state.challenger + ray.fall)) | ~validity)
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
