@@ -1,9 +1,9 @@
 """How soon a new obstacle shows, and whether one that left does: `python -m benchmarks.changes`
 
-Robots stand still on rough ground, each with its own ground and noise, all in one batch. Obstacles: after 60 s of empty
-ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells that it
-covers and points hit show it, 0.15 m above the ground or higher. Ghosts: a person crosses the view four times; counted are the cells that
-stay more than 0.1 m above the ground 3 s after. Writes benchmarks/results/changes.json.
+Robots stand still on rough ground, each with its own ground and noise, all in one batch. Obstacles: after 60 s of
+empty ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells that
+it covers and points hit show it, 0.15 m above the ground or higher. Ghosts: a person crosses the view four times;
+counted are the cells that stay more than 0.1 m above the ground 3 s after. Writes benchmarks/results/changes.json.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import torch.utils.benchmark as bench
 from torch.profiler import ProfilerActivity, profile
 
 from torchelev import ElevationMapConfig
-from torchelev.raycast import PolarGrid
+from torchelev.polar import PolarGrid
 from torchelev.state import blank_state
 
 

@@ -26,7 +26,12 @@ def test_hits_are_counted_in_the_cells_that_the_obstacle_covers():
     boxes = here.box(torch.tensor([2.65]), torch.zeros(1), changes.OBSTACLES["box"])
     at = torch.tensor([2.55, 0.02, 0.0])
     ground = float(here.field.height(here.tiles, at[None, None, :2]))
-    places = (at[0], 0.02, 0.2), (at[0], 0.02, 0.02), (at[0], 1.0, 0.2), (2.51, 0.02, 0.2)  # the last cell's centre: 2.5
+    places = (
+        (at[0], 0.02, 0.2),
+        (at[0], 0.02, 0.02),
+        (at[0], 1.0, 0.2),
+        (2.51, 0.02, 0.2),
+    )  # the last cell's centre: 2.5
     on, below, beside, before = ([x, y, ground + z] for x, y, z in places)
     number = changes.hits(here, torch.tensor([[on, on, below, beside, before, [torch.nan] * 3]]), boxes)
     assert number.sum() == 2 and number.max() == 2

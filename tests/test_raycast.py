@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev import GridConfig, RaycastConfig, SensorConfig
-from torchelev.raycast import BREADTH, PolarGrid, believed, clear_seen_through, rays_of, turn
+from torchelev.belief import believed, rays_of
+from torchelev.polar import BREADTH, PolarGrid, turn
+from torchelev.raycast import clear_seen_through
 
 CELLS, RESOLUTION = (40, 30), 0.1
 PLACES = [(0.0, 0.0), (0.55, -0.33), (-1.93, 0.04), (-2.6, 0.3)]  # in the middle, off it, at the rim, outside
@@ -79,12 +81,12 @@ def test_bounds_agree_with_marching(place):
     assert abs(np.median(difference)) < 0.03 and -0.5 < low and high < 2.0
 
 
-def ghosts(emap, seed=0):
+def ghosts(emap, cells=CELLS, seed=0):
     """The floor, known for long, with what is left of six people on it."""
     rng = np.random.default_rng(seed)
-    height = torch.zeros(1, *CELLS, dtype=torch.float64)
+    height = torch.zeros(1, *cells, dtype=torch.float64)
     for _ in range(6):
-        i, j = rng.integers(0, CELLS[0] - 4), rng.integers(0, CELLS[1] - 4)
+        i, j = rng.integers(0, cells[0] - 4), rng.integers(0, cells[1] - 4)
         height[0, i : i + 4, j : j + 4] = rng.uniform(0.3, 1.5)
     state = random_state(rng, emap.cfg.grid, known=1.0)
     return state._replace(
@@ -274,6 +276,25 @@ def test_where_nothing_is_known_only_rays_to_overhangs_are_believed(used, casts,
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
     changed = m._replace(used=m.used & used, casts=m.casts & casts)
     assert clear_seen_through(emap.state, changed, emap.cfg.grid, EVERY).bounded.any() == bounds
+
+
+@pytest.mark.parametrize("side", range(4))
+@pytest.mark.parametrize("unknown, height, clears", [(3, 0.3, True), (3, -0.1, False), (6, 0.3, False)])
+def test_a_ray_that_leaves_over_unknown_ground_passes_well_above_ground_near_by(side, unknown, height, clears):
+    """Some cells along the border are unknown; the ray passes there at this height, and below a ghost before it."""
+    emap = small_map(1, (31, 31), RESOLUTION, torch.float64, raycast=EVERY)
+    k, T = 30 - unknown, pose((0.0, 0.0, 1.0))
+    state = ghosts(emap, (31, 31))
+    elevation, validity = torch.zeros_like(state.elevation), torch.ones_like(state.validity)
+    elevation[0, 24, 13:18], validity[0, k + 1 :] = 1.5, False
+    elevation, validity = (torch.rot90(layer, side, (1, 2)) for layer in (elevation, validity))
+    angle = side * np.pi / 2
+    across = np.array([-np.sin(angle), np.cos(angle), 0.0])
+    end = np.array([3.0 * np.cos(angle), 3.0 * np.sin(angle), 1.0 - 2.0 * (1.0 - height)])  # half way at the border
+    hits = np.array([end + t * across for t in (-0.05, 0.0, 0.05)])
+    after = cast(emap, state._replace(elevation=elevation, validity=validity), hits, T)
+    assert (after.validity != validity).any() == clears
+    assert torch.equal(after.validity[elevation == 0], validity[elevation == 0]), "the ground stays"
 
 
 @pytest.mark.parametrize("number, bounds", [(1, False), (2, False), (3, True)])

@@ -1,0 +1,144 @@
+"""Which rays are believed: the lowest ray decides, so that one return that is too long would clear a line of ground."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchelev.grid import GridConfig, lattice_offset, locate
+from torchelev.masks import NOWHERE, chosen, lifted
+from torchelev.operators import running_minimum
+from torchelev.polar import PolarGrid, flat, turn
+from torchelev.state import MapState, Measurement
+from torchelev.storage import read, realize, realize_all
+from torchelev.windows import neighbours
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    from torchelev.raycast import RaycastConfig
+
+NO_FALL = 1e4  # a fall -dz/dr that no ray has
+# A ray that leaves the window over unknown ground is judged by the ground NEAR by, CLEARANCE above which it must pass:
+# with less, returns that are too long would set upper bounds below the truth.
+NEAR, CLEARANCE = 0.5, 0.2  # [m]
+
+
+class Rays(NamedTuple):
+    """The rays of one sensor."""
+
+    origin: Float[Tensor, "B 3"]  # [m] counted from the measurement's horizontal origin
+    xy: Float[Tensor, "B N 2"]  # [m] from the sensor to the hit
+    r: Float[Tensor, "B N"]  # [m] horizontal length
+    slope: Float[Tensor, "B N"]  # dz / dr
+    azimuth: Float[Tensor, "B N"]  # in turns
+    noise: Float[Tensor, "B N"]  # [m] standard deviation of its end
+    casts: Bool[Tensor, "B N"]
+    overhang: Bool[Tensor, "B N"]  # the point lies above the exclusion ramp
+
+
+def rays_of(m: Measurement, s: int) -> Rays:
+    """Return the rays of sensor s."""
+    sensors = m.origin.shape[1]
+    ray = m.points.unflatten(1, (sensors, -1))[:, s] - m.origin[:, s, None]
+    x, y, z = ray.unbind(-1)
+    r = (x.square() + y.square()).clamp(min=1e-12).sqrt()
+    casts, used, variance = (values.unflatten(1, (sensors, -1))[:, s] for values in (m.casts, m.used, m.variance))
+    return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), variance.sqrt(), casts, casts & ~used)
+
+
+def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
+    """Tell which rays may clear and bound: their end is credible, and they pass below no ground hit of late."""
+    lowest = state.elevation - height_margin(state, grid, cfg)
+    clearance = horizon(state, m, rays, lowest, grid, cfg) + rays.slope
+    return rays.casts & ends_well(state, m, rays, lowest, grid, cfg) & (clearance >= 0)
+
+
+def ends_well(
+    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
+) -> Bool[Tensor, "B N"]:
+    """Tell which rays end, or leave the window, in a well supported cell and not below it.
+
+    Where nothing is known, two kinds are believed, as too long a return lies below the ground: those that leave the
+    window CLEARANCE above the lowest ground NEAR by, less its margin, and those to a point above the exclusion ramp.
+    """
+    offset = lattice_offset(state, m, grid)[:, None]
+    start = rays.origin[:, None, :2] + offset
+    size = torch.stack([start.new_full((), n * grid.resolution) for n in (grid.height, grid.width)])
+    inner = 0.5 * grid.resolution  # half a cell inside, so that rounding leaves no ray outside
+    ahead = rays.xy > 0
+    room = chosen(ahead, size - inner - start, inner - start)
+    along = chosen(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never zero
+    shares = room / along
+    share = shares.amin(-1).clamp(0, 1)
+    x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
+    slot, inside = locate(x, y, offset[:, 0], grid)
+    ground = realize(lifted(lowest, ~well_supported(state, cfg, grid.resolution)))
+    floor = ground.flatten(1).gather(1, slot.to(torch.int64))
+    through_x = shares[..., 0] <= shares[..., 1]
+    border = torch.where(through_x, ahead[..., 0].to(torch.int32), 2 + ahead[..., 1].to(torch.int32))
+    place = torch.where(through_x, slot % grid.width, slot // grid.width)
+    borders, length = ground_at_borders(ground, grid)
+    near = borders.gather(1, (border * length + place).to(torch.int64)) + CLEARANCE
+    floor = chosen((share < 1) & (floor > 0.5 * NOWHERE), near, floor)
+    height = rays.origin[:, None, 2] + share * rays.r * rays.slope
+    return inside & (height >= floor) | rays.overhang
+
+
+def ground_at_borders(ground: Tensor, grid: GridConfig) -> tuple[Float[Tensor, "B 4L"], int]:
+    """Return the lowest ground [m] NEAR each place of the window's four borders, and their length L in cells.
+
+    The borders are those of low x, high x, low y and high y; NOWHERE or higher without ground.
+    """
+    cells = max(1, int(NEAR / grid.resolution))
+    rows, columns = (ground[:, :cells], ground[:, -cells:]), (ground[:, :, :cells], ground[:, :, -cells:])
+    sides = [*(side.amin(1) for side in rows), *(side.amin(2) for side in columns)]
+    length = max(grid.height, grid.width)
+    rims = [F.pad(side, (cells, cells + length - side.shape[1]), value=NOWHERE) for side in sides]
+    return realize(torch.stack(rims, 1)).unfold(2, 2 * cells + 1, 1).amin(-1).flatten(1), length
+
+
+def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
+    """Tell which known cells are believed: enough points agree, or on a neighbouring cell of like height."""
+    enough = state.validity & (state.support >= cfg.min_support)
+    _, above, _, left, right, _, below, _ = neighbours(lifted(state.elevation, ~enough), NOWHERE)
+    unlike = functools.reduce(torch.minimum, [(h - state.elevation).abs() for h in (above, left, right, below)])
+    return enough | (state.validity & (unlike <= resolution))
+
+
+def height_margin(state: MapState, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B H W"]:
+    """Return how far below a cell's elevation a ray must pass to contradict it [m]; half a cell allows for relief."""
+    # An infinite gate must leave finite heights.
+    return (cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()).clamp(max=NOWHERE)
+
+
+def horizon(
+    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
+) -> Float[Tensor, "B N"]:
+    """Return the steepest fall -dz/dr that a ray may have before it passes below ground hit within `min_time`.
+
+    Rays that pass below it contradict it, and are wrong returns. Kept in a polar table of half the resolution, filled
+    by gathering from the map: the running minimum, from the sensor outwards, of the fall to each bin's ground.
+    """
+    step = 2 * grid.resolution
+    polar = PolarGrid.of(grid, cfg)
+    ranges, azimuths = 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
+    device, dtype = rays.r.device, rays.r.dtype
+    rho = (torch.arange(ranges, device=device, dtype=dtype) + 0.5)[:, None] * step
+    angle = (torch.arange(azimuths, device=device, dtype=dtype) + 0.5) * (2 * math.pi / azimuths)
+    # Realized, or the compiler computes them anew for every bin of every environment.
+    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(realize_all(angle.cos(), angle.sin())))
+    slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
+    recent = state.validity & (state.time <= cfg.min_time)
+    below_sensor = chosen(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
+    fall = chosen(inside, read(realize(below_sensor).flatten(1), slot), NO_FALL * step) / rho
+    steepest = running_minimum(fall.detach(), from_end=False)  # compared with, and so without a gradient
+    k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
+    a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
+    limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
+    return chosen(k >= 0, limit, NO_FALL)
