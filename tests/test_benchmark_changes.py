@@ -17,6 +17,9 @@ def small(monkeypatch):
     monkeypatch.setattr(changes, "AFTER", 0.4)
 
 
+GONE = {"cells": 3, "environments": 2, "seen_through": 0, "environments_seen_through": 0, "of": 50}
+
+
 def world(seeds=2):
     return changes.World(changes.SENSORS["camera 64 x 48"], seeds, compiled=False)
 
@@ -58,9 +61,21 @@ def test_ghosts_are_what_stays_above_the_ground(small, monkeypatch):
     assert changes.ghosts(changes.SENSORS["camera 64 x 48"], 10, seeds=2, compiled=False)["environments"] == 2
 
 
+def test_cells_are_seen_through_where_a_ray_passes_below_and_beyond():
+    here = world(1)
+    T = here.T_map_sensor[0, :3, 3].float()
+    here.emap.elevation.fill_(float(T[2]) - 0.45)
+    centers = here.emap.cell_centers()[0]
+    cells = (centers - torch.tensor([1.02, 0.02])).norm(dim=-1)[None] < 0.01
+    assert cells.sum() == 1
+    for end, number in (((2.0, 0.04), 1), ((2.0, 0.1), 0), ((1.05, 0.02), 0), ((-2.0, 0.0), 0), ((3.0, 0.06), 0)):
+        point = torch.tensor([[[*end, float(T[2]) - 1.0]]])  # a ray falls 0.51 m on 1.02 m of 2 m, 0.34 m of 3 m
+        assert changes.seen_through(here, cells, point).tolist() == [number], end
+
+
 def test_the_command_writes_and_tabulates(small, monkeypatch, tmp_path):
     monkeypatch.setattr(changes, "obstacle_scans", lambda *given: {"median": 3, "most": 4, "points": 0.5})
-    monkeypatch.setattr(changes, "ghosts", lambda *given: {"cells": 0, "environments": 0, "of": 50})
+    monkeypatch.setattr(changes, "ghosts", lambda *given: GONE)
     result = CliRunner().invoke(changes.main, ["--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert "| box, 60.0% of the points | 0.5 | 3 | > 3 |" in result.output
