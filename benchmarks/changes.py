@@ -2,16 +2,18 @@
 
 Robots stand still on rough ground, each with its own ground and noise, all in one batch. Obstacles: after 60 s of
 empty ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells that
-it covers and points hit show it, 0.15 m above the ground or higher. Ghosts: a person crosses the view four times;
-counted are the cells that stay more than 0.1 m above the ground 3 s after, and which of them a ray passes below, so
-that the map could know. Writes benchmarks/results/changes.json.
+it covers and points hit show it, 0.15 m above the ground or higher. Plates: the same for one of 3 cm, until it shows
+to 80 %, for several rates of aging. Ghosts: a person crosses the view four times; counted are the cells that stay
+more than 0.1 m above the ground 3 s after, and which of them a ray of the last scan passes below, so that the map
+could know. Writes benchmarks/results/changes.json.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.report import commit, markdown_table, write_json
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev import AgingConfig, ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.sim import Boxes, DepthCamera, HeightField, Lidar, MountedSensor, mount, noise
 from torchelev.sim.scenes import waves
 
@@ -40,8 +42,11 @@ PERSON = OBSTACLES["person"]
 AHEAD = 2.5  # [m]
 SETTLED = 600  # scans of empty ground, at 10 Hz
 WATCHED = 40  # scans of the obstacle
-SHARES = {"box": (0.6, 0.15), "person": (0.15, 0.035), "wall": (0.15, 0.035)}  # of the points: some 2, or 0.5, a cell
+SHARES = {"box": (1.0,), "person": (0.15, 0.035), "wall": (0.15, 0.035)}  # of the points: some 2, or 0.5, a cell
+PLATE = (0.15, 0.15, 0.015)  # [m] half sizes
+RATES = (1e-7, 1e-6, 3e-6, 1e-5)  # [m^2/s] of aging, the first is the default
 HERTZ = (5, 10, 50)
+SECTIONS = ("obstacles", "plates", "ghosts")
 CROSSINGS, SECONDS, AFTER = 4, 5.0, 3.0  # how often, how long each [s], and when the ghosts are counted [s]
 CLEARLY = 0.05  # [m]
 
@@ -49,17 +54,17 @@ CLEARLY = 0.05  # [m]
 class World:
     """B robots that stand still, each on ground of its own, and what their sensors and maps see of it."""
 
-    def __init__(self, sensor: MountedSensor, seeds: int, compiled: bool) -> None:
+    def __init__(self, sensor: MountedSensor, seeds: int, compiled: bool, amplitude: float = 0.03, **cfg: Any) -> None:
         places = torch.linspace(-6.0, 6.0, 301, dtype=torch.float64)
         x, y = torch.meshgrid(places, places, indexing="ij")
-        ground = torch.stack([waves(seed, amplitude=0.03)[0](x, y) for seed in range(seeds)]).float()
+        ground = torch.stack([waves(seed, amplitude=amplitude)[0](x, y) for seed in range(seeds)]).float()
         self.sensor, self.seeds = sensor, seeds
         self.field, self.tiles = HeightField(ground, resolution=0.04), torch.arange(seeds)
         self.T_map_base = torch.eye(4, dtype=torch.float64).repeat(seeds, 1, 1)
         self.T_map_base[:, 2, 3] = ground[:, 150, 150] + BASE
         self.T_map_sensor = sensor.T_map_sensor(self.T_map_base)
         self.generator = torch.Generator().manual_seed(0)
-        self.emap = ElevationMap(ElevationMapConfig(grid=GRID), seeds)
+        self.emap = ElevationMap(ElevationMapConfig(grid=GRID, **cfg), seeds)
         if compiled:
             self.emap.compile()
 
@@ -92,27 +97,31 @@ class World:
 def obstacle_scans(
     sensor: MountedSensor, obstacle: str, share: float, seeds: int, settled: int, compiled: bool
 ) -> dict[str, Any]:
-    """Return how many scans pass until half of the cells hit show the obstacle, and how many points hit each."""
+    """Return how many scans pass until half of the cells hit show the obstacle, and how many points hit most a scan."""
     world = World(sensor, seeds, compiled)
     for _ in range(settled):
         world.scan(None, 0.1, share)
     boxes = world.ahead(OBSTACLES[obstacle])
-    hit, shown, points = torch.zeros_like(world.emap.validity), [], []
+    points, shown = torch.zeros_like(world.emap.elevation), []
     for _ in range(WATCHED):
-        number = hits(world, world.scan(boxes, 0.1, share), boxes)
-        hit |= number > 0
-        points.append(float(number.sum() / hit.sum().clamp(min=1)))
+        points += hits(world, world.scan(boxes, 0.1, share), boxes)
+        hit = points > 0
         shows = hit & (world.above_ground() > 0.15)
-        shown.append((shows.sum((1, 2)) / hit.sum((1, 2)).clamp(min=1)).tolist())
-    enough = [[share >= 0.5 for share in column] for column in zip(*shown, strict=True)]
-    scans = sorted(column.index(True) + 1 if True in column else WATCHED + 1 for column in enough)
-    return {"median": scans[len(scans) // 2], "most": scans[-1], "points": sum(points) / len(points)}
+        shown.append(2 * shows.sum((1, 2)) >= hit.sum((1, 2)).clamp(min=1))
+    return scans_until(shown) | {"points": float(points[points > 0].median()) / WATCHED}
 
 
-def hits(world: World, points: Tensor, boxes: Boxes) -> Tensor:
-    """Count the points (B, H, W) in each cell whose centre the obstacle covers, 5 cm or more above the ground."""
+def scans_until(shown: list[Tensor]) -> dict[str, int]:
+    """Return after how many scans (B,) first was true: the median and the most; one more than all if it never was."""
+    ever = torch.stack([*shown, torch.ones_like(shown[0])])
+    scans = (ever.int().argmax(0) + 1).sort().values
+    return {"median": int(scans[len(scans) // 2]), "most": int(scans[-1])}
+
+
+def hits(world: World, points: Tensor, boxes: Boxes, above: float = 0.05) -> Tensor:
+    """Count the points (B, H, W) in each cell whose centre the obstacle covers, so far above the ground [m]."""
     xy, z = points[..., :2].nan_to_num(), points[..., 2]
-    on = z > world.field.height(world.tiles, xy) + 0.05
+    on = z > world.field.height(world.tiles, xy) + above
     centers = world.emap.cell_centers()
     i, j = ((xy - centers[:, None, 0, 0]) / GRID.resolution).round().long().unbind(-1)
     on &= (i >= 0) & (i < GRID.height) & (j >= 0) & (j < GRID.width)
@@ -121,6 +130,22 @@ def hits(world: World, points: Tensor, boxes: Boxes) -> Tensor:
     place, half = boxes.T_map_box[:, 0, :2, 3], boxes.half_size[:, 0, :2]
     covered = ((centers - place[:, None, None]).abs() <= half[:, None, None]).all(-1)
     return number.view_as(world.emap.elevation) * covered
+
+
+def plate_scans(sensor: MountedSensor, rate: float, seeds: int, settled: int, compiled: bool) -> dict[str, Any]:
+    """Return how far long standing ground is off where a plate comes to lie, and after how many scans it shows to 80 %.
+
+    On flat ground, so that all of the plate lies above it.
+    """
+    world = World(sensor, seeds, compiled, amplitude=0.0, aging=AgingConfig(variance_rate=rate))
+    for _ in range(settled):
+        world.scan(None, 0.1)
+    boxes, flat = world.ahead(PLATE), world.above_ground()
+    hit, shown = torch.zeros_like(world.emap.validity), []
+    for _ in range(WATCHED):
+        hit |= hits(world, world.scan(boxes, 0.1), boxes, above=0.0) > 0
+        shown.append(torch.where(hit, world.above_ground(), math.nan).nanmean((1, 2)) >= 0.8 * 2 * PLATE[2])
+    return scans_until(shown) | {"rmse_mm": 1e3 * float(flat[hit].square().nanmean().sqrt())}
 
 
 def crossing(world: World, dt: float) -> Iterator[Boxes]:
@@ -173,52 +198,62 @@ def seen_through(world: World, cells: Tensor, points: Tensor) -> Tensor:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """Tabulate both."""
-    scans = [
-        [
-            name,
-            f"{row['points']:.1f}",
-            *(str(row[k]) if row[k] <= WATCHED else f"> {WATCHED}" for k in ("median", "most")),
-        ]
-        for name, row in result["obstacles"].items()
-    ]
-    columns = ("seen_through", "environments_seen_through", "cells", "environments")
-    left = [[name, *(str(row[column]) for column in columns), str(row["of"])] for name, row in result["ghosts"].items()]
+    """Tabulate all three."""
+
+    def scans(row: dict[str, Any]) -> list[str]:
+        return [str(row[k]) if row[k] <= WATCHED else f"> {WATCHED}" for k in ("median", "most")]
+
+    new = [[name, f"{row['points']:.1f}", *scans(row)] for name, row in result["obstacles"].items()]
+    plates = [[name, f"{row['rmse_mm']:.2f}", *scans(row)] for name, row in result["plates"].items()]
+    columns = ("seen_through", "environments_seen_through", "cells", "environments", "of")
+    left = [[name, *(str(row[column]) for column in columns)] for name, row in result["ghosts"].items()]
     return "\n\n".join(
         [
-            markdown_table(["obstacle", "points a cell", "scans to half, median", "most"], scans),
+            markdown_table(["obstacle", "points a cell", "scans to half, median", "most"], new),
+            markdown_table(["aging [m²/s]", "error before [mm]", "scans to 80 %, median", "most"], plates),
             markdown_table(
-                ["sensor", "left though seen through", "robots with any", "left", "robots with any", "of"], left
+                ["sensor", "cells left, seen through", "robots with such", "cells left", "robots with any", "robots"],
+                left,
             ),
         ]
     )
 
 
+def rows(
+    seeds: int, settled: int, hertz: tuple[int, ...], compiled: bool
+) -> Iterator[tuple[str, str, Callable[[], dict[str, Any]]]]:
+    """Yield the section, the name and the measurement of every row."""
+    camera, how = SENSORS["camera 120 x 90"], (seeds, settled, compiled)
+    for name, shares in SHARES.items():
+        for share in shares:
+            yield "obstacles", f"{name}, {share:.1%} of the points", partial(obstacle_scans, camera, name, share, *how)
+    for rate in RATES:
+        yield "plates", f"{rate:.0e}", partial(plate_scans, camera, rate, *how)
+    for name, sensor in SENSORS.items():
+        for rate in hertz:
+            yield "ghosts", f"{name} at {rate} Hz", partial(ghosts, sensor, rate, seeds, compiled)
+
+
 @click.command()
 @click.option("--seeds", default=50, show_default=True, help="Environments: grounds, people and noises.")
 @click.option("--settled", default=SETTLED, show_default=True, help="Scans of empty ground before an obstacle.")
-@click.option("--only", type=click.Choice(["obstacles", "ghosts"]), help="Measure one of the two.")
+@click.option("--only", type=click.Choice(SECTIONS), help="Measure one of the three.")
 @click.option("--hertz", type=int, multiple=True, default=HERTZ, show_default=True, help="Rates of the ghosts' scans.")
 @click.option("--compiled/--eager", default=True, show_default=True, help="Compile the map's updates.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Where to write.")
 def main(seeds: int, settled: int, only: str | None, hertz: tuple[int, ...], compiled: bool, out: Path) -> None:
-    """Count scans until new obstacles show, and what stays of people who left.
+    """Count scans until new obstacles and plates show, and what stays of people who left.
 
     Each row is written at once; rows that are not measured stay as they were.
     """
     torch.set_num_threads(2)
     path = out / "changes.json"
     result = json.loads(path.read_text()) if path.exists() else {}
-    result = {name: result.get(name, {}) for name in ("obstacles", "ghosts")}
-    how = {"seeds": seeds, "settled": settled, "commit": commit()}
-    new = [(name, share) for name in OBSTACLES for share in SHARES[name]] if only != "ghosts" else []
-    for name, share in tqdm(new, "obstacles"):
-        row = obstacle_scans(SENSORS["camera 120 x 90"], name, share, seeds, settled, compiled)
-        result["obstacles"][f"{name}, {share:.1%} of the points"] = row | how
-        write_json(path, result)
-    gone = [(name, rate) for name in SENSORS for rate in hertz] if only != "obstacles" else []
-    for name, rate in tqdm(gone, "ghosts"):
-        result["ghosts"][f"{name} at {rate} Hz"] = ghosts(SENSORS[name], rate, seeds, compiled) | how
+    result = {name: result.get(name, {}) for name in SECTIONS}
+    for section, name, measure in tqdm(
+        [row for row in rows(seeds, settled, hertz, compiled) if only in (None, row[0])]
+    ):
+        result[section][name] = measure() | {"seeds": seeds, "settled": settled, "commit": commit()}
         write_json(path, result)
     click.echo(tables(result))
 

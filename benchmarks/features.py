@@ -67,11 +67,7 @@ FEATURES = (
         "cleanup: static, 1 % too long", partial(rec.record_static, WRONG), metrics.wrongly_removed, "raycast", REMOVED
     ),
     Feature(
-        "exclusion area",
-        rec.record_overhang,
-        metrics.overhang_cells,
-        "sensor.exclusion",
-        OVERHANG,
+        "exclusion area", rec.record_overhang, metrics.overhang_cells, "sensor.exclusion", OVERHANG,
         shown=("bar at the end [%]", "ceiling at the end [%]"),
     ),  # fmt: skip
     Feature("edges", rec.record_walls, metrics.wall_tops, "fusion.edges", WALLS),

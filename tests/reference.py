@@ -461,38 +461,35 @@ def well_supported(c, layers, resolution, min_support):
     return bool(layers["validity"][c]) and any(enough(a) for a in [c, *like])
 
 
-def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate, near=0.5, clearance=0.2):
+def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate, near=0.5, clearance=0.15):
     """Whether a ray ends in a well supported cell and not below it, or passes the window's last half cell so.
 
     Where that is not well supported, whether it passes `clearance` above the lowest ground that is: of the strip along
     the border that it leaves through, as deep as `near`, and so far to both sides.
     """
     shape, share, side = layers["validity"].shape, 1.0, None
-    for k in range(2):
-        low, high = corner[k] * resolution, (corner[k] + shape[k]) * resolution
-        border = high - resolution / 2 if hit[k] > origin[k] else low + resolution / 2
-        if hit[k] != origin[k] and (border - origin[k]) / (hit[k] - origin[k]) < share:
-            share, side = (border - origin[k]) / (hit[k] - origin[k]), k
+    if cell_of(*hit[:2], corner, resolution, shape) is None:
+        for k in range(2):
+            low, high = corner[k] * resolution, (corner[k] + shape[k]) * resolution
+            border = high - resolution / 2 if hit[k] > origin[k] else low + resolution / 2
+            if hit[k] != origin[k] and (border - origin[k]) / (hit[k] - origin[k]) < share:
+                share, side = (border - origin[k]) / (hit[k] - origin[k]), k
     x, y, z = origin + max(share, 0.0) * (hit - origin)
     c = cell_of(x, y, corner, resolution, shape)
     if c is None:
         return False
-
-    def lowest(a):
-        return layers["elevation"][a] - gate * math.sqrt(layers["variance"][a] + (resolution / 2) ** 2)
-
     if well_supported(c, layers, resolution, min_support):
-        return z >= lowest(c)
+        return z >= layers["elevation"][c] - gate * math.sqrt(layers["variance"][c] + (resolution / 2) ** 2)
     if side is None:
         return False
     n, border = max(1, int(near / resolution)), shape[side] - 1 if hit[side] > origin[side] else 0
     strip = [
-        a
+        layers["elevation"][a]
         for a in np.ndindex(shape)
         if abs(a[side] - border) < n and abs(a[1 - side] - c[1 - side]) <= n
         if well_supported(a, layers, resolution, min_support)
     ]
-    return bool(strip) and z >= min(map(lowest, strip)) + clearance
+    return bool(strip) and z >= min(strip) + clearance
 
 
 def stays_above_recent(origin, hit, layers, corner, resolution, *, min_time, gate):

@@ -29,12 +29,8 @@ def test_hits_are_counted_in_the_cells_that_the_obstacle_covers():
     boxes = here.box(torch.tensor([2.65]), torch.zeros(1), changes.OBSTACLES["box"])
     at = torch.tensor([2.55, 0.02, 0.0])
     ground = float(here.field.height(here.tiles, at[None, None, :2]))
-    places = (
-        (at[0], 0.02, 0.2),
-        (at[0], 0.02, 0.02),
-        (at[0], 1.0, 0.2),
-        (2.51, 0.02, 0.2),
-    )  # the last cell's centre: 2.5
+    # The cell of x = 2.51 has its centre, 2.5, before the box.
+    places = [(2.55, 0.02, 0.2), (2.55, 0.02, 0.02), (2.55, 1.0, 0.2), (2.51, 0.02, 0.2)]
     on, below, beside, before = ([x, y, ground + z] for x, y, z in places)
     number = changes.hits(here, torch.tensor([[on, on, below, beside, before, [torch.nan] * 3]]), boxes)
     assert number.sum() == 2 and number.max() == 2
@@ -46,6 +42,20 @@ def test_an_obstacle_shows_and_settled_ground_delays_it(small):
     row = changes.obstacle_scans(changes.SENSORS["camera 64 x 48"], "wall", 1.0, seeds=2, settled=1, compiled=False)
     assert row["median"] <= 3 and row["points"] > 0.5
     assert world().above_ground().isnan().all()
+
+
+def test_scans_are_counted_until_something_first_shows():
+    yes, no = torch.tensor([True, False, False]), torch.tensor([False, True, False])
+    assert changes.scans_until([yes, no, no]) == {"median": 2, "most": 4}
+
+
+def test_a_plate_shows_sooner_where_ground_ages_faster(monkeypatch):
+    monkeypatch.setattr(changes, "WATCHED", 12)
+    slow, fast = (
+        changes.plate_scans(changes.SENSORS["camera 120 x 90"], rate, seeds=2, settled=25, compiled=False)
+        for rate in (0.0, 1e-2)
+    )
+    assert fast["median"] < slow["median"] and fast["rmse_mm"] > slow["rmse_mm"] > 0
 
 
 def test_ghosts_are_what_stays_above_the_ground(small, monkeypatch):
@@ -68,17 +78,25 @@ def test_cells_are_seen_through_where_a_ray_passes_below_and_beyond():
     centers = here.emap.cell_centers()[0]
     cells = (centers - torch.tensor([1.02, 0.02])).norm(dim=-1)[None] < 0.01
     assert cells.sum() == 1
-    for end, number in (((2.0, 0.04), 1), ((2.0, 0.1), 0), ((1.05, 0.02), 0), ((-2.0, 0.0), 0), ((3.0, 0.06), 0)):
-        point = torch.tensor([[[*end, float(T[2]) - 1.0]]])  # a ray falls 0.51 m on 1.02 m of 2 m, 0.34 m of 3 m
+    for end, number in (
+        ((2.0, 0.04), 1),
+        ((2.0, 0.1), 0),
+        ((1.05, 0.02), 0),
+        ((-2.0, 0.0), 0),
+        ((3.0, 0.06), 0),
+        ((2.15, 0.04), 0),
+    ):
+        point = torch.tensor([[[*end, float(T[2]) - 1.0]]])  # a ray falls 0.51 m on 1.02 m of 2 m, 0.47 m of 2.15 m
         assert changes.seen_through(here, cells, point).tolist() == [number], end
 
 
 def test_the_command_writes_and_tabulates(small, monkeypatch, tmp_path):
     monkeypatch.setattr(changes, "obstacle_scans", lambda *given: {"median": 3, "most": 4, "points": 0.5})
+    monkeypatch.setattr(changes, "plate_scans", lambda *given: {"rmse_mm": 0.2, "median": 3, "most": 61})
     monkeypatch.setattr(changes, "ghosts", lambda *given: GONE)
     result = CliRunner().invoke(changes.main, ["--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    assert "| box, 60.0% of the points | 0.5 | 3 | > 3 |" in result.output
+    assert "| box, 100.0% of the points | 0.5 | 3 | > 3 |" in result.output
     assert len(json.loads((tmp_path / "changes.json").read_text())["ghosts"]) == len(changes.SENSORS) * len(
         changes.HERTZ
     )

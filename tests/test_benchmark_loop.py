@@ -20,7 +20,7 @@ def test_a_loop_keeps_its_rate_and_does_not_catch_up():
     assert times[1] >= 0.05
     gaps = [b - a for a, b in zip(starts, starts[1:], strict=False)]
     due = starts[1] + times[1]  # of the call after the late one, which may itself start a little late
-    assert gaps[1] >= 0.05 and starts[4] - due >= 0.0399, "after a late update the rate is kept, not exceeded"
+    assert gaps[1] >= 0.05 and starts[4] - due >= 0.039, "after a late update the rate is kept, not exceeded"
 
 
 def test_figures_by_hand():

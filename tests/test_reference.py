@@ -206,8 +206,8 @@ def test_believed_rays():
     assert ends_well(1.5, 0.0), "less than a cell's edge above its neighbour"
     assert not ends_well(0.5, 0.0), "its neighbour has no support either"
     assert not ends_well(3.4, 0.0) and not ends_well(9.0, 0.0), "unknown, and left the window over it"
-    limits |= dict(near=2.0, clearance=0.5)  # of the ground at x = 2.5, from -1 m
-    assert ends_well(11.0, -2.5) and not ends_well(11.0, -3.5), "-0.25 and -0.75 over x = 3.5"
+    limits |= dict(near=2.0, clearance=0.5)  # of the ground at x = 2.5
+    assert ends_well(11.0, -0.9) and not ends_well(11.0, -1.1), "0.55 and 0.45 over x = 3.5"
     assert not ends_well(3.4, 2.0), "it does not leave the window"
     layers["validity"][3] = True
     assert ends_well(11.0, -1.9), "it leaves the last half cell, at x = 3.5, at 0.05"

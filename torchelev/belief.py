@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
 # A ray that leaves the window over unknown ground is judged by the ground NEAR by, CLEARANCE above which it must pass:
 # with less, returns that are too long would set upper bounds below the truth.
-NEAR, CLEARANCE = 0.5, 0.2  # [m]
+NEAR, CLEARANCE = 0.5, 0.15  # [m]
 
 
 class Rays(NamedTuple):
@@ -65,7 +65,7 @@ def ends_well(
     """Tell which rays end, or leave the window, in a well supported cell and not below it.
 
     Where nothing is known, two kinds are believed, as too long a return lies below the ground: those that leave the
-    window CLEARANCE above the lowest ground NEAR by, less its margin, and those to a point above the exclusion ramp.
+    window CLEARANCE above the lowest ground NEAR by, and those to a point above the exclusion ramp.
     """
     offset = lattice_offset(state, m, grid)[:, None]
     start = rays.origin[:, None, :2] + offset
@@ -73,19 +73,20 @@ def ends_well(
     inner = 0.5 * grid.resolution  # half a cell inside, so that rounding leaves no ray outside
     ahead = rays.xy > 0
     room = chosen(ahead, size - inner - start, inner - start)
-    along = chosen(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never zero
-    shares = room / along
-    share = shares.amin(-1).clamp(0, 1)
+    shares = room / chosen(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never by zero
+    end = start + rays.xy
+    leaves = ((end < 0) | (end >= size)).any(-1)
+    share = chosen(leaves, shares.amin(-1).clamp(0, 1), 1.0)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
-    ground = realize(lifted(lowest, ~well_supported(state, cfg, grid.resolution)))
-    floor = ground.flatten(1).gather(1, slot.to(torch.int64))
+    ground = realize(lifted(state.elevation, ~well_supported(state, cfg, grid.resolution)))
+    floor, known = (layer.flatten(1).gather(1, slot.to(torch.int64)) for layer in (lowest, ground))
     through_x = shares[..., 0] <= shares[..., 1]
     border = torch.where(through_x, ahead[..., 0].to(torch.int32), 2 + ahead[..., 1].to(torch.int32))
     place = torch.where(through_x, slot % grid.width, slot // grid.width)
     borders, length = ground_at_borders(ground, grid)
     near = borders.gather(1, (border * length + place).to(torch.int64)) + CLEARANCE
-    floor = chosen((share < 1) & (floor > 0.5 * NOWHERE), near, floor)
+    floor = chosen(known < 0.5 * NOWHERE, floor, chosen(leaves, near, NOWHERE))
     height = rays.origin[:, None, 2] + share * rays.r * rays.slope
     return inside & (height >= floor) | rays.overhang
 

@@ -35,7 +35,7 @@ class RaycastConfig:
     min_time: float = 1.0  # [s] cells hit within it stay, and contradict rays that pass below them
     min_incidence: float = 0.1  # alpha_n: |r . n| below it is a grazing ray
     max_range: float | None = None  # [m] rays count up to here; None: 1.1 half-diagonals of the window
-    min_support: float = 3.0  # points that agree with a ray's end, or a neighbouring cell, for the ray to be believed
+    min_support: float = 3.0  # points that agree with a cell, or one beside it, for rays that end there to be believed
     gate: float = 3.0  # a ray so many standard deviations below ground that is known is a wrong return
 
     def __post_init__(self) -> None:
@@ -116,9 +116,9 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     seen_through = passes_far_below(state, depth, grid, cfg) | (ray.incidence > cfg.min_incidence)
     gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
     validity = state.validity & ~gone
-    # A ray below a challenger shows that nothing stands there: outliers stop no other ray. Within a cell a ray falls as
-    # far as `fall`; those that end on an obstacle's top, two cells behind or farther, pass higher.
-    passed = realize((ray.found & (ray.height < state.challenger + ray.fall)) | ~validity)
+    # A ray below a challenger shows that nothing stands there: outliers stop no other ray. From centre to border a ray
+    # falls by half of `fall`; those that end on an obstacle's top, more than a cell behind, pass higher than that.
+    passed = realize((ray.found & (ray.height < state.challenger + 0.5 * ray.fall)) | ~validity)
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
