@@ -461,7 +461,7 @@ def well_supported(c, layers, resolution, min_support):
     return bool(layers["validity"][c]) and any(enough(a) for a in [c, *like])
 
 
-def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate, near=0.5, clearance=0.15):
+def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate, near=0.5, clearance=0.05):
     """Whether a ray ends in a well supported cell and not below it, or passes the window's last half cell so.
 
     Where that is not well supported, whether it passes `clearance` above the lowest ground that is: of the strip along

@@ -280,8 +280,8 @@ def test_where_nothing_is_known_only_rays_to_overhangs_are_believed(used, casts,
 
 
 @pytest.mark.parametrize("side", range(4))
-@pytest.mark.parametrize("unknown, height, clears", [(3, 0.25, True), (3, 0.05, False), (6, 0.25, False)])
-def test_a_ray_that_leaves_over_unknown_ground_passes_well_above_ground_near_by(side, unknown, height, clears):
+@pytest.mark.parametrize("unknown, height, clears", [(3, 0.1, True), (3, 0.0, False), (6, 0.1, False)])
+def test_a_ray_that_leaves_over_unknown_ground_passes_above_ground_near_by(side, unknown, height, clears):
     """Some cells along the border are unknown; the ray passes there at this height, and below a ghost before it."""
     emap = small_map(1, (31, 31), RESOLUTION, torch.float64, raycast=EVERY)
     k, T = 30 - unknown, pose((0.0, 0.0, 1.0))
@@ -464,7 +464,7 @@ def test_a_person_who_left_is_cleared_within_seconds(moves, remain):
     assert (layer > 0.05).sum() <= remain and layer.isfinite().float().mean() > 0.85
 
 
-@pytest.mark.parametrize("challenger, stays", [(0.44, True), (0.46, False), (0.9, False)])
+@pytest.mark.parametrize("challenger, stays", [(0.43, True), (0.45, False), (0.9, False)])
 def test_a_ray_below_a_challenger_refutes_it(challenger, stays):
     """Rays from 1 m height to the ground 2 m ahead pass over the cell half way at 0.475 m, and fall 5 cm in a cell."""
     emap = small_map(1, (40, 5), 0.1, drift=None)

@@ -7,6 +7,7 @@ looks its own entry up. Cost: points + table + cells, whatever the length of the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -116,9 +117,9 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     seen_through = passes_far_below(state, depth, grid, cfg) | (ray.incidence > cfg.min_incidence)
     gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
     validity = state.validity & ~gone
-    # A ray below a challenger shows that nothing stands there: outliers stop no other ray. From centre to border a ray
-    # falls by half of `fall`; those that end on an obstacle's top, more than a cell behind, pass higher than that.
-    passed = realize((ray.found & (ray.height < state.challenger + 0.5 * ray.fall)) | ~validity)
+    # A ray below a challenger shows that nothing stands there: outliers stop no other ray. From centre to corner a ray
+    # falls by 0.71 of `fall`; those that end on an obstacle's top, more than a cell behind, pass higher than that.
+    passed = realize((ray.found & (ray.height < state.challenger + math.sqrt(0.5) * ray.fall)) | ~validity)
     bounds = ray.found & ~validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
