@@ -17,6 +17,7 @@ a cell is the height of the ground at its centre. Every metric is defined in the
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 import time
 from collections.abc import Callable
 from functools import partial
@@ -180,7 +181,8 @@ def draw_row(figure, row, outcome: Outcome) -> None:
         ax.plot(path[:, 0], path[:, 1], color="crimson", linewidth=0.8)
         ax.set(xlim=(-4, 4.5), ylim=(-3.2, 3.2))
         figures = outcome.figures.get(name)
-        ax.set_title(f"{name}: {titled(figures, shown)}" if figures else name, fontsize=9 if len(shown) == 1 else 7)
+        title = f"{name}: {titled(figures, shown)}" if figures else name
+        ax.set_title(textwrap.fill(title, 32), fontsize=9)
     row[0].set_ylabel(f"{outcome.feature.name}\ny [m]", fontsize=9)
     figure.colorbar(image, ax=list(row), pad=0.01).set_label(f"{layer.replace('_', ' ')} [m]", fontsize=8)
 

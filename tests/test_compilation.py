@@ -334,7 +334,8 @@ def test_no_recompilation_for_new_values():
 
 
 @pytest.mark.parametrize(
-    "num_envs, chunk, sensors, base, variance", [(2, None, 1, True, False), (1, None, 2, False, True)]
+    "num_envs, chunk, sensors, base, variance",
+    [(2, None, 1, True, False), (1, None, 2, False, True), (5, 2, 1, True, False)],
 )
 def test_warm_maps_compile_nothing_more_and_are_untouched(compile_with, num_envs, chunk, sensors, base, variance):
     counter = CompileCounter()

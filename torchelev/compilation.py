@@ -223,13 +223,16 @@ def mark_dynamic(dim: int, *values: Tensor | None) -> None:
 
 
 def packed(value: Tensor) -> Tensor:
-    """Return the values with the strides of a new tensor, and as a normal one.
+    """Return the values as a tensor of its own, with the strides of a new one; they are copied only if they must be.
 
-    A slice, an expansion, or what was made in inference mode would get other graphs.
+    A slice, an expansion, or what was made in inference mode would get other graphs, and so would views of other bases.
     """
     with torch.inference_mode(False), torch.no_grad():
         value = value.contiguous().reshape(-1).view(value.shape)  # constants expanded in full would else stay so
-        return value.clone() if value.is_inference() else value
+        if value.is_inference():
+            return value.clone()
+        place = value.untyped_storage(), value.storage_offset(), value.shape, value.stride()
+        return value.new_empty(0).set_(*place)
 
 
 Values = TypeVar("Values", MapState, Measurement)
