@@ -44,6 +44,13 @@ def features() -> str:
     return markdown_table(["feature", "figure", "on", "off", "baseline", "bar", ""], rows)
 
 
+def changes() -> str:
+    """Tabulate how soon changes show."""
+    from benchmarks import changes as new
+
+    return new.tables(load("changes"))
+
+
 def real() -> str:
     """Tabulate held-out errors on flat cells."""
     head = ["recording", "cell", "method", "median", "p90", "coverage", "ms / scan"]
@@ -135,6 +142,7 @@ def block() -> str:
 TABLES = {
     "accuracy": accuracy,
     "features": features,
+    "changes": changes,
     "real": real,
     "speed": speed,
     "loop": loop,
