@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from benchmarks.report import commit, markdown_table, write_json
 from torchelev import AgingConfig, ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.grid import PointCells, locate
 from torchelev.sim import Boxes, DepthCamera, HeightField, Lidar, MountedSensor, mount, noise
 from torchelev.sim.scenes import waves
 
@@ -122,13 +123,10 @@ def hits(world: World, points: Tensor, boxes: Boxes, above: float = 0.05) -> Ten
     """Count the points (B, H, W) in each cell whose centre the obstacle covers, so far above the ground [m]."""
     xy, z = points[..., :2].nan_to_num(), points[..., 2]
     on = z > world.field.height(world.tiles, xy) + above
-    centers = world.emap.cell_centers()
-    i, j = ((xy - centers[:, None, 0, 0]) / GRID.resolution).round().long().unbind(-1)
-    on &= (i >= 0) & (i < GRID.height) & (j >= 0) & (j < GRID.width)
-    slot = torch.where(on, i * GRID.width + j, 0)
-    number = torch.zeros(len(xy), GRID.height * GRID.width).scatter_add(1, slot, on.float())
+    slot, inside = locate(*xy.unbind(-1), -world.emap.state.corner * GRID.resolution, GRID)
+    (number,) = PointCells(slot.long(), inside, GRID.num_cells).sums((on & inside).float())
     place, half = boxes.T_map_box[:, 0, :2, 3], boxes.half_size[:, 0, :2]
-    covered = ((centers - place[:, None, None]).abs() <= half[:, None, None]).all(-1)
+    covered = ((world.emap.cell_centers() - place[:, None, None]).abs() <= half[:, None, None]).all(-1)
     return number.view_as(world.emap.elevation) * covered
 
 

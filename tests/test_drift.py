@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torchelev import DriftConfig, SensorConfig
 from torchelev.drift import compensate
 from torchelev.grid import cells_of
+from torchelev.state import LAYERS
 
 SIGMA2 = 1e-4
 
@@ -30,7 +31,7 @@ def test_agrees_with_the_reference(seed, offset, gain, min_points):
     grid = emap.cfg.grid
     after = compensate(state, m, cells_of(state, m, grid), grid, cfg, 0.5)
     for b in range(2):
-        layers = {name: getattr(state, name)[b].numpy() for name in state._fields[2:-1]}
+        layers = {name: getattr(state, name)[b].numpy() for name in LAYERS}
         used = [p for p, u in zip(points[b], m.used[b], strict=True) if u]
         settings = dataclasses.asdict(cfg)
         number, mean, correction = reference.drift(

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from torchelev import GridConfig
 from torchelev.grid import PointCells, cell_centers, center_offsets, lattice_offset, locate, recenter, window_corner
-from torchelev.state import BLANK, MapState, blank_state
+from torchelev.state import BLANK, LAYERS, blank_state
 
 SEEDS = st.integers(0, 10_000)
 SIZES = st.tuples(st.integers(1, 9), st.integers(1, 9))
-LAYERS = MapState._fields[2:-1]
 
 
 def moved_to(emap, x, y, z=1.0):

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchelev import AgingConfig, BodyConfig, DriftConfig, FusionConfig, OverlapConfig, RaycastConfig, SensorConfig
-from torchelev.state import MapState, Statistics
+from torchelev.state import LAYERS, MapState, Statistics
 
 SEEDS = st.integers(0, 10_000)
 CLOUD_DTYPES = st.sampled_from([torch.float16, torch.float32, torch.float64])
@@ -209,7 +209,7 @@ def quarter_turned(state):
         return layer.transpose(1, 2).flip(1)
 
     width = state.elevation.shape[2]
-    layers = {n: turn(getattr(state, n)) for n in MapState._fields[2:-1]}
+    layers = {n: turn(getattr(state, n)) for n in LAYERS}
     layers["gradient_x"], layers["gradient_y"] = -layers["gradient_y"], layers["gradient_x"]
     corner = torch.stack([-state.corner[:, 1] - width, state.corner[:, 0]], -1)
     return state._replace(corner=corner, **layers)

@@ -14,6 +14,7 @@ from torchelev import GridConfig, RaycastConfig, SensorConfig
 from torchelev.belief import believed, ends_well, height_margin, rays_of
 from torchelev.polar import BREADTH, PolarGrid, turn
 from torchelev.raycast import clear_seen_through
+from torchelev.state import LAYERS
 
 CELLS, RESOLUTION = (40, 30), 0.1
 PLACES = [(0.0, 0.0), (0.55, -0.33), (-1.93, 0.04), (-2.6, 0.3)]  # in the middle, off it, at the rim, outside
@@ -52,7 +53,7 @@ def marched_heights(state, hits, T):
 def marched(state, hits, T):
     """The reference's validity after the rays."""
     lowest, _ = marched_heights(state, hits, T)
-    layers = {n: getattr(state, n)[0].numpy() for n in state._fields[2:-1]}
+    layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     straight_down = np.tile([0.0, 0.0, -1.0], (*CELLS, 1))  # every ray is steep enough
     rule = dict(min_time=EVERY.min_time, min_incidence=EVERY.min_incidence, gate=EVERY.gate)
     return reference.clear_seen_through(layers, lowest, straight_down, RESOLUTION, **rule)[0]
@@ -337,7 +338,7 @@ def test_where_rays_end_agrees_with_the_reference(place):
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
     rays, lowest = rays_of(m, 0), state.elevation - height_margin(state, emap.cfg.grid, EVERY)
     got = ends_well(state, m, rays, lowest, emap.cfg.grid, EVERY)[0].numpy()
-    layers = {n: getattr(state, n)[0].numpy() for n in state._fields[2:-1]}
+    layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     corner, rule = state.corner[0].tolist(), dict(min_support=EVERY.min_support, gate=EVERY.gate)
     expected = np.array([reference.ends_well(origin, hit, layers, corner, RESOLUTION, **rule) for hit in hits])
     leaves = np.array([reference.cell_of(*hit[:2], corner, RESOLUTION, CELLS) is None for hit in hits])
@@ -362,7 +363,7 @@ def test_believed_rays_agree_with_the_reference(place):
     m = m._replace(used=m.used & torch.from_numpy(rng.random((1, 3000)) < 0.9))
     rays = rays_of(m, 0)
     got = believed(state, m, rays, emap.cfg.grid, EVERY)[0].numpy()
-    layers = {n: getattr(state, n)[0].numpy() for n in state._fields[2:-1]}
+    layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     corner, origin = state.corner[0].tolist(), T[0, :3, 3].numpy()
     ends, over = [], []
     for hit, overhang in zip(hits, rays.overhang[0].tolist(), strict=True):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
 # A ray that leaves the window over unknown ground is judged by the ground NEAR by, CLEARANCE above which it must pass:
-# with less, returns that are too long would set upper bounds below the truth.
+# with a margin below uncertain ground instead, returns that are too long would set upper bounds below the truth.
 NEAR, CLEARANCE = 0.5, 0.05  # [m]
 
 
