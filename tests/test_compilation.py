@@ -1,13 +1,17 @@
 """Compilation: few graphs, the same results, shared where inputs are alike and apart where they are not."""
 
 import itertools
+import re
 
 import pytest
 import torch
 from conftest import assert_close, differences, mapped, scan, small_config, small_map, snapshot
 from torch._dynamo.callback import callback_handler
 from torch._dynamo.testing import CompileCounter
+from torch._inductor import config as inductor_config
 from torch._inductor.codegen.cpp import CppScheduling
+from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
+from torch._inductor.utils import run_and_get_code
 
 import torchelev
 from torchelev import ElevationMap, SensorConfig, fusion
@@ -251,6 +255,25 @@ def test_the_compiler_is_left_as_it_was(monkeypatch, capsys):
     assert usual == CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
     assert "failed" in capsys.readouterr().err
     assert not callback_handler.start_callbacks
+
+
+def test_eight_bytes_of_a_mask_are_loaded_at_once():
+    """Also where the rest of the mask is fewer than eight, and where the vectors are longer."""
+
+    def chosen(mask, values):
+        return torch.where(mask.bool(), values, -values)
+
+    generator = torch.Generator().manual_seed(0)
+    for number in (8, 64, 2003):
+        mask = torch.randint(2, (number,), generator=generator, dtype=torch.uint8)
+        values = torch.randn(number, generator=generator)
+        with inductor_config.patch(force_disable_caches=True):
+            result, codes = run_and_get_code(compiled(chosen), mask, values)
+        assert torch.equal(result, chosen(mask, values))
+        if isinstance(pick_vec_isa(), VecAVX2):
+            code = "".join(codes)
+            assert "<uint8_t>::loadu_one_fourth(" in code
+            assert re.search(r"<uint8_t>::loadu\(.*<int64_t>\(8L?\)\)", code) is None
 
 
 @pytest.mark.parametrize("sensors", [None, 2])
