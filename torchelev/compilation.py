@@ -78,7 +78,10 @@ def fast_mask_loads() -> Iterator[None]:
     from torch._inductor.cpu_vec_isa import VecAVX2
 
     name = "_get_vec_load_line"
-    usual = getattr(CppVecKernel, name, None)
+    usual: Any = getattr(CppVecKernel, name, None)
+    if usual is None:  # in another torch
+        yield
+        return
 
     def load(kernel: Any, *args: Any, **options: Any) -> str:
         line = usual(kernel, *args, **options)
@@ -86,13 +89,11 @@ def fast_mask_loads() -> Iterator[None]:
             return line
         return re.sub(r"(<uint8_t>::)loadu\((.*), static_cast<int64_t>\(8L?\)\)$", r"\1loadu_one_fourth(\2)", line)
 
-    if usual is not None:
-        setattr(CppVecKernel, name, load)
+    setattr(CppVecKernel, name, load)
     try:
         yield
     finally:
-        if usual is not None:
-            setattr(CppVecKernel, name, usual)
+        setattr(CppVecKernel, name, usual)
 
 
 _number = itertools.count()
