@@ -461,11 +461,12 @@ def well_supported(c, layers, resolution, min_support):
     return bool(layers["validity"][c]) and any(enough(a) for a in [c, *like])
 
 
-def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate, near=0.5, clearance=0.05):
-    """Whether a ray ends in a well supported cell and not below it, or passes the window's last half cell so.
+def believed_slope(origin, hit, layers, corner, resolution, *, min_support, gate, near=0.5, clearance=0.05):
+    """The slope dz/dr of a ray that ends in a well supported cell and not below it, or passes the last half cell so.
 
-    Where that is not well supported, whether it passes `clearance` above the lowest ground that is: of the strip along
-    the border that it leaves through, as deep as `near`, and so far to both sides.
+    None for others. Where the window's last half cell is not well supported, the lowest ground counts that is: of the
+    strip along the border that the ray leaves through, as deep as `near`, and so far to both sides. A ray no more than
+    `clearance` below that is believed, and taken for one that passes `clearance` above it.
     """
     shape, share, side = layers["validity"].shape, 1.0, None
     if cell_of(*hit[:2], corner, resolution, shape) is None:
@@ -474,14 +475,16 @@ def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate, nea
             border = high - resolution / 2 if hit[k] > origin[k] else low + resolution / 2
             if hit[k] != origin[k] and (border - origin[k]) / (hit[k] - origin[k]) < share:
                 share, side = (border - origin[k]) / (hit[k] - origin[k]), k
-    x, y, z = origin + max(share, 0.0) * (hit - origin)
-    c = cell_of(x, y, corner, resolution, shape)
+    share, length = max(share, 0.0), math.hypot(*(hit - origin)[:2])
+    x, y, z = origin + share * (hit - origin)
+    slope, c = (hit - origin)[2] / length, cell_of(x, y, corner, resolution, shape)
     if c is None:
-        return False
+        return None
     if well_supported(c, layers, resolution, min_support):
-        return z >= layers["elevation"][c] - gate * math.sqrt(layers["variance"][c] + (resolution / 2) ** 2)
+        margin = gate * math.sqrt(layers["variance"][c] + (resolution / 2) ** 2)
+        return slope if z >= layers["elevation"][c] - margin else None
     if side is None:
-        return False
+        return None
     n, border = max(1, int(near / resolution)), shape[side] - 1 if hit[side] > origin[side] else 0
     strip = [
         layers["elevation"][a]
@@ -489,7 +492,9 @@ def ends_well(origin, hit, layers, corner, resolution, *, min_support, gate, nea
         if abs(a[side] - border) < n and abs(a[1 - side] - c[1 - side]) <= n
         if well_supported(a, layers, resolution, min_support)
     ]
-    return bool(strip) and z >= min(strip) + clearance
+    if not strip or z < min(strip) - clearance:
+        return None
+    return (max(z, min(strip) + clearance) - origin[2]) / (share * length)
 
 
 def stays_above_recent(origin, hit, layers, corner, resolution, *, min_time, gate):

@@ -281,7 +281,9 @@ def test_where_nothing_is_known_only_rays_to_overhangs_are_believed(used, casts,
 
 
 @pytest.mark.parametrize("side", range(4))
-@pytest.mark.parametrize("unknown, height, clears", [(3, 0.1, True), (3, 0.0, False), (6, 0.1, False)])
+@pytest.mark.parametrize(
+    "unknown, height, clears", [(3, 0.1, True), (3, 0.0, True), (3, -0.12, False), (6, 0.1, False)]
+)
 def test_a_ray_that_leaves_over_unknown_ground_passes_above_ground_near_by(side, unknown, height, clears):
     """Some cells along the border are unknown; the ray passes there at this height, and below a ghost before it."""
     emap = small_map(1, (31, 31), RESOLUTION, torch.float64, raycast=EVERY)
@@ -337,13 +339,18 @@ def test_where_rays_end_agrees_with_the_reference(place):
     hits[::2] = origin + 4.0 * (hits[::2] - origin)
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
     rays, lowest = rays_of(m, 0), state.elevation - height_margin(state, emap.cfg.grid, EVERY)
-    got = ends_well(state, m, rays, lowest, emap.cfg.grid, EVERY)[0].numpy()
+    well, slope = (values[0].numpy() for values in ends_well(state, m, rays, lowest, emap.cfg.grid, EVERY))
     layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     corner, rule = state.corner[0].tolist(), dict(min_support=EVERY.min_support, gate=EVERY.gate)
-    expected = np.array([reference.ends_well(origin, hit, layers, corner, RESOLUTION, **rule) for hit in hits])
+    slopes = [reference.believed_slope(origin, hit, layers, corner, RESOLUTION, **rule) for hit in hits]
+    expected = np.array([value is not None for value in slopes])
     leaves = np.array([reference.cell_of(*hit[:2], corner, RESOLUTION, CELLS) is None for hit in hits])
     assert min((expected & leaves).sum(), (~expected & leaves).sum(), (expected & ~leaves).sum()) > 30
-    np.testing.assert_array_equal(got, expected | rays.overhang[0].numpy())
+    overhang = rays.overhang[0].numpy()
+    np.testing.assert_array_equal(well, expected | overhang)
+    np.testing.assert_allclose(slope[expected & ~overhang], np.array(slopes, float)[expected & ~overhang])
+    changed = np.abs(slope - rays.slope[0].numpy()) > 1e-6
+    assert (changed & expected).sum() > 5 and not (changed & overhang).any()
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -362,13 +369,14 @@ def test_believed_rays_agree_with_the_reference(place):
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
     m = m._replace(used=m.used & torch.from_numpy(rng.random((1, 3000)) < 0.9))
     rays = rays_of(m, 0)
-    got = believed(state, m, rays, emap.cfg.grid, EVERY)[0].numpy()
+    got = believed(state, m, rays, emap.cfg.grid, EVERY).casts[0].numpy()
     layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     corner, origin = state.corner[0].tolist(), T[0, :3, 3].numpy()
     ends, over = [], []
     for hit, overhang in zip(hits, rays.overhang[0].tolist(), strict=True):
         ray = (origin, hit, layers, corner, RESOLUTION)
-        ends.append(overhang or reference.ends_well(*ray, min_support=EVERY.min_support, gate=EVERY.gate))
+        slope = reference.believed_slope(*ray, min_support=EVERY.min_support, gate=EVERY.gate)
+        ends.append(overhang or slope is not None)
         over.append(reference.stays_above_recent(*ray, min_time=EVERY.min_time, gate=EVERY.gate))
     ends, over = np.array(ends), np.array(over)
     assert (ends & over).sum() > 50 and (ends & ~over).sum() > 5 and (~ends).sum() > 50

@@ -200,14 +200,17 @@ def test_believed_rays():
     origin, limits = np.array([-4.0, 0.5, 2.0]), dict(min_support=3, gate=2.0)  # 2 * sqrt(0 + 0.5^2) = 1 m below
 
     def ends_well(x, z):
-        return reference.ends_well(origin, np.array([x, 0.5, z]), layers, (0, 0), 1.0, **limits)
+        return reference.believed_slope(origin, np.array([x, 0.5, z]), layers, (0, 0), 1.0, **limits) is not None
 
     assert ends_well(2.5, 0.0) and ends_well(2.5, -0.9) and not ends_well(2.5, -1.1)
     assert ends_well(1.5, 0.0), "less than a cell's edge above its neighbour"
     assert not ends_well(0.5, 0.0), "its neighbour has no support either"
     assert not ends_well(3.4, 0.0) and not ends_well(9.0, 0.0), "unknown, and left the window over it"
     limits |= dict(near=2.0, clearance=0.5)  # of the ground at x = 2.5
-    assert ends_well(11.0, -0.9) and not ends_well(11.0, -1.1), "0.55 and 0.45 over x = 3.5"
+    assert ends_well(11.0, -2.9) and not ends_well(11.0, -3.1), "-0.45 and -0.55 over x = 3.5"
+    for z, passes in ((-0.9, 0.55), (-1.1, 0.5), (-2.9, 0.5)):
+        slope = reference.believed_slope(origin, np.array([11.0, 0.5, z]), layers, (0, 0), 1.0, **limits)
+        assert origin[2] + 7.5 * slope == pytest.approx(passes), "over x = 3.5"
     assert not ends_well(3.4, 2.0), "it does not leave the window"
     layers["validity"][3] = True
     assert ends_well(11.0, -1.9), "it leaves the last half cell, at x = 3.5, at 0.05"

@@ -19,7 +19,7 @@ from torchelev.storage import read, realize, realize_all
 from torchelev.windows import neighbours
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     from torchelev.raycast import RaycastConfig
 
@@ -52,21 +52,47 @@ def rays_of(m: Measurement, s: int) -> Rays:
     return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), variance.sqrt(), casts, casts & ~used)
 
 
-def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B N"]:
-    """Tell which rays may clear and bound: their end is credible, and they pass below no ground hit of late."""
+def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Rays:
+    """Return the rays; those cast that may clear and bound have a credible end and pass below no ground hit of late."""
     lowest = state.elevation - height_margin(state, grid, cfg)
-    clearance = horizon(state, m, rays, lowest, grid, cfg) + rays.slope
-    return rays.casts & ends_well(state, m, rays, lowest, grid, cfg) & (clearance >= 0)
+    above = horizon(state, m, rays, lowest, grid, cfg) + rays.slope >= 0
+    well, slope = ends_well(state, m, rays, lowest, grid, cfg)
+    return rays._replace(casts=rays.casts & well & above, slope=slope)
 
 
 def ends_well(
     state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
-) -> Bool[Tensor, "B N"]:
-    """Tell which rays end, or leave the window, in a well supported cell and not below it.
+) -> tuple[Bool[Tensor, "B N"], Float[Tensor, "B N"]]:
+    """Tell which rays end, or leave the window, in a well supported cell and not below it; and return their slopes.
 
-    Where nothing is known, two kinds are believed, as too long a return lies below the ground: those that leave the
-    window CLEARANCE above the lowest ground NEAR by, and those to a point above the exclusion ramp.
+    Where nothing is known, two kinds are believed, as too long a return lies below the ground: those to a point above
+    the exclusion ramp, and those that leave the window at most CLEARANCE below the lowest ground NEAR by. Relief may
+    have stopped the latter before the border, so they are taken for rays that pass CLEARANCE above that ground.
     """
+    end = ends(state, m, rays, grid)
+    ground = realize(lifted(state.elevation, ~well_supported(state, cfg, grid.resolution)))
+    floor, known = (layer.flatten(1).gather(1, end.slot) for layer in (lowest, ground))
+    near = ground_at_borders(ground, grid).gather(1, end.border)
+    unknown = known >= 0.5 * NOWHERE
+    floor = chosen(unknown, chosen(end.leaves, near - CLEARANCE, NOWHERE), floor)
+    z = rays.origin[:, None, 2]
+    well = end.inside & (z + end.reach * rays.slope >= floor)
+    above = torch.maximum(rays.slope, (near + CLEARANCE - z) / end.reach.clamp(min=1e-6))
+    return well | rays.overhang, torch.where(unknown & well & ~rays.overhang, above, rays.slope)
+
+
+class Ends(NamedTuple):
+    """Where rays end, or the last half cell of the window that they pass."""
+
+    slot: Int[Tensor, "B N"]
+    inside: Bool[Tensor, "B N"]  # false if the sensor is outside, too
+    reach: Float[Tensor, "B N"]  # [m] horizontal distance
+    leaves: Bool[Tensor, "B N"]
+    border: Int[Tensor, "B N"]  # place in `ground_at_borders`
+
+
+def ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> Ends:
+    """Locate where each ray ends or leaves the window."""
     offset = lattice_offset(state, m, grid)[:, None]
     start = rays.origin[:, None, :2] + offset
     size = torch.stack([start.new_full((), n * grid.resolution) for n in (grid.height, grid.width)])
@@ -79,29 +105,24 @@ def ends_well(
     share = chosen(leaves, shares.amin(-1).clamp(0, 1), 1.0)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
-    ground = realize(lifted(state.elevation, ~well_supported(state, cfg, grid.resolution)))
-    floor, known = (layer.flatten(1).gather(1, slot.to(torch.int64)) for layer in (lowest, ground))
     through_x = shares[..., 0] <= shares[..., 1]
-    border = torch.where(through_x, ahead[..., 0].to(torch.int32), 2 + ahead[..., 1].to(torch.int32))
+    side = torch.where(through_x, ahead[..., 0].to(torch.int32), 2 + ahead[..., 1].to(torch.int32))
     place = torch.where(through_x, slot % grid.width, slot // grid.width)
-    borders, length = ground_at_borders(ground, grid)
-    near = borders.gather(1, (border * length + place).to(torch.int64)) + CLEARANCE
-    floor = chosen(known < 0.5 * NOWHERE, floor, chosen(leaves, near, NOWHERE))
-    height = rays.origin[:, None, 2] + share * rays.r * rays.slope
-    return inside & (height >= floor) | rays.overhang
+    border = side * max(grid.height, grid.width) + place
+    return Ends(slot.to(torch.int64), inside, share * rays.r, leaves, border.to(torch.int64))
 
 
-def ground_at_borders(ground: Tensor, grid: GridConfig) -> tuple[Float[Tensor, "B 4L"], int]:
-    """Return the lowest ground [m] NEAR each place of the window's four borders, and their length L in cells.
+def ground_at_borders(ground: Tensor, grid: GridConfig) -> Float[Tensor, "B 4L"]:
+    """Return the lowest ground [m] NEAR each place of the window's four borders, NOWHERE or higher without ground.
 
-    The borders are those of low x, high x, low y and high y; NOWHERE or higher without ground.
+    The borders are those of low x, high x, low y and high y; L is the longer one's number of cells.
     """
     cells = max(1, int(NEAR / grid.resolution))
     rows, columns = (ground[:, :cells], ground[:, -cells:]), (ground[:, :, :cells], ground[:, :, -cells:])
     sides = [*(side.amin(1) for side in rows), *(side.amin(2) for side in columns)]
     length = max(grid.height, grid.width)
     rims = [F.pad(side, (cells, cells + length - side.shape[1]), value=NOWHERE) for side in sides]
-    return realize(torch.stack(rims, 1)).unfold(2, 2 * cells + 1, 1).amin(-1).flatten(1), length
+    return realize(torch.stack(rims, 1)).unfold(2, 2 * cells + 1, 1).amin(-1).flatten(1)
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:

@@ -48,7 +48,7 @@ class RaycastConfig:
         require(reach, "raycast.max_range", "must be positive", self.max_range, "give metres, or None")
 
 
-def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
+def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
     """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least a cell farther.
 
     At short range, where a cell spans several azimuth bins, an entry is the minimum over half of them.
@@ -56,7 +56,7 @@ def lowest_slopes(rays: Rays, casts: Tensor, polar: PolarGrid, grid: GridConfig)
     # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
-    index = flat(chosen(casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
+    index = flat(chosen(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
     return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen[1:]), polar.ranges, NO_RAY)
 
 
@@ -106,7 +106,7 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     polar, known = PolarGrid.of(grid, cfg), state.validity
     for s in range(m.origin.shape[1]):
         rays = rays_of(m, s)
-        table = lowest_slopes(rays, believed(state, m, rays, grid, cfg), polar, grid)
+        table = lowest_slopes(believed(state, m, rays, grid, cfg), polar, grid)
         state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), grid, cfg)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
 
