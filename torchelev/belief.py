@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from torchelev.raycast import RaycastConfig
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
-# A ray that leaves the window over unknown ground is judged by the ground NEAR by, CLEARANCE above which it must pass:
-# with a margin below uncertain ground instead, returns that are too long would set upper bounds below the truth.
+# A ray that leaves the window over unknown ground is judged by the ground NEAR by, and counts where it is CLEARANCE
+# above that: with a margin below uncertain ground instead, returns that are too long would bound below the truth.
 NEAR, CLEARANCE = 0.5, 0.05  # [m]
 
 
