@@ -88,6 +88,13 @@ def test_fusion_refuses(name):
         FusionConfig(**{name: 0.0})
 
 
+@pytest.mark.parametrize("name", ["relief", "max_support"])
+@pytest.mark.parametrize("value", [-1.0, float("inf"), float("nan")])
+def test_fusion_refuses_what_is_negative_or_not_finite(name, value):
+    with pytest.raises(ValueError, match=rf"fusion\.{name}: must be finite and not negative"):
+        FusionConfig(**{name: value})
+
+
 @pytest.mark.parametrize("name", ["scan_variance_floor", "max_variance"])
 def test_variances_are_finite(name):
     with pytest.raises(ValueError, match=rf"fusion\.{name}: must be finite"):
@@ -102,7 +109,15 @@ def test_edges_refuse(bad):
 
 @pytest.mark.parametrize(
     "bad",
-    [dict(min_time=-1.0), dict(min_incidence=1.0), dict(min_incidence=-0.1), dict(max_range=-1.0), dict(gate=0.0)],
+    [
+        dict(min_time=-1.0),
+        dict(min_incidence=1.0),
+        dict(min_incidence=-0.1),
+        dict(max_range=-1.0),
+        dict(max_range=float("inf")),
+        dict(min_support=float("nan")),
+        dict(gate=0.0),
+    ],
 )
 def test_raycast_refuses(bad):
     with pytest.raises(ValueError, match=f"raycast.{next(iter(bad))}"):

@@ -83,6 +83,8 @@ MISTAKES = {
     "own legs": with_legs,
     "give T_map_base, which the window follows": lambda p, T, base: (p, T + shift(0, 50.0), None),
     "check T_map_base": lambda p, T, base: (p, T, base + shift(0, 50.0)),
+    "the sensor moves by": lambda p, T, base: (p, T, torch.linalg.inv(base)),
+    "m against the base": lambda p, T, base: (p, T, torch.eye(4, dtype=torch.float64)[None]),
 }
 
 
@@ -120,6 +122,31 @@ def test_a_gate_that_takes_everything_is_named(walked, setting):
     scans = below if setting.startswith("overlap") else walked
     sentences = map_of(scans, cfg=ElevationMapConfig.from_dict(stages)).diagnose()
     assert any(setting in sentence for sentence in sentences), sentences
+
+
+def test_no_time_between_updates(walked):
+    (sentence,) = map_of(walked, dt=0.0).diagnose()
+    assert sentence.startswith("dt: 0 s in all updates")
+    emap = ElevationMap(CFG)  # two sensors that take turns: the second is of the same instant
+    for points, T, base in walked:
+        emap.update(points, T, base, dt=DT)
+        emap.update(points, T, base, dt=0.0)
+    assert emap.diagnose() == []
+
+
+@pytest.mark.parametrize("knows_base", [True, False])
+@pytest.mark.parametrize("height", [0.15, 0.25, 0.35])
+@pytest.mark.parametrize("slope", [0.0, 0.4])
+def test_the_ground_under_a_low_robot_is_no_leg(knows_base, height, slope):
+    """Its base rides so low over the ground that this lies where the legs of others are."""
+    emap, generator = ElevationMap(CFG), torch.Generator().manual_seed(0)
+    for k in range(20):
+        T = torch.eye(4, dtype=torch.float64)[None]
+        T[0, 0, 3], T[0, 2, 3] = 0.1 * k, height + slope * 0.1 * k
+        xy = 6 * torch.rand(1, 6000, 2, generator=generator) - 3
+        z = slope * xy[..., :1] - height + 0.01 * torch.randn(1, 6000, 1, generator=generator)
+        emap.update(torch.cat([xy, z], -1), T, T if knows_base else None, dt=0.1)
+    assert [text for text in emap.diagnose() if "legs" in text] == []
 
 
 def test_clouds_without_a_number(walked):

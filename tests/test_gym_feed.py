@@ -1,5 +1,6 @@
 """The feed by itself: what a simulator's own loop gets from its maps, without a wrapper."""
 
+import numpy as np
 import pytest
 import torch
 from test_gym_wrappers import CONFIG, DT, LAYERS, cloud_of, pose_of
@@ -61,5 +62,17 @@ def test_a_reset_of_some_fuses_their_clouds_alone():
 def test_it_needs_a_time_and_poses():
     with pytest.raises(TypeError, match="dt"):
         MapFeed(2, points=points, T_map_sensor=pose, T_map_base=pose)
+    with pytest.raises(ValueError, match="num_envs"):
+        MapFeed(0, points=points, T_map_sensor=pose, T_map_base=pose, dt=DT)
+    with pytest.raises(ValueError, match="dt: must be seconds, got True"):
+        MapFeed(2, points=points, T_map_sensor=pose, T_map_base=pose, dt=True)
+    assert MapFeed(2, points=points, T_map_sensor=pose, T_map_base=pose, dt=np.float32(DT)).dt == np.float32(DT)
     with pytest.raises(ValueError, match="T_map_base: must be a function of the environment, got NoneType"):
         MapFeed(2, points=points, T_map_sensor=pose, T_map_base=None, dt=DT)
+
+
+def test_what_a_reader_may_return():
+    arrays = lambda emap, T: (np.zeros((2, 3)), np.ones((2, 3)))  # noqa: E731
+    feed = MapFeed(2, points=points, T_map_sensor=pose, T_map_base=pose, dt=DT, read=arrays)
+    with pytest.raises(ValueError, match=r"read: must return a tensor \(2, ...\), got tuple"):
+        feed.read_blank()

@@ -1,9 +1,11 @@
 """Every writer leaves the older file whole when it fails, and refuses folders and devices."""
 
+import errno
 import os
 import stat
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,6 +78,26 @@ def test_an_error_within_the_block_writes_nothing(tmp_path):
         file.write(b"half")
         raise KeyboardInterrupt
     assert os.listdir(tmp_path) == []
+
+
+def test_other_errors_pass_through(tmp_path):
+    with pytest.raises(RuntimeError, match="of the caller"), atomic_file(tmp_path / "a"):
+        raise RuntimeError("of the caller")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_read_only_disk_is_named(tmp_path, monkeypatch):
+    """There even removing a file that does not exist fails."""
+
+    def read_only(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", ".tmp")
+
+    for name in ("open", "touch", "unlink"):
+        monkeypatch.setattr(Path, name, read_only)
+    with pytest.raises(WriteError, match="map.npz: cannot be written .Read-only file system"):
+        require_writable(tmp_path / "map.npz")
+    with pytest.raises(WriteError, match="map.npz: cannot be written .Read-only"), atomic_file(tmp_path / "map.npz"):
+        pass
 
 
 def test_links_and_permissions_stay(tmp_path):

@@ -51,6 +51,17 @@ def test_no_warning_without_cause(times):
     noted(times)
 
 
+def test_clouds_that_take_turns_do_not_hide_each_other():
+    watch = Pace()
+    for _ in range(60):
+        noted([0.008], 1000, watch)
+        noted([0.02], 100_000, watch)
+    with pytest.warns(RuntimeWarning, match="80 ms"):
+        for _ in range(60):
+            noted([0.08], 1000, watch)
+            noted([0.02], 100_000, watch)
+
+
 def test_larger_clouds_and_fewer_threads_are_told_apart():
     watch = noted(USUAL)
     noted([0.08] * 50, num_points=10_000, watch=watch)

@@ -222,6 +222,13 @@ def test_depth_to_points_refuses_masks():
         depth_to_points(torch.ones(4, 4, dtype=torch.bool), torch.eye(3), scale=1.0)
 
 
+def test_depth_to_points_refuses_arrays():
+    depth, intrinsics = torch.ones(4, 4), torch.eye(3)
+    for images, matrix, name in ((depth.numpy(), intrinsics, "depth"), (depth, intrinsics.numpy(), "intrinsics")):
+        with pytest.raises(TypeError, match=f"{name}: must be a torch.Tensor, got ndarray; make it one"):
+            depth_to_points(images, matrix)
+
+
 @given(SEEDS, st.sampled_from([torch.float32, torch.float64]), st.floats(0.2, 2.0))
 def test_voxel_filter_agrees_with_the_reference(seed, dtype, size):
     rng = np.random.default_rng(seed)

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from torchelev.raycast import RaycastConfig
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
-# A ray that leaves the window over unknown ground is judged by the ground NEAR by, and counts where it is CLEARANCE
-# above that: with a margin below uncertain ground instead, returns that are too long would bound below the truth.
+# A ray that leaves the window over unknown ground is believed down to CLEARANCE below the lowest ground NEAR by, and
+# taken for one that passes CLEARANCE above it, so that returns that are too long do not bound below the truth.
 NEAR, CLEARANCE = 0.5, 0.05  # [m]
 
 
@@ -53,7 +53,10 @@ def rays_of(m: Measurement, s: int) -> Rays:
 
 
 def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Rays:
-    """Return the rays; those cast that may clear and bound have a credible end and pass below no ground hit of late."""
+    """Return the rays with `casts` narrowed to those that are believed, and with their slopes corrected.
+
+    Believed rays end credibly (`ends_well`) and pass below no ground hit of late (`horizon`).
+    """
     lowest = state.elevation - height_margin(state, grid, cfg)
     above = horizon(state, m, rays, lowest, grid, cfg) + rays.slope >= 0
     well, slope = ends_well(state, m, rays, lowest, grid, cfg)
@@ -77,12 +80,12 @@ def ends_well(
     floor = chosen(unknown, chosen(end.leaves, near - CLEARANCE, NOWHERE), floor)
     z = rays.origin[:, None, 2]
     well = end.inside & (z + end.reach * rays.slope >= floor)
-    above = torch.maximum(rays.slope, (near + CLEARANCE - z) / end.reach.clamp(min=1e-6))
-    return well | rays.overhang, torch.where(unknown & well & ~rays.overhang, above, rays.slope)
+    raised = torch.maximum(rays.slope, (near + CLEARANCE - z) / end.reach.clamp(min=1e-6))
+    return well | rays.overhang, torch.where(unknown & well & ~rays.overhang, raised, rays.slope)
 
 
 class Ends(NamedTuple):
-    """Where rays end, or the last half cell of the window that they pass."""
+    """Where each ray ends, or where it is half a cell short of leaving the window."""
 
     slot: Int[Tensor, "B N"]
     inside: Bool[Tensor, "B N"]  # false if the sensor is outside, too
@@ -113,7 +116,7 @@ def ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> Ends:
 
 
 def ground_at_borders(ground: Tensor, grid: GridConfig) -> Float[Tensor, "B 4L"]:
-    """Return the lowest ground [m] NEAR each place of the window's four borders, NOWHERE or higher without ground.
+    """Return the lowest ground [m] NEAR each place of the window's four borders, about NOWHERE where there is none.
 
     The borders are those of low x, high x, low y and high y; L is the longer one's number of cells.
     """
@@ -159,7 +162,7 @@ def horizon(
     recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = chosen(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
     fall = chosen(inside, read(realize(below_sensor).flatten(1), slot), NO_FALL * step) / rho
-    steepest = running_minimum(fall.detach(), from_end=False)  # compared with, and so without a gradient
+    steepest = running_minimum(fall.detach())  # compared with, and so without a gradient
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))

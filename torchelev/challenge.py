@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from torchelev.fusion import FusionConfig, Guess, Prior
 
-MIN_CHALLENGERS = 4  # of the 3 x 3 cells that have a challenger; then points at any height above support it
+MIN_CHALLENGERS = 4  # cells of the 3 x 3 window with a challenger, from which on points at any height above count
 
 
 class Challenge(NamedTuple):

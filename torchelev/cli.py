@@ -183,6 +183,8 @@ def run_map(
     scans = scans.moved(mount) if poses_of == "base" and mount is not None else scans
     emap = new_map(load_config(config, resolution, size), device, options)
     prefix, run = output_prefix(out, emap), MappingRun(emap)
+    if scans.note:
+        click.echo(f"warning: {scans.note}", err=True)
     return finish(run, len(scans), prefix, fuse_all(run, scans, options), options)
 
 

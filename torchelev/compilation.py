@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
 KERNEL_ARGUMENTS = 16  # measured: 12 to 24 do as well
+CHANGES = 1  # number of the changes to the compiler below, which its cache does not see: count up with each
 
 
 def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., Any]:
@@ -36,8 +37,7 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
     options: dict[str, Any] = {}
     if all(value.device.type == "cpu" for value in inputs if isinstance(value, Tensor)):
         # What is read so often, or takes so many operations, is stored unasked. The usual limits, which other devices
-        # keep, are so low that all sums over a window are stored. Torch's cache does not see `short_kernels` and
-        # `fast_mask_loads`, but these options, and so gives nothing that was made without.
+        # keep, are so low that all sums over a window are stored.
         options |= {"realize_reads_threshold": 20, "realize_opcount_threshold": 120}
     if hasattr(config.cpp, "enable_tiling_heuristics"):
         # The compiler gives up vectorisation on many gathers, which pays off in the loops over points.
@@ -45,12 +45,26 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
     # Inputs are checked before, and torch's `opcheck` vouches in the tests for what operators return; checking the
     # shapes and addresses of all that in every update takes time.
     options |= {name: False for name in ("size_asserts", "alignment_asserts") if hasattr(config, name)}
-    with short_kernels(), fast_mask_loads():
+    tag = torch.compiler.config.patch(cache_key_tag=f"torchelev {CHANGES}")  # type: ignore[attr-defined]
+    with short_kernels(), fast_mask_loads(), tag:
         return compile(graph, inputs, options)
 
 
 @contextlib.contextmanager
-def short_kernels() -> Iterator[None]:
+def replaced(owner: Any, name: str, change: Callable[[Any], Any]) -> Iterator[None]:
+    """Let an attribute of the compiler be what `change` makes of it for a while, as far as this torch has it."""
+    usual = getattr(owner, name, None)
+    if usual is None:
+        yield
+        return
+    setattr(owner, name, change(usual))
+    try:
+        yield
+    finally:
+        setattr(owner, name, usual)
+
+
+def short_kernels() -> contextlib.AbstractContextManager[None]:
     """Let the compiler end a C++ function after so many arguments; it has no option for this.
 
     A function holds all that it stores until its end. One of all the loops between two operators takes 32 MB in place
@@ -58,17 +72,10 @@ def short_kernels() -> Iterator[None]:
     """
     from torch._inductor.codegen.cpp import CppScheduling
 
-    name = "MAX_FUSED_KERNEL_ARGS_NUM"
-    usual = getattr(CppScheduling, name, None)
-    setattr(CppScheduling, name, KERNEL_ARGUMENTS)
-    try:
-        yield
-    finally:
-        setattr(CppScheduling, name, usual)
+    return replaced(CppScheduling, "MAX_FUSED_KERNEL_ARGS_NUM", lambda _: KERNEL_ARGUMENTS)
 
 
-@contextlib.contextmanager
-def fast_mask_loads() -> Iterator[None]:
+def fast_mask_loads() -> contextlib.AbstractContextManager[None]:
     """Let the compiler load eight bytes of a mask into a vector of 256 bits directly.
 
     Torch's `loadu` with a number copies them into 32 bytes and loads those, which waits for the copy: ten times the
@@ -77,23 +84,16 @@ def fast_mask_loads() -> Iterator[None]:
     from torch._inductor.codegen.cpp import CppVecKernel
     from torch._inductor.cpu_vec_isa import VecAVX2
 
-    name = "_get_vec_load_line"
-    usual: Any = getattr(CppVecKernel, name, None)
-    if usual is None:  # in another torch
-        yield
-        return
+    def change(usual: Callable[..., str]) -> Callable[..., str]:
+        def load(kernel: Any, *args: Any, **options: Any) -> str:
+            line = usual(kernel, *args, **options)
+            if not isinstance(kernel.vec_isa, VecAVX2) or kernel.tiling_factor != 8:
+                return line
+            return re.sub(r"(<uint8_t>::)loadu\((.*), static_cast<int64_t>\(8L?\)\)$", r"\1loadu_one_fourth(\2)", line)
 
-    def load(kernel: Any, *args: Any, **options: Any) -> str:
-        line = usual(kernel, *args, **options)
-        if not isinstance(kernel.vec_isa, VecAVX2) or kernel.tiling_factor != 8:
-            return line
-        return re.sub(r"(<uint8_t>::)loadu\((.*), static_cast<int64_t>\(8L?\)\)$", r"\1loadu_one_fourth(\2)", line)
+        return load
 
-    setattr(CppVecKernel, name, load)
-    try:
-        yield
-    finally:
-        setattr(CppVecKernel, name, usual)
+    return replaced(CppVecKernel, "_get_vec_load_line", change)
 
 
 _number = itertools.count()

@@ -45,6 +45,7 @@ class Evidence:
     statistics: dict[str, float]  # of the last update
     num_known: int  # cells
     num_near: int  # known cells where overlap clearance works
+    oldest: float  # [s] since the known cell that waits longest was hit
     center: NDArray  # (2,) [m] of the window
 
     @cached_property
@@ -122,6 +123,7 @@ def evidence(cfg: ElevationMapConfig, state: MapState, looks: Sequence[Look], en
         used=used,
         statistics={name: float(value[env]) for name, value in state.statistics._asdict().items()},
         num_known=int(state.validity[env].sum()),
+        oldest=float(torch.where(state.validity[env], state.time[env], 0.0).max()),
         num_near=_known_near(cfg, state, looks[-1], env),
         center=corner + [grid.length_x / 2, grid.length_y / 2],
     )
@@ -130,7 +132,7 @@ def evidence(cfg: ElevationMapConfig, state: MapState, looks: Sequence[Look], en
 def _known_near(cfg: ElevationMapConfig, state: MapState, look: Look, env: int) -> int:
     if look.T_map_base is None or cfg.overlap is None:
         return 0
-    away = cell_centers(state.corner, cfg.grid)[env] - look.T_map_base[env, :2, 3]
+    away = cell_centers(state.corner[env, None], cfg.grid)[0] - look.T_map_base[env, :2, 3]
     return int((state.validity[env] & (away.norm(dim=-1) <= cfg.overlap.radius)).sum())
 
 
@@ -149,10 +151,26 @@ def wrong_poses(seen: Evidence) -> str | None:
     fit, mistakes = seen.explained
     if not mistakes:
         return None
-    tilt = "" if np.isnan(fit.level) else f"the ground that the sensor sees is tilted by {_degrees(fit.level):.0f} deg"
-    apart = "" if np.isnan(fit.agreement) else f"scans agree in {100 * fit.agreement:.0f} % of the cells they share"
+    tilt = "" if not fit.level < 0.8 else f"the ground that the sensor sees is tilted by {_degrees(fit.level):.0f} deg"
+    apart = "" if not fit.agreement < 0.75 else f"scans agree in {100 * fit.agreement:.0f} % of the cells they share"
     numbers = " and ".join(text for text in (tilt, apart) if text)
-    return f"poses: {'; or '.join(mistakes)} ({numbers} as it is, and fits when this is undone)"
+    return f"poses: {'; or '.join(mistakes)} (as given, {numbers}; without the mistake, ground and scans fit)"
+
+
+def wrong_base(seen: Evidence) -> str | None:
+    """The sensor moves against the base on which it is mounted. Sensors that take turns come back to their mounts."""
+    pairs = [(base, look[0]) for base, look in zip(seen.bases, seen.poses, strict=True) if base is not None]
+    mounts = [np.linalg.solve(base, T)[:3, 3] for base, T in pairs if np.isfinite(base).all() and np.isfinite(T).all()]
+    if len(mounts) < 4:
+        return None
+    apart = np.linalg.norm(np.array(mounts)[:, None] - np.array(mounts), axis=2)
+    alone = (apart < 0.1).sum(1) == 1
+    if apart.max() < 0.5 or alone.mean() < 0.5:
+        return None
+    return (
+        f"T_map_base: the sensor moves by {apart.max():.1f} m against the base; check T_map_base and T_map_sensor: poses "
+        "in the same map frame, of the same time, and not inverted"
+    )
 
 
 def _degrees(cosine: float) -> float:
@@ -192,7 +210,7 @@ def out_of_reach(seen: Evidence) -> str | None:
 
 
 def contradicted(seen: Evidence) -> str | None:
-    """The outlier gate rejects a great part: scans do not agree with each other."""
+    """The outlier gate rejects a large share: scans do not agree with each other."""
     outliers = seen.statistics["rejected_outlier"]
     total = outliers + seen.statistics["points_used"]
     if outliers < FEW or outliers < 0.3 * total or seen.explained[1]:
@@ -214,16 +232,18 @@ def cleared(seen: Evidence) -> str | None:
     return None
 
 
-def milliseconds(seen: Evidence) -> str | None:
-    """Times so long that the robot hardly moves, or stands for ages between two scans."""
-    dt = float(np.median(seen.dt))
+def wrong_times(seen: Evidence) -> str | None:
+    """Times so long that the robot hardly moves, or stands for ages between two scans, or no time at all."""
+    dt, travel = float(np.median(seen.dt)), float(np.ptp(seen.places, axis=0).max(initial=0))
+    if dt == 0 and seen.oldest == 0 and len(seen.places) >= 4 and travel > 0.5:
+        return f"dt: 0 s in all updates, in which the robot moves {travel:.1f} m; give the seconds since the last one"
     if dt < 5.0:
         return None
     moved = np.linalg.norm(np.diff(seen.places, axis=0), axis=1) / np.maximum(np.diff(seen.numbers), 1)
     speed = float(np.median(moved)) / dt if len(moved) else 0.0
     if not (speed < 0.05 and (dt >= 10.0 or speed > 0)):
         return None
-    return f"dt: {dt:g} s between updates, in which the robot moves at {100 * speed:.2g} cm/s; give seconds, not ms"
+    return f"dt: {dt:g} s between updates, in which the robot moves {100 * speed:.2g} cm/s; give seconds, not ms or ns"
 
 
 def own_legs(seen: Evidence) -> str | None:
@@ -241,12 +261,25 @@ def own_legs(seen: Evidence) -> str | None:
 
 
 def _beside_base(seen: Evidence, k: int) -> int:
-    """Count points used that lie within 0.4 m of the base's axis, at its height; without a base, near the sensor."""
+    """Count points used that stand above the ground within 0.4 m of the base; without one, 0.35 m of the sensor."""
     points, base = seen.in_map(k), seen.bases[k]
+    points = points[_above_ground(points, seen.places[k]) > 0.1]
     if base is None:
         return int((np.linalg.norm(points - seen.poses[k][0][:3, 3], axis=1) < 0.35).sum())
     x, y, z = ((points - base[:3, 3]) @ base[:3, :3]).T
     return int(((np.hypot(x, y) < 0.4) & (z > -0.35) & (z < 0.1)).sum())
 
 
-RULES = (millimetres, wrong_poses, rejected, out_of_reach, cleared, contradicted, milliseconds, own_legs)
+def _above_ground(points: NDArray, place: NDArray) -> NDArray:
+    """Return how far points (n, 3) lie above the plane of the ground within 1.5 m of a place (n,) [m]."""
+    A = np.column_stack([points[:, :2] - place[:2], np.ones(len(points))])
+    ground = np.linalg.norm(A[:, :2], axis=1) < 1.5
+    above = np.zeros(len(points))
+    for _ in range(4):  # what stands on the ground is left out, the more the better the plane fits
+        if ground.sum() >= 3:
+            above = points[:, 2] - A @ np.linalg.lstsq(A[ground], points[ground, 2], rcond=None)[0]
+            ground &= above < 0.05
+    return above
+
+
+RULES = (millimetres, wrong_poses, wrong_base, rejected, out_of_reach, cleared, contradicted, wrong_times, own_legs)

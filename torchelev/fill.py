@@ -53,13 +53,8 @@ def read_points(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridC
     before = uv - 0.5
     one, none = torch.ones_like(uv[..., :1]), torch.zeros_like(uv[..., :1])
     around = [before, before + torch.cat([one, none], -1), before + torch.cat([none, one], -1)]
-    return [_lowest_of_three(*layer) for layer in sample_layers(layers, torch.cat(around, 1), grid, "nearest")]
-
-
-def _lowest_of_three(values: Tensor, known: Tensor) -> Layer:
-    low = torch.where(known, values, torch.inf).unflatten(1, (3, -1)).amin(1)
-    found = torch.isfinite(low)
-    return torch.where(found, low, 0.0), found
+    corners = sample_layers(layers, torch.cat(around, 1), grid, "nearest")
+    return [lowest(values.unflatten(1, (3, -1)), known.unflatten(1, (3, -1)), dim=1) for values, known in corners]
 
 
 def fill_unknown(
@@ -82,7 +77,7 @@ def fill_unknown(
     if fill == "ground":
         ground, found = continue_ground((state.elevation, state.validity), uv, *base, grid, half)
     elif fill == "lowest":
-        ground, found = lowest(heights, known)
+        ground, found = (part[:, None] for part in lowest(heights, known, dim=1))
     elif fill == "upper_bound":
         ((ground, found),) = read_points([LAYERS["upper_bound"](state)], uv, grid, mode)
     elif fill == "inpaint":
@@ -92,9 +87,9 @@ def fill_unknown(
     return torch.where(known, heights, ground), known | found
 
 
-def lowest(heights: Float[Tensor, "B M"], known: Bool[Tensor, "B M"]) -> Layer:
-    """Return the lowest known height of each environment (B, 1), and whether there is one."""
-    low = torch.where(known, heights, torch.inf).amin(-1, keepdim=True)
+def lowest(heights: Float[Tensor, "B *M"], known: Bool[Tensor, "B *M"], dim: int) -> Layer:
+    """Return the lowest known height along a dimension, and whether there is one."""
+    low = torch.where(known, heights, torch.inf).amin(dim)
     found = torch.isfinite(low)
     return torch.where(found, low, 0.0), found
 

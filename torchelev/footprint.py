@@ -15,7 +15,7 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.grid import GridConfig
 from torchelev.polygons import PolygonCells, convex_hull, polygon_cells
-from torchelev.standing import FARTHEST, standing_cells
+from torchelev.standing import FARTHEST_CELLS, standing_cells
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def _locate(emap: ElevationMap, polygons: Tensor, cfg: FootprintConfig, corner: 
     extent = (uv.amax(-2) - uv.amin(-2)).amax(-1)
     if readable(value, emap.check_values) and value.numel():
         _refuse(uv, extent, most, cfg, grid)
-    return uv, (uv.abs() < FARTHEST).flatten(-2).all(-1) & (extent <= most)
+    return uv, (uv.abs() < FARTHEST_CELLS).flatten(-2).all(-1) & (extent <= most)
 
 
 def _refuse(uv: Tensor, extent: Tensor, most: float, cfg: FootprintConfig, grid: GridConfig) -> None:

@@ -44,6 +44,9 @@ class FusionConfig:
             require(
                 getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
             )
+        for name in ("relief", "max_support"):
+            good, mend = 0 <= getattr(self, name) < math.inf, "see its default"
+            require(good, f"fusion.{name}", "must be finite and not negative", getattr(self, name), mend)
         for name in ("min_above", "max_above_per_scan"):
             number = require_count(f"fusion.{name}", getattr(self, name), "see its default")
             require(number <= 255, f"fusion.{name}", "must be at most 255 points", number, "see its default")
@@ -84,7 +87,7 @@ class Prior(NamedTuple):
 
 
 def fuse(
-    state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig, has_rays: bool = True
+    state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig, has_rays: bool
 ) -> MapState:
     """Fuse the scan into the map (paper, Sec. II-C).
 

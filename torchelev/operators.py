@@ -106,15 +106,15 @@ def _scan(table: Tensor, from_end: bool) -> None:
 
 
 @torch.library.custom_op("torchelev::running_minimum", mutates_args=())
-def running_minimum(table: Tensor, from_end: bool) -> Tensor:
-    """Return the running minimum along dimension 1, a multiple of 8: over j <= k, or over j >= k from the end."""
+def running_minimum(table: Tensor) -> Tensor:
+    """Return the running minimum along dimension 1, a multiple of 8: over j <= k."""
     table = table.clone()
-    _scan(table, from_end)
+    _scan(table, from_end=False)
     return table
 
 
 @running_minimum.register_fake
-def _(table: Tensor, from_end: bool) -> Tensor:
+def _(table: Tensor) -> Tensor:
     return torch.empty_like(table)
 
 

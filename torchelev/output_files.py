@@ -7,7 +7,7 @@ import shutil
 import stat
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
@@ -43,10 +43,10 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         if target.exists():
             unfinished.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(unfinished, target)
-    except (OSError, RuntimeError) as error:  # torch.save raises RuntimeError where the disk is full
+    except OSError as error:
         raise WriteError(path, _reason(error)) from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        _remove(unfinished)
 
 
 def require_writable(path: str | Path, num_bytes: int = 0) -> None:
@@ -54,13 +54,12 @@ def require_writable(path: str | Path, num_bytes: int = 0) -> None:
     target = _target(path)
     probe = _temporary(target)
     try:
-        target.exists()  # refuses names that are too long
         probe.touch(exist_ok=False)
         free = shutil.disk_usage(target.parent).free
     except OSError as error:
         raise WriteError(path, _reason(error)) from error
     finally:
-        probe.unlink(missing_ok=True)
+        _remove(probe)
     limits = {"the disk has": free, "the size limit of files (ulimit -f) is": _size_limit()}
     for what, limit in limits.items():
         if limit is not None and limit < num_bytes:
@@ -104,8 +103,13 @@ def _temporary(target: Path) -> Path:
     return target.with_name(f".{uuid4().hex}.tmp")  # short: the target's name may be as long as names can be
 
 
-def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error).splitlines()[0] if str(error) else type(error).__name__
+def _remove(path: Path) -> None:
+    with suppress(OSError):  # also raised for a file that is not there if the disk is read-only
+        path.unlink()
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error) or type(error).__name__
 
 
 def _size_limit() -> int | None:

@@ -27,7 +27,7 @@ class Pace:
         self.clock = clock
         self.recent: dict[tuple[int, int], deque[float]] = {}
         self.best: dict[tuple[int, int], float] = {}
-        self.slow = 0
+        self.slow: dict[tuple[int, int], int] = {}
 
     def note(self, seconds: float, num_points: int) -> None:
         """Take in one update; warn, once in a process, if updates have become many times slower."""
@@ -38,8 +38,8 @@ class Pace:
             return
         median = statistics.median(recent)
         best = self.best[kind] = min(median, self.best.get(kind, median))
-        self.slow = self.slow + 1 if median > SLOWER * best else 0
-        if self.slow >= IN_A_ROW:
+        self.slow[kind] = self.slow.get(kind, 0) + 1 if median > SLOWER * best else 0
+        if self.slow[kind] >= IN_A_ROW:
             _warn(median, best)
 
 

@@ -39,8 +39,8 @@ _SENTENCES = {
     Reason.REACHED: "the path reaches the goal",
     Reason.START_OUTSIDE: "the start is outside of the window or not finite; recenter the map on the robot",
     Reason.GOAL_OUTSIDE: "the goal is outside of the window or not finite; give a goal within the window",
-    Reason.GOAL_UNKNOWN: "the goal's traversability is unknown, and no gentle bound vouches for it; "
-    "give a goal on ground that was seen",
+    Reason.GOAL_UNKNOWN: "the goal's traversability is unknown, and no gentle bound vouches for it, "
+    "or it is too close to impassable ground; give a goal on ground that was seen",
     Reason.GOAL_IMPASSABLE: "the ground at the goal is rated impassable, or too close to impassable ground",
     Reason.START_UNKNOWN: "no ground around the place where the robot stands is passable, and some of it is unknown; "
     "look at it, or initialize the map around the feet",

@@ -43,9 +43,11 @@ class RaycastConfig:
         require(self.min_time >= 0, "raycast.min_time", "must not be negative", self.min_time, "give seconds")
         cosine = 0 <= self.min_incidence < 1
         require(cosine, "raycast.min_incidence", "must lie in [0, 1)", self.min_incidence, "give a cosine such as 0.1")
-        reach = self.max_range is None or self.max_range > 0
+        reach = self.max_range is None or 0 < self.max_range < math.inf
         require(self.gate > 0, "raycast.gate", "must be positive", self.gate, "give standard deviations, such as 3")
-        require(reach, "raycast.max_range", "must be positive", self.max_range, "give metres, or None")
+        require(reach, "raycast.max_range", "must be positive and finite", self.max_range, "give metres, or None")
+        support = 0 <= self.min_support < math.inf
+        require(support, "raycast.min_support", "must be finite and not negative", self.min_support, "give points")
 
 
 def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:

@@ -229,7 +229,10 @@ def depth_to_points(
 
 
 def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
-    """Refuse depth images and intrinsics whose shapes do not fit each other."""
+    """Refuse what are no tensors, and depth images and intrinsics whose shapes do not fit each other."""
+    for name, value in (("depth", depth), ("intrinsics", intrinsics)):
+        hint = "make it one with torch.from_numpy or torch.tensor"
+        require(isinstance(value, Tensor), name, "must be a torch.Tensor", type(value).__name__, hint, TypeError)
     shape = tuple(depth.shape)
     require(depth.ndim >= 2, "depth", "expected (..., h, w)", shape, "add the image dimensions")
     channel = depth.ndim > 2 and shape[-1] == 1

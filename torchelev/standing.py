@@ -22,7 +22,7 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-FARTHEST = 2.0**30  # [cells] from the window; farther, a number of cells may not fit an integer
+FARTHEST_CELLS = 2.0**30  # from the window; farther, a number of cells may not fit an integer
 
 
 def place_footprint(
@@ -57,7 +57,7 @@ def standing_cells(
     require(fits, "standing", f"expected ({emap.num_envs}, V, 2) with V >= 3", shape, hint)
     size = max(grid.height, grid.width) + 1
     uv = value.detach().double() / grid.resolution - (emap.state if state is None else state).corner[:, None]
-    good = (uv.abs() < FARTHEST).flatten(1).all(1) & ((uv.amax(1) - uv.amin(1)).amax(-1) <= size - 1)
+    good = (uv.abs() < FARTHEST_CELLS).flatten(1).all(1) & ((uv.amax(1) - uv.amin(1)).amax(-1) <= size - 1)
     first, inside = polygon_cells(torch.where(good[:, None, None], uv, 0.0)[:, None], size)
     rows, in_rows = _on_patch(first[:, 0, 0], grid.height, size)
     columns, in_columns = _on_patch(first[:, 0, 1], grid.width, size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -110,8 +111,10 @@ def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotCon
 
 def write_weights(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
     """Write a head's config and weights."""
+    whole = io.BytesIO()  # into a file, torch raises RuntimeError where the disk is full
+    torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, whole)
     with atomic_file(path) as file:
-        torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, file)
+        file.write(whole.getbuffer())
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

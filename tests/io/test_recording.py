@@ -30,7 +30,7 @@ def test_natural_order_and_default_dt(tmp_path):
     assert [frame.T_map_sensor[0, 3] for frame in recording] == [1, 2, 10]
     assert [frame.dt for frame in recording] == [0, 0.1, 0.1]
     assert recording[2].points.tolist() == [[2.0] * 3] * 4
-    assert len(recording[1:]) == 2 and recording[-1].name == "scan_10.npy"
+    assert recording.note == "" and len(recording[1:]) == 2 and recording[-1].name == "scan_10.npy"
 
 
 def test_reads_a_scan_only_when_asked(tmp_path):
@@ -46,7 +46,11 @@ def test_reads_a_scan_only_when_asked(tmp_path):
 def test_numbered_scans_index_a_longer_pose_file(tmp_path):
     write_scans(tmp_path, ["000002", "000005"])
     write_kitti(tmp_path / "poses.txt", range(8))
-    assert open_recording(tmp_path).T_map_sensor[:, 0, 3].tolist() == [2, 5]
+    recording = open_recording(tmp_path)
+    assert recording.T_map_sensor[:, 0, 3].tolist() == [2, 5]
+    for same in (recording, recording[:1], recording.moved(np.eye(4))):
+        assert same.note.endswith("8 poses for 2 scans; each takes that of its number: "
+                                  "000002.npy takes line 3, 000005.npy line 6")  # fmt: skip
 
 
 def test_scans_named_by_time_take_the_nearest_pose(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,7 @@ class MapFeed:
         self.batch = () if num_envs is None else (num_envs,)
         self.dt = float(dt)  # type: ignore[arg-type]
         self.reader = DEFAULT_READ if read is None else read
-        self.emap = ElevationMap(cfg, num_envs=num_envs or 1, device=device)
+        self.emap = ElevationMap(cfg, num_envs=1 if num_envs is None else num_envs, device=device)
         self.device = self.emap.device
         self.intrinsics = None if intrinsics is None else as_tensor("intrinsics", intrinsics, self.device).double()
 
@@ -89,7 +90,10 @@ class MapFeed:
     def read(self, T_map_base: Tensor) -> Tensor:
         """Return what the reader gives as a new float32 tensor (B, ...), 0 where it is not finite."""
         values = self.reader(self.emap, T_map_base)
-        if isinstance(values, tuple):  # values and validity, as height scans give
+        if isinstance(values, tuple) and all(
+            isinstance(value, Tensor) for value in values
+        ):
+            # values and validity, as height scans give
             values = torch.stack([value.float() for value in values], 1)
         B = self.emap.num_envs
         fits = isinstance(values, Tensor) and values.ndim > 1 and values.shape[0] == B
@@ -130,7 +134,7 @@ def _check(sources: dict[str, Any], intrinsics: Any, dt: Any) -> None:
     require(len(given) == 1, "points, depth", "must be one function of the environment", actual, hint)
     paired = (intrinsics is not None) == (given == ["depth"])
     require(paired, "intrinsics", "must come with depth alone", given[0], "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    number = isinstance(dt, int | float) and 0 <= dt < math.inf
+    number = isinstance(dt, Real) and not isinstance(dt, bool) and 0 <= float(dt) < math.inf
     require(number, "dt", "must be seconds", repr(dt), "give the time of one step, such as env.unwrapped.dt")
 
 

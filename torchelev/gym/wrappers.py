@@ -51,7 +51,7 @@ from torch import Tensor
 
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.errors import require
-from torchelev.gym.feed import MapFeed, as_tensor
+from torchelev.gym.feed import MapFeed, Source, as_tensor
 
 
 class _MapObservation(RecordConstructorArgs):
@@ -65,11 +65,11 @@ class _MapObservation(RecordConstructorArgs):
         self,
         env: Any,
         *,
-        points: Callable[[Any], Any] | None = None,
-        depth: Callable[[Any], Any] | None = None,
+        points: Source | None = None,
+        depth: Source | None = None,
         intrinsics: Any = None,
-        T_map_sensor: Callable[[Any], Any] | None = None,
-        T_map_base: Callable[[Any], Any] | None = None,
+        T_map_sensor: Source | None = None,
+        T_map_base: Source | None = None,
         dt: float | None = None,
         read: Callable[[ElevationMap, Tensor], Any] | None = None,
         cfg: ElevationMapConfig | None = None,
@@ -87,8 +87,8 @@ class _MapObservation(RecordConstructorArgs):
         num_envs = env.num_envs if isinstance(env, VectorEnv) else None
         self._key, self._feed = key, MapFeed(num_envs, **sources, **poses, **maps)  # type: ignore[arg-type]
         self._ended = torch.zeros(self.emap.num_envs, dtype=torch.bool, device=self.emap.device)
-        shape = tuple(self._feed.read_blank().shape[1:])
-        self._extend_spaces(spaces.Box(-np.inf, np.inf, shape, np.float32))
+        self._last = self._feed.read_blank()
+        self._extend_spaces(spaces.Box(-np.inf, np.inf, tuple(self._last.shape[1:]), np.float32))
 
     @property
     def emap(self) -> ElevationMap:
@@ -175,7 +175,7 @@ class VectorElevationMapObservation(_MapObservation, VectorWrapper):
         actual = self.env.metadata.get("autoreset_mode", "none")
         known = actual in AutoresetMode.__members__.values()
         require(known, 'env.metadata["autoreset_mode"]', "must be an AutoresetMode", actual, hint)
-        self._mode, self._last = actual, self._feed.read_blank()
+        self._mode = actual
         self.single_observation_space = self._extended(self.env.single_observation_space, box)
         self.observation_space = self._extended(self.env.observation_space, batch_space(box, self.num_envs))
 

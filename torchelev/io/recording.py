@@ -37,11 +37,13 @@ class Recording(Sequence[Frame]):
     """Scans with poses. Indexing reads one scan from disk; nothing is kept.
 
     `files` (T), `T_map_sensor` (T, 4, 4) and `dt` (T,) [s] are known from the start. `read` takes a file to its points
-    (N, 3) [m].
+    (N, 3) [m]. `note` says how scans found their poses, where that may be a mistake.
     """
 
-    def __init__(self, files: list[Path], T_map_sensor: NDArray, dt: NDArray, read: Callable[[Path], NDArray]) -> None:
-        self.files, self.T_map_sensor, self.dt, self._read = files, T_map_sensor, dt, read
+    def __init__(
+        self, files: list[Path], T_map_sensor: NDArray, dt: NDArray, read: Callable[[Path], NDArray], note: str = ""
+    ) -> None:
+        self.files, self.T_map_sensor, self.dt, self._read, self.note = files, T_map_sensor, dt, read, note
 
     def __len__(self) -> int:
         return len(self.files)
@@ -52,13 +54,13 @@ class Recording(Sequence[Frame]):
     def __getitem__(self, index: slice) -> Recording: ...
     def __getitem__(self, index: int | slice) -> Frame | Recording:
         if isinstance(index, slice):
-            return Recording(self.files[index], self.T_map_sensor[index], self.dt[index], self._read)
+            return Recording(self.files[index], self.T_map_sensor[index], self.dt[index], self._read, self.note)
         path = self.files[index]
         return Frame(self._read(path), self.T_map_sensor[index], float(self.dt[index]), path.name)
 
     def moved(self, T_base_sensor: NDArray[np.float64]) -> Recording:
         """The same scans, for a pose file that has the poses of the robot's base: T_map_base T_base_sensor."""
-        return Recording(self.files, self.T_map_sensor @ T_base_sensor, self.dt, self._read)
+        return Recording(self.files, self.T_map_sensor @ T_base_sensor, self.dt, self._read, self.note)
 
 
 def open_recording(
@@ -82,12 +84,12 @@ def open_recording(
     camera = None if intrinsics is None else read_intrinsics(intrinsics)
     files = find_scans(Path(folder), depth=camera is not None)
     pose_file = Path(poses) if poses is not None else _find_poses(Path(folder))
-    matrices, times = _assign(files, pose_file, read_poses(pose_file, layout))
+    matrices, times, note = _assign(files, pose_file, read_poses(pose_file, layout))
 
     def read(path: Path) -> NDArray:
         return read_cloud(path, layout) if camera is None else _depth_points(path, camera)
 
-    return Recording(files, matrices, _steps(files, pose_file, times, dt), read)
+    return Recording(files, matrices, _steps(files, pose_file, times, dt), read, note)
 
 
 def find_scans(folder: Path, depth: bool = False) -> list[Path]:
@@ -174,12 +176,16 @@ def _find_poses(folder: Path) -> Path:
     raise RecordingError(folder, f"no pose file ({' or '.join(POSE_FILES)}) in it or beside it", "give it with --poses")
 
 
-def _assign(files: list[Path], pose_file: Path, poses: Poses) -> tuple[NDArray, NDArray | None]:
-    """Give each scan its pose: (T, 4, 4) and times (T,) [s] or None."""
-    index = _index_by_time(files, pose_file, poses.times)
+def _assign(files: list[Path], pose_file: Path, poses: Poses) -> tuple[NDArray, NDArray | None, str]:
+    """Give each scan its pose: (T, 4, 4), times (T,) [s] or None, and a note where poses are left over."""
+    index, note = _index_by_time(files, pose_file, poses.times), ""
     if index is None:
-        index = _index_by_order(files, pose_file, len(poses.T_map_sensor))
-    return poses.T_map_sensor[index], None if poses.times is None else poses.times[index]
+        count = len(poses.T_map_sensor)
+        index = _index_by_order(files, pose_file, count)
+        if count > len(files):
+            numbers = f"{files[0].name} takes line {index[0] + 1}, {files[-1].name} line {index[-1] + 1}"
+            note = f"{pose_file}: {count} poses for {len(files)} scans; each takes that of its number: {numbers}"
+    return poses.T_map_sensor[index], None if poses.times is None else poses.times[index], note
 
 
 def _index_by_time(files: list[Path], pose_file: Path, times: NDArray | None) -> NDArray | None:
