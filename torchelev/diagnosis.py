@@ -168,8 +168,8 @@ def wrong_base(seen: Evidence) -> str | None:
     if apart.max() < 0.5 or alone.mean() < 0.5:
         return None
     return (
-        f"T_map_base: the sensor moves by {apart.max():.1f} m against the base; check T_map_base and T_map_sensor: poses "
-        "in the same map frame, of the same time, and not inverted"
+        f"T_map_base: the sensor moves by {apart.max():.1f} m against the base; check T_map_base and T_map_sensor: "
+        "poses in the same map frame, of the same time, and not inverted"
     )
 
 
