@@ -1,11 +1,11 @@
 """How soon a new obstacle shows, and whether one that left does: `python -m benchmarks.changes`
 
 Robots stand still on rough ground, each with its own ground and noise, all in one batch. Obstacles: after 60 s of
-empty ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells that
-it covers and points hit show it, 0.15 m above the ground or higher. Plates: the same for one of 3 cm, until it shows
-to 80 %, for several rates of aging. Ghosts: a person crosses the view four times; counted are the cells that stay
-more than 0.1 m above the ground 3 s after, and which of them a ray of the last scan passes below, so that the map
-could know. Writes benchmarks/results/changes.json.
+empty ground a box of 0.3 m, a person or a wall stands 2.5 m ahead; counted are the scans until half of the cells in
+which it stands and points hit it show it, 0.15 m above the ground or higher. Plates: the same for one of 3 cm and the
+cells whose centres it covers, until it shows to 80 %, for several rates of aging. Ghosts: a person crosses the view
+four times; counted are the cells that stay more than 0.1 m above the ground 3 s after, and which of them a ray of the
+last scan passes below, so that the map could know. Writes benchmarks/results/changes.json.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from torchelev.sim.scenes import waves
 
 RESULTS = Path(__file__).parent / "results"
 GRID = GridConfig(resolution=0.04, length_x=8.0, length_y=8.0)
+HALF_CELL = GRID.resolution / 2
 BASE, MAST = 0.6, 0.3  # [m] the base above the ground, the sensor above the base
 CAMERA = DepthCamera(width=64, height=48, max_range=6.0)
 SENSORS = {
@@ -43,7 +44,7 @@ PERSON = OBSTACLES["person"]
 AHEAD = 2.5  # [m]
 SETTLED = 600  # scans of empty ground, at 10 Hz
 WATCHED = 40  # scans of the obstacle
-SHARES = {"box": (1.0,), "person": (0.25, 0.06), "wall": (0.25, 0.06)}  # of the points: some 2, or 0.5, a cell
+SHARES = {"box": (1.0,), "person": (0.15, 0.03), "wall": (0.12, 0.03)}  # of the points: some 2, or 0.5, a cell
 PLATE = (0.15, 0.15, 0.015)  # [m] half sizes
 RATES = (1e-7, 1e-5, 1e-4, 1e-3)  # [m^2/s] of aging, the first is the default
 HERTZ = (5, 10, 50)
@@ -119,15 +120,18 @@ def scans_until(shown: list[Tensor]) -> dict[str, int]:
     return {"median": int(scans[len(scans) // 2]), "most": int(scans[-1])}
 
 
-def hits(world: World, points: Tensor, boxes: Boxes, above: float = 0.05) -> Tensor:
-    """Count the points (B, H, W) in each cell whose centre the obstacle covers, so far above the ground [m]."""
+def hits(world: World, points: Tensor, boxes: Boxes, above: float = 0.05, beside: float = HALF_CELL) -> Tensor:
+    """Count the points (B, H, W) so far above the ground [m] in each cell in which part of the obstacle stands.
+
+    `beside`: how far from the obstacle the cell's centre may lie [m]; with 0 it covers the centre.
+    """
     xy, z = points[..., :2].nan_to_num(), points[..., 2]
     on = z > world.field.height(world.tiles, xy) + above
     slot, inside = locate(*xy.unbind(-1), -world.emap.state.corner * GRID.resolution, GRID)
     (number,) = PointCells(slot.long(), inside, GRID.num_cells).sums((on & inside).float())
-    place, half = boxes.T_map_box[:, 0, :2, 3], boxes.half_size[:, 0, :2]
-    covered = ((world.emap.cell_centers() - place[:, None, None]).abs() <= half[:, None, None]).all(-1)
-    return number.view_as(world.emap.elevation) * covered
+    place, half = boxes.T_map_box[:, 0, :2, 3], boxes.half_size[:, 0, :2] + beside
+    stands = ((world.emap.cell_centers() - place[:, None, None]).abs() < half[:, None, None]).all(-1)
+    return number.view_as(world.emap.elevation) * stands
 
 
 def plate_scans(sensor: MountedSensor, rate: float, seeds: int, settled: int, compiled: bool) -> dict[str, Any]:
@@ -141,7 +145,7 @@ def plate_scans(sensor: MountedSensor, rate: float, seeds: int, settled: int, co
     boxes, flat = world.ahead(PLATE), world.above_ground()
     hit, shown = torch.zeros_like(world.emap.validity), []
     for _ in range(WATCHED):
-        hit |= hits(world, world.scan(boxes, 0.1), boxes, above=0.0) > 0
+        hit |= hits(world, world.scan(boxes, 0.1), boxes, above=0.0, beside=0.0) > 0
         shown.append(torch.where(hit, world.above_ground(), math.nan).nanmean((1, 2)) >= 0.8 * 2 * PLATE[2])
     return scans_until(shown) | {"rmse_mm": 1e3 * float(flat[hit].square().nanmean().sqrt())}
 
@@ -188,7 +192,7 @@ def seen_through(world: World, cells: Tensor, points: Tensor) -> Tensor:
         reach = ray[:, :2].norm(dim=-1)
         forward = ray[:, :2] / reach[:, None]
         along = (place * forward).sum(-1)
-        beside = (place[..., 0] * forward[:, 1] - place[..., 1] * forward[:, 0]).abs() < GRID.resolution / 2
+        beside = (place[..., 0] * forward[:, 1] - place[..., 1] * forward[:, 0]).abs() < HALF_CELL
         over = beside & (along > 0) & (along < reach - 2 * GRID.resolution)
         below = T[2, 3] + along * ray[:, 2] / reach < height[marked][:, None] - CLEARLY
         numbers.append((over & below).any(1).sum())

@@ -461,12 +461,12 @@ def well_supported(c, layers, resolution, min_support):
     return bool(layers["validity"][c]) and any(enough(a) for a in [c, *like])
 
 
-def believed_slope(origin, hit, layers, corner, resolution, *, min_support, gate, near=0.5, clearance=0.05):
+def believed_slope(origin, hit, layers, corner, resolution, *, min_support, gate, near=1.0, clearance=0.05):
     """The slope dz/dr of a ray that ends in a well supported cell and not below it, or passes the last half cell so.
 
-    None for others. Where the window's last half cell is not well supported, the lowest ground counts that is: of the
-    strip along the border that the ray leaves through, as deep as `near`, and so far to both sides. A ray no more than
-    `clearance` below that is believed, and taken for one that passes `clearance` above it.
+    None for others. For a ray that leaves the window otherwise, the lowest ground counts that is well supported, of the
+    strip along the border that the ray leaves through, as deep as `near`, and so far to both sides. A ray that is never
+    more than `clearance` below that is believed, and taken for one that passes `clearance` above it.
     """
     shape, share, side = layers["validity"].shape, 1.0, None
     if cell_of(*hit[:2], corner, resolution, shape) is None:
@@ -482,7 +482,8 @@ def believed_slope(origin, hit, layers, corner, resolution, *, min_support, gate
         return None
     if well_supported(c, layers, resolution, min_support):
         margin = gate * math.sqrt(layers["variance"][c] + (resolution / 2) ** 2)
-        return slope if z >= layers["elevation"][c] - margin else None
+        if z >= layers["elevation"][c] - margin:
+            return slope
     if side is None:
         return None
     n, border = max(1, int(near / resolution)), shape[side] - 1 if hit[side] > origin[side] else 0
@@ -492,7 +493,7 @@ def believed_slope(origin, hit, layers, corner, resolution, *, min_support, gate
         if abs(a[side] - border) < n and abs(a[1 - side] - c[1 - side]) <= n
         if well_supported(a, layers, resolution, min_support)
     ]
-    if not strip or z < min(strip) - clearance:
+    if not strip or min(origin[2], hit[2]) < min(strip) - clearance:
         return None
     return (max(z, min(strip) + clearance) - origin[2]) / (share * length)
 

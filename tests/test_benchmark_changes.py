@@ -24,18 +24,20 @@ def world(seeds=2):
     return changes.World(changes.SENSORS["camera 64 x 48"], seeds, compiled=False)
 
 
-def test_hits_are_counted_in_the_cells_that_the_obstacle_covers():
+def test_hits_are_counted_in_the_cells_in_which_the_obstacle_stands():
     here = world(1)
     boxes = here.box(torch.tensor([2.65]), torch.zeros(1), changes.OBSTACLES["box"])
     at = torch.tensor([2.55, 0.02, 0.0])
     ground = float(here.field.height(here.tiles, at[None, None, :2]))
-    # The cell of x = 2.51 has its centre, 2.5, before the box.
-    places = [(2.55, 0.02, 0.2), (2.55, 0.02, 0.02), (2.55, 1.0, 0.2), (2.51, 0.02, 0.2)]
-    on, below, beside, before = ([x, y, ground + z] for x, y, z in places)
-    number = changes.hits(here, torch.tensor([[on, on, below, beside, before, [torch.nan] * 3]]), boxes)
-    assert number.sum() == 2 and number.max() == 2
-    center = here.emap.cell_centers()[number > 0][0]
-    assert (center - at[:2]).abs().max() <= changes.GRID.resolution / 2
+    # The box begins at x = 2.5, the centre of the cell of x = 2.51.
+    places = [(2.55, 0.02, 0.2), (2.55, 0.02, 0.02), (2.55, 1.0, 0.2), (2.51, 0.02, 0.2), (2.47, 0.02, 0.2)]
+    on, below, beside, rim, before = ([x, y, ground + z] for x, y, z in places)
+    points = torch.tensor([[on, on, below, beside, rim, before, [torch.nan] * 3]])
+    number = changes.hits(here, points, boxes)
+    assert number.sum() == 3 and number.max() == 2
+    center = here.emap.cell_centers()[number == 2][0]
+    assert (center - at[:2]).abs().max() <= changes.HALF_CELL
+    assert changes.hits(here, points, boxes, beside=-0.001).sum() == 2, "the box covers this cell's centre"
 
 
 def test_an_obstacle_shows_and_settled_ground_delays_it(small):

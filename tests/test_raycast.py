@@ -66,9 +66,9 @@ def marched(state, hits, T):
 def test_bounds_agree_with_marching(place):
     """Of a blank map and rays to overhangs, so that every ray is believed.
 
-    Measured: the table bounds 2 to 4 % of the cells less, because it wants a ray to reach a cell farther, and 0.6 %
-    more. Its bounds are a median of 0 to 2.5 cm higher: as it looks at the inner half of a cell, it misses the steeper
-    ray that only touches a corner. 95 % lie within -0.4 and 1.8 times what the ray falls over one cell.
+    Measured: the table bounds 1 to 2 % of the cells less, because it wants a ray to reach a cell farther, and 1.1 to
+    1.6 % more, where a ray passes up to one azimuth bin beside. Its bounds are a median of 0 to 2.1 cm higher: it reads
+    what reaches a cell farther. 95 % lie within -0.8 and 1.5 times what the ray falls over one cell.
     """
     emap, T = wide_map(), pose((*place, 1.0))
     hits = floor_hits(T)
@@ -78,8 +78,24 @@ def test_bounds_agree_with_marching(place):
     difference = (after.upper_bound[0].numpy() - lowest)[got & bounded]
     low, high = np.quantile(difference / fall[got & bounded], [0.05, 0.95])
     assert bounded.mean() > 0.3
-    assert (got & ~bounded).mean() < 0.01 and (bounded & ~got).mean() < 0.06
-    assert abs(np.median(difference)) < 0.03 and -0.5 < low and high < 2.0
+    assert (got & ~bounded).mean() < 0.02 and (bounded & ~got).mean() < 0.03
+    assert abs(np.median(difference)) < 0.03 and -1.0 < low and high < 2.0
+
+
+@pytest.mark.parametrize("place", PLACES[:2])
+def test_no_ray_over_a_cell_is_missed(place):
+    """Few rays, so that no other bounds the cells that they touch: all do up to two cells before their ends."""
+    emap, T = wide_map(), pose((*place, 1.0))
+    hits, origin = floor_hits(T, 40), T[0, :3, 3].numpy()
+    length = np.linalg.norm((hits - origin)[:, :2], axis=1, keepdims=True)
+    hits = (hits + 3 * (hits - origin))[length[:, 0] > 0.3]  # far and low enough to reach the rim
+    after = cast(emap, emap.state, hits, T, overhang=True)
+    length = np.linalg.norm((hits - origin)[:, :2], axis=1, keepdims=True)
+    short = hits - 2.0 * RESOLUTION * (hits - origin) / length
+    lowest, fall = marched_heights(emap.state, short, T)
+    crossed = np.isfinite(lowest)
+    assert crossed.sum() > 200 and after.bounded[0].numpy()[crossed].all()
+    assert (after.upper_bound[0].numpy()[crossed] <= lowest[crossed] + 1e-6).all()
 
 
 def ghosts(emap, cells=CELLS, seed=0):
@@ -105,7 +121,7 @@ def ghosts(emap, cells=CELLS, seed=0):
 def test_cleared_cells_agree_with_marching(place):
     """Ghosts that rays pass below. Rays that end on the floor of a ghost's cell are left out: they are not believed.
 
-    Measured: up to 10 % of the cells that marching clears stay, up to four cells more go, where rays pass beside them.
+    Measured: up to 2 % of the cells that marching clears stay, up to eight cells more go, where rays pass beside them.
     """
     emap, T = wide_map(), pose((*place, 1.0))
     state, hits = ghosts(emap), floor_hits(T)
@@ -115,7 +131,7 @@ def test_cleared_cells_agree_with_marching(place):
     cleared, got = ~marched(state, hits, T), ~after.validity[0].numpy()
     assert not (got & (state.elevation[0].numpy() == 0)).any(), "the floor stays"
     assert cleared.sum() > 20
-    assert (got & ~cleared).sum() <= max(4, 0.04 * cleared.sum()) and (cleared & ~got).sum() <= 0.15 * cleared.sum()
+    assert (got & ~cleared).sum() <= 8 and (cleared & ~got).sum() <= 0.04 * cleared.sum()
     assert after.statistics.cleared_seen_through.item() == got.sum()
 
 
@@ -282,20 +298,29 @@ def test_where_nothing_is_known_only_rays_to_overhangs_are_believed(used, casts,
 
 @pytest.mark.parametrize("side", range(4))
 @pytest.mark.parametrize(
-    "unknown, height, clears", [(3, 0.1, True), (3, 0.0, True), (3, -0.12, False), (6, 0.1, False)]
+    "unknown, ghost, end, clears",
+    [
+        (3, 18, (1.6, 0.1), True),
+        (3, 18, (1.6, 0.0), True),
+        (3, 18, (1.6, -0.12), False),
+        (3, 18, (3.0, -0.12), False),
+        (11, 18, (1.6, 0.1), False),
+        (0, 30, (2.0, 0.1), True),
+        (0, 30, (2.0, -0.12), False),
+    ],
 )
-def test_a_ray_that_leaves_over_unknown_ground_passes_above_ground_near_by(side, unknown, height, clears):
-    """Some cells along the border are unknown; the ray passes there at this height, and below a ghost before it."""
+def test_a_ray_that_leaves_over_no_ground_must_not_end_below_ground_near_by(side, unknown, ghost, end, clears):
+    """Some cells along the border are unknown, or a ghost stands there; the ray ends so far and high."""
     emap = small_map(1, (31, 31), RESOLUTION, torch.float64, raycast=EVERY)
     k, T = 30 - unknown, pose((0.0, 0.0, 1.0))
     state = ghosts(emap, (31, 31))
     elevation, validity = torch.zeros_like(state.elevation), torch.ones_like(state.validity)
-    elevation[0, 24, 13:18], validity[0, k + 1 :] = 1.5, False
+    elevation[0, ghost, 13:18], validity[0, k + 1 :] = 1.5, False
     elevation, validity = (torch.rot90(layer, side, (1, 2)) for layer in (elevation, validity))
     angle = side * np.pi / 2
     across = np.array([-np.sin(angle), np.cos(angle), 0.0])
-    end = np.array([3.0 * np.cos(angle), 3.0 * np.sin(angle), 1.0 - 2.0 * (1.0 - height)])  # half way at the border
-    hits = np.array([end + t * across for t in (-0.05, 0.0, 0.05)])
+    ahead = np.array([end[0] * np.cos(angle), end[0] * np.sin(angle), end[1]])
+    hits = np.array([ahead + t * across for t in (-0.05, 0.0, 0.05)])
     after = cast(emap, state._replace(elevation=elevation, validity=validity), hits, T)
     assert (after.validity != validity).any() == clears
     assert torch.equal(after.validity[elevation == 0], validity[elevation == 0]), "the ground stays"
@@ -327,17 +352,18 @@ def test_a_neighbour_of_like_height_vouches(step, bounds):
 
 @pytest.mark.parametrize("place", PLACES[:3])
 def test_where_rays_end_agrees_with_the_reference(place):
-    """Nearly level ground, a third of it unknown and more along the borders; rays end or leave at any height."""
-    emap, T = wide_map(), pose((*place, 1.0))
+    """Nearly level ground, a third of it unknown and more along the borders; low rays end or leave at any height."""
+    emap, T = wide_map(), pose((*place, 0.4))
     rng = np.random.default_rng(2)
     state = random_state(rng, emap.cfg.grid, known=0.6)
     i, j = torch.meshgrid(*(torch.arange(n) for n in CELLS), indexing="ij")
     rim = torch.minimum(torch.minimum(i, CELLS[0] - 1 - i), torch.minimum(j, CELLS[1] - 1 - j)) < 4
     validity = state.validity & ~(rim & torch.from_numpy(rng.random(CELLS) < 0.95))
-    state = state._replace(elevation=0.2 * state.elevation, variance=0.01 * state.variance, validity=validity)
-    origin, hits = T[0, :3, 3].numpy(), floor_hits(T, 2000) + rng.uniform(-0.6, 0.4, (2000, 1)) * [0, 0, 1]
-    hits[::2] = origin + 4.0 * (hits[::2] - origin)
+    state = state._replace(elevation=0.1 * state.elevation, variance=0.01 * state.variance, validity=validity)
+    origin, hits = T[0, :3, 3].numpy(), floor_hits(T, 6000) + rng.uniform(-0.2, 0.1, (6000, 1)) * [0, 0, 1]
+    hits[::2, :2] = origin[:2] + rng.uniform(1, 6, (3000, 1)) * (hits[::2, :2] - origin[:2])
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
+    m = m._replace(used=m.used & torch.from_numpy(rng.random((1, 6000)) < 0.8))
     rays, lowest = rays_of(m, 0), state.elevation - height_margin(state, emap.cfg.grid, EVERY)
     well, slope = (values[0].numpy() for values in ends_well(state, m, rays, lowest, emap.cfg.grid, EVERY))
     layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
@@ -421,13 +447,17 @@ def test_turn_grows_with_the_azimuth():
     assert (turn(angle.cos(), angle.sin()).diff() > 0).all()
 
 
-def test_widths_are_the_bins_of_a_cell_and_an_eighth():
+def test_two_entries_cover_all_bins_of_a_cell():
+    """And no others, wherever in the bins the cell lies."""
     polar = PolarGrid.of(GridConfig(resolution=0.1, length_x=4.0, length_y=3.0), RaycastConfig())
-    got = polar.widths(torch.arange(polar.ranges + 1.0).repeat(2, 3, 1))
-    assert got.shape == (2, 3, polar.ranges + 1) and (got == got[0, 0]).all()
-    for k, width in enumerate(got[0, 0].tolist()):
-        bins = BREADTH * polar.azimuths / (2 * np.pi * max(k, 0.5))
-        assert width == max(1, 2 ** np.ceil(np.log2(bins))), k  # doubled until it is as wide
+    width, entry = (value[0, 0].numpy() for value in polar.covered(torch.arange(polar.ranges + 1.0).repeat(2, 3, 1)))
+    k = np.arange(polar.ranges + 1)
+    np.testing.assert_allclose(width, BREADTH * polar.azimuths / (2 * np.pi * np.maximum(k, 0.5)), rtol=1e-6)
+    rows = [2 ** sum(k < rows for rows in polar.widen) for k in k]
+    np.testing.assert_array_equal(entry, rows)
+    for middle in np.linspace(10.0, 11.0, 50):
+        number = np.floor(middle + width / 2) - np.floor(middle - width / 2) + 1
+        assert (entry <= number).all() and (number <= 2 * entry).all()
 
 
 @pytest.mark.parametrize("spacing", [1.0, 1.3])

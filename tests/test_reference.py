@@ -207,14 +207,19 @@ def test_believed_rays():
     assert not ends_well(0.5, 0.0), "its neighbour has no support either"
     assert not ends_well(3.4, 0.0) and not ends_well(9.0, 0.0), "unknown, and left the window over it"
     limits |= dict(near=2.0, clearance=0.5)  # of the ground at x = 2.5
-    assert ends_well(11.0, -2.9) and not ends_well(11.0, -3.1), "-0.45 and -0.55 over x = 3.5"
-    for z, passes in ((-0.9, 0.55), (-1.1, 0.5), (-2.9, 0.5)):
-        slope = reference.believed_slope(origin, np.array([11.0, 0.5, z]), layers, (0, 0), 1.0, **limits)
-        assert origin[2] + 7.5 * slope == pytest.approx(passes), "over x = 3.5"
+    assert ends_well(11.0, -0.4) and not ends_well(11.0, -0.6) and not ends_well(4.5, -0.6)
+
+    def height(x):
+        slope = reference.believed_slope(origin, np.array([x, 0.5, -0.4]), layers, (0, 0), 1.0, **limits)
+        return origin[2] + 7.5 * slope
+
+    assert height(11.0) == pytest.approx(0.8) and height(4.5) == 0.5, "over x = 3.5"
     assert not ends_well(3.4, 2.0), "it does not leave the window"
     layers["validity"][3] = True
     assert ends_well(11.0, -1.9), "it leaves the last half cell, at x = 3.5, at 0.05"
     assert not ends_well(11.0, -4.1), "-1.05 there"
+    layers["elevation"][3] = 1.8
+    assert height(4.5) == 0.5, "below what stands at the border, by the ground near by"
     over = dict(min_time=1.0, gate=2.0)
     layers["elevation"][:] = 1.5  # ground hit of late, believed within 1 m: sampled last at x = 3, 7/9 of the way
     for z, time, above in ((0.2, 0, True), (0.0, 0, False), (0.0, 2, True)):

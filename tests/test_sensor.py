@@ -207,6 +207,8 @@ def test_opengl_cameras_look_along_minus_z(along):
         ((torch.ones(2, 1, 4, 5), torch.eye(3).repeat(2, 1, 1)), {}, r"intrinsics: expected .*\(2, 1, 3, 3\)"),
         ((torch.ones(2, 4, 5), torch.eye(3).repeat(3, 1, 1)), {}, "intrinsics"),
         ((torch.ones(4, 5), torch.eye(3)[None]), {}, "intrinsics"),
+        ((torch.ones(4, 5), torch.zeros(3, 3)), {}, "intrinsics: must have positive, finite focal lengths, got"),
+        ((torch.ones(2, 4, 5), torch.stack([torch.eye(3), -torch.eye(3)])), {}, "intrinsics: must have positive"),
         ((torch.ones(4, 4), torch.eye(3)), dict(frame="gl"), "frame"),
         ((torch.ones(4, 4), torch.eye(3)), dict(scale=0.0), "scale"),
         ((torch.ones(4, 4), torch.eye(3)), dict(scale=torch.nan), "scale"),

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from torchelev.raycast import RaycastConfig
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
-# A ray that leaves the window over unknown ground is believed down to CLEARANCE below the lowest ground NEAR by, and
-# taken for one that passes CLEARANCE above it, so that returns that are too long do not bound below the truth.
-NEAR, CLEARANCE = 0.5, 0.05  # [m]
+# A ray that leaves the window over no known ground is believed if it ends at most CLEARANCE below the lowest ground
+# NEAR by, and taken for one that passes CLEARANCE above it: returns that are too long shall not bound below the truth.
+NEAR, CLEARANCE = 1.0, 0.05  # [m]
 
 
 class Rays(NamedTuple):
@@ -68,20 +68,21 @@ def ends_well(
 ) -> tuple[Bool[Tensor, "B N"], Float[Tensor, "B N"]]:
     """Tell which rays end, or leave the window, in a well supported cell and not below it; and return their slopes.
 
-    Where nothing is known, two kinds are believed, as too long a return lies below the ground: those to a point above
-    the exclusion ramp, and those that leave the window at most CLEARANCE below the lowest ground NEAR by. Relief may
-    have stopped the latter before the border, so they are taken for rays that pass CLEARANCE above that ground.
+    Of the others two kinds are believed, as too long a return lies below the ground: those to a point above the
+    exclusion ramp, and those that leave the window and end at most CLEARANCE below the lowest ground NEAR by, where
+    nothing is known or below what once stood there. Relief may have stopped the latter before the border, so they are
+    taken for rays that pass CLEARANCE above that ground.
     """
     end = ends(state, m, rays, grid)
     ground = realize(lifted(state.elevation, ~well_supported(state, cfg, grid.resolution)))
     floor, known = (layer.flatten(1).gather(1, end.slot) for layer in (lowest, ground))
     near = ground_at_borders(ground, grid).gather(1, end.border)
-    unknown = known >= 0.5 * NOWHERE
-    floor = chosen(unknown, chosen(end.leaves, near - CLEARANCE, NOWHERE), floor)
     z = rays.origin[:, None, 2]
-    well = end.inside & (z + end.reach * rays.slope >= floor)
+    height, deepest = z + end.reach * rays.slope, z + rays.r * rays.slope.clamp(max=0)
+    over = (known < 0.5 * NOWHERE) & (height >= floor)
+    low = end.leaves & ~over & (deepest >= near - CLEARANCE)
     raised = torch.maximum(rays.slope, (near + CLEARANCE - z) / end.reach.clamp(min=1e-6))
-    return well | rays.overhang, torch.where(unknown & well & ~rays.overhang, raised, rays.slope)
+    return end.inside & (over | low) | rays.overhang, torch.where(low & ~rays.overhang, raised, rays.slope)
 
 
 class Ends(NamedTuple):

@@ -30,6 +30,14 @@ def readable(value: Tensor, always: bool = False) -> bool:
     return plain and not torch.compiler.is_compiling() and (always or value.device.type == "cpu")
 
 
+def require_tensor(name: str, value: object) -> Tensor:
+    """Return the value, and refuse what is no tensor."""
+    came = type(value).__name__
+    require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
+    assert isinstance(value, Tensor)
+    return value
+
+
 def check_tensor(
     name: str,
     value: object,
@@ -40,9 +48,7 @@ def check_tensor(
     """Refuse what is no tensor, or lies elsewhere, or has another dtype, which `convert` says how to mend."""
     if isinstance(value, Tensor) and value.dtype in dtypes and _same(value.device, device):
         return value  # before a message is made, which takes as long as all the rest
-    came = type(value).__name__
-    require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
-    assert isinstance(value, Tensor)
+    value = require_tensor(name, value)
     kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
     convert = convert or f"convert it with .to({torch.float32 if torch.float32 in dtypes else dtypes[0]})"
     require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, convert, TypeError)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, readable, require_indices
+from torchelev.checks import FLOATS, readable, require_indices, require_tensor
 from torchelev.errors import require, require_count, require_positive
 from torchelev.windows import AROUND, neighbours
 
@@ -81,10 +81,7 @@ def _summable(cost: Tensor) -> Tensor:
 
 
 def _check_grids(cost: object, goal: object) -> None:
-    for name, value in (("cost", cost), ("goal", goal)):
-        tensor = isinstance(value, Tensor)
-        require(tensor, name, "must be a torch.Tensor", type(value).__name__, "make it one", TypeError)
-    assert isinstance(cost, Tensor) and isinstance(goal, Tensor)
+    cost, goal = require_tensor("cost", cost), require_tensor("goal", goal)
     require(cost.dtype in FLOATS, "cost", "must be floats", cost.dtype, "convert it with .to(torch.float32)", TypeError)
     require(cost.ndim == 3, "cost", "expected (B, H, W)", tuple(cost.shape), "add the dimension of the maps")
     mend = "make it one with goal > 0"

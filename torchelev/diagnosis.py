@@ -82,6 +82,11 @@ class Evidence:
         poses = [sensors[0] if base is None else base for sensors, base in zip(self.poses, self.bases, strict=True)]
         return np.array([T[:3, 3] for T in poses])
 
+    @cached_property
+    def travel(self) -> float:
+        """[m] along the axis of the map along which the robot moved most."""
+        return float(np.ptp(self.places, axis=0).max())
+
 
 def diagnose(cfg: ElevationMapConfig, state: MapState, recent: Recent) -> list[str]:
     """Return what looks wrong, worst first, each once."""
@@ -160,10 +165,11 @@ def wrong_poses(seen: Evidence) -> str | None:
 def wrong_base(seen: Evidence) -> str | None:
     """The sensor moves against the base on which it is mounted. Sensors that take turns come back to their mounts."""
     pairs = [(base, look[0]) for base, look in zip(seen.bases, seen.poses, strict=True) if base is not None]
-    mounts = [np.linalg.solve(base, T)[:3, 3] for base, T in pairs if np.isfinite(base).all() and np.isfinite(T).all()]
+    mounts = np.array([base[:3, :3].T @ (T[:3, 3] - base[:3, 3]) for base, T in pairs]).reshape(-1, 3)
+    mounts = mounts[np.isfinite(mounts).all(1)]
     if len(mounts) < 4:
         return None
-    apart = np.linalg.norm(np.array(mounts)[:, None] - np.array(mounts), axis=2)
+    apart = np.linalg.norm(mounts[:, None] - mounts, axis=2)
     alone = (apart < 0.1).sum(1) == 1
     if apart.max() < 0.5 or alone.mean() < 0.5:
         return None
@@ -234,9 +240,9 @@ def cleared(seen: Evidence) -> str | None:
 
 def wrong_times(seen: Evidence) -> str | None:
     """Times so long that the robot hardly moves, or stands for ages between two scans, or no time at all."""
-    dt, travel = float(np.median(seen.dt)), float(np.ptp(seen.places, axis=0).max(initial=0))
-    if dt == 0 and seen.oldest == 0 and len(seen.places) >= 4 and travel > 0.5:
-        return f"dt: 0 s in all updates, in which the robot moves {travel:.1f} m; give the seconds since the last one"
+    dt = float(np.median(seen.dt))
+    if dt == 0 and seen.oldest == 0 and len(seen.places) >= 4 and seen.travel > 0.5:
+        return f"dt: 0 s in all updates, yet the robot moves {seen.travel:.1f} m; give the seconds since the last one"
     if dt < 5.0:
         return None
     moved = np.linalg.norm(np.diff(seen.places, axis=0), axis=1) / np.maximum(np.diff(seen.numbers), 1)
@@ -248,7 +254,7 @@ def wrong_times(seen: Evidence) -> str | None:
 
 def own_legs(seen: Evidence) -> str | None:
     """Points that move with the robot, where nothing else can be: within its own body's reach, above the ground."""
-    if len(seen.places) < 4 or np.ptp(seen.places, axis=0).max() < 0.5 or seen.explained[1]:
+    if len(seen.places) < 4 or seen.travel < 0.5 or seen.explained[1]:
         return None
     counts = [_beside_base(seen, k) for k in range(len(seen.numbers))]
     if np.mean(np.array(counts) >= 5) < 0.75:

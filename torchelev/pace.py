@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import math
 import statistics
 import time
 import warnings
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
 import torch
@@ -20,27 +22,34 @@ _warned = False
 Update = TypeVar("Update", bound=Callable[..., None])
 
 
+@dataclass
+class Recent:
+    """Updates of one kind."""
+
+    times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))  # [s]
+    best: float = math.inf  # [s] the lowest median so far
+    slow: int = 0  # how many of the last updates in a row had a median many times that
+
+
 class Pace:
     """How long updates take, apart for each order of the number of points and each number of threads."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.clock = clock
-        self.recent: dict[tuple[int, int], deque[float]] = {}
-        self.best: dict[tuple[int, int], float] = {}
-        self.slow: dict[tuple[int, int], int] = {}
+        self.recent: dict[tuple[int, int], Recent] = {}
 
     def note(self, seconds: float, num_points: int) -> None:
         """Take in one update; warn, once in a process, if updates have become many times slower."""
         kind = num_points.bit_length(), torch.get_num_threads()
-        recent = self.recent.setdefault(kind, deque(maxlen=RECENT))
-        recent.append(seconds)
-        if len(recent) < RECENT:
+        recent = self.recent.setdefault(kind, Recent())
+        recent.times.append(seconds)
+        if len(recent.times) < RECENT:
             return
-        median = statistics.median(recent)
-        best = self.best[kind] = min(median, self.best.get(kind, median))
-        self.slow[kind] = self.slow.get(kind, 0) + 1 if median > SLOWER * best else 0
-        if self.slow[kind] >= IN_A_ROW:
-            _warn(median, best)
+        median = statistics.median(recent.times)
+        recent.best = min(median, recent.best)
+        recent.slow = recent.slow + 1 if median > SLOWER * recent.best else 0
+        if recent.slow >= IN_A_ROW:
+            _warn(median, recent.best)
 
 
 def _warn(median: float, best: float) -> None:

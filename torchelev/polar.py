@@ -13,7 +13,7 @@ from torchelev.grid import GridConfig
 if TYPE_CHECKING:
     from torchelev.raycast import RaycastConfig
 
-BREADTH = 1.125  # [cells] a ray so near passes over a cell: with less, rays of a still sensor would miss some for ever
+BREADTH = math.sqrt(2)  # [cells] any ray over a cell passes within half its diagonal beside the cell's centre
 
 
 class PolarGrid(NamedTuple):
@@ -21,7 +21,8 @@ class PolarGrid(NamedTuple):
 
     ranges: int
     azimuths: int
-    widen: tuple[int, ...]  # up to which range BREADTH cells are wider than 1, 2, 4, ... azimuth bins
+    bins: float  # how many azimuth bins BREADTH cells cover at a range of one cell
+    widen: tuple[int, ...]  # below which range an entry is the minimum of 2, 4, 8, ... azimuth bins
 
     @classmethod
     def of(cls, grid: GridConfig, cfg: RaycastConfig) -> PolarGrid:
@@ -29,18 +30,24 @@ class PolarGrid(NamedTuple):
         reach = math.ceil((cfg.max_range or 0.55 * math.hypot(grid.length_x, grid.length_y)) / grid.resolution)
         # 8 % to spare, of which the approximated azimuth below takes 3: it widens some bins.
         azimuths = 2 * math.ceil(max(16.0, 1.08 * 2 * math.pi * reach) / 2)
-        width = BREADTH * azimuths / (2 * math.pi)  # in azimuth bins, at a range of one cell
-        levels = math.ceil(math.log2(2 * width))  # the sensor's own cell has a range of half a cell
-        return cls(reach, azimuths, tuple(math.ceil(width / 2**k) for k in range(levels)))
+        bins = BREADTH * azimuths / (2 * math.pi)
+        levels = math.ceil(math.log2(2 * bins + 1)) - 1  # the sensor's own cell has a range of half a cell
+        # Two entries of n bins cover all windows of n to 2 n bins, and a cell of x bins lies in at most floor(x) + 2.
+        return cls(reach, azimuths, bins, tuple(math.ceil(bins / (2 ** (k + 1) - 1)) for k in range(levels)))
 
-    def widths(self, k: Tensor) -> Tensor:
-        """Return how many azimuth bins a cell at range k is taken to cover, a power of two."""
-        # Compiled it is computed for each cell, else for each range and looked up: each is the faster there.
+    def covered(self, k: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how many azimuth bins a cell at range k covers, and of how many an entry is the minimum there."""
+        # Compiled they are computed for each cell, else for each range and looked up: each is the faster there.
         row = k if torch.compiler.is_compiling() else torch.arange(self.ranges + 1, device=k.device, dtype=k.dtype)
-        width = torch.ones_like(row)
+        entry = torch.ones_like(row)
         for level, rows in enumerate(self.widen):
-            width = torch.add(width, row < rows, alpha=2.0**level)
-        return width if row is k else width.index_select(0, k.to(torch.int32).flatten()).view_as(k)
+            entry = torch.add(entry, row < rows, alpha=2.0**level)
+        values = self.bins / row.clamp(min=0.5), entry
+        if row is k:
+            return values
+        index = k.to(torch.int32).flatten()
+        width, entry = (value.index_select(0, index).view_as(k) for value in values)
+        return width, entry
 
 
 def turn(x: Tensor, y: Tensor) -> Tensor:

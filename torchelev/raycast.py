@@ -53,13 +53,13 @@ class RaycastConfig:
 def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
     """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least a cell farther.
 
-    At short range, where a cell spans several azimuth bins, an entry is the minimum over half of them.
+    At short range, where a cell covers several azimuth bins, an entry is the minimum of about half as many.
     """
     # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
     index = flat(chosen(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
-    return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen[1:]), polar.ranges, NO_RAY)
+    return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
 
 
 class RayOverCell(NamedTuple):
@@ -79,11 +79,13 @@ def look_up(
     x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
     rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
     k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
-    width = polar.widths(k)
-    a = torch.floor(turn(x, y) * polar.azimuths - 0.5 * (width - 1))
+    # All the bins that the cell covers: two entries, the first and the last of them.
+    width, entry = polar.covered(k)
+    middle = turn(x, y) * polar.azimuths
+    a = torch.floor(middle - 0.5 * width)
+    further = (torch.floor(middle + 0.5 * width) - a + 1 - entry).clamp(min=0)
     a = chosen(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
-    # Its two halves, as widening the whole table once more would take longer than to read twice.
-    b = a + torch.floor(0.5 * width)
+    b = a + further
     b = chosen(b < polar.azimuths, b, b - polar.azimuths)
     slopes = table.flatten(1)
     lowest = torch.minimum(*(read(slopes, flat(k, place, polar.azimuths)) for place in (a, b)))

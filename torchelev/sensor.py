@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.checks import FARTHEST
+from torchelev.checks import FARTHEST, readable, require_tensor
 from torchelev.errors import require, require_count, require_positive
 from torchelev.grid import GridConfig
 from torchelev.state import Measurement, count
@@ -230,10 +230,8 @@ def depth_to_points(
 
 def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
     """Refuse what are no tensors, and depth images and intrinsics whose shapes do not fit each other."""
-    for name, value in (("depth", depth), ("intrinsics", intrinsics)):
-        hint = "make it one with torch.from_numpy or torch.tensor"
-        require(isinstance(value, Tensor), name, "must be a torch.Tensor", type(value).__name__, hint, TypeError)
-    shape = tuple(depth.shape)
+    shape = tuple(require_tensor("depth", depth).shape)
+    require_tensor("intrinsics", intrinsics)
     require(depth.ndim >= 2, "depth", "expected (..., h, w)", shape, "add the image dimensions")
     channel = depth.ndim > 2 and shape[-1] == 1
     require(not channel, "depth", "expected (..., h, w)", shape, "drop the channel dimension: depth.squeeze(-1)")
@@ -245,6 +243,11 @@ def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
     rule = f"expected (3, 3) or {(*images, 3, 3)} for depth of {shape}"
     hint = "give one matrix for all images, or one for each; drop a channel dimension of the depth"
     require(fits, "intrinsics", rule, tuple(intrinsics.shape), hint)
+    if readable(intrinsics):
+        focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
+        wrong = focal[~((focal > 0) & focal.isfinite()).all(-1)]
+        rule, hint = "must have positive, finite focal lengths", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+        require(not len(wrong), "intrinsics", rule, wrong[:1].tolist(), hint)
 
 
 def _in_metres(depth: Tensor, scale: float | None) -> Tensor:
@@ -276,7 +279,7 @@ def voxel_filter(points: Float[Tensor, "B N 3"], size: float, max_points: int | 
         TypeError: for points that are not floats.
     """
     require(size > 0, "size", "must be positive", size, "give the voxel's edge in metres")
-    fits = points.ndim == 3 and points.shape[-1] == 3
+    fits = require_tensor("points", points).ndim == 3 and points.shape[-1] == 3
     require(fits, "points", "expected (B, N, 3)", tuple(points.shape), "add the first dimension: points[None]")
     floats, hint = points.dtype.is_floating_point, "convert them with .to(torch.float32)"
     require(floats, "points", "must be floats", points.dtype, hint, TypeError)

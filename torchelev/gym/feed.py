@@ -90,10 +90,8 @@ class MapFeed:
     def read(self, T_map_base: Tensor) -> Tensor:
         """Return what the reader gives as a new float32 tensor (B, ...), 0 where it is not finite."""
         values = self.reader(self.emap, T_map_base)
-        if isinstance(values, tuple) and all(
-            isinstance(value, Tensor) for value in values
-        ):
-            # values and validity, as height scans give
+        if isinstance(values, tuple) and all(isinstance(value, Tensor) for value in values):
+            # Values and validity, as height scans give.
             values = torch.stack([value.float() for value in values], 1)
         B = self.emap.num_envs
         fits = isinstance(values, Tensor) and values.ndim > 1 and values.shape[0] == B
