@@ -18,8 +18,8 @@ setup: $(BIN)/.ready  ## make the environment .venv
 demo: setup  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
-test: setup  ## run all tests
-	$(BIN)/python -m pytest
+test: setup  ## run all tests, on all cores
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 lint: setup  ## check style
 	$(BIN)/ruff check .
