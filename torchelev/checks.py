@@ -32,8 +32,8 @@ def readable(value: Tensor, always: bool = False) -> bool:
 
 def require_tensor(name: str, value: object) -> Tensor:
     """Return the value, and refuse what is no tensor."""
-    came = type(value).__name__
-    require(isinstance(value, Tensor), name, "must be a torch.Tensor", came, "make it one with torch.tensor", TypeError)
+    actual, hint = type(value).__name__, "make it one with torch.tensor"
+    require(isinstance(value, Tensor), name, "must be a torch.Tensor", actual, hint, TypeError)
     assert isinstance(value, Tensor)
     return value
 
@@ -45,15 +45,15 @@ def check_tensor(
     dtypes: tuple[torch.dtype, ...],
     convert: str | None = None,
 ) -> Tensor:
-    """Refuse what is no tensor, or lies elsewhere, or has another dtype, which `convert` says how to mend."""
+    """Refuse what is no tensor, lies elsewhere, or has another dtype, for which `convert` is the hint."""
     if isinstance(value, Tensor) and value.dtype in dtypes and _same(value.device, device):
         return value  # before a message is made, which takes as long as all the rest
     value = require_tensor(name, value)
     kinds = ", ".join(str(d).removeprefix("torch.") for d in dtypes)
     convert = convert or f"convert it with .to({torch.float32 if torch.float32 in dtypes else dtypes[0]})"
     require(value.dtype in dtypes, name, f"must be {kinds}", value.dtype, convert, TypeError)
-    came = f"{tuple(value.shape)} on {value.device}"
-    require(_same(value.device, device), name, f"must be on {device}", came, "move it with .to(emap.device)")
+    actual = f"{tuple(value.shape)} on {value.device}"
+    require(_same(value.device, device), name, f"must be on {device}", actual, "move it with .to(emap.device)")
     return value
 
 
@@ -74,10 +74,10 @@ def check_points(points: object, num_envs: int, device: torch.device) -> Tensor:
     value = check_tensor("points", points, device, FLOATS)
     fits = value.ndim in (3, 4) and value.shape[0] == num_envs and value.shape[-1] == 3
     rule = f"expected (B, N, 3) or (B, S, N, 3) with B = {num_envs} on {device}"
-    mend = "give one cloud per environment, padded with NaN"
+    hint = "give one cloud per environment, padded with NaN"
     if value.ndim in (3, 4) and value.shape[-1] != 3:
-        mend = "transpose the last two dimensions" if value.shape[-2] == 3 else "keep x, y and z alone: points[..., :3]"
-    require(fits, "points", rule, f"{tuple(value.shape)} on {value.device}", mend)
+        hint = "transpose the last two dimensions" if value.shape[-2] == 3 else "keep x, y and z alone: points[..., :3]"
+    require(fits, "points", rule, f"{tuple(value.shape)} on {value.device}", hint)
     value = value if value.ndim == 4 else value[:, None]
     require(value.shape[1] > 0, "points", "must have at least one sensor", tuple(value.shape), "give S >= 1")
     return value
@@ -99,23 +99,23 @@ def _check_rigid(name: str, pose: Tensor) -> None:
     matrix = pose.detach().cpu().double().numpy()
     matrix = matrix if pose.ndim > 2 else matrix[None]
 
-    def refuse(bad: np.ndarray, rule: str, came: Callable[[], str], mend: str) -> None:
+    def refuse(bad: np.ndarray, rule: str, actual: Callable[[], str], hint: str) -> None:
         if bad.any():
-            require(False, name, rule, came() + _environments(bad), mend)
+            require(False, name, rule, actual() + _environments(bad), hint)
 
-    mend = "give any rigid pose where there is none, with points of NaN if it is to take none in"
-    refuse(~np.isfinite(matrix), "must be finite", lambda: "NaN or inf", mend)
-    mend = "use torchelev.frames.transform(position, quat_wxyz)"
+    hint = "give any rigid pose where there is none, with points of NaN if it is to take none in"
+    refuse(~np.isfinite(matrix), "must be finite", lambda: "NaN or inf", hint)
+    hint = "use torchelev.frames.transform(position, quat_wxyz)"
     rotation, distance, last = matrix[..., :3, :3], np.abs(matrix[..., :3, 3]), matrix[..., 3, :]
     error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3))
-    refuse(error >= 1e-3, "must be rigid (R R^T = 1)", lambda: f"an error of {error.max():.3g}", mend)
-    refuse(np.linalg.det(rotation) <= 0, "must not mirror", lambda: "determinant -1", mend)
+    refuse(error >= 1e-3, "must be rigid (R R^T = 1)", lambda: f"an error of {error.max():.3g}", hint)
+    refuse(np.linalg.det(rotation) <= 0, "must not mirror", lambda: "determinant -1", hint)
     other = last != (0, 0, 0, 1)
     if other.any() and (matrix[..., 3] == (0, 0, 0, 1)).all():
-        mend = "transpose it: the position is the last column"
-    refuse(other, "must have the last row 0 0 0 1", lambda: " ".join(f"{x:g}" for x in last[other.any(-1)][0]), mend)
-    mend = "check its units and source"
-    refuse(distance > FARTHEST, f"must lie within {FARTHEST:g} m", lambda: f"{distance.max():.3g} m", mend)
+        hint = "transpose it: the position is the last column"
+    refuse(other, "must have the last row 0 0 0 1", lambda: " ".join(f"{x:g}" for x in last[other.any(-1)][0]), hint)
+    hint = "check its units and source"
+    refuse(distance > FARTHEST, f"must lie within {FARTHEST:g} m", lambda: f"{distance.max():.3g} m", hint)
 
 
 def _environments(bad: np.ndarray) -> str:
@@ -127,8 +127,8 @@ def _environments(bad: np.ndarray) -> str:
 
 def require_full_precision(dtype: torch.dtype) -> None:
     """Refuse to fuse into a map of half precision, which holds neither a cell's number nor a millimetre's variance."""
-    mend = "call .float() on it; points may be of half precision"
-    require(dtype in FULL_PRECISION, "map", "must be float32 or float64 to take in points", dtype, mend, TypeError)
+    hint = "call .float() on it; points may be of half precision"
+    require(dtype in FULL_PRECISION, "map", "must be float32 or float64 to take in points", dtype, hint, TypeError)
 
 
 def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype, always: bool) -> Tensor:
@@ -142,8 +142,9 @@ def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype
         if readable(value, always):
             given = np.atleast_1d(value.detach().double().cpu().numpy())
             bad = ~((given >= 0) & (given < math.inf))
-            came = f"{given[bad][0]:g}{_environments(bad)}" if bad.any() else ""
-            require(not bad.any(), "dt", "must be finite and not negative", came, "give seconds since the last update")
+            hint = "give seconds since the last update"
+            actual = f"{given[bad][0]:g}{_environments(bad)}" if bad.any() else ""
+            require(not bad.any(), "dt", "must be finite and not negative", actual, hint)
         return value.to(dtype).expand(num_envs)
     number = isinstance(dt, (float, Real)) and not isinstance(dt, bool)  # a float is told ten times as fast
     require(number, "dt", "must be a number or a tensor", type(dt).__name__, "give seconds", TypeError)
@@ -154,12 +155,12 @@ def check_dt(dt: object, num_envs: int, device: torch.device, dtype: torch.dtype
 
 
 def require_indices(
-    name: str, value: Tensor, count: int, mend: str = "leave out the others", always: bool = False
+    name: str, value: Tensor, count: int, hint: str = "leave out the others", always: bool = False
 ) -> None:
     """Refuse numbers outside of [0, count), where they may be read."""
     if readable(value, always) and value.numel():
         low, high = int(value.min()), int(value.max())
-        require(low >= 0 and high < count, name, f"must lie in [0, {count})", f"{low}..{high}", mend)
+        require(low >= 0 and high < count, name, f"must lie in [0, {count})", f"{low}..{high}", hint)
 
 
 def check_env_ids(env_ids: object, num_envs: int, device: torch.device, always: bool) -> Tensor:

@@ -45,15 +45,15 @@ class ElevationMapConfig:
         if isinstance(self.filters, list):
             object.__setattr__(self, "filters", tuple(self.filters))
         chain = isinstance(self.filters, tuple) and all(isinstance(step, FilterConfig) for step in self.filters)
-        mend = "give (FilterConfig(layer=..., filter=...), ...)"
-        require(chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), mend, TypeError)
-        for name, hint in typing.get_type_hints(type(self)).items():
+        hint = "give (FilterConfig(layer=..., filter=...), ...)"
+        require(chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), hint, TypeError)
+        for name, annotation in typing.get_type_hints(type(self)).items():
             if name == "filters":
                 continue
-            value, kinds = getattr(self, name), typing.get_args(hint) or (hint,)
+            value, kinds = getattr(self, name), typing.get_args(annotation) or (annotation,)
             rule = f"must be {' or '.join('None' if kind is type(None) else f'a {kind.__name__}' for kind in kinds)}"
-            mend = "give an object, or build the whole with ElevationMapConfig.from_dict"
-            require(isinstance(value, hint), f"cfg.{name}", rule, repr(value), mend, TypeError)
+            hint = "give an object, or build the whole with ElevationMapConfig.from_dict"
+            require(isinstance(value, annotation), f"cfg.{name}", rule, repr(value), hint, TypeError)
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain dicts, as written to YAML and to `state_dict`."""

@@ -57,8 +57,8 @@ def cost_to_go(
     look = readable(cost)
     limit = rounds or (cost.shape[1] * cost.shape[2] + 1 if look else ROUNDS)
     if look:
-        mend = "give 1 for easy ground and inf for impassable"
-        require(bool((cost > 0).all()), "cost", "must be positive", "NaN, or 0 and less", mend)
+        hint = "give 1 for easy ground and inf for impassable"
+        require(bool((cost > 0).all()), "cost", "must be positive", "NaN, or 0 and less", hint)
     with torch.no_grad():
         lines = _summable(cost.detach()).transpose(0, 1).contiguous()  # (H, B, W)
         ahead, across = (_steps(c, resolution) for c in (lines, lines.transpose(0, 2).contiguous()))
@@ -84,8 +84,8 @@ def _check_grids(cost: object, goal: object) -> None:
     cost, goal = require_tensor("cost", cost), require_tensor("goal", goal)
     require(cost.dtype in FLOATS, "cost", "must be floats", cost.dtype, "convert it with .to(torch.float32)", TypeError)
     require(cost.ndim == 3, "cost", "expected (B, H, W)", tuple(cost.shape), "add the dimension of the maps")
-    mend = "make it one with goal > 0"
-    require(goal.dtype == torch.bool, "goal", "must be bool", goal.dtype, mend, TypeError)
+    hint = "make it one with goal > 0"
+    require(goal.dtype == torch.bool, "goal", "must be bool", goal.dtype, hint, TypeError)
     require(goal.shape == cost.shape, "goal", f"expected {tuple(cost.shape)}", tuple(goal.shape), "mark cells of cost")
 
 
@@ -148,8 +148,8 @@ def descend(
     B, H, W = cost.shape
     fits = tuple(value.shape) == (B, H, W)
     require(fits, "value", f"expected {(B, H, W)}", tuple(value.shape), "give what cost_to_go returns")
-    mend = "give one cell, i and j, for each map"
-    require(tuple(start.shape) == (B, 2), "start", f"expected {(B, 2)}", tuple(start.shape), mend)
+    hint = "give one cell, i and j, for each map"
+    require(tuple(start.shape) == (B, 2), "start", f"expected {(B, 2)}", tuple(start.shape), hint)
     for k, size in enumerate((H, W)):
         require_indices("start", start[:, k], size, "give cells of the map")
     cost = _summable(cost)

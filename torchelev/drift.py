@@ -30,8 +30,8 @@ class DriftConfig:
         require(0 < self.gain <= 1, "drift.gain", "must lie in (0, 1]", self.gain, "the paper's value is 1")
         gate = self.min_traversability
         share = gate is None or (isinstance(gate, int | float) and 0 <= gate <= 1)
-        mend = "leave it out for the head's own"
-        require(share, "drift.min_traversability", "must lie in [0, 1] or be None", repr(gate), mend)
+        hint = "leave it out for the head's own"
+        require(share, "drift.min_traversability", "must lie in [0, 1] or be None", repr(gate), hint)
         require(self.min_points >= 1, "drift.min_points", "must be at least 1", self.min_points, "give 50")
 
 

@@ -49,7 +49,7 @@ class ElevationMap(nn.Module):
             None: all on a GPU; on a CPU as many as fit into its caches, which is faster too.
         head: a trained head to take, itself and not a copy, in place of the weights that the config names.
 
-    Raises ValueError or TypeError for bad arguments, naming the argument, the rule, what came and the mend.
+    Raises ValueError or TypeError for bad arguments, naming the argument, the rule, the actual value and a hint.
     """
 
     corner: Tensor
@@ -131,8 +131,8 @@ class ElevationMap(nn.Module):
         apart = ("filters", "traversability.weights")
         fields = differing_fields(self.cfg.to_dict(), extra["config"]) if extra else []
         fields = [name for name in fields if not name.startswith(apart)]
-        mend = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
-        require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", mend)
+        hint = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
+        require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", hint)
         self._filtered.clear()
         self._recent.forget()
         super()._load_from_state_dict(state_dict, prefix, *args)
@@ -283,8 +283,8 @@ class ElevationMap(nn.Module):
         without its rays. Such a map is sound; go on with the next scan. Raises RuntimeError before torch 2.10, whose
         compiler cannot.
         """
-        new, mend = torch.__version__ >= "2.10", "upgrade it, or leave updates uncompiled"
-        require(new, "torch", "must be 2.10 or later to compile updates", torch.__version__, mend, RuntimeError)
+        new, hint = torch.__version__ >= "2.10", "upgrade it, or leave updates uncompiled"
+        require(new, "torch", "must be 2.10 or later to compile updates", torch.__version__, hint, RuntimeError)
         self._compiled = True
 
     def warm_up(
@@ -391,8 +391,8 @@ class ElevationMap(nn.Module):
     def _read(self, name: str, state: MapState | None) -> Layer:
         if name in self.filters:
             return self._filter(name, state)
-        mend = f"there are {', '.join(self.layers)}"
-        require(name in LAYERS, "layer", "must be a layer's name", repr(name), mend, KeyError)
+        hint = f"there are {', '.join(self.layers)}"
+        require(name in LAYERS, "layer", "must be a layer's name", repr(name), hint, KeyError)
         return LAYERS[name](self.state if state is None else state)
 
     def _filter(self, name: str, state: MapState | None) -> Layer:

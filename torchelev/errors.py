@@ -1,4 +1,4 @@
-"""One wording for every refusal: the argument, the rule, what came, the mend."""
+"""One wording for every error: the argument, the rule, the actual value, a hint."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import math
 from numbers import Integral, Real
 
 
-def message(argument: str, rule: str, came: object, mend: str) -> str:
+def message(argument: str, rule: str, actual: object, hint: str) -> str:
     """Compose the text of an error."""
-    return f"{argument}: {rule}, got {came}; {mend}"
+    return f"{argument}: {rule}, got {actual}; {hint}"
 
 
 def require(
-    holds: bool, argument: str, rule: str, came: object, mend: str, error: type[Exception] = ValueError
+    holds: bool, argument: str, rule: str, actual: object, hint: str, error: type[Exception] = ValueError
 ) -> None:
     """Raise `error` with a full message unless the rule holds."""
     if not holds:
-        raise error(message(argument, rule, came, mend))
+        raise error(message(argument, rule, actual, hint))
 
 
-def require_count(name: str, value: object, mend: str, least: int = 1) -> int:
+def require_count(name: str, value: object, hint: str, least: int = 1) -> int:
     """Return a whole number, Python's or NumPy's, of at least so many as an int; refuse all else."""
     good = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
     rule = f"must be an int of at least {least}" if least > 1 else "must be a positive int"
-    require(good, name, rule, repr(value), mend)
+    require(good, name, rule, repr(value), hint)
     return int(value)  # type: ignore[call-overload]
 
 
@@ -41,6 +41,6 @@ def whole_cells(name: str, length: float, resolution: float) -> int:
     require_positive(resolution=resolution, **{name: length})
     cells = length / resolution
     whole = math.isfinite(cells) and round(cells) >= 1 and abs(cells - round(cells)) < 1e-6 * cells
-    mend = f"try {max(1, round(cells)) * resolution:.6g}" if math.isfinite(cells) else "give metres"
-    require(whole, name, f"must be a whole number of times {resolution:g} m", f"{cells:.6g} times", mend)
+    hint = f"try {max(1, round(cells)) * resolution:.6g}" if math.isfinite(cells) else "give metres"
+    require(whole, name, f"must be a whole number of times {resolution:g} m", f"{cells:.6g} times", hint)
     return round(cells)

@@ -151,8 +151,8 @@ def _ground(
 ) -> _Ground:
     """Check the inputs and read the cells below the polygons."""
     rated = cfg.layer != "traversability" or emap.cfg.traversability is not None
-    mend = "give ElevationMapConfig a TraversabilityConfig, or FootprintConfig another layer"
-    require(rated, "traversability", "must not be switched off", "None", mend)
+    hint = "give ElevationMapConfig a TraversabilityConfig, or FootprintConfig another layer"
+    require(rated, "traversability", "must not be switched off", "None", hint)
     values, known = emap._read(cfg.layer, state)
     uv, fits = _locate(emap, polygons, cfg, (emap.state if state is None else state).corner)
     cells = polygon_cells(torch.where(fits[..., None, None], uv, 0.0), cfg.cells(emap.cfg.grid) + 1)
@@ -169,10 +169,10 @@ def _locate(emap: ElevationMap, polygons: Tensor, cfg: FootprintConfig, corner: 
     """Return the vertices in cells from the window's corner, and which polygons are finite and small enough."""
     value = check_tensor("polygons", polygons, emap.device, FLOATS)
     shaped = value.ndim == 4 and value.shape[0] == emap.num_envs and value.shape[3] == 2
-    mend = "give polygons for each environment, x and y alone"
-    require(shaped, "polygons", f"expected ({emap.num_envs}, P, V, 2)", tuple(value.shape), mend)
-    mend = "give the corners in order, or repeat the last one"
-    require(value.shape[2] >= 3, "polygons", "must have at least 3 vertices", value.shape[2], mend)
+    hint = "give polygons for each environment, x and y alone"
+    require(shaped, "polygons", f"expected ({emap.num_envs}, P, V, 2)", tuple(value.shape), hint)
+    hint = "give the corners in order, or repeat the last one"
+    require(value.shape[2] >= 3, "polygons", "must have at least 3 vertices", value.shape[2], hint)
     grid = emap.cfg.grid
     most = cfg.cells(grid) + ROUNDING
     uv = value.detach().double() / grid.resolution - corner[:, None, None]
@@ -188,8 +188,8 @@ def _refuse(uv: Tensor, extent: Tensor, most: float, cfg: FootprintConfig, grid:
     require(finite, "polygons", "must be finite", "NaN or inf", "pad by repeating the last vertex, not with NaN")
     largest = float(extent.max())
     rule = f"must extend no farther than max_extent = {cfg.max_extent:g} m along x and y"
-    mend = "enlarge max_extent of FootprintConfig, or divide the polygon"
-    require(largest <= most, "polygons", rule, f"{largest * grid.resolution:.6g} m", mend)
+    hint = "enlarge max_extent of FootprintConfig, or divide the polygon"
+    require(largest <= most, "polygons", rule, f"{largest * grid.resolution:.6g} m", hint)
 
 
 def _gather(values: Tensor, known: Tensor, cells: PolygonCells, grid: GridConfig) -> tuple[Tensor, Tensor]:

@@ -26,9 +26,9 @@ def transform(
     Raises ValueError for shapes that do not fit and, for CPU tensors, for a quaternion that is not normalised.
     """
     position, quat_wxyz = _floats("position", position), _floats("quat_wxyz", quat_wxyz)
-    came = f"{tuple(position.shape)} and {tuple(quat_wxyz.shape)}"
+    actual = f"{tuple(position.shape)} and {tuple(quat_wxyz.shape)}"
     fits = position.shape[-1:] == (3,) and quat_wxyz.shape == (*position.shape[:-1], 4)
-    require(fits, "position, quat_wxyz", "must be (..., 3) and (..., 4)", came, "give one quaternion per position")
+    require(fits, "position, quat_wxyz", "must be (..., 3) and (..., 4)", actual, "give one quaternion per position")
     if type(quat_wxyz) is Tensor and quat_wxyz.device.type == "cpu" and not torch.compiler.is_compiling():
         norm = torch.linalg.vector_norm(quat_wxyz.double(), dim=-1)
         worst = float(norm.flatten()[(norm - 1).abs().argmax()]) if norm.numel() else 1.0

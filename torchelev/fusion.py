@@ -38,21 +38,21 @@ class FusionConfig:
     edges: EdgeConfig | None = EdgeConfig()
 
     def __post_init__(self) -> None:
-        fits, mend = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"
-        require(fits, "fusion.edges", "must be an EdgeConfig or None", repr(self.edges), mend, TypeError)
+        fits, hint = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"
+        require(fits, "fusion.edges", "must be an EdgeConfig or None", repr(self.edges), hint, TypeError)
         for name in ("gate", "max_gate_std", "scan_variance_floor", "max_variance"):
             require(
                 getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
             )
         for name in ("relief", "max_support"):
-            good, mend = 0 <= getattr(self, name) < math.inf, "see its default"
-            require(good, f"fusion.{name}", "must be finite and not negative", getattr(self, name), mend)
+            good, hint = 0 <= getattr(self, name) < math.inf, "see its default"
+            require(good, f"fusion.{name}", "must be finite and not negative", getattr(self, name), hint)
         for name in ("min_above", "max_above_per_scan"):
             number = require_count(f"fusion.{name}", getattr(self, name), "see its default")
             require(number <= 255, f"fusion.{name}", "must be at most 255 points", number, "see its default")
         for name in ("scan_variance_floor", "max_variance"):
-            finite, mend = math.isfinite(getattr(self, name)), "give a large number such as 1e6"
-            require(finite, f"fusion.{name}", "must be finite", getattr(self, name), mend)
+            finite, hint = math.isfinite(getattr(self, name)), "give a large number such as 1e6"
+            require(finite, f"fusion.{name}", "must be finite", getattr(self, name), hint)
 
 
 class Scan(NamedTuple):

@@ -132,8 +132,8 @@ def from_grid_map(grid_map: GridMap) -> MapLayers:
     """
     info = grid_map.info
     same = len(grid_map.layers) == len(grid_map.data)
-    came = f"{len(grid_map.layers)} layers and {len(grid_map.data)} data"
-    require(same, "grid_map", "must have data for each layer", came, "check its publisher")
+    actual = f"{len(grid_map.layers)} layers and {len(grid_map.data)} data"
+    require(same, "grid_map", "must have data for each layer", actual, "check its publisher")
     start = int(grid_map.outer_start_index), int(grid_map.inner_start_index)
     layers = {}
     for name, array in zip(grid_map.layers, grid_map.data, strict=True):
@@ -159,8 +159,8 @@ def _matrix(name: str, array: Float32MultiArray) -> NDArray[np.float32]:
     """Return a layer's matrix as it lies in the circular buffer."""
     labels = [dim.label for dim in array.layout.dim]
     known = labels in ([COLUMN, ROW], [ROW, COLUMN])
-    mend = "label them as grid_map_ros does"
-    require(known, f"grid_map, {name}", f"dimensions must be {COLUMN}, {ROW}", ", ".join(labels) or "none", mend)
+    hint = "label them as grid_map_ros does"
+    require(known, f"grid_map, {name}", f"dimensions must be {COLUMN}, {ROW}", ", ".join(labels) or "none", hint)
     sizes = tuple(int(dim.size) for dim in array.layout.dim)
     data = np.asarray(array.data, dtype=np.float32)[array.layout.data_offset :]
     fits = data.size == sizes[0] * sizes[1] > 0

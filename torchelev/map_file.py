@@ -84,17 +84,17 @@ def as_array(value: Tensor) -> NDArray:
     return (value.float() if value.dtype == torch.bfloat16 else value).numpy()
 
 
-def read_npz(path: str | Path, mend: str) -> dict[str, NDArray]:
+def read_npz(path: str | Path, hint: str) -> dict[str, NDArray]:
     """Read every array of an `.npz`. Raises ValueError for another file and for one that is damaged."""
     with Path(path).open("rb") as file:
-        require(zipfile.is_zipfile(file), str(path), "must be an .npz file", "another, or one cut short", mend)
+        require(zipfile.is_zipfile(file), str(path), "must be an .npz file", "another, or one cut short", hint)
         file.seek(0)
         try:
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
         except Exception as error:  # what zipfile, zlib and numpy raise depends on which byte is damaged
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise ValueError(f"{path}: damaged, or no .npz file ({reason}); {mend}") from error
+            raise ValueError(f"{path}: damaged, or no .npz file ({reason}); {hint}") from error
 
 
 def _tensors(state: MapState) -> dict[str, Tensor]:
@@ -110,8 +110,8 @@ def _header(path: str | Path, arrays: dict[str, NDArray]) -> dict[str, Any]:
     except (KeyError, json.JSONDecodeError):
         header = None
     ours = isinstance(header, dict) and header.get("format") == FORMAT and "config" in header
-    mend = "write it with save_map; what save_npz wrote is read by load_npz"
-    require(ours, str(path), "must be a whole map", f"an .npz with {', '.join(arrays) or 'nothing'}", mend)
+    hint = "write it with save_map; what save_npz wrote is read by load_npz"
+    require(ours, str(path), "must be a whole map", f"an .npz with {', '.join(arrays) or 'nothing'}", hint)
     assert isinstance(header, dict)
     version = header.get("version")
     known = isinstance(version, int) and 1 <= version <= VERSION

@@ -95,8 +95,8 @@ def _refuse(given: Tensor, step: Tensor, samples: int) -> None:
     require(finite, "poses", "must be finite", "NaN or inf", "pad by repeating the last pose, not with NaN")
     longest = float(step.max()) if step.numel() else 0.0
     rule = "must not take the footprint farther than one cell from sample to sample"
-    mend = f"raise samples to {math.ceil(samples * longest)}, or give poses in between"
-    require(longest <= 1 + ROUNDING, "poses", rule, f"{longest:.3g} cells", mend)
+    hint = f"raise samples to {math.ceil(samples * longest)}, or give poses in between"
+    require(longest <= 1 + ROUNDING, "poses", rule, f"{longest:.3g} cells", hint)
 
 
 def _shorter_way(turn: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ def _cell(emap: ElevationMap, name: str, xy: object, state: MapState) -> tuple[T
     low, (i, j) = (cell >= 0).all(-1), cell.unbind(-1)
     inside = low & (i < grid.height) & (j < grid.width)
     if readable(value, emap.check_values):
-        came = [[round(x, 3) for x in place] for place in value.detach()[~inside].tolist()[:3]]
-        mend = f"windows are {grid.length_x:g} x {grid.length_y:g} m around emap.center; give a place in between"
-        require(bool(inside.all()), name, "must lie in the window", came, mend)
+        actual = [[round(x, 3) for x in place] for place in value.detach()[~inside].tolist()[:3]]
+        hint = f"windows are {grid.length_x:g} x {grid.length_y:g} m around emap.center; give a place in between"
+        require(bool(inside.all()), name, "must lie in the window", actual, hint)
     return torch.where(inside[:, None], cell, 0.0).to(torch.int64), inside

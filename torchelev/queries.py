@@ -56,8 +56,8 @@ def height_profile(
     """
     both = (("start", start), ("end", end))
     start, end = (check_xy(name, xy, emap.num_envs, emap.device).double() for name, xy in both)
-    mend = "give each line a start and an end"
-    require(start.shape == end.shape, "end", f"expected {tuple(start.shape)}", tuple(end.shape), mend)
+    hint = "give each line a start and an end"
+    require(start.shape == end.shape, "end", f"expected {tuple(start.shape)}", tuple(end.shape), hint)
     require_count("num_points", num_points, "give 2 for the ends alone", least=2)
     finite = torch.isfinite(start + end).all(-1, keepdim=True)
     start, way = torch.where(finite, start, torch.nan), torch.where(finite, end - start, 0.0)
@@ -87,8 +87,8 @@ def submap(
     """
     grid = emap.cfg.grid
     h, w = (whole_cells(n, length, grid.resolution) for n, length in (("length_x", length_x), ("length_y", length_y)))
-    mend = "give names such as ('elevation',)"
-    require(not isinstance(layers, str) and len(layers) > 0, "layers", "must be one or more names", repr(layers), mend)
+    hint = "give names such as ('elevation',)"
+    require(not isinstance(layers, str) and len(layers) > 0, "layers", "must be one or more names", repr(layers), hint)
     found = {name: emap._read(name, state) for name in layers}
     first = _first_cell(emap, center_xy, (h, w))
     corner = (emap.state if state is None else state).corner

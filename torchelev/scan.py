@@ -252,10 +252,10 @@ class HeightScan:
             require(feet is None, "feet", "must be left out", "feet for a scan around the base", "use HeightScan.feet")
             return T_map_base[:, None, :3, 3]
         shape = (emap.num_envs, self.num_feet, 3)
-        mend = "give the feet's positions in the map frame"
-        require(feet is not None, "feet", f"expected {shape}", "None", mend)
+        hint = "give the feet's positions in the map frame"
+        require(feet is not None, "feet", f"expected {shape}", "None", hint)
         value = checks.check_tensor("feet", feet, emap.device, checks.FLOATS)
-        require(tuple(value.shape) == shape, "feet", f"expected {shape}", tuple(value.shape), mend)
+        require(tuple(value.shape) == shape, "feet", f"expected {shape}", tuple(value.shape), hint)
         return value
 
     def _draw(self, emap: ElevationMap, noise: bool | Tensor) -> Tensor | None:

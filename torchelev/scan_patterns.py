@@ -60,14 +60,14 @@ def ring_points(rings: Iterable[tuple[float, int]]) -> Points:
 def as_points(xy: Any) -> Points:
     """Return what may be a tensor, an array or a list of pairs as points."""
     rows = xy.tolist() if hasattr(xy, "tolist") else xy
-    mend = "give (P, 2) numbers, x and y [m] in the base frame"
+    hint = "give (P, 2) numbers, x and y [m] in the base frame"
     try:
         points = tuple((float(x), float(y)) for x, y in rows)
     except (TypeError, ValueError):
         points = ()
-    require(len(points) > 0, "pattern", "must be one or more points (x, y)", type(xy).__name__, mend)
+    require(len(points) > 0, "pattern", "must be one or more points (x, y)", type(xy).__name__, hint)
     finite = all(math.isfinite(x) and math.isfinite(y) for x, y in points)
-    require(finite, "pattern", "must be finite", "NaN or inf", mend)
+    require(finite, "pattern", "must be finite", "NaN or inf", hint)
     return points
 
 
@@ -121,9 +121,9 @@ class Pattern:
         need = [2 * (span + grid.resolution) for span in self.span]
         if need[0] <= grid.length_x + 1e-9 and need[1] <= grid.length_y + 1e-9:
             return  # before a message is made
-        came = f"a window of {grid.length_x:g} x {grid.length_y:g} m"
+        actual = f"a window of {grid.length_x:g} x {grid.length_y:g} m"
         rule = f"must lie in the map at any heading, which takes {need[0]:.3g} x {need[1]:.3g} m"
-        require(False, "pattern", rule, came, "enlarge length_x and length_y of GridConfig, or shrink the pattern")
+        require(False, "pattern", rule, actual, "enlarge length_x and length_y of GridConfig, or shrink the pattern")
 
     def cells(self, grid: GridConfig) -> tuple[int, int]:
         """Return how many cells along x and y from the window's centre are read, at most."""

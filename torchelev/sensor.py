@@ -51,9 +51,9 @@ class SensorConfig:
     def __post_init__(self) -> None:
         require(self.noise_factor >= 0, "sensor.noise_factor", "must not be negative", self.noise_factor, "give 1e-4")
         require(self.noise_floor > 0, "sensor.noise_floor", "must be positive", self.noise_floor, "give 2.5e-5 m^2")
-        ordered = 0 <= self.min_distance < self.max_distance
-        came = (self.min_distance, self.max_distance)
-        require(ordered, "sensor.min_distance, max_distance", "must be ordered", came, "give 0 <= min < max in metres")
+        ordered, actual = 0 <= self.min_distance < self.max_distance, (self.min_distance, self.max_distance)
+        hint = "give 0 <= min < max in metres"
+        require(ordered, "sensor.min_distance, max_distance", "must be ordered", actual, hint)
 
 
 def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[Tensor, "B M"]:

@@ -56,9 +56,9 @@ class LearnedTraversabilityConfig:
     drift_gate: ClassVar[float] = 0.2  # as of the analytic head
 
     def __post_init__(self) -> None:
-        mend = "build a RobotConfig"
+        hint = "build a RobotConfig"
         fits = isinstance(self.robot, RobotConfig)
-        require(fits, "traversability.robot", "must be a RobotConfig", repr(self.robot), mend, TypeError)
+        require(fits, "traversability.robot", "must be a RobotConfig", repr(self.robot), hint, TypeError)
         path = self.weights is None or isinstance(self.weights, str | Path)
         require(path, "traversability.weights", "must be a path or None", repr(self.weights), "give a str", TypeError)
         if isinstance(self.weights, Path):
@@ -73,8 +73,8 @@ def make_head(
     Raises ValueError if it does not suit the robot or the resolution, or if the config asks for none.
     """
     if not isinstance(cfg, LearnedTraversabilityConfig):
-        mend = "give the config a LearnedTraversabilityConfig"
-        require(given is None, "head", "must be None unless the config asks for a trained one", "a head", mend)
+        hint = "give the config a LearnedTraversabilityConfig"
+        require(given is None, "head", "must be None unless the config asks for a trained one", "a head", hint)
         return None
     net = TraversabilityNet.from_pretrained(cfg.weights).requires_grad_(False) if given is None else given
     net.require_trained(cfg.robot, grid.resolution)

@@ -249,6 +249,6 @@ def _check_layers(layers: tuple[Tensor, ...], weight: Tensor) -> None:
     for name, layer in zip(("elevation", "validity", "variance", "upper_bound", "bounded"), layers, strict=True):
         dtype = torch.bool if name in ("validity", "bounded") else weight.dtype
         alike = tuple(layer.shape) == shape and layer.dtype == dtype and layer.device == device
-        came = f"{tuple(layer.shape)} {layer.dtype} on {layer.device}"
-        mend = "give the map's layers as they are, and move the head with .to(elevation)"
-        require(alike, name, f"must be {shape} {dtype} on {device}", came, mend)
+        actual = f"{tuple(layer.shape)} {layer.dtype} on {layer.device}"
+        hint = "give the map's layers as they are, and move the head with .to(elevation)"
+        require(alike, name, f"must be {shape} {dtype} on {device}", actual, hint)

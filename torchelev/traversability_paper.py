@@ -72,16 +72,16 @@ class PaperFilter(nn.Module):
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    mend = f"give an .npz with {', '.join(SHAPES)}"
-    require(path.exists(), str(path), "must be a file of weights", "no file", mend, FileNotFoundError)
+    hint = f"give an .npz with {', '.join(SHAPES)}"
+    require(path.exists(), str(path), "must be a file of weights", "no file", hint, FileNotFoundError)
     try:
         with np.load(path, allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in SHAPES if name in arrays}
     except (ValueError, OSError, zipfile.BadZipFile, AttributeError, TypeError) as error:
-        raise ValueError(message(str(path), "must be a file of weights", type(error).__name__, mend)) from error
+        raise ValueError(message(str(path), "must be a file of weights", type(error).__name__, hint)) from error
     for name, shape in SHAPES.items():
         array = found.get(name)
-        came = "none" if array is None else f"{array.shape} {array.dtype}"
+        actual = "none" if array is None else f"{array.shape} {array.dtype}"
         fits = array is not None and array.shape == shape and array.dtype.kind == "f" and bool(np.isfinite(array).all())
-        require(fits, f"{path}, {name}", f"must be {shape} finite floats", came, mend)
+        require(fits, f"{path}, {name}", f"must be {shape} finite floats", actual, hint)
     return {name: torch.from_numpy(array) for name, array in found.items()}

@@ -102,11 +102,11 @@ def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotCon
     low, high = RESOLUTIONS
     within = low * (1 - ROUNDING) <= resolution <= high * (1 + ROUNDING)
     require(within, "resolution", f"must be {low:g} to {high:g} m", resolution, "resample the map")
-    mend = "train a head for this robot: python -m training.traversability --robot ..."
+    hint = "train a head for this robot: python -m training.traversability --robot ..."
     for name, ratio in ratios(robot, resolution).items():
         low, high = ranges[name]
         within = low * (1 - ROUNDING) <= ratio <= high * (1 + ROUNDING)
-        require(within, name, f"must be within {low:.3g} to {high:.3g}, as trained", f"{ratio:.4g}", mend)
+        require(within, name, f"must be within {low:.3g} to {high:.3g}, as trained", f"{ratio:.4g}", hint)
 
 
 def write_weights(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
@@ -122,17 +122,17 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
     Raises FileNotFoundError without the file, ValueError if it holds anything else, or weights of another version.
     """
-    mend = "write it with TraversabilityNet.save"
+    hint = "write it with TraversabilityNet.save"
     missing = "train weights: python -m training.traversability"
     require(path.exists(), str(path), "must be a file of weights", "no file", missing, FileNotFoundError)
     try:
         found = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # what torch raises depends on which byte is damaged
-        raise ValueError(message(str(path), "must be a file of weights", type(error).__name__, mend)) from error
+        raise ValueError(message(str(path), "must be a file of weights", type(error).__name__, hint)) from error
     version = found.get("version") if isinstance(found, dict) else None
-    require(isinstance(version, int), str(path), "must be a file of weights", "something else", mend)
+    require(isinstance(version, int), str(path), "must be a file of weights", "something else", hint)
     require(version == VERSION, str(path), f"must be of version {VERSION}", version, "train with this torchelev")
-    require(_is_whole(found), str(path), "must be a file of weights", "other parts or types", mend)
+    require(_is_whole(found), str(path), "must be a file of weights", "other parts or types", hint)
     return found["config"], found["state_dict"]
 
 
@@ -148,11 +148,11 @@ def _is_whole(found: dict[str, Any]) -> bool:
     return sizes and tensors and pairs and all(len(pair) == 2 for pair in ranges.values())
 
 
-def require_same_shapes(path: Path, expected: Mapping[str, Tensor], came: Mapping[str, Tensor]) -> None:
+def require_same_shapes(path: Path, expected: Mapping[str, Tensor], actual: Mapping[str, Tensor]) -> None:
     """Raise ValueError unless weights have the shapes that they should, and are finite."""
-    shapes, others = ({name: tuple(value.shape) for name, value in each.items()} for each in (expected, came))
+    shapes, others = ({name: tuple(value.shape) for name, value in each.items()} for each in (expected, actual))
     differ = [name for name in shapes | others if shapes.get(name) != others.get(name)]
     text = ", ".join(f"{name} {others.get(name)} instead of {shapes.get(name)}" for name in differ)
     require(not differ, str(path), "must hold weights of the shapes that its config says", text, "train them again")
-    wild = ", ".join(name for name, value in came.items() if not bool(torch.isfinite(value).all()))
+    wild = ", ".join(name for name, value in actual.items() if not bool(torch.isfinite(value).all()))
     require(not wild, str(path), "must be finite", f"NaN or inf in {wild}", "train them again")

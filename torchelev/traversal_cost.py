@@ -85,8 +85,8 @@ def traversal_cost(
     Raises ValueError or TypeError for a confidence that does not fit, and a map whose traversability is switched off.
     """
     cfg = given_or_default(TraversalCostConfig, cfg)
-    mend = "give ElevationMapConfig a TraversabilityConfig"
-    require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", mend)
+    hint = "give ElevationMapConfig a TraversabilityConfig"
+    require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", hint)
     state = emap.state if state is None else state
     if confidence is None and emap.head is not None:
         confidence = emap.rate(state=state).confidence

@@ -117,8 +117,8 @@ class ResumableRunner(OnPolicyRunner):
         found = torch.load(path, weights_only=False, map_location=self.device)["infos"]
         require(found is not None, "checkpoint", "must hold the environments", str(path), f"give a {CHECKPOINT}")
         for name, here in self._kind().items():
-            there, mend = found["kind"][name], "use the settings that it was trained with"
-            require(there == here, "checkpoint", f"must be of {name} {here}", there, mend)
+            there, hint = found["kind"][name], "use the settings that it was trained with"
+            require(there == here, "checkpoint", f"must be of {name} {here}", there, hint)
         self.load(str(path), map_location=self.device)
         self.env.task.load_state_dict(found["task"])
         torch.set_rng_state(found["random"].cpu())

@@ -35,8 +35,8 @@ class FilterConfig:
         inputs = (self.inputs,) if isinstance(self.inputs, str) else tuple(self.inputs)
         if self.filter == "expression" and "formula" in settings:
             names = Expression(str(settings["formula"])).names
-            mend = "leave inputs out: a formula names its own"
-            require(inputs in ((), names), f"filters.{self.layer}", f"reads {', '.join(names)}", inputs, mend)
+            hint = "leave inputs out: a formula names its own"
+            require(inputs in ((), names), f"filters.{self.layer}", f"reads {', '.join(names)}", inputs, hint)
             inputs = names
         object.__setattr__(self, "inputs", inputs or ("elevation",))
         object.__setattr__(self, "settings", tuple(sorted(settings.items())))
@@ -55,12 +55,12 @@ def _plain(value: Any) -> Any:
 
 def filters_from_list(values: object) -> tuple[FilterConfig, ...]:
     """Read a list of entries. Raises ValueError for what is none, with its number."""
-    mend = "write one as {layer: smooth, filter: gaussian, sigma: 0.1}"
-    require(isinstance(values, list), "config.filters", "must be a list", type(values).__name__, mend)
+    hint = "write one as {layer: smooth, filter: gaussian, sigma: 0.1}"
+    require(isinstance(values, list), "config.filters", "must be a list", type(values).__name__, hint)
     assert isinstance(values, list)
     for number, entry in enumerate(values):
         named = isinstance(entry, dict) and all(isinstance(entry.get(key), str) for key in ("layer", "filter"))
-        require(named, f"config.filters[{number}]", "must name its layer and its filter", repr(entry), mend)
+        require(named, f"config.filters[{number}]", "must name its layer and its filter", repr(entry), hint)
     return tuple(_from_dict(entry) for entry in values)
 
 
@@ -96,8 +96,8 @@ class FilterChain(nn.Module):
         usable = cfg.layer.isidentifier() and cfg.layer not in there
         require(usable, where, "must be a name of its own, of letters and digits", repr(cfg.layer), "choose another")
         missing = [str(name) for name in cfg.inputs if name not in there]
-        mend = f"there are {', '.join(there)}"
-        require(not missing, where, "must read layers that are made before it", ", ".join(missing), mend)
+        hint = f"there are {', '.join(there)}"
+        require(not missing, where, "must read layers that are made before it", ", ".join(missing), hint)
         try:
             step = Filter(cfg.filter, **dict(cfg.settings))
             step.try_out(len(cfg.inputs), self.resolution)

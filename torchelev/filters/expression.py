@@ -113,8 +113,8 @@ def _parse(formula: str) -> ast.expr:
         raise _error(formula, f"cannot be read, {error or 'nested too deeply'}", 1) from None
 
 
-def _error(formula: str, rule: str, column: int, mend: str = GRAMMAR) -> ValueError:
-    return ValueError(message(f"formula, column {column}", rule, repr(formula), mend))
+def _error(formula: str, rule: str, column: int, hint: str = GRAMMAR) -> ValueError:
+    return ValueError(message(f"formula, column {column}", rule, repr(formula), hint))
 
 
 class _Translator:
@@ -124,9 +124,9 @@ class _Translator:
         self.formula, self.available = formula, available
         self.names: dict[str, None] = {}
 
-    def refused(self, node: ast.AST, rule: str, mend: str = GRAMMAR) -> ValueError:
+    def refused(self, node: ast.AST, rule: str, hint: str = GRAMMAR) -> ValueError:
         """Return the error for a node."""
-        return _error(self.formula, rule, getattr(node, "col_offset", 0) + 1, mend)
+        return _error(self.formula, rule, getattr(node, "col_offset", 0) + 1, hint)
 
     def text(self, node: ast.expr) -> str:
         """Return the part of the formula that became a node."""

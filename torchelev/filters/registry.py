@@ -79,8 +79,8 @@ def check_layers(name: str, layers: tuple[Layer, ...], shape: tuple[int, ...] | 
             _refuse(f"{name}, layer {number}", layer, pair)
     shapes = [values.shape for values, _ in layers] + ([] if shape is None else [shape])
     if len(set(shapes)) != 1:
-        came = [tuple(shape) for shape in shapes]
-        raise ValueError(message(name, "expected one or more layers of one shape", came, "read them from a map"))
+        actual = [tuple(shape) for shape in shapes]
+        raise ValueError(message(name, "expected one or more layers of one shape", actual, "read them from a map"))
 
 
 def _fits(values: Tensor, known: Tensor) -> bool:
@@ -89,13 +89,13 @@ def _fits(values: Tensor, known: Tensor) -> bool:
 
 
 def _refuse(argument: str, layer: Layer, pair: bool) -> NoReturn:
-    mend = "make one of values with NaN by filters.as_layer"
-    require(pair, argument, "must be a layer (values, known)", type(layer).__name__, mend, TypeError)
+    hint = "make one of values with NaN by filters.as_layer"
+    require(pair, argument, "must be a layer (values, known)", type(layer).__name__, hint, TypeError)
     values, known = layer
-    came = f"{tuple(values.shape)} {values.dtype} and {tuple(known.shape)} {known.dtype}"
+    actual = f"{tuple(values.shape)} {values.dtype} and {tuple(known.shape)} {known.dtype}"
     rule = "expected values (B, H, W) of floats and known (B, H, W)"
     require(known.dtype == torch.bool, argument, "known must be bool", known.dtype, "see as_layer")
-    raise ValueError(message(argument, rule, came, "see as_layer"))
+    raise ValueError(message(argument, rule, actual, "see as_layer"))
 
 
 def masked(layer: Layer) -> Layer:
@@ -170,8 +170,8 @@ class Filter(nn.Module):
         require(name in FILTERS, "filter", "must be a filter's name", repr(name), f"there are {known}")
         there = settings_of(name)
         others = sorted(set(settings) - set(there))
-        mend = f"it takes {', '.join(there) or 'none'}"
-        require(not others, f"filter {name}", "must be given settings that it has", ", ".join(others), mend)
+        hint = f"it takes {', '.join(there) or 'none'}"
+        require(not others, f"filter {name}", "must be given settings that it has", ", ".join(others), hint)
         missing = [n for n, p in there.items() if p.default is p.empty and n not in settings]
         require(not missing, f"filter {name}", f"needs {', '.join(missing)}", "none", "give a number for each")
         self.name, self.settings = name, settings
@@ -188,8 +188,8 @@ class Filter(nn.Module):
         wanted = sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
         any_number = any(p.kind is p.VAR_POSITIONAL for p in parameters)
         fits = inputs >= max(1, wanted) if any_number else inputs == wanted
-        came = f"{inputs} inputs"
-        require(fits, f"filter {self.name}", f"takes {wanted} layers", came, "name as many inputs")
+        actual = f"{inputs} inputs"
+        require(fits, f"filter {self.name}", f"takes {wanted} layers", actual, "name as many inputs")
         layer = torch.zeros(1, 4, 4), torch.eye(4, dtype=torch.bool)[None]
         self(*[layer] * inputs, resolution=resolution)
 

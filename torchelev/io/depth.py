@@ -118,8 +118,8 @@ def _checked(path: Path, intrinsics: Intrinsics) -> Intrinsics:
     if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         raise RecordingError(path, "fx and fy must be positive, all four finite", EXPECTED)
     if not (isinstance(scale, int | float) and 0 < scale <= 1):
-        mend = "5000 units per metre are 0.0002, millimetres 0.001"
-        raise RecordingError(path, f"depth_scale is metres per unit, in (0, 1], got {scale}", mend)
+        hint = "5000 units per metre are 0.0002, millimetres 0.001"
+        raise RecordingError(path, f"depth_scale is metres per unit, in (0, 1], got {scale}", hint)
     if along not in ("z", "ray"):
         raise RecordingError(path, f"along is 'z' or 'ray', got {along!r}")
     return intrinsics

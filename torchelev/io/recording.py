@@ -157,8 +157,8 @@ def _refuse_unreadable(files: list[Path], depth: bool) -> None:
 def _refuse_others(scans: list[Path], files: list[Path]) -> None:
     for path in sorted(files):
         if path.suffix.lower() not in BESIDE_SCANS | CLOUD_READERS.keys():
-            mend = f"convert it to one of {known_formats()}, or move it away"
-            raise RecordingError(path, f"unknown format '{path.suffix}'", mend)
+            hint = f"convert it to one of {known_formats()}, or move it away"
+            raise RecordingError(path, f"unknown format '{path.suffix}'", hint)
     suffixes = sorted({path.suffix.lower() for path in scans})
     if len(suffixes) > 1:
         raise RecordingError(scans[0].parent, f"holds scans of several formats: {' '.join(suffixes)}", "keep one")

@@ -128,9 +128,9 @@ def convex_region(region: Region, foothold_xy: Any, margin: float = 0.0) -> Floa
     distance = np.hypot(*(polygons.nearest(region.border, xy) - xy).T).min()
     inside = polygons.crossings(region.border, xy).sum() % 2 == 1
     free = inside and distance > max(margin, 1e-6)
-    came = f"{tuple(xy.tolist())}, {distance:.3g} m {'inside' if inside else 'outside'}"
+    actual = f"{tuple(xy.tolist())}, {distance:.3g} m {'inside' if inside else 'outside'}"
     rule = f"must lie in the region, more than {margin:g} m from its border"
-    require(free, "foothold_xy", rule, came, "take the x and y of nearest_foothold, or a smaller margin")
+    require(free, "foothold_xy", rule, actual, "take the x and y of nearest_foothold, or a smaller margin")
     return region.onto(polygons.free_polygon(region.border, xy, margin))
 
 

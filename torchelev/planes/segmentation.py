@@ -117,8 +117,8 @@ def segment(
 
 def _check(elevation: Tensor, resolution: float) -> None:
     tensor = isinstance(elevation, Tensor) and elevation.is_floating_point()
-    came = getattr(elevation, "dtype", type(elevation).__name__)
-    require(tensor, "elevation", "must be a tensor of floats", came, "give torch.as_tensor(...)", TypeError)
+    actual = getattr(elevation, "dtype", type(elevation).__name__)
+    require(tensor, "elevation", "must be a tensor of floats", actual, "give torch.as_tensor(...)", TypeError)
     fits = elevation.ndim in (2, 3) and min(elevation.shape[-2:]) > 0
     require(fits, "elevation", "must be (B, H, W) or (H, W)", tuple(elevation.shape), "give one cell at least")
     require_positive(resolution=resolution)

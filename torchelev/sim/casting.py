@@ -84,8 +84,8 @@ def _nearest(
 def _check(field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Tensor, max_range: float) -> None:
     B = len(tile_ids)
     fits = tuple(origin.shape) == (B, 3) and directions.ndim == 3 and directions.shape[::2] == (B, 3)
-    came = f"{tuple(origin.shape)} and {tuple(directions.shape)}"
-    require(fits, "origin, directions", f"expected ({B}, 3) and ({B}, M, 3)", came, "give one origin per tile id")
+    actual = f"{tuple(origin.shape)} and {tuple(directions.shape)}"
+    require(fits, "origin, directions", f"expected ({B}, 3) and ({B}, M, 3)", actual, "give one origin per tile id")
     whole = tile_ids.dtype == torch.int64
     require(whole, "tile_ids", "must be int64", tile_ids.dtype, "convert them with .to(torch.int64)", TypeError)
     devices = [value.device for value in (tile_ids, origin, directions)]
@@ -98,8 +98,8 @@ def _check(field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Ten
 def _check_boxes(boxes: Boxes, num_envs: int) -> None:
     K = boxes.half_size.shape[1]
     fits = tuple(boxes.T_map_box.shape) == (num_envs, K, 4, 4) and tuple(boxes.half_size.shape) == (num_envs, K, 3)
-    came = f"{tuple(boxes.T_map_box.shape)} and {tuple(boxes.half_size.shape)}"
-    require(fits, "boxes", f"expected ({num_envs}, K, 4, 4) and ({num_envs}, K, 3)", came, "pad with half sizes of 0")
+    actual = f"{tuple(boxes.T_map_box.shape)} and {tuple(boxes.half_size.shape)}"
+    require(fits, "boxes", f"expected ({num_envs}, K, 4, 4) and ({num_envs}, K, 3)", actual, "pad with half sizes of 0")
 
 
 def distance_to_boxes(

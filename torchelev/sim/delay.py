@@ -79,9 +79,9 @@ class Delay(nn.Module):
             with torch.inference_mode(False):  # else no later call outside of that mode could write into it
                 self.clouds = points.new_zeros((self.longest + 1, *points.shape))
                 self.poses = poses.new_zeros((self.longest + 1, *poses.shape))
-        came = f"{tuple(points.shape)} {points.dtype}, {poses.dtype}"
+        actual = f"{tuple(points.shape)} {points.dtype}, {poses.dtype}"
         same = self.clouds.shape[1:] == points.shape and self.clouds.dtype == points.dtype
         same = same and self.poses.dtype == poses.dtype
         rule = f"must stay {tuple(self.clouds.shape[1:])} {self.clouds.dtype}, {self.poses.dtype}"
-        require(same, "points, T_map_sensor", rule, came, "make one SensorErrors for each sensor")
+        require(same, "points, T_map_sensor", rule, actual, "make one SensorErrors for each sensor")
         return self.clouds, self.poses

@@ -138,8 +138,8 @@ class SensorErrors(PerEnvironment):
         placed = T_map_sensor is not None or not self.uses("latency")
         require(placed, "T_map_sensor", "must be given where clouds are late", None, "give the poses of now")
         if T_map_sensor is not None:
-            came = tuple(T_map_sensor.shape)
-            require(came == (B, 4, 4), "T_map_sensor", f"expected ({B}, 4, 4)", came, "give one per environment")
+            actual = tuple(T_map_sensor.shape)
+            require(actual == (B, 4, 4), "T_map_sensor", f"expected ({B}, 4, 4)", actual, "give one per environment")
         if image_shape is not None:
             whole = image_shape[0] * image_shape[1] == points.shape[1]
             require(whole, "image_shape", f"must hold {points.shape[1]} points", image_shape, "give (height, width)")

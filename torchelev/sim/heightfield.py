@@ -51,8 +51,8 @@ class HeightField:
     """
 
     def __init__(self, heights: Float[Tensor, "K H W"], resolution: float) -> None:
-        came = type(heights).__name__
-        require(isinstance(heights, Tensor), "heights", "must be a tensor", came, "use torch.as_tensor", TypeError)
+        actual = type(heights).__name__
+        require(isinstance(heights, Tensor), "heights", "must be a tensor", actual, "use torch.as_tensor", TypeError)
         fits = heights.ndim == 3 and heights.shape[0] >= 1 and min(heights.shape[1:]) >= 2
         require(fits, "heights", "must be (K, H, W) with H, W >= 2", tuple(heights.shape), "give K tiles of samples")
         few = heights.shape[1] * heights.shape[2] <= MOST_SAMPLES
@@ -95,8 +95,8 @@ class HeightField:
         Raises ValueError for shapes that do not fit.
         """
         fits = tile_ids.ndim == 1 and xy.ndim == 3 and xy.shape[::2] == (len(tile_ids), 2)
-        came = f"{tuple(tile_ids.shape)} and {tuple(xy.shape)}"
-        require(fits, "tile_ids, xy", "must be (B,) and (B, M, 2)", came, "give one tile and M places each")
+        actual = f"{tuple(tile_ids.shape)} and {tuple(xy.shape)}"
+        require(fits, "tile_ids, xy", "must be (B,) and (B, M, 2)", actual, "give one tile and M places each")
         offset = (xy / self.resolution).to(self.padded.dtype).nan_to_num(0.0)  # NaN would become an index
         place = offset.movedim(-1, 0) + self.middle[:, None, None]
         cell = place.floor()

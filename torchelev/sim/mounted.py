@@ -49,8 +49,8 @@ class MountedSensor:
     ) -> None:
         check_pose("T_base_sensor", T_base_sensor, (4, 4), T_base_sensor.device, True)
         max_range = pattern.max_range if max_range is None else max_range
-        rule, mend = "must be 0 <= min < max, finite", "give metres"
-        require(0 <= min_range < max_range < math.inf, "min_range, max_range", rule, (min_range, max_range), mend)
+        rule, hint = "must be 0 <= min < max, finite", "give metres"
+        require(0 <= min_range < max_range < math.inf, "min_range, max_range", rule, (min_range, max_range), hint)
         self.pattern, self.T_base_sensor, self.min_range, self.max_range = pattern, T_base_sensor, min_range, max_range
         self._fixed: dict[torch.device, tuple[Tensor, Tensor | None]] = {}
 

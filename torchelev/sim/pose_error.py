@@ -135,8 +135,8 @@ class PoseErrors(PerEnvironment):
         self.fresh.fill_(False)
 
     def _check(self, T_map_base: Tensor, dt: float | Tensor, moved: Tensor | None) -> None:
-        B, came = self.num_envs, tuple(T_map_base.shape)
-        require(came == (B, 4, 4), "T_map_base", f"expected ({B}, 4, 4)", came, "give one pose per environment")
+        B, actual = self.num_envs, tuple(T_map_base.shape)
+        require(actual == (B, 4, 4), "T_map_base", f"expected ({B}, 4, 4)", actual, "give one pose per environment")
         for name, value in (("dt", dt), ("moved", moved)):
             if isinstance(value, Tensor):
                 shape = tuple(value.shape)

@@ -164,6 +164,6 @@ def _load(path: Path, settings: dict[str, Any]) -> MappedTerrain:
     values = torch.load(path, weights_only=True)
     there = values.pop("settings")
     differ = [name for name in settings if settings[name] != there.get(name)]
-    mend = "remove the folder, or give the settings that it was made with"
-    require(not differ, str(path), "must be of the same settings", f"other {', '.join(differ)}", mend)
+    hint = "remove the folder, or give the settings that it was made with"
+    require(not differ, str(path), "must be of the same settings", f"other {', '.join(differ)}", hint)
     return MappedTerrain(**values | {"robot": RobotConfig(**values["robot"])})

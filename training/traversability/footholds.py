@@ -73,8 +73,8 @@ def lattice_around(xy: Float[Tensor, "M 2"], margin: float) -> Lattice:
     low, high = ((end / SPACING).tolist() for end in (xy.amin(0) - margin, xy.amax(0) + margin))
     first = [math.floor(k) for k in low]
     H, W = (math.ceil(k) + 1 - a for k, a in zip(high, first, strict=True))
-    mend = "rate smaller regions, one after the other"
-    require(H * W <= MOST_NODES, "xy", "must lie within some 80 x 80 m", f"{H * SPACING:g} x {W * SPACING:g} m", mend)
+    hint = "rate smaller regions, one after the other"
+    require(H * W <= MOST_NODES, "xy", "must lie within some 80 x 80 m", f"{H * SPACING:g} x {W * SPACING:g} m", hint)
     return Lattice((first[0], first[1]), (H, W))
 
 

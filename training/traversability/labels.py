@@ -77,9 +77,9 @@ def verdicts(
 
 def _check(field: HeightField, tile_ids: Tensor, xy: Tensor, robots: Sequence[RobotConfig], headings: int) -> None:
     fits = tile_ids.ndim == 1 and xy.ndim == 3 and xy.shape[::2] == (len(tile_ids), 2) and len(robots) == len(tile_ids)
-    came = f"{tuple(tile_ids.shape)}, {tuple(xy.shape)} and {len(robots)}"
+    actual = f"{tuple(tile_ids.shape)}, {tuple(xy.shape)} and {len(robots)}"
     rule = "must be (B,), (B, M, 2) and B robots"
-    require(fits, "tile_ids, xy, robots", rule, came, "give each robot one tile and M places")
+    require(fits, "tile_ids, xy, robots", rule, actual, "give each robot one tile and M places")
     there = bool(((tile_ids >= 0) & (tile_ids < field.num_tiles)).all())
     require(there, "tile_ids", f"must be from 0 to {field.num_tiles - 1}", tile_ids.tolist(), "name tiles of the field")
     require(bool(xy.isfinite().all()), "xy", "must be finite", "NaN or inf", "leave such places out")

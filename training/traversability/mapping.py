@@ -45,8 +45,8 @@ class DataConfig:
     def __post_init__(self) -> None:
         require_positive(window=self.window)
         positive = self.num_maps >= 1 and self.headings >= 1 and 1 <= self.looks[0] <= self.looks[1]
-        came = (self.num_maps, self.headings, self.looks)
-        require(positive, "num_maps, headings, looks", "must be at least 1", came, "see their defaults")
+        actual = (self.num_maps, self.headings, self.looks)
+        require(positive, "num_maps, headings, looks", "must be at least 1", actual, "see their defaults")
 
 
 class Look(NamedTuple):

@@ -118,8 +118,8 @@ class Trainer:
         """Go on from a checkpoint. Raises ValueError, before anything changed, if it is of other settings."""
         found = torch.load(path, weights_only=True)
         differ = [name for name, here in self.settings.items() if found["settings"].get(name) != here]
-        came = ", ".join(f"{name} {found['settings'].get(name)}" for name in differ)
-        require(not differ, str(path), "must be of the same settings", came, "resume with those it was begun with")
+        actual = ", ".join(f"{name} {found['settings'].get(name)}" for name in differ)
+        require(not differ, str(path), "must be of the same settings", actual, "resume with those it was begun with")
         self.net.load_state_dict(found["net"])
         self.optimizer.load_state_dict(found["optimizer"])
         self.step = found["step"]
