@@ -28,13 +28,13 @@ types: setup  ## check types
 	$(BIN)/mypy
 
 bench: setup  ## measure speed and scale, under ten minutes
-	$(BIN)/python -m benchmarks.run
-	$(BIN)/python -m benchmarks.readme
+	$(BIN)/python -m benchmarks.speed.run
+	$(BIN)/python -m docs.readme_tables
 
 quality: setup  ## measure accuracy and features, five minutes
-	$(BIN)/python -m benchmarks.accuracy
-	$(BIN)/python -m benchmarks.features
-	$(BIN)/python -m benchmarks.readme
+	$(BIN)/python -m benchmarks.quality.accuracy
+	$(BIN)/python -m benchmarks.quality.features
+	$(BIN)/python -m docs.readme_tables
 
 clean:  ## remove what the targets made
 	rm -rf $(VENV) demo.png

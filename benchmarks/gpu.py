@@ -20,11 +20,11 @@ import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
-from benchmarks import meter
-from benchmarks.report import markdown_table, slug, write_json
-from benchmarks.speed_sections import fresh_compiler
-from benchmarks.workload import BPEARL, Drive, full_config
+from benchmarks.speed import meter
+from benchmarks.speed.sections import fresh_compiler
+from benchmarks.speed.workload import BPEARL, Drive, full_config
 from torchelev import ElevationMap
+from torchelev.app.results import markdown_table, slug, write_json
 
 SCANS = 187  # points of a height scan
 Figure = tuple[str, Callable[[], Any]]  # its name, and what measures it

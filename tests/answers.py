@@ -17,7 +17,7 @@ from torch import Tensor
 
 import torchelev as te
 from torchelev import sim
-from torchelev.sim import scenes
+from torchelev.sim.exact import scenes
 
 FILE = Path(__file__).with_suffix(".npz")
 B, CELLS, RESOLUTION = 2, 24, 0.1
@@ -111,12 +111,12 @@ def of_readers(emap: te.ElevationMap) -> Answers:
 
 def of_planners(emap: te.ElevationMap) -> Answers:
     """Return planes, costs, ways, footprints and profiles."""
-    from torchelev.footprint import check_footprint
-    from torchelev.path_check import check_path
     from torchelev.planes import segment
-    from torchelev.planner import plan
-    from torchelev.queries import height_profile, submap
-    from torchelev.traversal_cost import traversal_cost
+    from torchelev.planning.footprint import check_footprint
+    from torchelev.planning.path_check import check_path
+    from torchelev.planning.planner import plan
+    from torchelev.planning.queries import height_profile, submap
+    from torchelev.planning.traversal_cost import traversal_cost
 
     start = emap.center[:, :2] + torch.tensor([-0.25, -0.25])
     goal = emap.center[:, :2] + torch.tensor([0.35, 0.25])

@@ -4,14 +4,14 @@ import itertools
 
 import pytest
 import torch
-from conftest import mapped, pose, scan, small_map
 from torch import Tensor
 
+from tests.helpers import mapped, pose, scan, small_map
 from torchelev import BodyConfig, LearnedTraversabilityConfig, SensorConfig
 from torchelev.filters.chain import FilterConfig
-from torchelev.fusion import FusionConfig
 from torchelev.layers import LAYERS
-from torchelev.queries import height_profile, submap
+from torchelev.planning.queries import height_profile, submap
+from torchelev.stages.fusion.fuse import FusionConfig
 
 OFF = {
     "drift": dict(drift=None),

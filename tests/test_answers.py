@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from answers import FILE, PARTS, machine
+
+from tests.answers import FILE, PARTS, machine
 
 RECORDED = dict(np.load(FILE))
 MACHINE = str(RECORDED.pop("machine"))

@@ -10,7 +10,10 @@ import sys
 import numpy as np
 import pytest
 import torch
-from conftest import (
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+import torchelev
+from tests.helpers import (
     assert_close,
     differences,
     mapped,
@@ -21,9 +24,6 @@ from conftest import (
     small_map,
     snapshot,
 )
-from torch._subclasses.fake_tensor import FakeTensorMode
-
-import torchelev
 from torchelev import (
     AgingConfig,
     DriftConfig,

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from conftest import pose, random_poses, small_config
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchelev import BodyConfig, ElevationMap, SensorConfig, operators
+from tests.helpers import pose, random_poses, small_config
+from torchelev import BodyConfig, ElevationMap, SensorConfig
+from torchelev.ops import operators
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 OPERATORS = [

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from conftest import off_borders, pose, random_state, small_map
 
+from tests.helpers import off_borders, pose, random_state, small_map
 from torchelev.pipeline import rate_surface
 
 CELLS = (6, 5)

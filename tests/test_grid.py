@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-import reference
 import torch
-from conftest import nans, pose, random_state, small_config, small_map
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests import reference
+from tests.helpers import nans, pose, random_state, small_config, small_map
 from torchelev import GridConfig
 from torchelev.grid import PointCells, cell_centers, center_offsets, lattice_offset, locate, recenter, window_corner
 from torchelev.state import BLANK, LAYERS, blank_state

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from conftest import (
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.utils._pytree import tree_leaves
+
+from tests.helpers import (
     differences,
     floats_finite,
     nans,
@@ -15,10 +19,6 @@ from conftest import (
     small_map,
     snapshot,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from torch.utils._pytree import tree_leaves
-
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig, checks
 from torchelev.state import Statistics, map_layers
 

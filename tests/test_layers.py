@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-import reference
 import torch
-from conftest import random_state, small_map
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests import reference
+from tests.helpers import random_state, small_map
 from torchelev.layers import LAYERS
 
 SEEDS = st.integers(0, 10_000)

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import mapped
 
+from tests.helpers import mapped
 from torchelev import TraversabilityNet, output_files
-from torchelev.demo import run_demo
-from torchelev.export import save_cloud, save_map, save_mesh, save_npz
+from torchelev.app.demo import run_demo
+from torchelev.io.export import save_cloud, save_map, save_mesh, save_npz
 from torchelev.output_files import WriteError, atomic_file, is_own_output, require_writable
-from torchelev.picture import save_image
-from torchelev.plot import Panel, save_layers
+from torchelev.viz.picture import save_image
+from torchelev.viz.plot import Panel, save_layers
 
 WRITERS = {
     "save_map.npz": lambda path: save_map(path, mapped()),

@@ -2,7 +2,10 @@
 
 import numpy as np
 import torch
-from conftest import (
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers import (
     assert_close,
     differences,
     off_borders,
@@ -15,9 +18,6 @@ from conftest import (
     snapshot,
     terrain,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from torchelev import AgingConfig, BodyConfig, DriftConfig, FusionConfig, OverlapConfig, RaycastConfig, SensorConfig
 from torchelev.state import LAYERS, MapState, Statistics
 

@@ -2,12 +2,12 @@
 
 import re
 
-from benchmarks.readme import ROOT, with_tables
+from docs.readme_tables import ROOT, with_tables
 
 
 def test_tables_are_those_of_the_results():
     text = (ROOT / "README.md").read_text()
-    assert with_tables(text) == text, "run python -m benchmarks.readme"
+    assert with_tables(text) == text, "run python -m docs.readme_tables"
 
 
 def test_its_python_runs_from_the_first_block_to_the_last():

@@ -5,7 +5,8 @@ import math
 
 import numpy as np
 import pytest
-import reference
+
+from tests import reference
 
 EYE = np.eye(4)
 

@@ -1,22 +1,22 @@
 """torchelev: batched, differentiable elevation mapping in PyTorch, for robots that learn."""
 
-from torchelev.aging import AgingConfig
 from torchelev.config import ElevationMapConfig
-from torchelev.drift import DriftConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.filters.chain import FilterConfig
-from torchelev.fusion import EdgeConfig, FusionConfig
 from torchelev.grid import GridConfig
-from torchelev.map_image import MapImage
-from torchelev.overlap import OverlapConfig
-from torchelev.raycast import RaycastConfig
+from torchelev.observations.height_scan import HeightScan
+from torchelev.observations.map_image import MapImage
 from torchelev.robot import RobotConfig
-from torchelev.scan import HeightScan
-from torchelev.sensor import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
+from torchelev.stages.age import AgingConfig
+from torchelev.stages.compensate import DriftConfig
+from torchelev.stages.fusion.fuse import EdgeConfig, FusionConfig
+from torchelev.stages.measure import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
+from torchelev.stages.overlap import OverlapConfig
+from torchelev.stages.surface import SurfaceConfig
+from torchelev.stages.visibility.clean_up import RaycastConfig
 from torchelev.state import MapState, Measurement, Statistics
-from torchelev.surface import SurfaceConfig
-from torchelev.traversability import LearnedTraversabilityConfig, TraversabilityConfig
-from torchelev.traversability_net import TraversabilityNet
+from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
+from torchelev.traversability.net import TraversabilityNet
 
 __version__ = "0.1.0"
 __all__ = [

@@ -6,7 +6,7 @@ import sys
 def run() -> None:
     """Start the command line, or say what to install for it."""
     try:
-        from torchelev.cli import main
+        from torchelev.app.cli import main
     except ModuleNotFoundError as error:
         sys.exit(f"Error: {error}; install the command line's packages with: pip install 'torchelev[io]'")
     main(prog_name="python -m torchelev")

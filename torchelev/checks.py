@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.transforms import is_transforming
+from torchelev.ops.transforms import is_transforming
 
 FARTHEST = 1e9  # [m] farther, a float64 counts cells wrongly
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)

@@ -8,17 +8,17 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any
 
-from torchelev.aging import AgingConfig
-from torchelev.drift import DriftConfig
 from torchelev.errors import require
 from torchelev.filters.chain import FilterConfig, filters_from_list
-from torchelev.fusion import FusionConfig
 from torchelev.grid import GridConfig
-from torchelev.overlap import OverlapConfig
-from torchelev.raycast import RaycastConfig
-from torchelev.sensor import SensorConfig
-from torchelev.surface import SurfaceConfig
-from torchelev.traversability import LearnedTraversabilityConfig, TraversabilityConfig
+from torchelev.stages.age import AgingConfig
+from torchelev.stages.compensate import DriftConfig
+from torchelev.stages.fusion.fuse import FusionConfig
+from torchelev.stages.measure import SensorConfig
+from torchelev.stages.overlap import OverlapConfig
+from torchelev.stages.surface import SurfaceConfig
+from torchelev.stages.visibility.clean_up import RaycastConfig
+from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
 
 
 @dataclass(frozen=True, kw_only=True)

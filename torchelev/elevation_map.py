@@ -11,23 +11,23 @@ import torch
 from torch import Tensor, nn
 
 from torchelev import checks
-from torchelev.compilation import compile_ahead, compiled_update
+from torchelev.compiled_update import compile_ahead, compiled_update
 from torchelev.config import ElevationMapConfig, differing_fields
-from torchelev.diagnosis import diagnose
+from torchelev.diagnosis.causes import diagnose
+from torchelev.diagnosis.pace import Pace, paced
+from torchelev.diagnosis.recent import Recent
 from torchelev.errors import require, require_count
 from torchelev.filters.chain import FilterChain
 from torchelev.grid import cell_centers, window_center
-from torchelev.initialize import METHODS, initialize
 from torchelev.layers import LAYERS, Layer, sample_layer
-from torchelev.pace import Pace, paced
+from torchelev.ops.storage import keep_freed_memory
+from torchelev.ops.transforms import require_reverse_mode
 from torchelev.pipeline import fuse_measurement, rate_surface, update_in_place, write
-from torchelev.recent import Recent
-from torchelev.sensor import measure
+from torchelev.stages.initialize import METHODS, initialize
+from torchelev.stages.measure import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
-from torchelev.storage import keep_freed_memory
-from torchelev.transforms import require_reverse_mode
-from torchelev.traversability import LearnedTraversabilityConfig, learned_rating, make_head
-from torchelev.traversability_net import Rating, TraversabilityNet, Weights
+from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
+from torchelev.traversability.net import Rating, TraversabilityNet, Weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

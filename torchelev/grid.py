@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require_positive, whole_cells
-from torchelev.operators import cell_sums, moved
+from torchelev.ops.operators import cell_sums, moved
+from torchelev.ops.storage import as_bits, from_bits, read, realize, realize_all
 from torchelev.state import BLANK, LAYERS, MASKS, MapState, Measurement
-from torchelev.storage import as_bits, from_bits, read, realize, realize_all
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -5,18 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchelev.aging import age
 from torchelev.config import ElevationMapConfig
-from torchelev.drift import compensate
-from torchelev.fusion import fuse
 from torchelev.grid import cells_of, recenter
-from torchelev.overlap import clear_other_floors
-from torchelev.raycast import clear_seen_through
-from torchelev.sensor import measure
+from torchelev.stages.age import age
+from torchelev.stages.compensate import compensate
+from torchelev.stages.fusion.fuse import fuse
+from torchelev.stages.measure import measure
+from torchelev.stages.overlap import clear_other_floors
+from torchelev.stages.surface import known_ground, normals
+from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MapState, Measurement, count, map_layers, tally
-from torchelev.surface import known_ground, normals
-from torchelev.traversability import TraversabilityConfig, learned_rating, rate_all, traversability
-from torchelev.traversability_net import Weights
+from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all, traversability
+from torchelev.traversability.net import Weights
 
 
 def fuse_measurement(

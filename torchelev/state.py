@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.storage import realize
+from torchelev.ops.storage import realize
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8

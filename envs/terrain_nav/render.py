@@ -15,7 +15,7 @@ from matplotlib.patches import Polygon
 from envs.terrain_nav.config import RobotConfig, TerrainNavConfig
 from envs.terrain_nav.robot import contacts
 from envs.terrain_nav.task import TerrainNav
-from torchelev.plot import UNKNOWN_COLOR
+from torchelev.viz.plot import UNKNOWN_COLOR
 
 OUTLINE = (0, 1, 3, 2)  # the footprint's corners in turn, of `contacts`
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from envs.terrain_nav.config import RobotConfig
-from torchelev.sim.heightfield import HeightField
+from torchelev.sim.terrains.heightfield import HeightField
 
 
 class RobotState(NamedTuple):

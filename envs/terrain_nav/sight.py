@@ -15,7 +15,7 @@ from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.course import Course
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, MapImage
 from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, preset
-from torchelev.sim.trajectories import pose
+from torchelev.sim.exact.trajectories import pose
 
 LAYERS = ("elevation", "upper_bound", "validity", "traversability")
 

@@ -11,9 +11,9 @@ cfg = ElevationMapConfig(filters=(FilterConfig(layer="smooth", filter="gaussian"
 """
 
 from torchelev.filters.chain import FilterChain, FilterConfig
-from torchelev.filters.distance import signed_distance
-from torchelev.filters.distance_field import SignedDistanceField
-from torchelev.filters.expression import Expression, expression
+from torchelev.filters.distances.distance import signed_distance
+from torchelev.filters.distances.distance_field import SignedDistanceField
+from torchelev.filters.expressions.expression import Expression, expression
 from torchelev.filters.extrema import closing, dilation, erosion, maximum, minimum, opening
 from torchelev.filters.footholds import foothold_score
 from torchelev.filters.geometry import (
@@ -27,7 +27,7 @@ from torchelev.filters.geometry import (
     step_height,
     traversability_three_part,
 )
-from torchelev.filters.inpainting import (
+from torchelev.filters.inpainting.inpaint import (
     fill_from,
     inpaint_diffusion,
     inpaint_minimum,

@@ -10,7 +10,7 @@ import numpy as np
 from torch import nn
 
 from torchelev.errors import require
-from torchelev.filters.expression import Expression
+from torchelev.filters.expressions.expression import Expression
 from torchelev.filters.registry import KEYS, Filter
 from torchelev.layers import LAYERS, Layer
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchelev.filters import opencv
 from torchelev.filters.registry import radius_cells, register
 from torchelev.layers import Layer
-from torchelev.operators import padded
-from torchelev.storage import as_bytes, realize
+from torchelev.ops.operators import padded
+from torchelev.ops.storage import as_bytes, realize
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

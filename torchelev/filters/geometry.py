@@ -22,9 +22,9 @@ from torchelev.filters import opencv
 from torchelev.filters.extrema import highest_known, lowest_known
 from torchelev.filters.registry import radius_cells, register
 from torchelev.layers import Layer, normal_component
-from torchelev.storage import as_bytes
-from torchelev.surface import Plane, fit_plane, known_ground, less
-from torchelev.windows import window_moments
+from torchelev.ops.storage import as_bytes
+from torchelev.ops.windows import window_moments
+from torchelev.stages.surface import Plane, fit_plane, known_ground, less
 
 if TYPE_CHECKING:
     from jaxtyping import Float

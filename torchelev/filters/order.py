@@ -12,7 +12,7 @@ import functools
 import torch
 from torch import Tensor
 
-from torchelev.storage import realize_all
+from torchelev.ops.storage import realize_all
 
 # "minimum" or "maximum", the two wires it is of, the wire it makes, and those that nothing reads afterwards
 Step = tuple[str, int, int, int, tuple[int, ...]]

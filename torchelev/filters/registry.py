@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchelev.errors import message, require, require_positive
 from torchelev.filters import opencv
 from torchelev.layers import Layer
-from torchelev.storage import as_bytes, keep_freed_memory
+from torchelev.ops.storage import as_bytes, keep_freed_memory
 
 if TYPE_CHECKING:
     from jaxtyping import Float

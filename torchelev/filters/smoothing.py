@@ -16,8 +16,8 @@ from torchelev.filters.extrema import blank, lowered
 from torchelev.filters.order import lowest_of_windows
 from torchelev.filters.registry import radius_cells, register
 from torchelev.layers import Layer
-from torchelev.operators import padded
-from torchelev.storage import as_bytes, realize
+from torchelev.ops.operators import padded
+from torchelev.ops.storage import as_bytes, realize
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.surface import fit_plane, known_ground
-from torchelev.windows import window_moments
+from torchelev.ops.windows import window_moments
+from torchelev.stages.surface import fit_plane, known_ground
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

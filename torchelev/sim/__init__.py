@@ -7,17 +7,17 @@ Many robots, fast: terrains as height fields, mounted sensors whose rays are cas
 sensors and poses that each environment draws for itself; float32 on any device.
 """
 
-from torchelev.sim.casting import Boxes
-from torchelev.sim.error_models import SensorErrorConfig, SensorErrors
-from torchelev.sim.heightfield import HeightField
-from torchelev.sim.mounted import MountedSensor
-from torchelev.sim.noise import dropout, noisy, outliers, range_noise
-from torchelev.sim.pose_error import PoseErrorConfig, PoseErrors
-from torchelev.sim.presets import ErrorPreset, preset
-from torchelev.sim.scenes import Box, Scene
-from torchelev.sim.sensors import DepthCamera, Lidar, NonRepetitiveLidar, cast
-from torchelev.sim.terrains import Terrain, TerrainGrid, make_terrain, terrain_grid
-from torchelev.sim.trajectories import MOUNT, Trajectory, mount, sink, turn_on_the_spot, walk
+from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors
+from torchelev.sim.errors.pose_error import PoseErrorConfig, PoseErrors
+from torchelev.sim.errors.presets import ErrorPreset, preset
+from torchelev.sim.exact.noise import dropout, noisy, outliers, range_noise
+from torchelev.sim.exact.scenes import Box, Scene
+from torchelev.sim.exact.sensors import DepthCamera, Lidar, NonRepetitiveLidar, cast
+from torchelev.sim.exact.trajectories import MOUNT, Trajectory, mount, sink, turn_on_the_spot, walk
+from torchelev.sim.sensors.casting import Boxes
+from torchelev.sim.sensors.mounted import MountedSensor
+from torchelev.sim.terrains.generate import Terrain, TerrainGrid, make_terrain, terrain_grid
+from torchelev.sim.terrains.heightfield import HeightField
 
 __all__ = [
     "MOUNT", "Box", "Boxes", "DepthCamera", "ErrorPreset", "HeightField", "Lidar", "MountedSensor",

@@ -10,13 +10,13 @@ import click
 
 from torchelev.output_files import atomic_file
 from torchelev.robot import RobotConfig
-from training.traversability.data import data_set
 from training.traversability.evaluate import evaluate, table
 from training.traversability.heads import baselines
-from training.traversability.mapping import DataConfig
+from training.traversability.maps.data import data_set
+from training.traversability.maps.mapping import DataConfig
+from training.traversability.maps.terrain import KINDS
 from training.traversability.picture import picture
 from training.traversability.robot import RobotType
-from training.traversability.terrain import KINDS
 from training.traversability.trainer import CHECKPOINT, FitConfig, Trainer
 
 POSITIVE = click.IntRange(1)

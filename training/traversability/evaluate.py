@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.report import markdown_table, write_json
+from torchelev.app.results import markdown_table, write_json
 from torchelev.robot import RobotConfig
-from torchelev.traversability_net import TraversabilityNet
-from training.traversability.data import MappedTerrain, data_set
+from torchelev.traversability.net import TraversabilityNet
 from training.traversability.heads import Score, baselines, family
-from training.traversability.mapping import DataConfig
+from training.traversability.maps.data import MappedTerrain, data_set
+from training.traversability.maps.mapping import DataConfig
+from training.traversability.maps.terrain import KINDS, UNSEEN_KINDS
 from training.traversability.metrics import SAFE, RatedMap, calibration_error, measure
 from training.traversability.robot import RobotType
-from training.traversability.terrain import KINDS, UNSEEN_KINDS
 
 RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
 SPLITS = {"held_out": KINDS, "unseen": UNSEEN_KINDS, "held_out_exact": KINDS}

@@ -17,11 +17,11 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
-from benchmarks.report import write_json
+from torchelev.app.results import write_json
 from torchelev.robot import RobotConfig
-from torchelev.traversability_net import TraversabilityNet
+from torchelev.traversability.net import TraversabilityNet
 from training.traversability.evaluate import SPLITS, evaluate, table
-from training.traversability.mapping import DataConfig
+from training.traversability.maps.mapping import DataConfig
 from training.traversability.robot import RobotType
 
 # Fixed before the first run.

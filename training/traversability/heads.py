@@ -12,14 +12,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev import TraversabilityConfig
-from torchelev.filters.inpainting import inpaint_minimum, inpaint_telea
+from torchelev.filters.inpainting.inpaint import inpaint_minimum, inpaint_telea
 from torchelev.filters.smoothing import gaussian
 from torchelev.layers import Layer
 from torchelev.pipeline import rate_surface
 from torchelev.state import blank_state
-from torchelev.traversability_paper import RIM, PaperFilter
-from training.traversability.data import MappedTerrain
-from training.traversability.mapping import map_config
+from torchelev.traversability.paper_filter import RIM, PaperFilter
+from training.traversability.maps.data import MappedTerrain
+from training.traversability.maps.mapping import map_config
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.plot import UNKNOWN_COLOR
-from torchelev.traversability_net import TraversabilityNet
-from training.traversability.data import MappedTerrain
+from torchelev.traversability.net import TraversabilityNet
+from torchelev.viz.plot import UNKNOWN_COLOR
 from training.traversability.heads import Score
+from training.traversability.maps.data import MappedTerrain
 
 Layers = dict[str, tuple[Tensor, Tensor]]  # values and where to show them, both (H, W)
 

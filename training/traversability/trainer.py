@@ -20,9 +20,9 @@ from tqdm import tqdm
 
 from torchelev.errors import require, require_positive
 from torchelev.robot import RobotConfig
-from torchelev.traversability_net import TraversabilityNet
-from torchelev.traversability_weights import RESOLUTIONS, ratios
-from training.traversability.data import MappedTerrain, save_atomically
+from torchelev.traversability.net import TraversabilityNet
+from torchelev.traversability.weight_file import RESOLUTIONS, ratios
+from training.traversability.maps.data import MappedTerrain, save_atomically
 from training.traversability.metrics import SAFE
 
 CHECKPOINT = "checkpoint.pt"

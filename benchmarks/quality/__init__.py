@@ -1,0 +1,1 @@
+"""Accuracy, features and behaviour against ground truth. Results are in `benchmarks/results`."""

@@ -1,0 +1,1 @@
+"""Time and memory. Results are in `benchmarks/results`."""

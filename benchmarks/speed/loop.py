@@ -1,0 +1,116 @@
+"""How long the updates of a 50 Hz loop take, alone and beside one busy process: `python -m benchmarks.speed.loop`
+
+A map of 10 x 10 m at 4 cm takes a scan of 43,074 points every 20 ms, compiled. Each condition runs in a process of its
+own, in turn: threads that spin while they wait, OpenMP's default, and `OMP_WAIT_POLICY=PASSIVE`, each idle and beside a
+process that keeps one core busy at equal priority. Writes p50, p99 and max [ms], and the share of late updates, those
+that ended after the next scan was due, into benchmarks/results/loop.json.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+
+from benchmarks.speed.workload import BPEARL, Drive, full_config
+from torchelev.app.results import markdown_table, write_json
+
+RESULTS = Path(__file__).parents[1] / "results"
+PERIOD = 0.02  # [s]
+POLICIES = ("default", "PASSIVE")
+BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends when this process does
+
+
+def loop(step: Callable[[], Any], count: int, period: float = PERIOD) -> list[float]:
+    """Call a step at a fixed rate and return how long each call took [s]; a late call is not caught up with."""
+    times = []
+    due = time.perf_counter()
+    for _ in range(count):
+        time.sleep(max(0.0, due - time.perf_counter()))
+        start = time.perf_counter()
+        step()
+        times.append(time.perf_counter() - start)
+        due = max(due + period, start + times[-1])
+    return times
+
+
+def figures(times: list[float], period: float = PERIOD) -> dict[str, float]:
+    """Return p50, p99 and max [ms] by nearest rank, and the share of calls that took longer than the period."""
+    ordered = sorted(times)
+    p50, p99 = (1e3 * ordered[math.ceil(q * len(ordered)) - 1] for q in (0.5, 0.99))
+    late = sum(t > period for t in times) / len(times)
+    return {"p50": p50, "p99": p99, "max": 1e3 * ordered[-1], "late": late, "updates": len(times)}
+
+
+@contextlib.contextmanager
+def busy_process() -> Iterator[None]:
+    """Keep one core busy in a process of its own."""
+    process = subprocess.Popen([sys.executable, "-c", BUSY])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def measure(count: int, threads: int, compiled: bool = True, points: int = BPEARL) -> dict[str, dict[str, float]]:
+    """Time the loop, idle, then beside a busy process, in this process."""
+    torch.set_num_threads(threads)
+    drive = Drive(full_config(), points, compiled=compiled)
+    if compiled:
+        drive.emap.warm_up(points)
+    drive.watch(8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that updates have become slow is what is measured
+        idle = figures(loop(drive, count))
+        with busy_process():
+            time.sleep(0.2)  # until it runs
+            return {"idle": idle, "busy": figures(loop(drive, count))}
+
+
+def measure_apart(policy: str, count: int, threads: int) -> dict[str, dict[str, float]]:
+    """Time the loop in a process whose OpenMP threads wait as the policy says."""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    if policy != "default":
+        environment["OMP_WAIT_POLICY"] = policy
+    code = f"import json; from benchmarks.speed.loop import measure; print(json.dumps(measure({count}, {threads})))"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def table(rows: dict[str, dict[str, dict[str, float]]]) -> str:
+    """Tabulate the figures of each policy and condition."""
+    lines = [
+        [policy, name, *(f"{row[key]:.1f}" for key in ("p50", "p99", "max")), f"{100 * row['late']:.1f}"]
+        for policy, conditions in rows.items()
+        for name, row in conditions.items()
+    ]
+    return markdown_table(["OMP_WAIT_POLICY", "beside it", "p50 [ms]", "p99 [ms]", "max [ms]", "late [%]"], lines)
+
+
+@click.command()
+@click.option("--seconds", default=30.0, show_default=True, help="Time for each condition.")
+@click.option("--threads", default=2, show_default=True, help="CPU threads.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Where to write.")
+def main(seconds: float, threads: int, out: Path) -> None:
+    """Time a 50 Hz loop of updates, idle and beside a busy process."""
+    torch.set_num_threads(threads)  # of the machine's description
+    count = max(1, round(seconds / PERIOD))
+    rows = {policy: measure_apart(policy, count, threads) for policy in POLICIES}
+    write_json(out / "loop.json", {"points": BPEARL, "hertz": 1 / PERIOD, "threads": threads, "rows": rows})
+    click.echo(table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""How the speed benchmarks measure: torch's timer, torch's record of allocations, and the bytes an update must move."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.utils.benchmark as bench
+from torch.profiler import ProfilerActivity, profile
+
+from torchelev import ElevationMapConfig
+from torchelev.stages.visibility.polar_table import PolarGrid
+from torchelev.state import blank_state
+
+
+def milliseconds(run: Callable[[], Any], seconds: float) -> dict[str, float]:
+    """Time a callable by torch's benchmark tool: median, minimum and interquartile range [ms]."""
+    return interleaved({"": run}, seconds, rounds=1)[""]
+
+
+def interleaved(runs: dict[Any, Callable[[], Any]], seconds: float, rounds: int = 5) -> dict[Any, dict[str, float]]:
+    """Time several callables in turn, `seconds` each in all, so that a shared machine's bad minutes hit them alike."""
+    threads = torch.get_num_threads()
+    timers = {name: bench.Timer("run()", globals={"run": run}, num_threads=threads) for name, run in runs.items()}
+    # How many calls one time is the mean of is fixed for all rounds, or their minima would mean different things.
+    calls = {name: max(1, round(1e-3 / timer.timeit(1).mean)) for name, timer in timers.items()}
+    times: dict[Any, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds):
+        for name, timer in timers.items():
+            end = time.perf_counter() + seconds / rounds
+            while not times[name] or time.perf_counter() < end:
+                times[name].append(timer.timeit(calls[name]).mean)
+    return {name: summary(values) for name, values in times.items()}
+
+
+def summary(times: list[float]) -> dict[str, float]:
+    """Return median, minimum and interquartile range [ms] of times [s]."""
+    quarters = statistics.quantiles(times, n=4) if len(times) > 1 else [times[0]] * 3
+    return {"median": 1e3 * quarters[1], "min": 1e3 * min(times), "iqr": 1e3 * (quarters[2] - quarters[0])}
+
+
+def peak_bytes(run: Callable[[], Any], device: str = "cpu") -> int:
+    """Return the most memory that a call holds at once beyond what was there before."""
+    if device != "cpu":
+        torch.cuda.synchronize()
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        run()
+        torch.cuda.synchronize()
+        return torch.cuda.max_memory_allocated() - before
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
+        run()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "trace.json"
+        record.export_chrome_trace(str(path))
+        events = json.loads(path.read_text())["traceEvents"]
+    held, peak = 0, 0
+    for event in sorted((e for e in events if e["name"] == "[memory]"), key=lambda e: (e["ts"], e["args"]["Ev Idx"])):
+        held += event["args"]["Bytes"]
+        peak = max(peak, held)
+    return peak
+
+
+def copy_bandwidth(device: str = "cpu", megabytes: int = 256) -> float:
+    """Return the bytes per second that copying a large tensor reads and writes."""
+    source = torch.ones(megabytes * 2**18, device=device)
+    target = torch.empty_like(source)
+    return 2 * source.nbytes / (milliseconds(lambda: target.copy_(source), 1.0)["min"] / 1e3)
+
+
+def state_bytes(cfg: ElevationMapConfig) -> int:
+    """Return the size of one robot's map."""
+    state = blank_state(cfg.grid, 1, "meta", torch.float32)
+    return sum(value.nbytes for value in (*state[:-1], *state.statistics))
+
+
+def table_bytes(cfg: ElevationMapConfig) -> int:
+    """Return the size of one robot's polar table."""
+    if cfg.raycast is None:
+        return 0
+    polar = PolarGrid.of(cfg.grid, cfg.raycast)
+    return 4 * polar.ranges * polar.azimuths
+
+
+def needed_memory(cfg: ElevationMapConfig, points: int) -> int:
+    """Return the bytes that one robot needs on paper: its map, its points and its polar table."""
+    return state_bytes(cfg) + 12 * points + table_bytes(cfg)
+
+
+def needed_traffic(cfg: ElevationMapConfig, points: int) -> int:
+    """Return the bytes that an update of one robot must move: map and table in and out once, points in."""
+    return 2 * state_bytes(cfg) + 12 * points + 2 * table_bytes(cfg)
+
+
+def exponent(sizes: list[float], times: list[float]) -> float:
+    """Fit times = a * sizes^p by least squares of the logarithms, and return p."""
+    x, y = ([math.log(v) for v in values] for values in (sizes, times))
+    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
+    return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / sum((a - mean_x) ** 2 for a in x)

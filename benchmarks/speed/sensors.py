@@ -1,0 +1,123 @@
+"""How long simulated sensors take to see terrain: rays per second, boxes, rounds of a cast, memory of a tile.
+
+    python -m benchmarks.speed.sensors                   # benchmarks/results/sensors.json, one minute
+    python -m benchmarks.speed.sensors --device cuda     # benchmarks/results/sensors-NAME.json
+
+The robots stand at random places of all kinds of terrain, from easy to hard.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.speed import meter
+from torchelev.app.results import markdown_table, slug, write_json
+from torchelev.sim import DepthCamera, Lidar, mount
+from torchelev.sim.exact.sensors import NonRepetitiveLidar
+from torchelev.sim.exact.trajectories import pose
+from torchelev.sim.sensors import tracing
+from torchelev.sim.sensors.casting import Boxes
+from torchelev.sim.sensors.mounted import MountedSensor
+from torchelev.sim.terrains.generate import terrain_grid
+from torchelev.sim.terrains.heightfield import HeightField
+from torchelev.sim.terrains.shapes import SHAPES
+
+LEVELS = 8
+SENSORS = {
+    "camera 32 x 16, 8 m": MountedSensor(DepthCamera(width=32, height=16), mount(35.0, 0.3, 0.1)),
+    "lidar 16 x 32, 20 m": MountedSensor(Lidar(rings=16, azimuths=32), mount(0.0, 0.0, 0.25)),
+    "rosette 512, 20 m": MountedSensor(NonRepetitiveLidar(rays=512), mount(20.0, 0.3, 0.1)),
+}
+CASES = [(name, robots, boxes) for name in SENSORS for robots, boxes in ((64, 0), (64, 12), (256, 0))]
+HEIGHT = 0.55  # [m] of the base over the ground
+
+
+def standing(field: HeightField, robots: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Return tiles (B,) and poses (B, 4, 4) of robots at random places within 3 m of the middle of a tile."""
+    generator = torch.Generator().manual_seed(seed)
+    tiles = torch.arange(robots) % field.num_tiles
+    xy = 6.0 * torch.rand(robots, 2, generator=generator) - 3.0
+    ground = field.to("cpu").height(tiles, xy[:, None])[:, 0]
+    yaw = 2 * math.pi * torch.rand(robots, generator=generator, dtype=torch.float64)
+    T_map_base = pose(torch.cat([xy, ground[:, None] + HEIGHT], -1).double(), yaw)
+    return tiles.to(field.device), T_map_base.float().to(field.device)
+
+
+def limbs(robots: int, count: int, device: str) -> Boxes | None:
+    """Return boxes of a leg's size in a circle around the base, base frame."""
+    if not count:
+        return None
+    angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    position = torch.stack([0.4 * angle.cos(), 0.4 * angle.sin(), torch.full_like(angle, -0.2)], -1)
+    T_base_box = pose(position, angle, 0.3).float().to(device)
+    half_size = torch.tensor([0.04, 0.04, 0.2], device=device)
+    return Boxes(T_base_box.expand(robots, count, 4, 4), half_size.expand(robots, count, 3))
+
+
+def rounds(look: Any) -> list[tuple[int, int]]:
+    """Return how many rays each round of a cast searched, and over how many cells along each axis."""
+    search, done = tracing.search, []
+
+    def counted(field: HeightField, rays: tracing.Rays, count: int) -> tuple[Tensor, Tensor]:
+        done.append((len(rays.number), count))
+        return search(field, rays, count)
+
+    tracing.search = counted
+    try:
+        look()
+    finally:
+        tracing.search = search
+    return done
+
+
+def measure(field: HeightField, seconds: float) -> list[dict[str, Any]]:
+    """Time all cases in turn."""
+    looks = {}
+    for name, robots, boxes in CASES:
+        tiles, T = standing(field, robots)
+        legs, sensor, step = limbs(robots, boxes, str(field.device)), SENSORS[name], torch.zeros_like(tiles)
+        looks[name, robots, boxes] = lambda a=sensor, b=tiles, c=T, d=legs, e=step: a(field, b, c, legs=d, step=e)
+    times = meter.interleaved(looks, seconds)
+    rows = []
+    for (name, robots, boxes), look in looks.items():
+        time_of, rays = times[name, robots, boxes], look().shape[:2].numel()
+        row = {"sensor": name, "robots": robots, "boxes": boxes, "rays": rays} | time_of
+        hits = float(look()[..., 0].isfinite().float().mean())
+        rows.append(row | {"rays_per_second": 1e3 * rays / time_of["median"], "hits": hits, "rounds": rounds(look)})
+    return rows
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seconds", type=float, default=6.0, help="for each case")
+    parser.add_argument("--out", help="the result, by default in benchmarks/results")
+    options = parser.parse_args()
+    grid = terrain_grid(list(SHAPES), LEVELS, device=options.device)
+    start = time.perf_counter()
+    field = HeightField(grid.field.heights, grid.field.resolution)
+    built = time.perf_counter() - start
+    held = sum(value.nbytes for value in (field.padded, *field.bounds)) / field.num_tiles
+    rows = measure(field, options.seconds)
+    name = "" if options.device == "cpu" else "-" + slug(torch.cuda.get_device_name())
+    tile = {"samples": list(field.heights.shape[1:]), "resolution": field.resolution, "bytes": held}
+    result = {"tiles": field.num_tiles, "tile": tile, "seconds_to_build": built, "cases": rows}
+    write_json(options.out or f"benchmarks/results/sensors{name}.json", result)
+    head = ["sensor", "robots", "boxes", "ms, median", "iqr", "M rays/s", "hits", "rounds"]
+    table = [
+        [r["sensor"], str(r["robots"]), str(r["boxes"]), f"{r['median']:.1f}", f"{r['iqr']:.1f}",
+         f"{r['rays_per_second'] / 1e6:.1f}", f"{r['hits']:.0%}", str(len(r["rounds"]))]
+        for r in rows
+    ]  # fmt: skip
+    print(markdown_table(head, table))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,246 @@
+"""`diagnose` names each usual mistake on simulated scans that provoke it, and is silent on sound ones."""
+
+import copy
+import os
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.helpers import nans, small_map
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.diagnosis.pose_hypotheses import quaternion, rotation
+from torchelev.sim import DepthCamera, Lidar, mount, range_noise, walk
+from torchelev.sim.exact import scenes as library
+
+DT = 0.2  # [s]
+CFG = ElevationMapConfig(grid=GridConfig(resolution=0.08, length_x=8.0, length_y=8.0))
+SENSORS = {"camera": (DepthCamera(width=80, height=60, max_range=6.0), 35.0), "lidar": (Lidar(azimuths=256), 0.0)}
+OPTICAL = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).double()
+FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+
+
+def move(T: Tensor, points: Tensor) -> Tensor:
+    return (points.double() @ T[..., :3, :3].mT + T[..., None, :3, 3]).float()
+
+
+@pytest.fixture(scope="module", params=SENSORS)
+def walked(request):
+    """Scans (points, T_map_sensor, T_map_base) of a walk over rough ground towards stairs, with a turn."""
+    scene, (sensor, pitch) = library.mixed(0), SENSORS[request.param]
+    route = [(-2.6, 0.05), (0.6, 0.05), (0.6, -0.6)]
+    path = walk(scene, route, dt=DT, T_base_sensor=mount(pitch))
+    steps = range(0, 24)
+    return [(sensor.cast(scene, path.T_map_sensor[k])[None], path.T_map_sensor[k, None], path.T_map_base[k, None])
+            for k in steps]  # fmt: skip
+
+
+def map_of(scans, mistake=lambda *scan: scan, dt=DT, cfg=CFG):
+    emap = ElevationMap(cfg)
+    for scan in scans:
+        emap.update(*mistake(*scan), dt=dt)
+    return emap
+
+
+def shift(axis, length):
+    """What to add to poses to move them along an axis of the map [m]."""
+    change = torch.zeros(4, 4)
+    change[axis, 3] = length
+    return change
+
+
+def transposed(T):
+    T = T.clone()
+    T[..., :3, :3] = T[..., :3, :3].mT.clone()
+    return T
+
+
+def reordered(T, shift):
+    """The pose that results if the order of the quaternion's entries is mistaken."""
+    T = T.clone()
+    T[0, :3, :3] = torch.from_numpy(rotation(np.roll(quaternion(T[0, :3, :3].numpy()), shift)))
+    return T
+
+
+def with_legs(points, T, base):
+    """60 points on a leg that moves with the base."""
+    spread = torch.rand(1, 60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.06, 0.06, 0.3])
+    leg = move(torch.linalg.inv(T) @ base, spread + torch.tensor([0.2, 0.15, -0.35]))
+    return torch.cat([points, leg], 1), T, base
+
+
+MISTAKES = {
+    "in the map frame already": lambda p, T, base: (move(T, p), T, base),
+    "millimetres": lambda p, T, base: (1000 * p, T, base),
+    "the points have optical axes": lambda p, T, base: (move(OPTICAL.T, p), T, base),
+    "the pose has optical axes": lambda p, T, base: (p, T @ OPTICAL, base),
+    "is inverted": lambda p, T, base: (p, torch.linalg.inv(T), base),
+    "rotation in T_map_sensor is transposed": lambda p, T, base: (p, transposed(T), base),
+    "order w x y z was read as x y z w": lambda p, T, base: (p, reordered(T, 1), base),
+    "order x y z w was read as w x y z": lambda p, T, base: (p, reordered(T, -1), base),
+    "upside down": lambda p, T, base: (move(FLIP, p), T, base),
+    "own legs": with_legs,
+    "give T_map_base, which the window follows": lambda p, T, base: (p, T + shift(0, 50.0), None),
+    "check T_map_base": lambda p, T, base: (p, T, base + shift(0, 50.0)),
+    "the sensor moves by": lambda p, T, base: (p, T, torch.linalg.inv(base)),
+    "m against the base": lambda p, T, base: (p, T, torch.eye(4, dtype=torch.float64)[None]),
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_is_named_first(walked, words):
+    sentences = map_of(walked, MISTAKES[words]).diagnose()
+    assert sentences and words in sentences[0], sentences
+
+
+def test_sound_scans_are_passed_over(walked):
+    assert map_of(walked).diagnose() == []
+    assert map_of(walked[:1]).diagnose() == []
+    assert map_of([(p, T, None) for p, T, _ in walked]).diagnose() == []
+
+
+def test_dt_in_milliseconds(walked):
+    for dt in (1000 * DT, 33.0):
+        (sentence,) = map_of(walked, dt=dt).diagnose()
+        assert sentence.startswith(f"dt: {dt:g} s") and "not ms" in sentence
+    assert "dt" in map_of(walked[:1] * 3, dt=100.0).diagnose()[0], "who stands still"
+
+
+SILENT_GATES = {
+    "sensor.min_distance": dict(sensor=dict(min_distance=30.0)),
+    "sensor.exclusion": dict(sensor=dict(exclusion=dict(offset=-9.0, height=-8.0))),
+    "sensor.body": dict(sensor=dict(body=dict(lower=[-20, -20, -20], upper=[20, 20, 20]))),
+    "overlap.height": dict(overlap=dict(height=0.2)),
+}
+
+
+@pytest.mark.parametrize("setting", SILENT_GATES)
+def test_a_gate_that_takes_everything_is_named(walked, setting):
+    stages = SILENT_GATES[setting] | {"grid": dict(resolution=0.08, length_x=8.0, length_y=8.0)}
+    below = [(p, T, base + shift(2, -1.5)) for p, T, base in walked]  # the ground seems to be a floor above
+    scans = below if setting.startswith("overlap") else walked
+    sentences = map_of(scans, cfg=ElevationMapConfig.from_dict(stages)).diagnose()
+    assert any(setting in sentence for sentence in sentences), sentences
+
+
+def test_no_time_between_updates(walked):
+    (sentence,) = map_of(walked, dt=0.0).diagnose()
+    assert sentence.startswith("dt: 0 s in all updates")
+    emap = ElevationMap(CFG)  # two sensors that take turns: the second is of the same instant
+    for points, T, base in walked:
+        emap.update(points, T, base, dt=DT)
+        emap.update(points, T, base, dt=0.0)
+    assert emap.diagnose() == []
+
+
+@pytest.mark.parametrize("knows_base", [True, False])
+@pytest.mark.parametrize("height", [0.15, 0.25, 0.35])
+@pytest.mark.parametrize("slope", [0.0, 0.4])
+def test_the_ground_under_a_low_robot_is_no_leg(knows_base, height, slope):
+    """Its base rides so low over the ground that this lies where the legs of others are."""
+    emap, generator = ElevationMap(CFG), torch.Generator().manual_seed(0)
+    for k in range(20):
+        T = torch.eye(4, dtype=torch.float64)[None]
+        T[0, 0, 3], T[0, 2, 3] = 0.1 * k, height + slope * 0.1 * k
+        xy = 6 * torch.rand(1, 6000, 2, generator=generator) - 3
+        z = slope * xy[..., :1] - height + 0.01 * torch.randn(1, 6000, 1, generator=generator)
+        emap.update(torch.cat([xy, z], -1), T, T if knows_base else None, dt=0.1)
+    assert [text for text in emap.diagnose() if "legs" in text] == []
+
+
+def test_clouds_without_a_number(walked):
+    (sentence,) = map_of(walked, lambda p, T, base: (p * torch.nan, T, base)).diagnose()
+    assert "NaN or infinite" in sentence
+
+
+def test_scans_that_contradict_each_other():
+    """Every other scan is higher by a metre than its pose says."""
+    ground = torch.rand(1, 4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 6.0, 0.0]) - 3.0
+    emap = ElevationMap(CFG)
+    for k in range(4):
+        T = torch.eye(4)[None].clone()
+        T[0, 2, 3] = 3.0 + k % 2
+        emap.update(ground, T, dt=0.1)
+    assert "contradict the map" in emap.diagnose()[-1]
+
+
+def test_nothing_is_said_of_what_was_not_seen():
+    emap = small_map(2)
+    assert emap.diagnose() == []
+    emap.update(nans(2), torch.eye(4).repeat(2, 1, 1), dt=0.0)
+    assert emap.diagnose() == []
+
+
+def test_reset_forgets_what_was_seen(walked):
+    emap = map_of(walked, MISTAKES["millimetres"])
+    assert emap.diagnose()
+    emap.reset()
+    assert emap.diagnose() == []
+
+
+@pytest.mark.parametrize("how", ["mask", "env_ids"])
+def test_a_reset_of_some_forgets_theirs_alone(walked, how):
+    emap = ElevationMap(CFG, num_envs=2)
+    p, T, base = walked[0]
+    emap.update(torch.cat([p, 1000 * p]), T.repeat(2, 1, 1), base.repeat(2, 1, 1), dt=DT)
+    for env, found in ((0, True), (1, False)):
+        emap.reset(**{how: torch.tensor([env]) if how == "env_ids" else torch.arange(2) == env})
+        assert bool(emap.diagnose()) == found
+
+
+def test_second_environment_is_looked_at(walked):
+    emap = ElevationMap(CFG, num_envs=2)
+    for p, T, base in walked[:3]:
+        emap.update(torch.cat([p, 1000 * p]), T.repeat(2, 1, 1), base.repeat(2, 1, 1), dt=DT)
+    assert "millimetres" in emap.diagnose()[0]
+
+
+def test_inputs_are_copied_and_maps_too(walked):
+    """A caller may reuse its tensors; deepcopy and inference mode go on, and the state is what it was."""
+    p, T, base = walked[0]
+    emap, names = ElevationMap(CFG), set(ElevationMap(CFG).state_dict())
+    with torch.inference_mode():
+        buffer = 1000 * p
+        emap.update(buffer, T, base, dt=DT)
+        buffer.zero_()
+    assert "millimetres" in emap.diagnose()[0]
+    assert "millimetres" in copy.deepcopy(emap).diagnose()[0]
+    assert set(emap.state_dict()) == names
+    twin = ElevationMap(CFG)
+    twin.update(p.clone().requires_grad_(), T, base, dt=DT)
+    copy.deepcopy(twin)
+
+
+def sound_scene(seed):
+    """A random terrain, sensor, mount, speed and window -> scene, sensor, path, config, whether the base is known."""
+    rng = np.random.default_rng(seed)
+    kinds = [lambda: library.slope(rng.uniform(0, 30)), lambda: library.rough(seed), library.stairs,
+             lambda: library.boxes(seed), lambda: library.mixed(seed), library.wall, library.overhang,
+             lambda: library.person(2.0), library.flat]  # fmt: skip
+    scene = kinds[rng.integers(len(kinds))]()
+    if rng.random() < 0.6:
+        sensor, pitch = DepthCamera(width=64, height=48, max_range=rng.uniform(4, 10)), rng.uniform(10, 50)
+    else:
+        rings, top = int(rng.choice([8, 16, 32])), rng.choice([15, 45])
+        sensor = Lidar(rings, 256, fov_high_deg=float(top), max_range=rng.uniform(8, 40))
+        pitch = rng.uniform(-5, 20)
+    start, end = rng.uniform(-2, 2, (2, 2))
+    T_base_sensor = mount(pitch, z=float(rng.choice([0.1, 0.25, 0.5, 1.5])))
+    path = walk(scene, [tuple(start), tuple(end)], speed=rng.uniform(0.2, 1.5), dt=DT, T_base_sensor=T_base_sensor)
+    size, resolution = float(rng.choice([4, 8, 16])), float(rng.choice([0.04, 0.1, 0.2]))
+    grid = GridConfig(resolution=resolution, length_x=size, length_y=size)
+    knows_base = size == 4 or rng.random() < 0.8  # a window of 4 m that does not follow the robot is a mistake
+    return scene, sensor, path, ElevationMapConfig(grid=grid), knows_base
+
+
+@pytest.mark.parametrize("seed", range(int(os.environ.get("SOUND_SCENES", 12))))
+def test_random_sound_scenes_are_passed_over(seed):
+    """SOUND_SCENES=100 in the environment tries more."""
+    scene, sensor, path, cfg, knows_base = sound_scene(seed)
+    generator, emap = torch.Generator().manual_seed(seed), ElevationMap(cfg)
+    for k in range(min(12, len(path.times))):
+        points = range_noise(sensor.cast(scene, path.T_map_sensor[k], float(path.times[k])), generator)
+        base = path.T_map_base[k, None] if knows_base else None
+        emap.update(points[None], path.T_map_sensor[k, None], base, dt=DT)
+    assert emap.diagnose() == []

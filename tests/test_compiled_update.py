@@ -1,0 +1,390 @@
+"""Compilation: few graphs, the same results, shared where inputs are alike and apart where they are not."""
+
+import itertools
+import re
+
+import pytest
+import torch
+from torch._dynamo.callback import callback_handler
+from torch._dynamo.testing import CompileCounter
+from torch._inductor import config as inductor_config
+from torch._inductor.codegen.cpp import CppScheduling
+from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
+from torch._inductor.utils import run_and_get_code
+
+import torchelev
+from tests.helpers import assert_close, differences, mapped, scan, small_config, small_map, snapshot
+from torchelev import ElevationMap, SensorConfig
+from torchelev.compiled_update import KERNEL_ARGUMENTS, Graphs, announced_compilation, compiled, graphs_of
+from torchelev.layers import LAYERS
+from torchelev.stages.fusion import fuse as fusion
+from torchelev.stages.fusion.contested import settle
+
+
+def core(emap):
+    """The differentiable core as one function."""
+
+    def run(state, points, T_map_sensor, T_map_base, dt):
+        return emap(state, emap.measure(points, T_map_sensor, T_map_base, dt))
+
+    return run
+
+
+@pytest.mark.parametrize("with_base", [True, False])
+@pytest.mark.parametrize("sensors", [None, 2])
+def test_the_core_compiles_as_one_graph(with_base, sensors):
+    emap = mapped(sensor=SensorConfig(body=torchelev.BodyConfig()))
+    cloud, T = scan(5)
+    base = T if with_base else None
+    if sensors:
+        cloud, T_sensor = cloud.unflatten(1, (sensors, -1)), T[:, None].repeat(1, sensors, 1, 1)
+    else:
+        T_sensor = T
+    dt = torch.full((2,), 0.1)
+    compiled = torch.compile(core(emap), fullgraph=True, backend="eager")
+    state = compiled(snapshot(emap), cloud, T_sensor, base, dt)
+    assert_close(state, core(emap)(emap.state, cloud, T_sensor, base, dt), 1e-6)
+
+
+def test_readers_and_resets_compile_as_one_graph():
+    emap = mapped()
+
+    def read(state, xy):
+        layers = [emap.layer(name, state=state) for name in LAYERS]
+        return layers, [emap.sample(xy, mode=mode, state=state) for mode in ("bilinear", "nearest")]
+
+    xy = torch.rand(2, 9, 2, generator=torch.Generator().manual_seed(0)) - 0.5
+    compiled = torch.compile(read, fullgraph=True, backend="eager")(emap.state, xy)
+    torch.testing.assert_close(compiled, read(emap.state, xy), equal_nan=True)
+    torch.compile(emap.reset, fullgraph=True, backend="eager")(mask=torch.tensor([True, False]))
+    assert not emap.validity[0].any() and emap.validity[1].any()
+
+
+def test_gradients_through_the_compiled_core():
+    emap = mapped()
+    cloud, T = scan(5)
+    results = []
+    for run in (core(emap), torch.compile(core(emap), fullgraph=True, backend="aot_eager")):
+        points = cloud.clone().requires_grad_()
+        after = run(snapshot(emap), points, T, T, torch.full((2,), 0.1))
+        bounds = after.upper_bound[after.bounded & ~after.validity]
+        (after.elevation.sum() + bounds.square().sum()).backward()
+        results.append(points.grad)
+    torch.testing.assert_close(*results)
+
+
+PARTS = len(Graphs._fields)  # of an update, a graph each
+
+
+def graphs():
+    """How many graphs were compiled so far."""
+    return torch._dynamo.utils.counters["stats"]["unique_graphs"]
+
+
+def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
+    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice.
+
+    Nor for another number of disputed cells: none, single ones, and tops and grounds of steps.
+    """
+    torch._dynamo.reset()
+    sides = []
+
+    def spy(points, *others):
+        height, side = settle(points, *others)
+        if not torch.compiler.is_compiling():
+            sides.append([len(points.cells), int((side > 0).sum()), int((side < 0).sum())])
+        return height, side
+
+    monkeypatch.setattr(fusion, "settle", spy)
+    before = graphs()
+    maps = {name: small_map(2) for name in ("eager", "compiled", "twin")}
+    maps["compiled"].compile()
+    maps["twin"].compile()
+    losses = {name: (torch.ones(1, requires_grad=True) * emap.elevation).sum() for name, emap in maps.items()}
+    for k, number in enumerate((300, 290, 5000, 200, 6000, 100)):
+        cloud, T = scan(k, 2, number)
+        cloud = cloud[:, :150] if number == 200 else cloud
+        T = T[:1].expand(2, 4, 4) if number == 200 else T
+        if number == 6000:  # a block of heights in every cell
+            T = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+            generator = torch.Generator().manual_seed(0)
+            cloud = torch.rand(2, 6000, 3, generator=generator) * torch.tensor([0.3, 0.3, 0.6]) - 0.15
+        cloud = cloud * torch.nan if number == 100 else cloud
+        for emap in maps.values():
+            emap.update(cloud, T, T, 0.3)
+        for name in ("compiled", "twin"):
+            assert_close(maps["eager"].state, maps[name].state, 1e-5)
+            floats = {
+                n for n, v in maps["eager"].state._asdict().items() if n != "statistics" and v.is_floating_point()
+            }
+            rounded = floats | {"drift_error", "drift_correction"}
+            assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
+    assert graphs() == before + PARTS
+    for loss in losses.values():
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            loss.backward()
+    disputed, tops, grounds = zip(*sides, strict=True)
+    assert 0 in disputed and max(disputed) > 10 and max(tops) > 0 and max(grounds) > 0
+
+
+def test_an_older_torch_is_refused(monkeypatch):
+    monkeypatch.setattr(torch, "__version__", torch.torch_version.TorchVersion("2.9.1"))
+    emap = small_map(1)
+    with pytest.raises(RuntimeError, match=r"torch.*2\.10 or later.*2\.9\.1.*upgrade"):
+        emap.compile()
+    cloud, T = scan(0, 1)
+    emap.update(cloud, T, dt=0.0)
+    assert emap.validity.any()
+
+
+def test_the_core_exports():
+    emap, (cloud, T) = mapped(), scan(5)
+
+    class Core(torch.nn.Module):
+        def forward(self, points, T, dt):
+            return emap(emap.state, emap.measure(points, T, T, dt)).elevation
+
+    inputs = (cloud, T, torch.full((2,), 0.1))
+    exported = torch.export.export(Core(), inputs, strict=False).module()
+    torch.testing.assert_close(exported(*inputs), Core()(*inputs))
+
+
+def test_compiled_update_equals_eager_without_what_may_be_left_out():
+    """By the real compiler too: one robot, two sensors, variances, no base pose, no drift, no overlap."""
+    torch._dynamo.reset()
+    maps = [small_map(1, drift=None, overlap=None) for _ in range(2)]
+    maps[1].compile()
+    for k in range(3):
+        cloud, T = scan(k, 1, 60)
+        clouds, poses = cloud.unflatten(1, (2, -1)), T[:, None].repeat(1, 2, 1, 1)
+        for emap in maps:
+            emap.update(clouds, poses, None, 0.3, variance=clouds[..., 0].abs() * 1e-3 + 1e-4)
+        # The roughness of ground that few cells tell is the root of a rounding error.
+        assert_close(maps[0].state, maps[1].state, 1e-5, skip=["traversability"])
+        torch.testing.assert_close(maps[1].state.traversability, maps[0].state.traversability, atol=1e-3, rtol=0)
+    assert maps[0].validity.any() and maps[0].bounded.any()
+
+
+def test_an_update_that_is_stopped_leaves_a_sound_map(compile_with, monkeypatch):
+    """By an error of the second graph: the window has moved, nothing was taken in, and the next scan is."""
+    compile_with("eager")
+    emap, eager = small_map(2), small_map(2)
+    emap.compile()
+    cloud, T = scan(0)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        name = "torchelev.compiled_update.graphs_of"
+        patch.setattr(name, lambda *key: graphs_of(*key)._replace(take_heights=stopped))
+        with pytest.raises(KeyboardInterrupt):
+            emap.update(cloud, T, T, 0.3)
+    assert not emap.validity.any()
+    eager.update(cloud[:, :0], T, T, 0.3)  # as a scan without points
+    for k, number in enumerate((200, 300)):
+        cloud, T = scan(k + 1, 2, number)
+        for one in (emap, eager):
+            one.update(cloud, T, T, 0.3)
+    assert_close(eager.state, emap.state, 1e-5)
+
+
+PLAIN = {"drift": None, "raycast": None, "overlap": None, "traversability": None}  # quick to trace
+
+
+def test_configs_of_one_shape_have_their_own_graphs(compile_with):
+    """Nine: of one code object the compiler keeps eight graphs, and refuses the next."""
+    compile_with("eager")
+    cloud, T = scan(0, 2, 60)
+    for k in range(9):
+        maps = [small_map(2, **PLAIN, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
+        maps[1].compile()
+        for emap in maps:
+            emap.update(cloud, T, T, 0.3)
+        assert_close(maps[0].state, maps[1].state)
+
+
+def test_inputs_of_every_kind_have_their_own_graphs(compile_with):
+    """More than eight of one config: precisions, sensors, with and without base and variances, numbers of robots."""
+    compile_with("eager")
+    for num_envs, sensors, dtype in ((2, 1, torch.float32), (5, 2, torch.float64), (3, 1, torch.bfloat16)):
+        cloud, T = scan(0, num_envs, 60)
+        clouds = cloud.to(dtype)[:, None].repeat(1, sensors, 1, 1)
+        for base, variance in itertools.product((T, None), (clouds[..., 0].abs() + 0.01, None)):
+            maps = [small_map(num_envs, **PLAIN) for _ in range(2)]
+            maps[1].compile()
+            for emap in maps:
+                emap.update(clouds, T[:, None].repeat(1, sensors, 1, 1), base, 0.3, variance=variance)
+            assert_close(maps[0].state, maps[1].state)
+
+
+def test_an_update_that_compiles_says_what_it_costs(compile_with, capsys):
+    counter = CompileCounter()
+    compile_with(counter)
+    for number, num_envs in enumerate((2, 2, 3, 5, 1, 7, 2)):
+        emap = small_map(num_envs)
+        emap.compile()
+        cloud, T = scan(number, num_envs)
+        before = counter.frame_count
+        emap.update(cloud, T, T, 0.1)
+        assert capsys.readouterr().err.count("compiling the update") == (counter.frame_count > before)
+    assert counter.frame_count == 3 * PARTS  # of 2, of 2 and more, of 1
+
+
+def test_what_is_compiled_anew_says_so(compile_with, capsys):
+    compile_with("eager")
+    emap = small_map(2)
+    emap.compile()
+    cloud, T = scan(0, 2)
+    for _ in range(2):
+        torch._dynamo.reset()
+        emap.update(cloud, T, T, 0.1)
+        assert capsys.readouterr().err.count("compiling the update") == 1
+    assert not callback_handler.start_callbacks
+
+
+def test_the_compiler_is_left_as_it_was(monkeypatch, capsys):
+    seen, usual = [], CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
+
+    def fails(*_):
+        seen.append(CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM)
+        raise ArithmeticError("of the compiler")
+
+    monkeypatch.setattr("torch._inductor.compile", fails)
+    with pytest.raises(Exception, match="of the compiler"), announced_compilation():
+        compiled(lambda x: x + 1)(torch.ones(2))
+    assert seen == [KERNEL_ARGUMENTS] and usual > KERNEL_ARGUMENTS
+    assert usual == CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
+    assert "failed" in capsys.readouterr().err
+    assert not callback_handler.start_callbacks
+
+
+def test_eight_bytes_of_a_mask_are_loaded_at_once():
+    """Also where the rest of the mask is fewer than eight, and where the vectors are longer."""
+
+    def chosen(mask, values):
+        return torch.where(mask.bool(), values, -values)
+
+    generator = torch.Generator().manual_seed(0)
+    for number in (8, 64, 2003):
+        mask = torch.randint(2, (number,), generator=generator, dtype=torch.uint8)
+        values = torch.randn(number, generator=generator)
+        with inductor_config.patch(force_disable_caches=True):
+            result, codes = run_and_get_code(compiled(chosen), mask, values)
+        assert torch.equal(result, chosen(mask, values))
+        if isinstance(pick_vec_isa(), VecAVX2):
+            code = "".join(codes)
+            assert "<uint8_t>::loadu_one_fourth(" in code
+            assert re.search(r"<uint8_t>::loadu\(.*<int64_t>\(8L?\)\)", code) is None
+
+
+@pytest.mark.parametrize("sensors", [None, 2])
+@pytest.mark.parametrize("with_variance", [False, True])
+def test_a_new_number_of_points_compiles_nothing(compile_with, sensors, with_variance):
+    """The same graphs for every number of points from 2 on, with the statistics and the map of the eager update."""
+    counter = CompileCounter()
+    compile_with(counter)
+    eager, compiled = small_map(2, drift=None), small_map(2, drift=None)
+    compiled.compile()
+    for k, number in enumerate((300, 290, 2, 310, 64, 65, 3, 1000)):
+        cloud, T = scan(k, 2, number * (sensors or 1))
+        variance = torch.full(cloud.shape[:-1], 1e-3)
+        T_sensor = T
+        if sensors:
+            cloud, variance = (v.unflatten(1, (sensors, number)) for v in (cloud, variance))
+            T_sensor = T[:, None].repeat(1, sensors, 1, 1)
+        for emap in (eager, compiled):
+            emap.update(cloud, T_sensor, T, 0.1, variance=variance if with_variance else None)
+        assert differences(eager.state, compiled.state) == [], number
+        assert counter.frame_count == PARTS, number
+
+
+@pytest.mark.parametrize("sensors", [None, 2])
+def test_clouds_of_no_or_one_point_run_eagerly(compile_with, sensors):
+    """The compiler takes sizes 0 and 1 for constants; they must not cost a graph each."""
+    counter = CompileCounter()
+    compile_with(counter)
+    eager, compiled = small_map(2), small_map(2)
+    compiled.compile()
+    for number in (0, 1):
+        cloud, T = scan(number, 2, number * (sensors or 1))
+        T_sensor = T
+        if sensors:
+            cloud, T_sensor = cloud.unflatten(1, (sensors, number)), T[:, None].repeat(1, sensors, 1, 1)
+        for emap in (eager, compiled):
+            emap.update(cloud, T_sensor, T, 0.1)
+            emap.update(cloud, T_sensor, T, 0.1, variance=torch.full(cloud.shape[:-1], 1e-3))
+        assert differences(eager.state, compiled.state) == []
+    assert compiled.validity.any() and counter.frame_count == 0
+
+
+def test_maps_of_equal_configs_share_their_graphs(compile_with):
+    counter = CompileCounter()
+    compile_with(counter)
+    maps = small_map(2), small_map(2)
+    for k, emap in enumerate(maps):
+        emap.compile()
+        cloud, T = scan(k, 2, 300 + k)
+        emap.update(cloud, T, T, 0.1)
+    assert counter.frame_count == PARTS
+
+
+def test_inference_mode_shares_the_graphs(compile_with):
+    """Training steps environments in inference mode, and tries them outside."""
+    counter = CompileCounter()
+    compile_with(counter)
+    emap = small_map(2)
+    emap.compile()
+    for k, mode in enumerate((False, True, False)):
+        cloud, T = scan(k, 2)
+        with torch.inference_mode(mode):
+            emap.update(cloud + 0.0, T + 0.0, T, 0.1)
+    assert counter.frame_count == PARTS and emap.validity.any()
+
+
+def test_equal_configs_share_the_compiled_update():
+    assert graphs_of(small_config(), (), 1) is graphs_of(small_config(), (), 1)
+    assert graphs_of(small_config(), (), 1) is not graphs_of(small_config(drift=None), (), 1)
+
+
+def test_no_recompilation_for_new_values():
+    """New dt, poses and clouds are data, not constants."""
+    emap, counter = mapped(), CompileCounter()
+    torch._dynamo.reset()
+    compiled = torch.compile(core(emap), fullgraph=True, backend=counter)
+    for k in range(4):
+        cloud, T = scan(k)
+        compiled(snapshot(emap), cloud, T, T, torch.full((2,), 0.1 * k))
+    assert counter.frame_count == 1
+
+
+@pytest.mark.parametrize(
+    "num_envs, chunk, sensors, base, variance",
+    [(2, None, 1, True, False), (1, None, 2, False, True), (5, 2, 1, True, False)],
+)
+def test_warm_maps_compile_nothing_more_and_are_untouched(compile_with, num_envs, chunk, sensors, base, variance):
+    counter = CompileCounter()
+    compile_with(counter)
+    emap = ElevationMap(small_config(), num_envs=num_envs, chunk=chunk)
+    cloud = torch.randn(num_envs, sensors, 50, 3, generator=torch.Generator().manual_seed(0))
+    T = torch.eye(4, dtype=torch.float64).repeat(num_envs, sensors, 1, 1)
+    given = dict(variance=torch.full(cloud.shape[:-1], 0.01) if variance else None)
+    emap.update(cloud, T, T[:, 0] if base else None, dt=0.1, **given)
+    before = snapshot(emap)
+    emap.warm_up(50, sensors, base=base, variance=variance)
+    assert counter.frame_count == 0, "a map that is not compiled has nothing to warm up"
+    emap.compile()
+    emap.warm_up(50, sensors, base=base, variance=variance)
+    assert counter.frame_count >= PARTS
+    assert differences(before, emap.state) == []
+    count = counter.frame_count
+    for points in (cloud, cloud[:, :, :40]):
+        values = None if not variance else given["variance"][:, :, : points.shape[2]]
+        emap.update(points, T, T[:, 0] if base else None, dt=0.1, variance=values)
+    assert counter.frame_count == count
+
+
+@pytest.mark.parametrize("numbers, name", [((0,), "num_points"), ((5, 0), "num_sensors"), ((2.5,), "num_points")])
+def test_warm_up_refuses_what_no_update_takes(numbers, name):
+    with pytest.raises((ValueError, TypeError), match=name):
+        mapped().warm_up(*numbers)

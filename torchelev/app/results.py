@@ -1,0 +1,61 @@
+"""What every benchmark writes: JSON with machine, versions and commit, and markdown tables."""
+
+from __future__ import annotations
+
+import json
+import platform
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+def machine() -> dict[str, Any]:
+    """Describe what a result was measured on."""
+    return {
+        "processor": _processor(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "commit": commit(),
+    }
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{len(names)} x {names[0]}" if names else platform.processor()
+
+
+def commit() -> str:
+    """Return the checkout's commit, with "+changes" if the working tree differs from it."""
+    try:
+        name = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+        paths = ["torchelev", "envs", "training/**.py", "benchmarks/**.py"]
+        status = ["git", "status", "--porcelain", "-uno", *paths]
+        changes = subprocess.run(status, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return name.stdout.strip() + ("+changes" if changes.stdout.strip() else "")
+
+
+def write_json(path: str | Path, values: dict[str, Any]) -> None:
+    """Write a result with the machine it was measured on."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    described = {"machine": None} | values | {"machine": machine()}  # values read from a file hold another machine's
+    Path(path).write_text(json.dumps(described, indent=1) + "\n")
+
+
+def slug(name: str) -> str:
+    """Return a name fit for a file: small letters and digits, joined by hyphens."""
+    return "-".join(re.findall(r"[a-z0-9]+", name.lower()))
+
+
+def markdown_table(head: list[str], rows: list[list[str]]) -> str:
+    """Format a table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

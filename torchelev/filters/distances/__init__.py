@@ -1,0 +1,1 @@
+"""Distance transforms and signed distance fields."""

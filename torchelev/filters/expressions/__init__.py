@@ -1,0 +1,1 @@
+"""The expression language of the filter chain: arithmetic over layers."""

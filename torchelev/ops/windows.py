@@ -1,0 +1,83 @@
+"""Sums and maxima over the square window around each cell, along one dimension after the other."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchelev.ops.operators import padded
+from torchelev.ops.storage import realize_all
+
+AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+
+
+def around(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return AROUND's rows and columns, (8,) int64; computed, as a copy to a GPU would make the host wait."""
+    k = torch.arange(8, device=device)
+    k = k + (k >= 4)
+    return k // 3 - 1, k % 3 - 1
+
+
+def _line(values: Tensor, rim: int, dim: int, k: int) -> Tensor:
+    """Return what lies k entries on, along a dimension that has a rim."""
+    return values.narrow(dim, rim + k, values.shape[dim] - 2 * rim)
+
+
+def shifted(values: Tensor, rim: int, i: int = 0, j: int = 0) -> Tensor:
+    """Return what lies (i, j) cells on, of (..., H + 2 rim, W + 2 rim) the inner (..., H, W)."""
+    return _line(_line(values, rim, -2, i), rim, -1, j)
+
+
+def _line_sums(values: Tensor, rim: int, radius: int, dim: int, order: int) -> list[Tensor]:
+    """Sum k^power * values over k = -radius .. radius along one dimension, for each power up to the order of 0 to 2."""
+    middle, steps = _line(values, rim, dim, 0), range(1, radius + 1)
+    sides = [(_line(values, rim, dim, -k), _line(values, rim, dim, k)) for k in steps]
+    both = [before + after for before, after in sides]
+    sums = [functools.reduce(torch.add, both, middle)]
+    if order >= 1:
+        sums.append(_weighted(steps, [after - before for before, after in sides]))
+    if order >= 2:
+        sums.append(_weighted([k * k for k in steps], both))
+    return sums
+
+
+def _weighted(weights: Sequence[int], values: list[Tensor]) -> Tensor:
+    """Sum weight * value; the first weight is 1."""
+    total = values[0]
+    for weight, value in zip(weights[1:], values[1:], strict=True):
+        total = torch.add(total, value, alpha=weight)
+    return total
+
+
+def window_moments(layers: list[tuple[Tensor, int]], rim: int, radius: int) -> list[Tensor]:
+    """Sum u^a v^b * values over the (2 * radius + 1)^2 window around each cell.
+
+    u and v count cells from the window's centre along H and W. For each layer (B, H + 2 * rim, W + 2 * rim) with its
+    order, 0 to 2, all moments (B, H, W) with a + b <= order: (0, 0), (0, 1), ... (1, 0), ... The rim is at least the
+    radius.
+    """
+    lines = [line for v, order in layers for line in _line_sums(v, rim, radius, -2, order)]
+    if radius > 1:  # three values are summed anew at each reading, for less memory
+        lines = realize_all(*lines)
+    orders = [order - a for _, order in layers for a in range(order + 1)]
+    return [
+        moment for line, order in zip(lines, orders, strict=True) for moment in _line_sums(line, rim, radius, -1, order)
+    ]
+
+
+def window_maximum(values: list[Tensor], rim: int, radius: int) -> list[Tensor]:
+    """Return each layer's maxima over the (2 * radius + 1)^2 window around each cell; shapes as in `window_moments`."""
+    for dim in (-2, -1):
+        lines = ([_line(v, rim, dim, k) for k in range(-radius, radius + 1)] for v in values)
+        values = realize_all(*(functools.reduce(torch.maximum, line) for line in lines))
+    return values
+
+
+def neighbours(values: Tensor, fill: float) -> list[Tensor]:
+    """Return the eight neighbours of each cell of (..., H, W) in the order of AROUND, `fill` outside the layer."""
+    rimmed = padded(values, 1, fill)
+    rows = [_line(rimmed, 1, -2, i) for i in (-1, 0, 1)]
+    return [_line(rows[1 + i], 1, -1, j) for i, j in AROUND]

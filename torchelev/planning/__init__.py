@@ -1,0 +1,1 @@
+"""What a planner asks of a map: footprints, paths, costs, and a planner over the grid."""

@@ -1,0 +1,1 @@
+"""Sensors on many robots at once, whose rays are cast at height fields and boxes."""

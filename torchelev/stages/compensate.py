@@ -1,0 +1,78 @@
+"""Height drift: the estimated sensor height wanders, so the map is moved to meet the newest scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.grid import GridConfig, PointCells, center_offsets
+from torchelev.ops.masks import as_factor, lifted, masked
+from torchelev.state import MapState, Measurement, count, tally
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriftConfig:
+    """Which points measure the drift, and how much of it is corrected."""
+
+    min_traversability: float | None = None  # flat enough for a height error to mean drift; None: the head's own
+    max_variance: float = 0.01  # [m^2] certain enough cells
+    max_error: float = 0.1  # [m] larger errors of single points are obstacles
+    gate: float = 2.0  # standard deviations around the mean error that still count
+    relief: float = 0.003  # [m] standard deviation of height within a flat cell
+    min_points: int = 50
+    max_drift: float = 0.1  # [m] a larger mean error is not corrected
+    gain: float = 1.0  # the paper adds the whole mean error
+
+    def __post_init__(self) -> None:
+        require(0 < self.gain <= 1, "drift.gain", "must lie in (0, 1]", self.gain, "the paper's value is 1")
+        gate = self.min_traversability
+        share = gate is None or (isinstance(gate, int | float) and 0 <= gate <= 1)
+        hint = "leave it out for the head's own"
+        require(share, "drift.min_traversability", "must lie in [0, 1] or be None", repr(gate), hint)
+        require(self.min_points >= 1, "drift.min_points", "must be at least 1", self.min_points, "give 50")
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Average (B, M) over what the mask keeps; 0 where it keeps nothing."""
+    # In float64: a float32 sum of more than 4096 points the compiler writes in another way, in another graph.
+    total = masked(values, mask).sum(1, dtype=torch.float64)
+    return (total / count(mask).clamp(min=1)).to(values.dtype)
+
+
+def compensate(
+    state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: DriftConfig, head_gate: float
+) -> MapState:
+    """Add the mean height error over certain, flat cells to elevation and upper bound (paper, Sec. II-D).
+
+    e = (1 / n) * sum (p_z - h), h the height at the point of its cell's plane, over points whose cell is known,
+    traversable and certain, with |p_z - h| <= max_error and then within `gate` standard deviations of their mean.
+    Corrected by gain * e where n >= min_points and |e| <= max_drift. Traversable is what the config says, else what is
+    rated `head_gate` or more.
+    """
+    px, py, pz = m.points.unbind(-1)
+    gate = head_gate if cfg.min_traversability is None else cfg.min_traversability
+    suits = state.validity & (state.traversability >= gate) & (state.variance <= cfg.max_variance)
+    # On a slope the height within a cell depends on where in the cell the point lies.
+    x, y = center_offsets(state, m, grid)
+    gx, gy = state.gradient_x, state.gradient_y
+    at_origin = state.elevation - gx * x - gy * y
+    # Cells that do not suit get a height that no point is near.
+    ground, gx, gy = cells.take(lifted(at_origin, ~suits), gx, gy)
+    error = pz - (ground + gx * px + gy * py)
+    counts = cells.inside & (error.abs() <= cfg.max_error)
+    mean = masked_mean(error, counts)
+    # Once more around the mean: the foot of a wall that nobody saw yet stands on ground that looks flat.
+    counts = counts & ((error - mean[:, None]).square() <= cfg.gate**2 * (m.variance + cfg.relief**2))
+    number, mean = count(counts), masked_mean(error, counts)
+    applies = (number >= cfg.min_points) & (mean.abs() <= cfg.max_drift)
+    correction = torch.where(applies, cfg.gain * mean, 0.0)
+    shift = correction[:, None, None]
+    state = state._replace(
+        elevation=state.elevation + shift * as_factor(state.validity),
+        challenger=state.challenger + shift.detach() * as_factor(state.challenger_support > 0),
+        upper_bound=state.upper_bound + shift * as_factor(state.bounded),
+    )
+    return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

@@ -1,0 +1,203 @@
+"""Cells whose points disagree: their robust mean, their step if they hold one, and how to work on them alone.
+
+Few cells are disputed, but each costs several rounds over its points. So a CPU picks out those cells and their points;
+a GPU, which would have to wait for the host to learn how many there are, goes through all. Nothing here has a
+gradient: a height is a guess around which `fusion` averages.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.stages.fusion.edges import EdgeConfig, side_of_step
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int, UInt8
+
+
+NO_HEIGHT = -1e30  # [m] below all heights
+
+
+class Shown(NamedTuple):
+    """The height that the scan and the map show of each cell, (B, C) [m]; NO_HEIGHT where they show none."""
+
+    scan: Float[Tensor, "B C"]  # mean of the points
+    map: Float[Tensor, "B C"]
+
+
+@torch.library.custom_op(
+    "torchelev::pick_out", mutates_args=(), schema="(Tensor cells, Tensor slot, Tensor[] columns) -> Tensor[]"
+)
+def pick_out(cells: UInt8[Tensor, "B C"], slot: Int[Tensor, "B M"], columns: list[Tensor]) -> list[Tensor]:
+    """Pick out the cells that are not zero, and their points.
+
+    Returns these cells (K,), numbered across environments, and of each point in one of them (P,) the place of its cell
+    among these K, and the point's value of each column (B, M). A custom operator, as the compiler must not look into
+    what depends on the data; it compiles what follows for any K and P.
+    """
+    disputed = cells.flatten().nonzero().squeeze(1)
+    picked = cells.gather(1, slot).flatten().nonzero().squeeze(1)
+    cell = slot.flatten().index_select(0, picked) + picked // slot.shape[1] * cells.shape[1]
+    owner = torch.searchsorted(disputed, cell)
+    return [disputed, owner, *(column.flatten().index_select(0, picked) for column in columns)]
+
+
+@pick_out.register_fake
+def _(cells: Tensor, slot: Tensor, columns: list[Tensor]) -> list[Tensor]:
+    context = torch.library.get_ctx()
+    K, P = context.new_dynamic_size(), context.new_dynamic_size()
+    return [slot.new_empty(K), slot.new_empty(P), *(column.new_empty(P) for column in columns)]
+
+
+@torch.library.custom_op("torchelev::pick_cells", mutates_args=())
+def pick_cells(cells: Tensor) -> Tensor:
+    """Return which cells (B, C) are not zero (K,), numbered across environments."""
+    return cells.flatten().nonzero().squeeze(1)
+
+
+@pick_cells.register_fake
+def _(cells: Tensor) -> Tensor:
+    return cells.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int64)
+
+
+@torch.library.custom_op(
+    "torchelev::put_in", mutates_args=(), schema="(Tensor[] layers, Tensor cells, Tensor[] values) -> Tensor[]"
+)
+def put_in(layers: list[Tensor], cells: Tensor, values: list[Tensor]) -> list[Tensor]:
+    """Return layers (B, C) with values (K,) at cells.
+
+    An operator, as the compiler would put it off to the end of the update and hold until then all that it reads.
+    """
+    pairs = zip(layers, values, strict=True)
+    return [layer.flatten().index_copy(0, cells, value).view_as(layer) for layer, value in pairs]
+
+
+@put_in.register_fake
+def _(layers: list[Tensor], cells: Tensor, values: list[Tensor]) -> list[Tensor]:
+    return [torch.empty_like(layer) for layer in layers]
+
+
+class Picked:
+    """K cells that are marked, numbered across environments; on a GPU all cells."""
+
+    def __init__(self, marked: UInt8[Tensor, "B C"]) -> None:
+        self.marked = marked
+        self.cells = pick_cells(marked) if self.picks_out(marked) else self.all(marked)
+
+    @staticmethod
+    def all(marked: Tensor) -> Tensor:
+        """Number all cells."""
+        return torch.arange(marked.numel(), device=marked.device)
+
+    @staticmethod
+    def picks_out(values: Tensor) -> bool:
+        """Tell whether the host may learn how many cells are picked: of a CPU, unless its tensors hold no data."""
+        return values.device.type == "cpu" and (torch.compiler.is_compiling() or type(values) is Tensor)
+
+    def of(self, layer: Tensor) -> Tensor:
+        """Read a layer (B, C) at the picked cells: -> (K,)."""
+        return layer.flatten().index_select(0, self.cells)
+
+    def put(self, layer: Tensor, values: Tensor) -> Tensor:
+        """Return a layer (B, C) with values (K,) put into the picked cells."""
+        if not self.picks_out(layer):  # K counts the other cells too
+            return torch.where(self.marked > 0, values.view_as(layer), layer)
+        return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
+
+
+class Disputed(Picked):
+    """K disputed cells and their P points; on a GPU all cells and all points."""
+
+    def __init__(
+        self,
+        cells: UInt8[Tensor, "B C"],
+        slot: Int[Tensor, "B M"],
+        columns: list[Tensor],
+        mean: Float[Tensor, "B C"],
+    ) -> None:
+        """Pick out the cells that are not 0, and of their points z, spread, weight, passed, ray x and ray y.
+
+        A cell of 2 is marked as a step. `mean` is that of the cell's points [m].
+        """
+        self.marked = cells
+        if self.picks_out(cells):
+            self.cells, self.owner, *columns = pick_out(cells, slot, columns)
+        else:
+            first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
+            self.cells = self.all(cells)
+            self.owner, columns = (slot + first).flatten(), [column.flatten() for column in columns]
+        self.mean = self.of(mean)
+        z, self.spread, self.weight, self.passed, *self.ray = columns
+        self.z = z - self.at_points(self.mean)  # [m] above the mean of the cell's points
+        self.used = (self.weight > 0).to(z.dtype)
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Sum the points' values (..., P) per cell: -> (..., K)."""
+        total = values.new_zeros(*values.shape[:-1], self.cells.shape[0])
+        return total.scatter_add_(-1, self.owner.expand(values.shape), values)
+
+    def highest(self, values: Tensor) -> Tensor:
+        """Return the highest of the points' values (..., P) per cell: -> (..., K)."""
+        highest = values.new_full((*values.shape[:-1], self.cells.shape[0]), -torch.inf)
+        return highest.scatter_reduce_(-1, self.owner.expand(values.shape), values, "amax")
+
+    def at_points(self, values: Tensor) -> Tensor:
+        """Give each point its cell's value: (..., K) -> (..., P)."""
+        return values.index_select(-1, self.owner)
+
+    def some(self, mask: Tensor) -> bool:
+        """Tell whether anything is true; assume so where the host would have to wait, and in compiled code."""
+        return torch.compiler.is_compiling() or not self.picks_out(mask) or bool(mask.any())
+
+
+def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """Divide sums over the points of a cell; zero where there is none."""
+    return numerator / denominator.clamp(min=torch.finfo(denominator.dtype).tiny)
+
+
+def robust_mean(points: Disputed) -> Tensor:
+    """Return each cell's robust mean (K,) [m] above its mean.
+
+    From the mean on, twice: the mean under the weights w / (1 + r^2 / sigma^2)^2 of the residuals r, which leave an
+    outlier out.
+    """
+    height = reduced_mean(points, points.z)
+    return height + reduced_mean(points, points.z - points.at_points(height))
+
+
+def reduced_mean(points: Disputed, residual: Tensor) -> Tensor:
+    """Return each cell's mean (K,) of the residuals (P,) [m], those far from zero reduced in weight."""
+    reduced = points.weight / (1.0 + residual.square() / points.spread).square()
+    moment, total = points.sum(torch.stack([reduced * residual, reduced])).unbind(0)
+    return ratio(moment, total)
+
+
+def settle(
+    points: Disputed,
+    height: Float[Tensor, "B C"],
+    shown: Shown,
+    width: int,
+    gate: float,
+    relief: float,
+    edges: EdgeConfig | None,
+) -> tuple[Float[Tensor, "B C"], Int[Tensor, "B C"]]:
+    """Settle the disputed cells: return the heights [m] and the side of each cell: of a step +1 top, -1 ground, else 0.
+
+    A disputed cell gets the robust mean of its points, or, if it is marked as a step or too many of its points are far
+    from that mean, the height of one end of the step. The other cells keep their `height`. `width` counts cells along
+    y, `relief` is in [m].
+    """
+    settled, side = robust_mean(points), torch.zeros_like(points.mean)
+    if edges is not None:
+        residual = points.z - points.at_points(settled)
+        near = points.used * (residual.square() <= gate**2 * points.spread)
+        number, close = points.sum(torch.stack([points.used, near])).unbind(0)
+        step = edges.holds_step(number, number - close) | (points.of(points.marked) > 1)
+        if points.some(step):
+            which, end = side_of_step(points, shown, width, relief, edges)
+            settled, side = torch.where(step, end, settled), torch.where(step, which, side)
+    nowhere = torch.zeros_like(height, dtype=torch.int8)
+    return points.put(height, points.mean + settled), points.put(nowhere, side.to(torch.int8))

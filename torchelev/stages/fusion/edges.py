@@ -1,0 +1,125 @@
+"""Walls and steps within a cell: is the cell's height that of the top or of the ground before it?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require, require_count
+from torchelev.ops.storage import realize, realize_all
+from torchelev.ops.windows import around
+
+if TYPE_CHECKING:
+    from torchelev.stages.fusion.contested import Disputed, Shown
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeConfig:
+    """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
+
+    min_points: int = 6
+    min_share: float = 0.25  # of the cell's points outside the gate around its estimate
+    min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
+    min_extreme: int = 2  # points within a standard deviation of the top or bottom, or beyond; fewer are outliers
+    refinements: int = 7  # each halves the distance to the top of a wall's face
+    margin: float = 0.25  # standard deviations below the top that still belong to it
+    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
+
+    def __post_init__(self) -> None:
+        for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
+            require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
+        require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
+
+    def holds_step(self, number: Tensor, far: Tensor) -> Tensor:
+        """Tell which cells hold a step, by the number of their points and of those far from the estimate."""
+        return (number >= self.min_points) & (far >= self.min_share * number)
+
+
+def side_of_step(points: Disputed, shown: Shown, width: int, relief: float, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
+    """Keep walls and steps sharp (paper, Sec. II-C): tell which side of a step is the cell's; `fusion` drops the other.
+
+    The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
+    where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is
+    what lies at the centre. Returns the side (K,), +1 top and -1 ground, and its height (K,) [m] above the mean.
+    """
+    top, bottom = ends_of_step(points, cfg)
+    low = points.used * (points.z < 0)
+    columns = [low, low * points.passed, *(points.used * part for part in points.ray)]
+    number_low, number_passed, x, y = points.sum(torch.stack(columns)).unbind(0)
+    # A wall that shows in no other cell must not vanish: then the top wins even where rays passed the centre.
+    di, dj = around(x.device)
+    exists, (in_scan, in_map) = values_around(list(shown), points.cells, di, dj, width)
+    middle, top_height = points.mean + 0.5 * top, points.mean + top - relief
+    behind = (in_map >= top_height[:, None]) & lie_behind(x, y, di, dj)
+    elsewhere = (exists & ((in_scan >= middle[:, None]) | behind)).any(1)
+    ground = (number_passed > cfg.min_passed * number_low) & elsewhere
+    return torch.where(ground, -1.0, 1.0).to(x.dtype), torch.where(ground, bottom, top)
+
+
+def ends_of_step(points: Disputed, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
+    """Return the heights (K,) of the step's top and bottom [m] above the mean.
+
+    The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
+    top of a wall's face. The bottom is the top of the step upside down, and takes two.
+    """
+    return top_of_step(points, points.z, cfg, cfg.refinements), -top_of_step(points, -points.z, cfg, 2)
+
+
+def top_of_step(points: Disputed, z: Tensor, cfg: EdgeConfig, rounds: int) -> Tensor:
+    """Move heights (K,) from 0 to the mean of the points at or past them, so many times; `z` (P,) are the points'.
+
+    Up to `margin` standard deviations short of a height lies past it. A level that fewer than `min_extreme` points
+    reach, give or take a standard deviation, is an outlier's, and no height lies above it.
+    """
+    noise = points.spread.sqrt()
+    # What rounds read is stored, or the first would compute it itself: so all have one code, which is compiled once.
+    z, past = realize_all(z, z + cfg.margin * noise)
+    most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), cfg.min_extreme)
+    columns = torch.stack([points.weight * z, points.weight])
+    most, height = realize_all(most, torch.zeros_like(most))
+    for _ in range(rounds):
+        moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
+        further = moment / total  # NaN where no point lies past the height, which compares as false
+        height = realize(torch.where(most >= further, further, height))
+    return height
+
+
+def level_reached(points: Disputed, reached: Tensor, number: int) -> Tensor:
+    """Return the highest level (K,) that so many of a cell's points reach; `reached` (P,) is how high each does."""
+    level = points.highest(reached)
+    for _ in range(number - 1):
+        at = points.at_points(level)
+        next_level = points.highest(torch.where(reached < at, reached, -torch.inf))
+        enough = points.sum((reached >= at).to(reached.dtype)) >= number
+        level = torch.where(enough, level, next_level)
+    return level
+
+
+def values_around(
+    layers: list[Tensor], cells: Tensor, di: Tensor, dj: Tensor, width: int
+) -> tuple[Tensor, list[Tensor]]:
+    """Read layers (B, C) at the eight neighbours (di, dj) of cells (K,) numbered across environments.
+
+    Returns which neighbours lie on the map, (K, 8), and each layer's values there, (K, 8).
+    """
+    num_cells = layers[0].shape[1]
+    i, j = cells % num_cells // width, cells % width
+    i, j = i[:, None] + di, j[:, None] + dj
+    exists = (i >= 0) & (i < num_cells // width) & (j >= 0) & (j < width)
+    place = torch.where(exists, cells[:, None] + di * width + dj, 0)
+    return exists, [layer.take(place) for layer in layers]
+
+
+def lie_behind(x: Tensor, y: Tensor, di: Tensor, dj: Tensor) -> Tensor:
+    """Tell which neighbours (di, dj) of a cell lie behind it, (K, 8), within 50 degrees of where its rays (K,) go.
+
+    Beside it along a wall lie cells that show the wall's face too, and the wall would end as every other cell's.
+    """
+    di, dj = di.to(x.dtype), dj.to(x.dtype)
+    limit = math.cos(math.radians(50)) * (di.square() + dj.square()).sqrt()
+    along = x[:, None] * di + y[:, None] * dj
+    return along > limit * (x.square() + y.square()).sqrt()[:, None]

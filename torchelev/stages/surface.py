@@ -1,0 +1,126 @@
+"""Local planes: the slope of the ground at every known cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.grid import GridConfig
+from torchelev.ops.masks import as_factor, chosen, masked, masked_any
+from torchelev.ops.operators import padded
+from torchelev.ops.storage import realize
+from torchelev.ops.windows import window_moments
+from torchelev.state import MapState
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceConfig:
+    """How far the plane of a normal reaches."""
+
+    radius: int = 1  # [cells] 1: the 3 x 3 neighbours
+
+    def __post_init__(self) -> None:
+        require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
+
+
+class Ground(NamedTuple):
+    """The known heights, with a rim around the map that windows may reach into; nothing is known there."""
+
+    known: Float[Tensor, "B H+2*rim W+2*rim"]  # 1 or 0
+    height: Float[Tensor, "B H+2*rim W+2*rim"]  # [m] from the map's mean; 0 where unknown
+    rim: int  # [cells]
+
+
+def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], rim: int) -> Ground:
+    """Put a rim around the known heights, once for all the windows."""
+    known = as_factor(validity).to(elevation.dtype)
+    number = known.sum((1, 2), keepdim=True).clamp(min=1)
+    # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
+    heights = masked_any(elevation, validity)  # what is not known may be NaN
+    datum = (heights.sum((1, 2), keepdim=True) / number).detach()
+    # One layer tells both, which is less to store and to read than two.
+    nowhere = 0.5 * torch.finfo(heights.dtype).max  # differences to it are finite
+    layer = padded(chosen(validity, heights - datum, nowhere), rim, nowhere)
+    known = as_factor(layer < nowhere).to(layer.dtype)
+    return Ground(known, layer * known, rim)
+
+
+class Plane(NamedTuple):
+    """Least-squares plane through the known cells of a window, for every cell."""
+
+    spans: Bool[Tensor, "B H W"]  # the known cells span a plane; elsewhere gradient and residual tell nothing
+
+    gradient_x: Float[Tensor, "B H W"]
+    gradient_y: Float[Tensor, "B H W"]
+    residual: Float[Tensor, "B H W"]  # [m^2] mean squared distance in z
+
+
+def less(value: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return value - x * y, in one operation."""
+    return torch.addcmul(value, x, y, value=-1)
+
+
+def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
+    """Fit z = c + g_x x + g_y y by least squares to the known cells within `radius` cells of each cell.
+
+    Only known cells enter, so a plane comes out right at the border of the known area. Cells that do not span a plane
+    (`spans_plane`) have some finite gradient.
+    """
+    z = ground.height
+    moments = window_moments([(ground.known, 2), (z, 1), (z.square(), 0)], ground.rim, radius)
+    n, n_v, n_vv, n_u, n_uv, n_uu, s_z, s_vz, s_uz, s_zz = moments
+    share = 1 / n.clamp(min=1)
+    mu, mv, mz = n_u * share, n_v * share, s_z * share
+    uu, vv, uv = less(n_uu * share, mu, mu), less(n_vv * share, mv, mv), less(n_uv * share, mu, mv)
+    uz, vz = less(s_uz * share, mu, mz), less(s_vz * share, mv, mz)
+    det = less(uu * vv, uv, uv)
+    spread = uu + vv
+    regular = det > 1e-4
+    # Both are far above these limits unless they are zero but for rounding.
+    safe_det, safe_spread = det.clamp(min=1e-4), spread.clamp(min=1e-2)
+    gu = chosen(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
+    gv = chosen(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
+    residual = less(less(less(s_zz * share, mz, mz), gu, uz), gv, vz).clamp(min=0)
+    return Plane(spans_plane(uu, uv, vv, radius), gu / resolution, gv / resolution, residual)
+
+
+def spans_plane(uu: Tensor, uv: Tensor, vv: Tensor, radius: int) -> Bool[Tensor, "B H W"]:
+    """Tell where the known cells of a window spread in two directions, by the covariance of their places [cells^2].
+
+    Its smaller eigenvalue, the variance across the line that fits them best, must reach `min_spread`: then
+    C - min_spread I has no negative eigenvalue.
+    """
+    u, v = uu - min_spread(radius), vv - min_spread(radius)
+    return (u >= 0) & (v >= 0) & (u * v >= uv * uv)
+
+
+def min_spread(radius: int) -> float:
+    """Return the variance [cells^2] across their line from which known cells span a plane.
+
+    At least that of two full rows of cells, 1/4: the cells that a line of points passes through stay below it, and
+    their heights tell the slope along the line alone. And 0.4 times the standard deviation of a full window,
+    r (r + 1) / 3 in variance: a narrower band can be one line of points and its noise, whose slope is the ray's.
+    """
+    rounding = 1e-3
+    return max(0.25, 0.4**2 * radius * (radius + 1) / 3) - rounding
+
+
+def normals(state: MapState, ground: Ground, grid: GridConfig, cfg: SurfaceConfig) -> MapState:
+    """Store the gradient of every known cell whose neighbours span a plane (paper, Sec. II-A).
+
+    The unit normal n = (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2) is made when it is read.
+    """
+    plane = fit_plane(ground, cfg.radius, grid.resolution)
+    has_normal = realize(state.validity & plane.spans)
+    return state._replace(
+        gradient_x=masked(plane.gradient_x, has_normal),
+        gradient_y=masked(plane.gradient_y, has_normal),
+        has_normal=has_normal,
+    )

@@ -1,0 +1,146 @@
+"""Rays: what lies below a ray that reached farther is gone, and what no ray saw lies below the lowest ray.
+
+All rays of a sensor share their origin, so a ray over a cell is known by azimuth and slope. Instead of marching along
+each ray, a polar table holds for each (range, azimuth) the lowest slope of the rays that reached farther; each cell
+looks its own entry up. Cost: points + table + cells, whatever the length of the rays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.grid import GridConfig, center_offsets
+from torchelev.ops.masks import chosen, masked, zeroed
+from torchelev.ops.operators import polar_minimum
+from torchelev.ops.storage import read, realize, realize_all
+from torchelev.stages.visibility.accepted_rays import Rays, believed, height_margin, rays_of
+from torchelev.stages.visibility.polar_table import PolarGrid, flat, turn
+from torchelev.state import MapState, Measurement, count, tally
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+NO_RAY = 1e4  # a slope above every ray's
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaycastConfig:
+    """When a ray removes a cell, and which rays are believed."""
+
+    min_time: float = 1.0  # [s] cells hit within it stay, and contradict rays that pass below them
+    min_incidence: float = 0.1  # alpha_n: |r . n| below it is a grazing ray
+    max_range: float | None = None  # [m] rays count up to here; None: 1.1 half-diagonals of the window
+    min_support: float = 3.0  # points that agree with a cell, or one beside it, for rays that end there to be believed
+    gate: float = 3.0  # a ray so many standard deviations below ground that is known is a wrong return
+
+    def __post_init__(self) -> None:
+        require(self.min_time >= 0, "raycast.min_time", "must not be negative", self.min_time, "give seconds")
+        cosine = 0 <= self.min_incidence < 1
+        require(cosine, "raycast.min_incidence", "must lie in [0, 1)", self.min_incidence, "give a cosine such as 0.1")
+        reach = self.max_range is None or 0 < self.max_range < math.inf
+        require(self.gate > 0, "raycast.gate", "must be positive", self.gate, "give standard deviations, such as 3")
+        require(reach, "raycast.max_range", "must be positive and finite", self.max_range, "give metres, or None")
+        support = 0 <= self.min_support < math.inf
+        require(support, "raycast.min_support", "must be finite and not negative", self.min_support, "give points")
+
+
+def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
+    """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least a cell farther.
+
+    At short range, where a cell covers several azimuth bins, an entry is the minimum of about half as many.
+    """
+    # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
+    last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
+    a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
+    index = flat(chosen(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
+    return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
+
+
+class RayOverCell(NamedTuple):
+    """The lowest ray of one sensor over each cell."""
+
+    found: Bool[Tensor, "B H W"]
+    height: Float[Tensor, "B H W"]  # [m] over the cell's centre
+    fall: Float[Tensor, "B H W"]  # [m] how far it falls over a cell's length, or rises
+    incidence: Float[Tensor, "B H W"]  # |r . n|
+
+
+def look_up(
+    state: MapState, m: Measurement, origin: Tensor, table: Tensor, polar: PolarGrid, grid: GridConfig
+) -> RayOverCell:
+    """Gather the lowest ray over each cell, or less than a cell beside it."""
+    x, y = center_offsets(state, m, grid)
+    x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
+    rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
+    k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
+    # All the bins that the cell covers: two entries, the first and the last of them.
+    width, entry = polar.covered(k)
+    middle = turn(x, y) * polar.azimuths
+    a = torch.floor(middle - 0.5 * width)
+    further = (torch.floor(middle + 0.5 * width) - a + 1 - entry).clamp(min=0)
+    a = chosen(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
+    b = a + further
+    b = chosen(b < polar.azimuths, b, b - polar.azimuths)
+    slopes = table.flatten(1)
+    lowest = torch.minimum(*(read(slopes, flat(k, place, polar.azimuths)) for place in (a, b)))
+    slope = realize(lowest)  # or the compiler would gather anew for the masks and for the heights
+    found = slope < NO_RAY
+    slope = masked(slope, found)
+    gx, gy = state.gradient_x, state.gradient_y
+    along = (slope - torch.addcmul(gx * x, gy, y) / rho).abs()
+    incidence = along / ((1 + slope.square()) * (1 + gx.square() + gy.square())).sqrt()
+    return RayOverCell(found, z_s + slope * rho, slope.abs() * grid.resolution, incidence)
+
+
+def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig) -> MapState:
+    """Remove what rays passed below, and bound what no ray saw (paper, Sec. II-E and II-H).
+
+    A known cell goes if a ray's height over it is below h - sigma, it was not hit for `min_time`, and |r . n| > alpha_n
+    (eq. 3 and 4), with n the cell's normal and r the direction of the lowest ray, the only one that the table keeps.
+    Eq. 4 keeps grazing rays from eroding smooth ground; a ray that `passes_far_below` does not graze, and needs none:
+    what is left of a ghost tilts its own normal, by which it would stay for ever.
+    The upper bound of an unknown cell is the lowest ray height over it so far.
+    """
+    polar, known = PolarGrid.of(grid, cfg), state.validity
+    for s in range(m.origin.shape[1]):
+        rays = rays_of(m, s)
+        table = lowest_slopes(believed(state, m, rays, grid, cfg), polar, grid)
+        state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), grid, cfg)
+    return tally(state, cleared_seen_through=count(known & ~state.validity))
+
+
+def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: RaycastConfig) -> MapState:
+    """Apply the lowest ray of one sensor to every cell."""
+    depth = state.elevation - ray.height
+    seen_through = passes_far_below(state, depth, grid, cfg) | (ray.incidence > cfg.min_incidence)
+    gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
+    validity = state.validity & ~gone
+    # A ray below a challenger shows that nothing stands there: outliers stop no other ray. From centre to corner a ray
+    # falls by 0.71 of `fall`; those that end on an obstacle's top, more than a cell behind, pass higher than that.
+    passed = realize((ray.found & (ray.height < state.challenger + math.sqrt(0.5) * ray.fall)) | ~validity)
+    bounds = ray.found & ~validity
+    lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
+    upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
+    challenger_support = zeroed(state.challenger_support, passed)
+    validity, bounded, upper_bound, challenger_support = realize_all(
+        validity, (state.bounded & ~state.validity) | bounds, upper_bound, challenger_support
+    )
+    return state._replace(
+        validity=validity, bounded=bounded, upper_bound=upper_bound, challenger_support=challenger_support
+    )
+
+
+def passes_far_below(state: MapState, depth: Tensor, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B H W"]:
+    """Tell where a ray passes so far below a cell that no grazing ray over its plane could, whatever the normal.
+
+    depth > gate * sqrt(sigma^2 + (resolution / 2)^2) + |gradient| * resolution / 2: the noise, the relief within the
+    cell, and what its plane rises from the centre to the border.
+    """
+    rise = (state.gradient_x.square() + state.gradient_y.square()).sqrt() * (0.5 * grid.resolution)
+    return depth > height_margin(state, grid, cfg) + rise

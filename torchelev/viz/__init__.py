@@ -1,0 +1,1 @@
+"""Pictures of maps: panels of layers, and the live view."""

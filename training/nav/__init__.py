@@ -1,0 +1,1 @@
+"""Train and evaluate policies for TerrainNav: `python -m training.nav`."""
