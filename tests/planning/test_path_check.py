@@ -181,7 +181,7 @@ def test_checks_do_not_read_values(monkeypatch):
 def test_bad_values_elsewhere_are_not_safe(monkeypatch):
     """As on a GPU, where nothing is read."""
     for module in ("footprint", "path_check"):
-        monkeypatch.setattr(f"torchelev.{module}.readable", lambda *args: False)
+        monkeypatch.setattr(f"torchelev.planning.{module}.readable", lambda *args: False)
     emap = ground_map(1.0)
     long = check_path(emap, path((-0.5, 0, 0), (0.0, 0, 0), (0.1, 0, 0)), FOOTPRINT, samples=2)
     assert long.footprints.safe.tolist() == [[True, False, False, True, True]] and long.first_unsafe.tolist() == [1]

@@ -181,7 +181,7 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path):
 def test_two_processes_train_one_policy(tmp_path):
     script = tmp_path / "two.py"
     script.write_text(
-        "import os, torch, tests.test_training_nav as t\n"
+        "import os, torch, tests.training.test_nav as t\n"
         "torch.set_num_threads(1)\n"
         f"folder = r'{tmp_path}/run'\n"
         "runner = t.make_runner(folder, 'blind', seed=int(os.environ['RANK']))\n"
