@@ -21,8 +21,9 @@ demo: setup  ## simulate a walk, map it, write demo.png
 test: setup  ## run all tests, on all cores
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
-lint: setup  ## check style
+lint: setup  ## check style, and that imports go downwards
 	$(BIN)/ruff check .
+	$(BIN)/lint-imports
 
 types: setup  ## check types
 	$(BIN)/mypy

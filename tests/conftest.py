@@ -5,8 +5,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
 
-from torchelev import compiled_update as compilation
 from torchelev.compiled_update import graphs_of
+from torchelev.ops import compiler
 
 settings.register_profile(
     "torchelev",
@@ -32,7 +32,7 @@ def compile_with(monkeypatch):
     """Let emap.compile() use another backend of the compiler, with the guards of the real one."""
 
     def use(backend):
-        monkeypatch.setattr(compilation, "inductor", backend)
+        monkeypatch.setattr(compiler, "inductor", backend)
         graphs_of.cache_clear()
         torch._dynamo.reset()
 

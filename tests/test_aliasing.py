@@ -11,7 +11,7 @@ from torchelev import BodyConfig, LearnedTraversabilityConfig, SensorConfig
 from torchelev.filters.chain import FilterConfig
 from torchelev.layers import LAYERS
 from torchelev.planning.queries import height_profile, submap
-from torchelev.stages.fusion.fuse import FusionConfig
+from torchelev.stages.fusion.config import FusionConfig
 
 OFF = {
     "drift": dict(drift=None),

@@ -15,10 +15,11 @@ from torch._inductor.utils import run_and_get_code
 import torchelev
 from tests.helpers import assert_close, differences, mapped, scan, small_config, small_map, snapshot
 from torchelev import ElevationMap, SensorConfig
-from torchelev.compiled_update import KERNEL_ARGUMENTS, Graphs, announced_compilation, compiled, graphs_of
+from torchelev.compiled_update import Graphs, graphs_of
 from torchelev.layers import LAYERS
+from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, compiled
 from torchelev.stages.fusion import fuse as fusion
-from torchelev.stages.fusion.contested import settle
+from torchelev.stages.fusion.consensus import settle
 
 
 def core(emap):

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import nans, pose, random_state, small_config, small_map
 from torchelev import GridConfig
-from torchelev.grid import PointCells, cell_centers, center_offsets, lattice_offset, locate, recenter, window_corner
+from torchelev.grid import cell_centers, locate
+from torchelev.stages.cells import PointCells, center_offsets, lattice_offset
+from torchelev.stages.recenter import recenter, window_corner
 from torchelev.state import BLANK, LAYERS, blank_state
 
 SEEDS = st.integers(0, 10_000)

@@ -9,11 +9,11 @@ from torchelev.observations.map_image import MapImage
 from torchelev.robot import RobotConfig
 from torchelev.stages.age import AgingConfig
 from torchelev.stages.compensate import DriftConfig
-from torchelev.stages.fusion.fuse import EdgeConfig, FusionConfig
+from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.measure import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
 from torchelev.stages.overlap import OverlapConfig
 from torchelev.stages.surface import SurfaceConfig
-from torchelev.stages.visibility.clean_up import RaycastConfig
+from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.state import MapState, Measurement, Statistics
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
 from torchelev.traversability.net import TraversabilityNet

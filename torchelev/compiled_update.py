@@ -1,156 +1,21 @@
-"""The compiled update: how it is compiled, announced, kept and found again."""
+"""The update as three compiled graphs: how they are kept and found again."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import itertools
-import re
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from types import FunctionType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
-from torchelev.errors import require_count
+from torchelev.ops.compiler import announced_compilation, compiled, mark_dynamic, packed
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.pipeline import move_along, take_heights, take_rays, update_in_place
 from torchelev.stages.measure import measure
 from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.traversability.net import Weights
-
-if TYPE_CHECKING:
-    from torchelev.elevation_map import ElevationMap
-
-KERNEL_ARGUMENTS = 16  # measured: 12 to 24 do as well
-PATCHES = 1  # version of the patches of the compiler below, which its cache does not see: raise it with each change
-
-
-def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., Any]:
-    """Compile by torch's compiler, with what pays off here, as far as this torch knows it."""
-    from torch._inductor import compile, config  # takes a second to import, which only compiling needs
-
-    options: dict[str, Any] = {}
-    if all(value.device.type == "cpu" for value in inputs if isinstance(value, Tensor)):
-        # What is read so often, or takes so many operations, is stored unasked. The usual limits, which other devices
-        # keep, are so low that all sums over a window are stored.
-        options |= {"realize_reads_threshold": 20, "realize_opcount_threshold": 120}
-    if hasattr(config.cpp, "enable_tiling_heuristics"):
-        # The compiler gives up vectorisation on many gathers, which pays off in the loops over points.
-        options["cpp.enable_tiling_heuristics"] = False
-    # Inputs are checked before, and torch's `opcheck` vouches in the tests for what operators return; checking the
-    # shapes and addresses of all that in every update takes time.
-    options |= {name: False for name in ("size_asserts", "alignment_asserts") if hasattr(config, name)}
-    cache = torch.compiler.config
-    tag = cache.patch(cache_key_tag=f"{cache.cache_key_tag}torchelev {PATCHES}")  # type: ignore[attr-defined]
-    with short_kernels(), fast_mask_loads(), tag:
-        return compile(graph, inputs, options)
-
-
-@contextlib.contextmanager
-def replaced(owner: Any, name: str, change: Callable[[Any], Any]) -> Iterator[None]:
-    """Let an attribute of the compiler be what `change` makes of it for a while, as far as this torch has it."""
-    usual = getattr(owner, name, None)
-    if usual is None:
-        yield
-        return
-    setattr(owner, name, change(usual))
-    try:
-        yield
-    finally:
-        setattr(owner, name, usual)
-
-
-def short_kernels() -> contextlib.AbstractContextManager[None]:
-    """Let the compiler end a C++ function after so many arguments; it has no option for this.
-
-    A function holds all that it stores until its end. One of all the loops between two operators takes 32 MB in place
-    of 13 with the learned head, and half a millisecond more, as that is more than the caches hold.
-    """
-    from torch._inductor.codegen.cpp import CppScheduling
-
-    return replaced(CppScheduling, "MAX_FUSED_KERNEL_ARGS_NUM", lambda _: KERNEL_ARGUMENTS)
-
-
-def fast_mask_loads() -> contextlib.AbstractContextManager[None]:
-    """Let the compiler load eight bytes of a mask into a vector of 256 bits directly.
-
-    Torch's `loadu` with a number copies them into 32 bytes and loads those, which waits for the copy: ten times the
-    time, and a quarter of what the kernels of an update of 64 robots take. Vectors of 512 bits have no such detour.
-    """
-    from torch._inductor.codegen.cpp import CppVecKernel
-    from torch._inductor.cpu_vec_isa import VecAVX2
-
-    def change(usual: Callable[..., str]) -> Callable[..., str]:
-        def load(kernel: Any, *args: Any, **options: Any) -> str:
-            line = usual(kernel, *args, **options)
-            if not isinstance(kernel.vec_isa, VecAVX2) or kernel.tiling_factor != 8:
-                return line
-            return re.sub(r"(<uint8_t>::)loadu\((.*), static_cast<int64_t>\(8L?\)\)$", r"\1loadu_one_fourth(\2)", line)
-
-        return load
-
-    return replaced(CppVecKernel, "_get_vec_load_line", change)
-
-
-_number = itertools.count()
-
-
-def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function with a code object of its own.
-
-    The compiler finds its graphs by code object and guards. Functions that differ by what they enclose alone, which no
-    guard looks at here, would be given each other's graphs; and of one code object it keeps no more than eight.
-    """
-    assert isinstance(function, FunctionType)
-    code = function.__code__.replace(co_name=f"{function.__name__}_{next(_number)}")
-    return FunctionType(code, function.__globals__, code.co_name, function.__defaults__, function.__closure__)
-
-
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function as one compiled graph; call what it returns under `announced_compilation`."""
-    options: dict[str, Any] = {}
-    if hasattr(torch.compiler, "skip_guard_on_globals_unsafe"):
-        options["guard_filter_fn"] = guards_on_arguments
-    return torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
-
-
-def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
-    """Choose which guards are checked before each call: not those on code and config, which are frozen.
-
-    Checking these hundreds took a third of a millisecond.
-    """
-    fixed = ("cfg", "stages", "__dict__")
-    return [not guard.is_global and not any(name in guard.name for name in fixed) for guard in guards]
-
-
-@contextlib.contextmanager
-def announced_compilation() -> Iterator[None]:
-    """Say on stderr what is going on for a minute, and what it cost, if anything is compiled."""
-    from torch._dynamo.callback import callback_handler
-
-    starts: list[float] = []
-
-    def announce(*_: Any) -> None:
-        if not starts:
-            print("torchelev: compiling the update, for up to a minute ...", end=" ", file=sys.stderr, flush=True)
-        starts.append(time.perf_counter())
-
-    callback_handler.register_start_callback(announce)
-    end = "failed"
-    try:
-        yield
-        if starts:
-            end = f"done in {time.perf_counter() - starts[0]:.0f} s. Later processes find it in the compiler's cache."
-    finally:
-        if announce in callback_handler.start_callbacks:  # a reset of the compiler clears them
-            callback_handler.remove_start_callback(announce)
-        if starts:
-            print(end, file=sys.stderr, flush=True)
 
 
 def compiled_update(
@@ -173,34 +38,19 @@ def compiled_update(
 
 
 def compile_ahead(
-    emap: ElevationMap,
-    num_points: int,
-    num_sensors: int,
-    base: bool,
-    variance: bool,
-    dtype: torch.dtype,
-    pose_dtype: torch.dtype,
+    inputs: Sequence[Tensor | None], sizes: Iterable[int], dtype: torch.dtype, cfg: ElevationMapConfig, weights: Any
 ) -> None:
-    """Run compiled updates of each size that the map divides its environments into, on a blank state of their own."""
-    N = require_count("num_points", num_points, "give the number of points of each sensor")
-    S = require_count("num_sensors", num_sensors, "give the number of sensors")
-    B, device = emap.num_envs, emap.device
+    """Run compiled updates for each number of environments, of the first ones of these inputs, on a blank state."""
+    sizes = list(sizes)
+    points = inputs[0]
+    assert points is not None
     with torch.inference_mode(False), torch.no_grad():
-        points = torch.full((1, 1, 1, 1), torch.nan, dtype=dtype, device=device).expand(B, S, N, 3)
-        T = torch.eye(4, dtype=pose_dtype, device=device).expand(B, S, 4, 4)
-        variances = torch.ones((1, 1, 1), dtype=dtype, device=device).expand(B, S, N) if variance else None
-        given = emap._check_inputs(points, T, T[:, 0] if base else None, 0.0, variances)
-        if not emap._compiled:
-            return
-        ends = [chunk.indices(B)[:2] for chunk in emap._chunks()]
-        sizes = dict.fromkeys(end - start for start, end in ends)  # the last chunk may be smaller
-        scratch = blank_state(emap.cfg.grid, max(sizes), device, emap.elevation.dtype)
-    weights = None if emap.head is None else emap.head.weights.detached()
+        scratch = blank_state(cfg.grid, max(sizes), points.device, dtype)
     with torch.inference_mode():
         for size in sizes:
             state = map_layers(lambda layer, n=size: layer[:n], scratch)
-            inputs: list[Any] = [None if value is None else value[:size] for value in given]
-            compiled_update(state, *inputs, cfg=emap._stages, weights=weights)
+            first: list[Any] = [None if value is None else value[:size] for value in inputs]
+            compiled_update(state, *first, cfg=cfg, weights=weights)
 
 
 class Graphs(NamedTuple):
@@ -244,26 +94,6 @@ def write_changes(stored: MapState, old: MapState, new: MapState) -> None:
         return stored if new is old else stored.copy_(as_bytes(new) if new.dtype == torch.bool else new)
 
     map_layers(write, stored, old, new)
-
-
-def mark_dynamic(dim: int, *values: Tensor | None) -> None:
-    """Let the size along a dimension differ from call to call."""
-    for value in values:
-        if value is not None:
-            torch._dynamo.maybe_mark_dynamic(value, dim)
-
-
-def packed(value: Tensor) -> Tensor:
-    """Return the values as a tensor of its own, with the strides of a new one; they are copied only if they must be.
-
-    A slice, an expansion, or what was made in inference mode would get other graphs, and so would views of other bases.
-    """
-    with torch.inference_mode(False), torch.no_grad():
-        value = value.contiguous().reshape(-1).view(value.shape)  # constants expanded in full would else stay so
-        if value.is_inference():
-            return value.clone()
-        place = value.untyped_storage(), value.storage_offset(), value.shape, value.stride()
-        return value.new_empty(0).set_(*place)
 
 
 Values = TypeVar("Values", MapState, Measurement)

@@ -13,11 +13,11 @@ from torchelev.filters.chain import FilterConfig, filters_from_list
 from torchelev.grid import GridConfig
 from torchelev.stages.age import AgingConfig
 from torchelev.stages.compensate import DriftConfig
-from torchelev.stages.fusion.fuse import FusionConfig
+from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.measure import SensorConfig
 from torchelev.stages.overlap import OverlapConfig
 from torchelev.stages.surface import SurfaceConfig
-from torchelev.stages.visibility.clean_up import RaycastConfig
+from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
 
 

@@ -312,7 +312,19 @@ class ElevationMap(nn.Module):
 
         Raises ValueError or TypeError for arguments that no update takes.
         """
-        compile_ahead(self, num_points, num_sensors, base, variance, dtype, pose_dtype)
+        N = require_count("num_points", num_points, "give the number of points of each sensor")
+        S = require_count("num_sensors", num_sensors, "give the number of sensors")
+        B, device = self.num_envs, self.device
+        with torch.inference_mode(False), torch.no_grad():
+            points = torch.full((1, 1, 1, 1), torch.nan, dtype=dtype, device=device).expand(B, S, N, 3)
+            T = torch.eye(4, dtype=pose_dtype, device=device).expand(B, S, 4, 4)
+            variances = torch.ones((1, 1, 1), dtype=dtype, device=device).expand(B, S, N) if variance else None
+            inputs = self._check_inputs(points, T, T[:, 0] if base else None, 0.0, variances)
+        if self._compiled:
+            ends = [chunk.indices(B)[:2] for chunk in self._chunks()]
+            sizes = dict.fromkeys(end - start for start, end in ends)  # the last chunk may be smaller
+            weights = None if self.head is None else self.head.weights.detached()
+            compile_ahead(inputs, sizes, self.elevation.dtype, self._stages, weights)
 
     def extra_repr(self) -> str:
         """Say how many maps there are, and how large."""

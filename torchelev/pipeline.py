@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
-from torchelev.grid import cells_of, recenter
 from torchelev.stages.age import age
+from torchelev.stages.cells import cells_of
 from torchelev.stages.compensate import compensate
 from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.measure import measure
 from torchelev.stages.overlap import clear_other_floors
+from torchelev.stages.recenter import recenter
 from torchelev.stages.surface import known_ground, normals
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MapState, Measurement, count, map_layers, tally

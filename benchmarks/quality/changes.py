@@ -24,10 +24,11 @@ from tqdm import tqdm
 
 from torchelev import AgingConfig, ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.app.results import commit, markdown_table, write_json
-from torchelev.grid import PointCells, locate
+from torchelev.grid import locate
 from torchelev.sim import Boxes, DepthCamera, HeightField, Lidar, MountedSensor, mount
 from torchelev.sim.exact import noise
 from torchelev.sim.exact.scenes import waves
+from torchelev.stages.cells import PointCells
 
 RESULTS = Path(__file__).parents[1] / "results"
 GRID = GridConfig(resolution=0.04, length_x=8.0, length_y=8.0)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import pose, random_state, seen_from, small_map, terrain
 from torchelev import DriftConfig, SensorConfig
-from torchelev.grid import cells_of
+from torchelev.stages.cells import cells_of
 from torchelev.stages.compensate import compensate
 from torchelev.state import LAYERS
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import nans, pose, random_state, seen_from, small_map
 from torchelev import OverlapConfig
-from torchelev.grid import recenter
 from torchelev.stages.overlap import clear_other_floors
+from torchelev.stages.recenter import recenter
 
 
 @given(

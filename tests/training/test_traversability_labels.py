@@ -466,7 +466,7 @@ def test_balls_rest_on_what_they_touch_first():
 
 
 def test_agreement_by_hand():
-    from training.traversability.labels.physics import summarize, table
+    from training.traversability.physics import summarize, table
 
     def row(kind, verdict, stood, limit):
         return {"kind": kind, "verdict": verdict, "stood": stood, "stood_at_limit": limit, "legs_clear": stood}
@@ -486,7 +486,7 @@ def test_agreement_by_hand():
 
 def test_a_tile_gives_stances_of_both_labels():
     pytest.importorskip("mujoco")
-    from training.traversability.labels.physics import rows_of_tile
+    from training.traversability.physics import rows_of_tile
 
     field = tile(lambda x, y: -1.0 * (x.remainder(1.1) < 0.5), 8.0)
     rows = rows_of_tile(field, "moats", ROBOT, 2, np.random.default_rng(0))

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.grid import GridConfig, PointCells, center_offsets
+from torchelev.grid import GridConfig
 from torchelev.ops.masks import as_factor, lifted, masked
+from torchelev.stages.cells import PointCells, center_offsets
 from torchelev.state import MapState, Measurement, count, tally
 
 

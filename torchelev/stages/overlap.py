@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.grid import GridConfig, center_offsets
+from torchelev.grid import GridConfig
 from torchelev.ops.masks import zeroed
 from torchelev.ops.storage import realize_all
+from torchelev.stages.cells import center_offsets
 from torchelev.state import MapState, Measurement, count, tally
 
 if TYPE_CHECKING:

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from torchelev.ops.windows import AROUND, around
-from torchelev.stages.fusion.contested import NO_HEIGHT, Disputed, Shown, settle
-from torchelev.stages.fusion.edges import EdgeConfig, ends_of_step, lie_behind, values_around
+from torchelev.stages.fusion.config import EdgeConfig
+from torchelev.stages.fusion.consensus import settle
+from torchelev.stages.fusion.contested import NO_HEIGHT, Disputed, Shown
+from torchelev.stages.fusion.edges import ends_of_step, lie_behind, values_around
 
 
 @pytest.mark.parametrize("degrees", range(0, 360, 24))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import off_borders, pose, random_poses, random_state, scan, small_map
 from torchelev import EdgeConfig, FusionConfig, SensorConfig
-from torchelev.grid import cells_of
+from torchelev.stages.cells import cells_of
 from torchelev.stages.fusion.contested import Disputed
 from torchelev.stages.fusion.fuse import fuse
 

@@ -16,7 +16,9 @@ from torchelev.stages.fusion.edges import values_around
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
 
-    from torchelev.stages.fusion.fuse import FusionConfig, Guess, Prior
+    from torchelev.stages.fusion.config import FusionConfig
+    from torchelev.stages.fusion.consensus import Guess
+    from torchelev.stages.fusion.points import Prior
 
 MIN_CHALLENGERS = 4  # cells of the 3 x 3 window with a challenger, from which on points at any height above count
 

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.stages.fusion.edges import EdgeConfig, side_of_step
-
 if TYPE_CHECKING:
     from jaxtyping import Float, Int, UInt8
 
@@ -156,48 +154,3 @@ class Disputed(Picked):
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
     """Divide sums over the points of a cell; zero where there is none."""
     return numerator / denominator.clamp(min=torch.finfo(denominator.dtype).tiny)
-
-
-def robust_mean(points: Disputed) -> Tensor:
-    """Return each cell's robust mean (K,) [m] above its mean.
-
-    From the mean on, twice: the mean under the weights w / (1 + r^2 / sigma^2)^2 of the residuals r, which leave an
-    outlier out.
-    """
-    height = reduced_mean(points, points.z)
-    return height + reduced_mean(points, points.z - points.at_points(height))
-
-
-def reduced_mean(points: Disputed, residual: Tensor) -> Tensor:
-    """Return each cell's mean (K,) of the residuals (P,) [m], those far from zero reduced in weight."""
-    reduced = points.weight / (1.0 + residual.square() / points.spread).square()
-    moment, total = points.sum(torch.stack([reduced * residual, reduced])).unbind(0)
-    return ratio(moment, total)
-
-
-def settle(
-    points: Disputed,
-    height: Float[Tensor, "B C"],
-    shown: Shown,
-    width: int,
-    gate: float,
-    relief: float,
-    edges: EdgeConfig | None,
-) -> tuple[Float[Tensor, "B C"], Int[Tensor, "B C"]]:
-    """Settle the disputed cells: return the heights [m] and the side of each cell: of a step +1 top, -1 ground, else 0.
-
-    A disputed cell gets the robust mean of its points, or, if it is marked as a step or too many of its points are far
-    from that mean, the height of one end of the step. The other cells keep their `height`. `width` counts cells along
-    y, `relief` is in [m].
-    """
-    settled, side = robust_mean(points), torch.zeros_like(points.mean)
-    if edges is not None:
-        residual = points.z - points.at_points(settled)
-        near = points.used * (residual.square() <= gate**2 * points.spread)
-        number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-        step = edges.holds_step(number, number - close) | (points.of(points.marked) > 1)
-        if points.some(step):
-            which, end = side_of_step(points, shown, width, relief, edges)
-            settled, side = torch.where(step, end, settled), torch.where(step, which, side)
-    nowhere = torch.zeros_like(height, dtype=torch.int8)
-    return points.put(height, points.mean + settled), points.put(nowhere, side.to(torch.int8))

@@ -3,40 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchelev.errors import require, require_count
 from torchelev.ops.storage import realize, realize_all
 from torchelev.ops.windows import around
+from torchelev.stages.fusion.config import EdgeConfig
 
 if TYPE_CHECKING:
     from torchelev.stages.fusion.contested import Disputed, Shown
-
-
-@dataclass(frozen=True, kw_only=True)
-class EdgeConfig:
-    """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
-
-    min_points: int = 6
-    min_share: float = 0.25  # of the cell's points outside the gate around its estimate
-    min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
-    min_extreme: int = 2  # points within a standard deviation of the top or bottom, or beyond; fewer are outliers
-    refinements: int = 7  # each halves the distance to the top of a wall's face
-    margin: float = 0.25  # standard deviations below the top that still belong to it
-    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
-
-    def __post_init__(self) -> None:
-        for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
-            require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
-        require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
-
-    def holds_step(self, number: Tensor, far: Tensor) -> Tensor:
-        """Tell which cells hold a step, by the number of their points and of those far from the estimate."""
-        return (number >= self.min_points) & (far >= self.min_share * number)
 
 
 def side_of_step(points: Disputed, shown: Shown, width: int, relief: float, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:

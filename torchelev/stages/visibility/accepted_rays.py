@@ -10,18 +10,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.grid import GridConfig, lattice_offset, locate
+from torchelev.grid import GridConfig, locate
 from torchelev.ops.masks import NOWHERE, chosen, lifted
 from torchelev.ops.operators import running_minimum
 from torchelev.ops.storage import read, realize, realize_all
 from torchelev.ops.windows import neighbours
+from torchelev.stages.cells import lattice_offset
 from torchelev.stages.visibility.polar_table import PolarGrid, flat, turn
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from torchelev.stages.visibility.clean_up import RaycastConfig
+    from torchelev.stages.visibility.config import RaycastConfig
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
 # A ray that leaves the window over no known ground is believed if it ends at most CLEARANCE below the lowest ground

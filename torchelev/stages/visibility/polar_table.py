@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 
 if TYPE_CHECKING:
-    from torchelev.stages.visibility.clean_up import RaycastConfig
+    from torchelev.stages.visibility.config import RaycastConfig
 
 BREADTH = math.sqrt(2)  # [cells] any ray over a cell passes within half its diagonal beside the cell's centre
 

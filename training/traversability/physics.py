@@ -1,4 +1,4 @@
-"""Do the labels tell where a robot stands? `python -m training.traversability.labels.physics` asks MuJoCo.
+"""Do the labels tell where a robot stands? `python -m training.traversability.physics` asks MuJoCo.
 
 On terrain as trained on, and on the kind never trained on, stances are drawn at random, up to as many that the labels
 let stand as not. A rigid box on four balls is put down there and simulated: on the label's footholds where it says that
@@ -33,7 +33,7 @@ from training.traversability.labels.stances import STANDS, VERDICTS, ground_arou
 from training.traversability.maps.terrain import KINDS, LENGTH, RIM, UNSEEN_KINDS, draw_robot, make_tiles
 from training.traversability.robot import RobotType
 
-RESULT = Path(__file__).parents[2] / "results" / "traversability-physics.json"
+RESULT = Path(__file__).parents[1] / "results" / "traversability-physics.json"
 CANDIDATES = 400  # stances on a tile to draw from
 HEADINGS = 8
 FRICTION = 0.9  # as is usual between rubber and stone

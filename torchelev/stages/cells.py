@@ -1,0 +1,55 @@
+"""Which cell of the window each point falls into, and where cells lie as seen from a measurement."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig, locate
+from torchelev.ops.operators import cell_sums
+from torchelev.ops.storage import realize, realize_all
+from torchelev.state import MapState, Measurement
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+
+class PointCells(NamedTuple):
+    """Which cell each point falls into. Points outside point to some cell, so mask what is summed by `inside`."""
+
+    slot: Int[Tensor, "B M"]
+    inside: Bool[Tensor, "B M"]
+    num_cells: int
+
+    def sums(self, *columns: Float[Tensor, "B M"]) -> tuple[Float[Tensor, "B C"], ...]:
+        """Sum columns of the points' values per cell; they must be zero outside."""
+        return cell_sums(self.slot, torch.stack(columns), self.num_cells).unbind(0)
+
+    def take(self, *layers: Tensor) -> list[Tensor]:
+        """Give each point its cell's value of each layer: (B, H, W) or (B, C) -> (B, M)."""
+        return [cells.flatten(1).gather(1, self.slot) for cells in realize_all(*layers)]
+
+
+def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[Tensor, "B 2"]:
+    """Return where the measurement's horizontal origin lies, seen from the window's corner [m]."""
+    # A cell number fits float32 exactly only as a difference of near ones; far ones are clamped, they are outside.
+    cells = (m.anchor - state.corner).clamp(-(2**22), 2**22)
+    return realize(cells.to(m.points.dtype) * grid.resolution)
+
+
+def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[Tensor, Tensor]:
+    """Return x (B, H, 1) and y (B, 1, W) of the cell centres [m], counted from the measurement's horizontal origin."""
+    cells = (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
+    x = torch.arange(grid.height, device=cells.device) + cells[:, 0, None]
+    y = torch.arange(grid.width, device=cells.device) + cells[:, 1, None]
+    x, y = realize_all(x * grid.resolution, y * grid.resolution)
+    return x[:, :, None], y[:, None, :]
+
+
+def cells_of(state: MapState, m: Measurement, grid: GridConfig) -> PointCells:
+    """Find the cell of each point that measures the ground."""
+    slot, inside = locate(m.points[..., 0], m.points[..., 1], lattice_offset(state, m, grid), grid)
+    slot, inside = realize_all(slot.to(torch.int64), inside & m.used)
+    return PointCells(slot, inside, grid.num_cells)

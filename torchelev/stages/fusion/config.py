@@ -1,0 +1,65 @@
+"""Settings of the height update."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchelev.errors import require, require_count
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeConfig:
+    """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
+
+    min_points: int = 6
+    min_share: float = 0.25  # of the cell's points outside the gate around its estimate
+    min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
+    min_extreme: int = 2  # points within a standard deviation of the top or bottom, or beyond; fewer are outliers
+    refinements: int = 7  # each halves the distance to the top of a wall's face
+    margin: float = 0.25  # standard deviations below the top that still belong to it
+    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
+
+    def __post_init__(self) -> None:
+        for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
+            require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
+        require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
+
+    def holds_step(self, number: Tensor, far: Tensor) -> Tensor:
+        """Tell which cells hold a step, by the number of their points and of those far from the estimate."""
+        return (number >= self.min_points) & (far >= self.min_share * number)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionConfig:
+    """Kalman update and outlier gate."""
+
+    gate: float = 3.0  # Mahalanobis distance beyond which a point is an outlier
+    max_gate_std: float = 0.05  # [m] an uncertain cell's gate grows no wider, or an outlier would slip in
+    relief: float = 0.25  # [cells] standard deviation of height within a cell of rough or sloped ground
+    scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
+    outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
+    max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
+    min_above: int = 5  # points above a cell, `challenge.py`, that found it anew, however settled it is
+    max_above_per_scan: int = 2  # of those points, how many one scan adds: a single bad scan is no obstacle
+    max_variance: float = 1.0  # [m^2]
+    edges: EdgeConfig | None = EdgeConfig()
+
+    def __post_init__(self) -> None:
+        fits, hint = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"
+        require(fits, "fusion.edges", "must be an EdgeConfig or None", repr(self.edges), hint, TypeError)
+        for name in ("gate", "max_gate_std", "scan_variance_floor", "max_variance"):
+            require(
+                getattr(self, name) > 0, f"fusion.{name}", "must be positive", getattr(self, name), "see its default"
+            )
+        for name in ("relief", "max_support"):
+            good, hint = 0 <= getattr(self, name) < math.inf, "see its default"
+            require(good, f"fusion.{name}", "must be finite and not negative", getattr(self, name), hint)
+        for name in ("min_above", "max_above_per_scan"):
+            number = require_count(f"fusion.{name}", getattr(self, name), "see its default")
+            require(number <= 255, f"fusion.{name}", "must be at most 255 points", number, "see its default")
+        for name in ("scan_variance_floor", "max_variance"):
+            finite, hint = math.isfinite(getattr(self, name)), "give a large number such as 1e6"
+            require(finite, f"fusion.{name}", "must be finite", getattr(self, name), hint)

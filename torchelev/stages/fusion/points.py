@@ -1,0 +1,97 @@
+"""What the height update reads: the points of the scan, the cells before it, and which points agree with a height."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig
+from torchelev.ops.storage import as_bytes
+from torchelev.stages.cells import PointCells
+from torchelev.stages.fusion.config import FusionConfig
+from torchelev.state import MapState, Measurement
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, UInt8
+
+
+class Scan(NamedTuple):
+    """This scan's points, with the cell of each."""
+
+    z: Float[Tensor, "B M"]  # [m]
+    spread: Float[Tensor, "B M"]  # [m^2] variance of z around its cell's height
+    weight: Float[Tensor, "B M"]  # 1 / sigma_p^2, zero where not used
+    used: Bool[Tensor, "B M"]
+    ray: list[Float[Tensor, "B M"]]  # [m] x and y from the sensor to the point
+    passed: Bool[Tensor, "B M"]  # the ray passed over the cell's centre before it hit
+    cells: PointCells
+
+    def sums(self, *columns: Tensor) -> tuple[Tensor, ...]:
+        """Sum numbers, or count what is true, over the points of each cell."""
+        return self.cells.sums(*(column.to(self.z.dtype) for column in columns))
+
+    def columns(self) -> list[Tensor]:
+        """Return what `Disputed` needs of every point, without a gradient."""
+        return [value.detach() for value in (self.z, self.spread, self.weight, as_bytes(self.passed), *self.ray)]
+
+
+class Prior(NamedTuple):
+    """The cells before the scan, flat."""
+
+    elevation: Float[Tensor, "B C"]
+    variance: Float[Tensor, "B C"]
+    known: Bool[Tensor, "B C"]
+    support: Float[Tensor, "B C"]
+    challenger: Float[Tensor, "B C"]
+    challenger_support: UInt8[Tensor, "B C"]
+
+
+def gather_scan(m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> Scan:
+    """Find what the update needs of each point, and whether its ray passed over the cell's centre."""
+    xy, z, used = m.points[..., :2], m.points[..., 2], cells.inside
+    from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
+    sensors = m.origin.shape[1]
+    ray = (xy.unflatten(1, (sensors, -1)) - m.origin[:, :, None, :2]).flatten(1, 2)
+    return Scan(
+        z=z,
+        spread=m.variance + (cfg.relief * grid.resolution) ** 2,
+        weight=torch.where(used, 1.0 / m.variance, 0.0),
+        used=used,
+        ray=list(ray.unbind(-1)),
+        passed=passed_center(from_center, ray),
+        cells=cells,
+    )
+
+
+def passed_center(from_center: Tensor, ray: Tensor) -> Tensor:
+    """Tell which rays passed over the middle of the cell before they hit: within 45 degrees of straight behind it.
+
+    A wall that the ray meets at an angle also has points farther along the ray; those passed the centre by.
+    """
+    along = (from_center * ray).sum(-1)
+    across = from_center[..., 0] * ray[..., 1] - from_center[..., 1] * ray[..., 0]
+    return along > across.abs()
+
+
+def gather_prior(state: MapState) -> Prior:
+    """Flatten what the update reads of the map."""
+    return Prior(
+        elevation=state.elevation.flatten(1),
+        variance=state.variance.flatten(1),
+        known=state.validity.flatten(1),
+        support=state.support.flatten(1),
+        challenger=state.challenger.detach().flatten(1),
+        challenger_support=state.challenger_support.flatten(1),
+    )
+
+
+def gate_variance(variance: Tensor, cfg: FusionConfig) -> Tensor:
+    """Return the variance [m^2] that an elevation of this variance widens its gate by."""
+    return variance.clamp(max=cfg.max_gate_std**2).detach()
+
+
+def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
+    """Tell which points lie within the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
+    return scan.used & ((scan.z - height).square() <= cfg.gate**2 * (scan.spread + variance))

@@ -1,0 +1,29 @@
+"""When a ray removes a cell, and which rays are accepted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torchelev.errors import require
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaycastConfig:
+    """When a ray removes a cell, and which rays are believed."""
+
+    min_time: float = 1.0  # [s] cells hit within it stay, and contradict rays that pass below them
+    min_incidence: float = 0.1  # alpha_n: |r . n| below it is a grazing ray
+    max_range: float | None = None  # [m] rays count up to here; None: 1.1 half-diagonals of the window
+    min_support: float = 3.0  # points that agree with a cell, or one beside it, for rays that end there to be believed
+    gate: float = 3.0  # a ray so many standard deviations below ground that is known is a wrong return
+
+    def __post_init__(self) -> None:
+        require(self.min_time >= 0, "raycast.min_time", "must not be negative", self.min_time, "give seconds")
+        cosine = 0 <= self.min_incidence < 1
+        require(cosine, "raycast.min_incidence", "must lie in [0, 1)", self.min_incidence, "give a cosine such as 0.1")
+        reach = self.max_range is None or 0 < self.max_range < math.inf
+        require(self.gate > 0, "raycast.gate", "must be positive", self.gate, "give standard deviations, such as 3")
+        require(reach, "raycast.max_range", "must be positive and finite", self.max_range, "give metres, or None")
+        support = 0 <= self.min_support < math.inf
+        require(support, "raycast.min_support", "must be finite and not negative", self.min_support, "give points")
