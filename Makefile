@@ -23,6 +23,7 @@ test: setup  ## run all tests, on all cores
 
 lint: setup  ## check style, and that imports go downwards
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check --quiet .
 	$(BIN)/lint-imports
 
 types: setup  ## check types

@@ -1,6 +1,5 @@
 """What the tests share: small configs, poses, clouds, random states, and how two states are compared."""
 
-
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings

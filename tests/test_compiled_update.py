@@ -18,8 +18,8 @@ from torchelev import ElevationMap, SensorConfig
 from torchelev.compiled_update import Graphs, graphs_of
 from torchelev.layers import LAYERS
 from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, compiled
-from torchelev.stages.fusion import fuse as fusion
-from torchelev.stages.fusion.consensus import settle
+from torchelev.stages.fusion import consensus
+from torchelev.stages.fusion.consensus import resolve_contested
 
 
 def core(emap):
@@ -85,18 +85,18 @@ def graphs():
 def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
     """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice.
 
-    Nor for another number of disputed cells: none, single ones, and tops and grounds of steps.
+    Nor for another number of contested cells: none, single ones, and tops and grounds of steps.
     """
     torch._dynamo.reset()
     sides = []
 
     def spy(points, *others):
-        height, side = settle(points, *others)
+        height, side = resolve_contested(points, *others)
         if not torch.compiler.is_compiling():
             sides.append([len(points.cells), int((side > 0).sum()), int((side < 0).sum())])
         return height, side
 
-    monkeypatch.setattr(fusion, "settle", spy)
+    monkeypatch.setattr(consensus, "resolve_contested", spy)
     before = graphs()
     maps = {name: small_map(2) for name in ("eager", "compiled", "twin")}
     maps["compiled"].compile()

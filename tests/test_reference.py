@@ -200,25 +200,25 @@ def test_believed_rays():
     layers["elevation"][1] = 0.9
     origin, limits = np.array([-4.0, 0.5, 2.0]), dict(min_support=3, gate=2.0)  # 2 * sqrt(0 + 0.5^2) = 1 m below
 
-    def ends_well(x, z):
+    def has_credible_end(x, z):
         return reference.believed_slope(origin, np.array([x, 0.5, z]), layers, (0, 0), 1.0, **limits) is not None
 
-    assert ends_well(2.5, 0.0) and ends_well(2.5, -0.9) and not ends_well(2.5, -1.1)
-    assert ends_well(1.5, 0.0), "less than a cell's edge above its neighbour"
-    assert not ends_well(0.5, 0.0), "its neighbour has no support either"
-    assert not ends_well(3.4, 0.0) and not ends_well(9.0, 0.0), "unknown, and left the window over it"
+    assert has_credible_end(2.5, 0.0) and has_credible_end(2.5, -0.9) and not has_credible_end(2.5, -1.1)
+    assert has_credible_end(1.5, 0.0), "less than a cell's edge above its neighbour"
+    assert not has_credible_end(0.5, 0.0), "its neighbour has no support either"
+    assert not has_credible_end(3.4, 0.0) and not has_credible_end(9.0, 0.0), "unknown, and left the window over it"
     limits |= dict(near=2.0, clearance=0.5)  # of the ground at x = 2.5
-    assert ends_well(11.0, -0.4) and not ends_well(11.0, -0.6) and not ends_well(4.5, -0.6)
+    assert has_credible_end(11.0, -0.4) and not has_credible_end(11.0, -0.6) and not has_credible_end(4.5, -0.6)
 
     def height(x):
         slope = reference.believed_slope(origin, np.array([x, 0.5, -0.4]), layers, (0, 0), 1.0, **limits)
         return origin[2] + 7.5 * slope
 
     assert height(11.0) == pytest.approx(0.8) and height(4.5) == 0.5, "over x = 3.5"
-    assert not ends_well(3.4, 2.0), "it does not leave the window"
+    assert not has_credible_end(3.4, 2.0), "it does not leave the window"
     layers["validity"][3] = True
-    assert ends_well(11.0, -1.9), "it leaves the last half cell, at x = 3.5, at 0.05"
-    assert not ends_well(11.0, -4.1), "-1.05 there"
+    assert has_credible_end(11.0, -1.9), "it leaves the last half cell, at x = 3.5, at 0.05"
+    assert not has_credible_end(11.0, -4.1), "-1.05 there"
     layers["elevation"][3] = 1.8
     assert height(4.5) == 0.5, "below what stands at the border, by the ground near by"
     over = dict(min_time=1.0, gate=2.0)

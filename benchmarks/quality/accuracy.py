@@ -44,7 +44,7 @@ NOISES = {
 }
 
 
-class Recording(NamedTuple):
+class SimulatedRun(NamedTuple):
     """One simulated run."""
 
     scene: Scene
@@ -53,7 +53,7 @@ class Recording(NamedTuple):
     T_map_base: Tensor
 
 
-def record(scene: Scene, motion: str) -> Recording:
+def record(scene: Scene, motion: str) -> SimulatedRun:
     """Simulate a scene's scans."""
     sensor: sensors.DepthCamera | sensors.Lidar = sensors.DepthCamera()
     if motion == "turn":
@@ -65,16 +65,16 @@ def record(scene: Scene, motion: str) -> Recording:
         level = trajectories.mount(pitch_deg=0.0)
         path = trajectories.walk(scene, [(-1.0, 0.0), (0.2, 0.0)], speed=0.6, T_base_sensor=level)
     clean = [sensor.cast(scene, T, float(t)) for T, t in zip(path.T_map_sensor, path.times, strict=True)]
-    return Recording(scene, clean, path.T_map_sensor, path.T_map_base)
+    return SimulatedRun(scene, clean, path.T_map_sensor, path.T_map_base)
 
 
 @functools.cache
-def recorded(name: str, motion: str) -> Recording:
+def recorded(name: str, motion: str) -> SimulatedRun:
     """Return a recording, simulated once."""
     return record(SCENES[name](), motion)
 
 
-def corrupt(recording: Recording, kind: str) -> list[Tensor]:
+def corrupt(recording: SimulatedRun, kind: str) -> list[Tensor]:
     """Add noise to a recording's scans, the same in every run."""
     generator = torch.Generator().manual_seed(1)
     return [NOISES[kind](points, generator) for points in recording.clean]
@@ -89,7 +89,7 @@ class Cells(NamedTuple):
     mostly_right: Tensor  # more right points than wrong ones
 
 
-def plain_cells(emap: ElevationMap, recording: Recording, scans: list[Tensor]) -> Cells:
+def plain_cells(emap: ElevationMap, recording: SimulatedRun, scans: list[Tensor]) -> Cells:
     """Bin every point of the recording into the map's window: the plain baseline."""
     in_map = torch.cat(
         [p.double() @ T[:3, :3].T + T[:3, 3] for p, T in zip(scans, recording.T_map_sensor, strict=True)]
@@ -114,7 +114,7 @@ def cell_of(emap: ElevationMap, points: Tensor) -> tuple[Tensor, Tensor]:
     return k[:, 0] * GRID.width + k[:, 1], inside
 
 
-def build_map(recording: Recording, scans: list[Tensor], cfg: ElevationMapConfig | None = None) -> ElevationMap:
+def build_map(recording: SimulatedRun, scans: list[Tensor], cfg: ElevationMapConfig | None = None) -> ElevationMap:
     """Map a recording with default settings."""
     emap = ElevationMap(cfg or ElevationMapConfig(grid=GRID))
     for points, T_map_sensor, T_map_base in zip(scans, recording.T_map_sensor, recording.T_map_base, strict=True):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from benchmarks.quality.feature_recordings import CAMERA, DT, Recording
+from benchmarks.quality.feature_recordings import CAMERA, DT, SimulatedRun
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.grid import GridConfig
@@ -26,7 +26,7 @@ Watch = Callable[[ElevationMap, int], None]
 Figures = dict[str, float]
 
 
-def fuse(recording: Recording, cfg: ElevationMapConfig, watch: Watch | None = None) -> ElevationMap:
+def fuse(recording: SimulatedRun, cfg: ElevationMapConfig, watch: Watch | None = None) -> ElevationMap:
     """Map a recording; `watch` sees the map after each frame."""
     emap = ElevationMap(cfg)
     for k, frame in enumerate(recording.frames):
@@ -44,7 +44,7 @@ class Cells(NamedTuple):
     error: Tensor  # (H, W) [m], elevation less truth
 
 
-def cells_of(emap: ElevationMap, recording: Recording, k: int = -1) -> Cells:
+def cells_of(emap: ElevationMap, recording: SimulatedRun, k: int = -1) -> Cells:
     """Read the map beside the truth at frame k."""
     xy, elevation = emap.cell_centers()[0], emap.layer("elevation")[0].double()
     return Cells(xy, elevation, elevation - recording.truth(xy, k))
@@ -67,7 +67,7 @@ def share(part: Tensor, whole: Tensor) -> float:
     return float((part & whole).sum()) / total if total else math.nan
 
 
-def seam_step(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
+def seam_step(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
     """Measure the step where what the robot sees now meets what it saw long ago, in the last map.
 
     A seam is a pair of neighbouring cells, one hit within the last 0.5 s, the other last hit 3 s ago or earlier,
@@ -97,14 +97,14 @@ def seam_step(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, E
     }, emap
 
 
-def near_step(recording: Recording, xy: Tensor, k: int = -1) -> Tensor:
+def near_step(recording: SimulatedRun, xy: Tensor, k: int = -1) -> Tensor:
     """Tell which cells (...), by their centres (..., 2), have a step of 5 cm in the truth within 1.5 cells."""
     reach = GRID.resolution * torch.tensor([-1.5, -0.5, 0.5, 1.5], dtype=torch.float64)
     z = recording.truth(xy[..., None, :] + torch.cartesian_prod(reach, reach), k)
     return z.amax(-1) - z.amin(-1) > 0.05
 
 
-def cells_left(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
+def cells_left(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
     """Measure what stays of a person who stood, walked away and left the view.
 
     The person's cells: more than 10 cm above the ground, within 8 cm of where the body was, in the map after any frame
@@ -137,7 +137,7 @@ def cells_left(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, 
     }, emap
 
 
-def wrongly_removed(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
+def wrongly_removed(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
     """Measure what vanishes of a static world.
 
     A cell is right if within 5 cm of the truth. `removed [%]`: share of the cells ever right that, at some frame, were
@@ -165,7 +165,7 @@ def wrongly_removed(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figu
     }, emap
 
 
-def overhang_cells(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
+def overhang_cells(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
     """Measure what an overhanging bar and a ceiling leave on the ground.
 
     Overhang cells: hit by exact returns of bar or ceiling that lay above the default ramp, by none that lay below it.
@@ -205,7 +205,7 @@ def overhang_cells(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figur
     }, emap
 
 
-def within_exclusion(recording: Recording) -> Tensor:
+def within_exclusion(recording: SimulatedRun) -> Tensor:
     """Return the lattice's cells whose overhang was only ever seen above the default ramp."""
     above, below = world(), world()
     for k, points in enumerate(recording.exact):
@@ -217,7 +217,7 @@ def within_exclusion(recording: Recording) -> Tensor:
     return above & ~below
 
 
-def wall_tops(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
+def wall_tops(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
     """Measure how high walls stand in the map: one of 0.5 m, whose top is seen, and one of 1 m, whose face alone is.
 
     A row is the cells across a wall that it touches, anywhere along it but for 8 cm at the ends of its pieces, where an
@@ -250,13 +250,13 @@ def on_wall(wall: Box, xy: Tensor, margin: float) -> Tensor:
     return ((xy >= low) & (xy <= high)).all(-1)
 
 
-def top_errors(recording: Recording, cells: Cells, wall: Box) -> Tensor:
+def top_errors(recording: SimulatedRun, cells: Cells, wall: Box) -> Tensor:
     """Return the absolute errors of the known cells with their centre on the wall and an exact return on their top."""
     hit = hits(recording, wall, wall.high[2] - 1e-3)[world_index(cells.xy)]
     return cells.error[on_wall(wall, cells.xy, 0.0) & hit & cells.error.isfinite()].abs()
 
 
-def row_errors(recording: Recording, cells: Cells, wall: Box) -> Tensor:
+def row_errors(recording: SimulatedRun, cells: Cells, wall: Box) -> Tensor:
     """Return, for each row of cells across the wall, the absolute difference of its height from the wall's."""
     y = cells.xy[..., 1]
     along = (y > wall.low[1] + 0.08) & (y < wall.high[1] - 0.08)
@@ -266,7 +266,7 @@ def row_errors(recording: Recording, cells: Cells, wall: Box) -> Tensor:
     return (height.clamp(min=0.0) - wall.high[2]).abs()[seen]
 
 
-def hits(recording: Recording, wall: Box, above: float) -> Tensor:
+def hits(recording: SimulatedRun, wall: Box, above: float) -> Tensor:
     """Return the lattice's cells in which an exact return hit the wall higher than `above` [m]."""
     hit = world()
     for points in recording.exact:
@@ -275,7 +275,7 @@ def hits(recording: Recording, wall: Box, above: float) -> Tensor:
     return hit
 
 
-def other_floor(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
+def other_floor(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
     """Measure what stays of the floor that the robot left.
 
     `other floor [%]`: of the known cells within 3 m of the robot, those whose error is more than half a storey
@@ -303,7 +303,7 @@ def other_floor(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures,
     return {"other floor [%]": near_and_wrong(emap, -1), "worst [%]": max(worst)}, emap
 
 
-def bounds(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
+def bounds(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:
     """Measure the upper bound of unseen cells.
 
     Unseen in view: unknown in the last map, no exact return ever hit it, and its centre was within the camera's
@@ -328,7 +328,7 @@ def bounds(recording: Recording, cfg: ElevationMapConfig) -> tuple[Figures, Elev
     }, emap
 
 
-def in_view(recording: Recording, xy: Tensor) -> Tensor:
+def in_view(recording: SimulatedRun, xy: Tensor) -> Tensor:
     """Tell which places (H, W, 2) were within the camera's horizontal field of view, 0.5 to 4 m away, at some frame."""
     seen = torch.zeros(xy.shape[:-1], dtype=torch.bool)
     half = math.radians(CAMERA.fov_x_deg) / 2

@@ -18,7 +18,7 @@ CAMERA = DepthCamera(max_range=6.0)
 DOME = Lidar(rings=48, azimuths=720, fov_low_deg=-60.0, fov_high_deg=60.0, max_range=10.0)
 
 
-class Frame(NamedTuple):
+class SimulatedScan(NamedTuple):
     """One instant: points (1, N, 3) [m] in the sensor frame, and the poses (1, 4, 4) that the robot believes."""
 
     points: Tensor
@@ -29,11 +29,11 @@ class Frame(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Recording:
+class SimulatedRun:
     """A scene, what was seen of it, and the noiseless points (N, 3) of each frame in the true map frame."""
 
     scene: Scene
-    frames: list[Frame]
+    frames: list[SimulatedScan]
     exact: list[Tensor]
     T_true_sensor: Tensor  # (T, 4, 4)
 
@@ -51,7 +51,7 @@ def record(
     below: Sequence[float] | None = None,
     too_long: float = 0.0,
     seed: int = 0,
-) -> Recording:
+) -> SimulatedRun:
     """Cast from the true path, add noise; the robot believes `believed`."""
     generator = torch.Generator().manual_seed(seed)
     believed = believed or path
@@ -64,8 +64,10 @@ def record(
         T = path.T_map_sensor[k]
         exact.append(clean.double() @ T[:3, :3].T + T[:3, 3])
         level = math.inf if below is None else below[k]
-        frames.append(Frame(points[None], believed.T_map_sensor[k][None], believed.T_map_base[k][None], t, level))
-    return Recording(scene=scene, frames=frames, exact=exact, T_true_sensor=path.T_map_sensor)
+        frames.append(
+            SimulatedScan(points[None], believed.T_map_sensor[k][None], believed.T_map_base[k][None], t, level)
+        )
+    return SimulatedRun(scene=scene, frames=frames, exact=exact, T_true_sensor=path.T_map_sensor)
 
 
 def lane(seed: int = 3) -> Scene:
@@ -76,7 +78,7 @@ def lane(seed: int = 3) -> Scene:
     return Scene(name="lane", terrain=terrain, steepness=steepness, boxes=(*left, *right))
 
 
-def record_drift() -> Recording:
+def record_drift() -> SimulatedRun:
     """Walk round a square on rough ground with boxes, while the odometry sinks by 15 cm, evenly in time."""
     terrain, steepness = scenes.waves(5, amplitude=0.05)
     inner, outer = scenes.crates(5, 4, (-0.6, 0.6, -0.4, 0.4)), scenes.crates(6, 14, (-4.0, 4.0, 2.2, 4.0))
@@ -87,7 +89,7 @@ def record_drift() -> Recording:
     return record(scene, path, believed=drifted)
 
 
-def record_person(too_long: float = 0.0) -> Recording:
+def record_person(too_long: float = 0.0) -> SimulatedRun:
     """Follow a person who stands on the lane, 3 m ahead, and from t = 2 s walks away along it; gone at t = 6 s."""
     scene, pace = lane(), 1.0
     stands = scenes.person(until=2.0, x=0.713, y=-0.2).boxes[0]
@@ -99,14 +101,14 @@ def record_person(too_long: float = 0.0) -> Recording:
     return record(scene, walk(scene, [(-2.0, 0.0), (0.5, 0.0)], speed=0.25, dt=DT), too_long=too_long)
 
 
-def record_static(too_long: float = 0.0) -> Recording:
+def record_static(too_long: float = 0.0) -> SimulatedRun:
     """Walk over rough ground and up two stairs, turn and come down; ramp, stairs and boxes around, nothing moves."""
     scene = scenes.mixed(0)  # no higher than this: from the landing the ground would be another floor
     path = walk(scene, [(-2.6, 0.05), (1.75, 0.05), (1.75, -0.35), (0.4, -0.9)], speed=0.6, dt=DT)
     return record(scene, path, too_long=too_long)
 
 
-def record_overhang() -> Recording:
+def record_overhang() -> SimulatedRun:
     """Walk below the bar and under the ceiling, past the obstacle, with a lidar that sees from -60 to 60 degrees."""
     scene = scenes.overhang()
     path = walk(scene, [(-1.5, -0.85), (4.0, -0.85)], dt=DT, T_base_sensor=mount(0.0))
@@ -121,7 +123,7 @@ def staggered_wall(x: float, y0: float, y1: float, top: float) -> list[Box]:
     ]
 
 
-def record_walls() -> Recording:
+def record_walls() -> SimulatedRun:
     """Walk towards walls of 0.5 m and 1 m, turn to one and the other; the camera is pitched down by 15 degrees only."""
     pieces = (*staggered_wall(1.987, -2.5, -0.313, 0.5), *staggered_wall(2.493, 0.307, 2.9, 1.0))
     scene = Scene(name="walls", boxes=(*pieces, scenes.block(1.213, 1.437, -0.191, 0.227, 0.12)))
@@ -129,7 +131,7 @@ def record_walls() -> Recording:
     return record(scene, walk(scene, route, dt=DT, T_base_sensor=mount(15.0)))
 
 
-def record_floors(up: bool) -> Recording:
+def record_floors(up: bool) -> SimulatedRun:
     """Walk on one floor, take the stairs, and walk on the other floor, over or under where it was before."""
     scene = scenes.two_floors()
     route = [(3.0, -1.0), (-3.2, -1.0), (-3.2, 1.6), (3.2, 1.6), (3.2, -1.0), (-1.0, -1.0)]
@@ -145,7 +147,7 @@ def record_floors(up: bool) -> Recording:
     return record(scene, path, below=below)
 
 
-def record_hidden(too_long: float = 0.0) -> Recording:
+def record_hidden(too_long: float = 0.0) -> SimulatedRun:
     """Walk down the lane: ground behind the boxes and their own far sides stay unseen."""
     scene = lane()
     return record(scene, walk(scene, [(-2.0, 0.0), (1.5, 0.0)], dt=DT), too_long=too_long)

@@ -30,7 +30,7 @@ import torch
 from benchmarks.quality import feature_metrics as metrics
 from benchmarks.quality import feature_recordings as rec
 from benchmarks.quality.feature_metrics import GRID, Figures
-from benchmarks.quality.feature_recordings import Recording
+from benchmarks.quality.feature_recordings import SimulatedRun
 from torchelev.app.results import machine, markdown_table, write_json
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
@@ -43,8 +43,8 @@ class Feature:
     """A recording, how it is measured, what switches the feature off, and what must hold with it on."""
 
     name: str
-    record: Callable[[], Recording]
-    measure: Callable[[Recording, ElevationMapConfig], tuple[Figures, ElevationMap]]
+    record: Callable[[], SimulatedRun]
+    measure: Callable[[SimulatedRun, ElevationMapConfig], tuple[Figures, ElevationMap]]
     off: str  # dotted name of the setting that is set to None
     bars: dict[str, tuple[str, float]]  # metric -> ("<=" or ">=", limit)
     shown: tuple[str, ...] = ()  # metrics in the picture besides the first of the bars
@@ -68,7 +68,11 @@ FEATURES = (
         "cleanup: static, 1 % too long", partial(rec.record_static, WRONG), metrics.wrongly_removed, "raycast", REMOVED
     ),
     Feature(
-        "exclusion area", rec.record_overhang, metrics.overhang_cells, "sensor.exclusion", OVERHANG,
+        "exclusion area",
+        rec.record_overhang,
+        metrics.overhang_cells,
+        "sensor.exclusion",
+        OVERHANG,
         shown=("bar at the end [%]", "ceiling at the end [%]"),
     ),  # fmt: skip
     Feature("edges", rec.record_walls, metrics.wall_tops, "fusion.edges", WALLS),
@@ -107,7 +111,7 @@ class Outcome(NamedTuple):
     feature: Feature
     figures: dict[str, Figures]
     maps: dict[str, ElevationMap]
-    recording: Recording
+    recording: SimulatedRun
 
 
 def examine(feature: Feature) -> Outcome:

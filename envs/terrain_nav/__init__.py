@@ -1,6 +1,6 @@
 """TerrainNav: the paper's local navigation, as a task for reinforcement learning."""
 
-from envs.terrain_nav.config import CourseConfig, RewardConfig, RobotConfig, SightConfig, TerrainNavConfig
+from envs.terrain_nav.config import BodyConfig, CourseConfig, RewardConfig, SightConfig, TerrainNavConfig
 from envs.terrain_nav.task import TerrainNav
 
-__all__ = ["CourseConfig", "RewardConfig", "RobotConfig", "SightConfig", "TerrainNav", "TerrainNavConfig"]
+__all__ = ["CourseConfig", "RewardConfig", "BodyConfig", "SightConfig", "TerrainNav", "TerrainNavConfig"]

@@ -38,7 +38,7 @@ class CourseConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotConfig:
+class BodyConfig:
     """A base that follows velocity commands over the ground, and where it cannot."""
 
     length: float = 0.6  # [m] of the footprint
@@ -95,7 +95,7 @@ class TerrainNavConfig:
     """Everything about the task."""
 
     course: CourseConfig = field(default_factory=CourseConfig)
-    robot: RobotConfig = field(default_factory=RobotConfig)
+    robot: BodyConfig = field(default_factory=BodyConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     sight: SightConfig = field(default_factory=SightConfig)
     dt: float = 0.2  # [s] between actions

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from envs.terrain_nav.config import RobotConfig, TerrainNavConfig
+from envs.terrain_nav.config import BodyConfig, TerrainNavConfig
 from envs.terrain_nav.robot import contacts
 from envs.terrain_nav.task import TerrainNav
 from torchelev.viz.plot import UNKNOWN_COLOR
@@ -73,7 +73,7 @@ def save_strip(shots: Sequence[Snapshot], path: Path, *, trail: Sequence[np.ndar
     figure.savefig(path)
 
 
-def _draw_column(axes: Sequence[Axes], shot: Snapshot, walked: Sequence[np.ndarray], robot: RobotConfig) -> None:
+def _draw_column(axes: Sequence[Axes], shot: Snapshot, walked: Sequence[np.ndarray], robot: BodyConfig) -> None:
     level = float(np.median(shot.truth))
     limits = {"vmin": level - 0.6, "vmax": level + 0.6}
     _draw(axes[0], shot.truth, shot.truth_extent, limits)

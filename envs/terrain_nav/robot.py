@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from envs.terrain_nav.config import RobotConfig
+from envs.terrain_nav.config import BodyConfig
 from torchelev.sim.terrains.heightfield import HeightField
 
 
@@ -35,7 +35,7 @@ class Ground:
         self.field, self.highest = field, HeightField(highest, field.resolution)
 
 
-def contacts(xy: Tensor, yaw: Tensor, cfg: RobotConfig) -> Tensor:
+def contacts(xy: Tensor, yaw: Tensor, cfg: BodyConfig) -> Tensor:
     """Return the footprint's corners and the middles of its sides (B, 8, 2) [m]; the corners are the feet."""
     points = _footprint(cfg.length / 2, cfg.width / 2, xy.device)
     cos, sin = yaw.cos()[:, None], yaw.sin()[:, None]
@@ -50,7 +50,7 @@ def _footprint(a: float, b: float, device: torch.device) -> Tensor:
         return torch.tensor(points, device=device)
 
 
-def base_pose(xy: Tensor, yaw: Tensor, tile_ids: Tensor, field: HeightField, cfg: RobotConfig) -> Tensor:
+def base_pose(xy: Tensor, yaw: Tensor, tile_ids: Tensor, field: HeightField, cfg: BodyConfig) -> Tensor:
     """Return T_map_base (B, 4, 4): over the feet, tilted as the plane through them."""
     feet = field.height(tile_ids, contacts(xy, yaw, cfg)[:, :4])
     front, rear, left, right = (feet[:, pair].mean(1) for pair in ((0, 1), (2, 3), (0, 2), (1, 3)))
@@ -65,7 +65,7 @@ def base_pose(xy: Tensor, yaw: Tensor, tile_ids: Tensor, field: HeightField, cfg
 
 
 def advance(
-    state: RobotState, action: Tensor, tile_ids: Tensor, ground: Ground, cfg: RobotConfig, dt: float
+    state: RobotState, action: Tensor, tile_ids: Tensor, ground: Ground, cfg: BodyConfig, dt: float
 ) -> RobotState:
     """Move for one substep of dt [s]; `action` (B, 2) in [-1, 1]: forward speed and yaw rate.
 

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 import envs.terrain_nav.task as task_module
-from envs.terrain_nav import CourseConfig, RobotConfig, SightConfig, TerrainNav, TerrainNavConfig
+from envs.terrain_nav import BodyConfig, CourseConfig, SightConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.course import Course, make_course
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
 from envs.terrain_nav.rsl_rl import mirror
@@ -19,7 +19,7 @@ from torchelev.sim.sensors import mounted
 from torchelev.sim.terrains.heightfield import HeightField
 from training.nav.evaluate import evaluate, straight_line
 
-ROBOT = RobotConfig()
+ROBOT = BodyConfig()
 SMALL = CourseConfig(num_tiles=4, num_routes=16)
 FLAT = CourseConfig(num_tiles=1, num_routes=8, shares=(0.0, 0.0, 0.0), roughness=0.0)
 IDS = torch.zeros(1, dtype=torch.int64)

@@ -59,7 +59,7 @@ class DemoResult:
         )
 
 
-class Frame(NamedTuple):
+class DemoScan(NamedTuple):
     """One instant of the recording."""
 
     points: Tensor  # (N, 3) [m] sensor frame
@@ -104,14 +104,14 @@ def _person() -> tuple[Box, Box]:
     )  # fmt: skip
 
 
-def observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator) -> Frame:
+def observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator) -> DemoScan:
     """Return what the camera sees at step k: range noise, and 1 % of the pixels at wrong depths."""
     points = CAMERA.cast(scene, path.T_map_sensor[k], float(path.times[k]))
     points = outliers(range_noise(points, generator), generator, dust=0.005, flying=0.005)
-    return Frame(points, path.T_map_sensor[k], path.T_map_base[k])
+    return DemoScan(points, path.T_map_sensor[k], path.T_map_base[k])
 
 
-def fuse(emap: ElevationMap, frame: Frame) -> float:
+def fuse(emap: ElevationMap, frame: DemoScan) -> float:
     """Fuse one frame and return how long it took [ms]."""
     start = time.perf_counter()
     emap.update(frame.points[None], frame.T_map_sensor[None], frame.T_map_base[None], DT)
@@ -126,7 +126,7 @@ class Seen:
         self.half = round(reach / resolution)
         self.cells = torch.zeros(2 * self.half, 2 * self.half, dtype=torch.bool)
 
-    def add(self, frame: Frame, window: Tensor) -> None:
+    def add(self, frame: DemoScan, window: Tensor) -> None:
         """Mark the cells of one frame's returns; forget the cells outside the window, centres (H, W, 2)."""
         T = frame.T_map_sensor
         points = frame.points[frame.points.isfinite().all(-1)].double()

@@ -30,7 +30,7 @@ class Scan:
     step: int
 
 
-class Plane(NamedTuple):
+class GroundPlane(NamedTuple):
     """The plane with most points of a scan, in the sensor frame: normal . p = offset."""
 
     normal: NDArray
@@ -61,7 +61,7 @@ class Fit(NamedTuple):
         return self.level < 0.5 or self.agreement < 0.55
 
 
-def largest_plane(points: NDArray) -> Plane | None:
+def largest_plane(points: NDArray) -> GroundPlane | None:
     """Find the plane with most points by random triples (RANSAC); None unless it holds 40 % of them."""
     near = points[np.linalg.norm(points, axis=1) < REACH]
     if len(near) < 50:
@@ -74,10 +74,10 @@ def largest_plane(points: NDArray) -> Plane | None:
     width = 0.03 + 0.015 * np.linalg.norm(near, axis=1)
     shares = (np.abs(near @ normal.T - offset) < width[:, None]).mean(0)
     best = int(shares.argmax())
-    return Plane(normal[best], float(offset[best]), float(shares[best])) if shares[best] > 0.4 else None
+    return GroundPlane(normal[best], float(offset[best]), float(shares[best])) if shares[best] > 0.4 else None
 
 
-def fit(scans: list[Scan], planes: list[Plane | None], undo: Callable[[Scan], tuple[NDArray, NDArray]]) -> Fit:
+def fit(scans: list[Scan], planes: list[GroundPlane | None], undo: Callable[[Scan], tuple[NDArray, NDArray]]) -> Fit:
     """Judge the scans after a mistake was undone; `undo` gives the right pose, and the sensor's place in the points."""
     levels, heights, cells = [], [], []
     for scan, plane in zip(scans, planes, strict=True):

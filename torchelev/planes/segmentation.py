@@ -68,7 +68,7 @@ class HostMap(NamedTuple):
     joined_y: Bool[ndarray, "H W-1"]
 
 
-class Frame(NamedTuple):
+class GridFrame(NamedTuple):
     """Where the cells of one map lie."""
 
     resolution: float  # [m]
@@ -110,7 +110,7 @@ def segment(
     host = [values.cpu().numpy() for values in (known, heights, *local)]
     corners = middles - np.array(heights.shape[1:]) * resolution / 2
     return [
-        _segment(HostMap(*layers), radius, Frame(resolution, corner), cfg)
+        _segment(HostMap(*layers), radius, GridFrame(resolution, corner), cfg)
         for *layers, corner in zip(*host, corners, strict=True)
     ]
 
@@ -135,7 +135,7 @@ def _middles(center: Any, number: int) -> Float[ndarray, "B 2"]:
     return np.broadcast_to(values[..., :2], (number, 2))
 
 
-def _segment(one: HostMap, radius: int, frame: Frame, cfg: PlaneConfig) -> Planes:
+def _segment(one: HostMap, radius: int, frame: GridFrame, cfg: PlaneConfig) -> Planes:
     """Segment one map."""
     labels, number = components(one.planar, one.joined_x, one.joined_y)
     if number == 0:
@@ -171,7 +171,9 @@ def _fit(labels: Int[ndarray, "P"], before: RegionPlanes, surface: Surface) -> R
     return fit_planes(moments, (before.gradient_x, before.gradient_y), surface.weight)
 
 
-def _assemble(labels: Int[ndarray, "H W"], plane: RegionPlanes, frame: Frame, cfg: PlaneConfig) -> tuple[Region, ...]:
+def _assemble(
+    labels: Int[ndarray, "H W"], plane: RegionPlanes, frame: GridFrame, cfg: PlaneConfig
+) -> tuple[Region, ...]:
     """Trace the regions and put their polygons onto their planes."""
     if len(plane.number) == 0:
         return ()
@@ -188,7 +190,9 @@ def _assemble(labels: Int[ndarray, "H W"], plane: RegionPlanes, frame: Frame, cf
     )
 
 
-def _polygons(outlines: Outlines, plane: RegionPlanes, frame: Frame) -> tuple[list[list[ndarray]], list[list[ndarray]]]:
+def _polygons(
+    outlines: Outlines, plane: RegionPlanes, frame: GridFrame
+) -> tuple[list[list[ndarray]], list[list[ndarray]]]:
     """Return for each region the polygons that surround its ground, and those that leave some out."""
     label = np.repeat(outlines.label, outlines.length)
     xy = frame.xy(outlines.points / 2)

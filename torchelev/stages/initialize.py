@@ -1,4 +1,4 @@
-"""A first guess of the ground from the feet that stand on it."""
+"""A first estimate of the ground from the feet that stand on it."""
 
 from __future__ import annotations
 

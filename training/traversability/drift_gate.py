@@ -31,7 +31,7 @@ SEED = 77  # of recordings that no training sees
 HEADS = ("analytic", "learned")
 
 
-class Recording(NamedTuple):
+class SimulatedRun(NamedTuple):
     """What the robots of one batch saw."""
 
     field: HeightField
@@ -39,15 +39,15 @@ class Recording(NamedTuple):
     looks: list[Look]
 
 
-def record(index: int) -> Recording:
+def record(index: int) -> SimulatedRun:
     """Walk over two tiles of random kinds."""
     rng, cfg = np.random.default_rng([SEED, index]), DataConfig()
     robot = draw_robot(rng)
     field = make_tiles([str(kind) for kind in rng.choice(list(KINDS), cfg.num_maps)], rng)
-    return Recording(field, robot, list(walk_and_look(field, robot, cfg, rng)))
+    return SimulatedRun(field, robot, list(walk_and_look(field, robot, cfg, rng)))
 
 
-def configuration(recording: Recording, head: str, threshold: float | None) -> ElevationMapConfig:
+def configuration(recording: SimulatedRun, head: str, threshold: float | None) -> ElevationMapConfig:
     """Return the default configuration with a head and a gate; None: no compensation."""
     cfg = map_config(RESOLUTION, DataConfig().window)
     learned = LearnedTraversabilityConfig(robot=recording.robot)
@@ -57,7 +57,7 @@ def configuration(recording: Recording, head: str, threshold: float | None) -> E
     return dataclasses.replace(cfg, traversability=rating, drift=drift)
 
 
-def height_errors(recording: Recording, cfg: ElevationMapConfig) -> Tensor:
+def height_errors(recording: SimulatedRun, cfg: ElevationMapConfig) -> Tensor:
     """Map a recording; return each map's error [m], NaN for one that knows nothing."""
     emap = ElevationMap(cfg, recording.field.num_tiles)
     for look in recording.looks:

@@ -371,9 +371,9 @@ def test_parts_make_the_whole(monkeypatch):
     field, tiles, origin, d = scene(2, B=5)
     boxes = Boxes(torch.eye(4).expand(5, 1, 4, 4) + 0, torch.rand(5, 1, 3))
     whole = cast(field, tiles, origin, d, 3.0, boxes)
-    monkeypatch.setattr("torchelev.sim.sensors.casting.MOST_RAYS", 2 * d.shape[1] + 1)
+    monkeypatch.setattr("torchelev.sim.sensors.casting.MAX_RAYS", 2 * d.shape[1] + 1)
     same(cast(field, tiles, origin, d, 3.0, boxes), whole)
-    monkeypatch.setattr("torchelev.sim.sensors.casting.MOST_RAYS", 1)
+    monkeypatch.setattr("torchelev.sim.sensors.casting.MAX_RAYS", 1)
     same(cast(field, tiles, origin, d, 3.0, boxes), whole)
 
 

@@ -7,8 +7,8 @@ import torch
 
 from torchelev.ops.windows import AROUND, around
 from torchelev.stages.fusion.config import EdgeConfig
-from torchelev.stages.fusion.consensus import settle
-from torchelev.stages.fusion.contested import NO_HEIGHT, Disputed, Shown
+from torchelev.stages.fusion.consensus import resolve_contested
+from torchelev.stages.fusion.contested import NO_HEIGHT, CellHeights, ContestedCells
 from torchelev.stages.fusion.edges import ends_of_step, lie_behind, values_around
 
 
@@ -37,12 +37,12 @@ def test_points_that_are_not_used_hold_no_level():
     weight = torch.tensor([[1.0] * 7 + [0.0] * 2])
     slot, cells = torch.zeros(1, 9, dtype=torch.int64), torch.ones(1, 1, dtype=torch.uint8)
     ray, passed, mean = torch.ones(1, 9), torch.zeros(1, 9, dtype=torch.uint8), torch.tensor([[6 / 7]])
-    ends = []
+    find_ends = []
     for count in (7, 9):
         columns = [value[:, :count] for value in (z, torch.full((1, 9), 1e-4), weight, passed, ray, ray)]
-        ends.append(ends_of_step(Disputed(cells, slot[:, :count], columns, mean), EdgeConfig()))
-    assert ends[0] == ends[1]
-    top, bottom = (mean.item() + end.item() for end in ends[0])
+        find_ends.append(ends_of_step(ContestedCells(cells, slot[:, :count], columns, mean), EdgeConfig()))
+    assert find_ends[0] == find_ends[1]
+    top, bottom = (mean.item() + end.item() for end in find_ends[0])
     assert top == pytest.approx(6 / 7)  # the next level, 1.5, would be reached by the outlier alone
     assert bottom == pytest.approx(0.0, abs=1e-6)
 
@@ -53,9 +53,9 @@ def test_each_refinement_halves_the_distance_to_the_top_of_a_face(refinements, t
     z = torch.linspace(0, 1, 20_001, dtype=torch.float64)[None]
     slot, passed, cells = torch.zeros_like(z, dtype=torch.int64), torch.zeros_like(z), torch.ones(1, 1)
     columns = [z, torch.full_like(z, 1e-10), torch.ones_like(z), passed, passed, passed]
-    points = Disputed(cells.to(torch.uint8), slot, columns, 0.5 * cells.double())
-    ends = ends_of_step(points, EdgeConfig(refinements=refinements))
-    assert [0.5 + end.item() for end in ends] == pytest.approx([top, 0.125], abs=1e-3)
+    points = ContestedCells(cells.to(torch.uint8), slot, columns, 0.5 * cells.double())
+    find_ends = ends_of_step(points, EdgeConfig(refinements=refinements))
+    assert [0.5 + end.item() for end in find_ends] == pytest.approx([top, 0.125], abs=1e-3)
 
 
 def one_cell(z, weight, step=0, passed=0, seen=None, known=None):
@@ -72,8 +72,8 @@ def one_cell(z, weight, step=0, passed=0, seen=None, known=None):
         for cell, height in values.items():
             layer[0, cell] = height
     columns = [z, zeros + 1e-4, weight, (zeros + passed).to(torch.uint8), zeros + 1.0, zeros]
-    points = Disputed(marked + step * marked, (zeros + 4).to(torch.int64), columns, scan)
-    results = settle(points, cells, Shown(scan, seen_before), 3, 3.0, 0.01, EdgeConfig())
+    points = ContestedCells(marked + step * marked, (zeros + 4).to(torch.int64), columns, scan)
+    results = resolve_contested(points, cells, CellHeights(scan, seen_before), 3, 3.0, 0.01, EdgeConfig())
     return [result[0, 4].item() for result in results]
 
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import off_borders, pose, random_state, seen_from, small_map
 from torchelev import GridConfig, RaycastConfig, SensorConfig
-from torchelev.stages.visibility.accepted_rays import believed, ends_well, height_margin, rays_of
+from torchelev.stages.visibility.accepted_rays import accepted_rays, has_credible_end, height_margin, sensor_rays
 from torchelev.stages.visibility.clean_up import clear_seen_through
-from torchelev.stages.visibility.polar_table import BREADTH, PolarGrid, turn
+from torchelev.stages.visibility.polar_table import BREADTH, PolarGrid, azimuth_fraction
 from torchelev.state import LAYERS
 
 CELLS, RESOLUTION = (40, 30), 0.1
@@ -364,8 +364,8 @@ def test_where_rays_end_agrees_with_the_reference(place):
     hits[::2, :2] = origin[:2] + rng.uniform(1, 6, (3000, 1)) * (hits[::2, :2] - origin[:2])
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
     m = m._replace(used=m.used & torch.from_numpy(rng.random((1, 6000)) < 0.8))
-    rays, lowest = rays_of(m, 0), state.elevation - height_margin(state, emap.cfg.grid, EVERY)
-    well, slope = (values[0].numpy() for values in ends_well(state, m, rays, lowest, emap.cfg.grid, EVERY))
+    rays, lowest = sensor_rays(m, 0), state.elevation - height_margin(state, emap.cfg.grid, EVERY)
+    well, slope = (values[0].numpy() for values in has_credible_end(state, m, rays, lowest, emap.cfg.grid, EVERY))
     layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     corner, rule = state.corner[0].tolist(), dict(min_support=EVERY.min_support, gate=EVERY.gate)
     slopes = [reference.believed_slope(origin, hit, layers, corner, RESOLUTION, **rule) for hit in hits]
@@ -394,21 +394,21 @@ def test_believed_rays_agree_with_the_reference(place):
     hits = floor_hits(T, 3000) + np.column_stack([np.zeros((3000, 2)), rng.uniform(-0.6, 0.4, 3000)])
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
     m = m._replace(used=m.used & torch.from_numpy(rng.random((1, 3000)) < 0.9))
-    rays = rays_of(m, 0)
-    got = believed(state, m, rays, emap.cfg.grid, EVERY).casts[0].numpy()
+    rays = sensor_rays(m, 0)
+    got = accepted_rays(state, m, rays, emap.cfg.grid, EVERY).casts[0].numpy()
     layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     corner, origin = state.corner[0].tolist(), T[0, :3, 3].numpy()
-    ends, over = [], []
+    find_ends, over = [], []
     for hit, overhang in zip(hits, rays.overhang[0].tolist(), strict=True):
         ray = (origin, hit, layers, corner, RESOLUTION)
         slope = reference.believed_slope(*ray, min_support=EVERY.min_support, gate=EVERY.gate)
-        ends.append(overhang or slope is not None)
+        find_ends.append(overhang or slope is not None)
         over.append(reference.stays_above_recent(*ray, min_time=EVERY.min_time, gate=EVERY.gate))
-    ends, over = np.array(ends), np.array(over)
-    assert (ends & over).sum() > 50 and (ends & ~over).sum() > 5 and (~ends).sum() > 50
-    expected = (ends & over) & rays.casts[0].numpy()
+    find_ends, over = np.array(find_ends), np.array(over)
+    assert (find_ends & over).sum() > 50 and (find_ends & ~over).sum() > 5 and (~find_ends).sum() > 50
+    expected = (find_ends & over) & rays.casts[0].numpy()
     assert (got == expected).mean() > 0.99
-    assert not (got & ~ends).any(), "where a ray ends is told exactly"
+    assert not (got & ~find_ends).any(), "where a ray ends is told exactly"
 
 
 def test_each_sensor_casts_from_its_own_place():
@@ -436,7 +436,7 @@ def test_rays_straight_down_and_from_odd_places(x, y):
 
 @given(st.floats(-10, 10), st.floats(-10, 10))
 def test_turn_is_an_azimuth(x, y):
-    got = float(turn(torch.tensor(x, dtype=torch.float64), torch.tensor(y, dtype=torch.float64)))
+    got = float(azimuth_fraction(torch.tensor(x, dtype=torch.float64), torch.tensor(y, dtype=torch.float64)))
     expected = np.arctan2(y, x) / (2 * np.pi) % 1.0
     assert 0 <= got <= 1
     assert min(abs(got - expected), 1 - abs(got - expected)) < 1e-3 or abs(x) + abs(y) < 1e-300
@@ -444,7 +444,7 @@ def test_turn_is_an_azimuth(x, y):
 
 def test_turn_grows_with_the_azimuth():
     angle = torch.linspace(0, 2 * np.pi, 100_001, dtype=torch.float64)[:-1]
-    assert (turn(angle.cos(), angle.sin()).diff() > 0).all()
+    assert (azimuth_fraction(angle.cos(), angle.sin()).diff() > 0).all()
 
 
 def test_two_entries_cover_all_bins_of_a_cell():

@@ -35,7 +35,7 @@ def check_range(name: str, value: Any, lowest: float = 0.0, highest: float = mat
     require(within, name, rule, repr(value), "give one value or a pair (low, high) within")
 
 
-class PerEnvironment(nn.Module):
+class DomainRandomization(nn.Module):
     """B environments, each with its own values of a config's fields, drawn at reset and constant until the next.
 
     Args:
@@ -140,7 +140,7 @@ class PerEnvironment(nn.Module):
         """Set the state of the random numbers."""
         self.generator.set_state(state["generator"].cpu())
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PerEnvironment:
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DomainRandomization:
         before = self.device
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         if self.device != before:

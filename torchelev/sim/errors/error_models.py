@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.sim.errors.delay import Cloud, Delay
-from torchelev.sim.errors.draws import PerEnvironment, Range, check_range, limits
+from torchelev.sim.errors.draws import DomainRandomization, Range, check_range, limits
 from torchelev.sim.errors.range_errors import across_edge, artefacts, disparity_steps, flying, steps
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ class SensorErrorConfig:
         require(most <= 1, "SensorErrorConfig.too_short, too_long", "must sum to 1 at most", most, "lower one")
 
 
-class SensorErrors(PerEnvironment):
-    """Errors of B sensors, each with its own values; see `PerEnvironment` for the arguments.
+class SensorErrors(DomainRandomization):
+    """Errors of B sensors, each with its own values; see `DomainRandomization` for the arguments.
 
     ```python
     errors = SensorErrors(SensorErrorConfig(range_constant=(0.0, 0.01), latency=(0, 2)), num_envs=B)
@@ -94,7 +94,7 @@ class SensorErrors(PerEnvironment):
             buffer.copy_(torch.where(mask[:, None], self.normal(self.num_envs, 3), buffer))
 
     def mounting(self) -> Float[Tensor, "B 4 4"]:
-        """Return T_nominal_true: where each sensor really sits, seen from where it is believed to sit.
+        """Return T_nominal_true: where each sensor really sits, seen from where it is accepted to sit.
 
         T_base_sensor.float() @ mounting() is what to cast rays with; the map is told T_base_sensor. Float32.
         """

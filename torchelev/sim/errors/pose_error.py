@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.sim.errors.draws import PerEnvironment, Range, check_range
+from torchelev.sim.errors.draws import DomainRandomization, Range, check_range
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -48,8 +48,8 @@ class PoseErrorConfig:
             check_range(f"PoseErrorConfig.{field.name}", getattr(self, field.name), lowest)
 
 
-class PoseErrors(PerEnvironment):
-    """Estimated poses of B robots, each with its own errors; see `PerEnvironment` for the arguments.
+class PoseErrors(DomainRandomization):
+    """Estimated poses of B robots, each with its own errors; see `DomainRandomization` for the arguments.
 
     The estimate's frame is that of odometry, which equals the map frame at reset. With p the true place, e its error
     and psi the error of the yaw, which starts as bias_yaw, each call adds

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 
-MOST_RAYS = 2**18  # cast at once, which bounds the memory that it takes
+MAX_RAYS = 2**18  # cast at once, which bounds the memory that it takes
 
 
 class Boxes(NamedTuple):
@@ -60,7 +60,7 @@ def cast(
     if origin.device.type == "cpu":
         keep_freed_memory()
     B, M = directions.shape[:2]
-    some = max(1, MOST_RAYS // max(1, M))
+    some = max(1, MAX_RAYS // max(1, M))
     parts = []
     with torch.no_grad():
         for first in range(0, max(1, B), some):

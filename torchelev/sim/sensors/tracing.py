@@ -69,19 +69,19 @@ def trace(
 ) -> Float[Tensor, "B M"]:
     """Return the distance [m] to the surface, more than `max_range` where it is not met within that; all float32."""
     rays = rays_from(field, tile_ids, origin, directions)
-    picks_out, most = _picks_out(origin.device), max_range / field.resolution
+    can_select, most = _picks_out(origin.device), max_range / field.resolution
     distance = torch.full_like(rays.along, math.inf)
     searched, count, skips = 0, 1, FIRST_SKIPS
     # A cell is left after `resolution` [m] or more, so that by then each ray has met the surface or come to its end.
     while searched <= most + 1 and len(rays.number):
-        if picks_out:
+        if can_select:
             count = max(1, min(MOST_CELLS, WORK // len(rays.number)))
         rays = rays._replace(along=skip(field, rays, skips))
         ahead, horizon = search(field, rays, count)
         missed = ahead > horizon
         found = (rays.along + ahead).masked_fill(missed, math.inf)
         rays = rays._replace(along=rays.along + horizon)
-        if picks_out:
+        if can_select:
             distance.index_copy_(0, rays.number, found)
             rays = rays.keep((missed & (rays.along <= max_range)).nonzero().squeeze(1))
         else:

@@ -10,14 +10,14 @@ from torch import Tensor
 from torchelev.ops.masks import chosen
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.ops.windows import around
-from torchelev.stages.fusion.contested import NO_HEIGHT, Picked, put_in
+from torchelev.stages.fusion.contested import NO_HEIGHT, SelectedCells, put_in
 from torchelev.stages.fusion.edges import values_around
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
 
     from torchelev.stages.fusion.config import FusionConfig
-    from torchelev.stages.fusion.consensus import Guess
+    from torchelev.stages.fusion.consensus import Consensus
     from torchelev.stages.fusion.points import Prior
 
 MIN_CHALLENGERS = 4  # cells of the 3 x 3 window with a challenger, from which on points at any height above count
@@ -31,7 +31,7 @@ class Challenge(NamedTuple):
     won: Bool[Tensor, "B C"]  # the scan is to found the cell anew
 
 
-def challenge_from_above(prior: Prior, guess: Guess, width: int, relief: float, cfg: FusionConfig) -> Challenge:
+def challenge_from_above(prior: Prior, consensus: Consensus, width: int, relief: float, cfg: FusionConfig) -> Challenge:
     """Let points above the elevation agree with each other.
 
     The challenger is the lowest height that contradicted the elevation from above, and what lies within the gate of it
@@ -46,11 +46,14 @@ def challenge_from_above(prior: Prior, guess: Guess, width: int, relief: float, 
 
     `width` counts cells along y, `relief` is in [m].
     """
-    cells = guess.doubtful
-    known, trusted = (cells.of(as_bytes(mask)) > 0 for mask in (prior.known, guess.trusted))
+    cells = consensus.contested
+    known, trusted = (cells.of(as_bytes(mask)) > 0 for mask in (prior.known, consensus.trusted))
     challenger, support = cells.of(prior.challenger), cells.of(prior.challenger_support).to(torch.int32)
-    height, votes = cells.of(guess.height), cells.of(guess.number).clamp(max=cfg.max_above_per_scan).to(torch.int32)
-    variance = cells.of(prior.variance).clamp(max=cfg.max_gate_std**2) + cells.of(guess.variance) + relief**2
+    height, votes = (
+        cells.of(consensus.height),
+        cells.of(consensus.number).clamp(max=cfg.max_above_per_scan).to(torch.int32),
+    )
+    variance = cells.of(prior.variance).clamp(max=cfg.max_gate_std**2) + cells.of(consensus.variance) + relief**2
     reach = cfg.gate * variance.sqrt()
     challengers, settled = look_around(prior, cells, width, cfg)
     above = known & ~trusted & (height > cells.of(prior.elevation)) & (height - reach > settled)
@@ -67,7 +70,7 @@ def challenge_from_above(prior: Prior, guess: Guess, width: int, relief: float, 
 
 
 def look_around(
-    prior: Prior, cells: Picked, width: int, cfg: FusionConfig
+    prior: Prior, cells: SelectedCells, width: int, cfg: FusionConfig
 ) -> tuple[Int[Tensor, "K"], Float[Tensor, "K"]]:
     """Count the challengers in the 3 x 3 window, and return its highest settled elevation [m], NO_HEIGHT without.
 

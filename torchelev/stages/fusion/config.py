@@ -27,7 +27,7 @@ class EdgeConfig:
             require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
         require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
 
-    def holds_step(self, number: Tensor, far: Tensor) -> Tensor:
+    def has_step(self, number: Tensor, far: Tensor) -> Tensor:
         """Tell which cells hold a step, by the number of their points and of those far from the estimate."""
         return (number >= self.min_points) & (far >= self.min_share * number)
 

@@ -11,15 +11,15 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import chosen
 from torchelev.ops.storage import as_bytes, realize, realize_all
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
-from torchelev.stages.fusion.contested import NO_HEIGHT, Disputed, Picked, Shown, ratio
+from torchelev.stages.fusion.contested import NO_HEIGHT, CellHeights, ContestedCells, SelectedCells, ratio
 from torchelev.stages.fusion.edges import side_of_step
-from torchelev.stages.fusion.points import Prior, Scan, agrees, gate_variance
+from torchelev.stages.fusion.points import Prior, ScanPoints, agrees, gate_variance
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
-def robust_mean(points: Disputed) -> Tensor:
+def robust_mean(points: ContestedCells) -> Tensor:
     """Return each cell's robust mean (K,) [m] above its mean.
 
     From the mean on, twice: the mean under the weights w / (1 + r^2 / sigma^2)^2 of the residuals r, which leave an
@@ -29,25 +29,25 @@ def robust_mean(points: Disputed) -> Tensor:
     return height + reduced_mean(points, points.z - points.at_points(height))
 
 
-def reduced_mean(points: Disputed, residual: Tensor) -> Tensor:
+def reduced_mean(points: ContestedCells, residual: Tensor) -> Tensor:
     """Return each cell's mean (K,) of the residuals (P,) [m], those far from zero reduced in weight."""
     reduced = points.weight / (1.0 + residual.square() / points.spread).square()
     moment, total = points.sum(torch.stack([reduced * residual, reduced])).unbind(0)
     return ratio(moment, total)
 
 
-def settle(
-    points: Disputed,
+def resolve_contested(
+    points: ContestedCells,
     height: Float[Tensor, "B C"],
-    shown: Shown,
+    shown: CellHeights,
     width: int,
     gate: float,
     relief: float,
     edges: EdgeConfig | None,
 ) -> tuple[Float[Tensor, "B C"], Int[Tensor, "B C"]]:
-    """Settle the disputed cells: return the heights [m] and the side of each cell: of a step +1 top, -1 ground, else 0.
+    """Resolve the contested cells: return all heights [m], and the side of each cell: +1 top, -1 ground, 0 no step.
 
-    A disputed cell gets the robust mean of its points, or, if it is marked as a step or too many of its points are far
+    A contested cell gets the robust mean of its points, or, if it is marked as a step or too many of its points are far
     from that mean, the height of one end of the step. The other cells keep their `height`. `width` counts cells along
     y, `relief` is in [m].
     """
@@ -56,15 +56,15 @@ def settle(
         residual = points.z - points.at_points(settled)
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-        step = edges.holds_step(number, number - close) | (points.of(points.marked) > 1)
-        if points.some(step):
+        step = edges.has_step(number, number - close) | (points.of(points.marked) > 1)
+        if points.any_true(step):
             which, end = side_of_step(points, shown, width, relief, edges)
             settled, side = torch.where(step, end, settled), torch.where(step, which, side)
     nowhere = torch.zeros_like(height, dtype=torch.int8)
     return points.put(height, points.mean + settled), points.put(nowhere, side.to(torch.int8))
 
 
-class Guess(NamedTuple):
+class Consensus(NamedTuple):
     """What a cell's height is about, before the points that count are chosen. Without a gradient."""
 
     height: Float[Tensor, "B C"]  # [m]
@@ -74,10 +74,10 @@ class Guess(NamedTuple):
     variance: Float[Tensor, "B C"]  # [m^2] of their mean, 1e12 without any
     near: Bool[Tensor, "B M"]  # points that agree with the cell's elevation
     gate_at: Float[Tensor, "B M"]  # [m^2] of the elevation of each point's cell
-    doubtful: Picked  # cells with points most of which contradict the elevation, or with a challenger
+    contested: SelectedCells  # cells with points most of which contradict the elevation, or with a challenger
 
 
-def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Guess:
+def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Consensus:
     """Trust a cell's elevation where most points agree with it, else the robust mean, and at a step one of its ends."""
     elevation_at, variance_at = scan.cells.take(prior.elevation, prior.variance)
     gate_at = gate_variance(variance_at, cfg)
@@ -89,12 +89,12 @@ def guess_heights(scan: Scan, prior: Prior, grid: GridConfig, cfg: FusionConfig)
     # A single point is its cell's robust mean, and most cells of a sparse scan have one.
     step, untrusted = torch.zeros_like(trusted), ~trusted & (number > 1)
     if (edges := cfg.edges) is not None:
-        step = trusted & edges.holds_step(number, number - agreeing)
+        step = trusted & edges.has_step(number, number - agreeing)
     height = chosen(trusted, prior.elevation, mean).detach()
-    shown = Shown(chosen(number > 0, mean, NO_HEIGHT), chosen(prior.known, prior.elevation.detach(), NO_HEIGHT))
-    doubtful = Picked(as_bytes((number > 0) & ((prior.known & ~trusted) | (prior.challenger_support > 0))))
+    shown = CellHeights(chosen(number > 0, mean, NO_HEIGHT), chosen(prior.known, prior.elevation.detach(), NO_HEIGHT))
+    contested = SelectedCells(as_bytes((number > 0) & ((prior.known & ~trusted) | (prior.challenger_support > 0))))
     cells = as_bytes(untrusted) + 2 * as_bytes(step)
-    points = Disputed(cells, scan.cells.slot, scan.columns(), shown.scan)
-    height, side = settle(points, height, shown, grid.width, cfg.gate, cfg.relief * grid.resolution, edges)
+    points = ContestedCells(cells, scan.cells.slot, scan.columns(), shown.scan)
+    height, side = resolve_contested(points, height, shown, grid.width, cfg.gate, cfg.relief * grid.resolution, edges)
     variance = (1.0 / weight.detach().clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor)
-    return Guess(height, side, trusted, number, variance, near, gate_at, doubtful)
+    return Consensus(height, side, trusted, number, variance, near, gate_at, contested)

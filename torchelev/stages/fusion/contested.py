@@ -1,8 +1,8 @@
 """Cells whose points disagree: their robust mean, their step if they hold one, and how to work on them alone.
 
-Few cells are disputed, but each costs several rounds over its points. So a CPU picks out those cells and their points;
+Few cells are contested, but each costs several rounds over its points. So a CPU picks out those cells and their points;
 a GPU, which would have to wait for the host to learn how many there are, goes through all. Nothing here has a
-gradient: a height is a guess around which `fusion` averages.
+gradient: a height is an estimate around which `fuse` averages.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 NO_HEIGHT = -1e30  # [m] below all heights
 
 
-class Shown(NamedTuple):
+class CellHeights(NamedTuple):
     """The height that the scan and the map show of each cell, (B, C) [m]; NO_HEIGHT where they show none."""
 
     scan: Float[Tensor, "B C"]  # mean of the points
@@ -29,21 +29,21 @@ class Shown(NamedTuple):
 @torch.library.custom_op(
     "torchelev::pick_out", mutates_args=(), schema="(Tensor cells, Tensor slot, Tensor[] columns) -> Tensor[]"
 )
-def pick_out(cells: UInt8[Tensor, "B C"], slot: Int[Tensor, "B M"], columns: list[Tensor]) -> list[Tensor]:
+def select_points(cells: UInt8[Tensor, "B C"], slot: Int[Tensor, "B M"], columns: list[Tensor]) -> list[Tensor]:
     """Pick out the cells that are not zero, and their points.
 
     Returns these cells (K,), numbered across environments, and of each point in one of them (P,) the place of its cell
     among these K, and the point's value of each column (B, M). A custom operator, as the compiler must not look into
     what depends on the data; it compiles what follows for any K and P.
     """
-    disputed = cells.flatten().nonzero().squeeze(1)
+    contested = cells.flatten().nonzero().squeeze(1)
     picked = cells.gather(1, slot).flatten().nonzero().squeeze(1)
     cell = slot.flatten().index_select(0, picked) + picked // slot.shape[1] * cells.shape[1]
-    owner = torch.searchsorted(disputed, cell)
-    return [disputed, owner, *(column.flatten().index_select(0, picked) for column in columns)]
+    owner = torch.searchsorted(contested, cell)
+    return [contested, owner, *(column.flatten().index_select(0, picked) for column in columns)]
 
 
-@pick_out.register_fake
+@select_points.register_fake
 def _(cells: Tensor, slot: Tensor, columns: list[Tensor]) -> list[Tensor]:
     context = torch.library.get_ctx()
     K, P = context.new_dynamic_size(), context.new_dynamic_size()
@@ -51,12 +51,12 @@ def _(cells: Tensor, slot: Tensor, columns: list[Tensor]) -> list[Tensor]:
 
 
 @torch.library.custom_op("torchelev::pick_cells", mutates_args=())
-def pick_cells(cells: Tensor) -> Tensor:
+def select_cells(cells: Tensor) -> Tensor:
     """Return which cells (B, C) are not zero (K,), numbered across environments."""
     return cells.flatten().nonzero().squeeze(1)
 
 
-@pick_cells.register_fake
+@select_cells.register_fake
 def _(cells: Tensor) -> Tensor:
     return cells.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int64)
 
@@ -78,12 +78,12 @@ def _(layers: list[Tensor], cells: Tensor, values: list[Tensor]) -> list[Tensor]
     return [torch.empty_like(layer) for layer in layers]
 
 
-class Picked:
+class SelectedCells:
     """K cells that are marked, numbered across environments; on a GPU all cells."""
 
     def __init__(self, marked: UInt8[Tensor, "B C"]) -> None:
         self.marked = marked
-        self.cells = pick_cells(marked) if self.picks_out(marked) else self.all(marked)
+        self.cells = select_cells(marked) if self.can_select(marked) else self.all(marked)
 
     @staticmethod
     def all(marked: Tensor) -> Tensor:
@@ -91,7 +91,7 @@ class Picked:
         return torch.arange(marked.numel(), device=marked.device)
 
     @staticmethod
-    def picks_out(values: Tensor) -> bool:
+    def can_select(values: Tensor) -> bool:
         """Tell whether the host may learn how many cells are picked: of a CPU, unless its tensors hold no data."""
         return values.device.type == "cpu" and (torch.compiler.is_compiling() or type(values) is Tensor)
 
@@ -101,13 +101,13 @@ class Picked:
 
     def put(self, layer: Tensor, values: Tensor) -> Tensor:
         """Return a layer (B, C) with values (K,) put into the picked cells."""
-        if not self.picks_out(layer):  # K counts the other cells too
+        if not self.can_select(layer):  # K counts the other cells too
             return torch.where(self.marked > 0, values.view_as(layer), layer)
         return layer.flatten().index_copy(0, self.cells, values).view_as(layer)
 
 
-class Disputed(Picked):
-    """K disputed cells and their P points; on a GPU all cells and all points."""
+class ContestedCells(SelectedCells):
+    """K contested cells and their P points; on a GPU all cells and all points."""
 
     def __init__(
         self,
@@ -121,8 +121,8 @@ class Disputed(Picked):
         A cell of 2 is marked as a step. `mean` is that of the cell's points [m].
         """
         self.marked = cells
-        if self.picks_out(cells):
-            self.cells, self.owner, *columns = pick_out(cells, slot, columns)
+        if self.can_select(cells):
+            self.cells, self.owner, *columns = select_points(cells, slot, columns)
         else:
             first = torch.arange(cells.shape[0], device=cells.device)[:, None] * cells.shape[1]
             self.cells = self.all(cells)
@@ -146,9 +146,9 @@ class Disputed(Picked):
         """Give each point its cell's value: (..., K) -> (..., P)."""
         return values.index_select(-1, self.owner)
 
-    def some(self, mask: Tensor) -> bool:
+    def any_true(self, mask: Tensor) -> bool:
         """Tell whether anything is true; assume so where the host would have to wait, and in compiled code."""
-        return torch.compiler.is_compiling() or not self.picks_out(mask) or bool(mask.any())
+        return torch.compiler.is_compiling() or not self.can_select(mask) or bool(mask.any())
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:

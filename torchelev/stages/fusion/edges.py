@@ -13,10 +13,12 @@ from torchelev.ops.windows import around
 from torchelev.stages.fusion.config import EdgeConfig
 
 if TYPE_CHECKING:
-    from torchelev.stages.fusion.contested import Disputed, Shown
+    from torchelev.stages.fusion.contested import CellHeights, ContestedCells
 
 
-def side_of_step(points: Disputed, shown: Shown, width: int, relief: float, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
+def side_of_step(
+    points: ContestedCells, shown: CellHeights, width: int, relief: float, cfg: EdgeConfig
+) -> tuple[Tensor, Tensor]:
     """Keep walls and steps sharp (paper, Sec. II-C): tell which side of a step is the cell's; `fusion` drops the other.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
@@ -37,7 +39,7 @@ def side_of_step(points: Disputed, shown: Shown, width: int, relief: float, cfg:
     return torch.where(ground, -1.0, 1.0).to(x.dtype), torch.where(ground, bottom, top)
 
 
-def ends_of_step(points: Disputed, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
+def ends_of_step(points: ContestedCells, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
     """Return the heights (K,) of the step's top and bottom [m] above the mean.
 
     The top is the mean of the points above the mean, repeated: each of the `refinements` halves the distance to the
@@ -46,7 +48,7 @@ def ends_of_step(points: Disputed, cfg: EdgeConfig) -> tuple[Tensor, Tensor]:
     return top_of_step(points, points.z, cfg, cfg.refinements), -top_of_step(points, -points.z, cfg, 2)
 
 
-def top_of_step(points: Disputed, z: Tensor, cfg: EdgeConfig, rounds: int) -> Tensor:
+def top_of_step(points: ContestedCells, z: Tensor, cfg: EdgeConfig, rounds: int) -> Tensor:
     """Move heights (K,) from 0 to the mean of the points at or past them, so many times; `z` (P,) are the points'.
 
     Up to `margin` standard deviations short of a height lies past it. A level that fewer than `min_extreme` points
@@ -65,7 +67,7 @@ def top_of_step(points: Disputed, z: Tensor, cfg: EdgeConfig, rounds: int) -> Te
     return height
 
 
-def level_reached(points: Disputed, reached: Tensor, number: int) -> Tensor:
+def level_reached(points: ContestedCells, reached: Tensor, number: int) -> Tensor:
     """Return the highest level (K,) that so many of a cell's points reach; `reached` (P,) is how high each does."""
     level = points.highest(reached)
     for _ in range(number - 1):

@@ -13,9 +13,9 @@ from torchelev.ops.storage import as_bytes, realize, realize_all
 from torchelev.stages.cells import PointCells
 from torchelev.stages.fusion.challenge import Challenge, challenge_from_above
 from torchelev.stages.fusion.config import FusionConfig
-from torchelev.stages.fusion.consensus import Guess, guess_heights
+from torchelev.stages.fusion.consensus import Consensus, estimate_consensus
 from torchelev.stages.fusion.contested import ratio
-from torchelev.stages.fusion.points import Prior, Scan, agrees, gate_variance, gather_prior, gather_scan
+from torchelev.stages.fusion.points import Prior, ScanPoints, agrees, gate_variance, gather_points, gather_prior
 from torchelev.state import BLANK, MapState, Measurement, count, tally
 
 if TYPE_CHECKING:
@@ -41,14 +41,14 @@ def fuse(
     variance, as in the paper, and founds the cell anew once the votes are used up, or once enough points above it agree
     with each other (`challenge`): a new obstacle shows soon, however long the ground before it was seen.
     """
-    scan, prior = gather_scan(m, cells, grid, cfg), gather_prior(state)
-    guess = guess_heights(scan, prior, grid, cfg)
+    scan, prior = gather_points(m, cells, grid, cfg), gather_prior(state)
+    consensus = estimate_consensus(scan, prior, grid, cfg)
     if has_rays:  # nothing else tells outliers in a blind spot from an obstacle
-        challenge = challenge_from_above(prior, guess, grid.width, cfg.relief * grid.resolution, cfg)
+        challenge = challenge_from_above(prior, consensus, grid.width, cfg.relief * grid.resolution, cfg)
     else:
         unchanged = prior.challenger.clone(), prior.challenger_support.clone()
         challenge = Challenge(*unchanged, torch.zeros_like(prior.known))
-    scanned, ignored = scan_of_cells(scan, prior, guess, cfg)
+    scanned, ignored = measure_cells(scan, prior, consensus, cfg)
     state, taken = merge(state, prior, scanned, challenge, grid, cfg)
     points_used = masked(scanned.kept, taken).sum(1).to(torch.int64)
     return tally(
@@ -60,42 +60,46 @@ def fuse(
     )
 
 
-def scan_of_cells(scan: Scan, prior: Prior, guess: Guess, cfg: FusionConfig) -> tuple[ScanOfCells, Tensor]:
-    """Average the points that lie within the gate around the guess and on its side; tell which the side ignores."""
-    height_at, side_at, trusted_at = scan.cells.take(guess.height, guess.side, as_bytes(guess.trusted))
-    kept, ignored = on_side(scan, height_at, guess.gate_at * trusted_at, side_at, cfg)
+def measure_cells(
+    scan: ScanPoints, prior: Prior, consensus: Consensus, cfg: FusionConfig
+) -> tuple[CellMeasurement, Tensor]:
+    """Average the points that lie within the gate around the consensus and on its side; tell which the side ignores."""
+    height_at, side_at, trusted_at = scan.cells.take(consensus.height, consensus.side, as_bytes(consensus.trusted))
+    kept, ignored = on_side(scan, height_at, consensus.gate_at * trusted_at, side_at, cfg)
     weight = torch.where(kept, scan.weight, 0.0)
-    # Around the guess, so that float32 keeps millimetres at any altitude.
-    columns = (weight, weight * (scan.z - height_at), kept, ignored, guess.near & ~ignored)
+    # Around the consensus, so that float32 keeps millimetres at any altitude.
+    columns = (weight, weight * (scan.z - height_at), kept, ignored, consensus.near & ~ignored)
     information, moment, kept_number, edge, agreeing = scan.sums(*columns)
-    height = guess.height + ratio(moment, information)
+    height = consensus.height + ratio(moment, information)
     # The paper ignores the points below a wall's top: a scan of its lower part alone has nothing against the top.
     settled = prior.support >= (cfg.edges.min_settled if cfg.edges is not None else 0.0)
-    lower_part = (guess.side > 0) & (height < prior.elevation) & settled
+    lower_part = (consensus.side > 0) & (height < prior.elevation) & settled
     # Points on the face of a wall speak for its top.
     votes = kept_number + edge
-    cells = ScanOfCells(
+    cells = CellMeasurement(
         height=height,
         # Of cells with points; elsewhere it need but be finite.
         variance=(1.0 / information.clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor),
         kept=kept_number,
         votes=votes,
-        dissent=guess.number - votes,
+        dissent=consensus.number - votes,
         agreeing=chosen(lower_part, votes, agreeing),
     )
     return cells, ignored
 
 
-def on_side(scan: Scan, guess: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
+def on_side(
+    scan: ScanPoints, consensus: Tensor, gate: Tensor, side: Tensor, cfg: FusionConfig
+) -> tuple[Tensor, Tensor]:
     """Return the points kept and, in cells with a step, the points ignored as being of its other side."""
-    residual = side * (scan.z - guess)
+    residual = side * (scan.z - consensus)
     margin = cfg.edges.margin if cfg.edges is not None else 0.0
     ignored = scan.used & (residual < -margin * scan.spread.sqrt())
-    kept, ignored = realize_all(agrees(scan, guess, gate, cfg) & ~ignored, ignored)
+    kept, ignored = realize_all(agrees(scan, consensus, gate, cfg) & ~ignored, ignored)
     return kept, ignored
 
 
-class ScanOfCells(NamedTuple):
+class CellMeasurement(NamedTuple):
     """What the scan says of each cell; heights in [m], the others count points."""
 
     height: Float[Tensor, "B C"]
@@ -107,7 +111,7 @@ class ScanOfCells(NamedTuple):
 
 
 def merge(
-    state: MapState, prior: Prior, scan: ScanOfCells, challenge: Challenge, grid: GridConfig, cfg: FusionConfig
+    state: MapState, prior: Prior, scan: CellMeasurement, challenge: Challenge, grid: GridConfig, cfg: FusionConfig
 ) -> tuple[MapState, Tensor]:
     """Take the scan's heights into the cells, or count them as votes against. Returns also where they were taken."""
     hit, innovation = scan.kept > 0, scan.height - prior.elevation

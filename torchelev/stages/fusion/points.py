@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, UInt8
 
 
-class Scan(NamedTuple):
+class ScanPoints(NamedTuple):
     """This scan's points, with the cell of each."""
 
     z: Float[Tensor, "B M"]  # [m]
@@ -33,7 +33,7 @@ class Scan(NamedTuple):
         return self.cells.sums(*(column.to(self.z.dtype) for column in columns))
 
     def columns(self) -> list[Tensor]:
-        """Return what `Disputed` needs of every point, without a gradient."""
+        """Return what `ContestedCells` needs of every point, without a gradient."""
         return [value.detach() for value in (self.z, self.spread, self.weight, as_bytes(self.passed), *self.ray)]
 
 
@@ -48,13 +48,13 @@ class Prior(NamedTuple):
     challenger_support: UInt8[Tensor, "B C"]
 
 
-def gather_scan(m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> Scan:
+def gather_points(m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> ScanPoints:
     """Find what the update needs of each point, and whether its ray passed over the cell's centre."""
     xy, z, used = m.points[..., :2], m.points[..., 2], cells.inside
     from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
     sensors = m.origin.shape[1]
     ray = (xy.unflatten(1, (sensors, -1)) - m.origin[:, :, None, :2]).flatten(1, 2)
-    return Scan(
+    return ScanPoints(
         z=z,
         spread=m.variance + (cfg.relief * grid.resolution) ** 2,
         weight=torch.where(used, 1.0 / m.variance, 0.0),
@@ -92,6 +92,6 @@ def gate_variance(variance: Tensor, cfg: FusionConfig) -> Tensor:
     return variance.clamp(max=cfg.max_gate_std**2).detach()
 
 
-def agrees(scan: Scan, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
+def agrees(scan: ScanPoints, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
     """Tell which points lie within the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
     return scan.used & ((scan.z - height).square() <= cfg.gate**2 * (scan.spread + variance))

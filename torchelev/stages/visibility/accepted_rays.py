@@ -1,4 +1,4 @@
-"""Which rays are believed: the lowest ray decides, so that one return that is too long would clear a line of ground."""
+"""Which rays are accepted: the lowest ray decides, so that one return that is too long would clear a line of ground."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchelev.ops.operators import running_minimum
 from torchelev.ops.storage import read, realize, realize_all
 from torchelev.ops.windows import neighbours
 from torchelev.stages.cells import lattice_offset
-from torchelev.stages.visibility.polar_table import PolarGrid, flat, turn
+from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from torchelev.stages.visibility.config import RaycastConfig
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
-# A ray that leaves the window over no known ground is believed if it ends at most CLEARANCE below the lowest ground
+# A ray that leaves the window over no known ground is accepted if it ends at most CLEARANCE below the lowest ground
 # NEAR by, and taken for one that passes CLEARANCE above it: returns that are too long shall not bound below the truth.
 NEAR, CLEARANCE = 1.0, 0.05  # [m]
 
@@ -43,38 +43,38 @@ class Rays(NamedTuple):
     overhang: Bool[Tensor, "B N"]  # the point lies above the exclusion ramp
 
 
-def rays_of(m: Measurement, s: int) -> Rays:
+def sensor_rays(m: Measurement, s: int) -> Rays:
     """Return the rays of sensor s."""
     sensors = m.origin.shape[1]
     ray = m.points.unflatten(1, (sensors, -1))[:, s] - m.origin[:, s, None]
     x, y, z = ray.unbind(-1)
     r = (x.square() + y.square()).clamp(min=1e-12).sqrt()
     casts, used, variance = (values.unflatten(1, (sensors, -1))[:, s] for values in (m.casts, m.used, m.variance))
-    return Rays(m.origin[:, s], ray[..., :2], r, z / r, turn(x, y), variance.sqrt(), casts, casts & ~used)
+    return Rays(m.origin[:, s], ray[..., :2], r, z / r, azimuth_fraction(x, y), variance.sqrt(), casts, casts & ~used)
 
 
-def believed(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Rays:
-    """Return the rays with `casts` narrowed to those that are believed, and with their slopes corrected.
+def accepted_rays(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Rays:
+    """Return the rays with `casts` narrowed to those that are accepted, and with their slopes corrected.
 
-    Believed rays end credibly (`ends_well`) and pass below no ground hit of late (`horizon`).
+    Believed rays end credibly (`has_credible_end`) and pass below no ground hit of late (`horizon`).
     """
     lowest = state.elevation - height_margin(state, grid, cfg)
     above = horizon(state, m, rays, lowest, grid, cfg) + rays.slope >= 0
-    well, slope = ends_well(state, m, rays, lowest, grid, cfg)
+    well, slope = has_credible_end(state, m, rays, lowest, grid, cfg)
     return rays._replace(casts=rays.casts & well & above, slope=slope)
 
 
-def ends_well(
+def has_credible_end(
     state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
 ) -> tuple[Bool[Tensor, "B N"], Float[Tensor, "B N"]]:
     """Tell which rays end, or leave the window, in a well supported cell and not below it; and return their slopes.
 
-    Of the others two kinds are believed, as too long a return lies below the ground: those to a point above the
+    Of the others two kinds are accepted, as too long a return lies below the ground: those to a point above the
     exclusion ramp, and those that leave the window and end at most CLEARANCE below the lowest ground NEAR by, where
     nothing is known or below what once stood there. Relief may have stopped the latter before the border, so they are
     taken for rays that pass CLEARANCE above that ground.
     """
-    end = ends(state, m, rays, grid)
+    end = find_ends(state, m, rays, grid)
     ground = realize(lifted(state.elevation, ~well_supported(state, cfg, grid.resolution)))
     floor, known = (layer.flatten(1).gather(1, end.slot) for layer in (lowest, ground))
     near = ground_at_borders(ground, grid).gather(1, end.border)
@@ -86,7 +86,7 @@ def ends_well(
     return end.inside & (over | low) | rays.overhang, torch.where(low & ~rays.overhang, raised, rays.slope)
 
 
-class Ends(NamedTuple):
+class RayEnds(NamedTuple):
     """Where each ray ends, or where it is half a cell short of leaving the window."""
 
     slot: Int[Tensor, "B N"]
@@ -96,7 +96,7 @@ class Ends(NamedTuple):
     border: Int[Tensor, "B N"]  # place in `ground_at_borders`
 
 
-def ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> Ends:
+def find_ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> RayEnds:
     """Locate where each ray ends or leaves the window."""
     offset = lattice_offset(state, m, grid)[:, None]
     start = rays.origin[:, None, :2] + offset
@@ -114,7 +114,7 @@ def ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> Ends:
     side = torch.where(through_x, ahead[..., 0].to(torch.int32), 2 + ahead[..., 1].to(torch.int32))
     place = torch.where(through_x, slot % grid.width, slot // grid.width)
     border = side * max(grid.height, grid.width) + place
-    return Ends(slot.to(torch.int64), inside, share * rays.r, leaves, border.to(torch.int64))
+    return RayEnds(slot.to(torch.int64), inside, share * rays.r, leaves, border.to(torch.int64))
 
 
 def ground_at_borders(ground: Tensor, grid: GridConfig) -> Float[Tensor, "B 4L"]:
@@ -131,7 +131,7 @@ def ground_at_borders(ground: Tensor, grid: GridConfig) -> Float[Tensor, "B 4L"]
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
-    """Tell which known cells are believed: enough points agree, or on a neighbouring cell of like height."""
+    """Tell which known cells are accepted: enough points agree, or on a neighbouring cell of like height."""
     enough = state.validity & (state.support >= cfg.min_support)
     _, above, _, left, right, _, below, _ = neighbours(lifted(state.elevation, ~enough), NOWHERE)
     unlike = functools.reduce(torch.minimum, [(h - state.elevation).abs() for h in (above, left, right, below)])

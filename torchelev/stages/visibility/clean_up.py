@@ -18,9 +18,9 @@ from torchelev.ops.masks import chosen, masked, zeroed
 from torchelev.ops.operators import polar_minimum
 from torchelev.ops.storage import read, realize, realize_all
 from torchelev.stages.cells import center_offsets
-from torchelev.stages.visibility.accepted_rays import Rays, believed, height_margin, rays_of
+from torchelev.stages.visibility.accepted_rays import Rays, accepted_rays, height_margin, sensor_rays
 from torchelev.stages.visibility.config import RaycastConfig
-from torchelev.stages.visibility.polar_table import PolarGrid, flat, turn
+from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
 from torchelev.state import MapState, Measurement, count, tally
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def look_up(
     k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
     # All the bins that the cell covers: two entries, the first and the last of them.
     width, entry = polar.covered(k)
-    middle = turn(x, y) * polar.azimuths
+    middle = azimuth_fraction(x, y) * polar.azimuths
     a = torch.floor(middle - 0.5 * width)
     further = (torch.floor(middle + 0.5 * width) - a + 1 - entry).clamp(min=0)
     a = chosen(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
@@ -89,8 +89,8 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     """
     polar, known = PolarGrid.of(grid, cfg), state.validity
     for s in range(m.origin.shape[1]):
-        rays = rays_of(m, s)
-        table = lowest_slopes(believed(state, m, rays, grid, cfg), polar, grid)
+        rays = sensor_rays(m, s)
+        table = lowest_slopes(accepted_rays(state, m, rays, grid, cfg), polar, grid)
         state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), grid, cfg)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
 

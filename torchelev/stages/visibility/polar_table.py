@@ -50,7 +50,7 @@ class PolarGrid(NamedTuple):
         return width, entry
 
 
-def turn(x: Tensor, y: Tensor) -> Tensor:
+def azimuth_fraction(x: Tensor, y: Tensor) -> Tensor:
     """Return the azimuth as a fraction of a turn in [0, 1], within 0.001 turns of atan2 and without its cost.
 
     Rays and cells use the same function, so that only its monotony matters.

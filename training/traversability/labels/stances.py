@@ -57,7 +57,7 @@ class Stances(NamedTuple):
     feet: Float[Tensor, "N 4 3"]  # [m] tile frame, the footholds; where the verdict is "stands"
 
 
-class Plane(NamedTuple):
+class StancePlane(NamedTuple):
     """The planes of N bodies."""
 
     middle: Float[Tensor, "3 N"]  # [m] mean of the feet
@@ -109,22 +109,22 @@ def _check_stances(ground: Ground, soles: Tensor, xy: Tensor, theta: Tensor, rob
     verdict[left] += 1
     left = left[low_steps(ground, soles[left], robot)]
     verdict[left] += 1
-    plane = Plane(plane.middle[:, left], plane.gradient[:, left])
+    plane = StancePlane(plane.middle[:, left], plane.gradient[:, left])
     left = left[clear(ground, plane, xy[left], theta[left], robot)]
     verdict[left] += 1
     return verdict
 
 
-def plane_through(feet: Float[Tensor, "N 4 3"]) -> Plane:
+def plane_through(feet: Float[Tensor, "N 4 3"]) -> StancePlane:
     """Fit the least-squares plane through four feet."""
     middle = feet.mean(1)
     x, y, z = (feet - middle[:, None]).unbind(-1)
     xx, xy, yy, xz, yz = ((a * b).sum(1) for a, b in ((x, x), (x, y), (y, y), (x, z), (y, z)))
     det = (xx * yy - xy * xy).clamp(min=1e-9)  # of feet in a line it is zero
-    return Plane(middle.t(), torch.stack([(yy * xz - xy * yz) / det, (xx * yz - xy * xz) / det]))
+    return StancePlane(middle.t(), torch.stack([(yy * xz - xy * yz) / det, (xx * yz - xy * xz) / det]))
 
 
-def gentle(plane: Plane, robot: RobotConfig) -> Bool[Tensor, "N"]:
+def gentle(plane: StancePlane, robot: RobotConfig) -> Bool[Tensor, "N"]:
     """Tell which bodies are not too steep: atan |gradient of the plane through the feet| <= max_slope."""
     return plane.gradient.square().sum(0) <= math.tan(robot.max_slope) ** 2
 
@@ -157,7 +157,7 @@ def highest_step(ground: Ground, a: Float[Tensor, "5 N"], b: Float[Tensor, "5 N"
 
 
 def clear(
-    ground: Ground, plane: Plane, xy: Float[Tensor, "N 2"], theta: Float[Tensor, "N"], robot: RobotConfig
+    ground: Ground, plane: StancePlane, xy: Float[Tensor, "N 2"], theta: Float[Tensor, "N"], robot: RobotConfig
 ) -> Bool[Tensor, "N"]:
     """Tell which bodies are clear of the ground: max over the body's rectangle of z - plane <= clearance.
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from envs.terrain_nav import CourseConfig
-from envs.terrain_nav.config import RobotConfig as BodyConfig
+from envs.terrain_nav.config import BodyConfig
 from envs.terrain_nav.course import make_course
 from envs.terrain_nav.robot import base_pose
 from torchelev.robot import RobotConfig
@@ -24,7 +24,7 @@ UNSEEN_KINDS = ("stepping_stones",)  # never trained on
 
 LENGTH, RESOLUTION = 8.0, 0.02  # [m] of a tile: its side, and the distance of its samples
 STRETCH = (0.5, 2.0)  # by which a tile's heights are multiplied, for slopes and steps beyond what robots overcome
-MOST_TILT = 0.2  # gradient of the plane that is added to a tile
+MAX_TILT = 0.2  # gradient of the plane that is added to a tile
 RIM = 1.0  # [m] that walks keep away from a tile's rim
 LOOK_INTERVAL = 0.3  # [s]
 CANDIDATES = 4  # walks of which a robot takes the easiest
@@ -56,7 +56,7 @@ def make_tiles(kinds: Sequence[str], rng: np.random.Generator) -> HeightField:
 
 def _tile(kind: str, rng: np.random.Generator) -> Tensor:
     seed, difficulty = int(rng.integers(2**31)), float(rng.random())
-    stretch, gradient, heading = rng.uniform(*STRETCH), rng.uniform(0, MOST_TILT), rng.uniform(-math.pi, math.pi)
+    stretch, gradient, heading = rng.uniform(*STRETCH), rng.uniform(0, MAX_TILT), rng.uniform(-math.pi, math.pi)
     if kind == "obstacles":
         course = CourseConfig(num_tiles=1, length=LENGTH, resolution=RESOLUTION, seed=seed, num_routes=1)
         heights = make_course(course).field.heights[0]
