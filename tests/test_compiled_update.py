@@ -178,7 +178,7 @@ def test_an_update_that_is_stopped_leaves_a_sound_map(compile_with, monkeypatch)
 
     with monkeypatch.context() as patch:
         name = "torchelev.compiled_update.graphs_of"
-        patch.setattr(name, lambda *key: graphs_of(*key)._replace(take_heights=stopped))
+        patch.setattr(name, lambda *key: graphs_of(*key)._replace(fuse_heights=stopped))
         with pytest.raises(KeyboardInterrupt):
             emap.update(cloud, T, T, 0.3)
     assert not emap.validity.any()

@@ -12,8 +12,14 @@ from torch import Tensor
 from torchelev.config import ElevationMapConfig
 from torchelev.ops.compiler import announced_compilation, compiled, mark_dynamic, packed
 from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.pipeline import move_along, take_heights, take_rays, update_in_place
+from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, update_in_place
+from torchelev.stages.age import age
+from torchelev.stages.compensate import compensate
+from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.measure import measure
+from torchelev.stages.overlap import clear_other_floors
+from torchelev.stages.recenter import recenter
+from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.traversability.net import Weights
 
@@ -31,10 +37,10 @@ def compiled_update(
     with announced_compilation():
         graphs = graphs_of(cfg, kinds, points.shape[1])
         stored = with_masks(stored, as_bytes)
-        m = graphs.move_along(stored, *inputs)
+        m = graphs.move_window(stored, *inputs)
         mark_dynamic(1, m.points, m.variance, m.used, m.casts)
-        graphs.take_heights(stored, m)
-        graphs.take_rays(stored, m, weights)
+        graphs.fuse_heights(stored, m)
+        graphs.apply_rays(stored, m, weights)
 
 
 def compile_ahead(
@@ -53,6 +59,30 @@ def compile_ahead(
             compiled_update(state, *first, cfg=cfg, weights=weights)
 
 
+# `pipeline.forward` in three parts, see `Graphs`.
+
+
+def move_window(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+    """Move the window with the robot, and let time pass."""
+    state = reset_statistics(state, m)
+    state = recenter(state, m, cfg.grid)
+    return age(state, m, cfg.aging)
+
+
+def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+    """Compensate the height drift, and fuse the points' heights."""
+    state = compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)
+    return fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
+
+
+def apply_rays(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
+    """Clear what is gone or another floor, and rate what is left."""
+    state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
+    state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
+    state = rate_surface(state, cfg, weights)
+    return count_bounded(state)
+
+
 class Graphs(NamedTuple):
     """The parts of an update, compiled: what one stores on its way is free again before the next.
 
@@ -60,9 +90,9 @@ class Graphs(NamedTuple):
     an update without its points or rays. Masks come and go as bytes, see `as_bytes`.
     """
 
-    move_along: Callable[..., Measurement]
-    take_heights: Callable[..., None]
-    take_rays: Callable[..., None]
+    move_window: Callable[..., Measurement]
+    fuse_heights: Callable[..., None]
+    apply_rays: Callable[..., None]
 
 
 @functools.cache
@@ -74,7 +104,7 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
         dtype = stored.elevation.dtype
         m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, dtype)
         state = with_masks(stored, as_mask)
-        write_changes(stored, state, move_along(state, m, cfg))
+        write_changes(stored, state, move_window(state, m, cfg))
         return with_masks(m, as_bytes)
 
     def in_place(stages: Callable[..., MapState]) -> Callable[..., None]:
@@ -84,7 +114,7 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
 
         return compiled(run)
 
-    return Graphs(compiled(first), in_place(take_heights), in_place(take_rays))
+    return Graphs(compiled(first), in_place(fuse_heights), in_place(apply_rays))
 
 
 def write_changes(stored: MapState, old: MapState, new: MapState) -> None:

@@ -55,6 +55,13 @@ class ElevationMapConfig:
             hint = "give an object, or build the whole with ElevationMapConfig.from_dict"
             require(isinstance(value, annotation), f"cfg.{name}", rule, repr(value), hint, TypeError)
 
+    @property
+    def drift_gate(self) -> float:
+        """The traversability from which on a cell measures the height drift: the setting, or else the head's own."""
+        if self.drift is not None and self.drift.min_traversability is not None:
+            return self.drift.min_traversability
+        return (self.traversability or TraversabilityConfig).drift_gate
+
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain dicts, as written to YAML and to `state_dict`."""
         filters = [step.to_dict() for step in self.filters]

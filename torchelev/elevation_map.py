@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 import torch
 from torch import Tensor, nn
 
-from torchelev import checks
+from torchelev import checks, pipeline
 from torchelev.compiled_update import compile_ahead, compiled_update
 from torchelev.config import ElevationMapConfig, differing_fields
 from torchelev.diagnosis.causes import diagnose
@@ -22,7 +22,7 @@ from torchelev.grid import cell_centers, window_center
 from torchelev.layers import LAYERS, Layer, sample_layer
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import require_reverse_mode
-from torchelev.pipeline import fuse_measurement, rate_surface, update_in_place, write
+from torchelev.pipeline import rate_surface, update_in_place, write
 from torchelev.stages.initialize import METHODS, initialize
 from torchelev.stages.measure import measure
 from torchelev.state import MapState, Measurement, Statistics, blank_state, forget, map_layers
@@ -243,7 +243,7 @@ class ElevationMap(nn.Module):
         """
         checks.require_full_precision(state.elevation.dtype)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
-        new = fuse_measurement(state, measurement, self.cfg, self._weights)
+        new = pipeline.forward(state, measurement, self.cfg, self._weights)
         # What no stage changed is still the caller's tensor, which an update or a reset may overwrite.
         given = (*state[:-1], *state.statistics, *measurement)
         # Not by `id`, on whose values the compiler would make its graphs depend.

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
 from torchelev.stages.age import age
-from torchelev.stages.cells import cells_of
 from torchelev.stages.compensate import compensate
 from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.measure import measure
@@ -20,39 +19,17 @@ from torchelev.traversability.heads import TraversabilityConfig, learned_rating,
 from torchelev.traversability.net import Weights
 
 
-def fuse_measurement(
-    state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None
-) -> MapState:
-    """Run the stages in order (paper, Fig. 2). Pure: it changes none of its arguments. `weights` are the head's."""
-    state = move_along(state, m, cfg)
-    state = take_heights(state, m, cfg)
-    return take_rays(state, m, cfg, weights)
-
-
-def move_along(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
-    """Move the window with the robot, and let time pass."""
-    state = start_tally(state, m)
+def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
+    """Run the stages in their order (paper, Fig. 2). Pure: changes none of its arguments. `weights` are the head's."""
+    state = reset_statistics(state, m)
     state = recenter(state, m, cfg.grid)
-    return age(state, m, cfg.aging)
-
-
-def take_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
-    """Compensate the height drift, and fuse the points' heights."""
-    cells = cells_of(state, m, cfg.grid)
-    if cfg.drift is not None:
-        gate = (cfg.traversability or TraversabilityConfig).drift_gate
-        state = compensate(state, m, cells, cfg.grid, cfg.drift, gate)
-    return fuse(state, m, cells, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
-
-
-def take_rays(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
-    """Clear what is gone or another floor, and rate what is left."""
-    if cfg.raycast is not None:
-        state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
-    if cfg.overlap is not None:
-        state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
+    state = age(state, m, cfg.aging)
+    state = compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)
+    state = fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
+    state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
+    state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
     state = rate_surface(state, cfg, weights)
-    return tally(state, cells_bounded=count(state.bounded & ~state.validity))
+    return count_bounded(state)
 
 
 def rate_surface(state: MapState, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
@@ -70,11 +47,16 @@ def rate_surface(state: MapState, cfg: ElevationMapConfig, weights: Weights | No
     return state._replace(traversability=rating.traversability, rated=state.validity)
 
 
-def start_tally(state: MapState, m: Measurement) -> MapState:
+def reset_statistics(state: MapState, m: Measurement) -> MapState:
     """Set the statistics to zero, and to what the sensor's gates rejected."""
     gates = ("rejected_invalid", "rejected_range", "rejected_body", "rejected_overhang")
     zeros = {name: torch.zeros_like(value) for name, value in state.statistics._asdict().items()}
     return tally(state, **(zeros | {name: getattr(m, name) for name in gates}))
+
+
+def count_bounded(state: MapState) -> MapState:
+    """Count the unknown cells that have an upper bound."""
+    return tally(state, cells_bounded=count(state.bounded & ~state.validity))
 
 
 def update_in_place(
@@ -90,7 +72,7 @@ def update_in_place(
 ) -> None:
     """Measure, fuse, and write the new values into the stored state's own tensors; points come as (B, S, N, 3)."""
     m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, stored.elevation.dtype)
-    write(stored, fuse_measurement(stored, m, cfg, weights))
+    write(stored, forward(stored, m, cfg, weights))
 
 
 def write(stored: MapState, new: MapState) -> None:

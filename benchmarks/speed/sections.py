@@ -19,12 +19,13 @@ from torch.utils._pytree import tree_map
 from benchmarks.speed import meter
 from benchmarks.speed.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
 from torchelev import compiled_update as compilation
-from torchelev import grid, pipeline
+from torchelev import pipeline
+from torchelev.ops import compiler
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages import age as aging
 from torchelev.stages import compensate as drift
 from torchelev.stages import measure as sensor
-from torchelev.stages import overlap
+from torchelev.stages import overlap, recenter
 from torchelev.stages.fusion import fuse as fusion
 from torchelev.stages.visibility import clean_up as raycast
 from torchelev.state import MapState, Measurement, map_layers
@@ -78,15 +79,12 @@ def stages(seconds: float, track: Track) -> dict[str, Any]:
     def transform(state: MapState, m: Measurement) -> Measurement:
         return sensor.measure(cloud[:, None], T[:, None], T, drive.dt, None, g, cfg.sensor, torch.float32)
 
-    def cells(state: MapState, m: Measurement) -> grid.PointCells:
-        return grid.cells_of(state, m, g)
-
     all_stages: dict[str, Callable[[MapState, Measurement], Any]] = {
         "point transform, gates, noise": transform,
-        "recenter": lambda state, m: grid.recenter(state, m, g),
+        "recenter": lambda state, m: recenter.recenter(state, m, g),
         "age": lambda state, m: aging.age(state, m, cfg.aging),
-        "drift compensation": lambda state, m: drift.compensate(state, m, cells(state, m), g, cfg.drift, 0.5),
-        "height update": lambda state, m: fusion.fuse(state, m, cells(state, m), g, cfg.fusion),
+        "drift compensation": lambda state, m: drift.compensate(state, m, g, cfg.drift, cfg.drift_gate),
+        "height update": lambda state, m: fusion.fuse(state, m, g, cfg.fusion, has_rays=True),
         "ray casting": lambda state, m: raycast.clear_seen_through(state, m, g, cfg.raycast),
         "overlap clearance": lambda state, m: overlap.clear_other_floors(state, m, g, cfg.overlap),
         "normals and traversability": lambda state, m: pipeline.rate_surface(state, cfg),
@@ -105,7 +103,7 @@ def compiled_alone(stage: Callable[[MapState, Measurement], Any], inputs: list[A
     def on_bytes(values: Any) -> Any:
         return mask_bytes(stage(*(compilation.with_masks(value, as_mask) for value in values)))
 
-    compiled = compilation.compiled(on_bytes)
+    compiled = compiler.compiled(on_bytes)
     values = [tuple(compilation.with_masks(part, as_bytes) for part in value) for value in inputs]
 
     def run() -> None:
@@ -192,7 +190,7 @@ def parts(seconds: float, track: Track) -> dict[str, Any]:
         ids, mask = torch.arange(0, count, 2), torch.arange(count) % 2 == 0
         runs = {
             "update": drive,
-            "recenter": compiled_alone(lambda state, m, g=cfg.grid: grid.recenter(state, m, g), chunks_of(drive)),
+            "recenter": compiled_alone(lambda state, m, g=cfg.grid: recenter.recenter(state, m, g), chunks_of(drive)),
             "sample 187": lambda emap=emap, scan=scan: emap.sample(scan),
             "reset": other.reset,
             "reset ids": lambda other=other, ids=ids: other.reset(ids),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchelev.ops.masks import NOWHERE, as_factor, chosen, lifted, masked, masked_any
+from torchelev.ops.masks import NOWHERE, as_factor, lifted, masked, masked_any, where_finite
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 
@@ -36,10 +36,10 @@ def test_masked_any_leaves_nothing_of_other_values(values, other):
 @pytest.mark.parametrize("mask", [MASK, MASK[:1], MASK.transpose(0, 1).contiguous().transpose(0, 1)])
 def test_chosen_chooses_to_the_bit(values, mask):
     others = 1e4 * values.flip(0)
-    assert torch.equal(chosen(mask, values, others), torch.where(mask, values, others))
-    assert torch.equal(chosen(mask, values, others[0]), torch.where(mask, values, others[0]))
-    assert torch.equal(chosen(mask, values, 0.1), torch.where(mask, values, 0.1))
-    assert chosen(mask, values, 0.1).dtype == values.dtype
+    assert torch.equal(where_finite(mask, values, others), torch.where(mask, values, others))
+    assert torch.equal(where_finite(mask, values, others[0]), torch.where(mask, values, others[0]))
+    assert torch.equal(where_finite(mask, values, 0.1), torch.where(mask, values, 0.1))
+    assert where_finite(mask, values, 0.1).dtype == values.dtype
 
 
 def test_float16_holds_nowhere():
@@ -51,6 +51,6 @@ def test_gradients_are_those_of_a_choice():
     (masked(values, MASK) + lifted(values, MASK) * as_factor(~MASK)).sum().backward()
     assert torch.equal(values.grad, torch.ones_like(values))
     others = values.detach().clone().requires_grad_()
-    chosen(MASK, values, 3 * others).sum().backward()
+    where_finite(MASK, values, 3 * others).sum().backward()
     assert torch.equal(values.grad, 1.0 + MASK)
     assert torch.equal(others.grad, 3.0 * ~MASK)

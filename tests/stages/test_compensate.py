@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
-from tests.helpers import pose, random_state, seen_from, small_map, terrain
-from torchelev import DriftConfig, SensorConfig
-from torchelev.stages.cells import cells_of
+from tests.helpers import pose, random_state, seen_from, small_config, small_map, terrain
+from torchelev import DriftConfig, LearnedTraversabilityConfig, SensorConfig, TraversabilityConfig
 from torchelev.stages.compensate import compensate
 from torchelev.state import LAYERS
 
@@ -29,7 +28,7 @@ def test_agrees_with_the_reference(seed, offset, gain, min_points):
     T = pose((0.1, 0.2, 1.0), num_envs=2)
     m = emap.measure(seen_from(T, torch.from_numpy(np.stack(points))), T, None, 0.1)
     grid = emap.cfg.grid
-    after = compensate(state, m, cells_of(state, m, grid), grid, cfg, 0.5)
+    after = compensate(state, m, grid, cfg, 0.5)
     for b in range(2):
         layers = {name: getattr(state, name)[b].numpy() for name in LAYERS}
         used = [p for p, u in zip(points[b], m.used[b], strict=True) if u]
@@ -85,17 +84,29 @@ def test_off_or_too_few_points_or_too_much_drift(drift):
     assert emap.statistics.drift_correction.item() == 0
 
 
-def test_the_config_overrules_the_gate_of_the_head():
+@pytest.mark.parametrize("gate, counts", [(0.6, True), (0.61, False)])
+def test_ground_counts_from_the_gate_on(gate, counts):
     """Ground rated 0.6 counts from 0.6 on."""
     emap = small_map(1)
     emap.update(flat_cloud(0.0), pose(), None, 0.1)
     state = emap.state._replace(traversability=torch.full_like(emap.state.traversability, 0.6))
     m = emap.measure(flat_cloud(0.05), pose(), None, 0.1)
-    grid = emap.cfg.grid
-    cells = cells_of(state, m, grid)
-    for of_config, of_head, counts in ((None, 0.6, True), (None, 0.61, False), (0.6, 0.9, True), (0.61, 0.1, False)):
-        after = compensate(state, m, cells, grid, DriftConfig(min_traversability=of_config), of_head)
-        assert (after.statistics.drift_points.item() > 0) == counts
+    after = compensate(state, m, emap.cfg.grid, DriftConfig(), gate)
+    assert (after.statistics.drift_points.item() > 0) == counts
+
+
+@pytest.mark.parametrize(
+    "setting, head, gate",
+    [
+        (None, TraversabilityConfig(), TraversabilityConfig.drift_gate),
+        (None, LearnedTraversabilityConfig(), LearnedTraversabilityConfig.drift_gate),
+        (None, None, TraversabilityConfig.drift_gate),
+        (0.7, LearnedTraversabilityConfig(), 0.7),
+    ],
+)
+def test_the_config_overrules_the_gate_of_the_head(setting, head, gate):
+    cfg = small_config(drift=DriftConfig(min_traversability=setting), traversability=head)
+    assert cfg.drift_gate == gate
 
 
 @pytest.mark.parametrize("bad", [dict(gain=0.0), dict(gain=1.5), dict(min_points=0), dict(min_traversability=1.5)])

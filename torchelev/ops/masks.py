@@ -27,7 +27,7 @@ def masked_any(values: Tensor, mask: Tensor) -> Tensor:
     return masked(values.nan_to_num(0.0, 0.0, 0.0), mask)
 
 
-def chosen(mask: Tensor, values: Tensor, others: Tensor | float) -> Tensor:
+def where_finite(mask: Tensor, values: Tensor, others: Tensor | float) -> Tensor:
     """Return the values where the mask is true, else the others. Finite ones, or NaN would be left."""
     others = others if isinstance(others, Tensor) else values.new_full((), others)
     if torch.compiler.is_compiling():

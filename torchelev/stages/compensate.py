@@ -10,7 +10,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import as_factor, lifted, masked
-from torchelev.stages.cells import PointCells, center_offsets
+from torchelev.stages.cells import cells_of, center_offsets
 from torchelev.state import MapState, Measurement, count, tally
 
 
@@ -44,18 +44,20 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def compensate(
-    state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: DriftConfig, head_gate: float
+    state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig | None, min_traversability: float
 ) -> MapState:
     """Add the mean height error over certain, flat cells to elevation and upper bound (paper, Sec. II-D).
 
     e = (1 / n) * sum (p_z - h), h the height at the point of its cell's plane, over points whose cell is known,
     traversable and certain, with |p_z - h| <= max_error and then within `gate` standard deviations of their mean.
-    Corrected by gain * e where n >= min_points and |e| <= max_drift. Traversable is what the config says, else what is
-    rated `head_gate` or more.
+    Corrected by gain * e where n >= min_points and |e| <= max_drift. Cells are traversable if they are rated
+    at least `min_traversability`. None for `cfg`: no compensation.
     """
+    if cfg is None:
+        return state
+    cells = cells_of(state, m, grid)
     px, py, pz = m.points.unbind(-1)
-    gate = head_gate if cfg.min_traversability is None else cfg.min_traversability
-    suits = state.validity & (state.traversability >= gate) & (state.variance <= cfg.max_variance)
+    suits = state.validity & (state.traversability >= min_traversability) & (state.variance <= cfg.max_variance)
     # On a slope the height within a cell depends on where in the cell the point lies.
     x, y = center_offsets(state, m, grid)
     gx, gy = state.gradient_x, state.gradient_y

@@ -46,15 +46,15 @@ class Floor(NamedTuple):
     upper: Float[Tensor, "B 1 1"]
 
 
-def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: OverlapConfig) -> MapState:
+def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: OverlapConfig | None) -> MapState:
     """Clear cells near the robot whose height differs from the robot's by more than a threshold (paper, Sec. II-F).
 
     The robot's height is its base's, z_b, or that of a low base on the same ground: min(z_b, z_g + base_height), with
     z_g from `ground_below`. So a tall robot keeps its ground. Cells hit by this scan may differ by height * (1 + d /
     radius) at distance d: a slope is no other floor. What lies below the base is no upper floor. Skipped without a base
-    pose. A cell's upper bound goes too when it belongs to another floor.
+    pose or `cfg`. A cell's upper bound goes too when it belongs to another floor.
     """
-    if m.base is None:
+    if m.base is None or cfg is None:
         return state
     x, y = center_offsets(state, m, grid)
     x, y = x - m.base[:, 0, None, None], y - m.base[:, 1, None, None]

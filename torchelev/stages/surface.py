@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import as_factor, chosen, masked, masked_any
+from torchelev.ops.masks import as_factor, masked, masked_any, where_finite
 from torchelev.ops.operators import padded
 from torchelev.ops.storage import realize
 from torchelev.ops.windows import window_moments
@@ -47,7 +47,7 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
     datum = (heights.sum((1, 2), keepdim=True) / number).detach()
     # One layer tells both, which is less to store and to read than two.
     nowhere = 0.5 * torch.finfo(heights.dtype).max  # differences to it are finite
-    layer = padded(chosen(validity, heights - datum, nowhere), rim, nowhere)
+    layer = padded(where_finite(validity, heights - datum, nowhere), rim, nowhere)
     known = as_factor(layer < nowhere).to(layer.dtype)
     return Ground(known, layer * known, rim)
 
@@ -85,8 +85,8 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     regular = det > 1e-4
     # Both are far above these limits unless they are zero but for rounding.
     safe_det, safe_spread = det.clamp(min=1e-4), spread.clamp(min=1e-2)
-    gu = chosen(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
-    gv = chosen(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
+    gu = where_finite(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
+    gv = where_finite(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
     residual = less(less(less(s_zz * share, mz, mz), gu, uz), gv, vz).clamp(min=0)
     return Plane(spans_plane(uu, uv, vv, radius), gu / resolution, gv / resolution, residual)
 

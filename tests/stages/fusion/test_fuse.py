@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import off_borders, pose, random_poses, random_state, scan, small_map
 from torchelev import EdgeConfig, FusionConfig, SensorConfig
-from torchelev.stages.cells import cells_of
 from torchelev.stages.fusion.contested import ContestedCells
 from torchelev.stages.fusion.fuse import fuse
 
@@ -114,7 +113,7 @@ def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0):
     cloud = (torch.from_numpy(in_map) - T[:, :, None, :3, 3]) @ T[:, :, :3, :3]
     m = emap.measure(cloud, T, None, 0.1)
     grid = emap.cfg.grid
-    after = fuse(state, m, cells_of(state, m, grid), grid, cfg, has_rays=True)
+    after = fuse(state, m, grid, cfg, has_rays=True)
     for b in range(2):
         points = in_map[b].reshape(-1, 3)
         origins = np.repeat(T[b, :, :3, 3].numpy(), num_points, 0)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.masks import chosen
+from torchelev.ops.masks import where_finite
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.ops.windows import around
 from torchelev.stages.fusion.contested import NO_HEIGHT, SelectedCells, put_in
@@ -77,7 +77,7 @@ def look_around(
     Before the scan, so that its own outliers vouch for none.
     """
     settled = prior.known & (prior.support >= 0.5 * cfg.max_support)
-    layers = [as_bytes(prior.challenger_support > 0), chosen(settled, prior.elevation, NO_HEIGHT)]
+    layers = [as_bytes(prior.challenger_support > 0), where_finite(settled, prior.elevation, NO_HEIGHT)]
     exists, (supported, heights) = values_around(layers, cells.cells, *around(cells.cells.device), width)
     own, own_height = (cells.of(layer) for layer in layers)
     number = own.to(torch.int32) + (exists & (supported > 0)).sum(1, dtype=torch.int32)

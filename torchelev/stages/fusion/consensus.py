@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import chosen
+from torchelev.ops.masks import where_finite
 from torchelev.ops.storage import as_bytes, realize, realize_all
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.fusion.contested import NO_HEIGHT, CellHeights, ContestedCells, SelectedCells, ratio
@@ -90,8 +90,10 @@ def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: Fu
     step, untrusted = torch.zeros_like(trusted), ~trusted & (number > 1)
     if (edges := cfg.edges) is not None:
         step = trusted & edges.has_step(number, number - agreeing)
-    height = chosen(trusted, prior.elevation, mean).detach()
-    shown = CellHeights(chosen(number > 0, mean, NO_HEIGHT), chosen(prior.known, prior.elevation.detach(), NO_HEIGHT))
+    height = where_finite(trusted, prior.elevation, mean).detach()
+    shown = CellHeights(
+        where_finite(number > 0, mean, NO_HEIGHT), where_finite(prior.known, prior.elevation.detach(), NO_HEIGHT)
+    )
     contested = SelectedCells(as_bytes((number > 0) & ((prior.known & ~trusted) | (prior.challenger_support > 0))))
     cells = as_bytes(untrusted) + 2 * as_bytes(step)
     points = ContestedCells(cells, scan.cells.slot, scan.columns(), shown.scan)

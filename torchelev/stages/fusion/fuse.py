@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import as_factor, chosen, masked, zeroed
+from torchelev.ops.masks import as_factor, masked, where_finite, zeroed
 from torchelev.ops.storage import as_bytes, realize, realize_all
-from torchelev.stages.cells import PointCells
+from torchelev.stages.cells import cells_of
 from torchelev.stages.fusion.challenge import Challenge, challenge_from_above
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.consensus import Consensus, estimate_consensus
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-def fuse(
-    state: MapState, m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig, has_rays: bool
-) -> MapState:
+def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> MapState:
     """Fuse the scan into the map (paper, Sec. II-C).
 
     Within the scan, the points of a cell become one height z_s by consensus: those within the Mahalanobis gate of
@@ -41,7 +39,7 @@ def fuse(
     variance, as in the paper, and founds the cell anew once the votes are used up, or once enough points above it agree
     with each other (`challenge`): a new obstacle shows soon, however long the ground before it was seen.
     """
-    scan, prior = gather_points(m, cells, grid, cfg), gather_prior(state)
+    scan, prior = gather_points(m, cells_of(state, m, grid), grid, cfg), gather_prior(state)
     consensus = estimate_consensus(scan, prior, grid, cfg)
     if has_rays:  # nothing else tells outliers in a blind spot from an obstacle
         challenge = challenge_from_above(prior, consensus, grid.width, cfg.relief * grid.resolution, cfg)
@@ -83,7 +81,7 @@ def measure_cells(
         kept=kept_number,
         votes=votes,
         dissent=consensus.number - votes,
-        agreeing=chosen(lower_part, votes, agreeing),
+        agreeing=where_finite(lower_part, votes, agreeing),
     )
     return cells, ignored
 
@@ -117,7 +115,7 @@ def merge(
     hit, innovation = scan.kept > 0, scan.height - prior.elevation
     limit = gate_variance(prior.variance, cfg) + scan.variance + (cfg.relief * grid.resolution) ** 2
     agree = realize(prior.known & hit & (innovation.square() <= cfg.gate**2 * limit))
-    votes = chosen(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
+    votes = where_finite(agree, scan.votes - scan.dissent, scan.agreeing - scan.votes)
     support = prior.support + votes
     found = hit & ~agree & (~prior.known | (support < 0) | challenge.won)
     found, taken = realize_all(found, agree | found)
@@ -126,9 +124,11 @@ def merge(
     fused = prior.elevation + masked(innovation / (information * scan.variance), taken)
     # Limited before it is multiplied, too: an infinite one would make NaN of cells without points.
     outvoted = prior.variance + min(cfg.outlier_variance, cfg.max_variance) * scan.kept
-    posterior = chosen(taken, (1.0 / information).clamp(max=cfg.max_variance), outvoted.clamp(max=cfg.max_variance))
-    fresh = chosen(prior.known & ~challenge.won, -support, scan.votes - scan.dissent)
-    support = chosen(hit, chosen(found, fresh, support).clamp(0, cfg.max_support), prior.support)
+    posterior = where_finite(
+        taken, (1.0 / information).clamp(max=cfg.max_variance), outvoted.clamp(max=cfg.max_variance)
+    )
+    fresh = where_finite(prior.known & ~challenge.won, -support, scan.votes - scan.dissent)
+    support = where_finite(hit, where_finite(found, fresh, support).clamp(0, cfg.max_support), prior.support)
 
     def store(cells: Tensor) -> Tensor:
         return cells.view(state.elevation.shape)
@@ -136,7 +136,7 @@ def merge(
     hit_now = store(taken)
     elevation, variance, support, challenger, challenger_support, validity, time = realize_all(
         store(fused),
-        chosen(state.validity | hit_now, store(posterior), BLANK["variance"]),
+        where_finite(state.validity | hit_now, store(posterior), BLANK["variance"]),
         store(support),
         store(challenge.height),
         store(zeroed(challenge.support, found)),

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.grid import GridConfig, locate
-from torchelev.ops.masks import NOWHERE, chosen, lifted
+from torchelev.ops.masks import NOWHERE, lifted, where_finite
 from torchelev.ops.operators import running_minimum
 from torchelev.ops.storage import read, realize, realize_all
 from torchelev.ops.windows import neighbours
@@ -103,11 +103,11 @@ def find_ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> 
     size = torch.stack([start.new_full((), n * grid.resolution) for n in (grid.height, grid.width)])
     inner = 0.5 * grid.resolution  # half a cell inside, so that rounding leaves no ray outside
     ahead = rays.xy > 0
-    room = chosen(ahead, size - inner - start, inner - start)
-    shares = room / chosen(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never by zero
+    room = where_finite(ahead, size - inner - start, inner - start)
+    shares = room / where_finite(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never by zero
     end = start + rays.xy
     leaves = ((end < 0) | (end >= size)).any(-1)
-    share = chosen(leaves, shares.amin(-1).clamp(0, 1), 1.0)
+    share = where_finite(leaves, shares.amin(-1).clamp(0, 1), 1.0)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
     through_x = shares[..., 0] <= shares[..., 1]
@@ -162,10 +162,10 @@ def horizon(
     x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(realize_all(angle.cos(), angle.sin())))
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     recent = state.validity & (state.time <= cfg.min_time)
-    below_sensor = chosen(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
-    fall = chosen(inside, read(realize(below_sensor).flatten(1), slot), NO_FALL * step) / rho
+    below_sensor = where_finite(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
+    fall = where_finite(inside, read(realize(below_sensor).flatten(1), slot), NO_FALL * step) / rho
     steepest = running_minimum(fall.detach())  # compared with, and so without a gradient
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
-    return chosen(k >= 0, limit, NO_FALL)
+    return where_finite(k >= 0, limit, NO_FALL)

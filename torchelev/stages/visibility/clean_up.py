@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import chosen, masked, zeroed
+from torchelev.ops.masks import masked, where_finite, zeroed
 from torchelev.ops.operators import polar_minimum
 from torchelev.ops.storage import read, realize, realize_all
 from torchelev.stages.cells import center_offsets
@@ -38,7 +38,7 @@ def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tenso
     # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
-    index = flat(chosen(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
+    index = flat(where_finite(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
     return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
 
 
@@ -64,9 +64,9 @@ def look_up(
     middle = azimuth_fraction(x, y) * polar.azimuths
     a = torch.floor(middle - 0.5 * width)
     further = (torch.floor(middle + 0.5 * width) - a + 1 - entry).clamp(min=0)
-    a = chosen(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
+    a = where_finite(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
     b = a + further
-    b = chosen(b < polar.azimuths, b, b - polar.azimuths)
+    b = where_finite(b < polar.azimuths, b, b - polar.azimuths)
     slopes = table.flatten(1)
     lowest = torch.minimum(*(read(slopes, flat(k, place, polar.azimuths)) for place in (a, b)))
     slope = realize(lowest)  # or the compiler would gather anew for the masks and for the heights
@@ -78,15 +78,17 @@ def look_up(
     return RayOverCell(found, z_s + slope * rho, slope.abs() * grid.resolution, incidence)
 
 
-def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig) -> MapState:
+def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None) -> MapState:
     """Remove what rays passed below, and bound what no ray saw (paper, Sec. II-E and II-H).
 
     A known cell goes if a ray's height over it is below h - sigma, it was not hit for `min_time`, and |r . n| > alpha_n
     (eq. 3 and 4), with n the cell's normal and r the direction of the lowest ray, the only one that the table keeps.
     Eq. 4 keeps grazing rays from eroding smooth ground; a ray that `passes_far_below` does not graze, and needs none:
     what is left of a ghost tilts its own normal, by which it would stay for ever.
-    The upper bound of an unknown cell is the lowest ray height over it so far.
+    The upper bound of an unknown cell is the lowest ray height over it so far. None for `cfg`: rays tell nothing.
     """
+    if cfg is None:
+        return state
     polar, known = PolarGrid.of(grid, cfg), state.validity
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
