@@ -90,9 +90,9 @@ class Graphs(NamedTuple):
     an update without its points or rays. Masks come and go as bytes, see `as_bytes`.
     """
 
-    move_window: Callable[..., Measurement]
-    fuse_heights: Callable[..., None]
-    apply_rays: Callable[..., None]
+    move_window: Callable[..., Measurement]  #: measures, moves the window and ages it
+    fuse_heights: Callable[..., None]  #: compensates drift and fuses the points' heights
+    apply_rays: Callable[..., None]  #: clears cells, bounds unknown ones and rates the rest
 
 
 @functools.cache

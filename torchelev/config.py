@@ -28,18 +28,22 @@ class ElevationMapConfig:
     `filters` make further layers when they are read, see `torchelev.filters`.
     """
 
-    grid: GridConfig = field(default_factory=GridConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    aging: AgingConfig = field(default_factory=AgingConfig)
+    grid: GridConfig = field(default_factory=GridConfig)  #: size of the window and its cells
+    sensor: SensorConfig = field(default_factory=SensorConfig)  #: noise model, range, exclusion area and body box
+    aging: AgingConfig = field(default_factory=AgingConfig)  #: how fast an unmeasured cell loses certainty
+    #: drift compensation; None switches it off: for poses without height drift
     drift: DriftConfig | None = field(default_factory=DriftConfig)
-    fusion: FusionConfig = field(default_factory=FusionConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)  #: Kalman update and outlier gate
+    #: visibility clean-up and upper bound; None switches both off: for static scenes
     raycast: RaycastConfig | None = field(default_factory=RaycastConfig)
+    #: overlap clearance; None switches it off: for buildings of one floor
     overlap: OverlapConfig | None = field(default_factory=OverlapConfig)
-    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)  #: reach of the planes of normals
+    #: the analytic or the learned head; None: no rating
     traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
         default_factory=TraversabilityConfig
     )
-    filters: tuple[FilterConfig, ...] = ()
+    filters: tuple[FilterConfig, ...] = ()  #: further layers, made when they are read
 
     def __post_init__(self) -> None:
         if isinstance(self.filters, list):

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class GridConfig:
     """Size of the window and of its cells."""
 
-    resolution: float = 0.04  # [m]
-    length_x: float = 10.0  # [m]
-    length_y: float = 10.0  # [m]
+    resolution: float = 0.04  #: [m]
+    length_x: float = 10.0  #: [m]
+    length_y: float = 10.0  #: [m]
 
     def __post_init__(self) -> None:
         require_positive(**{"grid.resolution": self.resolution})

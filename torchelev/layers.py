@@ -52,8 +52,8 @@ LAYERS: dict[str, Callable[[MapState], Layer]] = {
 class Corners(NamedTuple):
     """The K cells that each point is read from; a cell's number H * W stands for nothing."""
 
-    cell: Int[Tensor, "B KM"]
-    weight: Float[Tensor, "B K M"]
+    cell: Int[Tensor, "B KM"]  #: flat cell number of each corner
+    weight: Float[Tensor, "B K M"]  #: bilinear weight of each corner, 0 outside the window
 
 
 def sample_layer(

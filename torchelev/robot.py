@@ -12,13 +12,13 @@ from torchelev.errors import require, require_positive
 class RobotConfig:
     """A legged robot that stands on four feet at the corners of a rectangle."""
 
-    length: float = 0.7  # [m] between front and hind feet
-    width: float = 0.4  # [m] between left and right feet
-    foot_radius: float = 0.03  # [m]
-    foot_reach: float = 0.1  # [m] by which a foot may choose another place than its nominal one
-    step_height: float = 0.2  # [m] that a foot can overcome
-    clearance: float = 0.3  # [m] that the legs leave between ground and belly
-    max_slope: float = 0.5  # [rad] of the body
+    length: float = 0.7  #: [m] between front and hind feet
+    width: float = 0.4  #: [m] between left and right feet
+    foot_radius: float = 0.03  #: [m]
+    foot_reach: float = 0.1  #: [m] by which a foot may choose another place than its nominal one
+    step_height: float = 0.2  #: [m] that a foot can overcome
+    clearance: float = 0.3  #: [m] that the legs leave between ground and belly
+    max_slope: float = 0.5  #: [rad] of the body
 
     def __post_init__(self) -> None:
         require_positive(**{field.name: getattr(self, field.name) for field in fields(self)})

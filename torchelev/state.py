@@ -19,42 +19,42 @@ if TYPE_CHECKING:
 class Statistics(NamedTuple):
     """What the last update did, per environment. Counts are int64 (B,), heights are [m] (B,)."""
 
-    points_used: Int[Tensor, "B"]
-    rejected_invalid: Int[Tensor, "B"]  # NaN or inf
-    rejected_range: Int[Tensor, "B"]  # nearer or farther than the sensor measures
-    rejected_body: Int[Tensor, "B"]  # on the robot itself
-    rejected_overhang: Int[Tensor, "B"]  # above the exclusion ramp
-    rejected_outside: Int[Tensor, "B"]  # not over the window
-    rejected_outlier: Int[Tensor, "B"]  # outside the Mahalanobis gate
-    rejected_edge: Int[Tensor, "B"]  # on the wrong side of a step within their cell
-    drift_points: Int[Tensor, "B"]
-    drift_error: Float[Tensor, "B"]
-    drift_correction: Float[Tensor, "B"]
-    cleared_seen_through: Int[Tensor, "B"]
-    cleared_other_floors: Int[Tensor, "B"]
-    cells_bounded: Int[Tensor, "B"]  # unknown cells that have an upper bound
+    points_used: Int[Tensor, "B"]  #: fused into a cell's height
+    rejected_invalid: Int[Tensor, "B"]  #: NaN or inf
+    rejected_range: Int[Tensor, "B"]  #: nearer or farther than the sensor measures
+    rejected_body: Int[Tensor, "B"]  #: on the robot itself
+    rejected_overhang: Int[Tensor, "B"]  #: above the exclusion ramp
+    rejected_outside: Int[Tensor, "B"]  #: not over the window
+    rejected_outlier: Int[Tensor, "B"]  #: outside the Mahalanobis gate
+    rejected_edge: Int[Tensor, "B"]  #: on the wrong side of a step within their cell
+    drift_points: Int[Tensor, "B"]  #: that measured the height drift
+    drift_error: Float[Tensor, "B"]  #: [m] mean height error of these points
+    drift_correction: Float[Tensor, "B"]  #: [m] added to the map's heights
+    cleared_seen_through: Int[Tensor, "B"]  #: cells that visibility clean-up removed
+    cleared_other_floors: Int[Tensor, "B"]  #: cells that overlap clearance removed
+    cells_bounded: Int[Tensor, "B"]  #: unknown cells that have an upper bound
 
 
 class MapState(NamedTuple):
     """B robot-centric maps. No NaN: a value counts only where its mask says so."""
 
-    corner: Int[Tensor, "B 2"]  # cell numbers of [..., 0, 0] on the map frame's lattice
-    base_height: Float[Tensor, "B"]  # [m] z of the last T_map_base
-    elevation: Float[Tensor, "B H W"]  # [m] map frame
-    variance: Float[Tensor, "B H W"]  # [m^2]
-    validity: Bool[Tensor, "B H W"]  # elevation is known
-    support: Float[Tensor, "B H W"]  # points that agree, less points that disagree
-    challenger: Float[Tensor, "B H W"]  # [m] lowest height that contradicts the elevation from above; no gradient
-    challenger_support: UInt8[Tensor, "B H W"]  # points that do so, less points that do not
-    time: Float[Tensor, "B H W"]  # [s] since the last hit
-    upper_bound: Float[Tensor, "B H W"]  # [m] of cells that are not known
-    bounded: Bool[Tensor, "B H W"]  # upper_bound is known
-    gradient_x: Float[Tensor, "B H W"]  # dz/dx
-    gradient_y: Float[Tensor, "B H W"]  # dz/dy
-    has_normal: Bool[Tensor, "B H W"]  # the known neighbours span a plane; elsewhere the gradient is 0
-    traversability: Float[Tensor, "B H W"]  # in [0, 1]
-    rated: Bool[Tensor, "B H W"]  # the known cells of the head's window span a plane; elsewhere traversability is 0
-    statistics: Statistics
+    corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the map frame's lattice
+    base_height: Float[Tensor, "B"]  #: [m] z of the last T_map_base
+    elevation: Float[Tensor, "B H W"]  #: [m] map frame
+    variance: Float[Tensor, "B H W"]  #: [m^2]
+    validity: Bool[Tensor, "B H W"]  #: elevation is known
+    support: Float[Tensor, "B H W"]  #: points that agree, less points that disagree
+    challenger: Float[Tensor, "B H W"]  #: [m] lowest height that contradicts the elevation from above; no gradient
+    challenger_support: UInt8[Tensor, "B H W"]  #: points that do so, less points that do not
+    time: Float[Tensor, "B H W"]  #: [s] since the last hit
+    upper_bound: Float[Tensor, "B H W"]  #: [m] of cells that are not known
+    bounded: Bool[Tensor, "B H W"]  #: upper_bound is known
+    gradient_x: Float[Tensor, "B H W"]  #: dz/dx
+    gradient_y: Float[Tensor, "B H W"]  #: dz/dy
+    has_normal: Bool[Tensor, "B H W"]  #: the known neighbours span a plane; elsewhere the gradient is 0
+    traversability: Float[Tensor, "B H W"]  #: in [0, 1]
+    rated: Bool[Tensor, "B H W"]  #: the known cells of the head's window span a plane; elsewhere traversability is 0
+    statistics: Statistics  #: of the last update
 
 
 class Measurement(NamedTuple):
@@ -63,18 +63,18 @@ class Measurement(NamedTuple):
     Horizontal coordinates count from `anchor`, so that float32 keeps them exact far from the origin.
     """
 
-    anchor: Int[Tensor, "B 2"]  # cell number that x = y = 0 below stands for
-    points: Float[Tensor, "B M 3"]  # [m] zero where ignored
-    variance: Float[Tensor, "B M"]  # [m^2] of each height
-    used: Bool[Tensor, "B M"]  # measures the ground
-    casts: Bool[Tensor, "B M"]  # its ray clears and bounds (points rejected as overhang do)
-    origin: Float[Tensor, "B S 3"]  # [m] the sensors
-    base: Float[Tensor, "B 3"] | None  # [m] the robot; None, or NaN in one environment: the window stays
-    dt: Float[Tensor, "B"]  # [s]
-    rejected_invalid: Int[Tensor, "B"]
-    rejected_range: Int[Tensor, "B"]
-    rejected_body: Int[Tensor, "B"]
-    rejected_overhang: Int[Tensor, "B"]
+    anchor: Int[Tensor, "B 2"]  #: cell number that x = y = 0 below stands for
+    points: Float[Tensor, "B M 3"]  #: [m] zero where ignored
+    variance: Float[Tensor, "B M"]  #: [m^2] of each height
+    used: Bool[Tensor, "B M"]  #: measures the ground
+    casts: Bool[Tensor, "B M"]  #: its ray clears and bounds (points rejected as overhang do)
+    origin: Float[Tensor, "B S 3"]  #: [m] the sensors
+    base: Float[Tensor, "B 3"] | None  #: [m] the robot; None, or NaN in one environment: the window stays
+    dt: Float[Tensor, "B"]  #: [s]
+    rejected_invalid: Int[Tensor, "B"]  #: see `Statistics`
+    rejected_range: Int[Tensor, "B"]  #: see `Statistics`
+    rejected_body: Int[Tensor, "B"]  #: see `Statistics`
+    rejected_overhang: Int[Tensor, "B"]  #: see `Statistics`
 
 
 LAYERS = MapState._fields[2:-1]  # (B, H, W)

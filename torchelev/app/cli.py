@@ -84,9 +84,10 @@ class OneLineError(click.ClickException):
 class MapOptions:
     """What the user asked of the map, checked."""
 
+    #: takes sensor-frame points into the base frame; None: not given
     T_base_sensor: NDArray[np.float64] | None
-    sensor_height: float | None
-    fixed: bool
+    sensor_height: float | None  #: [m] of the sensor above the base, in place of T_base_sensor
+    fixed: bool  #: the window stays where it is
 
     @property
     def knows_base(self) -> bool:

@@ -44,12 +44,12 @@ WARM_UP = 3  # updates that do not count as time per update
 class DemoResult:
     """What the demo measured, over the cells that the map knows at the end."""
 
-    rmse: float  # [m]
-    rmse_off_steps: float  # [m] over the cells that no step cuts, nor their neighbours
-    p95: float  # [m] 95 % of the cells are this near the truth or nearer
-    coverage: float  # share of the cells hit by any ray that the map knows
-    ms_per_update: float  # [ms] median
-    updates: int
+    rmse: float  #: [m]
+    rmse_off_steps: float  #: [m] over the cells that no step cuts, nor their neighbours
+    p95: float  #: [m] 95 % of the cells are this near the truth or nearer
+    coverage: float  #: share of the cells hit by any ray that the map knows
+    ms_per_update: float  #: [ms] median
+    updates: int  #: number of scans that were fused
 
     def __str__(self) -> str:
         return (
@@ -62,9 +62,9 @@ class DemoResult:
 class DemoScan(NamedTuple):
     """One instant of the recording."""
 
-    points: Tensor  # (N, 3) [m] sensor frame
-    T_map_sensor: Tensor  # (4, 4)
-    T_map_base: Tensor  # (4, 4)
+    points: Tensor  #: (N, 3) [m] sensor frame
+    T_map_sensor: Tensor  #: (4, 4)
+    T_map_base: Tensor  #: (4, 4)
 
 
 def course() -> Scene:

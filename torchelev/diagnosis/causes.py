@@ -34,19 +34,19 @@ GATES = {
 class Evidence:
     """What is known of one environment, on the host."""
 
-    cfg: ElevationMapConfig
-    numbers: list[int]  # of the updates, one per look
-    points: list[list[NDArray]]  # [m] sensor frame, per look and sensor, (n, 3); not all are finite
-    poses: list[list[NDArray]]  # T_map_sensor, per look and sensor
-    bases: list[NDArray | None]
-    dt: NDArray  # [s]
-    gates: dict[str, int]  # points of all looks by the gate that rejected them
-    used: list[NDArray]  # which points of a look passed the sensor's gates
-    statistics: dict[str, float]  # of the last update
-    num_known: int  # cells
-    num_near: int  # known cells where overlap clearance works
-    oldest: float  # [s] since the known cell that waits longest was hit
-    center: NDArray  # (2,) [m] of the window
+    cfg: ElevationMapConfig  #: of the map
+    numbers: list[int]  #: of the updates, one per look
+    points: list[list[NDArray]]  #: [m] sensor frame, per look and sensor, (n, 3); not all are finite
+    poses: list[list[NDArray]]  #: T_map_sensor, per look and sensor
+    bases: list[NDArray | None]  #: T_map_base of each update, None where none was given
+    dt: NDArray  #: [s]
+    gates: dict[str, int]  #: points of all looks by the gate that rejected them
+    used: list[NDArray]  #: which points of a look passed the sensor's gates
+    statistics: dict[str, float]  #: of the last update
+    num_known: int  #: cells
+    num_near: int  #: known cells where overlap clearance works
+    oldest: float  #: [s] since the known cell that waits longest was hit
+    center: NDArray  #: (2,) [m] of the window
 
     @cached_property
     def num_points(self) -> int:

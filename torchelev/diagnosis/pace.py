@@ -26,9 +26,9 @@ Update = TypeVar("Update", bound=Callable[..., None])
 class Recent:
     """Updates of one kind."""
 
-    times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))  # [s]
-    best: float = math.inf  # [s] the lowest median so far
-    slow: int = 0  # how many of the last updates in a row had a median many times that
+    times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))  #: [s]
+    best: float = math.inf  #: [s] the lowest median so far
+    slow: int = 0  #: how many of the last updates in a row had a median many times that
 
 
 class Pace:

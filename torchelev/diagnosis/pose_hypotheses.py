@@ -25,25 +25,25 @@ OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # takes x right, y do
 class Scan:
     """One sensor's finite points (n, 3) [m] in its frame, its pose, and the time step it belongs to."""
 
-    points: NDArray
-    T: NDArray  # (4, 4) T_map_sensor
-    step: int
+    points: NDArray  #: (N, 3) [m] sensor frame
+    T: NDArray  #: (4, 4) T_map_sensor
+    step: int  #: time step that it belongs to
 
 
 class GroundPlane(NamedTuple):
     """The plane with most points of a scan, in the sensor frame: normal . p = offset."""
 
-    normal: NDArray
-    offset: float
-    share: float  # of the points
+    normal: NDArray  #: (3,) unit vector
+    offset: float  #: [m] of the plane along its normal
+    share: float  #: of the points
 
 
 class Fit(NamedTuple):
     """How sound a set of scans looks; NaN where nothing tells."""
 
-    level: float  # cosine between the planes' normals and the vertical, median
-    agreement: float  # share of the common cells in which scans have the same height
-    bounce: float  # [m] standard deviation of the sensor's height over the planes
+    level: float  #: cosine between the planes' normals and the vertical, median
+    agreement: float  #: share of the common cells in which scans have the same height
+    bounce: float  #: [m] standard deviation of the sensor's height over the planes
 
     @property
     def score(self) -> float:

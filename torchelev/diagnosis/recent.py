@@ -17,12 +17,12 @@ POINTS = 3000  # of each sensor, evenly spaced
 class Look(NamedTuple):
     """One update's inputs, thinned."""
 
-    number: int  # of the update
-    points: Tensor  # (E, S, n, 3) [m] sensor frame
-    T_map_sensor: Tensor  # (E, S, 4, 4)
-    T_map_base: Tensor | None  # (E, 4, 4)
-    dt: Tensor  # (E,) [s]
-    variance: Tensor | None  # (E, S, n) [m^2]
+    number: int  #: of the update
+    points: Tensor  #: (E, S, n, 3) [m] sensor frame
+    T_map_sensor: Tensor  #: (E, S, 4, 4)
+    T_map_base: Tensor | None  #: (E, 4, 4)
+    dt: Tensor  #: (E,) [s]
+    variance: Tensor | None  #: (E, S, n) [m^2]
 
 
 class Recent:

@@ -22,10 +22,10 @@ class FilterConfig:
     In YAML it is an entry of the list `filters`: `- {layer: smooth, filter: gaussian, inputs: elevation, sigma: 0.1}`.
     """
 
-    layer: str  # the name of what it makes
-    filter: str  # the name of the filter, see FILTERS
-    inputs: tuple[str, ...] | str = ()  # what it reads; left out: elevation, or what a formula names
-    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  # kept as pairs, as a config is hashed
+    layer: str  #: the name of what it makes
+    filter: str  #: the name of the filter, see FILTERS
+    inputs: tuple[str, ...] | str = ()  #: what it reads; left out: elevation, or what a formula names
+    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  #: kept as pairs, as a config is hashed
 
     def __post_init__(self) -> None:
         settings = {name: _plain(value) for name, value in dict(self.settings).items()}

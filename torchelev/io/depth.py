@@ -16,9 +16,9 @@ EXPECTED = "write four numbers fx fy cx cy [px], a 3x3 matrix, or YAML with thos
 class Intrinsics(NamedTuple):
     """A pinhole camera and what its depth values mean."""
 
-    matrix: NDArray[np.float64]  # (3, 3) [px]
-    depth_scale: float = 0.001  # metres per unit of the image
-    along: Literal["z", "ray"] = "z"  # depth along the optical axis, or along each pixel's ray
+    matrix: NDArray[np.float64]  #: (3, 3) [px]
+    depth_scale: float = 0.001  #: metres per unit of the image
+    along: Literal["z", "ray"] = "z"  #: depth along the optical axis, or along each pixel's ray
 
 
 def read_depth(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32]:

@@ -42,11 +42,11 @@ MEND = "write it with save_npz"
 class SavedMap(NamedTuple):
     """One map as `save_npz` wrote it."""
 
-    layers: dict[str, NDArray]  # name -> (H, W), NaN where unknown
-    resolution: float  # [m]
-    center: NDArray[np.float64]  # (3,) [m], map frame
-    config: dict[str, Any]  # for ElevationMapConfig.from_dict
-    axes: str = AXES
+    layers: dict[str, NDArray]  #: name -> (H, W), NaN where unknown
+    resolution: float  #: [m]
+    center: NDArray[np.float64]  #: (3,) [m], map frame
+    config: dict[str, Any]  #: for ElevationMapConfig.from_dict
+    axes: str = AXES  #: how tensor indices relate to the map frame's axes
 
     @property
     def extent(self) -> tuple[float, float, float, float]:

@@ -30,75 +30,75 @@ SLACK = 1e-3  # cells by which a length may miss a whole number
 class Point(NamedTuple):
     """As geometry_msgs/Point [m]."""
 
-    x: float
-    y: float
-    z: float = 0.0  # GridMap has none: heights are absolute
+    x: float  #: [m]
+    y: float  #: [m]
+    z: float = 0.0  #: GridMap has none: heights are absolute
 
 
 class Quaternion(NamedTuple):
     """As geometry_msgs/Quaternion; a GridMap does not turn."""
 
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-    w: float = 1.0
+    x: float = 0.0  #: of the unit quaternion x, y, z, w
+    y: float = 0.0  #: see x
+    z: float = 0.0  #: see x
+    w: float = 1.0  #: see x
 
 
 class Pose(NamedTuple):
     """As geometry_msgs/Pose."""
 
-    position: Point
-    orientation: Quaternion = Quaternion()
+    position: Point  #: of the map's centre
+    orientation: Quaternion = Quaternion()  #: of the map
 
 
 class GridMapInfo(NamedTuple):
     """As grid_map_msgs/GridMapInfo."""
 
-    resolution: float  # [m]
-    length_x: float  # [m]
-    length_y: float  # [m]
-    pose: Pose  # of the map's centre
+    resolution: float  #: [m]
+    length_x: float  #: [m]
+    length_y: float  #: [m]
+    pose: Pose  #: of the map's centre
 
 
 class Dimension(NamedTuple):
     """As std_msgs/MultiArrayDimension."""
 
-    label: str
-    size: int
-    stride: int
+    label: str  #: "column_index" or "row_index"
+    size: int  #: number of entries
+    stride: int  #: entries of this dimension and all faster ones
 
 
 class Layout(NamedTuple):
     """As std_msgs/MultiArrayLayout: the slow dimension first."""
 
-    dim: list[Dimension]
-    data_offset: int = 0
+    dim: list[Dimension]  #: outermost first
+    data_offset: int = 0  #: entries before the first
 
 
 class Float32MultiArray(NamedTuple):
     """As std_msgs/Float32MultiArray."""
 
-    layout: Layout
-    data: NDArray[np.float32]  # (H * W,)
+    layout: Layout  #: of the data
+    data: NDArray[np.float32]  #: (H * W,)
 
 
 class GridMap(NamedTuple):
     """As grid_map_msgs/GridMap, less its header."""
 
-    info: GridMapInfo
-    layers: list[str]
-    basic_layers: list[str]  # must be known for a cell to count as valid
-    data: list[Float32MultiArray]  # one per layer, NaN where unknown
-    outer_start_index: int = 0  # row of the buffer that holds the first row
-    inner_start_index: int = 0  # column of the buffer that holds the first column
+    info: GridMapInfo  #: frame, size and pose
+    layers: list[str]  #: names, in the order of the data
+    basic_layers: list[str]  #: must be known for a cell to count as valid
+    data: list[Float32MultiArray]  #: one per layer, NaN where unknown
+    outer_start_index: int = 0  #: row of the buffer that holds the first row
+    inner_start_index: int = 0  #: column of the buffer that holds the first column
 
 
 class MapLayers(NamedTuple):
     """What `from_grid_map` found, in torchelev's convention."""
 
-    layers: dict[str, NDArray[np.float32]]  # name -> (H, W): i grows with +x, j with +y
-    center: NDArray[np.float64]  # (3,) [m]
-    resolution: float  # [m]
+    layers: dict[str, NDArray[np.float32]]  #: name -> (H, W): i grows with +x, j with +y
+    center: NDArray[np.float64]  #: (3,) [m]
+    resolution: float  #: [m]
 
 
 def to_grid_map(

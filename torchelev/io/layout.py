@@ -24,10 +24,10 @@ BIN_HINT = "say which with --bin-layout (float32x5: nuScenes)"
 class FileLayout:
     """The layout of a recording's files; None: as told from the files, or refused where they contradict it."""
 
-    bin: str | None = None  # of `.bin`: float32 or float64, x, and numbers per point; None: float32x4, as KITTI
-    quaternions: Literal["xyzw", "wxyz"] | None = None  # of pose files with 8 columns; None: xyzw, as TUM
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None  # of their times; None: s, or of times since 1970 any
-    pcd_frame: Literal["sensor", "viewpoint"] | None = None  # of `.pcd`: sensor, or that in which VIEWPOINT is
+    bin: str | None = None  #: of `.bin`: float32 or float64, x, and numbers per point; None: float32x4, as KITTI
+    quaternions: Literal["xyzw", "wxyz"] | None = None  #: of pose files with 8 columns; None: xyzw, as TUM
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None  #: of their times; None: s, or of times since 1970 any
+    pcd_frame: Literal["sensor", "viewpoint"] | None = None  #: of `.pcd`: sensor, or that in which VIEWPOINT is
 
     def __post_init__(self) -> None:
         if self.bin is not None:
@@ -37,8 +37,8 @@ class FileLayout:
 class BinLayout(NamedTuple):
     """Numbers of a `.bin`, x y z first."""
 
-    dtype: str
-    columns: int
+    dtype: str  #: NumPy's name of a value's type, such as "<f4"
+    columns: int  #: values of each point
 
     @property
     def num_bytes(self) -> int:

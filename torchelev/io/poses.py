@@ -22,8 +22,8 @@ TRANSFORM = "give 12 numbers (the upper 3x4 of T_base_sensor, row by row) or a f
 class Poses(NamedTuple):
     """Poses of a sensor in the map frame and, where the file has them, their times."""
 
-    T_map_sensor: NDArray[np.float64]  # (T, 4, 4), translation in [m]
-    times: NDArray[np.float64] | None  # (T,) [s]
+    T_map_sensor: NDArray[np.float64]  #: (T, 4, 4), translation in [m]
+    times: NDArray[np.float64] | None  #: (T,) [s]
 
 
 def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:

@@ -24,10 +24,10 @@ CLOCK_ROUNDING = 1e-6  # [s] by which readings of a clock may come early
 class Published(NamedTuple):
     """Layers as they were at `stamp`, for the caller to keep: nothing writes to them later."""
 
-    layers: dict[str, NDArray]  # name -> (B, H, W), NaN where unknown
-    center: NDArray  # (B, 3) [m], map frame
-    resolution: float  # [m]
-    stamp: float  # [s] the `now` of the offer
+    layers: dict[str, NDArray]  #: name -> (B, H, W), NaN where unknown
+    center: NDArray  #: (B, 3) [m], map frame
+    resolution: float  #: [m]
+    stamp: float  #: [s] the `now` of the offer
 
 
 class Publisher:

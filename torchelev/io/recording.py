@@ -27,10 +27,10 @@ TIME_TOLERANCE = 0.02  # [s] between a scan named by its time and its pose, as T
 class Frame(NamedTuple):
     """One scan of a recording."""
 
-    points: NDArray[np.float32]  # (N, 3) [m], sensor frame; NaN where the sensor saw nothing
-    T_map_sensor: NDArray[np.float64]  # (4, 4)
-    dt: float  # [s] since the scan before, 0 for the first
-    name: str  # file name, for messages
+    points: NDArray[np.float32]  #: (N, 3) [m], sensor frame; NaN where the sensor saw nothing
+    T_map_sensor: NDArray[np.float64]  #: (4, 4)
+    dt: float  #: [s] since the scan before, 0 for the first
+    name: str  #: file name, for messages
 
 
 class Recording(Sequence[Frame]):

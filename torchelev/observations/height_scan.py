@@ -49,20 +49,20 @@ class HeightScan:
     Raises ValueError for settings out of range.
     """
 
-    pattern: Points = field(repr=False)  # (P, 2) [m]
-    alignment: str = "yaw"
-    mode: str = "bilinear"
-    nominal_height: float = 0.0  # [m] of z over the ground; elsewhere called the offset
-    clip: float | None = None  # [m] values lie within +-clip before they are scaled
-    scale: float = 1.0
-    fill: str | float = "ground"
-    original: str | float = "base"  # what fill="original" stands for: another rule, or a number
-    standing_height: float | None = None  # [m] of z over flat ground, where the map knows none; None: nominal_height
-    inpaint_rings: int = 5  # cells that "inpaint" reaches into what is unknown
-    noise: float = 0.0  # [m] half the width of the uniform noise that a call may ask for
-    noise_after_clip: bool = False
-    num_feet: int = 0  # patterns around feet; 0: one around the base
-    reach: float = 0.0  # [m] how far from the base a foot may be
+    pattern: Points = field(repr=False)  #: (P, 2) [m]
+    alignment: str = "yaw"  #: how the pattern turns with the robot: "yaw", "base" or "world"
+    mode: str = "bilinear"  #: "bilinear" or "nearest" reading of the map
+    nominal_height: float = 0.0  #: [m] of z over the ground; elsewhere called the offset
+    clip: float | None = None  #: [m] values lie within +-clip before they are scaled
+    scale: float = 1.0  #: factor on the values, last of all
+    fill: str | float = "ground"  #: what unknown cells read: a rule's name, or a number [m]
+    original: str | float = "base"  #: what fill="original" stands for: another rule, or a number
+    standing_height: float | None = None  #: [m] of z over flat ground, where the map knows none; None: nominal_height
+    inpaint_rings: int = 5  #: cells that "inpaint" reaches into what is unknown
+    noise: float = 0.0  #: [m] half the width of the uniform noise that a call may ask for
+    noise_after_clip: bool = False  #: add noise after clipping, as some simulators do, not before
+    num_feet: int = 0  #: patterns around feet; 0: one around the base
+    reach: float = 0.0  #: [m] how far from the base a foot may be
     _pattern: Pattern = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -36,15 +36,15 @@ class MapImage:
     Raises ValueError for settings out of range.
     """
 
-    length_x: float = 1.6  # [m]
-    length_y: float = 1.6  # [m]
-    resolution: float = 0.05  # [m]
-    offset: tuple[float, float] = (0.0, 0.0)  # [m] the image's middle, x and y from the base
-    layers: tuple[str, ...] = ("elevation", "validity", "upper_bound", "traversability")
-    alignment: str = "yaw"  # as of HeightScan
-    mode: str = "bilinear"
-    nominal_height: float = 0.0  # [m] of the base over flat ground
-    shape: tuple[int, int, int] = field(init=False)  # C, H, W
+    length_x: float = 1.6  #: [m]
+    length_y: float = 1.6  #: [m]
+    resolution: float = 0.05  #: [m]
+    offset: tuple[float, float] = (0.0, 0.0)  #: [m] the image's middle, x and y from the base
+    layers: tuple[str, ...] = ("elevation", "validity", "upper_bound", "traversability")  #: channels, in this order
+    alignment: str = "yaw"  #: as of HeightScan
+    mode: str = "bilinear"  #: "bilinear" or "nearest" reading of the map
+    nominal_height: float = 0.0  #: [m] of the base over flat ground
+    shape: tuple[int, int, int] = field(init=False)  #: C, H, W
     _pattern: Pattern = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -96,10 +96,11 @@ def grid_coordinates(
 class Pattern:
     """Points that move with a robot. Their constants lie on the device of the map, from the first call there on."""
 
-    points: Points
-    alignment: str = "yaw"
-    reach: float = 0.0  # [m] how far from the base the patterns' middles may lie
-    span: tuple[float, float] = field(init=False)  # [m] how far along x and y points may lie from the base
+    points: Points  #: (M, 2) or (M, 3) [m] in the aligned frame
+    alignment: str = "yaw"  #: how the points turn with the robot
+    reach: float = 0.0  #: [m] how far from the base the patterns' middles may lie
+    span: tuple[float, float] = field(init=False)  #: [m] how far along x and y points may lie from the base
+    #: the points on each device and in each dtype asked for so far
     tensors: dict[tuple[torch.device, torch.dtype], Tensor] = field(
         init=False, default_factory=dict, repr=False, compare=False
     )

@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 class Limits(NamedTuple):
     """What counts as a plane, in metres."""
 
-    slope: float  # [m/m]
-    roughness: float  # [m] root mean square distance from the plane
-    distance: float  # [m] of a single cell
-    curvature: float  # [1/m] of the slope between neighbours
+    slope: float  #: [m/m]
+    roughness: float  #: [m] root mean square distance from the plane
+    distance: float  #: [m] of a single cell
+    curvature: float  #: [1/m] of the slope between neighbours
 
 
 class LocalPlanes(NamedTuple):
     """The plane of the window around each cell, and which neighbours' planes agree."""
 
-    gradient_x: Float[Tensor, "B H W"]  # [m/m]
-    gradient_y: Float[Tensor, "B H W"]
-    planar: Bool[Tensor, "B H W"]
-    joined_x: Bool[Tensor, "B H-1 W"]  # a cell and the next one along x
-    joined_y: Bool[Tensor, "B H W-1"]
+    gradient_x: Float[Tensor, "B H W"]  #: [m/m]
+    gradient_y: Float[Tensor, "B H W"]  #: dz/dy
+    planar: Bool[Tensor, "B H W"]  #: the cell lies on its plane
+    joined_x: Bool[Tensor, "B H-1 W"]  #: a cell and the next one along x
+    joined_y: Bool[Tensor, "B H W-1"]  #: the cell and its neighbour along y lie on one surface
 
 
 def window_radius(window: float, resolution: float) -> int:

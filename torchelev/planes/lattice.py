@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 class Outlines(NamedTuple):
     """Closed polygons in pixels of the lattice, one after the other, with their region on the left."""
 
-    points: Int[ndarray, "P 2"]
-    length: Int[ndarray, "C"]  # points of each polygon
-    area: Int[ndarray, "C"]  # [pixels^2] twice the area; negative where it is a hole
-    label: Int[ndarray, "C"]
+    points: Int[ndarray, "P 2"]  #: corners of all outlines, one after the other, in cells
+    length: Int[ndarray, "C"]  #: points of each polygon
+    area: Int[ndarray, "C"]  #: [pixels^2] twice the area; negative where it is a hole
+    label: Int[ndarray, "C"]  #: region of each outline
 
 
 def _open(cells: Bool[ndarray, "H W"], along_x: Bool[ndarray, "H-1 W"], along_y: Bool[ndarray, "H W-1"]) -> ndarray:

@@ -27,17 +27,16 @@ class Region:
     a cell apart. They may touch themselves in a corner where two cells do.
     """
 
-    label: int  # of its cells in `Planes.labels`
-    normal: Float[ndarray, "3"]  # unit, up
-    point: Float[ndarray, "3"]  # on the plane, above the cells' mean x and y
-    boundary: Float[ndarray, "K 3"] = field(repr=False)
-    holes: list[Float[ndarray, "_ 3"]] = field(repr=False)
-    inset: list[Float[ndarray, "_ 3"]] = field(
-        repr=False
-    )  # what is left of the region a margin away from its border and holes
-    inset_holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  # what to leave out of the inset
-    area: float  # [m^2] of its cells, projected onto x and y
-    roughness: float  # [m] root mean square distance of its cells from the plane
+    label: int  #: of its cells in `Planes.labels`
+    normal: Float[ndarray, "3"]  #: unit, up
+    point: Float[ndarray, "3"]  #: on the plane, above the cells' mean x and y
+    boundary: Float[ndarray, "K 3"] = field(repr=False)  #: [m] outer polygon, counter-clockwise, map frame
+    holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  #: [m] polygons inside the boundary, clockwise
+    #: what is left of the region a margin away from its border and holes
+    inset: list[Float[ndarray, "_ 3"]] = field(repr=False)
+    inset_holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  #: what to leave out of the inset
+    area: float  #: [m^2] of its cells, projected onto x and y
+    roughness: float  #: [m] root mean square distance of its cells from the plane
 
     @property
     def bounding_box(self) -> tuple[Float[ndarray, "2"], Float[ndarray, "2"]]:
@@ -73,17 +72,17 @@ class Region:
 class Foothold(NamedTuple):
     """Where a foot can stand."""
 
-    point: Float[ndarray, "3"]  # [m] map frame, on the region's plane, in its inset
-    region: Region
-    distance: float  # [m] from the query, in x and y
+    point: Float[ndarray, "3"]  #: [m] map frame, on the region's plane, in its inset
+    region: Region  #: the region that carries it
+    distance: float  #: [m] from the query, in x and y
 
 
 @dataclass(frozen=True, eq=False)
 class Planes:
     """The planar regions of one map."""
 
-    labels: Int[ndarray, "H W"]  # int32, -1: none
-    regions: tuple[Region, ...] = field(repr=False)  # regions[k] has label k
+    labels: Int[ndarray, "H W"]  #: int32, -1: none
+    regions: tuple[Region, ...] = field(repr=False)  #: regions[k] has label k
 
     def nearest_foothold(self, xy: Any) -> Foothold | None:
         """Return the point of the regions' insets that is nearest to (x, y) [m] in x and y; None if there is no inset.

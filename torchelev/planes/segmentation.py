@@ -30,13 +30,13 @@ HIGHEST = 1e5  # [m] heights beyond count as unknown
 class PlaneConfig:
     """What counts as a planar region."""
 
-    window: float = 0.2  # [m] the side of the square whose cells make a cell's local plane; 3 cells at least
-    max_inclination: float = 0.6  # [rad] of local planes and of regions
-    max_roughness: float = 0.01  # [m] root mean square distance of the cells from their plane, more than the noise
-    max_distance: float = 0.025  # [m] of any cell from its region's plane
-    max_curvature: float = 2.0  # [1/m] change of slope between neighbouring cells of a region, where it begins
-    min_area: float = 0.04  # [m^2] projected onto x and y
-    margin: float = 0.03  # [m] that the inset keeps from the region's border
+    window: float = 0.2  #: [m] the side of the square whose cells make a cell's local plane; 3 cells at least
+    max_inclination: float = 0.6  #: [rad] of local planes and of regions
+    max_roughness: float = 0.01  #: [m] root mean square distance of the cells from their plane, more than the noise
+    max_distance: float = 0.025  #: [m] of any cell from its region's plane
+    max_curvature: float = 2.0  #: [1/m] change of slope between neighbouring cells of a region, where it begins
+    min_area: float = 0.04  #: [m^2] projected onto x and y
+    margin: float = 0.03  #: [m] that the inset keeps from the region's border
 
     def __post_init__(self) -> None:
         for name in ("window", "max_roughness", "max_distance", "max_curvature"):
@@ -59,20 +59,20 @@ class PlaneConfig:
 class HostMap(NamedTuple):
     """One map and its local planes on the host, as of `LocalPlanes`."""
 
-    known: Bool[ndarray, "H W"]
-    height: Float[ndarray, "H W"]  # [m]
-    gradient_x: Float[ndarray, "H W"]
-    gradient_y: Float[ndarray, "H W"]
-    planar: Bool[ndarray, "H W"]
-    joined_x: Bool[ndarray, "H-1 W"]
-    joined_y: Bool[ndarray, "H W-1"]
+    known: Bool[ndarray, "H W"]  #: the cell has a height
+    height: Float[ndarray, "H W"]  #: [m]
+    gradient_x: Float[ndarray, "H W"]  #: dz/dx
+    gradient_y: Float[ndarray, "H W"]  #: dz/dy
+    planar: Bool[ndarray, "H W"]  #: the cell lies on its local plane
+    joined_x: Bool[ndarray, "H-1 W"]  #: the cell and its neighbour along x lie on one surface
+    joined_y: Bool[ndarray, "H W-1"]  #: the cell and its neighbour along y lie on one surface
 
 
 class GridFrame(NamedTuple):
     """Where the cells of one map lie."""
 
-    resolution: float  # [m]
-    corner: Float[ndarray, "2"]  # [m] the lowest x and y of the map
+    resolution: float  #: [m]
+    corner: Float[ndarray, "2"]  #: [m] the lowest x and y of the map
 
     def xy(self, cell: ndarray) -> Float[ndarray, "... 2"]:
         """Return x and y [m] of places given in cells from the corner."""

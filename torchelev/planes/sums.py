@@ -18,16 +18,16 @@ class Surface(NamedTuple):
     So no neighbour of a cell lies on the other side of the map, and no run of cells goes on in the next row.
     """
 
-    shape: tuple[int, int]  # H, W
-    known: Bool[ndarray, "P"]
-    x: Float[ndarray, "P"]  # [m] from the map's middle
-    y: Float[ndarray, "P"]
-    z: Float[ndarray, "P"]  # [m] from the map's mean; 0 where unknown
-    gradient_x: Float[ndarray, "P"]  # [m/m] of the window's plane
-    gradient_y: Float[ndarray, "P"]
-    before: Float[ndarray, "5 P"]  # running sums of z, y z, z z and the gradients
-    resolution: float  # [m]
-    radius: int  # [cells] of the windows
+    shape: tuple[int, int]  #: H, W
+    known: Bool[ndarray, "P"]  #: the cell has a height
+    x: Float[ndarray, "P"]  #: [m] from the map's middle
+    y: Float[ndarray, "P"]  #: [m] of the cell's centre
+    z: Float[ndarray, "P"]  #: [m] from the map's mean; 0 where unknown
+    gradient_x: Float[ndarray, "P"]  #: [m/m] of the window's plane
+    gradient_y: Float[ndarray, "P"]  #: dz/dy
+    before: Float[ndarray, "5 P"]  #: running sums of z, y z, z z and the gradients
+    resolution: float  #: [m]
+    radius: int  #: [cells] of the windows
 
     @property
     def weight(self) -> float:
@@ -69,9 +69,9 @@ def running_sums(values: Sequence[Float[ndarray, "P"]], W: int) -> Float[ndarray
 class Runs(NamedTuple):
     """Neighbouring cells of a row that have the same region."""
 
-    start: Int[ndarray, "R"]
-    end: Int[ndarray, "R"]  # the cell after the last
-    region: Int[ndarray, "R"]
+    start: Int[ndarray, "R"]  #: first cell of each run
+    end: Int[ndarray, "R"]  #: the cell after the last
+    region: Int[ndarray, "R"]  #: region of each run
 
 
 def find_runs(labels: Int[ndarray, "P"]) -> Runs:
@@ -105,14 +105,14 @@ def _run_sums(before: Float[ndarray, "M P"], runs: Runs) -> Float[ndarray, "M R"
 class RegionPlanes(NamedTuple):
     """The planes z = z0 + g_x (x - x0) + g_y (y - y0) of K regions, each (K,) float64."""
 
-    number: ndarray  # of cells
-    x0: ndarray  # [m] the cells' mean
-    y0: ndarray
-    z0: ndarray
-    gradient_x: ndarray  # [m/m]
-    gradient_y: ndarray
-    roughness: ndarray  # [m] root mean square distance of the cells
-    extent: ndarray  # [m^2] mean square distance of the cells from their mean, in x and y
+    number: ndarray  #: of cells
+    x0: ndarray  #: [m] the cells' mean
+    y0: ndarray  #: [m] of the centroid
+    z0: ndarray  #: [m] of the centroid
+    gradient_x: ndarray  #: [m/m]
+    gradient_y: ndarray  #: dz/dy
+    roughness: ndarray  #: [m] root mean square distance of the cells
+    extent: ndarray  #: [m^2] mean square distance of the cells from their mean, in x and y
 
     def at(self, label: ndarray) -> RegionPlanes:
         """Return some of the planes."""

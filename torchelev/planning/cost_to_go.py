@@ -127,9 +127,9 @@ def _carry(source: tuple[Tensor, ...], target: tuple[Tensor, ...], straight: Ten
 class Descent(NamedTuple):
     """The cells that a way passes."""
 
-    cells: Int[Tensor, "B K 2"]  # the last is repeated
-    length: Float[Tensor, "B"]  # [m]
-    reached: Bool[Tensor, "B"]  # it ends where the cost to go is 0
+    cells: Int[Tensor, "B K 2"]  #: the last is repeated
+    length: Float[Tensor, "B"]  #: [m]
+    reached: Bool[Tensor, "B"]  #: it ends where the cost to go is 0
 
 
 def descend(

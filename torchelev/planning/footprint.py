@@ -33,12 +33,12 @@ class FootprintConfig:
     over it: for that, give polygons of where the body's centre may be instead of the body's own.
     """
 
-    layer: str = "traversability"  # 0 to 1, the better
-    min_traversability: float = 0.5  # mean over the known cells, at least
-    unsafe_traversability: float = 0.3  # a cell below it is unsafe
-    max_unsafe: float = 0.05  # share of unsafe cells, at most
-    max_unknown: float = 0.2  # share of cells that are unknown or outside of the window, at most
-    max_extent: float = 1.5  # [m] of a polygon along x and y, at most: the cost grows with its square
+    layer: str = "traversability"  #: 0 to 1, the better
+    min_traversability: float = 0.5  #: mean over the known cells, at least
+    unsafe_traversability: float = 0.3  #: a cell below it is unsafe
+    max_unsafe: float = 0.05  #: share of unsafe cells, at most
+    max_unknown: float = 0.2  #: share of cells that are unknown or outside of the window, at most
+    max_extent: float = 1.5  #: [m] of a polygon along x and y, at most: the cost grows with its square
 
     def __post_init__(self) -> None:
         for name in ("min_traversability", "unsafe_traversability", "max_unsafe", "max_unknown"):
@@ -56,10 +56,10 @@ class FootprintConfig:
 class FootprintCheck(NamedTuple):
     """What is known of P footprints on each of B maps. Means and shares are 0 to 1."""
 
-    safe: Bool[Tensor, "B P"]
-    traversability: Float[Tensor, "B P"]  # mean over the known cells, 0 where none is
-    unknown: Float[Tensor, "B P"]  # share of cells that are unknown or outside of the window, and not `assumed`
-    unsafe: Float[Tensor, "B P"]  # share of cells that are known to be unsafe
+    safe: Bool[Tensor, "B P"]  #: nothing known, or required to be known, forbids the footprint
+    traversability: Float[Tensor, "B P"]  #: mean over the known cells, 0 where none is
+    unknown: Float[Tensor, "B P"]  #: share of cells that are unknown or outside of the window, and not `assumed`
+    unsafe: Float[Tensor, "B P"]  #: share of cells that are known to be unsafe
 
 
 class _Ground(NamedTuple):

@@ -24,10 +24,10 @@ ROUNDING = 1e-3  # [cells] by which a step may be too long
 class PathCheck(NamedTuple):
     """What is known of a path of T poses on each of B maps, at M = (T - 1) * samples + 1 places along it."""
 
-    safe: Bool[Tensor, "B"]
-    first_unsafe: Int[Tensor, "B"]  # number of the first pose that cannot be reached safely; T: there is none
-    poses: Float[Tensor, "B M 3"]  # x, y [m], map frame, and yaw [rad]; every `samples`-th is one of those given
-    footprints: FootprintCheck  # (B, M), at these places
+    safe: Bool[Tensor, "B"]  #: every footprint along the path is safe
+    first_unsafe: Int[Tensor, "B"]  #: number of the first pose that cannot be reached safely; T: there is none
+    poses: Float[Tensor, "B M 3"]  #: x, y [m], map frame, and yaw [rad]; every `samples`-th is one of those given
+    footprints: FootprintCheck  #: (B, M), at these places
 
 
 def check_path(

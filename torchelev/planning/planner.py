@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 class Path(NamedTuple):
     """A path of at most K cells on each of B maps."""
 
-    xy: Float[Tensor, "B K 2"]  # [m] map frame, from the start on; the last waypoint is repeated
-    cost: Float[Tensor, "B"]  # [m] of easy ground that cost as much; inf if there is no way
-    length: Float[Tensor, "B"]  # [m]
-    reached: Bool[Tensor, "B"]  # it ends at the goal
-    count: Int[Tensor, "B"]  # type: ignore[assignment]  # waypoints before the repeats; 0 if the start is outside
-    reason: Int[Tensor, "B"]  # why it is not reached: a `Reason`; `explain` puts it into words
+    xy: Float[Tensor, "B K 2"]  #: [m] map frame, from the start on; the last waypoint is repeated
+    cost: Float[Tensor, "B"]  #: [m] of easy ground that cost as much; inf if there is no way
+    length: Float[Tensor, "B"]  #: [m]
+    reached: Bool[Tensor, "B"]  #: it ends at the goal
+    count: Int[Tensor, "B"]  #: type: ignore[assignment]  # waypoints before the repeats; 0 if the start is outside
+    reason: Int[Tensor, "B"]  #: why it is not reached: a `Reason`; `explain` puts it into words
 
     def poses(self, chord: float = 0.4) -> Float[Tensor, "B K 3"]:
         """Return x, y [m] and yaw [rad] of each waypoint, as `check_path` takes them.

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 class PolygonCells(NamedTuple):
     """The cells of P polygons for each of B maps, on a square patch of S x S cells around each polygon."""
 
-    first: Int[Tensor, "B P 2"]  # the patch's cell [0, 0], in cells from where the polygons are counted
-    inside: Bool[Tensor, "B P S S"]  # the cell belongs to the polygon
+    first: Int[Tensor, "B P 2"]  #: the patch's cell [0, 0], in cells from where the polygons are counted
+    inside: Bool[Tensor, "B P S S"]  #: the cell belongs to the polygon
 
 
 class Edges(NamedTuple):
     """The edges of polygons, each from its end of smaller x: so the same whichever way the polygon runs."""
 
-    x0: Float[Tensor, "B P V 1"]
-    y0: Float[Tensor, "B P V 1"]
-    x1: Float[Tensor, "B P V 1"]
-    y1: Float[Tensor, "B P V 1"]
+    x0: Float[Tensor, "B P V 1"]  #: [m] of each edge's start
+    y0: Float[Tensor, "B P V 1"]  #: [m] of each edge's start
+    x1: Float[Tensor, "B P V 1"]  #: [m] of each edge's end
+    y1: Float[Tensor, "B P V 1"]  #: [m] of each edge's end
 
 
 def polygon_cells(uv: Float[Tensor, "B P V 2"], size: int) -> PolygonCells:

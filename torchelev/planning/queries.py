@@ -23,17 +23,17 @@ FARTHEST = 2.0**30  # [cells] from the map frame's origin
 class HeightProfile(NamedTuple):
     """What P points along each of M lines read, the ends included."""
 
-    values: Float[Tensor, "B M P"]  # 0 where not valid
-    valid: Bool[Tensor, "B M P"]
-    distance: Float[Tensor, "B M P"]  # [m] from the line's start, in the plane
+    values: Float[Tensor, "B M P"]  #: 0 where not valid
+    valid: Bool[Tensor, "B M P"]  #: the height is known
+    distance: Float[Tensor, "B M P"]  #: [m] from the line's start, in the plane
 
 
 class Submap(NamedTuple):
     """h x w cells of each map, on the map's own lattice. Index [i, j]: i grows with +x, j with +y."""
 
-    layers: dict[str, Float[Tensor, "B h w"]]  # by name, NaN where unknown or outside of the map
-    center: Float[Tensor, "B 2"]  # [m] of these cells, map frame, float64
-    resolution: float  # [m]
+    layers: dict[str, Float[Tensor, "B h w"]]  #: by name, NaN where unknown or outside of the map
+    center: Float[Tensor, "B 2"]  #: [m] of these cells, map frame, float64
+    resolution: float  #: [m]
 
 
 def height_profile(

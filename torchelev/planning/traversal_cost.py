@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 class TraversalCostConfig:
     """What makes ground impassable, and what the rest costs. The weights are added to 1 for each metre."""
 
-    min_traversability: float = 0.3  # known ground rated below it is impassable
-    weight_traversability: float = 4.0  # of ground rated 0
-    weight_confidence: float = 1.0  # of ground whose rating is worth nothing, or that is not known
-    cross_unknown: bool = True  # False: whatever is not known is impassable
-    max_inclination: float = 0.5  # [rad] of the upper bound; steeper, what is not known is taken for a drop
-    inclination_distance: float = 0.3  # [m] over which the inclination is taken: half of what the feet span
-    weight_inclination: float = 1.0  # of unknown ground at max_inclination
-    inflation_radius: float = 0.0  # [m] by which what is impassable grows; 0 for ratings that count the robot's size
-    stand_radius: float = 0.4  # [m] around a path's start the robot stands, if no `standing` footprint is given
+    min_traversability: float = 0.3  #: known ground rated below it is impassable
+    weight_traversability: float = 4.0  #: of ground rated 0
+    weight_confidence: float = 1.0  #: of ground whose rating is worth nothing, or that is not known
+    cross_unknown: bool = True  #: False: whatever is not known is impassable
+    max_inclination: float = 0.5  #: [rad] of the upper bound; steeper, what is not known is taken for a drop
+    inclination_distance: float = 0.3  #: [m] over which the inclination is taken: half of what the feet span
+    weight_inclination: float = 1.0  #: of unknown ground at max_inclination
+    inflation_radius: float = 0.0  #: [m] by which what is impassable grows; 0 for ratings that count the robot's size
+    stand_radius: float = 0.4  #: [m] around a path's start the robot stands, if no `standing` footprint is given
 
     def __post_init__(self) -> None:
         whole = isinstance(self.cross_unknown, bool)

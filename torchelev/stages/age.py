@@ -12,7 +12,7 @@ from torchelev.state import MapState, Measurement
 class AgingConfig:
     """How fast an estimate loses certainty while it is not measured."""
 
-    variance_rate: float = 1e-7  # [m^2/s] sigma_t^2 per second: 1 cm after 17 minutes
+    variance_rate: float = 1e-7  #: [m^2/s] sigma_t^2 per second: 1 cm after 17 minutes
 
     def __post_init__(self) -> None:
         rate = self.variance_rate

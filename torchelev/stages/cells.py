@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class PointCells(NamedTuple):
     """Which cell each point falls into. Points outside point to some cell, so mask what is summed by `inside`."""
 
-    slot: Int[Tensor, "B M"]
-    inside: Bool[Tensor, "B M"]
-    num_cells: int
+    slot: Int[Tensor, "B M"]  #: flat cell number of each point
+    inside: Bool[Tensor, "B M"]  #: the point lies in the window and measures the ground
+    num_cells: int  #: C = H * W
 
     def sums(self, *columns: Float[Tensor, "B M"]) -> tuple[Float[Tensor, "B C"], ...]:
         """Sum columns of the points' values per cell; they must be zero outside."""

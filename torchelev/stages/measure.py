@@ -23,30 +23,31 @@ if TYPE_CHECKING:
 class ExclusionConfig:
     """The ramp of the paper's Fig. 3: points above it are overhangs, not ground."""
 
-    slope: float = 0.3  # tan(theta_a)
-    distance: float = 1.0  # [m] b: horizontal distance at which the ramp starts to rise
-    offset: float = 0.2  # [m] c: height above the sensor before b
-    height: float = 1.0  # [m] d: height above the sensor that is never exceeded
+    slope: float = 0.3  #: tan(theta_a)
+    distance: float = 1.0  #: [m] b: horizontal distance at which the ramp starts to rise
+    offset: float = 0.2  #: [m] c: height above the sensor before b
+    height: float = 1.0  #: [m] d: height above the sensor that is never exceeded
 
 
 @dataclass(frozen=True, kw_only=True)
 class BodyConfig:
     """A box in the base frame that holds the robot; points inside are the robot's own."""
 
-    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  # [m]
-    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  # [m]
+    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  #: [m]
+    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  #: [m]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorConfig:
     """Noise model and gates of the points."""
 
-    noise_factor: float = 1e-4  # alpha_d: sigma_p^2 = alpha_d * d^2 + noise_floor; 1 % of the distance
-    noise_floor: float = 2.5e-5  # [m^2] (5 mm)^2
-    min_distance: float = 0.1  # [m]
-    max_distance: float = 50.0  # [m]
+    noise_factor: float = 1e-4  #: alpha_d: sigma_p^2 = alpha_d * d^2 + noise_floor; 1 % of the distance
+    noise_floor: float = 2.5e-5  #: [m^2] (5 mm)^2
+    min_distance: float = 0.1  #: [m]
+    max_distance: float = 50.0  #: [m]
+    #: ramp above which points are overhangs; None: every point counts
     exclusion: ExclusionConfig | None = ExclusionConfig()
-    body: BodyConfig | None = None
+    body: BodyConfig | None = None  #: box around the robot whose points are ignored; None: none are
 
     def __post_init__(self) -> None:
         require(self.noise_factor >= 0, "sensor.noise_factor", "must not be negative", self.noise_factor, "give 1e-4")

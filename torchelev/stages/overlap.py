@@ -25,10 +25,10 @@ STANCE = 0.5  # [m] half the size of the ground that a robot stands on
 class OverlapConfig:
     """What is near, what is another floor, and how high robots are."""
 
-    radius: float = 3.0  # [m] horizontal distance from the base
-    height: float = 1.5  # [m] difference from the robot's height
-    base_height: float = 0.6  # [m] the robot's height is its base's, but no higher than this above its ground
-    max_base_height: float = 2.5  # [m] ground farther below the base is not what the robot stands on
+    radius: float = 3.0  #: [m] horizontal distance from the base
+    height: float = 1.5  #: [m] difference from the robot's height
+    base_height: float = 0.6  #: [m] the robot's height is its base's, but no higher than this above its ground
+    max_base_height: float = 2.5  #: [m] ground farther below the base is not what the robot stands on
 
     def __post_init__(self) -> None:
         require(self.radius > 0, "overlap.radius", "must be positive", self.radius, "give metres, or overlap=None")
@@ -42,8 +42,8 @@ class OverlapConfig:
 class Floor(NamedTuple):
     """The heights around the robot that belong to its own floor [m], from the base's height."""
 
-    lower: Float[Tensor, "B 1 1"]
-    upper: Float[Tensor, "B 1 1"]
+    lower: Float[Tensor, "B 1 1"]  #: lowest height of the floor
+    upper: Float[Tensor, "B 1 1"]  #: highest height of the floor
 
 
 def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: OverlapConfig | None) -> MapState:

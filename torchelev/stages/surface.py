@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class SurfaceConfig:
     """How far the plane of a normal reaches."""
 
-    radius: int = 1  # [cells] 1: the 3 x 3 neighbours
+    radius: int = 1  #: [cells] 1: the 3 x 3 neighbours
 
     def __post_init__(self) -> None:
         require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
@@ -33,9 +33,9 @@ class SurfaceConfig:
 class Ground(NamedTuple):
     """The known heights, with a rim around the map that windows may reach into; nothing is known there."""
 
-    known: Float[Tensor, "B H+2*rim W+2*rim"]  # 1 or 0
-    height: Float[Tensor, "B H+2*rim W+2*rim"]  # [m] from the map's mean; 0 where unknown
-    rim: int  # [cells]
+    known: Float[Tensor, "B H+2*rim W+2*rim"]  #: 1 or 0
+    height: Float[Tensor, "B H+2*rim W+2*rim"]  #: [m] from the map's mean; 0 where unknown
+    rim: int  #: [cells]
 
 
 def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], rim: int) -> Ground:
@@ -55,11 +55,11 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
 class Plane(NamedTuple):
     """Least-squares plane through the known cells of a window, for every cell."""
 
-    spans: Bool[Tensor, "B H W"]  # the known cells span a plane; elsewhere gradient and residual tell nothing
+    spans: Bool[Tensor, "B H W"]  #: the known cells span a plane; elsewhere gradient and residual tell nothing
 
-    gradient_x: Float[Tensor, "B H W"]
-    gradient_y: Float[Tensor, "B H W"]
-    residual: Float[Tensor, "B H W"]  # [m^2] mean squared distance in z
+    gradient_x: Float[Tensor, "B H W"]  #: dz/dx
+    gradient_y: Float[Tensor, "B H W"]  #: dz/dy
+    residual: Float[Tensor, "B H W"]  #: [m^2] mean squared distance in z
 
 
 def less(value: Tensor, x: Tensor, y: Tensor) -> Tensor:

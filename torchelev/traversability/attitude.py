@@ -35,19 +35,19 @@ class Attitude(NamedTuple):
     0 where the ground that each depends on is not completed: under the feet for slope and step, else under all.
     """
 
-    slope: Float[Tensor, "B H W"]  # squared gradient of the body; this, step and belly are squashed
-    step: Float[Tensor, "B H W"]  # highest step between neighbouring feet
-    belly: Float[Tensor, "B H W"]  # height of the highest ground under the body over the feet, by the clearance
-    stands: Float[Tensor, "B H W"]  # near 1 where none of these is above the limit, near 0 where one is
-    complete: Float[Tensor, "B H W"]  # 1 or 0: feet and body are over completed ground
+    slope: Float[Tensor, "B H W"]  #: squared gradient of the body; this, step and belly are squashed
+    step: Float[Tensor, "B H W"]  #: highest step between neighbouring feet
+    belly: Float[Tensor, "B H W"]  #: height of the highest ground under the body over the feet, by the clearance
+    stands: Float[Tensor, "B H W"]  #: near 1 where none of these is above the limit, near 0 where one is
+    complete: Float[Tensor, "B H W"]  #: 1 or 0: feet and body are over completed ground
 
 
 class Footing(NamedTuple):
     """Where feet may stand, and what lies between them. Feet: (B, H + 2 foot, W + 2 foot)."""
 
-    height: Tensor  # [m] of feet
-    steepness: Tensor  # [m per cell] of the ground under feet
-    highest: Tensor  # [m] highest of 3 x 3 cells; far below all ground where it is not completed
+    height: Tensor  #: [m] of feet
+    steepness: Tensor  #: [m per cell] of the ground under feet
+    highest: Tensor  #: [m] highest of 3 x 3 cells; far below all ground where it is not completed
 
 
 def attitudes(

@@ -70,13 +70,13 @@ def widened_maximum(values: Tensor, steps: Sequence[int]) -> Tensor:
 class Surface(NamedTuple):
     """The ground around every cell and the cells of the margin, unknown ones completed. Heights from the map's mean."""
 
-    height: Float[Tensor, "B h w"]  # [m]
-    known: Float[Tensor, "B h w"]  # 1 or 0
-    shares: list[Tensor]  # (B, h, w) of known cells in each window
-    means: list[Tensor]  # (B, h, w) [m] of each window, blended with the next where it knows little
-    hidden: Float[Tensor, "B h w"]  # [m] of the upper bound below what completes the ground
-    bounded: Float[Tensor, "B h w"]  # 1 or 0, of unknown cells
-    variance: Float[Tensor, "B h w"]  # [m^2] mean of the known ones of 3 x 3 cells
+    height: Float[Tensor, "B h w"]  #: [m]
+    known: Float[Tensor, "B h w"]  #: 1 or 0
+    shares: list[Tensor]  #: (B, h, w) of known cells in each window
+    means: list[Tensor]  #: (B, h, w) [m] of each window, blended with the next where it knows little
+    hidden: Float[Tensor, "B h w"]  #: [m] of the upper bound below what completes the ground
+    bounded: Float[Tensor, "B h w"]  #: 1 or 0, of unknown cells
+    variance: Float[Tensor, "B h w"]  #: [m^2] mean of the known ones of 3 x 3 cells
 
 
 def complete(
@@ -127,11 +127,11 @@ def _windows(layers: Tensor, scales: Scales) -> tuple[list[Tensor], list[Tensor]
 class Extremes(NamedTuple):
     """Of the windows around every cell that feet may stand on, and of the body's window around every cell."""
 
-    near: tuple[Tensor, Tensor]  # (B, h, w) [m] highest and lowest of 3 x 3 cells
-    far: tuple[Tensor, Tensor]  # (B, h, w) [m] of a foot's reach
-    complete: Float[Tensor, "B h w"]  # 1 or 0: all of a foot's reach is completed ground
-    body: Float[Tensor, "B h' w'"]  # [m] highest of half the body's width
-    body_complete: Float[Tensor, "B h' w'"]  # 1 or 0
+    near: tuple[Tensor, Tensor]  #: (B, h, w) [m] highest and lowest of 3 x 3 cells
+    far: tuple[Tensor, Tensor]  #: (B, h, w) [m] of a foot's reach
+    complete: Float[Tensor, "B h w"]  #: 1 or 0: all of a foot's reach is completed ground
+    body: Float[Tensor, "B h' w'"]  #: [m] highest of half the body's width
+    body_complete: Float[Tensor, "B h' w'"]  #: 1 or 0
 
 
 def extremes(ground: Surface, scales: Scales) -> Extremes:

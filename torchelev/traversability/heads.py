@@ -29,10 +29,10 @@ __all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "Traversabili
 class TraversabilityConfig:
     """Critical values of the analytic head: at each of them traversability is zero."""
 
-    radius: float = 0.1  # [m] of the window that a foot or wheel needs
-    critical_slope: float = 0.7  # [rad]
-    critical_step: float = 0.2  # [m]
-    critical_roughness: float = 0.05  # [m] standard deviation around the local plane
+    radius: float = 0.1  #: [m] of the window that a foot or wheel needs
+    critical_slope: float = 0.7  #: [rad]
+    critical_step: float = 0.2  #: [m]
+    critical_roughness: float = 0.05  #: [m] standard deviation around the local plane
 
     # From which rating on cells measure the height drift; measured by `training.traversability.drift_gate`.
     drift_gate: ClassVar[float] = 0.5
@@ -51,8 +51,9 @@ class TraversabilityConfig:
 class LearnedTraversabilityConfig:
     """The trained head: the robot that it rates the ground for, and a file of weights if not those of torchelev."""
 
+    #: size and abilities of the robot that the ground is rated for
     robot: RobotConfig = field(default_factory=RobotConfig)
-    weights: str | Path | None = None  # of what `TraversabilityNet.save` wrote
+    weights: str | Path | None = None  #: of what `TraversabilityNet.save` wrote
 
     drift_gate: ClassVar[float] = 0.2  # as of the analytic head
 

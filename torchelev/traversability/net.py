@@ -38,8 +38,8 @@ PRETRAINED = Path(__file__).parent / "weights" / "traversability.pt"
 class Rating(NamedTuple):
     """What the head says of every cell."""
 
-    traversability: Float[Tensor, "B H W"]  # 0 to 1, the share of headings at which the robot stands there
-    confidence: Float[Tensor, "B H W"]  # 0 to 1, the probability that "traversability >= 0.5" is right
+    traversability: Float[Tensor, "B H W"]  #: 0 to 1, the share of headings at which the robot stands there
+    confidence: Float[Tensor, "B H W"]  #: 0 to 1, the probability that "traversability >= 0.5" is right
 
 
 def _biased(bias: Tensor, weight: Tensor, values: list[float]) -> Tensor:

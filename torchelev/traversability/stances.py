@@ -15,18 +15,18 @@ Cells = tuple[int, int]  # along x and y; of places, from the cell under the bod
 class Way(NamedTuple):
     """From foot to foot, in cells from the first: 3 x 3 cells around each place and the feet leave none out."""
 
-    end: Cells
-    places: tuple[Cells, ...]  # between the feet, evenly
-    spacing: float  # at most
+    end: Cells  #: the other foot
+    places: tuple[Cells, ...]  #: between the feet, evenly
+    spacing: float  #: at most
 
 
 class Stance(NamedTuple):
     """A heading of the body over a cell, in cells."""
 
-    feet: tuple[Cells, ...]  # front left, front right, hind left, hind right
-    spine: tuple[Cells, ...]  # centres of squares under the body: the middle, the front, the hind one
-    length: float  # between front and hind feet
-    width: float
+    feet: tuple[Cells, ...]  #: front left, front right, hind left, hind right
+    spine: tuple[Cells, ...]  #: centres of squares under the body: the middle, the front, the hind one
+    length: float  #: between front and hind feet
+    width: float  #: between left and right feet
 
     @property
     def diagonal(self) -> bool:
@@ -78,8 +78,8 @@ def stances(robot: RobotConfig, resolution: float) -> tuple[Stance, ...]:
 class Scales(NamedTuple):
     """Windows, how they grow, and how far they are needed, in cells."""
 
-    steps: tuple[tuple[int, ...], ...]  # of each window over the one before
-    stances: tuple[Stance, ...]
+    steps: tuple[tuple[int, ...], ...]  #: of each window over the one before
+    stances: tuple[Stance, ...]  #: one for each heading
 
     @property
     def foot(self) -> int:

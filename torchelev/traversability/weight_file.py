@@ -28,18 +28,18 @@ CONFIG = {"cell_channels", "stance_channels", "ranges"}
 class Weights(NamedTuple):
     """The head's parameters: C channels of each cell, D with those of its surroundings, S of each stance."""
 
-    cell: Float[Tensor, "C F"]  # of the features of a cell
-    cell_bias: Float[Tensor, "C"]
-    cell_condition: Float[Tensor, "C N"]  # of the robot's ratios
-    foot: Float[Tensor, "S D"]  # of a cell with a foot on it
-    center: Float[Tensor, "S D"]  # of the cell under the body's centre
-    attitude: Float[Tensor, "S 3"]  # of its slope, step and belly
-    stance_bias: Float[Tensor, "S"]
-    stance_condition: Float[Tensor, "S N"]
-    mixed: Float[Tensor, "C S+2"]  # of the means over headings, the last two of `stands` and `complete`
-    mixed_bias: Float[Tensor, "C"]
-    answer: Float[Tensor, "2 C"]
-    answer_bias: Float[Tensor, "2"]
+    cell: Float[Tensor, "C F"]  #: of the features of a cell
+    cell_bias: Float[Tensor, "C"]  #: added to it
+    cell_condition: Float[Tensor, "C N"]  #: of the robot's ratios
+    foot: Float[Tensor, "S D"]  #: of a cell with a foot on it
+    center: Float[Tensor, "S D"]  #: of the cell under the body's centre
+    attitude: Float[Tensor, "S 3"]  #: of its slope, step and belly
+    stance_bias: Float[Tensor, "S"]  #: added to them
+    stance_condition: Float[Tensor, "S N"]  #: of the robot's ratios
+    mixed: Float[Tensor, "C S+2"]  #: of the means over headings, the last two of `stands` and `complete`
+    mixed_bias: Float[Tensor, "C"]  #: added to it
+    answer: Float[Tensor, "2 C"]  #: of the mixed channels, for both answers
+    answer_bias: Float[Tensor, "2"]  #: added to it
 
     def detached(self) -> Weights:
         """Return the weights without gradient."""

@@ -34,12 +34,12 @@ class Panel:
     None follow the values, less the outermost 1 % at either end, so that one stray cell does not bleach the picture.
     """
 
-    title: str
-    values: NDArray
-    unit: str = ""
-    cmap: str = "viridis"
-    vmin: float | None = None
-    vmax: float | None = None
+    title: str  #: above the panel
+    values: NDArray  #: (H, W), NaN where unknown
+    unit: str = ""  #: beside the colour bar
+    cmap: str = "viridis"  #: Matplotlib's name of the colours
+    vmin: float | None = None  #: value of the lowest colour; None: the lowest value
+    vmax: float | None = None  #: value of the highest colour; None: the highest value
 
 
 def save_layers(

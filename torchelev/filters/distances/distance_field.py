@@ -26,10 +26,10 @@ BLOCK = 2**16  # cells of the grid
 class FieldConfig:
     """How far around the ground a signed distance field reaches."""
 
-    below: float = 0.2  # [m] from the lowest known cell down to the lowest level
-    height: float = 1.6  # [m] from the lowest level to the highest
-    spacing: float | None = None  # [m] of the levels; None: the map's resolution
-    max_distance: float = 0.5  # [m] farther points of the grid hold this distance
+    below: float = 0.2  #: [m] from the lowest known cell down to the lowest level
+    height: float = 1.6  #: [m] from the lowest level to the highest
+    spacing: float | None = None  #: [m] of the levels; None: the map's resolution
+    max_distance: float = 0.5  #: [m] farther points of the grid hold this distance
 
     def __post_init__(self) -> None:
         require_positive(height=self.height, max_distance=self.max_distance)
@@ -41,9 +41,9 @@ class FieldConfig:
 class FieldSample(NamedTuple):
     """What a field holds at points; 0 where not valid."""
 
-    distance: Float[Tensor, "B M"]  # [m] positive above the ground
-    gradient: Float[Tensor, "B M 3"]  # of the distance; 1 long but for interpolation, points away from the ground
-    valid: Bool[Tensor, "B M"]
+    distance: Float[Tensor, "B M"]  #: [m] positive above the ground
+    gradient: Float[Tensor, "B M 3"]  #: of the distance; 1 long but for interpolation, points away from the ground
+    valid: Bool[Tensor, "B M"]  #: most of the columns around it are known
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +64,12 @@ class SignedDistanceField:
     What grid_map_sdf (Fankhauser & Hutter 2016) and Grandia et al. 2022 keep for planners, in a batch.
     """
 
-    values: Float[Tensor, "B K H W"]  # [m]
-    known: Bool[Tensor, "B H W"]
-    floor: Float[Tensor, "B"]  # [m] height of the lowest level, map frame
-    center: Float[Tensor, "B 2"]  # [m] of the window, map frame
-    resolution: float
-    spacing: float
+    values: Float[Tensor, "B K H W"]  #: [m]
+    known: Bool[Tensor, "B H W"]  #: the column has a known height
+    floor: Float[Tensor, "B"]  #: [m] height of the lowest level, map frame
+    center: Float[Tensor, "B 2"]  #: [m] of the window, map frame
+    resolution: float  #: [m] of the cells
+    spacing: float  #: [m] between the levels
 
     @classmethod
     def from_layer(

@@ -23,10 +23,10 @@ SAFETY = 4.0  # how much larger the error may be than a cycle's estimate of it
 class Level(NamedTuple):
     """The equations of one grid, (B, H, W) each."""
 
-    ahead: Tensor  # weight of the edge to the next cell along H; 0 at the end
-    beside: Tensor  # weight of the edge to the next cell along W; 0 at the end
-    sink: Tensor  # weight of the edges to known cells
-    share: Tensor  # 1 / the sum of all of a cell's edges; 0 where there is no equation
+    ahead: Tensor  #: weight of the edge to the next cell along H; 0 at the end
+    beside: Tensor  #: weight of the edge to the next cell along W; 0 at the end
+    sink: Tensor  #: weight of the edges to known cells
+    share: Tensor  #: 1 / the sum of all of a cell's edges; 0 where there is no equation
 
 
 def finish(ahead: Tensor, beside: Tensor, sink: Tensor) -> Level:

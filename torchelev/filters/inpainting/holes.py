@@ -47,11 +47,11 @@ def compressed(parent: Tensor) -> Tensor:
 class Cells(NamedTuple):
     """The unknown cells of all maps, which have a rim of one cell each and lie one behind the other."""
 
-    unknown: Tensor  # (B * (H + 2) * (W + 2),) bool; the rim is not
-    known: Tensor  # the same of known cells; the rim is not
-    place: Tensor  # (M,) where the cells lie in these; places that are not unknown do no harm
-    number: Tensor  # which of the M lies at each place that is unknown
-    around: list[int]  # how far on each of the eight neighbours lies, in increasing order
+    unknown: Tensor  #: (B * (H + 2) * (W + 2),) bool; the rim is not
+    known: Tensor  #: the same of known cells; the rim is not
+    place: Tensor  #: (M,) where the cells lie in these; places that are not unknown do no harm
+    number: Tensor  #: which of the M lies at each place that is unknown
+    around: list[int]  #: how far on each of the eight neighbours lies, in increasing order
 
 
 def cells_of(known: Tensor) -> Cells:

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 class Cloud(NamedTuple):
     """What a sensor gives at one instant, for each environment."""
 
-    points: Float[Tensor, "B M 3"]  # [m] sensor frame, NaN where nothing came back
-    T_map_sensor: Float[Tensor, "B 4 4"] | None  # where they were taken, or are accepted to have been
+    points: Float[Tensor, "B M 3"]  #: [m] sensor frame, NaN where nothing came back
+    T_map_sensor: Float[Tensor, "B 4 4"] | None  #: where they were taken, or are accepted to have been
 
 
 class Delay(nn.Module):

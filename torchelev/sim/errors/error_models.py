@@ -31,23 +31,23 @@ class SensorErrorConfig:
     They act in the order of the fields: what the ray meets, noise, quantisation, losses, latency.
     """
 
-    flying: Range = 0.0  # share, of the points at an edge, that come to lie between its two sides
-    flying_step: Range = 0.1  # [m] an edge is where the ranges of two neighbours differ by more
-    too_short: Range = 0.0  # share of the points that come back from 0.1 to 1 times their range, as from dust
-    too_long: Range = 0.0  # share of the points that come back from 1.05 to 2 times their range, as by a mirror
-    range_constant: Range = 0.0  # [m] 1 sigma along the ray = range_constant + range_quadratic * d^2
-    range_quadratic: Range = 0.0  # [1/m]
-    range_step: Range = 0.0  # [m] ranges are multiples of it
-    point_noise: Range = 0.0  # [m] 1 sigma of x, y and z each
-    outliers: Range = 0.0  # share of the points that have `outlier_noise` instead
-    outlier_noise: Range = 0.0  # [m] 1 sigma of x, y and z each
-    disparity_step: Range = 0.0  # [1/m] 1/x are multiples of it, as in stereo: x has steps of disparity_step * x^2 [m]
-    dropout: Range = 0.0  # share of the points that are lost
-    missed_frames: Range = 0.0  # share of the clouds that are lost as a whole
-    latency: Range = 0  # [calls] whole: the cloud that comes out went in so many calls ago
-    clock_offset: bool = False  # late clouds are taken for current ones, instead of coming with their own pose
-    mounting_position: Range = 0.0  # [m] 1 sigma of the sensor's place along each axis, drawn at reset
-    mounting_rotation_deg: Range = 0.0  # [deg] 1 sigma of its turn about each axis, drawn at reset
+    flying: Range = 0.0  #: share, of the points at an edge, that come to lie between its two sides
+    flying_step: Range = 0.1  #: [m] an edge is where the ranges of two neighbours differ by more
+    too_short: Range = 0.0  #: share of the points that come back from 0.1 to 1 times their range, as from dust
+    too_long: Range = 0.0  #: share of the points that come back from 1.05 to 2 times their range, as by a mirror
+    range_constant: Range = 0.0  #: [m] 1 sigma along the ray = range_constant + range_quadratic * d^2
+    range_quadratic: Range = 0.0  #: [1/m]
+    range_step: Range = 0.0  #: [m] ranges are multiples of it
+    point_noise: Range = 0.0  #: [m] 1 sigma of x, y and z each
+    outliers: Range = 0.0  #: share of the points that have `outlier_noise` instead
+    outlier_noise: Range = 0.0  #: [m] 1 sigma of x, y and z each
+    disparity_step: Range = 0.0  #: [1/m] 1/x are multiples of it, as in stereo: x has steps of disparity_step * x^2 [m]
+    dropout: Range = 0.0  #: share of the points that are lost
+    missed_frames: Range = 0.0  #: share of the clouds that are lost as a whole
+    latency: Range = 0  #: [calls] whole: the cloud that comes out went in so many calls ago
+    clock_offset: bool = False  #: late clouds are taken for current ones, instead of coming with their own pose
+    mounting_position: Range = 0.0  #: [m] 1 sigma of the sensor's place along each axis, drawn at reset
+    mounting_rotation_deg: Range = 0.0  #: [deg] 1 sigma of its turn about each axis, drawn at reset
 
     def __post_init__(self) -> None:
         for field in fields(self):

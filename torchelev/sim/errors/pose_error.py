@@ -28,19 +28,19 @@ class PoseErrorConfig:
     bias; it feels noise, and drift since the ground was seen.
     """
 
-    bias_x: Range = 0.0  # [m] constant error, may be negative; that of x and y along the map's axes
-    bias_y: Range = 0.0  # [m]
-    bias_z: Range = 0.0  # [m]
-    bias_yaw_deg: Range = 0.0  # [deg] error of the heading from the start on
-    noise_xy: Range = 0.0  # [m] 1 sigma, x and y each
-    noise_z: Range = 0.0  # [m] 1 sigma
-    noise_yaw_deg: Range = 0.0  # [deg] 1 sigma
-    drift_xy_time: Range = 0.0  # [m / sqrt(s)] x and y each
-    drift_z_time: Range = 0.0  # [m / sqrt(s)]
-    drift_yaw_time_deg: Range = 0.0  # [deg / sqrt(s)]
-    drift_xy_distance: Range = 0.0  # [m / sqrt(m)] x and y each: feet that slip
-    drift_z_distance: Range = 0.0  # [m / sqrt(m)]
-    drift_yaw_distance_deg: Range = 0.0  # [deg / sqrt(m)]
+    bias_x: Range = 0.0  #: [m] constant error, may be negative; that of x and y along the map's axes
+    bias_y: Range = 0.0  #: [m]
+    bias_z: Range = 0.0  #: [m]
+    bias_yaw_deg: Range = 0.0  #: [deg] error of the heading from the start on
+    noise_xy: Range = 0.0  #: [m] 1 sigma, x and y each
+    noise_z: Range = 0.0  #: [m] 1 sigma
+    noise_yaw_deg: Range = 0.0  #: [deg] 1 sigma
+    drift_xy_time: Range = 0.0  #: [m / sqrt(s)] x and y each
+    drift_z_time: Range = 0.0  #: [m / sqrt(s)]
+    drift_yaw_time_deg: Range = 0.0  #: [deg / sqrt(s)]
+    drift_xy_distance: Range = 0.0  #: [m / sqrt(m)] x and y each: feet that slip
+    drift_z_distance: Range = 0.0  #: [m / sqrt(m)]
+    drift_yaw_distance_deg: Range = 0.0  #: [deg / sqrt(m)]
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -16,7 +16,9 @@ from torchelev.sim.errors.pose_error import PoseErrorConfig
 class ErrorPreset(NamedTuple):
     """What `SensorErrors` and `PoseErrors` take: a config each, or kinds of episodes as pairs (share, config)."""
 
+    #: of all episodes, or kinds of episodes as pairs (share, config)
     sensor: SensorErrorConfig | Sequence[tuple[float, SensorErrorConfig]] = SensorErrorConfig()
+    #: of all episodes, or kinds of episodes as pairs (share, config)
     pose: PoseErrorConfig | Sequence[tuple[float, PoseErrorConfig]] = PoseErrorConfig()
 
 

@@ -21,12 +21,12 @@ DEEP = -20.0  # [m] where boxes that stand on the ground begin
 class Box:
     """An axis-aligned box, from `low` to `high` [m, map frame] at t = 0, there while since <= t < until [s]."""
 
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m/s]
-    since: float = -math.inf  # [s]
-    until: float = math.inf  # [s]
-    grounded: bool = False  # its top is ground: part of the scene's height
+    low: tuple[float, float, float]  #: [m] lowest corner
+    high: tuple[float, float, float]  #: [m] highest corner
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: [m/s]
+    since: float = -math.inf  #: [s]
+    until: float = math.inf  #: [s]
+    grounded: bool = False  #: its top is ground: part of the scene's height
 
     def corners(self, t: float) -> tuple[list[float], list[float]]:
         """Return the low and the high corner [m] at time t [s]."""
@@ -56,10 +56,10 @@ class Scene:
     `terrain(x, y) -> z` must be continuous, with a slope of `steepness` or less everywhere: ray casting relies on it.
     """
 
-    name: str = "flat"
-    terrain: Callable[[Tensor, Tensor], Tensor] = _plane
-    steepness: float = 0.0  # upper bound of |gradient|
-    boxes: tuple[Box, ...] = field(default_factory=tuple)
+    name: str = "flat"  #: for tables and pictures
+    terrain: Callable[[Tensor, Tensor], Tensor] = _plane  #: height [m] of the ground at x, y [m]
+    steepness: float = 0.0  #: upper bound of |gradient|
+    boxes: tuple[Box, ...] = field(default_factory=tuple)  #: what stands on the ground
 
     def height(self, x: Tensor, y: Tensor, t: float = 0.0, below: float = math.inf) -> Tensor:
         """Return the ground's height [m], any shape: the higher of terrain and boxes that stand on the ground.

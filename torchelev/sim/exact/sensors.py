@@ -43,12 +43,12 @@ def points_seen(directions: Tensor, scene: Scene, T_map_sensor: Tensor, max_rang
 class DepthCamera(_Sensor):
     """A pinhole camera. Sensor frame: x forward, y left, z up. Rays row by row from the upper left pixel."""
 
-    width: int = 160
-    height: int = 120
-    fov_x_deg: float = 86.0
-    fov_y_deg: float = 58.0
-    max_range: float = 8.0  # [m]
-    pinhole: tuple[float, float, float, float] | None = None  # fx, fy, cx, cy [pixels], in place of the fields of view
+    width: int = 160  #: pixels of a row
+    height: int = 120  #: pixels of a column
+    fov_x_deg: float = 86.0  #: [deg] field of view from side to side
+    fov_y_deg: float = 58.0  #: [deg] field of view from top to bottom
+    max_range: float = 8.0  #: [m]
+    pinhole: tuple[float, float, float, float] | None = None  #: fx, fy, cx, cy [pixels], in place of the fields of view
 
     @classmethod
     def from_intrinsics(
@@ -94,11 +94,11 @@ class DepthCamera(_Sensor):
 class Lidar(_Sensor):
     """A turning lidar. Sensor frame: x forward, y left, z up. Rays ring by ring from the lowest."""
 
-    rings: int = 32
-    azimuths: int = 1024
-    fov_low_deg: float = -55.0
-    fov_high_deg: float = 15.0
-    max_range: float = 20.0  # [m]
+    rings: int = 32  #: beams, one above the other
+    azimuths: int = 1024  #: measurements of each beam in one turn
+    fov_low_deg: float = -55.0  #: [deg] elevation of the lowest beam
+    fov_high_deg: float = 15.0  #: [deg] elevation of the highest beam
+    max_range: float = 20.0  #: [m]
 
     @cached_property
     def directions(self) -> Tensor:
@@ -120,11 +120,11 @@ class NonRepetitiveLidar:
     no petal comes twice. Real sensors' speeds, channels and timing differ. Sensor frame: x forward, y left, z up.
     """
 
-    rays: int = 1024  # in a step
-    fov_deg: float = 70.0  # full cone; chosen
-    turns: float = 4.618  # of theta in a step; chosen
-    k: float = 3.618033988749895  # half petals in a turn; chosen, 2 + the golden ratio
-    max_range: float = 20.0  # [m]
+    rays: int = 1024  #: in a step
+    fov_deg: float = 70.0  #: full cone; chosen
+    turns: float = 4.618  #: of theta in a step; chosen
+    k: float = 3.618033988749895  #: half petals in a turn; chosen, 2 + the golden ratio
+    max_range: float = 20.0  #: [m]
 
     def directions(self, step: int | Tensor) -> Tensor:
         """Return the unit vectors of a step, float64: (rays, 3), or (B, rays, 3) for steps (B,), on their device."""

@@ -20,9 +20,9 @@ Point = tuple[float, float]
 class Trajectory(NamedTuple):
     """A robot's path, T instants."""
 
-    T_map_base: Tensor  # (T, 4, 4) float64
-    T_map_sensor: Tensor  # (T, 4, 4) float64
-    times: Tensor  # (T,) [s]
+    T_map_base: Tensor  #: (T, 4, 4) float64
+    T_map_sensor: Tensor  #: (T, 4, 4) float64
+    times: Tensor  #: (T,) [s]
 
     def then(self, other: Trajectory) -> Trajectory:
         """Join two paths; the second starts one step after the first ends."""

@@ -24,8 +24,8 @@ MAX_RAYS = 2**18  # cast at once, which bounds the memory that it takes
 class Boxes(NamedTuple):
     """K boxes in each environment. Those with a half size of zero or less, or without a finite pose, are not there."""
 
-    T_map_box: Float[Tensor, "B K 4 4"]  # the box's frame lies in its middle
-    half_size: Float[Tensor, "B K 3"]  # [m]
+    T_map_box: Float[Tensor, "B K 4 4"]  #: the box's frame lies in its middle
+    half_size: Float[Tensor, "B K 3"]  #: [m]
 
     def moved(self, T: Float[Tensor, "B 4 4"]) -> Boxes:
         """Return the boxes, given in frame b, in frame a: `T` is T_a_b."""

@@ -30,13 +30,13 @@ HUGE = 1e30
 class Rays(NamedTuple):
     """N rays. x and y are counted in cells, z and the way along the ray in metres."""
 
-    number: Int[Tensor, "N"]  # which of the rays that were asked for
-    tile: Int[Tensor, "N"]
-    along: Float[Tensor, "N"]  # [m] nothing was hit before
-    start: Float[Tensor, "3 N"]
-    step: Float[Tensor, "3 N"]  # per metre along
-    sign: Float[Tensor, "2 N"]  # 1 where x, y grow along the ray, else -1
-    inverse: Float[Tensor, "2 N"]  # [m] along per cell of x, y
+    number: Int[Tensor, "N"]  #: which of the rays that were asked for
+    tile: Int[Tensor, "N"]  #: tile that each ray is cast at
+    along: Float[Tensor, "N"]  #: [m] nothing was hit before
+    start: Float[Tensor, "3 N"]  #: [m] tile frame
+    step: Float[Tensor, "3 N"]  #: per metre along
+    sign: Float[Tensor, "2 N"]  #: 1 where x, y grow along the ray, else -1
+    inverse: Float[Tensor, "2 N"]  #: [m] along per cell of x, y
 
     def keep(self, which: Int[Tensor, "K"]) -> Rays:
         """Return some of the rays."""

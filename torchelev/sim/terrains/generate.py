@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 class Terrain:
     """K tiles. Each has its own frame with the origin at its centre, where a flat start platform lies at z = 0."""
 
-    field: HeightField  # what is walked on and seen: the truth at the samples, bilinear between
-    kind: tuple[str, ...]  # of each tile, by name
-    kinds: tuple[str, ...]  # those that there are
-    kind_ids: Int[Tensor, "K"]  # of each tile, a number in `kinds`
-    difficulty: Float[Tensor, "K"]  # 0 to 1
-    random: Float[Tensor, "K R"]  # each tile's table of chance, 0 to 1
+    field: HeightField  #: what is walked on and seen: the truth at the samples, bilinear between
+    kind: tuple[str, ...]  #: of each tile, by name
+    kinds: tuple[str, ...]  #: those that there are
+    kind_ids: Int[Tensor, "K"]  #: of each tile, a number in `kinds`
+    difficulty: Float[Tensor, "K"]  #: 0 to 1
+    random: Float[Tensor, "K R"]  #: each tile's table of chance, 0 to 1
 
     def truth(self, tile_ids: Int[Tensor, "B"], xy: Float[Tensor, "B M 2"]) -> Float[Tensor, "B M"]:
         """Return the ground's height [m] in closed form at places xy [m] of each environment's tile.
@@ -48,7 +48,7 @@ class Terrain:
 class TerrainGrid(Terrain):
     """Tiles of each kind at each level of difficulty, and the rule by which robots change level: see `terrain_grid`."""
 
-    num_levels: int
+    num_levels: int  #: rows of tiles, from the easiest to the hardest
 
     def tile_ids(self, level: Int[Tensor, "B"], kind: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
         """Return the tiles of levels 0 to num_levels - 1 and kinds, numbers in `kinds`.

@@ -25,13 +25,13 @@ class Bounds(NamedTuple):
     `highest` holds the tiles of one size, row by row, then those of the next.
     """
 
-    highest: Float[Tensor, "T"]  # [m] within the block and the eight around it
-    edge: Float[Tensor, "L 1"]  # [cells] of a block
-    reach: Float[Tensor, "L 1"]  # [cells] from one block ahead to its far side
-    last: Float[Tensor, "2 L 1"]  # number of the last block along x and y
-    row: Float[Tensor, "L 1"]  # blocks along y
-    first: Int[Tensor, "L 1"]  # where tile 0 begins in `highest`
-    size: Int[Tensor, "L 1"]  # blocks in a tile
+    highest: Float[Tensor, "T"]  #: [m] within the block and the eight around it
+    edge: Float[Tensor, "L 1"]  #: [cells] of a block
+    reach: Float[Tensor, "L 1"]  #: [cells] from one block ahead to its far side
+    last: Float[Tensor, "2 L 1"]  #: number of the last block along x and y
+    row: Float[Tensor, "L 1"]  #: blocks along y
+    first: Int[Tensor, "L 1"]  #: where tile 0 begins in `highest`
+    size: Int[Tensor, "L 1"]  #: blocks in a tile
 
 
 class HeightField:

@@ -26,9 +26,9 @@ MIN_CHALLENGERS = 4  # cells of the 3 x 3 window with a challenger, from which o
 class Challenge(NamedTuple):
     """What contradicts the elevations from above, after the scan."""
 
-    height: Float[Tensor, "B C"]  # [m]
-    support: UInt8[Tensor, "B C"]  # points
-    won: Bool[Tensor, "B C"]  # the scan is to found the cell anew
+    height: Float[Tensor, "B C"]  #: [m]
+    support: UInt8[Tensor, "B C"]  #: points
+    won: Bool[Tensor, "B C"]  #: the scan is to found the cell anew
 
 
 def challenge_from_above(prior: Prior, consensus: Consensus, width: int, relief: float, cfg: FusionConfig) -> Challenge:

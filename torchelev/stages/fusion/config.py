@@ -14,13 +14,13 @@ from torchelev.errors import require, require_count
 class EdgeConfig:
     """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
 
-    min_points: int = 6
-    min_share: float = 0.25  # of the cell's points outside the gate around its estimate
-    min_passed: float = 0.1  # of its low points, how many passed the centre for the ground to win over the top
-    min_extreme: int = 2  # points within a standard deviation of the top or bottom, or beyond; fewer are outliers
-    refinements: int = 7  # each halves the distance to the top of a wall's face
-    margin: float = 0.25  # standard deviations below the top that still belong to it
-    min_settled: float = 6.0  # points; support from which a wall's top stands although a scan sees less of its face
+    min_points: int = 6  #: points of a cell from which on it can hold a step
+    min_share: float = 0.25  #: of the cell's points outside the gate around its estimate
+    min_passed: float = 0.1  #: of its low points, how many passed the centre for the ground to win over the top
+    min_extreme: int = 2  #: points within a standard deviation of the top or bottom, or beyond; fewer are outliers
+    refinements: int = 7  #: each halves the distance to the top of a wall's face
+    margin: float = 0.25  #: standard deviations below the top that still belong to it
+    min_settled: float = 6.0  #: points; support from which a wall's top stands although a scan sees less of its face
 
     def __post_init__(self) -> None:
         for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
@@ -36,16 +36,16 @@ class EdgeConfig:
 class FusionConfig:
     """Kalman update and outlier gate."""
 
-    gate: float = 3.0  # Mahalanobis distance beyond which a point is an outlier
-    max_gate_std: float = 0.05  # [m] an uncertain cell's gate grows no wider, or an outlier would slip in
-    relief: float = 0.25  # [cells] standard deviation of height within a cell of rough or sloped ground
-    scan_variance_floor: float = 1e-6  # [m^2] points of one scan share the error of its pose
-    outlier_variance: float = 1e-4  # [m^2] added by a scan that mostly disagrees
-    max_support: float = 60.0  # points; how many must disagree until a settled cell is founded anew
-    min_above: int = 5  # points above a cell, `challenge.py`, that found it anew, however settled it is
-    max_above_per_scan: int = 2  # of those points, how many one scan adds: a single bad scan is no obstacle
-    max_variance: float = 1.0  # [m^2]
-    edges: EdgeConfig | None = EdgeConfig()
+    gate: float = 3.0  #: Mahalanobis distance beyond which a point is an outlier
+    max_gate_std: float = 0.05  #: [m] an uncertain cell's gate grows no wider, or an outlier would slip in
+    relief: float = 0.25  #: [cells] standard deviation of height within a cell of rough or sloped ground
+    scan_variance_floor: float = 1e-6  #: [m^2] points of one scan share the error of its pose
+    outlier_variance: float = 1e-4  #: [m^2] added by a scan that mostly disagrees
+    max_support: float = 60.0  #: points; how many must disagree until a settled cell is founded anew
+    min_above: int = 5  #: points above a cell, `challenge.py`, that found it anew, however settled it is
+    max_above_per_scan: int = 2  #: of those points, how many one scan adds: a single bad scan is no obstacle
+    max_variance: float = 1.0  #: [m^2]
+    edges: EdgeConfig | None = EdgeConfig()  #: walls and steps kept sharp; None: every cell averages its points
 
     def __post_init__(self) -> None:
         fits, hint = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"

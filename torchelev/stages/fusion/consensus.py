@@ -67,14 +67,14 @@ def resolve_contested(
 class Consensus(NamedTuple):
     """What a cell's height is about, before the points that count are chosen. Without a gradient."""
 
-    height: Float[Tensor, "B C"]  # [m]
-    side: Int[Tensor, "B C"]  # of a step: +1 top, -1 ground, 0 no step
-    trusted: Bool[Tensor, "B C"]  # most points agree with the cell's elevation, whose variance then widens the gate
-    number: Float[Tensor, "B C"]  # of the scan's points
-    variance: Float[Tensor, "B C"]  # [m^2] of their mean, 1e12 without any
-    near: Bool[Tensor, "B M"]  # points that agree with the cell's elevation
-    gate_at: Float[Tensor, "B M"]  # [m^2] of the elevation of each point's cell
-    contested: SelectedCells  # cells with points most of which contradict the elevation, or with a challenger
+    height: Float[Tensor, "B C"]  #: [m]
+    side: Int[Tensor, "B C"]  #: of a step: +1 top, -1 ground, 0 no step
+    trusted: Bool[Tensor, "B C"]  #: most points agree with the cell's elevation, whose variance then widens the gate
+    number: Float[Tensor, "B C"]  #: of the scan's points
+    variance: Float[Tensor, "B C"]  #: [m^2] of their mean, 1e12 without any
+    near: Bool[Tensor, "B M"]  #: points that agree with the cell's elevation
+    gate_at: Float[Tensor, "B M"]  #: [m^2] of the elevation of each point's cell
+    contested: SelectedCells  #: cells with points most of which contradict the elevation, or with a challenger
 
 
 def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Consensus:

@@ -22,8 +22,8 @@ NO_HEIGHT = -1e30  # [m] below all heights
 class CellHeights(NamedTuple):
     """The height that the scan and the map show of each cell, (B, C) [m]; NO_HEIGHT where they show none."""
 
-    scan: Float[Tensor, "B C"]  # mean of the points
-    map: Float[Tensor, "B C"]
+    scan: Float[Tensor, "B C"]  #: mean of the points
+    map: Float[Tensor, "B C"]  #: [m] elevation
 
 
 @torch.library.custom_op(

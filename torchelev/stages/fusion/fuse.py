@@ -100,12 +100,12 @@ def on_side(
 class CellMeasurement(NamedTuple):
     """What the scan says of each cell; heights in [m], the others count points."""
 
-    height: Float[Tensor, "B C"]
-    variance: Float[Tensor, "B C"]
-    kept: Float[Tensor, "B C"]  # make up the height
-    votes: Float[Tensor, "B C"]  # speak for the height
-    dissent: Float[Tensor, "B C"]  # speak against it
-    agreeing: Float[Tensor, "B C"]  # speak for the cell's elevation
+    height: Float[Tensor, "B C"]  #: [m]
+    variance: Float[Tensor, "B C"]  #: [m^2]
+    kept: Float[Tensor, "B C"]  #: make up the height
+    votes: Float[Tensor, "B C"]  #: speak for the height
+    dissent: Float[Tensor, "B C"]  #: speak against it
+    agreeing: Float[Tensor, "B C"]  #: speak for the cell's elevation
 
 
 def merge(

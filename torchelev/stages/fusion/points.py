@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 class ScanPoints(NamedTuple):
     """This scan's points, with the cell of each."""
 
-    z: Float[Tensor, "B M"]  # [m]
-    spread: Float[Tensor, "B M"]  # [m^2] variance of z around its cell's height
-    weight: Float[Tensor, "B M"]  # 1 / sigma_p^2, zero where not used
-    used: Bool[Tensor, "B M"]
-    ray: list[Float[Tensor, "B M"]]  # [m] x and y from the sensor to the point
-    passed: Bool[Tensor, "B M"]  # the ray passed over the cell's centre before it hit
-    cells: PointCells
+    z: Float[Tensor, "B M"]  #: [m]
+    spread: Float[Tensor, "B M"]  #: [m^2] variance of z around its cell's height
+    weight: Float[Tensor, "B M"]  #: 1 / sigma_p^2, zero where not used
+    used: Bool[Tensor, "B M"]  #: lies in the window and measures the ground
+    ray: list[Float[Tensor, "B M"]]  #: [m] x and y from the sensor to the point
+    passed: Bool[Tensor, "B M"]  #: the ray passed over the cell's centre before it hit
+    cells: PointCells  #: the cell of each point
 
     def sums(self, *columns: Tensor) -> tuple[Tensor, ...]:
         """Sum numbers, or count what is true, over the points of each cell."""
@@ -40,12 +40,12 @@ class ScanPoints(NamedTuple):
 class Prior(NamedTuple):
     """The cells before the scan, flat."""
 
-    elevation: Float[Tensor, "B C"]
-    variance: Float[Tensor, "B C"]
-    known: Bool[Tensor, "B C"]
-    support: Float[Tensor, "B C"]
-    challenger: Float[Tensor, "B C"]
-    challenger_support: UInt8[Tensor, "B C"]
+    elevation: Float[Tensor, "B C"]  #: [m]
+    variance: Float[Tensor, "B C"]  #: [m^2]
+    known: Bool[Tensor, "B C"]  #: the elevation is known
+    support: Float[Tensor, "B C"]  #: points that agree, less points that disagree
+    challenger: Float[Tensor, "B C"]  #: [m] lowest height that contradicts the elevation from above
+    challenger_support: UInt8[Tensor, "B C"]  #: points that do so, less points that do not
 
 
 def gather_points(m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> ScanPoints:

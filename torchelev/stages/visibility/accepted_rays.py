@@ -33,14 +33,14 @@ NEAR, CLEARANCE = 1.0, 0.05  # [m]
 class Rays(NamedTuple):
     """The rays of one sensor."""
 
-    origin: Float[Tensor, "B 3"]  # [m] counted from the measurement's horizontal origin
-    xy: Float[Tensor, "B N 2"]  # [m] from the sensor to the hit
-    r: Float[Tensor, "B N"]  # [m] horizontal length
-    slope: Float[Tensor, "B N"]  # dz / dr
-    azimuth: Float[Tensor, "B N"]  # in turns
-    noise: Float[Tensor, "B N"]  # [m] standard deviation of its end
-    casts: Bool[Tensor, "B N"]
-    overhang: Bool[Tensor, "B N"]  # the point lies above the exclusion ramp
+    origin: Float[Tensor, "B 3"]  #: [m] counted from the measurement's horizontal origin
+    xy: Float[Tensor, "B N 2"]  #: [m] from the sensor to the hit
+    r: Float[Tensor, "B N"]  #: [m] horizontal length
+    slope: Float[Tensor, "B N"]  #: dz / dr
+    azimuth: Float[Tensor, "B N"]  #: in turns
+    noise: Float[Tensor, "B N"]  #: [m] standard deviation of its end
+    casts: Bool[Tensor, "B N"]  #: clears and bounds cells
+    overhang: Bool[Tensor, "B N"]  #: the point lies above the exclusion ramp
 
 
 def sensor_rays(m: Measurement, s: int) -> Rays:
@@ -89,11 +89,11 @@ def has_credible_end(
 class RayEnds(NamedTuple):
     """Where each ray ends, or where it is half a cell short of leaving the window."""
 
-    slot: Int[Tensor, "B N"]
-    inside: Bool[Tensor, "B N"]  # false if the sensor is outside, too
-    reach: Float[Tensor, "B N"]  # [m] horizontal distance
-    leaves: Bool[Tensor, "B N"]
-    border: Int[Tensor, "B N"]  # place in `ground_at_borders`
+    slot: Int[Tensor, "B N"]  #: flat cell number
+    inside: Bool[Tensor, "B N"]  #: false if the sensor is outside, too
+    reach: Float[Tensor, "B N"]  #: [m] horizontal distance
+    leaves: Bool[Tensor, "B N"]  #: the ray ends outside the window
+    border: Int[Tensor, "B N"]  #: place in `ground_at_borders`
 
 
 def find_ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> RayEnds:

@@ -45,10 +45,10 @@ def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tenso
 class RayOverCell(NamedTuple):
     """The lowest ray of one sensor over each cell."""
 
-    found: Bool[Tensor, "B H W"]
-    height: Float[Tensor, "B H W"]  # [m] over the cell's centre
-    fall: Float[Tensor, "B H W"]  # [m] how far it falls over a cell's length, or rises
-    incidence: Float[Tensor, "B H W"]  # |r . n|
+    found: Bool[Tensor, "B H W"]  #: a ray passes over the cell
+    height: Float[Tensor, "B H W"]  #: [m] over the cell's centre
+    fall: Float[Tensor, "B H W"]  #: [m] how far it falls over a cell's length, or rises
+    incidence: Float[Tensor, "B H W"]  #: |r . n|
 
 
 def look_up(

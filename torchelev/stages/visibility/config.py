@@ -12,11 +12,11 @@ from torchelev.errors import require
 class RaycastConfig:
     """When a ray removes a cell, and which rays are accepted."""
 
-    min_time: float = 1.0  # [s] cells hit within it stay, and contradict rays that pass below them
-    min_incidence: float = 0.1  # alpha_n: |r . n| below it is a grazing ray
-    max_range: float | None = None  # [m] rays count up to here; None: 1.1 half-diagonals of the window
-    min_support: float = 3.0  # points that agree with a cell, or one beside it, for rays that end there to be accepted
-    gate: float = 3.0  # a ray so many standard deviations below ground that is known is a wrong return
+    min_time: float = 1.0  #: [s] cells hit within it stay, and contradict rays that pass below them
+    min_incidence: float = 0.1  #: alpha_n: |r . n| below it is a grazing ray
+    max_range: float | None = None  #: [m] rays count up to here; None: 1.1 half-diagonals of the window
+    min_support: float = 3.0  #: points that agree with a cell, or one beside it, for rays that end there to be accepted
+    gate: float = 3.0  #: a ray so many standard deviations below ground that is known is a wrong return
 
     def __post_init__(self) -> None:
         require(self.min_time >= 0, "raycast.min_time", "must not be negative", self.min_time, "give seconds")

@@ -19,10 +19,10 @@ BREADTH = math.sqrt(2)  # [cells] any ray over a cell passes within half its dia
 class PolarGrid(NamedTuple):
     """Size of the polar table: bins are no longer than a cell, and no wider at any range used."""
 
-    ranges: int
-    azimuths: int
-    bins: float  # how many azimuth bins BREADTH cells cover at a range of one cell
-    widen: tuple[int, ...]  # below which range an entry is the minimum of 2, 4, 8, ... azimuth bins
+    ranges: int  #: bins along a ray, one cell long
+    azimuths: int  #: bins around the sensor
+    bins: float  #: how many azimuth bins BREADTH cells cover at a range of one cell
+    widen: tuple[int, ...]  #: below which range an entry is the minimum of 2, 4, 8, ... azimuth bins
 
     @classmethod
     def of(cls, grid: GridConfig, cfg: RaycastConfig) -> PolarGrid:
