@@ -27,7 +27,8 @@ class Path(NamedTuple):
     cost: Float[Tensor, "B"]  #: [m] of easy ground that cost as much; inf if there is no way
     length: Float[Tensor, "B"]  #: [m]
     reached: Bool[Tensor, "B"]  #: it ends at the goal
-    count: Int[Tensor, "B"]  #: type: ignore[assignment]  # waypoints before the repeats; 0 if the start is outside
+    #: waypoints before the repeats; 0 if the start is outside
+    count: Int[Tensor, "B"]  # type: ignore[assignment]
     reason: Int[Tensor, "B"]  #: why it is not reached: a `Reason`; `explain` puts it into words
 
     def poses(self, chord: float = 0.4) -> Float[Tensor, "B K 3"]:
