@@ -1,5 +1,6 @@
 """torchelev: batched, differentiable elevation mapping in PyTorch, for robots that learn."""
 
+from torchelev.clouds import depth_to_points, voxel_filter
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.filters.chain import FilterConfig
@@ -10,7 +11,7 @@ from torchelev.robot import RobotConfig
 from torchelev.stages.age import AgingConfig
 from torchelev.stages.compensate import DriftConfig
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
-from torchelev.stages.measure import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
+from torchelev.stages.measure import BodyConfig, ExclusionConfig, SensorConfig
 from torchelev.stages.overlap import OverlapConfig
 from torchelev.stages.surface import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig

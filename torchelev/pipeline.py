@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
+from torchelev.ops.masks import count
 from torchelev.stages.age import age
 from torchelev.stages.compensate import compensate
 from torchelev.stages.fusion.fuse import fuse
@@ -14,7 +15,7 @@ from torchelev.stages.overlap import clear_other_floors
 from torchelev.stages.recenter import recenter
 from torchelev.stages.surface import known_ground, normals
 from torchelev.stages.visibility.clean_up import clear_seen_through
-from torchelev.state import MapState, Measurement, count, map_layers, tally
+from torchelev.state import MapState, Measurement, map_layers, tally
 from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all, traversability
 from torchelev.traversability.net import Weights
 

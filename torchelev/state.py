@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import realize
-
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
 
@@ -130,10 +128,3 @@ def map_layers(function: Callable[..., Tensor], *states: MapState) -> MapState:
 def tally(state: MapState, **counts: Tensor) -> MapState:
     """Return the state with these statistics replaced."""
     return state._replace(statistics=state.statistics._replace(**counts))
-
-
-def count(mask: Tensor) -> Tensor:
-    """Count what is true in each environment: (B, ...) bool -> (B,) int64."""
-    # Compiled code counts in 32 bits faster, eager code in 64; no map has more cells or points than 32 bits hold.
-    bits = torch.int32 if torch.compiler.is_compiling() else torch.int64
-    return realize(mask).flatten(1).sum(1, dtype=bits).to(torch.int64)

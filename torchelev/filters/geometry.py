@@ -24,12 +24,16 @@ from torchelev.filters.registry import radius_cells, register
 from torchelev.layers import Layer, normal_component
 from torchelev.ops.storage import as_bytes
 from torchelev.ops.windows import window_moments
-from torchelev.stages.surface import Plane, fit_plane, known_ground, less
+from torchelev.stages.surface import Plane, fit_plane, known_ground
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 TINY = 1e-12  # below it a root counts as zero, where its derivative would be infinite
+
+
+def less(value, x, y):
+    return value - x * y
 
 
 def root(square: Tensor) -> Tensor:

@@ -243,7 +243,7 @@ def _depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
     """Points (H * W, 3) [m] of a depth image in the optical frame: x right, y down, z forward."""
     import torch
 
-    from torchelev.stages.measure import depth_to_points
+    from torchelev.clouds import depth_to_points
 
     depth = read_depth(path, camera.depth_scale)
     check_size(path, camera, depth.shape)

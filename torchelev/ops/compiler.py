@@ -33,10 +33,28 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
     # Inputs are checked before, and torch's `opcheck` vouches in the tests for what operators return; checking the
     # shapes and addresses of all that in every update takes time.
     options |= {name: False for name in ("size_asserts", "alignment_asserts") if hasattr(config, name)}
+    choose_bytes_as_integers(graph)
     cache = torch.compiler.config
     tag = cache.patch(cache_key_tag=f"{cache.cache_key_tag}torchelev {PATCHES}")  # type: ignore[attr-defined]
     with short_kernels(), fast_mask_loads(), tag:
         return compile(graph, inputs, options)
+
+
+def choose_bytes_as_integers(graph: torch.fx.GraphModule) -> None:
+    """Let `torch.where` choose bytes as integers of 32 bits: of bytes alone the compiler makes no vectors."""
+    for node in graph.graph.find_nodes(op="call_function", target=torch.where):
+        result = node.meta.get("example_value")
+        if result is None or result.dtype != torch.uint8:
+            continue
+        with graph.graph.inserting_before(node):
+            mask, *values = node.args
+            values = [
+                graph.graph.call_method("to", (v, torch.int32)) if isinstance(v, torch.fx.Node) else v for v in values
+            ]
+            chosen = graph.graph.call_function(torch.where, (mask, *values))
+            node.replace_all_uses_with(graph.graph.call_method("to", (chosen, torch.uint8)))
+        graph.graph.erase_node(node)
+    graph.recompile()
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
 """Operations that the compiler makes 5 to 30 times slower on a CPU: as custom operators they stay as they are.
 
 It would turn sums per cell into atomic additions, test at every read of a border whether it lies outside, and compute
-every term of a running minimum again for every reader. `moved`, for eager code, reads the shifts on the host.
+every term of a running minimum again for every reader.
 """
 
 from __future__ import annotations
@@ -14,27 +14,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.ops.transforms import with_gradient
-
-
-@torch.library.custom_op(
-    "torchelev::moved", mutates_args=(), schema="(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]"
-)
-def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
-    """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; entering cells are blank."""
-    H, W = layers[0].shape[1:]
-    # Padded where cells enter, and by as many less than nothing where they leave.
-    rims = [(-j, j, -i, i) for i, j in ((max(-H, min(i, H)), max(-W, min(j, W))) for i, j in shift.tolist())]
-    if len(rims) == 1:
-        return [F.pad(layer, rims[0], value=blank) for layer, blank in zip(layers, blanks, strict=True)]
-    return [
-        torch.stack([F.pad(part, rim, value=blank) for part, rim in zip(layer, rims, strict=True)])
-        for layer, blank in zip(layers, blanks, strict=True)
-    ]
-
-
-@moved.register_fake
-def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
-    return [torch.empty_like(layer) for layer in layers]
 
 
 @torch.library.custom_op("torchelev::cell_sums", mutates_args=())

@@ -1,37 +1,78 @@
-"""What the compiler is to store, and how; masks as bytes or bits. Eager code stores every value anyway."""
+"""What compiled code keeps in memory, and how. Uncompiled code stores every value anyway."""
 
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from jaxtyping import Int, Shaped
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def stored(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Make compiled code store what a function returns: a tensor, or nested tuples of tensors.
+
+    The compiler would otherwise compute a value anew for every reader: a sum over a window once per neighbour, a number
+    of the environment once per point. Place it on functions whose result has several readers, or is gathered from.
+    Masks are stored as bytes. What the function returns unchanged of its arguments is left as it is.
+    """
+
+    @functools.wraps(function)
+    def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        result = function(*args, **kwargs)
+        if not torch.compiler.is_compiling():
+            return result
+        given = _tensors(args)
+        new = [value for value in _tensors(result) if not any(value is other for other in given)]
+        return _replaced(result, new, realize_all(*new))
+
+    return run
+
+
+def _tensors(value: Any) -> list[Tensor]:
+    """Return the tensors in nested tuples and lists."""
+    if isinstance(value, Tensor):
+        return [value]
+    if isinstance(value, tuple | list):
+        return [tensor for part in value for tensor in _tensors(part)]
+    return []
+
+
+def _replaced(value: Any, old: list[Tensor], new: list[Tensor]) -> Any:
+    """Return nested tuples and lists with some tensors replaced."""
+    if isinstance(value, Tensor):
+        found = [other for one, other in zip(old, new, strict=True) if one is value]
+        return found[0] if found else value
+    if isinstance(value, tuple | list):
+        parts = [_replaced(part, old, new) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    return value
 
 
 @torch.library.custom_op("torchelev::realize", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
-def _realize(values: list[Tensor]) -> list[Tensor]:
+def _cloned(values: list[Tensor]) -> list[Tensor]:
     return [value.clone() for value in values]
 
 
-@_realize.register_fake
+@_cloned.register_fake
 def _(values: list[Tensor]) -> list[Tensor]:
     return [torch.empty_like(value) for value in values]
 
 
-_realize.register_autograd(lambda ctx, grads: (grads,))
+_cloned.register_autograd(lambda ctx, grads: (grads,))
 
 
 def realize(value: Tensor) -> Tensor:
-    """Make the compiler store the values. It would otherwise compute them anew wherever they are read."""
+    """Make compiled code store a value; see `stored`, which does so for the results of a function."""
     return realize_all(value)[0]
 
 
 def realize_all(*values: Tensor) -> list[Tensor]:
-    """Make the compiler store these values, masks as bytes; eager code does so anyway.
+    """Make compiled code store these values, masks as bytes.
 
     A demand for a memory layout does it at no cost but has no gradient; where one is wanted, the values are copied.
     """
@@ -39,8 +80,8 @@ def realize_all(*values: Tensor) -> list[Tensor]:
         return list(values)
     masks = [value.dtype == torch.bool for value in values]
     plain = [as_bytes(value) if mask else value for value, mask in zip(values, masks, strict=True)]
-    stored = _realize(plain) if torch.is_grad_enabled() else [_in_memory(value) for value in plain]
-    return [as_mask(value) if mask else value for value, mask in zip(stored, masks, strict=True)]
+    kept = _cloned(plain) if torch.is_grad_enabled() else [_in_memory(value) for value in plain]
+    return [as_mask(value) if mask else value for value, mask in zip(kept, masks, strict=True)]
 
 
 def _in_memory(value: Tensor) -> Tensor:
@@ -59,27 +100,9 @@ def as_bytes(mask: Tensor) -> Tensor:
     return mask.to(torch.int32).to(torch.uint8) if torch.compiler.is_compiling() else mask.view(torch.uint8)
 
 
-def as_mask(stored: Tensor) -> Tensor:
-    """Return what `as_bytes` stored. Compiled code compares integers eight times as fast as bytes."""
-    return stored.to(torch.int32) > 0 if torch.compiler.is_compiling() else stored.view(torch.bool)
-
-
-def read(values: Shaped[Tensor, "B K"], index: Int[Tensor, "B I J"]) -> Shaped[Tensor, "B I J"]:
-    """Give each entry the value at its index."""
-    if torch.compiler.is_compiling():  # a flat index it would store, or divide to find row and column
-        environment = torch.arange(len(index), device=index.device, dtype=index.dtype)[:, None, None]
-        return torch.ops.aten._unsafe_index(values, [environment, index])
-    return values.gather(1, index.flatten(1).to(torch.int64)).view_as(index)
-
-
-def as_bits(masks: list[Tensor]) -> Tensor:
-    """Return up to eight masks as the bits of one uint8."""
-    return functools.reduce(torch.add, (mask.to(torch.int32) << k for k, mask in enumerate(masks))).to(torch.uint8)
-
-
-def from_bits(bits: Tensor, number: int) -> list[Tensor]:
-    """Return the masks that `as_bits` packed."""
-    return [(bits.to(torch.int32) & (1 << k)) > 0 for k in range(number)]
+def as_mask(bytes_: Tensor) -> Tensor:
+    """Return the mask that `as_bytes` made bytes of. Compiled code compares integers eight times as fast as bytes."""
+    return bytes_.to(torch.int32) > 0 if torch.compiler.is_compiling() else bytes_.view(torch.bool)
 
 
 @functools.cache

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig, locate
+from torchelev.ops.indexing import read
 from torchelev.ops.operators import cell_sums
-from torchelev.ops.storage import realize, realize_all
+from torchelev.ops.storage import stored
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class PointCells(NamedTuple):
-    """Which cell each point falls into. Points outside point to some cell, so mask what is summed by `inside`."""
+    """The cell of each point. Points outside the window are given some cell: mask what is summed by `inside`."""
 
     slot: Int[Tensor, "B M"]  #: flat cell number of each point
     inside: Bool[Tensor, "B M"]  #: the point lies in the window and measures the ground
@@ -29,27 +30,28 @@ class PointCells(NamedTuple):
 
     def take(self, *layers: Tensor) -> list[Tensor]:
         """Give each point its cell's value of each layer: (B, H, W) or (B, C) -> (B, M)."""
-        return [cells.flatten(1).gather(1, self.slot) for cells in realize_all(*layers)]
+        return [read(layer.flatten(1), self.slot) for layer in layers]
 
 
+@stored
 def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[Tensor, "B 2"]:
     """Return where the measurement's horizontal origin lies, seen from the window's corner [m]."""
     # A cell number fits float32 exactly only as a difference of near ones; far ones are clamped, they are outside.
     cells = (m.anchor - state.corner).clamp(-(2**22), 2**22)
-    return realize(cells.to(m.points.dtype) * grid.resolution)
+    return cells.to(m.points.dtype) * grid.resolution
 
 
+@stored
 def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[Tensor, Tensor]:
     """Return x (B, H, 1) and y (B, 1, W) of the cell centres [m], counted from the measurement's horizontal origin."""
     cells = (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
     x = torch.arange(grid.height, device=cells.device) + cells[:, 0, None]
     y = torch.arange(grid.width, device=cells.device) + cells[:, 1, None]
-    x, y = realize_all(x * grid.resolution, y * grid.resolution)
-    return x[:, :, None], y[:, None, :]
+    return (x * grid.resolution)[:, :, None], (y * grid.resolution)[:, None, :]
 
 
+@stored
 def cells_of(state: MapState, m: Measurement, grid: GridConfig) -> PointCells:
     """Find the cell of each point that measures the ground."""
     slot, inside = locate(m.points[..., 0], m.points[..., 1], lattice_offset(state, m, grid), grid)
-    slot, inside = realize_all(slot.to(torch.int64), inside & m.used)
-    return PointCells(slot, inside, grid.num_cells)
+    return PointCells(slot.to(torch.int64), inside & m.used, grid.num_cells)

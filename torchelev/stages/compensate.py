@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import as_factor, lifted, masked
+from torchelev.ops.masks import NOWHERE, count
 from torchelev.stages.cells import cells_of, center_offsets
-from torchelev.state import MapState, Measurement, count, tally
+from torchelev.state import MapState, Measurement, tally
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,21 +37,22 @@ class DriftConfig:
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Average (B, M) over what the mask keeps; 0 where it keeps nothing."""
-    # In float64: a float32 sum of more than 4096 points the compiler writes in another way, in another graph.
-    total = masked(values, mask).sum(1, dtype=torch.float64)
+    """Average values (B, M) where the mask is true; 0 where it is nowhere."""
+    # In float64: the compiler would put float32 sums of more than 4,096 points into a graph of their own.
+    total = (values * mask).sum(1, dtype=torch.float64)
     return (total / count(mask).clamp(min=1)).to(values.dtype)
 
 
 def compensate(
     state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig | None, min_traversability: float
 ) -> MapState:
-    """Add the mean height error over certain, flat cells to elevation and upper bound (paper, Sec. II-D).
+    """Add the mean height error over flat, certain cells to elevation and upper bound (paper, Sec. II-D).
 
-    e = (1 / n) * sum (p_z - h), h the height at the point of its cell's plane, over points whose cell is known,
-    traversable and certain, with |p_z - h| <= max_error and then within `gate` standard deviations of their mean.
-    Corrected by gain * e where n >= min_points and |e| <= max_drift. Cells are traversable if they are rated
-    at least `min_traversability`. None for `cfg`: no compensation.
+        e = (1 / n) * sum (p_z - h),    h <- h + gain * e
+
+    with h the height of the cell's plane below the point. The sum covers the points whose cell is known, certain and
+    rated at least `min_traversability`, with |p_z - h| <= max_error, and then those within `gate` standard deviations
+    of their mean. No correction if n < min_points or |e| > max_drift, or without `cfg`.
     """
     if cfg is None:
         return state
@@ -62,20 +63,20 @@ def compensate(
     x, y = center_offsets(state, m, grid)
     gx, gy = state.gradient_x, state.gradient_y
     at_origin = state.elevation - gx * x - gy * y
-    # Cells that do not suit get a height that no point is near.
-    ground, gx, gy = cells.take(lifted(at_origin, ~suits), gx, gy)
+    # Unsuitable cells get a height that no point is near.
+    ground, gx, gy = cells.take(at_origin + NOWHERE * ~suits, gx, gy)
     error = pz - (ground + gx * px + gy * py)
     counts = cells.inside & (error.abs() <= cfg.max_error)
     mean = masked_mean(error, counts)
-    # Once more around the mean: the foot of a wall that nobody saw yet stands on ground that looks flat.
+    # Again around the mean: the foot of a wall that was not seen before stands on ground that looks flat.
     counts = counts & ((error - mean[:, None]).square() <= cfg.gate**2 * (m.variance + cfg.relief**2))
     number, mean = count(counts), masked_mean(error, counts)
     applies = (number >= cfg.min_points) & (mean.abs() <= cfg.max_drift)
     correction = torch.where(applies, cfg.gain * mean, 0.0)
     shift = correction[:, None, None]
     state = state._replace(
-        elevation=state.elevation + shift * as_factor(state.validity),
-        challenger=state.challenger + shift.detach() * as_factor(state.challenger_support > 0),
-        upper_bound=state.upper_bound + shift * as_factor(state.bounded),
+        elevation=state.elevation + shift * state.validity,
+        challenger=state.challenger + shift.detach() * (state.challenger_support > 0),
+        upper_bound=state.upper_bound + shift * state.bounded,
     )
     return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import zeroed
-from torchelev.ops.storage import realize_all
+from torchelev.ops.masks import count
+from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
-from torchelev.state import MapState, Measurement, count, tally
+from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -66,12 +66,17 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     slope = torch.where(hit, distance * (cfg.height / cfg.radius), 0.0)
     other = near & state.validity & is_outside(height, floor, slope)
     other_bound = near & state.bounded & is_outside((state.upper_bound - base).detach(), floor, 0.0)
-    challenger_support = zeroed(state.challenger_support, other)
-    validity, bounded, challenger_support = realize_all(
-        state.validity & ~other, state.bounded & ~(other | other_bound), challenger_support
+    return tally(clear(state, other, other_bound), cleared_other_floors=count(other))
+
+
+@stored
+def clear(state: MapState, cells: Bool[Tensor, "B H W"], bounds: Bool[Tensor, "B H W"]) -> MapState:
+    """Forget the heights and bounds of some cells, and the bounds alone of others."""
+    return state._replace(
+        validity=state.validity & ~cells,
+        bounded=state.bounded & ~(cells | bounds),
+        challenger_support=torch.where(cells, 0, state.challenger_support),
     )
-    state = state._replace(validity=validity, bounded=bounded, challenger_support=challenger_support)
-    return tally(state, cleared_other_floors=count(other))
 
 
 def ground_below(

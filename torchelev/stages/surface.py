@@ -10,9 +10,8 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import as_factor, masked, masked_any, where_finite
 from torchelev.ops.operators import padded
-from torchelev.ops.storage import realize
+from torchelev.ops.storage import stored
 from torchelev.ops.windows import window_moments
 from torchelev.state import MapState
 
@@ -40,15 +39,14 @@ class Ground(NamedTuple):
 
 def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H W"], rim: int) -> Ground:
     """Put a rim around the known heights, once for all the windows."""
-    known = as_factor(validity).to(elevation.dtype)
-    number = known.sum((1, 2), keepdim=True).clamp(min=1)
+    heights = torch.where(validity, elevation, 0.0)  # unknown ones may be NaN
+    number = validity.to(elevation.dtype).sum((1, 2), keepdim=True).clamp(min=1)
     # Heights from the map's mean: squares of absolute heights would cost float32 its millimetres.
-    heights = masked_any(elevation, validity)  # what is not known may be NaN
     datum = (heights.sum((1, 2), keepdim=True) / number).detach()
-    # One layer tells both, which is less to store and to read than two.
+    # One layer holds both height and validity, which is less to store and to read than two.
     nowhere = 0.5 * torch.finfo(heights.dtype).max  # differences to it are finite
-    layer = padded(where_finite(validity, heights - datum, nowhere), rim, nowhere)
-    known = as_factor(layer < nowhere).to(layer.dtype)
+    layer = padded(torch.where(validity, heights - datum, nowhere), rim, nowhere)
+    known = (layer < nowhere).to(layer.dtype)
     return Ground(known, layer * known, rim)
 
 
@@ -62,11 +60,6 @@ class Plane(NamedTuple):
     residual: Float[Tensor, "B H W"]  #: [m^2] mean squared distance in z
 
 
-def less(value: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Return value - x * y, in one operation."""
-    return torch.addcmul(value, x, y, value=-1)
-
-
 def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     """Fit z = c + g_x x + g_y y by least squares to the known cells within `radius` cells of each cell.
 
@@ -76,21 +69,21 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     z = ground.height
     moments = window_moments([(ground.known, 2), (z, 1), (z.square(), 0)], ground.rim, radius)
     n, n_v, n_vv, n_u, n_uv, n_uu, s_z, s_vz, s_uz, s_zz = moments
-    share = 1 / n.clamp(min=1)
-    mu, mv, mz = n_u * share, n_v * share, s_z * share
-    uu, vv, uv = less(n_uu * share, mu, mu), less(n_vv * share, mv, mv), less(n_uv * share, mu, mv)
-    uz, vz = less(s_uz * share, mu, mz), less(s_vz * share, mv, mz)
-    det = less(uu * vv, uv, uv)
-    spread = uu + vv
-    regular = det > 1e-4
-    # Both are far above these limits unless they are zero but for rounding.
-    safe_det, safe_spread = det.clamp(min=1e-4), spread.clamp(min=1e-2)
-    gu = where_finite(regular, less(vv * uz, uv, vz) / safe_det, uz / safe_spread)
-    gv = where_finite(regular, less(uu * vz, uv, uz) / safe_det, vz / safe_spread)
-    residual = less(less(less(s_zz * share, mz, mz), gu, uz), gv, vz).clamp(min=0)
+    w = 1 / n.clamp(min=1)
+    mu, mv, mz = n_u * w, n_v * w, s_z * w
+    uu, uv, vv = n_uu * w - mu * mu, n_uv * w - mu * mv, n_vv * w - mv * mv
+    uz, vz, zz = s_uz * w - mu * mz, s_vz * w - mv * mz, s_zz * w - mz * mz
+    det, trace = uu * vv - uv * uv, uu + vv
+    is_regular = det > 1e-4
+    # Both are far above these limits, or zero but for rounding.
+    safe_det, safe_trace = det.clamp(min=1e-4), trace.clamp(min=1e-2)
+    gu = torch.where(is_regular, (vv * uz - uv * vz) / safe_det, uz / safe_trace)
+    gv = torch.where(is_regular, (uu * vz - uv * uz) / safe_det, vz / safe_trace)
+    residual = (zz - gu * uz - gv * vz).clamp(min=0)
     return Plane(spans_plane(uu, uv, vv, radius), gu / resolution, gv / resolution, residual)
 
 
+@stored
 def spans_plane(uu: Tensor, uv: Tensor, vv: Tensor, radius: int) -> Bool[Tensor, "B H W"]:
     """Tell where the known cells of a window spread in two directions, by the covariance of their places [cells^2].
 
@@ -118,9 +111,7 @@ def normals(state: MapState, ground: Ground, grid: GridConfig, cfg: SurfaceConfi
     The unit normal n = (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2) is made when it is read.
     """
     plane = fit_plane(ground, cfg.radius, grid.resolution)
-    has_normal = realize(state.validity & plane.spans)
+    has_normal = state.validity & plane.spans
     return state._replace(
-        gradient_x=masked(plane.gradient_x, has_normal),
-        gradient_y=masked(plane.gradient_y, has_normal),
-        has_normal=has_normal,
+        gradient_x=plane.gradient_x * has_normal, gradient_y=plane.gradient_y * has_normal, has_normal=has_normal
     )

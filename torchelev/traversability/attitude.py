@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import realize
+from torchelev.ops.storage import stored
 from torchelev.ops.windows import shifted
 from torchelev.robot import RobotConfig
 from torchelev.traversability.features import Extremes, Surface, mean_of_three, squashed, taps, widened_mean
@@ -55,9 +55,9 @@ def attitudes(
 ) -> list[Attitude]:
     """Return how the body stands at each heading."""
     height = shifted(ground.height, scales.margin - scales.foot - 1)
-    steepness = realize(_steepness(height).clamp(max=math.tan(robot.max_slope) * resolution))
-    highest = realize(extreme.near[0] - DEPTH * (1 - extreme.complete))
-    footing = Footing(widened_mean(height, (1,)), steepness, highest)
+    footing = Footing(
+        widened_mean(height, (1,)), _steepness(height, math.tan(robot.max_slope) * resolution), _highest_near(extreme)
+    )
     return [_attitude(footing, extreme, stance, scales, robot, resolution) for stance in scales.stances]
 
 
@@ -84,12 +84,19 @@ def _below_one(*squares: Tensor) -> Tensor:
     return 1 / functools.reduce(torch.mul, gates)
 
 
-def _steepness(height: Tensor) -> Tensor:
-    """Return the slope [m per cell] around each cell, which edges beside it are none of.
+@stored
+def _highest_near(extreme: Extremes) -> Tensor:
+    """Return the highest ground [m] of 3 x 3 cells, far below all ground where it is not completed."""
+    return extreme.near[0] - DEPTH * (1 - extreme.complete)
 
-    Along each axis, of rows of three cells, the gentler one of the slopes to both sides, if both rise or both fall.
+
+@stored
+def _steepness(height: Tensor, steepest: float) -> Tensor:
+    """Return the slope [m per cell] around each cell, at most `steepest`; edges beside the cell do not count.
+
+    Along each axis it is the gentler of the slopes to both sides, of rows of three cells, if both rise or both fall.
     """
-    return (_gentler(height, -2) + _gentler(height, -1)).clamp(min=LEVEL**2).sqrt()
+    return (_gentler(height, -2) + _gentler(height, -1)).clamp(min=LEVEL**2).sqrt().clamp(max=steepest)
 
 
 def _gentler(height: Tensor, dim: int) -> Tensor:
@@ -130,14 +137,19 @@ def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> l
             values = values.narrow(dim - 2, rim + low[dim] + place[dim], size)
         return values
 
-    start, end = at(footing.height, scales.foot), at(footing.height, scales.foot, way.end)
+    heights = [at(footing.height, scales.foot), at(footing.height, scales.foot, way.end)]
     between = [at(footing.highest, scales.stood_on, place) for place in way.places]
-    rise = torch.maximum(_rise([start, *between, end]), _rise([end, *between[::-1], start]))
-    explained = torch.minimum(at(footing.steepness, scales.foot), at(footing.steepness, scales.foot, way.end))
+    steepness = torch.minimum(at(footing.steepness, scales.foot), at(footing.steepness, scales.foot, way.end))
     # The highest of 3 x 3 cells lies up to a diagonal farther on.
-    step = realize(rise - explained * (way.spacing + DIAGONAL))
+    step = _unexplained_rise(*heights, between, steepness * (way.spacing + DIAGONAL))
     H, W = (size - 2 * scales.foot for size in footing.height.shape[-2:])
     return [step.narrow(-2, i - low[0], H).narrow(-1, j - low[1], W) for i, j in starts]
+
+
+@stored
+def _unexplained_rise(start: Tensor, end: Tensor, between: list[Tensor], explained: Tensor) -> Tensor:
+    """Return the larger rise [m] of both directions between two feet, less what the slope explains."""
+    return torch.maximum(_rise([start, *between, end]), _rise([end, *between[::-1], start])) - explained
 
 
 def _rise(heights: Sequence[Tensor]) -> Tensor:

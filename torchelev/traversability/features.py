@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.operators import padded
-from torchelev.ops.storage import realize, realize_all
+from torchelev.ops.storage import stored
 from torchelev.ops.windows import shifted
 from torchelev.robot import RobotConfig
 from torchelev.traversability.stances import Scales
@@ -50,17 +50,29 @@ def mean_of_three(values: Tensor, step: int, dim: int) -> Tensor:
 def widened_mean(values: Tensor, steps: Sequence[int]) -> Tensor:
     """Return the mean of 3 x 3 entries a step apart, of that the mean of those the next step apart, and so on."""
     for step in steps:
-        values = realize(mean_of_three(mean_of_three(values, step, -2), step, -1))
+        values = mean_of_nine(values, step)
     return values
+
+
+@stored
+def mean_of_nine(values: Tensor, step: int) -> Tensor:
+    """Return the mean of 3 x 3 entries `step` apart."""
+    return mean_of_three(mean_of_three(values, step, -2), step, -1)
 
 
 def widened_maximum(values: Tensor, steps: Sequence[int]) -> Tensor:
     """Return the highest of 3 x 3 entries a step apart, of that the highest of those the next step apart, and so on."""
     for step in steps:
-        for dim in (-2, -1):
-            before, middle, after = taps(values, step, dim)
-            values = torch.maximum(torch.maximum(before, after), middle)
-        values = realize(values)
+        values = highest_of_nine(values, step)
+    return values
+
+
+@stored
+def highest_of_nine(values: Tensor, step: int) -> Tensor:
+    """Return the highest of 3 x 3 entries `step` apart."""
+    for dim in (-2, -1):
+        before, middle, after = taps(values, step, dim)
+        values = torch.maximum(torch.maximum(before, after), middle)
     return values
 
 
@@ -98,12 +110,25 @@ def complete(
     shares, means, noise = _windows(layers[:3], scales)
     inner = shifted(layers, scales.radii[-1])
     known, height, bound, unseen = inner[0], inner[1], inner[3], inner[4]
+    means = blend(shares, means)
+    hidden, height = fill(height, known, means[0], bound, unseen * (shares[-1] > 0))
+    return Surface(height, known, shares, means, hidden, unseen, noise)
+
+
+@stored
+def blend(shares: list[Tensor], means: list[Tensor]) -> list[Tensor]:
+    """Return each window's mean, blended with that of the next larger one where it knows little."""
+    means = list(means)
     for k in (2, 1, 0):
         means[k] = means[k + 1] + (shares[k] * (1 / QUARTER)).clamp(max=1) * (means[k] - means[k + 1])
-    means = realize_all(*means)
-    hidden = (means[0] - bound).clamp(min=0) * unseen * (shares[-1] > 0)
-    hidden, height = realize_all(hidden, height + (means[0] - hidden) * (1 - known))
-    return Surface(height, known, shares, means, hidden, unseen, noise)
+    return means
+
+
+@stored
+def fill(height: Tensor, known: Tensor, mean: Tensor, bound: Tensor, is_bounded: Tensor) -> tuple[Tensor, Tensor]:
+    """Fill unknown cells with the mean [m], not above their bound; return also how far below the mean it is [m]."""
+    hidden = (mean - bound).clamp(min=0) * is_bounded
+    return hidden, height + (mean - hidden) * (1 - known)
 
 
 def _windows(layers: Tensor, scales: Scales) -> tuple[list[Tensor], list[Tensor], Tensor]:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import NOWHERE, masked
-from torchelev.ops.storage import realize
+from torchelev.ops.masks import NOWHERE
 from torchelev.ops.windows import window_maximum
 from torchelev.robot import RobotConfig
 from torchelev.stages.surface import Ground, fit_plane
@@ -116,5 +115,5 @@ def traversability(state: MapState, ground: Ground, grid: GridConfig, cfg: Trave
     roughness = plane.residual.clamp(min=1e-12).sqrt()
     worst = torch.maximum(slope / cfg.critical_slope, step / cfg.critical_step)
     worst = torch.maximum(worst, roughness / cfg.critical_roughness)
-    rated = realize(state.validity & plane.spans)
-    return state._replace(traversability=masked((1 - worst).clamp(min=0), rated), rated=rated)
+    rated = state.validity & plane.spans
+    return state._replace(traversability=(1 - worst).clamp(min=0) * rated, rated=rated)

@@ -17,7 +17,7 @@ from torchelev.sim.exact.sensors import NonRepetitiveLidar
 from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor
 from torchelev.sim.terrains.heightfield import HeightField
-from torchelev.stages.measure import depth_to_points
+from torchelev.clouds import depth_to_points
 
 CAMERA = DepthCamera(width=16, height=12)
 PATTERNS = [CAMERA, Lidar(rings=6, azimuths=32), NonRepetitiveLidar(rays=100)]

@@ -54,7 +54,7 @@ def _divide(a: Value, b: Value) -> Value:
 
 
 def divide_by(number: float) -> Callable[[Value], Value]:
-    """a / c of a number c that is written out."""
+    """A / c of a number c that is written out."""
 
     def divided(a: Value) -> Value:
         none = torch.zeros_like(a[0]), torch.zeros_like(a[1])
@@ -145,7 +145,7 @@ def _compare(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Value, V
 
 
 def chain(comparisons: Sequence[Callable[[Value, Value], Value]], values: Sequence[Value]) -> Value:
-    """a < b <= c holds where each of its comparisons does."""
+    """A < b <= c holds where each of its comparisons does."""
     held = [compare(*pair) for compare, pair in zip(comparisons, itertools.pairwise(values), strict=True)]
     return functools.reduce(_multiply, held)
 

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.masks import where_finite
-from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.ops.indexing import SelectedCells
 from torchelev.ops.windows import around
-from torchelev.stages.fusion.contested import NO_HEIGHT, SelectedCells, put_in
+from torchelev.stages.fusion.contested import NO_HEIGHT
 from torchelev.stages.fusion.edges import values_around
 
 if TYPE_CHECKING:
@@ -47,12 +46,10 @@ def challenge_from_above(prior: Prior, consensus: Consensus, width: int, relief:
     `width` counts cells along y, `relief` is in [m].
     """
     cells = consensus.contested
-    known, trusted = (cells.of(as_bytes(mask)) > 0 for mask in (prior.known, consensus.trusted))
+    known, trusted = cells.of(prior.known), cells.of(consensus.trusted)
     challenger, support = cells.of(prior.challenger), cells.of(prior.challenger_support).to(torch.int32)
-    height, votes = (
-        cells.of(consensus.height),
-        cells.of(consensus.number).clamp(max=cfg.max_above_per_scan).to(torch.int32),
-    )
+    height, number = cells.of(consensus.height), cells.of(consensus.number)
+    votes = number.clamp(max=cfg.max_above_per_scan).to(torch.int32)
     variance = cells.of(prior.variance).clamp(max=cfg.max_gate_std**2) + cells.of(consensus.variance) + relief**2
     reach = cfg.gate * variance.sqrt()
     challengers, settled = look_around(prior, cells, width, cfg)
@@ -62,11 +59,10 @@ def challenge_from_above(prior: Prior, consensus: Consensus, width: int, relief:
     strays = above & ~replaced & ~backed & (height > challenger + reach)
     kept = torch.where(replaced & ~backed, 0, support)
     after = torch.where(strays, kept, kept + torch.where(above, votes, -votes)).clamp(0, cfg.min_above)
-    won = as_bytes(above & (after >= cfg.min_above))
-    layers = [prior.challenger, prior.challenger_support, torch.zeros_like(prior.challenger_support)]
+    won = above & (after >= cfg.min_above)
+    layers = [prior.challenger, prior.challenger_support, torch.zeros_like(prior.known)]
     values = [torch.where(replaced, height, challenger), after.to(torch.uint8), won]
-    height, support, won = put_in(layers, cells.cells, values)
-    return Challenge(height, support, as_mask(won))
+    return Challenge(*cells.put_all(layers, values))
 
 
 def look_around(
@@ -77,8 +73,8 @@ def look_around(
     Before the scan, so that its own outliers vouch for none.
     """
     settled = prior.known & (prior.support >= 0.5 * cfg.max_support)
-    layers = [as_bytes(prior.challenger_support > 0), where_finite(settled, prior.elevation, NO_HEIGHT)]
-    exists, (supported, heights) = values_around(layers, cells.cells, *around(cells.cells.device), width)
-    own, own_height = (cells.of(layer) for layer in layers)
-    number = own.to(torch.int32) + (exists & (supported > 0)).sum(1, dtype=torch.int32)
-    return number, torch.maximum(own_height, torch.where(exists, heights, NO_HEIGHT).amax(1))
+    layers = [prior.challenger_support, torch.where(settled, prior.elevation, NO_HEIGHT)]
+    exists, (supports, heights) = values_around(layers, cells.cells, *around(cells.cells.device), width)
+    support, height = (cells.of(layer) for layer in layers)
+    number = (support > 0).to(torch.int32) + (exists & (supports > 0)).sum(1, dtype=torch.int32)
+    return number, torch.maximum(height, torch.where(exists, heights, NO_HEIGHT).amax(1))

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import where_finite
-from torchelev.ops.storage import as_bytes, realize, realize_all
+from torchelev.ops.indexing import SelectedCells
+from torchelev.ops.storage import stored
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
-from torchelev.stages.fusion.contested import NO_HEIGHT, CellHeights, ContestedCells, SelectedCells, ratio
+from torchelev.stages.fusion.contested import NO_HEIGHT, CellHeights, ContestedCells, ratio
 from torchelev.stages.fusion.edges import side_of_step
 from torchelev.stages.fusion.points import Prior, ScanPoints, agrees, gate_variance
 
@@ -56,7 +56,7 @@ def resolve_contested(
         residual = points.z - points.at_points(settled)
         near = points.used * (residual.square() <= gate**2 * points.spread)
         number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-        step = edges.has_step(number, number - close) | (points.of(points.marked) > 1)
+        step = edges.has_step(number, number - close) | points.has_step
         if points.any_true(step):
             which, end = side_of_step(points, shown, width, relief, edges)
             settled, side = torch.where(step, end, settled), torch.where(step, which, side)
@@ -79,24 +79,33 @@ class Consensus(NamedTuple):
 
 def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Consensus:
     """Trust a cell's elevation where most points agree with it, else the robust mean, and at a step one of its ends."""
+    near, gate_at = compare_with_prior(scan, prior, cfg)
+    number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
+    number, trusted = trust_majority(number, agreeing, prior.known)
+    mean = ratio(moment, weight).detach()
+    has_step = torch.zeros_like(trusted)
+    if cfg.edges is not None:
+        has_step = trusted & cfg.edges.has_step(number, number - agreeing)
+    elevation = prior.elevation.detach()
+    shown = CellHeights(torch.where(number > 0, mean, NO_HEIGHT), torch.where(prior.known, elevation, NO_HEIGHT))
+    # A single point is its cell's robust mean, and most cells of a sparse scan have one.
+    points = ContestedCells(~trusted & (number > 1), has_step, scan.cells.slot, scan.columns(), shown.scan)
+    height, relief = torch.where(trusted, elevation, mean), cfg.relief * grid.resolution
+    height, side = resolve_contested(points, height, shown, grid.width, cfg.gate, relief, cfg.edges)
+    variance = (1.0 / weight.detach().clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor)
+    is_challenged = (number > 0) & ((prior.known & ~trusted) | (prior.challenger_support > 0))
+    return Consensus(height, side, trusted, number, variance, near, gate_at, SelectedCells(is_challenged))
+
+
+@stored
+def compare_with_prior(scan: ScanPoints, prior: Prior, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
+    """Return which points agree with their cell's elevation, and the variance [m^2] by which it widens the gate."""
     elevation_at, variance_at = scan.cells.take(prior.elevation, prior.variance)
     gate_at = gate_variance(variance_at, cfg)
-    near, gate_at = realize_all(agrees(scan, elevation_at, gate_at, cfg), gate_at)
-    number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
-    number = realize(number.clamp(min=0))  # a copy of its own, or all four sums would be held as long as this one
-    mean = ratio(moment, weight).detach()
-    trusted = realize(prior.known & (2 * agreeing >= number))  # or the sums would be held for it
-    # A single point is its cell's robust mean, and most cells of a sparse scan have one.
-    step, untrusted = torch.zeros_like(trusted), ~trusted & (number > 1)
-    if (edges := cfg.edges) is not None:
-        step = trusted & edges.has_step(number, number - agreeing)
-    height = where_finite(trusted, prior.elevation, mean).detach()
-    shown = CellHeights(
-        where_finite(number > 0, mean, NO_HEIGHT), where_finite(prior.known, prior.elevation.detach(), NO_HEIGHT)
-    )
-    contested = SelectedCells(as_bytes((number > 0) & ((prior.known & ~trusted) | (prior.challenger_support > 0))))
-    cells = as_bytes(untrusted) + 2 * as_bytes(step)
-    points = ContestedCells(cells, scan.cells.slot, scan.columns(), shown.scan)
-    height, side = resolve_contested(points, height, shown, grid.width, cfg.gate, cfg.relief * grid.resolution, edges)
-    variance = (1.0 / weight.detach().clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor)
-    return Consensus(height, side, trusted, number, variance, near, gate_at, contested)
+    return agrees(scan, elevation_at, gate_at, cfg), gate_at
+
+
+@stored  # or all four sums would be held as long as these two
+def trust_majority(number: Tensor, agreeing: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the number of each cell's points, and whether its elevation is known and at least half agree with it."""
+    return number.clamp(min=0), known & (2 * agreeing >= number)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import realize, realize_all
+from torchelev.ops.storage import stored
 from torchelev.ops.windows import around
 from torchelev.stages.fusion.config import EdgeConfig
 
@@ -55,20 +55,32 @@ def top_of_step(points: ContestedCells, z: Tensor, cfg: EdgeConfig, rounds: int)
     reach, give or take a standard deviation, is an outlier's, and no height lies above it.
     """
     noise = points.spread.sqrt()
-    # What rounds read is stored, or the first would compute it itself: so all have one code, which is compiled once.
-    z, past = realize_all(z, z + cfg.margin * noise)
-    most = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), cfg.min_extreme)
+    z, past = levels(z, cfg.margin * noise)
+    highest = level_reached(points, torch.where(points.used > 0, z + noise, -torch.inf), cfg.min_extreme)
     columns = torch.stack([points.weight * z, points.weight])
-    most, height = realize_all(most, torch.zeros_like(most))
+    height = torch.zeros_like(highest)
     for _ in range(rounds):
-        moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
-        further = moment / total  # NaN where no point lies past the height, which compares as false
-        height = realize(torch.where(most >= further, further, height))
+        height = climb(points, columns, past, highest, height)
     return height
 
 
+@stored  # or the first round would compute it itself, and compile to other code than the others
+def levels(z: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the points' heights (P,) [m], and up to which heights each counts as past them."""
+    return z, z + margin
+
+
+@stored
+def climb(points: ContestedCells, columns: Tensor, past: Tensor, highest: Tensor, height: Tensor) -> Tensor:
+    """Move heights (K,) to the mean of the points past them, but no higher than `highest`."""
+    moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
+    mean = moment / total  # NaN where no point lies past the height, which compares as false
+    return torch.where(highest >= mean, mean, height)
+
+
+@stored
 def level_reached(points: ContestedCells, reached: Tensor, number: int) -> Tensor:
-    """Return the highest level (K,) that so many of a cell's points reach; `reached` (P,) is how high each does."""
+    """Return the highest level (K,) that so many of a cell's points reach; `reached` (P,) is each point's level."""
     level = points.highest(reached)
     for _ in range(number - 1):
         at = points.at_points(level)

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.storage import as_bytes
 from torchelev.stages.cells import PointCells
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.state import MapState, Measurement
@@ -34,7 +33,7 @@ class ScanPoints(NamedTuple):
 
     def columns(self) -> list[Tensor]:
         """Return what `ContestedCells` needs of every point, without a gradient."""
-        return [value.detach() for value in (self.z, self.spread, self.weight, as_bytes(self.passed), *self.ray)]
+        return [value.detach() for value in (self.z, self.spread, self.weight, self.passed, *self.ray)]
 
 
 class Prior(NamedTuple):

@@ -11,9 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.grid import GridConfig, locate
-from torchelev.ops.masks import NOWHERE, lifted, where_finite
+from torchelev.ops.indexing import read
+from torchelev.ops.masks import NOWHERE
 from torchelev.ops.operators import running_minimum
-from torchelev.ops.storage import read, realize, realize_all
+from torchelev.ops.storage import stored
 from torchelev.ops.windows import neighbours
 from torchelev.stages.cells import lattice_offset
 from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
@@ -56,7 +57,7 @@ def sensor_rays(m: Measurement, s: int) -> Rays:
 def accepted_rays(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Rays:
     """Return the rays with `casts` narrowed to those that are accepted, and with their slopes corrected.
 
-    Believed rays end credibly (`has_credible_end`) and pass below no ground hit of late (`horizon`).
+    Accepted rays end credibly (`has_credible_end`) and do not pass below recently hit ground (`horizon`).
     """
     lowest = state.elevation - height_margin(state, grid, cfg)
     above = horizon(state, m, rays, lowest, grid, cfg) + rays.slope >= 0
@@ -75,8 +76,8 @@ def has_credible_end(
     taken for rays that pass CLEARANCE above that ground.
     """
     end = find_ends(state, m, rays, grid)
-    ground = realize(lifted(state.elevation, ~well_supported(state, cfg, grid.resolution)))
-    floor, known = (layer.flatten(1).gather(1, end.slot) for layer in (lowest, ground))
+    ground = supported_ground(state, cfg, grid.resolution)
+    floor, known = (read(layer.flatten(1), end.slot) for layer in (lowest, ground))
     near = ground_at_borders(ground, grid).gather(1, end.border)
     z = rays.origin[:, None, 2]
     height, deepest = z + end.reach * rays.slope, z + rays.r * rays.slope.clamp(max=0)
@@ -84,6 +85,12 @@ def has_credible_end(
     low = end.leaves & ~over & (deepest >= near - CLEARANCE)
     raised = torch.maximum(rays.slope, (near + CLEARANCE - z) / end.reach.clamp(min=1e-6))
     return end.inside & (over | low) | rays.overhang, torch.where(low & ~rays.overhang, raised, rays.slope)
+
+
+@stored
+def supported_ground(state: MapState, cfg: RaycastConfig, resolution: float) -> Float[Tensor, "B H W"]:
+    """Return the elevation [m] of well supported cells, NOWHERE higher elsewhere."""
+    return state.elevation + NOWHERE * ~well_supported(state, cfg, resolution)
 
 
 class RayEnds(NamedTuple):
@@ -103,11 +110,11 @@ def find_ends(state: MapState, m: Measurement, rays: Rays, grid: GridConfig) -> 
     size = torch.stack([start.new_full((), n * grid.resolution) for n in (grid.height, grid.width)])
     inner = 0.5 * grid.resolution  # half a cell inside, so that rounding leaves no ray outside
     ahead = rays.xy > 0
-    room = where_finite(ahead, size - inner - start, inner - start)
-    shares = room / where_finite(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never by zero
+    room = torch.where(ahead, size - inner - start, inner - start)
+    shares = room / torch.where(ahead, rays.xy.clamp(min=1e-9), rays.xy.clamp(max=-1e-9))  # never by zero
     end = start + rays.xy
     leaves = ((end < 0) | (end >= size)).any(-1)
-    share = where_finite(leaves, shares.amin(-1).clamp(0, 1), 1.0)
+    share = torch.where(leaves, shares.amin(-1).clamp(0, 1), 1.0)
     x, y = (rays.origin[:, None, :2] + share[..., None] * rays.xy).unbind(-1)
     slot, inside = locate(x, y, offset[:, 0], grid)
     through_x = shares[..., 0] <= shares[..., 1]
@@ -123,17 +130,22 @@ def ground_at_borders(ground: Tensor, grid: GridConfig) -> Float[Tensor, "B 4L"]
     The borders are those of low x, high x, low y and high y; L is the longer one's number of cells.
     """
     cells = max(1, int(NEAR / grid.resolution))
+    return border_minima(ground, cells, grid).unfold(2, 2 * cells + 1, 1).amin(-1).flatten(1)
+
+
+@stored
+def border_minima(ground: Tensor, cells: int, grid: GridConfig) -> Float[Tensor, "B 4 L+2*cells"]:
+    """Return the lowest ground [m] within so many cells of each border, NOWHERE for so many cells beyond its ends."""
     rows, columns = (ground[:, :cells], ground[:, -cells:]), (ground[:, :, :cells], ground[:, :, -cells:])
     sides = [*(side.amin(1) for side in rows), *(side.amin(2) for side in columns)]
     length = max(grid.height, grid.width)
-    rims = [F.pad(side, (cells, cells + length - side.shape[1]), value=NOWHERE) for side in sides]
-    return realize(torch.stack(rims, 1)).unfold(2, 2 * cells + 1, 1).amin(-1).flatten(1)
+    return torch.stack([F.pad(side, (cells, cells + length - side.shape[1]), value=NOWHERE) for side in sides], 1)
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
     """Tell which known cells are accepted: enough points agree, or on a neighbouring cell of like height."""
     enough = state.validity & (state.support >= cfg.min_support)
-    _, above, _, left, right, _, below, _ = neighbours(lifted(state.elevation, ~enough), NOWHERE)
+    _, above, _, left, right, _, below, _ = neighbours(state.elevation + NOWHERE * ~enough, NOWHERE)
     unlike = functools.reduce(torch.minimum, [(h - state.elevation).abs() for h in (above, left, right, below)])
     return enough | (state.validity & (unlike <= resolution))
 
@@ -155,17 +167,21 @@ def horizon(
     step = 2 * grid.resolution
     polar = PolarGrid.of(grid, cfg)
     ranges, azimuths = 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
-    device, dtype = rays.r.device, rays.r.dtype
-    rho = (torch.arange(ranges, device=device, dtype=dtype) + 0.5)[:, None] * step
-    angle = (torch.arange(azimuths, device=device, dtype=dtype) + 0.5) * (2 * math.pi / azimuths)
-    # Realized, or the compiler computes them anew for every bin of every environment.
-    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(realize_all(angle.cos(), angle.sin())))
+    rho = (torch.arange(ranges, device=rays.r.device, dtype=rays.r.dtype) + 0.5)[:, None] * step
+    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(directions(azimuths, rays.r)))
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     recent = state.validity & (state.time <= cfg.min_time)
-    below_sensor = where_finite(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
-    fall = where_finite(inside, read(realize(below_sensor).flatten(1), slot), NO_FALL * step) / rho
+    below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
+    fall = torch.where(inside, read(below_sensor.flatten(1), slot), NO_FALL * step) / rho
     steepest = running_minimum(fall.detach())  # compared with, and so without a gradient
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
-    return where_finite(k >= 0, limit, NO_FALL)
+    return torch.where(k >= 0, limit, NO_FALL)
+
+
+@stored  # or each bin of every environment would compute them anew
+def directions(number: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the cosines and sines of so many azimuths (number,), evenly spaced."""
+    angle = (torch.arange(number, device=like.device, dtype=like.dtype) + 0.5) * (2 * math.pi / number)
+    return angle.cos(), angle.sin()

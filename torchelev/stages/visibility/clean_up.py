@@ -14,14 +14,15 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.masks import masked, where_finite, zeroed
+from torchelev.ops.indexing import read
+from torchelev.ops.masks import count
 from torchelev.ops.operators import polar_minimum
-from torchelev.ops.storage import read, realize, realize_all
+from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
 from torchelev.stages.visibility.accepted_rays import Rays, accepted_rays, height_margin, sensor_rays
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
-from torchelev.state import MapState, Measurement, count, tally
+from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -38,7 +39,7 @@ def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tenso
     # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
     last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
     a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
-    index = flat(where_finite(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
+    index = flat(torch.where(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
     return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
 
 
@@ -59,23 +60,27 @@ def look_up(
     x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
     rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
     k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
-    # All the bins that the cell covers: two entries, the first and the last of them.
-    width, entry = polar.covered(k)
-    middle = azimuth_fraction(x, y) * polar.azimuths
-    a = torch.floor(middle - 0.5 * width)
-    further = (torch.floor(middle + 0.5 * width) - a + 1 - entry).clamp(min=0)
-    a = where_finite(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
-    b = a + further
-    b = where_finite(b < polar.azimuths, b, b - polar.azimuths)
-    slopes = table.flatten(1)
-    lowest = torch.minimum(*(read(slopes, flat(k, place, polar.azimuths)) for place in (a, b)))
-    slope = realize(lowest)  # or the compiler would gather anew for the masks and for the heights
-    found = slope < NO_RAY
-    slope = masked(slope, found)
+    lowest = lowest_slope(table, k, azimuth_fraction(x, y) * polar.azimuths, polar)
+    found = lowest < NO_RAY
+    slope = lowest * found
     gx, gy = state.gradient_x, state.gradient_y
-    along = (slope - torch.addcmul(gx * x, gy, y) / rho).abs()
+    along = (slope - (gx * x + gy * y) / rho).abs()
     incidence = along / ((1 + slope.square()) * (1 + gx.square() + gy.square())).sqrt()
     return RayOverCell(found, z_s + slope * rho, slope.abs() * grid.resolution, incidence)
+
+
+@stored
+def lowest_slope(table: Tensor, k: Tensor, azimuth: Tensor, polar: PolarGrid) -> Float[Tensor, "B H W"]:
+    """Return the lowest slope in all azimuth bins that cells at range k cover; `azimuth` counts bins."""
+    # Two entries, the first and the last, hold the minimum of all.
+    width, entry = polar.covered(k)
+    a = torch.floor(azimuth - 0.5 * width)
+    further = (torch.floor(azimuth + 0.5 * width) - a + 1 - entry).clamp(min=0)
+    a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
+    b = a + further
+    b = torch.where(b < polar.azimuths, b, b - polar.azimuths)
+    slopes = table.flatten(1)
+    return torch.minimum(*(read(slopes, flat(k, place, polar.azimuths)) for place in (a, b)))
 
 
 def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None) -> MapState:
@@ -98,24 +103,37 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
 
 
 def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: RaycastConfig) -> MapState:
-    """Apply the lowest ray of one sensor to every cell."""
-    depth = state.elevation - ray.height
-    seen_through = passes_far_below(state, depth, grid, cfg) | (ray.incidence > cfg.min_incidence)
-    gone = state.validity & ray.found & (depth > state.variance.sqrt()) & (state.time > cfg.min_time) & seen_through
-    validity = state.validity & ~gone
-    # A ray below a challenger shows that nothing stands there: outliers stop no other ray. From centre to corner a ray
-    # falls by 0.71 of `fall`; those that end on an obstacle's top, more than a cell behind, pass higher than that.
-    passed = realize((ray.found & (ray.height < state.challenger + math.sqrt(0.5) * ray.fall)) | ~validity)
-    bounds = ray.found & ~validity
+    """Apply the lowest ray of one sensor to every cell (paper, eq. 3 and 4).
+
+    A cell goes if p_z < h - sigma (3) and |r . n| > alpha_n (4), and if it was not hit for `min_time`.
+    """
+    h, sigma, p_z = state.elevation, state.variance.sqrt(), ray.height
+    passes_below = h - p_z > sigma
+    is_steep = ray.incidence > cfg.min_incidence
+    is_old = state.time > cfg.min_time
+    gone = ray.found & passes_below & is_old & (is_steep | passes_far_below(state, h - p_z, grid, cfg))
+    return bound(refute_challengers(state, ray, state.validity & ~gone), ray)
+
+
+@stored
+def refute_challengers(state: MapState, ray: RayOverCell, validity: Bool[Tensor, "B H W"]) -> MapState:
+    """Keep the cells that are still valid, and forget challengers that a ray passes below.
+
+    Nothing stands there: outliers stop no other ray. From a cell's centre to its corner a ray falls by 0.71 of `fall`;
+    those that end on an obstacle's top, more than a cell behind, pass higher than that.
+    """
+    passes_below = ray.found & (ray.height < state.challenger + math.sqrt(0.5) * ray.fall)
+    challenger_support = torch.where(passes_below | ~validity, 0, state.challenger_support)
+    return state._replace(validity=validity, challenger_support=challenger_support)
+
+
+@stored
+def bound(state: MapState, ray: RayOverCell) -> MapState:
+    """Lower the upper bound of unknown cells to the ray's height (paper, Sec. II-H)."""
+    bounds = ray.found & ~state.validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
     upper_bound = torch.where(bounds, lower, state.upper_bound)  # which may be infinite where nothing is bounded
-    challenger_support = zeroed(state.challenger_support, passed)
-    validity, bounded, upper_bound, challenger_support = realize_all(
-        validity, (state.bounded & ~state.validity) | bounds, upper_bound, challenger_support
-    )
-    return state._replace(
-        validity=validity, bounded=bounded, upper_bound=upper_bound, challenger_support=challenger_support
-    )
+    return state._replace(bounded=bounds | (state.bounded & ~state.validity), upper_bound=upper_bound)
 
 
 def passes_far_below(state: MapState, depth: Tensor, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B H W"]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
+from torchelev.ops.indexing import tabulate
 
 if TYPE_CHECKING:
     from torchelev.stages.visibility.config import RaycastConfig
@@ -35,25 +36,21 @@ class PolarGrid(NamedTuple):
         # Two entries of n bins cover all windows of n to 2 n bins, and a cell of x bins lies in at most floor(x) + 2.
         return cls(reach, azimuths, bins, tuple(math.ceil(bins / (2 ** (k + 1) - 1)) for k in range(levels)))
 
-    def covered(self, k: Tensor) -> tuple[Tensor, Tensor]:
+    def covered(self, k: Tensor) -> list[Tensor]:
         """Return how many azimuth bins a cell at range k covers, and of how many an entry is the minimum there."""
-        # Compiled they are computed for each cell, else for each range and looked up: each is the faster there.
-        row = k if torch.compiler.is_compiling() else torch.arange(self.ranges + 1, device=k.device, dtype=k.dtype)
-        entry = torch.ones_like(row)
+        return tabulate(self._covered, k, self.ranges + 1)
+
+    def _covered(self, k: Tensor) -> list[Tensor]:
+        entry = torch.ones_like(k)
         for level, rows in enumerate(self.widen):
-            entry = torch.add(entry, row < rows, alpha=2.0**level)
-        values = self.bins / row.clamp(min=0.5), entry
-        if row is k:
-            return values
-        index = k.to(torch.int32).flatten()
-        width, entry = (value.index_select(0, index).view_as(k) for value in values)
-        return width, entry
+            entry = entry + 2.0**level * (k < rows)
+        return [self.bins / k.clamp(min=0.5), entry]
 
 
 def azimuth_fraction(x: Tensor, y: Tensor) -> Tensor:
     """Return the azimuth as a fraction of a turn in [0, 1], within 0.001 turns of atan2 and without its cost.
 
-    Rays and cells use the same function, so that only its monotony matters.
+    Rays and cells use the same function, so it need only be monotonic.
     """
     ax, ay = x.abs(), y.abs()
     high = torch.maximum(ax, ay)
@@ -64,10 +61,10 @@ def azimuth_fraction(x: Tensor, y: Tensor) -> Tensor:
     return mirrored(half, 1.0, y)
 
 
-def mirrored(share: Tensor, whole: float, side: Tensor) -> Tensor:
-    """Return whole - share where `side` is negative, -0.0 too, else the share, which lies in [0, whole]."""
-    half = torch.copysign(share.new_full((), whole / 2), side)
-    return (share + (half - whole / 2)).abs()
+def mirrored(angle: Tensor, full: float, side: Tensor) -> Tensor:
+    """Return full - angle where `side` is negative, -0.0 too, else the angle, which lies in [0, full]."""
+    half = torch.copysign(angle.new_full((), full / 2), side)
+    return (angle + (half - full / 2)).abs()
 
 
 def flat(row: Tensor, column: Tensor, width: int) -> Tensor:

@@ -1,0 +1,80 @@
+"""Move layers by whole cells, each environment by its own shift."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchelev.ops.indexing import read
+from torchelev.ops.storage import realize_all
+
+if TYPE_CHECKING:
+    from jaxtyping import Int
+
+HOST_ENVIRONMENTS = 4  # up to so many environments copying beats gathering
+
+
+def move_layers(layers: dict[str, Tensor], shift: Int[Tensor, "B 2"], blank: dict[str, float]) -> dict[str, Tensor]:
+    """Shift layers (B, H, W) by whole cells: cell (i, j) gets what was at (i, j) + shift.
+
+    Entering cells get the layer's value in `blank`, or 0. Up to eight layers may be masks.
+    """
+    masks = [name for name, layer in layers.items() if layer.dtype == torch.bool]
+    names = [name for name in layers if name not in masks]
+    # All masks move as the bits of one layer.
+    values = [*(layers[name] for name in names), _as_bits([layers[name] for name in masks])]
+    blanks = [*(blank.get(name, 0.0) for name in names), 0.0]
+    # Copying takes an eighth of the time of gathering that is not compiled, but has no gradient, and the host must know
+    # the shifts.
+    eager = not torch.compiler.is_compiling() and not torch.is_grad_enabled()
+    copies = eager and shift.shape[0] <= HOST_ENVIRONMENTS and shift.device.type == "cpu"
+    *values, bits = moved(values, shift, blanks) if copies else _gathered(values, shift, blanks)
+    return dict(zip((*names, *masks), (*values, *_from_bits(bits, len(masks))), strict=True))
+
+
+def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
+    """Shift layers by gathering."""
+    H, W = layers[0].shape[1:]
+    i = torch.arange(H, device=shift.device)[None, :, None] + shift[:, 0, None, None]
+    j = torch.arange(W, device=shift.device)[None, None, :] + shift[:, 1, None, None]
+    entering = (i < 0) | (i >= H) | (j < 0) | (j >= W)
+    index = i.clamp(0, H - 1) * W + j.clamp(0, W - 1)
+    values = [read(layer.flatten(1), index) for layer in layers]
+    # Bytes become numbers here: among these, compiled code chooses so much faster that all of it takes half as long.
+    blanked = [torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)]
+    return realize_all(*(value.to(layer.dtype) for value, layer in zip(blanked, layers, strict=True)))
+
+
+@torch.library.custom_op(
+    "torchelev::moved", mutates_args=(), schema="(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]"
+)
+def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
+    """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; the host reads the shifts."""
+    H, W = layers[0].shape[1:]
+    # Padded where cells enter, and by as many less than nothing where they leave.
+    rims = [(-j, j, -i, i) for i, j in ((max(-H, min(i, H)), max(-W, min(j, W))) for i, j in shift.tolist())]
+    if len(rims) == 1:
+        return [F.pad(layer, rims[0], value=blank) for layer, blank in zip(layers, blanks, strict=True)]
+    return [
+        torch.stack([F.pad(part, rim, value=blank) for part, rim in zip(layer, rims, strict=True)])
+        for layer, blank in zip(layers, blanks, strict=True)
+    ]
+
+
+@moved.register_fake
+def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
+    return [torch.empty_like(layer) for layer in layers]
+
+
+def _as_bits(masks: list[Tensor]) -> Tensor:
+    """Return up to eight masks as the bits of one uint8."""
+    return functools.reduce(torch.add, (mask.to(torch.int32) << k for k, mask in enumerate(masks))).to(torch.uint8)
+
+
+def _from_bits(bits: Tensor, number: int) -> list[Tensor]:
+    """Return the masks that `_as_bits` packed."""
+    return [(bits.to(torch.int32) & (1 << k)) > 0 for k in range(number)]
