@@ -218,8 +218,14 @@ def _arrays(values: dict[str, object]) -> Answers:
 
 
 def machine() -> str:
-    """Name what decides on rounding: torch's version and the CPU's vectors."""
-    return f"torch {torch.__version__.split('+')[0]}, {torch.backends.cpu.get_cpu_capability()}"
+    """Name what rounding depends on: torch's version, the CPU's vectors and its model."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    facts = dict(line.split(":", 1) for line in lines if ":" in line)
+    model = " ".join(
+        value.strip() for key, value in facts.items() if key.strip() in ("vendor_id", "cpu family", "model")
+    )
+    return f"torch {torch.__version__.split('+')[0]}, {torch.backends.cpu.get_cpu_capability()}, {model}"
 
 
 def main() -> None:

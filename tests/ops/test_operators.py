@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.ops.operators import cell_sums, moved, padded, polar_minimum, running_minimum
+from torchelev.ops.moving import moved
+from torchelev.ops.operators import cell_sums, padded, polar_minimum, running_minimum
 
 
 @given(st.integers(0, 10_000), st.integers(1, 2), st.integers(1, 4), st.integers(1, 6))
@@ -75,7 +76,7 @@ def test_gradient_of_padded():
 TABLE = torch.linspace(0, 1, 64).view(2, 8, 4)
 MARKED = torch.tensor([[0, 2, 0, 0], [1, 0, 0, 0]], dtype=torch.uint8)
 SLOT = torch.tensor([[1, 1, 2], [0, 3, 0]])
-POINTS = [torch.rand(2, 3, generator=torch.Generator().manual_seed(k)) + 0.1 for k in range(6)]  # see Disputed
+POINTS = [torch.rand(2, 3, generator=torch.Generator().manual_seed(k)) + 0.1 for k in range(6)]  # see ContestedCells
 POINTS[3] = (POINTS[3] > 0.5).to(torch.uint8)
 
 

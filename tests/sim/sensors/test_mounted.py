@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from tests.helpers import pose, random_poses
 from tests.test_gpu import OneDevice
 from torchelev import ElevationMap
+from torchelev.clouds import depth_to_points
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact import scenes
 from torchelev.sim.exact.sensors import NonRepetitiveLidar
 from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor
 from torchelev.sim.terrains.heightfield import HeightField
-from torchelev.clouds import depth_to_points
 
 CAMERA = DepthCamera(width=16, height=12)
 PATTERNS = [CAMERA, Lidar(rings=6, azimuths=32), NonRepetitiveLidar(rays=100)]

@@ -35,12 +35,12 @@ def test_points_that_are_not_used_hold_no_level():
     """One return far above the step's top is an outlier, also if points that are not used lie as high."""
     z = torch.tensor([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 3.0, 3.0]])
     weight = torch.tensor([[1.0] * 7 + [0.0] * 2])
-    slot, cells = torch.zeros(1, 9, dtype=torch.int64), torch.ones(1, 1, dtype=torch.uint8)
+    slot, cells, no_step = torch.zeros(1, 9, dtype=torch.int64), torch.tensor([[True]]), torch.tensor([[False]])
     ray, passed, mean = torch.ones(1, 9), torch.zeros(1, 9, dtype=torch.uint8), torch.tensor([[6 / 7]])
     find_ends = []
     for count in (7, 9):
         columns = [value[:, :count] for value in (z, torch.full((1, 9), 1e-4), weight, passed, ray, ray)]
-        find_ends.append(ends_of_step(ContestedCells(cells, slot[:, :count], columns, mean), EdgeConfig()))
+        find_ends.append(ends_of_step(ContestedCells(cells, no_step, slot[:, :count], columns, mean), EdgeConfig()))
     assert find_ends[0] == find_ends[1]
     top, bottom = (mean.item() + end.item() for end in find_ends[0])
     assert top == pytest.approx(6 / 7)  # the next level, 1.5, would be reached by the outlier alone
@@ -51,9 +51,9 @@ def test_points_that_are_not_used_hold_no_level():
 def test_each_refinement_halves_the_distance_to_the_top_of_a_face(refinements, top):
     """A wall's face of 1 m, its points evenly spread; the bottom takes two."""
     z = torch.linspace(0, 1, 20_001, dtype=torch.float64)[None]
-    slot, passed, cells = torch.zeros_like(z, dtype=torch.int64), torch.zeros_like(z), torch.ones(1, 1)
+    slot, passed, cells = torch.zeros_like(z, dtype=torch.int64), torch.zeros_like(z), torch.tensor([[True]])
     columns = [z, torch.full_like(z, 1e-10), torch.ones_like(z), passed, passed, passed]
-    points = ContestedCells(cells.to(torch.uint8), slot, columns, 0.5 * cells.double())
+    points = ContestedCells(cells, ~cells, slot, columns, 0.5 * cells.double())
     find_ends = ends_of_step(points, EdgeConfig(refinements=refinements))
     assert [0.5 + end.item() for end in find_ends] == pytest.approx([top, 0.125], abs=1e-3)
 
@@ -65,14 +65,14 @@ def one_cell(z, weight, step=0, passed=0, seen=None, known=None):
     """
     z, weight = torch.tensor([z]), torch.tensor([weight])
     cells, zeros = torch.zeros(1, 9), torch.zeros_like(z)
-    marked = cells.to(torch.uint8).index_fill(1, torch.tensor([4]), 1)
+    middle = (cells > 0).index_fill(1, torch.tensor([4]), True)
     scan, seen_before = torch.full_like(cells, NO_HEIGHT), torch.full_like(cells, NO_HEIGHT)
     mean = {4: (z * weight).sum() / weight.sum()}
     for layer, values in ((scan, (seen or {}) | mean), (seen_before, known or {})):
         for cell, height in values.items():
             layer[0, cell] = height
     columns = [z, zeros + 1e-4, weight, (zeros + passed).to(torch.uint8), zeros + 1.0, zeros]
-    points = ContestedCells(marked + step * marked, (zeros + 4).to(torch.int64), columns, scan)
+    points = ContestedCells(middle & (step == 0), middle & (step > 0), (zeros + 4).to(torch.int64), columns, scan)
     results = resolve_contested(points, cells, CellHeights(scan, seen_before), 3, 3.0, 0.01, EdgeConfig())
     return [result[0, 4].item() for result in results]
 
