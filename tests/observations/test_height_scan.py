@@ -19,7 +19,7 @@ from torchelev.layers import LAYERS
 from torchelev.observations.fill import FILLS, MODES, inpaint
 from torchelev.observations.height_scan import PRESETS, HeightScan
 from torchelev.observations.map_image import CHANNELS, MapImage
-from torchelev.observations.patterns import ALIGNMENTS, heading, steps
+from torchelev.observations.patterns import ALIGNMENTS, Pattern, compute_heading, space_by_arange
 
 SEEDS = st.integers(0, 10_000)
 BASE = (0.3, -0.2, 0.7)
@@ -121,8 +121,8 @@ def test_grids_end_as_the_originals_do():
         size = dict(length_x=1.1, length_y=1.1, resolution=resolution)
         assert HeightScan.isaac_lab(**size).num_points == isaac**2
         assert HeightScan.mjlab(**size).num_points == mjlab**2
-    assert steps(1.1, 0.04, 1e-9)[-1] == pytest.approx(0.53)
-    assert steps(1.1, 0.04, 0.02)[-1] == pytest.approx(0.57)
+    assert space_by_arange(1.1, 0.04, 1e-9)[-1] == pytest.approx(0.53)
+    assert space_by_arange(1.1, 0.04, 0.02)[-1] == pytest.approx(0.57)
     other = HeightScan.mjlab(length_x=0.4, length_y=0.2, resolution=0.2).pattern
     assert np.allclose(other, [(-0.2, -0.1), (0.0, -0.1), (0.2, -0.1), (-0.2, 0.1), (0.0, 0.1), (0.2, 0.1)])
 
@@ -133,7 +133,7 @@ def test_steps_are_those_of_arange(centimetres, resolution):
     isaac = torch.arange(start=-length / 2, end=length / 2 + 1.0e-9, step=resolution)
     mjlab = torch.arange(-length / 2, length / 2 + resolution * 0.5, resolution, dtype=torch.float32)
     for beyond, theirs in ((1e-9, isaac), (resolution * 0.5, mjlab)):
-        mine = steps(length, resolution, beyond)
+        mine = space_by_arange(length, resolution, beyond)
         assert len(mine) == len(theirs) and np.allclose(mine, theirs, atol=1e-6)
 
 
@@ -274,23 +274,23 @@ def test_alignments_by_hand():
 @given(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4), st.floats(-1.4, 1.4))
 def test_the_heading_is_yaw_whatever_the_tilt(yaw, pitch, roll):
     expected = torch.tensor([[math.cos(yaw), math.sin(yaw)]], dtype=torch.float64)
-    torch.testing.assert_close(heading(pose(yaw=yaw, pitch=pitch, roll=roll)), expected)
+    torch.testing.assert_close(compute_heading(pose(yaw=yaw, pitch=pitch, roll=roll)), expected)
 
 
 def test_straight_up_the_y_axis_says_where_left_is():
     """x up, y to (-0.6, 0.8): ahead is (0.8, 0.6), although the x axis leans to (-0.05, 0) by rounding."""
     T = torch.eye(4)[None].clone()
     T[0, :3, 0], T[0, :3, 1], T[0, :3, 2] = torch.tensor([[0.0, 0, 1], [-0.6, 0.8, 0], [-0.8, -0.6, 0]])
-    torch.testing.assert_close(heading(T), torch.tensor([[0.8, 0.6]]))
+    torch.testing.assert_close(compute_heading(T), torch.tensor([[0.8, 0.6]]))
     T[0, 0, 0] = -0.05
-    torch.testing.assert_close(heading(T), torch.tensor([[0.8, 0.6]]))
+    torch.testing.assert_close(compute_heading(T), torch.tensor([[0.8, 0.6]]))
 
 
 @pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2, math.pi / 2 - 0.05, -math.pi / 2 + 0.05])
 def test_a_base_that_points_straight_up_has_a_heading(pitch):
     """The y axis, turned right, takes over: without roll it says the same."""
     T = pose(yaw=0.7, pitch=pitch).requires_grad_()
-    ahead = heading(T)
+    ahead = compute_heading(T)
     torch.testing.assert_close(ahead, torch.tensor([[math.cos(0.7), math.sin(0.7)]], dtype=torch.float64))
     ahead.sum().backward()
     assert T.grad.isfinite().all()
@@ -380,7 +380,7 @@ def loop_scan(scan, emap, T, feet, b):
         if not good and scan.fill == "upper_bound":
             ground, good = loop_sample(bound, known | layers["bounded"], x, y, corner, scan.mode)
         if not good and scan.fill == "ground":
-            half = scan._pattern.cells(emap.cfg.grid)
+            half = Pattern(scan.pattern, scan.alignment, scan.reach).half_extent(emap.cfg.grid)
             value = loop_ground(h, known, x, y, T[b, :3, 3].tolist(), corner, half)
             ground, good = (0.0, False) if value is None else (value, True)
         if not good and scan.fill == "inpaint":
@@ -763,14 +763,14 @@ GOOD = dict(xy=[(0.0, 0.1)])
         (lambda: HeightScan.points(**GOOD, mode="linear"), "mode: must be one of bilinear, nearest, minimum, got"),
         (lambda: HeightScan.points(**GOOD, fill="zero"), "fill: must be a number or one of ground, base, lowest"),
         (lambda: HeightScan.points(**GOOD, fill=None), "fill: must be a number or one of ground, base, lowest"),
-        (lambda: HeightScan.points(**GOOD, fill=math.inf), "fill: must be finite where nothing clips, got inf"),
+        (lambda: HeightScan.points(**GOOD, fill=math.inf), "fill: must be finite without a clip, got inf"),
         (lambda: HeightScan.points(**GOOD, fill=math.nan, clip=1.0), "fill: must be finite"),
         (lambda: HeightScan.points(**GOOD, original="original"), "original: must be a number or one of ground, base"),
         (lambda: HeightScan.points(**GOOD, standing_height=math.nan), "standing_height: must be a finite number"),
         (lambda: HeightScan.points(**GOOD, clip=0.0), "clip: must be a positive number, got 0.0"),
-        (lambda: HeightScan.points(**GOOD, noise=-0.1), "noise: must be a finite, not negative number, got -0.1"),
+        (lambda: HeightScan.points(**GOOD, noise=-0.1), "noise: must be a finite number of at least 0, got -0.1"),
         (lambda: HeightScan.points(**GOOD, scale=math.nan), "scale: must be a finite number, got nan"),
-        (lambda: HeightScan.points(**GOOD, inpaint_rings=1.5), "inpaint_rings: must be a finite, not negative int"),
+        (lambda: HeightScan.points(**GOOD, inpaint_rings=1.5), "inpaint_rings: must be an int of at least 0"),
         (lambda: HeightScan.points([]), "pattern: must be one or more points"),
         (lambda: HeightScan.points(torch.zeros(4, 3)), "pattern: must be one or more points"),
         (lambda: HeightScan.points([(0.0, math.nan)]), "pattern: must be finite"),

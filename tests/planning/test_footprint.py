@@ -315,7 +315,7 @@ def test_bad_values_elsewhere_are_not_safe(monkeypatch):
         (rectangle()[:, :, :2], ValueError, "at least 3 vertices, got 2; "),
         (rectangle()[0], ValueError, r"expected \(1, P, V, 2\), got \(1, 4, 2\); "),
         (rectangle().repeat(2, 1, 1, 1), ValueError, r"expected \(1, P, V, 2\), got \(2, 1, 4, 2\)"),
-        (torch.zeros(1, 1, 4, 3), ValueError, "x and y alone"),
+        (torch.zeros(1, 1, 4, 3), ValueError, "x and y of polygons"),
         (torch.zeros(1, 1, 4, 2).int(), TypeError, "must be float16"),
         (rectangle().numpy(), TypeError, "must be a torch.Tensor"),
         (torch.zeros(1, 1, 4, 2, device="meta"), ValueError, "must be on cpu"),

@@ -14,6 +14,8 @@ from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap
 from torchelev.planning.footprint import FootprintConfig, check_footprint
 from torchelev.planning.path_check import check_path
+from torchelev.planning.planner import plan
+from torchelev.planning.standing import place_footprint
 
 SEEDS = st.integers(0, 10_000)
 FOOTPRINT = torch.tensor([[0.25, 0.125], [-0.25, 0.125], [-0.25, -0.125], [0.25, -0.125]]).double()
@@ -92,6 +94,36 @@ def test_a_turned_footprint_lies_where_it_should():
         for cell in ((9, 7), (8, 8), (6, 7), (8, 5)):
             check = check_path(blocked(cell), path((0.0, 0.0, yaw)), lopsided)
             assert check.safe.tolist() == [cell != cells]
+
+
+# Why not --------------------------------------------------------------------------------------------------------------
+
+
+def test_an_empty_path_is_not_safe():
+    """No path leads through the first map's wall. No threshold and no assumed ground makes it safe."""
+    emap = ground_map(1.0, num_envs=2)
+    emap.traversability[0, 10] = 0.0
+    here = emap.center[:, :2].double()
+    found = plan(emap, here, here + torch.tensor([0.6, 0.0]))
+    assert found.reached.tolist() == [False, True] and found.poses()[0].isnan().all()
+    check = check_path(emap, found.poses(), FOOTPRINT)
+    assert check.safe.tolist() == [False, True] and check.first_unsafe.tolist() == [0, found.xy.shape[1]]
+    assert check.poses[0].isnan().all() and check.footprints.unknown[0].eq(1).all()
+    assert check.explain() == [
+        "the path is empty: no path was found; Path.explain() says why",
+        "every footprint along the path is safe",
+    ]
+    here = place_footprint(emap, FOOTPRINT, torch.cat([here, torch.zeros(2, 1)], 1)[:, None])[:, 0]
+    lenient = FootprintConfig(min_traversability=0.0, max_unsafe=1.0, max_unknown=1.0)
+    assert check_path(emap, found.poses(), FOOTPRINT, lenient, standing=here).safe.tolist() == [False, True]
+
+
+def test_a_path_that_is_not_safe_says_where():
+    check = check_path(blocked((11, 7)), path((-0.5, 0, 0), (0, 0, 0), (0.5, 0, 0)), FOOTPRINT, samples=4)
+    assert check.explain() == [
+        "pose 2 cannot be reached safely: at x = 0.25 m, y = 0.00 m mean traversability 0.88, "
+        "12% of the cells unsafe, 0% unknown"
+    ]
 
 
 # Properties -----------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.planning.polygons import convex_hull, polygon_cells
+from torchelev.planning.polygons import convex_hull, rasterize
 
 SEEDS = st.integers(0, 10_000)
 SIZE = 13
@@ -16,7 +16,7 @@ SIZE = 13
 def marks(polygon, size=SIZE):
     """The cells (i, j) of one polygon, in cells from the origin."""
     uv = torch.from_numpy(np.array(polygon, dtype=np.float64))[None, None]
-    first, inside = polygon_cells(uv, size)
+    first, inside = rasterize(uv, size)
     return {(int(i + first[0, 0, 0]), int(j + first[0, 0, 1])) for i, j in inside[0, 0].nonzero()}
 
 
@@ -138,15 +138,15 @@ def test_order_orientation_padding_and_place_do_not_matter(seed, narrow):
 def test_batches_of_polygons_equal_single_ones():
     rng = np.random.default_rng(0)
     polygons = np.stack([[star(rng, 5) for _ in range(7)] for _ in range(3)])
-    first, inside = polygon_cells(torch.from_numpy(polygons), SIZE)
+    first, inside = rasterize(torch.from_numpy(polygons), SIZE)
     for b in range(3):
         for p in range(7):
-            single = polygon_cells(torch.from_numpy(polygons[b : b + 1, p : p + 1]), SIZE)
+            single = rasterize(torch.from_numpy(polygons[b : b + 1, p : p + 1]), SIZE)
             assert torch.equal(single.first[0, 0], first[b, p]) and torch.equal(single.inside[0, 0], inside[b, p])
 
 
 def test_no_polygons():
-    assert polygon_cells(torch.zeros(2, 0, 4, 2).double(), 5).inside.shape == (2, 0, 5, 5)
+    assert rasterize(torch.zeros(2, 0, 4, 2).double(), 5).inside.shape == (2, 0, 5, 5)
 
 
 # Hulls ----------------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from torchelev.layers import LAYERS
 from torchelev.planning.footprint import FootprintConfig, check_footprint, unsafe_area
 from torchelev.planning.path_check import check_path
 from torchelev.planning.queries import height_profile, submap
-from torchelev.planning.standing import place_footprint, standing_cells
+from torchelev.planning.standing import mark_standing_cells, place_footprint
 
 SEEDS = st.integers(0, 10_000)
 FOOTPRINT = torch.tensor([[0.25, 0.125], [-0.25, 0.125], [-0.25, -0.125], [0.25, -0.125]]).double()
@@ -122,7 +122,7 @@ def test_the_cells_are_those_of_loops(seed):
     emap = random_map(seed)
     polygons = random_polygons(np.random.default_rng(seed), emap)
     for p in range(polygons.shape[1]):
-        marked = standing_cells(emap, polygons[:, p])
+        marked = mark_standing_cells(emap, polygons[:, p])
         for b in range(2):
             uv = (polygons[b, p] / RESOLUTION - CORNER[b]).tolist()
             inside = [[holds(uv, i + 0.5, j + 0.5) for j in range(14)] for i in range(16)]
@@ -137,7 +137,7 @@ def test_checks_agree_with_a_map_where_the_robot_stands_on_good_ground(seed):
     emap, filled = random_map(seed), random_map(seed)
     polygons = random_polygons(rng, emap)
     standing = polygons[:, 0]
-    below = standing_cells(emap, standing) & ~emap.validity
+    below = mark_standing_cells(emap, standing) & ~emap.validity
     filled.validity |= below
     filled.rated |= below
     filled.traversability[below] = 1.0
@@ -151,7 +151,7 @@ def test_batches_equal_single_maps():
     emap = random_map(3)
     polygons = random_polygons(np.random.default_rng(3), emap)
     both = check_footprint(emap, polygons, standing=polygons[:, 0])
-    marked = standing_cells(emap, polygons[:, 0])
+    marked = mark_standing_cells(emap, polygons[:, 0])
     single = ground_map()
     for b in range(2):
         for name, value in emap.state._asdict().items():
@@ -159,8 +159,10 @@ def test_batches_equal_single_maps():
                 getattr(single, name).copy_(value[b : b + 1])
         alone = check_footprint(single, polygons[b : b + 1], standing=polygons[b : b + 1, 0])
         assert all(torch.equal(x[0], y[b]) for x, y in zip(alone, both, strict=True))
-        assert torch.equal(standing_cells(single, polygons[b : b + 1, 0])[0], marked[b])
-    assert torch.equal(standing_cells(single, polygons[:1, 0], emap.state._replace(corner=CORNER[:1]))[0], marked[0])
+        assert torch.equal(mark_standing_cells(single, polygons[b : b + 1, 0])[0], marked[b])
+    assert torch.equal(
+        mark_standing_cells(single, polygons[:1, 0], emap.state._replace(corner=CORNER[:1]))[0], marked[0]
+    )
 
 
 def test_footprints_at_poses():
@@ -185,7 +187,7 @@ def test_nothing_waits_for_the_device(monkeypatch):
         assert check_footprint(emap, polygons, standing=polygons[:, 0]).unsafe.shape == (2, 3)
         poses = torch.empty(2, 3, 3, device="meta")
         placed = place_footprint(emap, torch.empty(4, 2, device="meta"), poses)
-        assert placed.shape == (2, 3, 4, 2) and standing_cells(emap, placed[:, 0]).shape == emap.validity.shape
+        assert placed.shape == (2, 3, 4, 2) and mark_standing_cells(emap, placed[:, 0]).shape == emap.validity.shape
 
 
 @pytest.mark.parametrize(

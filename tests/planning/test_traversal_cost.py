@@ -14,12 +14,7 @@ from tests.helpers import random_state
 from tests.planning.test_footprint import RESOLUTION, ground_map, random_map
 from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap, ElevationMapConfig
-from torchelev.planning.traversal_cost import (
-    TraversalCostConfig,
-    cost_of_layers,
-    inclination,
-    traversal_cost,
-)
+from torchelev.planning.traversal_cost import TraversalCostConfig, cost_of_layers, traversal_cost
 
 SEEDS = st.integers(0, 10_000)
 INF = math.inf
@@ -52,34 +47,6 @@ def test_known_ground_by_hand(rating, confidence, cost):
     emap = ground_map(rating)
     q = None if confidence is None else torch.full_like(emap.elevation, confidence)
     assert traversal_cost(emap, confidence=q)[0, 3, 4].item() == pytest.approx(cost)
-
-
-def test_the_inclination_by_hand():
-    """0.25 m are two cells along x and y; along the diagonals one is nearer to it than two."""
-    values = torch.zeros(1, 7, 7, dtype=torch.float64)
-    values[0, 3, 3] = 0.1
-    angle, known = inclination((values, torch.ones_like(values) > 0), RESOLUTION, 0.25)
-    expected = torch.zeros(7, 7, dtype=torch.float64)
-    expected[[1, 5, 3, 3], [3, 3, 1, 5]] = math.atan(0.1 / 0.25)
-    expected[[2, 2, 4, 4], [2, 4, 2, 4]] = expected[3, 3] = math.atan(0.1 / (0.125 * math.sqrt(2)))
-    torch.testing.assert_close(angle[0], expected)
-    assert known.all()
-    lone = torch.zeros_like(known)
-    lone[0, 3, 3] = lone[0, 0, 6] = True
-    assert not inclination((values / 0, lone), RESOLUTION, 0.25)[1].any(), "nothing around it is known"
-
-
-def test_planes_have_their_inclination():
-    """Along the axes and the diagonals exactly, elsewhere at most 8 % less steep."""
-    x, y = torch.meshgrid(torch.arange(30.0).double(), torch.arange(30.0).double(), indexing="ij")
-    known = torch.ones(1, 30, 30, dtype=torch.bool)
-    for degrees in range(0, 360, 15):
-        turn = math.radians(degrees)
-        plane = 0.05 * 0.4 * (math.cos(turn) * x + math.sin(turn) * y)[None]
-        steepness = inclination((plane, known), 0.05, 0.3)[0][0, 10:20, 10:20].tan() / 0.4
-        assert steepness.min() > 0.92 and steepness.max() < 1 + 1e-9
-        if degrees % 45 == 0:
-            assert steepness.min() > 1 - 1e-9
 
 
 def test_a_gentle_bound_is_passable_and_a_steep_one_is_not():

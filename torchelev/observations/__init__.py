@@ -1,1 +1,1 @@
-"""What a policy reads: height scans, foot heights and images of the map, and how unknown cells are filled."""
+"""Observations for policies: height scans, map images, and estimates for unknown cells. Environments are in `gym`."""

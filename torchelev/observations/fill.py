@@ -1,10 +1,10 @@
-"""Reading layers at points, and the ground that is assumed where the map knows nothing."""
+"""Read layers at points, and fill heights where the map is unknown."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,89 +26,107 @@ FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint")
 ORIGINAL = "original"
 
 
+class Query(NamedTuple):
+    """The points at which an observation reads the maps."""
+
+    uv: Float[Tensor, "B M 2"]  #: points, in cells from the window's corner
+    base_uv: Float[Tensor, "B 1 2"]  #: the base, in cells from the window's corner
+    base_z: Float[Tensor, "B 1"]  #: [m] height of the base, map frame
+    half_extent: tuple[int, int]  #: [cells] largest distance of points from the window's centre along x and y
+    grid: GridConfig  #: the maps' grid
+    mode: str  #: one of MODES
+
+
 def require_mode(mode: object) -> None:
-    """Refuse a mode of reading that does not exist."""
+    """Refuse an unknown mode of reading."""
     require(mode in MODES, "mode", f"must be one of {', '.join(MODES)}", repr(mode), "use bilinear")
 
 
 def require_fill(name: str, fill: object, names: Sequence[str], clip: float | None) -> None:
-    """Refuse what is neither a rule's name nor a number; inf may only stand where it is clipped."""
-    number = isinstance(fill, int | float) and not isinstance(fill, bool)
-    named = isinstance(fill, str) and fill in names
-    require(number or named, name, f"must be a number or one of {', '.join(names)}", repr(fill), "use ground")
+    """Refuse a fill that is neither one of `names` nor a number; inf needs a clip."""
+    is_number = isinstance(fill, int | float) and not isinstance(fill, bool)
+    is_name = isinstance(fill, str) and fill in names
+    require(is_number or is_name, name, f"must be a number or one of {', '.join(names)}", repr(fill), "use ground")
     if isinstance(fill, int | float):
-        bounded = math.isfinite(fill) or (clip is not None and not math.isnan(fill))
-        require(bounded, name, "must be finite where nothing clips", fill, "give metres, or clip")
+        is_bounded = math.isfinite(fill) or (clip is not None and not math.isnan(fill))
+        require(is_bounded, name, "must be finite without a clip", fill, "give metres, or clip")
 
 
 def read_points(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridConfig, mode: str) -> list[Layer]:
-    """Read layers (B, H, W) at `uv`, in cells from the window's corner: values (B, M), 0 where not known, and known.
+    """Read layers at points.
 
-    "bilinear" and "nearest" as in `ElevationMap.sample`. "minimum" is the lowest known of three cells: the one whose
-    centre comes before the point in x and y, the next one in x, the next one in y. legged_gym reads the corners of its
-    height field so.
+    "bilinear" and "nearest" are those of `ElevationMap.sample`. "minimum" is the lowest known one of three cells: the
+    one whose centre precedes the point along x and y, the next one along x, and the next one along y. legged_gym reads
+    the vertices of its height field that way.
+
+    Args:
+        layers: values, and where they are known, (B, H, W).
+        uv: the points, in cells from the window's corner.
+        grid: the maps' grid.
+        mode: one of MODES.
+
+    Returns:
+        For each layer its values (B, M), 0 where not known, and where they are known.
     """
     if mode != "minimum":
         return sample_layers(layers, uv, grid, mode)
-    before = uv - 0.5
-    one, none = torch.ones_like(uv[..., :1]), torch.zeros_like(uv[..., :1])
-    around = [before, before + torch.cat([one, none], -1), before + torch.cat([none, one], -1)]
-    corners = sample_layers(layers, torch.cat(around, 1), grid, "nearest")
-    return [lowest(values.unflatten(1, (3, -1)), known.unflatten(1, (3, -1)), dim=1) for values, known in corners]
+    preceding = uv - 0.5
+    one, zero = torch.ones_like(uv[..., :1]), torch.zeros_like(uv[..., :1])
+    corners = [preceding, preceding + torch.cat([one, zero], -1), preceding + torch.cat([zero, one], -1)]
+    read = sample_layers(layers, torch.cat(corners, 1), grid, "nearest")
+    return [find_lowest(values.unflatten(1, (3, -1)), known.unflatten(1, (3, -1)), dim=1) for values, known in read]
 
 
-def fill_unknown(
-    fill: str | float,
-    state: MapState,
-    uv: Float[Tensor, "B M 2"],
-    base: tuple[Float[Tensor, "B 1 2"], Float[Tensor, "B 1"]],
-    read: Layer,
-    grid: GridConfig,
-    mode: str,
-    half: tuple[int, int],
-    rings: int,
-) -> Layer:
-    """Complete heights that were read (B, M) by a rule: heights, and where the map or the rule knows one.
+def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, rings: int) -> Layer:
+    """Fill the unknown ones of the heights read at points by a rule.
 
-    "base" and numbers know no ground. `base`: where it is, in cells from the window's corner, and its height [m].
-    `half`: how many cells along x and y from the window's centre the points may lie. `rings`: how far to inpaint.
+    Args:
+        fill: one of FILLS, or a number. "base" and numbers fill in no heights.
+        state: the state of the maps.
+        query: the points.
+        read: the elevation (B, M) at the points, and where it is known.
+        rings: how far "inpaint" reaches [cells].
+
+    Returns:
+        Heights (B, M), and where the map or the rule provides one.
     """
-    heights, known = read
+    elevation, known = read
+    layer = (state.elevation, state.validity)
     if fill == "ground":
-        ground, found = continue_ground((state.elevation, state.validity), uv, *base, grid, half)
+        ground, found = continue_ground(layer, query.uv, query.base_uv, query.base_z, query.grid, query.half_extent)
     elif fill == "lowest":
-        ground, found = (part[:, None] for part in lowest(heights, known, dim=1))
+        ground, found = (part[:, None] for part in find_lowest(elevation, known, dim=1))
     elif fill == "upper_bound":
-        ((ground, found),) = read_points([LAYERS["upper_bound"](state)], uv, grid, mode)
+        ((ground, found),) = read_points([LAYERS["upper_bound"](state)], query.uv, query.grid, query.mode)
     elif fill == "inpaint":
-        ((ground, found),) = read_points([inpaint((state.elevation, state.validity), half, rings)], uv, grid, mode)
+        ((ground, found),) = read_points([inpaint(layer, query.half_extent, rings)], query.uv, query.grid, query.mode)
     else:
-        return heights, known
-    return torch.where(known, heights, ground), known | found
+        return elevation, known
+    return torch.where(known, elevation, ground), known | found
 
 
-def lowest(heights: Float[Tensor, "B *M"], known: Bool[Tensor, "B *M"], dim: int) -> Layer:
-    """Return the lowest known height along a dimension, and whether there is one."""
+def find_lowest(heights: Float[Tensor, "B *M"], known: Bool[Tensor, "B *M"], dim: int) -> Layer:
+    """Return the lowest known height along a dimension, 0 if there is none, and whether there is one."""
     low = torch.where(known, heights, torch.inf).amin(dim)
     found = torch.isfinite(low)
     return torch.where(found, low, 0.0), found
 
 
-def inpaint(layer: Layer, half: tuple[int, int], rings: int) -> Layer:
-    """Fill unknown cells with the mean of their known neighbours, of eight: `rings` times, each a ring of cells.
+def inpaint(layer: Layer, half_extent: tuple[int, int], rings: int) -> Layer:
+    """Fill unknown cells with the mean of their known neighbours among eight, one ring of cells after the other.
 
-    Only cells that points or their filling need are looked at: `half` + `rings` cells along x and y to each side of
-    the window's centre. Of the others nothing is known.
+    Only cells within `half_extent` + `rings` cells of the window's centre along x and y are read; the others are
+    unknown in the result.
     """
     values, known = layer
     H, W = values.shape[1:]
-    top, left = (max(0, n // 2 - cells - rings) for n, cells in zip((H, W), half, strict=True))
+    top, left = (max(0, n // 2 - cells - rings) for n, cells in zip((H, W), half_extent, strict=True))
     part = known[:, top : H - top, left : W - left]
     heights = torch.where(part, values[:, top : H - top, left : W - left], 0.0)
-    both = torch.stack([heights, part.to(values.dtype)], 1)  # height and weight, 0 or 1
+    weighted = torch.stack([heights, part.to(values.dtype)], 1)  # height and weight, 0 or 1
     for _ in range(rings):
-        (sums,) = window_moments([(padded(both, 1, 0.0), 0)], 1, 1)  # on a CPU, a twelfth of pooling's time
-        both = torch.where(both[:, 1:] > 0, both, sums / sums[:, 1:].clamp(min=1))
-    heights, weight = both.unbind(1)
+        (sums,) = window_moments([(padded(weighted, 1, 0.0), 0)], 1, 1)  # on a CPU, a twelfth of pooling's time
+        weighted = torch.where(weighted[:, 1:] > 0, weighted, sums / sums[:, 1:].clamp(min=1))
+    heights, weight = weighted.unbind(1)
     rim = [left, left, top, top]
     return F.pad(heights, rim), F.pad(weight, rim) > 0

@@ -1,4 +1,4 @@
-"""The ground where the map knows none: what is known nearby, continued, else the ground under the robot."""
+"""Continue the known ground over unknown cells: nearby known heights, else the ground below the robot."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torchelev.layers import Layer, sample_layer
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-MARGIN = 0.5  # [m] how far beyond the points cells are looked at
-LARGEST = 1.0  # [m] side of the largest block of cells that counts as near a point
+_MARGIN = 0.5  # [m] beyond the pattern within which cells are read
+_MAX_BLOCK = 1.0  # [m] side of the largest block of cells that counts as near a point
 
 
 def continue_ground(
@@ -25,54 +25,63 @@ def continue_ground(
     base_uv: Float[Tensor, "B 1 2"],
     base_z: Float[Tensor, "B 1"],
     grid: GridConfig,
-    half: tuple[int, int],
+    half_extent: tuple[int, int],
 ) -> Layer:
-    """Estimate the ground at points, in cells from the window's corner, from the known cells of an elevation layer.
+    """Estimate the ground at points from the known cells of an elevation layer.
 
-    Means of the known cells over blocks of 1, 2, 4, ... cells a side, read bilinearly: the smallest block that knows
-    something counts, up to 1 m a side. Farther from what is known, the ground is flat, as high as under the base:
-    the mean of the smallest block around the base, of any size, that lies below the base.
+    The known cells are averaged over blocks of 1, 2, 4, ... cells a side, and each level is read bilinearly. A point
+    takes the smallest block that holds a known cell, up to 1 m a side. Farther from known cells the ground is flat, at
+    its height below the base: the mean of the smallest block of any size around the base that lies below the base.
 
-    Only cells at most `half` + 0.5 m along x and y from the window's centre are looked at, so that time and memory grow
-    with the pattern and not with the window. Returns heights (B, M), and where there is one: nowhere on an empty map.
+    Args:
+        layer: the elevation, and where it is known.
+        uv: the points, in cells from the window's corner.
+        base_uv: the base, in cells from the window's corner.
+        base_z: height of the base [m], map frame.
+        grid: the map's grid.
+        half_extent: largest distance of the points from the window's centre [cells]. Cells more than 0.5 m farther
+            away are ignored, so that time and memory grow with the pattern and not with the window.
+
+    Returns:
+        Heights (B, M) and whether there is one; on an empty map there is none.
     """
     values, known = layer
-    margin = math.ceil(MARGIN / grid.resolution)
-    top, left = (max(0, n // 2 - cells - margin) for n, cells in zip(values.shape[1:], half, strict=True))
+    margin = math.ceil(_MARGIN / grid.resolution)
+    top, left = (max(0, n // 2 - cells - margin) for n, cells in zip(values.shape[1:], half_extent, strict=True))
     values, known = (v[:, top : v.shape[1] - top, left : v.shape[2] - left] for v in (values, known))
-    z = torch.nan_to_num(base_z, nan=0.0, posinf=0.0, neginf=0.0)  # on a GPU nobody has looked at the poses
-    above = torch.where(known, values - z[..., None], 0.0)
-    places = torch.cat([uv, base_uv], 1)
-    places = torch.stack([places[..., 0] - top, places[..., 1] - left], -1)
-    levels = _levels((above, known), places)
-    near = 1 + max(0, math.floor(math.log2(LARGEST / grid.resolution)))
+    z = torch.nan_to_num(base_z, nan=0.0, posinf=0.0, neginf=0.0)  # GPU poses are not checked
+    relative = torch.where(known, values - z[..., None], 0.0)
+    points = torch.cat([uv, base_uv], 1)
+    points = torch.stack([points[..., 0] - top, points[..., 1] - left], -1)
+    levels = _read_levels((relative, known), points)
+    num_near = 1 + max(0, math.floor(math.log2(_MAX_BLOCK / grid.resolution)))
     below = [(mean[:, -1:], found[:, -1:] & (mean[:, -1:] < 0)) for mean, found in levels]
-    base_ground, base_found = _first_known(below)
-    ground, found = _first_known([(mean[:, :-1], found[:, :-1]) for mean, found in levels[:near]])
+    base_ground, base_found = _take_first_known(below)
+    ground, found = _take_first_known([(mean[:, :-1], found[:, :-1]) for mean, found in levels[:num_near]])
     return torch.where(found, ground, base_ground) + z, found | base_found
 
 
-def _levels(layer: Layer, places: Float[Tensor, "B M 2"]) -> list[Layer]:
-    """Read a layer at places, in cells from its corner, as means over blocks of 1, 2, 4, ... cells a side, up to all.
+def _read_levels(layer: Layer, points: Float[Tensor, "B M 2"]) -> list[Layer]:
+    """Read a layer at points [cells], averaged over blocks of 1, 2, 4, ... cells a side, up to one block.
 
-    A block's mean is that of its quarters, of those that are known.
+    The mean of a block is that of its known quarters.
     """
     values, known = layer
-    read = []
+    levels = []
     while True:
         H, W = values.shape[1:]
         blocks = GridConfig(resolution=1.0, length_x=H, length_y=W)
-        read.append(sample_layer((values, known), places, blocks, "bilinear"))
+        levels.append(sample_layer((values, known), points, blocks, "bilinear"))
         if max(H, W) == 1:
-            return read
-        both = F.avg_pool2d(torch.stack([values, known.to(values.dtype)], 1), 2, ceil_mode=True)
-        total, weight = both.unbind(1)
+            return levels
+        averages = F.avg_pool2d(torch.stack([values, known.to(values.dtype)], 1), 2, ceil_mode=True)
+        total, weight = averages.unbind(1)
         known = weight > 0
-        values, places = total / torch.where(known, weight, 1.0), places / 2
+        values, points = total / torch.where(known, weight, 1.0), points / 2
 
 
-def _first_known(layers: list[Layer]) -> Layer:
-    """Return the first value that is known, at each place."""
+def _take_first_known(layers: list[Layer]) -> Layer:
+    """Return at each point the value of the first layer that is known there."""
     values, known = layers[-1]
     for value, found in reversed(layers[:-1]):
         values, known = torch.where(found, value, values), known | found

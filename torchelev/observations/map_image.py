@@ -1,4 +1,4 @@
-"""The map around the robots as images, for convolutional policies."""
+"""Images of the map around the robots, for convolutional policies."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torchelev.errors import require, whole_cells
 from torchelev.layers import Layer
 from torchelev.observations import patterns
 from torchelev.observations.fill import read_points, require_mode
-from torchelev.observations.height_scan import check_base
-from torchelev.observations.patterns import Pattern, centered
+from torchelev.observations.inputs import check_base
+from torchelev.observations.patterns import Pattern
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -26,43 +26,64 @@ CHANNELS = ("elevation", "validity", "variance", "upper_bound", "traversability"
 
 @dataclass(frozen=True, kw_only=True)
 class MapImage:
-    """The map around the base as images (B, C, H, W) for convolutions.
+    """Read the map around the base as images (B, C, H, W), for convolutional policies.
 
-    H = length_x / resolution, W = length_y / resolution. Index [i, j]: i grows with +x, j with +y; the pixels' centres
-    lie at offset + (i + 0.5 - H / 2) * resolution. Channels: "elevation" and "upper_bound" [m], counted from the ground
-    `nominal_height` below the base; "validity", 1 where the elevation is known; "variance" [m^2]; "traversability", 0
-    to 1, the better. What is not known is 0 in every channel.
+    H = length_x / resolution and W = length_y / resolution. Index [i, j]: i grows with +x, j with +y; the centre of a
+    pixel is at offset + (i + 0.5 - H / 2, j + 0.5 - W / 2) * resolution. Unknown pixels are 0 in every channel.
 
-    Raises ValueError for settings out of range.
+    Channels:
+
+    - "elevation" and "upper_bound" [m], above the ground `nominal_height` below the base
+    - "validity", 1 where the elevation is known
+    - "variance" [m^2]
+    - "traversability", 0 (bad) to 1 (good)
+
+    Raises:
+        ValueError: for a setting out of range.
     """
 
-    length_x: float = 1.6  #: [m]
-    length_y: float = 1.6  #: [m]
-    resolution: float = 0.05  #: [m]
-    offset: tuple[float, float] = (0.0, 0.0)  #: [m] the image's middle, x and y from the base
+    length_x: float = 1.6  #: [m] along x, a whole number of pixels
+    length_y: float = 1.6  #: [m] along y, a whole number of pixels
+    resolution: float = 0.05  #: [m] side of a pixel
+    offset: tuple[float, float] = (0.0, 0.0)  #: [m] centre of the image (x, y), base frame
     layers: tuple[str, ...] = ("elevation", "validity", "upper_bound", "traversability")  #: channels, in this order
-    alignment: str = "yaw"  #: as of HeightScan
-    mode: str = "bilinear"  #: "bilinear" or "nearest" reading of the map
-    nominal_height: float = 0.0  #: [m] of the base over flat ground
-    shape: tuple[int, int, int] = field(init=False)  #: C, H, W
+    #: "yaw" turns the image with the base's heading; "base" turns it in 3D and drops z; "world" only moves it
+    alignment: str = "yaw"
+    mode: str = "bilinear"  #: how the map is read: "bilinear", "nearest" or "minimum", as of `HeightScan`
+    nominal_height: float = 0.0  #: [m] of the base over flat ground: that ground then has elevation 0
+    shape: tuple[int, int, int] = field(init=False)  #: (C, H, W), for the policy's input layer
     _pattern: Pattern = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         H, W = (whole_cells(name, getattr(self, name), self.resolution) for name in ("length_x", "length_y"))
-        known = len(self.layers) > 0 and all(name in CHANNELS for name in self.layers)
-        require(known, "layers", f"must be some of {', '.join(CHANNELS)}", repr(self.layers), "correct their names")
+        are_channels = len(self.layers) > 0 and all(name in CHANNELS for name in self.layers)
+        hint = "correct their names"
+        require(are_channels, "layers", f"must be some of {', '.join(CHANNELS)}", repr(self.layers), hint)
         require_mode(self.mode)
         require(math.isfinite(self.nominal_height), "nominal_height", "must be finite", self.nominal_height, "give 0")
-        x, y = (centered(n, self.resolution, at) for n, at in zip((H, W), self.offset, strict=True))
+        axes = zip(self.offset, (H, W), strict=True)
+        x, y = (patterns.space_around(middle, count, self.resolution) for middle, count in axes)
         object.__setattr__(self, "shape", (len(self.layers), H, W))
-        object.__setattr__(self, "_pattern", Pattern(patterns.as_points(patterns.y_fastest(x, y)), self.alignment))
+        points = patterns.parse_points(patterns.order_y_fastest(x, y))
+        object.__setattr__(self, "_pattern", Pattern(points, self.alignment))
 
     def __call__(
         self, emap: ElevationMap, T_map_base: Float[Tensor, "B 4 4"], *, state: MapState | None = None
     ) -> Float[Tensor, "B C H W"]:
-        """Read the images around the robots: a fresh tensor without NaN, differentiable as a height scan is.
+        """Read an image around the base of each environment.
 
-        Raises ValueError or TypeError for inputs that do not fit, and for a window that the image does not fit into.
+        Differentiable in the state and, in bilinear mode, in T_map_base.
+
+        Args:
+            emap: the maps.
+            T_map_base: base poses, in float64 far from the origin.
+            state: the state to read; None: that of the maps.
+
+        Returns:
+            A fresh tensor without NaN.
+
+        Raises:
+            ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the image.
         """
         grid = emap.cfg.grid
         self._pattern.require_inside(grid)
@@ -70,25 +91,25 @@ class MapImage:
         state = emap.state if state is None else state
         base = T_map_base[:, None, :3, 3]
         uv = self._pattern.place(T_map_base, base, state.corner, grid.resolution, state.elevation.dtype)
-        floor = base[..., 2].to(uv.dtype) - self.nominal_height
+        reference = base[..., 2].to(uv.dtype) - self.nominal_height
         sources = dict.fromkeys("elevation" if name == "validity" else name for name in self.layers)
         sampled = read_points([emap._read(name, state) for name in sources], uv, grid, self.mode)
         read = dict(zip(sources, sampled, strict=True))
-        images = torch.stack([_channel(name, read, floor) for name in self.layers], 1)
-        return torch.where(torch.isfinite(floor)[:, None], images, 0.0).unflatten(-1, self.shape[1:])
+        images = torch.stack([_channel(name, read, reference) for name in self.layers], 1)
+        return torch.where(torch.isfinite(reference)[:, None], images, 0.0).unflatten(-1, self.shape[1:])
 
     def xy(self, T_map_base: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B M 2"]:
-        """Return where the pixels lie [m], map frame, row by row: to read what else is known of those places.
+        """Return the centres of the pixels [m], map frame, row by row, for instance for `ElevationMap.sample`.
 
         In the dtype of the poses, and differentiable in them.
         """
-        origin = torch.zeros(len(T_map_base), 2, dtype=torch.int64, device=T_map_base.device)
-        return self._pattern.place(T_map_base, T_map_base[:, None, :3, 3], origin, 1.0, T_map_base.dtype)
+        corner = torch.zeros(len(T_map_base), 2, dtype=torch.int64, device=T_map_base.device)
+        return self._pattern.place(T_map_base, T_map_base[:, None, :3, 3], corner, 1.0, T_map_base.dtype)
 
 
-def _channel(name: str, read: dict[str, Layer], floor: Float[Tensor, "B 1"]) -> Float[Tensor, "B M"]:
+def _channel(name: str, read: dict[str, Layer], reference: Float[Tensor, "B 1"]) -> Float[Tensor, "B M"]:
     """Return one channel of an image."""
     if name == "validity":
-        return read["elevation"][1].to(floor.dtype)
+        return read["elevation"][1].to(reference.dtype)
     values, known = read[name]
-    return torch.where(known, values - floor, 0.0) if name in ("elevation", "upper_bound") else values
+    return torch.where(known, values - reference, 0.0) if name in ("elevation", "upper_bound") else values

@@ -1,1 +1,1 @@
-"""What a planner asks of a map: footprints, paths, costs, and a planner over the grid."""
+"""Planning on a map: footprint checks, traversal costs, local paths and queries. Robot control is not here."""

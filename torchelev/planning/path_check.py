@@ -1,4 +1,4 @@
-"""Where a robot may walk: its footprint, checked all along a path."""
+"""Check where a robot may walk: its footprint all along a path."""
 
 from __future__ import annotations
 
@@ -12,22 +12,41 @@ from torchelev.checks import given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint
-from torchelev.planning.standing import as_xy_yaw, at_poses, check_polygon
+from torchelev.planning.standing import MAX_CELL_OFFSET, check_polygon, check_poses, transform_polygon
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-ROUNDING = 1e-3  # [cells] by which a step may be too long
+ROUNDING = 1e-3  # [cells] tolerance on the distance between samples
 
 
 class PathCheck(NamedTuple):
-    """What is known of a path of T poses on each of B maps, at M = (T - 1) * samples + 1 places along it."""
+    """Ratings of a path of T poses on each of B maps, sampled at M = (T - 1) * samples + 1 places."""
 
-    safe: Bool[Tensor, "B"]  #: every footprint along the path is safe
-    first_unsafe: Int[Tensor, "B"]  #: number of the first pose that cannot be reached safely; T: there is none
-    poses: Float[Tensor, "B M 3"]  #: x, y [m], map frame, and yaw [rad]; every `samples`-th is one of those given
+    safe: Bool[Tensor, "B"]  #: every footprint along the path is safe; False for an empty path
+    first_unsafe: Int[Tensor, "B"]  #: index of the first pose that cannot be reached safely; T if all can
+    poses: Float[Tensor, "B M 3"]  #: x, y [m] and yaw [rad], map frame; every `samples`-th is a given pose
     footprints: FootprintCheck  #: (B, M), at these places
+
+    def explain(self) -> list[str]:
+        """Say for each path whether it is safe, else why not. The host waits for the device.
+
+        A path that is not safe although the numbers meet the thresholds has poses too far apart for `samples`.
+        """
+        columns = (self.safe, _is_empty(self.poses), self.first_unsafe, self.footprints.safe.to(torch.uint8).argmin(1))
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        return [self._explain(b, *row) for b, row in enumerate(rows)]
+
+    def _explain(self, b: int, is_safe: bool, is_empty: bool, pose: int, sample: int) -> str:
+        if is_safe:
+            return "every footprint along the path is safe"
+        if is_empty:
+            return "the path is empty: no path was found; Path.explain() says why"
+        x, y, _ = self.poses[b, sample].tolist()
+        mean, unknown, unsafe = (float(values[b, sample]) for values in self.footprints[1:])
+        ground = f"mean traversability {mean:.2f}, {unsafe:.0%} of the cells unsafe, {unknown:.0%} unknown"
+        return f"pose {pose} cannot be reached safely: at x = {x:.2f} m, y = {y:.2f} m {ground}"
 
 
 def check_path(
@@ -40,79 +59,92 @@ def check_path(
     standing: Float[Tensor, "B V 2"] | None = None,
     state: MapState | None = None,
 ) -> PathCheck:
-    """Check the footprint at poses and between them, as `check_footprint` does.
+    """Check a footprint at poses and between them, with `check_footprint`.
 
-    Between two poses the robot moves straight and turns evenly, the shorter way. `samples` footprints are checked for
-    each such segment, the last one at its end. No vertex may move farther than one cell from one to the next, so that
-    nothing wider than a cell is stepped over.
+    Between two poses the robot moves straight and turns evenly, the shorter way around. `samples` footprints are
+    checked on each such segment, the last one at its end. From one sample to the next, each vertex may move by one
+    cell at most, so that no obstacle wider than a cell is stepped over.
+
+    A path whose poses x, y, yaw are all NaN is empty, as `Path.poses` returns it where `plan` found no path: it is not
+    safe, and pose 0 is the first unsafe one. Pad other paths by repeating the last pose.
 
     Args:
         emap: the maps.
-        poses: x, y [m], map frame, and yaw [rad]; or T_map_base, of which the heading counts (`scan_patterns.heading`),
-            so that the footprint stays level.
-        footprint: a polygon [m], base frame, convex or not.
+        poses: x, y [m] and yaw [rad], map frame; or T_map_base, of which the position and the heading
+            (`observations.patterns.compute_heading`) are used: the footprint stays level.
+        footprint: vertices of a polygon [m], base frame, convex or not.
         cfg: the thresholds.
-        samples: how many footprints a segment has. More are needed the farther the poses lie apart.
-        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`): unknown ground
-            under them is assumed to carry the robot, as in `plan`. None: the footprint at the first pose. For a path
-            that begins elsewhere, give where the robot is, or NaN to assume nothing.
-        state: of the maps; None: their own.
+        samples: footprints on each segment. Give more for poses that lie farther apart.
+        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`). Unknown cells
+            below them are assumed to be passable, as in `plan`. None: the footprint at the first pose. For a path that
+            starts elsewhere give the robot's place, or NaN to assume nothing.
+        state: the state to read; None: that of the maps.
 
-    Raises ValueError or TypeError for inputs that do not fit. Poses that are not finite or too far apart for `samples`
-    are refused on a CPU, as is a footprint wider than `max_extent`; on other devices the path is not safe there, unless
-    the map has `check_values`.
+    Raises:
+        ValueError, TypeError: for a wrong shape, dtype or device. On a CPU, or with the map's `check_values`, also for
+            poses that are not finite, poses too far apart for `samples`, and a footprint wider than `max_extent`;
+            elsewhere, where reading them would make the host wait, such places are not safe.
     """
     cfg = given_or_default(FootprintConfig, cfg)
-    given, polygon = as_xy_yaw(emap, poses), check_polygon(emap, footprint)
+    given, polygon = check_poses(emap, poses), check_polygon(emap, footprint)
     if readable(footprint, emap.check_values):
-        _refuse_wide(polygon, cfg.max_extent)
+        _require_fits(polygon, cfg.max_extent)
     require_count("samples", samples, "give 8")
-    shift, turn = given[:, 1:, :2] - given[:, :-1, :2], _shorter_way(given[:, 1:, 2:] - given[:, :-1, 2:])
-    reach = torch.linalg.vector_norm(polygon, dim=-1).amax()
-    way = torch.linalg.vector_norm(shift, dim=-1) + reach * turn[..., 0].abs()  # of no vertex is it longer
-    step = way / (samples * emap.cfg.grid.resolution)
+    is_empty = _is_empty(given)
+    shift, turn = given[:, 1:, :2] - given[:, :-1, :2], _wrap_angle(given[:, 1:, 2:] - given[:, :-1, 2:])
+    radius = torch.linalg.vector_norm(polygon, dim=-1).amax()
+    # No vertex moves farther than the base does and the farthest vertex turns.
+    distance = torch.linalg.vector_norm(shift, dim=-1) + radius * turn[..., 0].abs()
+    step = torch.where(is_empty[:, None], 0.0, distance / (samples * emap.cfg.grid.resolution))
     if readable(poses, emap.check_values):
-        _refuse(given, step, samples)
+        _require_close(torch.where(is_empty[:, None, None], 0.0, given), step, samples)
     places = _interpolate(given, torch.cat([shift, turn], -1), samples)
-    polygons = at_poses(polygon, places)
+    # An empty path lies nowhere: so far away that nothing is known.
+    nowhere = 2 * MAX_CELL_OFFSET * emap.cfg.grid.resolution
+    polygons = torch.where(is_empty[:, None, None, None], nowhere, transform_polygon(polygon, places))
     standing = polygons[:, 0] if standing is None else standing
     footprints = check_footprint(emap, polygons, cfg, standing=standing, state=state)
-    near = (step <= 1 + ROUNDING).repeat_interleave(samples, 1)
-    safe = footprints.safe & torch.cat([near.new_ones(len(near), 1), near], 1)
-    return PathCheck(safe.all(1), _first_unsafe(safe, samples), places, footprints._replace(safe=safe))
+    is_close = (step <= 1 + ROUNDING).repeat_interleave(samples, 1)
+    safe = footprints.safe & torch.cat([is_close.new_ones(len(is_close), 1), is_close], 1)
+    return PathCheck(safe.all(1), _find_first_unsafe(safe, samples), places, footprints._replace(safe=safe))
 
 
-def _refuse_wide(footprint: Tensor, max_extent: float) -> None:
-    """Refuse a footprint that may not fit `max_extent` at some heading; this reads its values."""
-    widest = float(torch.pdist(footprint).max())
+def _is_empty(poses: Float[Tensor, "B T 3"]) -> Bool[Tensor, "B"]:
+    return torch.isnan(poses).flatten(1).all(1)
+
+
+def _require_fits(footprint: Tensor, max_extent: float) -> None:
+    """Refuse a footprint that is larger than `max_extent` at some heading; this reads its values."""
+    width = float(torch.pdist(footprint).max())
     rule = f"must be no wider than max_extent = {max_extent:g} m at any heading"
-    require(widest <= max_extent * (1 + 1e-6), "footprint", rule, f"{widest:.6g} m", "enlarge it in FootprintConfig")
+    require(width <= max_extent * (1 + 1e-6), "footprint", rule, f"{width:.6g} m", "enlarge it in FootprintConfig")
 
 
-def _refuse(given: Tensor, step: Tensor, samples: int) -> None:
+def _require_close(given: Tensor, step: Tensor, samples: int) -> None:
     """Refuse poses that are not finite or too far apart; this reads their values."""
-    finite = bool(torch.isfinite(given).all())
-    require(finite, "poses", "must be finite", "NaN or inf", "pad by repeating the last pose, not with NaN")
+    is_finite = bool(torch.isfinite(given).all())
+    require(is_finite, "poses", "must be finite", "NaN or inf", "pad by repeating the last pose, not with NaN")
     longest = float(step.max()) if step.numel() else 0.0
-    rule = "must not take the footprint farther than one cell from sample to sample"
+    rule = "must not move the footprint by more than one cell from sample to sample"
     hint = f"raise samples to {math.ceil(samples * longest)}, or give poses in between"
     require(longest <= 1 + ROUNDING, "poses", rule, f"{longest:.3g} cells", hint)
 
 
-def _shorter_way(turn: Tensor) -> Tensor:
-    return torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+def _wrap_angle(angle: Tensor) -> Tensor:
+    """Wrap an angle [rad] to [-pi, pi)."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def _interpolate(given: Tensor, change: Tensor, samples: int) -> Float[Tensor, "B M 3"]:
-    """Return `samples` poses for each segment, from its start on, and the last pose."""
-    share = torch.arange(samples, device=given.device, dtype=given.dtype)[:, None] / samples
-    # Zero times NaN would reach the pose before.
-    between = given[:, :-1, None] + share * torch.nan_to_num(change, 0.0, 0.0, 0.0)[:, :, None]
+    """Return `samples` poses for each segment, its start included, and the last pose."""
+    fraction = torch.arange(samples, device=given.device, dtype=given.dtype)[:, None] / samples
+    # 0 * NaN would make the pose before it NaN.
+    between = given[:, :-1, None] + fraction * torch.nan_to_num(change, 0.0, 0.0, 0.0)[:, :, None]
     return torch.cat([between.flatten(1, 2), given[:, -1:]], 1)
 
 
-def _first_unsafe(safe: Bool[Tensor, "B M"], samples: int) -> Int[Tensor, "B"]:
-    """Return the number of the first pose that is unsafe or comes after something unsafe; of none, one more."""
+def _find_first_unsafe(safe: Bool[Tensor, "B M"], samples: int) -> Int[Tensor, "B"]:
+    """Return the index of the first pose at or behind an unsafe sample; the number of poses if all are safe."""
     sample = torch.arange(safe.shape[1], device=safe.device)
     pose = torch.div(sample + samples - 1, samples, rounding_mode="floor")
     return torch.where(safe, pose[-1] + 1, pose).amin(1)

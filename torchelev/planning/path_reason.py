@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchelev.ops.windows import AROUND, neighbours
-from torchelev.planning.traversal_cost import disc
+from torchelev.planning.traversal_cost import mark_disc
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
 class Reason(IntEnum):
-    """Why a path ends where it does. `sentence` says it, with the likely remedy."""
+    """Why a path ends where it does. `sentence` puts it into words, with the likely remedy."""
 
     REACHED = 0
     START_OUTSIDE = 1
@@ -25,9 +25,9 @@ class Reason(IntEnum):
     GOAL_IMPASSABLE = 4
     START_UNKNOWN = 5
     START_IMPASSABLE = 6
-    ROUNDS = 7
-    NO_WAY = 8
-    STEP_LIMIT = 9
+    ROUND_LIMIT = 7
+    NO_PATH = 8
+    CELL_LIMIT = 9
 
     @property
     def sentence(self) -> str:
@@ -37,18 +37,25 @@ class Reason(IntEnum):
 
 _SENTENCES = {
     Reason.REACHED: "the path reaches the goal",
-    Reason.START_OUTSIDE: "the start is outside of the window or not finite; recenter the map on the robot",
-    Reason.GOAL_OUTSIDE: "the goal is outside of the window or not finite; give a goal within the window",
-    Reason.GOAL_UNKNOWN: "the goal's traversability is unknown, and no gentle bound vouches for it, "
-    "or it is too close to impassable ground; give a goal on ground that was seen",
-    Reason.GOAL_IMPASSABLE: "the ground at the goal is rated impassable, or too close to impassable ground",
-    Reason.START_UNKNOWN: "no ground around the place where the robot stands is passable, and some of it is unknown; "
-    "look at it, or initialize the map around the feet",
-    Reason.START_IMPASSABLE: "all ground around the place where the robot stands is rated impassable",
-    Reason.ROUNDS: "the search stopped after its last round before it reached the start; raise rounds",
-    Reason.NO_WAY: "impassable or unknown ground separates the start from the goal",
-    Reason.STEP_LIMIT: "the path is longer than max_cells; raise it, or plan again from the path's end",
+    Reason.START_OUTSIDE: "the start is outside the window or not finite; recenter the map on the robot",
+    Reason.GOAL_OUTSIDE: "the goal is outside the window or not finite; give a goal inside the window",
+    Reason.GOAL_UNKNOWN: "the traversability at the goal is unknown and its upper bound is steep or unknown, "
+    "or the goal is too close to impassable ground; give a goal on ground that was measured",
+    Reason.GOAL_IMPASSABLE: "the ground at the goal is rated impassable, or is too close to impassable ground",
+    Reason.START_UNKNOWN: "no ground around the robot is passable, and some of it is unknown; "
+    "measure it, or initialize the map around the feet",
+    Reason.START_IMPASSABLE: "all ground around the robot is rated impassable",
+    Reason.ROUND_LIMIT: "the search ended after its last round, before it reached the start; raise rounds",
+    Reason.NO_PATH: "impassable or unknown ground separates the start from the goal",
+    Reason.CELL_LIMIT: "the path is longer than max_cells; raise it, or plan again from the end of the path",
 }
+
+
+class Endpoint(NamedTuple):
+    """The start or the goal of a path on each of B maps."""
+
+    cell: Int[Tensor, "B 2"]  #: (i, j); (0, 0) if outside the window
+    is_inside: Bool[Tensor, "B"]  #: the point lies inside the window
 
 
 def find_reason(
@@ -56,53 +63,61 @@ def find_reason(
     value: Float[Tensor, "B H W"],
     rated: Bool[Tensor, "B H W"],
     standing: Bool[Tensor, "B H W"],
-    ends: tuple[tuple[Int[Tensor, "B 2"], Bool[Tensor, "B"]], tuple[Int[Tensor, "B 2"], Bool[Tensor, "B"]]],
+    start: Endpoint,
+    goal: Endpoint,
     reached: Bool[Tensor, "B"],
 ) -> Int[Tensor, "B"]:
-    """Return the `Reason` of each map, int64, without reading values.
+    """Return the `Reason` of each map, int64, without waiting for the device.
 
     Args:
-        cost: of each cell, `traversal_cost`.
+        cost: the cost of each cell, as `traversal_cost` returns it.
         value: the cost to go.
-        rated: cells of known traversability.
-        standing: cells under the robot.
-        ends: the cells (i, j) of the start and of the goal, and whether each lies in the window.
-        reached: the path ends at the goal.
+        rated: the cells of known traversability.
+        standing: the cells below the robot.
+        start: the start of the path.
+        goal: the goal of the path.
+        reached: whether the path ends at the goal.
     """
-    (start, starts), (goal, goals) = ends
-    passable = torch.isfinite(cost)
-    around = _around(standing | disc(start, cost, 0.0))
-    some, free, unseen = (mask.flatten(1).any(1) for mask in (around, around & passable, around & ~rated))
-    caged = some & ~free  # the robot may fill a small window
-    reason = torch.where(_unfinished(value, passable), Reason.ROUNDS.value, torch.full_like(start[:, 0], Reason.NO_WAY))
-    reason = torch.where(caged & ~unseen, Reason.START_IMPASSABLE.value, reason)
-    reason = torch.where(caged & unseen, Reason.START_UNKNOWN.value, reason)
-    reason = torch.where(torch.isfinite(at(value, start)), Reason.STEP_LIMIT.value, reason)
-    blocked, rating = ~at(passable, goal), at(rated, goal)
-    reason = torch.where(blocked & rating, Reason.GOAL_IMPASSABLE.value, reason)
-    reason = torch.where(blocked & ~rating, Reason.GOAL_UNKNOWN.value, reason)
-    reason = torch.where(goals, reason, Reason.GOAL_OUTSIDE.value)
-    reason = torch.where(starts, reason, Reason.START_OUTSIDE.value)
-    return torch.where(reached, Reason.REACHED.value, reason)
+    is_passable = torch.isfinite(cost)
+    around = _mark_border(standing | mark_disc(start.cell, cost, 0.0))
+    masks = (around, around & is_passable, around & ~rated)
+    has_border, has_exit, has_unknown = (mask.flatten(1).any(1) for mask in masks)
+    is_enclosed = has_border & ~has_exit  # without a border, the robot fills the window
+    is_blocked, is_rated = ~read_cell(is_passable, goal.cell), read_cell(rated, goal.cell)
+    # From the most general reason to the most specific one.
+    reason = torch.full_like(start.cell[:, 0], Reason.NO_PATH)
+    for holds, specific in (
+        (_can_spread(value, is_passable), Reason.ROUND_LIMIT),
+        (is_enclosed & ~has_unknown, Reason.START_IMPASSABLE),
+        (is_enclosed & has_unknown, Reason.START_UNKNOWN),
+        (torch.isfinite(read_cell(value, start.cell)), Reason.CELL_LIMIT),
+        (is_blocked & is_rated, Reason.GOAL_IMPASSABLE),
+        (is_blocked & ~is_rated, Reason.GOAL_UNKNOWN),
+        (~goal.is_inside, Reason.GOAL_OUTSIDE),
+        (~start.is_inside, Reason.START_OUTSIDE),
+        (reached, Reason.REACHED),
+    ):
+        reason = torch.where(holds, specific.value, reason)
+    return reason
 
 
-def at(layer: Tensor, cell: Int[Tensor, "B 2"]) -> Tensor:
-    """Return what one cell of each map holds."""
+def read_cell(layer: Tensor, cell: Int[Tensor, "B 2"]) -> Tensor:
+    """Return the value at cell (i, j) of each map."""
     return layer.flatten(1).gather(1, cell[:, :1] * layer.shape[2] + cell[:, 1:])[:, 0]
 
 
-def _around(cells: Bool[Tensor, "B H W"]) -> Bool[Tensor, "B H W"]:
-    """Mark the cells beside those marked. No step cuts a corner, so that the diagonal neighbours do not count."""
-    return (_beside(torch.where(cells, 0.0, 1.0), 1.0) == 0) & ~cells
+def _mark_border(cells: Bool[Tensor, "B H W"]) -> Bool[Tensor, "B H W"]:
+    """Mark the straight neighbours of cells. Diagonal ones cannot be reached alone, as no step cuts a corner."""
+    return (_neighbour_minimum(torch.where(cells, 0.0, 1.0), 1.0) == 0) & ~cells
 
 
-def _unfinished(value: Float[Tensor, "B H W"], passable: Bool[Tensor, "B H W"]) -> Bool[Tensor, "B"]:
-    """Tell whether the search can still spread: a passable cell without a value is beside one that has one."""
-    nearest = _beside(value, torch.inf)
-    return (torch.isinf(value) & passable & torch.isfinite(nearest)).flatten(1).any(1)
+def _can_spread(value: Float[Tensor, "B H W"], is_passable: Bool[Tensor, "B H W"]) -> Bool[Tensor, "B"]:
+    """Return whether the search stopped early: some passable cell without a value has a neighbour with one."""
+    nearest = _neighbour_minimum(value, torch.inf)
+    return (torch.isinf(value) & is_passable & torch.isfinite(nearest)).flatten(1).any(1)
 
 
-def _beside(values: Tensor, fill: float) -> Tensor:
-    """Return the least value of each cell's four straight neighbours."""
+def _neighbour_minimum(values: Tensor, fill: float) -> Tensor:
+    """Return the minimum over the four straight neighbours of each cell."""
     straight = [v for (i, j), v in zip(AROUND, neighbours(values, fill), strict=True) if i == 0 or j == 0]
     return torch.stack(straight).amin(0)

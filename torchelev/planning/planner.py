@@ -1,4 +1,4 @@
-"""Local paths over a map."""
+"""Plan local paths on the grid of a map."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torchelev.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.planning.cost_to_go import cost_to_go, descend
-from torchelev.planning.path_reason import Reason, at, find_reason
-from torchelev.planning.standing import standing_cells
-from torchelev.planning.traversal_cost import TraversalCostConfig, disc, traversal_cost
+from torchelev.planning.path_reason import Endpoint, Reason, find_reason, read_cell
+from torchelev.planning.standing import mark_standing_cells
+from torchelev.planning.traversal_cost import TraversalCostConfig, mark_disc, traversal_cost
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -21,37 +21,44 @@ if TYPE_CHECKING:
 
 
 class Path(NamedTuple):
-    """A path of at most K cells on each of B maps."""
+    """A path of at most K waypoints, the centres of cells, on each of B maps."""
 
     xy: Float[Tensor, "B K 2"]  #: [m] map frame, from the start on; the last waypoint is repeated
-    cost: Float[Tensor, "B"]  #: [m] of easy ground that cost as much; inf if there is no way
+    cost: Float[Tensor, "B"]  #: length [m] of a path of equal cost over ground of cost 1; inf if there is no path
     length: Float[Tensor, "B"]  #: [m]
-    reached: Bool[Tensor, "B"]  #: it ends at the goal
-    #: waypoints before the repeats; 0 if the start is outside
+    reached: Bool[Tensor, "B"]  #: the path ends at the goal
+    #: number of waypoints without the repeated ones; 0 if the start is outside the window
     count: Int[Tensor, "B"]  # type: ignore[assignment]
-    reason: Int[Tensor, "B"]  #: why it is not reached: a `Reason`; `explain` puts it into words
+    reason: Int[Tensor, "B"]  #: why the path ends where it does, a `Reason`; `explain` puts it into words
 
     def poses(self, chord: float = 0.4) -> Float[Tensor, "B K 3"]:
-        """Return x, y [m] and yaw [rad] of each waypoint, as `check_path` takes them.
+        """Return x, y [m] and yaw [rad] of each waypoint, for `check_path`.
 
-        The yaw is the direction from `chord` / 2 [m] behind to as far ahead along the path, as far as it goes: single
-        cells turn by 45 degrees at a time. The last waypoint's pose is repeated like its place. The yaw is 0 where
-        there is only one waypoint. How the robot turns from where it looks now to the first yaw is not part of it. Ask
-        `reached` first: where it is False, `check_path` checks the poses up to where the path ends.
+        The yaw is the direction of the path from `chord` / 2 behind the waypoint to `chord` / 2 ahead of it, as single
+        steps turn by 45 degrees at a time; a path of one waypoint has yaw 0. The last waypoint's pose is repeated. The
+        turn from the robot's present heading to the first yaw is not included.
 
-        Raises ValueError unless `chord` is positive.
+        Where no path was found (`cost` is inf), all poses are NaN: an empty path, which `check_path` rates as not safe.
+        A path longer than `max_cells` has poses up to its last waypoint, short of the goal: test `reached`, too.
+
+        Args:
+            chord: length of the path over which its direction is taken [m].
+
+        Raises:
+            ValueError: unless `chord` is positive.
         """
         require_positive(chord=chord)
         steps = torch.linalg.vector_norm(self.xy[:, 1:] - self.xy[:, :-1], dim=-1)
-        along = torch.nn.functional.pad(steps.cumsum(1), (1, 0))
+        travelled = torch.nn.functional.pad(steps.cumsum(1), (1, 0))
         last = (self.count - 1).clamp(min=0)[:, None]
-        ahead = torch.searchsorted(along, along + chord / 2).minimum(last)
-        behind = (torch.searchsorted(along, along - chord / 2, right=True) - 1).clamp(min=0)
-        to, since = (self.xy.gather(1, k[..., None].expand(-1, -1, 2)) for k in (ahead, behind))
-        x, y = (to - since).unbind(-1)
+        ahead = torch.searchsorted(travelled, travelled + chord / 2).minimum(last)
+        behind = (torch.searchsorted(travelled, travelled - chord / 2, right=True) - 1).clamp(min=0)
+        end, begin = (self.xy.gather(1, k[..., None].expand(-1, -1, 2)) for k in (ahead, behind))
+        x, y = (end - begin).unbind(-1)
         poses = torch.cat([self.xy, torch.atan2(y, x)[..., None]], -1)
         waypoint = torch.arange(self.xy.shape[1], device=last.device).minimum(last)
-        return poses.gather(1, waypoint[..., None].expand(-1, -1, 3))
+        poses = poses.gather(1, waypoint[..., None].expand(-1, -1, 3))
+        return torch.where(torch.isfinite(self.cost)[:, None, None], poses, torch.nan)
 
     def explain(self) -> list[str]:
         """Return each `reason` as a sentence. The host waits for the device."""
@@ -70,57 +77,59 @@ def plan(
     standing: Float[Tensor, "B V 2"] | None = None,
     state: MapState | None = None,
 ) -> Path:
-    """Find the cheapest way over each map from cell to cell, by `traversal_cost`.
+    """Find the cheapest path from start to goal over the cells of each map, by `traversal_cost`.
 
-    The start's cell is passable, even if it is rated impassable: a robot may leave such ground, and `check_path` tells
-    of it. Unknown ground under the robot where it stands now is passable too (see `torchelev.planning.standing`).
+    The cell of the start is passable even if it is rated impassable: a robot may leave such ground, and `check_path`
+    reports it. Cells of unknown traversability below the robot are passable too (`torchelev.planning.standing`).
 
     Args:
         emap: the maps.
         start_xy: where the robots stand [m], map frame.
         goal_xy: where they should go [m], map frame.
-        cfg: thresholds and weights.
-        confidence: of the traversability, 0 to 1; None: the learned head's own, else 1.
-        max_cells: K, of the longest way; None: twice the cells along x and y together. Of a longer way the first K
-            cells come back, and `reached` is False.
-        rounds: as of `cost_to_go`.
-        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`): give the same to
-            `check_path`. None: a disc of `stand_radius` around the start.
-        state: of the maps; None: their own.
+        cfg: thresholds and weights of the cost.
+        confidence: confidence of the traversability, 0 to 1; None: that of the learned head, else 1.
+        max_cells: K, the largest number of waypoints; None: 2 (H + W). Of a longer path the first K waypoints are
+            returned, and `reached` is False.
+        rounds: the largest number of rounds of `cost_to_go`.
+        standing: footprints on which the robots stand now [m], map frame (`standing.place_footprint`). Give the same to
+            `check_path`. None: a disc of radius `stand_radius` around the start.
+        state: the state to read; None: that of the maps.
 
-    Raises ValueError or TypeError for wrong shapes, dtypes and devices. Places outside of the window or not finite are
-    refused on a CPU; on other devices they are not reached, unless the map has `check_values`.
+    Raises:
+        ValueError, TypeError: for a wrong shape, dtype or device. On a CPU, or with the map's `check_values`, also for
+            a start or goal outside the window or not finite; elsewhere, where reading them would make the host wait,
+            the path does not reach its goal.
     """
     cfg, grid = given_or_default(TraversalCostConfig, cfg), emap.cfg.grid
     current = emap.state if state is None else state
-    start, starts = _cell(emap, "start_xy", start_xy, current)
-    goal, goals = _cell(emap, "goal_xy", goal_xy, current)
-    longest = 2 * (grid.height + grid.width) if max_cells is None else max_cells
-    cost = traversal_cost(emap, cfg, confidence=confidence, start=start, standing=standing, state=state)
-    target = disc(goal, cost, 0.0) & (starts & goals)[:, None, None]
+    start, goal = (_find_cell(emap, *point, current) for point in (("start_xy", start_xy), ("goal_xy", goal_xy)))
+    max_cells = 2 * (grid.height + grid.width) if max_cells is None else max_cells
+    cost = traversal_cost(emap, cfg, confidence=confidence, start=start.cell, standing=standing, state=state)
+    target = mark_disc(goal.cell, cost, 0.0) & (start.is_inside & goal.is_inside)[:, None, None]
     value = cost_to_go(cost, target, resolution=grid.resolution, rounds=rounds)
-    way = descend(value, cost, start, resolution=grid.resolution, max_cells=longest)
-    reached = way.reached & starts
+    path = descend(value, cost, start.cell, resolution=grid.resolution, max_cells=max_cells)
+    reached = path.reached & start.is_inside
     rated = emap._read("traversability", state)[1]
     radius = cfg.stand_radius / grid.resolution
-    below = disc(start, cost, radius) if standing is None else standing_cells(emap, standing, state)
-    reason = find_reason(cost, value, rated, below, ((start, starts), (goal, goals)), reached)
-    xy = (way.cells + current.corner[:, None]).double().add(0.5) * grid.resolution
-    moves = (way.cells[:, 1:] != way.cells[:, :-1]).any(-1).sum(1)
-    count = torch.where(starts, moves + 1, 0)
-    return Path(xy, torch.where(starts, at(value, start), torch.inf), way.length, reached, count, reason)
+    below = mark_disc(start.cell, cost, radius) if standing is None else mark_standing_cells(emap, standing, state)
+    reason = find_reason(cost, value, rated, below, start, goal, reached)
+    xy = (path.cells + current.corner[:, None]).double().add(0.5) * grid.resolution
+    num_steps = (path.cells[:, 1:] != path.cells[:, :-1]).any(-1).sum(1)
+    count = torch.where(start.is_inside, num_steps + 1, 0)
+    start_value = torch.where(start.is_inside, read_cell(value, start.cell), torch.inf)
+    return Path(xy, start_value, path.length, reached, count, reason)
 
 
-def _cell(emap: ElevationMap, name: str, xy: object, state: MapState) -> tuple[Tensor, Tensor]:
-    """Return the cell (B, 2) of each place, the first one if it lies outside, and whether it lies inside."""
+def _find_cell(emap: ElevationMap, name: str, xy: object, state: MapState) -> Endpoint:
+    """Check points (B, 2) and return their cells."""
     value, grid = check_tensor(name, xy, emap.device, FLOATS), emap.cfg.grid
     shape = (emap.num_envs, 2)
-    require(tuple(value.shape) == shape, name, f"expected {shape}", tuple(value.shape), "give one place for each map")
+    require(tuple(value.shape) == shape, name, f"expected {shape}", tuple(value.shape), "give one point for each map")
     cell = torch.floor(value.detach().double() / grid.resolution) - state.corner
-    low, (i, j) = (cell >= 0).all(-1), cell.unbind(-1)
-    inside = low & (i < grid.height) & (j < grid.width)
+    i, j = cell.unbind(-1)
+    is_inside = (cell >= 0).all(-1) & (i < grid.height) & (j < grid.width)
     if readable(value, emap.check_values):
-        actual = [[round(x, 3) for x in place] for place in value.detach()[~inside].tolist()[:3]]
-        hint = f"windows are {grid.length_x:g} x {grid.length_y:g} m around emap.center; give a place in between"
-        require(bool(inside.all()), name, "must lie in the window", actual, hint)
-    return torch.where(inside[:, None], cell, 0.0).to(torch.int64), inside
+        actual = [[round(x, 3) for x in point] for point in value.detach()[~is_inside].tolist()[:3]]
+        hint = f"windows are {grid.length_x:g} x {grid.length_y:g} m around emap.center; give a point inside"
+        require(bool(is_inside.all()), name, "must lie in the window", actual, hint)
+    return Endpoint(torch.where(is_inside[:, None], cell, 0.0).to(torch.int64), is_inside)

@@ -1,4 +1,4 @@
-"""Which cells lie in a polygon: marked on a small patch of cells around it, whatever the size of the map."""
+"""Rasterize polygons on small patches of cells, whatever the size of the map, and enclose cells in convex hulls."""
 
 from __future__ import annotations
 
@@ -15,50 +15,55 @@ if TYPE_CHECKING:
 
 
 class PolygonCells(NamedTuple):
-    """The cells of P polygons for each of B maps, on a square patch of S x S cells around each polygon."""
+    """The cells of P polygons on each of B maps, on a patch of S x S cells around each polygon."""
 
-    first: Int[Tensor, "B P 2"]  #: the patch's cell [0, 0], in cells from where the polygons are counted
-    inside: Bool[Tensor, "B P S S"]  #: the cell belongs to the polygon
-
-
-class Edges(NamedTuple):
-    """The edges of polygons, each from its end of smaller x: so the same whichever way the polygon runs."""
-
-    x0: Float[Tensor, "B P V 1"]  #: [m] of each edge's start
-    y0: Float[Tensor, "B P V 1"]  #: [m] of each edge's start
-    x1: Float[Tensor, "B P V 1"]  #: [m] of each edge's end
-    y1: Float[Tensor, "B P V 1"]  #: [m] of each edge's end
+    first: Int[Tensor, "B P 2"]  #: cell (i, j) at the patch's index [0, 0], counted from the vertices' origin
+    inside: Bool[Tensor, "B P S S"]  #: True where the cell belongs to the polygon
 
 
-def polygon_cells(uv: Float[Tensor, "B P V 2"], size: int) -> PolygonCells:
-    """Mark the cells whose centres lie in each polygon by the even-odd rule; `uv` are its vertices, in cells.
+class _Edges(NamedTuple):
+    """Polygon edges [cells] in order of increasing x, so that the polygon's orientation does not matter."""
 
-    Of two polygons that share an edge, a centre on the edge belongs to one. A polygon without any centre, one smaller
-    than a cell or narrower, has the cells that its boundary passes, sampled every 0.71 cells or closer, so that no
-    polygon is without cells. It must extend no farther than `size` - 1 cells along x and y; what does is left out.
+    x0: Float[Tensor, "B P V 1"]
+    y0: Float[Tensor, "B P V 1"]
+    x1: Float[Tensor, "B P V 1"]
+    y1: Float[Tensor, "B P V 1"]
+
+
+def rasterize(uv: Float[Tensor, "B P V 2"], size: int) -> PolygonCells:
+    """Mark the cells of each polygon on a patch of `size` x `size` cells.
+
+    A cell belongs to a polygon if its centre lies inside, by the even-odd rule; a centre on an edge that two polygons
+    share belongs to one of them. A polygon that contains no centre gets the cells that its boundary crosses, sampled
+    every 0.71 cells or closer, so that every polygon has at least one cell.
+
+    Args:
+        uv: vertices [cells]. A polygon may extend over at most `size` - 1 cells along x and y; the part beyond is
+            ignored.
+        size: side of the patch [cells].
     """
     first = torch.floor(uv.amin(-2))
     edges = _edges(uv - first[..., None, :])
-    centred = _holds_centre(edges, size)
-    passed = _boundary_passes(edges, size)
-    inside = centred | (passed & ~centred.flatten(-2).any(-1)[..., None, None])
+    has_centre = _contains_centre(edges, size)
+    on_boundary = _boundary_crosses(edges, size)
+    inside = has_centre | (on_boundary & ~has_centre.flatten(-2).any(-1)[..., None, None])
     return PolygonCells(first.to(torch.int64), inside)
 
 
-def _edges(vertices: Float[Tensor, "B P V 2"]) -> Edges:
+def _edges(vertices: Float[Tensor, "B P V 2"]) -> _Edges:
     x, y = vertices[..., None].unbind(-2)
     x_next, y_next = (values.roll(-1, -2) for values in (x, y))
-    turn = x > x_next
-    start = (torch.where(turn, after, before) for before, after in ((x, x_next), (y, y_next)))
-    end = (torch.where(turn, before, after) for before, after in ((x, x_next), (y, y_next)))
-    return Edges(*start, *end)
+    swap = x > x_next
+    start = (torch.where(swap, after, before) for before, after in ((x, x_next), (y, y_next)))
+    end = (torch.where(swap, before, after) for before, after in ((x, x_next), (y, y_next)))
+    return _Edges(*start, *end)
 
 
-def _holds_centre(edges: Edges, size: int) -> Bool[Tensor, "B P S S"]:
-    """Tell which cells' centres lie inside: with an odd number of edges below them, along their row.
+def _contains_centre(edges: _Edges, size: int) -> Bool[Tensor, "B P S S"]:
+    """Mark the cells whose centre is inside: an odd number of edges crosses their row before the centre.
 
-    Each edge is entered once per row, at the first cell whose centre lies beyond it, and the rows are summed up: cost
-    grows with S * V + S^2, not with S^2 * V.
+    Each edge adds 1 to the first cell behind its crossing, and a cumulative sum along the row counts the crossings.
+    The cost is S * V + S^2, not S^2 * V.
     """
     x0, y0, x1, y1 = edges
     row = torch.arange(size, device=x0.device)
@@ -66,34 +71,38 @@ def _holds_centre(edges: Edges, size: int) -> Bool[Tensor, "B P S S"]:
     crosses = (x0 <= centre) & (centre < x1)
     y = y0 + (centre - x0) / torch.where(crosses, x1 - x0, 1.0) * (y1 - y0)
     column = torch.where(crosses, torch.floor(y + 0.5).clamp(0, size), size)
-    entered = _sum_cells(row * (size + 1) + column.to(torch.int64), size, size + 1)
-    return (entered[..., :size].cumsum(-1).to(torch.int32) & 1).bool()
+    crossings = _count(row * (size + 1) + column.to(torch.int64), size, size + 1)
+    return (crossings[..., :size].cumsum(-1).to(torch.int32) & 1).bool()
 
 
-def _boundary_passes(edges: Edges, size: int) -> Bool[Tensor, "B P S S"]:
+def _boundary_crosses(edges: _Edges, size: int) -> Bool[Tensor, "B P S S"]:
+    """Mark the cells that hold a sample of the boundary."""
     x0, y0, x1, y1 = edges
     along = torch.arange(2 * size + 1, device=x0.device, dtype=x0.dtype) / (2 * size)
     i, j = (torch.floor(a + (b - a) * along).clamp(0, size - 1).to(torch.int64) for a, b in ((x0, x1), (y0, y1)))
-    return _sum_cells(i * size + j, size, size) > 0.5
+    return _count(i * size + j, size, size) > 0.5
 
 
-def _sum_cells(slot: Int[Tensor, "B P V M"], rows: int, columns: int) -> Float[Tensor, "B P H W"]:
-    """Count how often each cell of (rows, columns) occurs."""
-    index = slot.flatten(0, 1).flatten(1)
+def _count(cell: Int[Tensor, "B P V M"], rows: int, columns: int) -> Float[Tensor, "B P H W"]:
+    """Count how often each cell number of a patch (rows, columns) occurs."""
+    index = cell.flatten(0, 1).flatten(1)
     ones = torch.ones(1, *index.shape, device=index.device)
-    return cell_sums(index, ones, rows * columns)[0].view(*slot.shape[:2], rows, columns)
+    return cell_sums(index, ones, rows * columns)[0].view(*cell.shape[:2], rows, columns)
 
 
 def convex_hull(cells: np.ndarray) -> np.ndarray:
-    """Return the convex hull of marked cells (S, S), counter-clockwise, in cells from the first one's corner."""
+    """Return the convex hull (K, 2) of marked cells (S, S): counter-clockwise, in cells from the corner of [0, 0].
+
+    Monotone chain (A. M. Andrew, 1979) over the corners of the cells.
+    """
     i, j = (index.tolist() for index in np.nonzero(cells))
     corners = sorted({(a + x, b + y) for a, b in zip(i, j, strict=True) for x in (0, 1) for y in (0, 1)})
-    half = [_turning_left(corners), _turning_left(corners[::-1])]
-    return np.array([point for points in half for point in points[:-1]], dtype=np.float64).reshape(-1, 2)
+    chains = [_lower_chain(corners), _lower_chain(corners[::-1])]
+    return np.array([point for chain in chains for point in chain[:-1]], dtype=np.float64).reshape(-1, 2)
 
 
-def _turning_left(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Drop the points that do not lie on the lower chain (monotone chain, A. M. Andrew, 1979)."""
+def _lower_chain(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Keep the points of a sorted list at which the hull turns left."""
     chain: list[tuple[int, int]] = []
     for x, y in points:
         while len(chain) > 1 and _cross(*chain[-2], *chain[-1], x, y) <= 0:
@@ -103,4 +112,5 @@ def _turning_left(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _cross(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> int:
+    """Return the cross product of a->b and a->c."""
     return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
