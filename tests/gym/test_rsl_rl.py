@@ -217,9 +217,9 @@ def test_refuses_what_rsl_rl_cannot_take():
         GymVecEnv(Counters())
     with pytest.raises(ValueError, match="observation 'flag': must be one tensor, got dict; flatten"):
         make(changed(flag={"inner": torch.zeros(B)}))
-    with pytest.raises(ValueError, match=re.escape("observation 'flag': expected (3, ...), got (2, 1); give a row")):
+    with pytest.raises(ValueError, match=re.escape("observation 'flag': expected (3, ...), got (2, 1); give one row")):
         make(changed(flag=torch.zeros(2, 1)))
-    with pytest.raises(ValueError, match=re.escape("observation 'flag': expected (3, ...), got (); give a row")):
+    with pytest.raises(ValueError, match=re.escape("observation 'flag': expected (3, ...), got (); give one row")):
         make(changed(flag=torch.zeros(())))
 
 

@@ -1,7 +1,7 @@
-"""Maps for gymnasium environments: the observation wrappers, the feed from a simulator, and rsl-rl's `VecEnv`.
+"""Maps for gymnasium environments: observation wrappers, a feed from any simulator, and rsl-rl's `VecEnv`.
 
-Environments and tasks are not here: they are the user's, or examples in a checkout's `envs/`. Needs gymnasium
-(``pip install 'torchelev[gym]'``); `torchelev.gym.rsl_rl` needs rsl-rl too, and is imported by that name.
+Environments and tasks are not here: bring your own, or see `envs/` in a checkout. Needs gymnasium
+(``pip install 'torchelev[gym]'``). `torchelev.gym.rsl_rl` also needs rsl-rl; import it by that name.
 """
 
 try:

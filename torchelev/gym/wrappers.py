@@ -1,7 +1,7 @@
-"""The elevation map as an observation of any gymnasium environment, single or vector, NumPy or torch.
+"""Add an elevation map to the observations of any gymnasium environment, single or vector, NumPy or torch.
 
-Functions of the environment give its points (or depth images) and poses. The wrapper fuses one cloud per reset and step
-and adds what `read` makes of the map to the observation. MuJoCo's Ant with a depth camera on its torso:
+You give functions that return the environment's points (or depth images) and poses. The wrapper fuses one cloud per
+reset and step, and adds what `read` returns to the observation. MuJoCo's Ant with a depth camera on its torso:
 
 >>> import gymnasium, mujoco
 >>> import numpy as np
@@ -55,11 +55,11 @@ from torchelev.gym.feed import MapFeed, Source, as_tensor
 
 
 class _MapObservation(RecordConstructorArgs):
-    """What both wrappers share: their arguments, and what they add to spaces and observations."""
+    """Base of both wrappers: their arguments, and how they extend spaces and observations."""
 
-    _wraps: type  # the kind of environment
-    _wrapper: type  # its gymnasium wrapper
-    _hint: str  # for the other kind
+    _env_type: type  # of the environments that can be wrapped
+    _wrapper_type: type  # gymnasium's wrapper of that type
+    _hint: str  # for environments of another type
 
     def __init__(
         self,
@@ -76,14 +76,14 @@ class _MapObservation(RecordConstructorArgs):
         device: torch.device | str = "cpu",
         key: str = "map",
     ) -> None:
-        kind = self._wraps.__name__
-        require(isinstance(env, self._wraps), "env", f"must be a {kind}", type(env).__name__, self._hint, TypeError)
+        rule = f"must be a {self._env_type.__name__}"
+        require(isinstance(env, self._env_type), "env", rule, type(env).__name__, self._hint, TypeError)
         sources = {"points": points, "depth": depth, "intrinsics": intrinsics}
         poses = {"T_map_sensor": T_map_sensor, "T_map_base": T_map_base, "dt": dt}
         maps = {"read": read, "cfg": cfg, "device": device}
-        # Not copied: a function may be the method of something large, such as the simulation.
+        # Not copied: a function may be a method of a large object, such as the simulation.
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **sources, **poses, **maps, key=key)
-        self._wrapper.__init__(self, env)  # type: ignore[misc]
+        self._wrapper_type.__init__(self, env)  # type: ignore[misc]
         num_envs = env.num_envs if isinstance(env, VectorEnv) else None
         self._key, self._feed = key, MapFeed(num_envs, **sources, **poses, **maps)  # type: ignore[arg-type]
         self._ended = torch.zeros(self.emap.num_envs, dtype=torch.bool, device=self.emap.device)
@@ -92,19 +92,19 @@ class _MapObservation(RecordConstructorArgs):
 
     @property
     def emap(self) -> ElevationMap:
-        """The maps: for `layer`, `state_dict`, `compile`."""
+        """The maps, for instance to read layers, to save them or to compile their updates."""
         return self._feed.emap
 
     def _extend_spaces(self, box: spaces.Box) -> None:
         raise NotImplementedError
 
-    def _extended(self, space: spaces.Space, box: spaces.Space) -> spaces.Dict:
+    def _extend(self, space: spaces.Space, box: spaces.Space) -> spaces.Dict:
         parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
         require(self._key not in parts, "key", "must be a new key", repr(self._key), f"there are {', '.join(parts)}")
         return spaces.Dict({**parts, self._key: box})
 
-    def _joined(self, observation: Any, values: Tensor) -> dict[str, Any]:
-        """Add the map's values to an observation, as the kind of array that it holds."""
+    def _add_map(self, observation: Any, values: Tensor) -> dict[str, Any]:
+        """Add the map's values to an observation, as the kind of array that the observation holds."""
         leaf = observation
         while isinstance(leaf, dict | tuple):
             leaf = next(iter(leaf.values() if isinstance(leaf, dict) else leaf), None)
@@ -115,111 +115,121 @@ class _MapObservation(RecordConstructorArgs):
 class ElevationMapObservation(_MapObservation, gymnasium.Wrapper):
     """Add the elevation map to the observation of a single environment.
 
-    The observation becomes a Dict of what it was, under "observation" or its own keys, and of `key`. `reset` forgets
-    the map, and so does a step in which a `gymnasium.wrappers.Autoreset` below resets.
+    The observation becomes a Dict that holds the map under `key`. A Dict observation keeps its own keys; any other one
+    is found under "observation". `reset` resets the map, and so does a step in which a `gymnasium.wrappers.Autoreset`
+    inside this wrapper resets the environment.
 
     Args:
-        env: the environment to wrap. The functions below get it; NaN points are ignored.
-        points: env -> (N, 3) or (S, N, 3) [m], sensor frame.
-        depth: env -> (h, w) or (S, h, w) [m] along the optical axis, in place of `points`.
-        intrinsics: (3, 3) [pixels], with `depth`. The sensor frame is then x right, y down, z forward.
+        env: the environment to wrap. The functions below get it as their argument.
+        points: env -> (N, 3) or (S, N, 3) [m], sensor frame; NaN points are ignored.
+        depth: env -> (h, w) or (S, h, w) [m] along the optical axis, instead of `points`.
+        intrinsics: (3, 3) [pixels], required with `depth`. The sensor frame is then x right, y down, z forward.
         T_map_sensor: env -> (4, 4) or (S, 4, 4), sensor frame to map frame.
-        T_map_base: env -> (4, 4), the robot, which the map's window follows.
-        dt: time of one step [s].
-        read: (emap, T_map_base (B, 4, 4)) -> (B, ...), such as a `torchelev.MapImage`, or values and validity,
-            such as a `HeightScan`, which are stacked to (B, 2, ...); here B = 1. What is not finite becomes 0. None:
-            elevation less the base's z, and validity, every 0.1 m of 1.6 x 1.0 m around the base.
-        cfg: of the map.
-        device: of the map.
-        key: of the map in the observation.
+        T_map_base: env -> (4, 4), base frame to map frame; the map's window follows the base.
+        dt: duration of one step [s].
+        read: (emap, T_map_base) -> (B, ...), such as a `torchelev.MapImage`; or values and validity, such as a
+            `HeightScan`, which are stacked to (B, 2, ...). Here B = 1. Values that are not finite become 0. None: the
+            elevation relative to the base and its validity, every 0.1 m of 1.6 x 1.0 m around the base.
+        cfg: config of the map.
+        device: device of the map.
+        key: key of the map in the observation.
 
     Raises:
-        ValueError, TypeError: for what is missing or does not fit, naming the argument, the rule and the fix.
+        ValueError, TypeError: for a missing argument or a wrong value.
     """
 
-    _wraps, _wrapper, _hint = gymnasium.Env, gymnasium.Wrapper, "use VectorElevationMapObservation for a VectorEnv"
+    _env_type, _wrapper_type = gymnasium.Env, gymnasium.Wrapper
+    _hint = "use VectorElevationMapObservation for a VectorEnv"
 
     def _extend_spaces(self, box: spaces.Box) -> None:
-        self.observation_space = self._extended(self.env.observation_space, box)
+        self.observation_space = self._extend(self.env.observation_space, box)
         self._autoreset = _has_autoreset(self.env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and forget its map."""
+        """Reset the environment and its map."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._ended = torch.zeros_like(self._ended)
         values = self._feed.observe(self.env, torch.ones_like(self._ended), stepped=False)[0]
-        return self._joined(observation, values), info
+        return self._add_map(observation, values), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment and fuse what it sees."""
+        """Step the environment and fuse its cloud."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         began, self._ended = self._ended, torch.full_like(self._ended, self._autoreset and (terminated or truncated))
         values = self._feed.observe(self.env, began, stepped=True)[0]
-        return self._joined(observation, values), reward, terminated, truncated, info
+        return self._add_map(observation, values), reward, terminated, truncated, info
 
 
 class VectorElevationMapObservation(_MapObservation, VectorWrapper):
     """Add the elevation map to the observations of a vector environment.
 
-    As `ElevationMapObservation`, for B environments: each function returns a leading dimension B, or a list or tuple
-    of B arrays, as `env.call` does. An environment's map begins anew exactly when its episode does. In
-    `metadata["autoreset_mode"]` NEXT_STEP that is the step after the last one; in SAME_STEP the last one, and
-    `infos["final_obs"]` then gets the map of one step before, as the final cloud is gone when the step returns; in any
-    mode `reset(options={"reset_mask": ...})`, which leaves the other maps as they are.
+    Arguments and errors are those of `ElevationMapObservation`, for B environments: each function returns an array with
+    a leading dimension B, or a list or tuple of B arrays, as `env.call` does.
+
+    The map of an environment is reset exactly when its episode starts. By `metadata["autoreset_mode"]`:
+
+    - NEXT_STEP: in the step after the last one of an episode.
+    - SAME_STEP: in the last step itself. `infos["final_obs"]` then holds the map of the step before, as the environment
+      has already replaced its final cloud when the step returns.
+    - DISABLED: by `reset` alone.
+
+    In every mode `reset(options={"reset_mask": ...})` resets the masked environments and leaves the other maps as they
+    are.
     """
 
-    _wraps, _wrapper, _hint = VectorEnv, VectorWrapper, "use ElevationMapObservation for a single Env"
+    _env_type, _wrapper_type = VectorEnv, VectorWrapper
+    _hint = "use ElevationMapObservation for a single Env"
 
     def _extend_spaces(self, box: spaces.Box) -> None:
         hint = f"set {' or '.join(mode.name for mode in AutoresetMode)}"
         actual = self.env.metadata.get("autoreset_mode", "none")
-        known = actual in AutoresetMode.__members__.values()
-        require(known, 'env.metadata["autoreset_mode"]', "must be an AutoresetMode", actual, hint)
+        is_known = actual in AutoresetMode.__members__.values()
+        require(is_known, 'env.metadata["autoreset_mode"]', "must be an AutoresetMode", actual, hint)
         self._mode = actual
-        self.single_observation_space = self._extended(self.env.single_observation_space, box)
-        self.observation_space = self._extended(self.env.observation_space, batch_space(box, self.num_envs))
+        self.single_observation_space = self._extend(self.env.single_observation_space, box)
+        self.observation_space = self._extend(self.env.observation_space, batch_space(box, self.num_envs))
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environments, all or those of `options["reset_mask"]`, and forget their maps."""
+        """Reset all environments, or those of `options["reset_mask"]`, and their maps."""
         mask = None if options is None else options.get("reset_mask")
         began = torch.ones_like(self._ended) if mask is None else self._flags(mask)
-        # A copy, as environments take the mask out of their options.
+        # A copy: environments remove the mask from their options.
         observations, infos = self.env.reset(seed=seed, options=None if options is None else dict(options))
         self._ended = self._ended & ~began
-        return self._observed(observations, began, stepped=False), infos
+        return self._observe(observations, began, stepped=False), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step the environments, fuse what they see, and forget the maps of those that began anew."""
+        """Step the environments, reset the maps of new episodes, and fuse one cloud into each map."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         ended = self._flags(terminations) | self._flags(truncations)
         if self._mode is AutoresetMode.SAME_STEP and "final_obs" in infos:
-            infos = {**infos, "final_obs": self._final(infos["final_obs"])}
+            infos = {**infos, "final_obs": self._add_map_to_final(infos["final_obs"])}
         began = {
             AutoresetMode.NEXT_STEP: self._ended,
             AutoresetMode.SAME_STEP: ended,
             AutoresetMode.DISABLED: torch.zeros_like(ended),
         }[self._mode]
         self._ended = ended
-        return self._observed(observations, began, stepped=True), rewards, terminations, truncations, infos
+        return self._observe(observations, began, stepped=True), rewards, terminations, truncations, infos
 
     def _flags(self, value: Any) -> Tensor:
         return as_tensor("flags", value, self.emap.device).bool()
 
-    def _observed(self, observations: Any, began: Tensor, stepped: bool) -> dict[str, Any]:
+    def _observe(self, observations: Any, began: Tensor, stepped: bool) -> dict[str, Any]:
         values = self._feed.observe(self.env, began, stepped)
         if self._mode is AutoresetMode.SAME_STEP:
-            self._last = values.clone()  # the caller owns the other
-        return self._joined(observations, values)
+            self._last = values.clone()  # the caller may change the observation
+        return self._add_map(observations, values)
 
-    def _final(self, observations: Any) -> Any:
-        """Add the last map to the final observations, which are an array of objects, or batched."""
+    def _add_map_to_final(self, observations: Any) -> Any:
+        """Add the last map to the final observations: an array of objects with None, or a batch."""
         if not (isinstance(observations, np.ndarray) and observations.dtype == object):
-            return self._joined(observations, self._last)
-        joined = np.full_like(observations, None)
+            return self._add_map(observations, self._last)
+        result = np.full_like(observations, None)
         for i, observation in enumerate(observations):
             if observation is not None:
-                joined[i] = self._joined(observation, self._last[i])
-        return joined
+                result[i] = self._add_map(observation, self._last[i])
+        return result
 
 
 def _has_autoreset(env: Any) -> bool:

@@ -74,7 +74,7 @@ def read_points(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridC
     one, zero = torch.ones_like(uv[..., :1]), torch.zeros_like(uv[..., :1])
     corners = [preceding, preceding + torch.cat([one, zero], -1), preceding + torch.cat([zero, one], -1)]
     read = sample_layers(layers, torch.cat(corners, 1), grid, "nearest")
-    return [find_lowest(values.unflatten(1, (3, -1)), known.unflatten(1, (3, -1)), dim=1) for values, known in read]
+    return [_find_lowest(values.unflatten(1, (3, -1)), known.unflatten(1, (3, -1)), dim=1) for values, known in read]
 
 
 def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, rings: int) -> Layer:
@@ -95,7 +95,7 @@ def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, 
     if fill == "ground":
         ground, found = continue_ground(layer, query.uv, query.base_uv, query.base_z, query.grid, query.half_extent)
     elif fill == "lowest":
-        ground, found = (part[:, None] for part in find_lowest(elevation, known, dim=1))
+        ground, found = (part[:, None] for part in _find_lowest(elevation, known, dim=1))
     elif fill == "upper_bound":
         ((ground, found),) = read_points([LAYERS["upper_bound"](state)], query.uv, query.grid, query.mode)
     elif fill == "inpaint":
@@ -105,7 +105,7 @@ def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, 
     return torch.where(known, elevation, ground), known | found
 
 
-def find_lowest(heights: Float[Tensor, "B *M"], known: Bool[Tensor, "B *M"], dim: int) -> Layer:
+def _find_lowest(heights: Float[Tensor, "B *M"], known: Bool[Tensor, "B *M"], dim: int) -> Layer:
     """Return the lowest known height along a dimension, 0 if there is none, and whether there is one."""
     low = torch.where(known, heights, torch.inf).amin(dim)
     found = torch.isfinite(low)

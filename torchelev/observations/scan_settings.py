@@ -63,16 +63,16 @@ class ScanSettings:
         rule, hint = "must be a finite number or None", "give the base's height over the ground where the robot stands"
         require(in_range, "standing_height", rule, repr(standing), hint)
         for name in ("nominal_height", "scale"):
-            self._require_number(name, int | float, "must be a finite number", -math.inf)
+            self._require_number(name, (int, float), "must be a finite number", -math.inf)
         for name in ("noise", "reach"):
-            self._require_number(name, int | float, "must be a finite number of at least 0", 0)
+            self._require_number(name, (int, float), "must be a finite number of at least 0", 0)
         for name in ("num_feet", "inpaint_rings"):
-            self._require_number(name, int, "must be an int of at least 0", 0)
+            self._require_number(name, (int,), "must be an int of at least 0", 0)
         object.__setattr__(self, "placement", Pattern(self.pattern, self.alignment, self.reach))
 
-    def _require_number(self, name: str, kind: type, rule: str, minimum: float) -> None:
+    def _require_number(self, name: str, types: tuple[type[int] | type[float], ...], rule: str, minimum: float) -> None:
         value = getattr(self, name)
-        in_range = isinstance(value, kind) and math.isfinite(value) and value >= minimum
+        in_range = isinstance(value, types) and math.isfinite(value) and value >= minimum
         require(in_range, name, rule, repr(value), "leave it out for its default")
 
     @property

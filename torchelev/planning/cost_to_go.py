@@ -15,7 +15,7 @@ from torchelev.ops.windows import AROUND, neighbours
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-DEFAULT_ROUNDS = 16  # off the CPU, where testing for convergence would make the host wait
+_DEFAULT_ROUNDS = 16  # off the CPU, where testing for convergence would make the host wait
 
 
 class _StepCosts(NamedTuple):
@@ -57,7 +57,7 @@ def cost_to_go(
     if rounds is not None:
         require_count("rounds", rounds, "give 16, or None")
     can_read = readable(cost)
-    max_rounds = rounds or (cost.shape[1] * cost.shape[2] + 1 if can_read else DEFAULT_ROUNDS)
+    max_rounds = rounds or (cost.shape[1] * cost.shape[2] + 1 if can_read else _DEFAULT_ROUNDS)
     if can_read:
         hint = "give 1 for easy ground and inf for impassable"
         require(bool((cost > 0).all()), "cost", "must be positive", "NaN, or 0 and less", hint)
