@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from tests.planning.test_footprint import RESOLUTION
+from tests.planning.maps import RESOLUTION
 from torchelev.planning.inclination import compute_inclination
 
 

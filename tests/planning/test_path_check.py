@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import pose
-from tests.planning.test_footprint import ground_map, random_map, rectangle
+from tests.planning.maps import ground_map, random_map, rectangle
 from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap
 from torchelev.planning.footprint import FootprintConfig, check_footprint

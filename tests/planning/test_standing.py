@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import pose
-from tests.planning.test_footprint import (
+from tests.planning.maps import (
     CORNER,
     RESOLUTION,
     ground_map,

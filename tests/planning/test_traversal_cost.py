@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.helpers import random_state
-from tests.planning.test_footprint import RESOLUTION, ground_map, random_map
+from tests.planning.maps import RESOLUTION, ground_map, random_map
 from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.planning.traversal_cost import TraversalCostConfig, cost_of_layers, traversal_cost
