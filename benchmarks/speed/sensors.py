@@ -20,7 +20,7 @@ from benchmarks.speed import meter
 from torchelev.app.results import markdown_table, slug, write_json
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact.sensors import NonRepetitiveLidar
-from torchelev.sim.exact.trajectories import pose
+from torchelev.sim.poses import pose
 from torchelev.sim.sensors import tracing
 from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor

@@ -6,35 +6,9 @@ import math
 from dataclasses import dataclass, field
 
 from torchelev.errors import require
+from torchelev.sim import CourseConfig
 
 PERCEPTION = ("map", "truth", "blind")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CourseConfig:
-    """The ground: square tiles with obstacles that a robot must walk around, and some that it can walk over."""
-
-    num_tiles: int = 64
-    length: float = 12.0  # [m] side of a tile
-    resolution: float = 0.05  # [m]
-    seed: int = 0
-    spacing: float = 2.0  # [m] between the sites of obstacles
-    jitter: float = 0.15  # [m] how far a site is off its lattice, each way
-    half_diagonal: tuple[float, float] = (0.5, 0.75)  # [m] of an obstacle's footprint
-    block_height: tuple[float, float] = (0.3, 0.7)  # [m] too high to climb
-    pit_depth: tuple[float, float] = (0.5, 1.0)  # [m] deep enough to fall into
-    step_height: tuple[float, float] = (0.06, 0.15)  # [m] low enough to walk over
-    shares: tuple[float, float, float] = (0.4, 0.3, 0.2)  # of the sites: blocks, pits, steps; the rest is free
-    roughness: float = 0.03  # [m] amplitude of the ground's waves
-    distance: tuple[float, float] = (4.0, 6.0)  # [m] from start to goal
-    clearance: float = 0.5  # [m] level ground around starts and goals
-    num_routes: int = 256  # pairs of start and goal per tile
-
-    def __post_init__(self) -> None:
-        room = self.spacing - 2 * (self.half_diagonal[1] + self.jitter)
-        require(room >= 0, "course.spacing", "must leave a gap between obstacles", f"{room:.2f} m", "raise it")
-        require(sum(self.shares) <= 1, "course.shares", "must not exceed 1 together", self.shares, "lower one")
-        require(self.num_tiles >= 1, "course.num_tiles", "must be positive", self.num_tiles, "give one or more")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,16 +6,13 @@ base [m], validity, traversability. `sense` looks and draws what is random; `ima
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
 from envs.terrain_nav.config import TerrainNavConfig
-from envs.terrain_nav.course import Course
+from envs.terrain_nav.course import RatedCourse
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, MapImage
-from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, preset
-from torchelev.sim.exact.trajectories import pose
+from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, mount_on_rim, preset
 
 LAYERS = ("elevation", "upper_bound", "validity", "traversability")
 
@@ -36,7 +33,7 @@ def crop(cfg: TerrainNavConfig) -> MapImage:
 class Blind(nn.Module):
     """Sees nothing: an image of unknown ground."""
 
-    def __init__(self, cfg: TerrainNavConfig, course: Course, num_envs: int, compiled: bool = False) -> None:
+    def __init__(self, cfg: TerrainNavConfig, course: RatedCourse, num_envs: int, compiled: bool = False) -> None:
         super().__init__()
         self.cfg, self.course, self.num_envs, self.crop = cfg, course, num_envs, crop(cfg)
         self.generator = torch.Generator(course.field.device)
@@ -68,7 +65,7 @@ class Truth(Blind):
     def __init__(
         self,
         cfg: TerrainNavConfig,
-        course: Course,
+        course: RatedCourse,
         num_envs: int,
         compiled: bool = False,
         noise: float | None = None,
@@ -94,10 +91,12 @@ class Truth(Blind):
         return torch.stack([elevation, elevation, torch.ones_like(elevation), rating], 1)
 
 
-def _mounting(yaw: float, cfg: TerrainNavConfig) -> Tensor:
-    """Return T_base_sensor (4, 4) of a camera at the rim of the robot's body that looks out and down."""
-    place = [cfg.robot.length / 2 * math.cos(yaw), cfg.robot.width / 2 * math.sin(yaw), 0.05]
-    return pose(torch.tensor(place), torch.tensor(yaw), math.radians(cfg.sight.camera_pitch_deg)).float()
+def _mountings(cfg: TerrainNavConfig) -> list[Tensor]:
+    """Return T_base_sensor (4, 4) of the cameras on the rim of the robot's body."""
+    # Headings are rounded to float32, on which the recorded rollout in tests/answers.npz depends.
+    yaws_deg = torch.tensor(cfg.sight.camera_yaws_deg).deg2rad().double().rad2deg().tolist()
+    body, pitch_deg = cfg.robot, cfg.sight.camera_pitch_deg
+    return [mount_on_rim(body.length, body.width, yaw_deg, pitch_deg).float() for yaw_deg in yaws_deg]
 
 
 class Mapped(Blind):
@@ -105,7 +104,7 @@ class Mapped(Blind):
 
     T_estimated: Tensor
 
-    def __init__(self, cfg: TerrainNavConfig, course: Course, num_envs: int, compiled: bool = False) -> None:
+    def __init__(self, cfg: TerrainNavConfig, course: RatedCourse, num_envs: int, compiled: bool = False) -> None:
         super().__init__(cfg, course, num_envs)
         sight, device = cfg.sight, course.field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
@@ -113,8 +112,7 @@ class Mapped(Blind):
         if compiled:
             self.emap.compile()
         camera = DepthCamera(*sight.camera_pixels, *sight.camera_fov_deg, max_range=sight.max_range)
-        mounts = (_mounting(math.radians(yaw), cfg) for yaw in sight.camera_yaws_deg)
-        self.cameras = [MountedSensor(camera, T.to(device)) for T in mounts]
+        self.cameras = [MountedSensor(camera, T.to(device)) for T in _mountings(cfg)]
         sensor, odometry = preset(sight.sensor_errors).sensor, preset(sight.pose_errors).pose
         self.sensor_errors = nn.ModuleList(SensorErrors(sensor, num_envs, device) for _ in self.cameras)
         self.pose_errors = PoseErrors(odometry, num_envs, device)

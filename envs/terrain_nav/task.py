@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from envs.terrain_nav.config import PERCEPTION, TerrainNavConfig
-from envs.terrain_nav.course import make_course
+from envs.terrain_nav.course import make_rated_course
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
 from envs.terrain_nav.sight import SIGHTS, Truth
 from torchelev.errors import require
@@ -86,7 +86,7 @@ class TerrainNav(nn.Module):
         names = ", ".join(PERCEPTION)
         require(perception in PERCEPTION, "perception", f"must be one of {names}", repr(perception), "use map")
         self.cfg, self.num_envs, self.perception = cfg or TerrainNavConfig(), num_envs, perception
-        self.course = make_course(self.cfg.course, device)
+        self.course = make_rated_course(self.cfg.course, device)
         self.ground = Ground(self.course.field, self.cfg.robot.reach)
         self.generator = torch.Generator(device)
         self.sight = SIGHTS[perception](self.cfg, self.course, num_envs, compiled)

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 import envs.terrain_nav.task as task_module
 from envs.terrain_nav import BodyConfig, CourseConfig, SightConfig, TerrainNav, TerrainNavConfig
-from envs.terrain_nav.course import Course, make_course
+from envs.terrain_nav.course import RatedCourse, make_rated_course
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
 from envs.terrain_nav.rsl_rl import mirror
 from envs.terrain_nav.task import ENDINGS
@@ -102,40 +102,6 @@ def test_base_pose_on_a_slope():
     assert float(T[2, 3]) == pytest.approx(0.2 * 0.5 - 0.1 * 0.3 + 0.45, abs=1e-4)
 
 
-# The course ---------------------------------------------------------------------------------------------------------
-
-
-def test_courses_come_from_their_seed():
-    one, same, other = (make_course(dataclasses.replace(SMALL, seed=seed)) for seed in (3, 3, 4))
-    assert torch.equal(one.field.heights, same.field.heights) and torch.equal(one.starts, same.starts)
-    assert not torch.equal(one.field.heights, other.field.heights)
-
-
-def test_routes_are_of_the_wanted_length_between_level_places():
-    course = make_course(SMALL)
-    distance = (course.starts - course.goals).norm(dim=-1)
-    assert float(distance.min()) >= 4.0 and float(distance.max()) <= 6.0
-    ring = torch.stack([torch.tensor([math.cos(a), math.sin(a)]) for a in torch.linspace(0, 6.28, 16).tolist()]) * 0.4
-    for places in (course.starts, course.goals):
-        around = (places[:, :, None] + ring).flatten(1, 2)
-        heights = course.field.height(torch.arange(4), around).view(4, -1, 16)
-        assert float((heights.amax(-1) - heights.amin(-1)).max()) < 0.2
-
-
-def test_a_straight_line_fails_more_often_than_not():
-    cfg = TerrainNavConfig(course=SMALL)
-    result = evaluate(straight_line, cfg, "truth", episodes=256)
-    assert result["success"] < 0.5
-    assert sum(result[name] for name in ENDINGS) == 1.0, "each robot counts once, by its first episode"
-
-
-def test_obstacles_leave_gaps_and_bad_settings_are_refused():
-    with pytest.raises(ValueError, match="course.spacing: must leave a gap"):
-        CourseConfig(spacing=1.0)
-    with pytest.raises(ValueError, match="course.shares"):
-        CourseConfig(shares=(0.5, 0.5, 0.5))
-
-
 # Episodes -----------------------------------------------------------------------------------------------------------
 
 
@@ -175,6 +141,13 @@ def run(task, steps, action=(1.0, 0.0)):
         if bool(outcome.done):
             return step + 1, outcome
     return steps, outcome
+
+
+def test_a_straight_line_fails_more_often_than_not():
+    cfg = TerrainNavConfig(course=SMALL)
+    result = evaluate(straight_line, cfg, "truth", episodes=256)
+    assert result["success"] < 0.5
+    assert sum(result[name] for name in ENDINGS) == 1.0, "each robot counts once, by its first episode"
 
 
 def test_walls_end_in_being_stuck():
@@ -376,11 +349,12 @@ def test_seeds_make_episodes():
 @pytest.mark.parametrize("perception", ["map", "truth", "blind"])
 def test_host_reads_nothing_back_from_the_device(monkeypatch, perception):
     # Tensors on "meta" have no values, so that reading one raises; copying one from the host needs a constructor.
-    course = make_course(SMALL)
+    course = make_rated_course(SMALL)
     ground = Ground(course.field, ROBOT.reach)
     ground.field, ground.highest = ground.field.to("meta"), ground.highest.to("meta")
-    moved = [course.field, course.traversability, course.starts, course.goals]
-    monkeypatch.setattr(task_module, "make_course", lambda cfg, device: Course(*(part.to(device) for part in moved)))
+    parts = (course.field, course.starts, course.goals, course.traversability)
+    moved = RatedCourse(*(part.to("meta") for part in parts))
+    monkeypatch.setattr(task_module, "make_rated_course", lambda cfg, device: moved)
     monkeypatch.setattr(task_module, "Ground", lambda field, reach: ground)
     monkeypatch.setattr(torch, "Generator", NoGenerator)
     monkeypatch.setattr(mounted, "check_pose", lambda *_: None)  # reads the cameras' mountings when they are built

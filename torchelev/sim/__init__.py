@@ -13,15 +13,18 @@ from torchelev.sim.errors.presets import ErrorPreset, preset
 from torchelev.sim.exact.noise import dropout, noisy, outliers, range_noise
 from torchelev.sim.exact.scenes import Box, Scene
 from torchelev.sim.exact.sensors import DepthCamera, Lidar, NonRepetitiveLidar, cast
-from torchelev.sim.exact.trajectories import MOUNT, Trajectory, mount, sink, turn_on_the_spot, walk
+from torchelev.sim.exact.trajectories import Trajectory, sink, turn_on_the_spot, walk
+from torchelev.sim.poses import MOUNT, mount, mount_on_rim
 from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor
+from torchelev.sim.terrains.course import Course, CourseConfig, make_course
 from torchelev.sim.terrains.generate import Terrain, TerrainGrid, make_terrain, terrain_grid
 from torchelev.sim.terrains.heightfield import HeightField
 
 __all__ = [
-    "MOUNT", "Box", "Boxes", "DepthCamera", "ErrorPreset", "HeightField", "Lidar", "MountedSensor",
-    "NonRepetitiveLidar", "PoseErrorConfig", "PoseErrors", "Scene", "SensorErrorConfig", "SensorErrors", "Terrain",
-    "TerrainGrid", "Trajectory", "cast", "dropout", "make_terrain", "mount", "noisy", "outliers", "preset",
-    "range_noise", "sink", "terrain_grid", "turn_on_the_spot", "walk",
+    "MOUNT", "Box", "Boxes", "Course", "CourseConfig", "DepthCamera", "ErrorPreset", "HeightField", "Lidar",
+    "MountedSensor", "NonRepetitiveLidar", "PoseErrorConfig", "PoseErrors", "Scene", "SensorErrorConfig",
+    "SensorErrors", "Terrain", "TerrainGrid", "Trajectory", "cast", "dropout", "make_course", "make_terrain",
+    "mount", "mount_on_rim", "noisy", "outliers", "preset", "range_noise", "sink", "terrain_grid",
+    "turn_on_the_spot", "walk",
 ]  # fmt: skip

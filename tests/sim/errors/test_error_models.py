@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import NoGenerator
-from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors, rigid
+from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors
 from torchelev.sim.errors.presets import PRESETS, preset
 from torchelev.sim.errors.range_errors import across_edge
 
@@ -380,15 +380,6 @@ def test_mounting_stays_until_reset():
     first = errors.mounting()
     errors(rays(3, 5))
     assert torch.equal(errors.mounting(), first)
-
-
-def test_rotation_vectors_by_hand():
-    vector = torch.tensor([[0.0, 0.0, math.pi / 2], [math.pi, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    T = rigid(vector, torch.tensor([[1.0, 2.0, 3.0]]).expand(3, 3))
-    torch.testing.assert_close(T[0, :3, :3], torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-6, rtol=0)
-    torch.testing.assert_close(T[1, :3, :3], torch.diag(torch.tensor([1.0, -1, -1])), atol=1e-6, rtol=0)
-    torch.testing.assert_close(T[2, :3, :3], torch.eye(3), atol=0, rtol=0)
-    assert T[:, :3, 3].tolist() == [[1.0, 2.0, 3.0]] * 3
 
 
 # Refusals and presets -----------------------------------------------------------------------------------------------

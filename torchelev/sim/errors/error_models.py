@@ -17,6 +17,7 @@ from torchelev.errors import require
 from torchelev.sim.errors.delay import Cloud, Delay
 from torchelev.sim.errors.draws import DomainRandomization, Range, check_range, limits
 from torchelev.sim.errors.range_errors import across_edge, artefacts, disparity_steps, flying, steps
+from torchelev.sim.poses import pose_from_rotation_vector
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -99,7 +100,7 @@ class SensorErrors(DomainRandomization):
         T_base_sensor.float() @ mounting() is what to cast rays with; the map is told T_base_sensor. Float32.
         """
         vector = self.turned * torch.deg2rad(self.value("mounting_rotation_deg", 2))
-        return rigid(vector, self.shifted * self.value("mounting_position", 2))
+        return pose_from_rotation_vector(vector, self.shifted * self.value("mounting_position", 2))
 
     def forward(
         self,
@@ -173,16 +174,3 @@ class SensorErrors(DomainRandomization):
         missed = self.uniform(self.num_envs, 1) < self.value("missed_frames", 2)
         gone = missed | (self.uniform(*points.shape[:2]) < self.value("dropout", 2))
         return points.masked_fill(gone[..., None], float("nan"))
-
-
-def rigid(vector: Float[Tensor, "B 3"], position: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4 4"]:
-    """Return transforms (B, 4, 4) of rotation vectors [rad] and positions [m], by Rodrigues' formula."""
-    x, y, z = vector.unbind(-1)
-    zero, angle = torch.zeros_like(x), torch.linalg.vector_norm(vector, dim=-1)[:, None, None]
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(-1, 3, 3)
-    T = torch.eye(4, dtype=vector.dtype, device=vector.device).repeat(len(vector), 1, 1)
-    # sin(a) / a and (1 - cos(a)) / a^2, which are 1 and 1/2 at 0.
-    a, b = torch.sinc(angle / math.pi), torch.sinc(angle / (2 * math.pi)).square() / 2
-    T[:, :3, :3] += a * cross + b * cross @ cross
-    T[:, :3, 3] = position
-    return T

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torchelev.sim.waves import natural_waves
+
 DEEP = -20.0  # [m] where boxes that stand on the ground begin
 
 
@@ -98,33 +100,6 @@ def steps(x0: float, y0: float, y1: float, *, count: int, rise: float, run: floa
     return [block(x0 + k * run, end, y0, y1, base + (k + 1) * rise) for k in range(count)]
 
 
-def _uniform(generator: torch.Generator, low: float, high: float, count: int) -> Tensor:
-    return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
-
-
-def waves(seed: int, amplitude: float = 0.08, count: int = 6) -> tuple[Callable[[Tensor, Tensor], Tensor], float]:
-    """Return a sum of sines of 0.4 to 3 m length, about +-`amplitude` [m], and a bound of its slope.
-
-    Short waves are lower: the height of each is proportional to its length, as on natural ground.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    length = torch.logspace(math.log10(0.4), math.log10(3.0), count, dtype=torch.float64)
-    heading = _uniform(generator, 0.0, 2 * math.pi, count)
-    phase = _uniform(generator, 0.0, 2 * math.pi, count).tolist()
-    # Peaks of random sines rarely meet: 1.6 root-sum-squares is what the ground reaches in practice.
-    height = length * amplitude / (1.6 * length.square().sum().sqrt())
-    k = 2 * math.pi / length
-    kx, ky, a = (k * heading.cos()).tolist(), (k * heading.sin()).tolist(), height.tolist()
-
-    def terrain(x: Tensor, y: Tensor) -> Tensor:
-        z = torch.zeros_like(x)
-        for i in range(count):
-            z += a[i] * torch.sin(kx[i] * x + ky[i] * y + phase[i])
-        return z
-
-    return terrain, float((k * height).sum())
-
-
 def flat() -> Scene:
     """Make flat ground at z = 0."""
     return Scene(name="flat")
@@ -138,8 +113,8 @@ def slope(angle_deg: float = 15.0) -> Scene:
 
 def rough(seed: int = 0) -> Scene:
     """Make smooth rough ground of about +-8 cm."""
-    terrain, steepness = waves(seed)
-    return Scene(name="rough", terrain=terrain, steepness=steepness)
+    relief = natural_waves(seed)
+    return Scene(name="rough", terrain=relief, steepness=relief.steepness)
 
 
 def stairs(rise: float = 0.17, run: float = 0.29, count: int = 8) -> Scene:
@@ -170,7 +145,7 @@ def crates(seed: int, count: int, area: tuple[float, float, float, float], keep_
 
 def mixed(seed: int = 0) -> Scene:
     """Make rough ground behind (x < -1), a ramp of 15 degrees to the left (y > 1), stairs ahead, boxes to the right."""
-    relief, steepness = waves(seed, amplitude=0.06)
+    relief = natural_waves(seed, amplitude=0.06)
     gradient = math.tan(math.radians(15.0))
 
     def terrain(x: Tensor, y: Tensor) -> Tensor:
@@ -181,7 +156,8 @@ def mixed(seed: int = 0) -> Scene:
     landing = block(1.217 + 6 * 0.29, 4.5, -0.787, 0.913, 6 * 0.17)
     aside = crates(seed + 1, 9, (-0.8, 3.6, -3.7, -1.4))
     # The relief is faded in over 1 m, which adds its height to its slope.
-    return Scene(name="mixed", terrain=terrain, steepness=gradient + steepness + 0.1, boxes=(*climb, landing, *aside))
+    steepness = gradient + relief.steepness + 0.1
+    return Scene(name="mixed", terrain=terrain, steepness=steepness, boxes=(*climb, landing, *aside))
 
 
 def wall() -> Scene:

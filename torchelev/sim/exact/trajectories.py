@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchelev.sim.exact.scenes import Scene
+from torchelev.sim.poses import MOUNT, pose
 
 Point = tuple[float, float]
 
@@ -32,33 +33,6 @@ class Trajectory(NamedTuple):
             torch.cat([self.T_map_sensor, other.T_map_sensor]),
             torch.cat([self.times, other.times - other.times[0] + self.times[-1] + step]),
         )
-
-
-def pose(position: Tensor, yaw: Tensor, pitch: Tensor | float = 0.0, roll: Tensor | float = 0.0) -> Tensor:
-    """Return T (..., 4, 4) float64 from a position (..., 3) [m] and angles (...) [rad], R = Rz(yaw) Ry(pitch) Rx(roll).
-
-    A positive pitch turns the nose down.
-    """
-    angles = torch.broadcast_tensors(*(torch.as_tensor(a, dtype=torch.float64) for a in (yaw, pitch, roll)))
-    (cy, cp, cr), (sy, sp, sr) = [a.cos() for a in angles], [a.sin() for a in angles]
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    T = torch.eye(4, dtype=torch.float64).repeat(*cy.shape, 1, 1)
-    T[..., :3, :3] = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    T[..., :3, 3] = position
-    return T
-
-
-def mount(pitch_deg: float = 35.0, x: float = 0.0, z: float = 0.25) -> Tensor:
-    """Return T_base_sensor (4, 4): a sensor at (x, 0, z) [m] in the base frame, looking down by `pitch_deg`."""
-    angle = torch.tensor(math.radians(pitch_deg), dtype=torch.float64)
-    return pose(torch.tensor([x, 0.0, z], dtype=torch.float64), torch.zeros_like(angle), angle)
-
-
-MOUNT = mount()
 
 
 def turn_on_the_spot(

@@ -21,11 +21,13 @@ if TYPE_CHECKING:
 class Pattern(Protocol):
     """Rays in the sensor frame, as of DepthCamera, Lidar and NonRepetitiveLidar."""
 
-    max_range: float  # [m]
+    @property
+    def max_range(self) -> float:
+        """Range beyond which nothing is hit [m]."""
 
     @property
     def directions(self) -> Tensor | Callable[[Tensor], Tensor]:
-        """Unit vectors (M, 3), or what makes those of a step."""
+        """Unit vectors (M, 3), or a function that returns those of a step."""
 
 
 class MountedSensor:
