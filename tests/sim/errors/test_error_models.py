@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.helpers import NoGenerator
 from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors
 from torchelev.sim.errors.presets import PRESETS, preset
-from torchelev.sim.errors.range_errors import across_edge
+from torchelev.sim.errors.range_errors import find_range_across_edge
 
 NAN = float("nan")
 LIVELY = SensorErrorConfig(
@@ -175,7 +175,7 @@ def test_flying_pixels_need_a_step_and_two_returns():
 
 def test_without_an_image_the_neighbours_are_those_in_the_order():
     d = torch.tensor([[1.0, 1.0, 3.0, 3.0, 3.1]])
-    assert across_edge(d, (1, 5)).tolist() == [[1.0, 3.0, 1.0, pytest.approx(3.1), 3.0]]
+    assert find_range_across_edge(d, (1, 5)).tolist() == [[1.0, 3.0, 1.0, pytest.approx(3.1), 3.0]]
 
 
 @given(seed=st.integers(0, 10_000), h=st.integers(1, 4), w=st.integers(1, 5))
@@ -183,7 +183,7 @@ def test_the_neighbour_across_an_edge_is_the_one_that_differs_most(seed, h, w):
     rng = np.random.default_rng(seed)
     image = rng.uniform(1, 5, (h, w))
     image[rng.uniform(size=(h, w)) < 0.2] = np.nan
-    got = across_edge(torch.from_numpy(image).view(1, -1), (h, w)).view(h, w).numpy()
+    got = find_range_across_edge(torch.from_numpy(image).view(1, -1), (h, w)).view(h, w).numpy()
     for i in range(h):
         for j in range(w):
             around = ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1))
