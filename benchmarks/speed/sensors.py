@@ -65,7 +65,7 @@ def rounds(look: Any) -> list[tuple[int, int]]:
     search, done = tracing.search, []
 
     def counted(field: HeightField, rays: tracing.Rays, count: int) -> tuple[Tensor, Tensor]:
-        done.append((len(rays.number), count))
+        done.append((len(rays.ray), count))
         return search(field, rays, count)
 
     tracing.search = counted

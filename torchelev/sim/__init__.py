@@ -1,10 +1,11 @@
-"""Made-up worlds with known truth, to test maps in and to train policies in. Needs torch only.
+"""Simulated worlds with known ground truth, to test maps in and to train policies in. Needs torch only.
 
-One robot, exact: scenes in closed form, sensors that see them to below 0.1 mm, noise, paths; float64 on the CPU inside,
-points come back as float32 in the sensor frame.
+For one robot, exact: scenes in closed form (`exact/`), with sensors that see them to below 0.1 mm, noise and
+trajectories. They compute in float64 on the CPU; points are returned as float32 in the sensor frame.
 
-Many robots, fast: terrains as height fields, mounted sensors whose rays are cast at them and at boxes, and errors of
-sensors and poses that each environment draws for itself; float32 on any device.
+For many robots, fast: height fields and courses (`terrains/`), mounted sensors that cast rays at them and at boxes
+(`sensors/`), and errors of sensors and poses that each environment draws for itself (`errors/`). They compute in
+float32 on any device. Environments that robots act in are not here: see `envs/`.
 """
 
 from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors

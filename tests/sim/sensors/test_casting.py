@@ -16,13 +16,13 @@ from torchelev.sim.sensors.casting import Boxes, cast
 from torchelev.sim.terrains.heightfield import HeightField
 
 FINE = 5e-4  # [m] step of the march
-PATHS = ["picks out", "goes through all"]  # what a CPU does, and what a GPU does
+PATHS = ["selects rays", "keeps all rays"]  # what a CPU does, and what a GPU does
 
 
 @pytest.fixture(params=PATHS)
 def path(request, monkeypatch):
     if request.param == PATHS[1]:
-        monkeypatch.setattr(tracing, "_picks_out", lambda device: False)
+        monkeypatch.setattr(tracing, "can_select_rays", lambda device: False)
     return request.param
 
 
@@ -279,9 +279,9 @@ def test_no_ray_is_left_over(terrain, path, monkeypatch):
 
     def watched(field, rays, count):
         ahead, horizon = search(field, rays, count)
-        seen["most"] = max(seen.get("most", 0), count)
+        seen["max"] = max(seen.get("max", 0), count)
         done = (ahead <= horizon) | (rays.along + horizon > 6.0)
-        last.update({n: last.get(n, False) or d for n, d in zip(rays.number.tolist(), done.tolist(), strict=True)})
+        last.update({n: last.get(n, False) or d for n, d in zip(rays.ray.tolist(), done.tolist(), strict=True)})
         return ahead, horizon
 
     monkeypatch.setattr(tracing, "search", watched)
@@ -291,7 +291,7 @@ def test_no_ray_is_left_over(terrain, path, monkeypatch):
         tile, origins, d = difficult_rays(kind, rng, field, 60)
         cast(field, torch.from_numpy(tile), torch.from_numpy(origins), torch.from_numpy(d)[:, None], 6.0)
         assert len(last) == 60 and all(last.values()), kind
-    assert seen["most"] == tracing.MOST_CELLS
+    assert seen["max"] == tracing.MAX_CELLS
 
 
 # Properties -----------------------------------------------------------------------------------------------------------
@@ -323,7 +323,7 @@ def test_paths_agree(seed):
     field, tiles, origin, d = scene(seed, kind=RAYS[seed % len(RAYS)])
     picked = cast(field, tiles, origin, d, 4.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tracing, "_picks_out", lambda device: False)
+        patch.setattr(tracing, "can_select_rays", lambda device: False)
         same(cast(field, tiles, origin, d, 4.0), picked)
 
 
@@ -491,7 +491,7 @@ def test_host_reads_nothing_back(monkeypatch):
 
 
 def test_path_of_a_gpu_has_static_shapes(monkeypatch):
-    monkeypatch.setattr(tracing, "_picks_out", lambda device: False)
+    monkeypatch.setattr(tracing, "can_select_rays", lambda device: False)
     field, *inputs, reach, boxes = on("cpu")
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         boxes = Boxes(*(mode.from_tensor(v) for v in boxes))

@@ -48,9 +48,8 @@ class SensorErrorConfig:
     point_noise: Range = 0.0  #: [m] 1 sigma of x, y and z each
     outliers: Range = 0.0  #: fraction of the points with `outlier_noise` in place of `point_noise`
     outlier_noise: Range = 0.0  #: [m] 1 sigma of x, y and z each
-    disparity_step: Range = (
-        0.0  #: [1/m] 1/x is rounded to multiples of this, as in stereo: x in steps of this times x^2
-    )
+    #: [1/m] 1/x is rounded to multiples of this, as in stereo, so that x comes in steps of disparity_step * x^2 [m]
+    disparity_step: Range = 0.0
     dropout: Range = 0.0  #: fraction of the points that are lost
     missed_frames: Range = 0.0  #: fraction of the clouds that are lost as a whole
     latency: Range = 0  #: [calls] integer delay of each cloud
