@@ -1,4 +1,4 @@
-"""The course that TerrainNav takes place on, with the traversability of its true ground."""
+"""The course of TerrainNav, with the traversability of its true ground."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torchelev.sim import Course, CourseConfig, HeightField, make_course
 
 @dataclass(frozen=True, eq=False)
 class RatedCourse(Course):
-    """A course whose ground is rated for a critic that sees the truth."""
+    """A course with the traversability of its ground, for a critic that sees the truth."""
 
-    traversability: HeightField  #: 0 to 1, of the true ground, by the rule that rates maps
+    traversability: HeightField  #: from 0 to 1, computed from the true ground as a map computes it
 
 
 def make_rated_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> RatedCourse:
-    """Make the course of a config and rate its ground; the same settings make the same course."""
+    """Make the course of a config and the traversability of its ground; the same config makes the same course."""
     course = make_course(cfg, device)
     traversability = HeightField(_rate(course.field), cfg.resolution)
     return RatedCourse(course.field, course.starts, course.goals, traversability)

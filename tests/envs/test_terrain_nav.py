@@ -130,8 +130,8 @@ def placed(course_height, **settings):
     task.course = dataclasses.replace(task.course, field=field_of(course_height))
     task.ground = Ground(task.course.field, task.cfg.robot.reach)
     for name, value in {"xy": (0.0, 0.0), "goal": (3.0, 0.0)}.items():
-        task._put(name, torch.tensor([value]))
-    task._put("yaw", torch.zeros(1))
+        getattr(task, name).copy_(torch.tensor([value]))
+    task.yaw.zero_()
     return task
 
 
@@ -368,7 +368,7 @@ def test_host_reads_nothing_back_from_the_device(monkeypatch, perception):
                 monkeypatch.setattr(torch, name, None)
         task.reset(task.advance(torch.empty(3, 2, device="meta")).done)
         task.sense()
-        assert all(part.is_meta for part in [*task.observe().values(), *task.shares.values()])
+        assert all(part.is_meta for part in [*task.observe().values(), *task.ending_fractions.values()])
 
 
 def test_a_mirror_exchanges_left_and_right():

@@ -64,7 +64,7 @@ def test_its_steps_are_those_of_the_task():
             assert torch.equal(seen[name], expected), name
         assert torch.equal(reward, outcome.reward) and torch.equal(done, outcome.done.long())
         assert torch.equal(extras["time_outs"], outcome.truncated.float())
-        assert extras["log"] == {f"/{name}": share for name, share in other.shares.items()}
+        assert extras["log"] == {f"/{name}": share for name, share in other.ending_fractions.items()}
     assert env.cfg == dataclasses.asdict(CFG) and env.max_episode_length == 10
     other.reset()
     one.load_state_dict(other.state_dict())

@@ -42,7 +42,7 @@ class Box:
         return self.since <= t < self.until
 
     def covers(self, x: Tensor, y: Tensor, t: float = 0.0) -> Tensor:
-        """Tell at which places x, y [m], of any shape, the box lies, whatever its height."""
+        """Tell which places x, y [m], of any shape, lie within the outline of the box seen from above."""
         low, high = self.corners(t)
         return (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
 
@@ -84,13 +84,13 @@ class Scene:
         xy = xy.double()
         return self.height(xy[..., 0], xy[..., 1], t, below)
 
-    def covered(self, xy: Tensor, t: float = 0.0) -> Tensor:
+    def is_covered(self, xy: Tensor, t: float = 0.0) -> Tensor:
         """Tell which places xy (..., 2) [m] lie under or in a box that is not grounded (bar, ceiling, person)."""
-        under = torch.zeros(xy.shape[:-1], dtype=torch.bool)
+        is_covered = torch.zeros(xy.shape[:-1], dtype=torch.bool)
         for box in self.boxes:
             if box.exists(t) and not box.grounded:
-                under = under | box.covers(xy[..., 0], xy[..., 1], t)
-        return under
+                is_covered = is_covered | box.covers(xy[..., 0], xy[..., 1], t)
+        return is_covered
 
 
 def block(x0: float, x1: float, y0: float, y1: float, top: float) -> Box:
