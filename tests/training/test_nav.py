@@ -42,7 +42,7 @@ def test_a_vec_env_of_rsl_rl():
         assert bool(done.all()) == (step == 10)
     assert extras["time_outs"].tolist() == [1.0] * 4 and float(extras["log"]["/truncated"]) == 1.0
     assert env.episode_length_buf.tolist() == [0] * 4
-    env.task._put("goal", env.task.xy)
+    env.task.goal.copy_(env.task.xy)
     _, _, done, extras = env.step(torch.zeros(4, 2))
     assert bool(done.all()) and not bool(extras["time_outs"].any()), "a success is no time-out"
     env.episode_length_buf = torch.tensor([1, 2, 3, 4])

@@ -70,13 +70,21 @@ class SensorErrorConfig:
 class SensorErrors(DomainRandomization):
     """Errors of B sensors, each with its own values.
 
-    For the arguments see `DomainRandomization`.
-
     ```python
     errors = SensorErrors(SensorErrorConfig(range_constant=(0.0, 0.01), latency=(0, 2)), num_envs=B)
     points, T_map_sensor = errors(points, T_map_sensor, image_shape=(h, w))
     errors.reset(mask=dones)
     ```
+
+    Args:
+        cfg: One config, or several kinds of episodes as pairs (share, config), see `DomainRandomization`.
+        num_envs: B.
+        device: Where the errors are drawn and stored.
+        seed: The same seed and the same calls give bitwise equal errors on the same kind of device.
+
+    Raises:
+        TypeError: `cfg` is of another type.
+        ValueError: The shares do not sum to 1, or `num_envs` is not positive.
     """
 
     config_type = SensorErrorConfig

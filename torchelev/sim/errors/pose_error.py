@@ -51,7 +51,7 @@ class PoseErrorConfig:
 class PoseErrors(DomainRandomization):
     """Estimated poses of B robots, each with its own errors.
 
-    For the arguments see `DomainRandomization`. Poses are estimated in the odometry frame, which equals the map frame
+    Poses are estimated in the odometry frame, which equals the map frame
     at reset. With p the true position, e its error and psi the error of the yaw, which starts at bias_yaw, each call
     computes
 
@@ -66,6 +66,16 @@ class PoseErrors(DomainRandomization):
     T_map_base_estimated = pose_errors(T_map_base, dt=0.02)  # once each step
     pose_errors.reset(mask=dones)
     ```
+
+    Args:
+        cfg: One config, or several kinds of episodes as pairs (share, config), see `DomainRandomization`.
+        num_envs: B.
+        device: Where the errors are drawn and stored.
+        seed: The same seed and the same calls give bitwise equal errors on the same kind of device.
+
+    Raises:
+        TypeError: `cfg` is of another type.
+        ValueError: The shares do not sum to 1, or `num_envs` is not positive.
     """
 
     config_type = PoseErrorConfig
