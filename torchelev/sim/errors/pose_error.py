@@ -51,9 +51,8 @@ class PoseErrorConfig:
 class PoseErrors(DomainRandomization):
     """Estimated poses of B robots, each with its own errors.
 
-    Poses are estimated in the odometry frame, which equals the map frame
-    at reset. With p the true position, e its error and psi the error of the yaw, which starts at bias_yaw, each call
-    computes
+    Poses are estimated in the odometry frame, which equals the map frame at reset. With p the true position, e its
+    error and psi the error of the yaw, which starts at bias_yaw, each call computes
 
         psi += N(0, drift_yaw_time^2 dt + drift_yaw_distance^2 |dp|)
         e   += (Rz(psi) - 1) dp + N(0, drift_time^2 dt + drift_distance^2 |dp|)   (x, y and z each)
