@@ -1,7 +1,8 @@
-"""Reinforcement-learning environments on torchelev. Application code: run from the checkout.
+"""Reinforcement learning environments built on torchelev. Application code: run from the checkout.
 
-Importing this registers `torchelev/TerrainNav-v0` with gymnasium, where that is installed;
-`gymnasium.make("envs:torchelev/TerrainNav-v0")` imports it by itself.
+Importing this package registers `torchelev/TerrainNav-v0` with gymnasium, where that is installed;
+`gymnasium.make("envs:torchelev/TerrainNav-v0")` imports it by itself. Trainings are in `training/`; wrappers for
+environments of your own are in `torchelev.gym`.
 """
 
 import contextlib

@@ -27,7 +27,7 @@ from torchelev.app.results import commit, markdown_table, write_json
 from torchelev.grid import locate
 from torchelev.sim import Boxes, DepthCamera, HeightField, Lidar, MountedSensor, mount
 from torchelev.sim.exact import noise
-from torchelev.sim.exact.scenes import waves
+from torchelev.sim.waves import natural_waves
 from torchelev.stages.cells import PointCells
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -61,7 +61,7 @@ class World:
     def __init__(self, sensor: MountedSensor, seeds: int, compiled: bool, amplitude: float = 0.03, **cfg: Any) -> None:
         places = torch.linspace(-6.0, 6.0, 301, dtype=torch.float64)
         x, y = torch.meshgrid(places, places, indexing="ij")
-        ground = torch.stack([waves(seed, amplitude=amplitude)[0](x, y) for seed in range(seeds)]).float()
+        ground = torch.stack([natural_waves(seed, amplitude)(x, y) for seed in range(seeds)]).float()
         self.sensor, self.seeds = sensor, seeds
         self.field, self.tiles = HeightField(ground, resolution=0.04), torch.arange(seeds)
         self.T_map_base = torch.eye(4, dtype=torch.float64).repeat(seeds, 1, 1)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchelev.sim import Box, DepthCamera, Lidar, Scene, Trajectory, dropout, mount, outliers, range_noise, sink, walk
 from torchelev.sim.exact import scenes
+from torchelev.sim.waves import natural_waves
 
 DT = 0.2  # [s]
 CAMERA = DepthCamera(max_range=6.0)
@@ -72,17 +73,17 @@ def record(
 
 def lane(seed: int = 3) -> Scene:
     """Make rough ground (about +-5 cm) with boxes of 10 to 50 cm on both sides of a lane along y = 0."""
-    terrain, steepness = scenes.waves(seed, amplitude=0.05)
+    relief = natural_waves(seed, amplitude=0.05)
     left = scenes.crates(seed, 10, (-3.5, 3.5, 0.9, 3.0))
     right = scenes.crates(seed + 1, 10, (-3.5, 3.5, -3.0, -0.9))
-    return Scene(name="lane", terrain=terrain, steepness=steepness, boxes=(*left, *right))
+    return Scene(name="lane", terrain=relief, steepness=relief.steepness, boxes=(*left, *right))
 
 
 def record_drift() -> SimulatedRun:
     """Walk round a square on rough ground with boxes, while the odometry sinks by 15 cm, evenly in time."""
-    terrain, steepness = scenes.waves(5, amplitude=0.05)
+    relief = natural_waves(5, amplitude=0.05)
     inner, outer = scenes.crates(5, 4, (-0.6, 0.6, -0.4, 0.4)), scenes.crates(6, 14, (-4.0, 4.0, 2.2, 4.0))
-    scene = Scene(name="square", terrain=terrain, steepness=steepness, boxes=(*inner, *outer))
+    scene = Scene(name="square", terrain=relief, steepness=relief.steepness, boxes=(*inner, *outer))
     square = [(-1.5, -1.3), (1.5, -1.3), (1.5, 1.3), (-1.5, 1.3), (-1.5, -1.3), (0.0, -1.3)]
     path = walk(scene, square, dt=DT)
     drifted = path._replace(T_map_base=sink(path.T_map_base), T_map_sensor=sink(path.T_map_sensor))

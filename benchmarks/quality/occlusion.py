@@ -27,7 +27,7 @@ from torchelev.planning.planner import Path, plan
 from torchelev.planning.traversal_cost import TraversalCostConfig
 from torchelev.sim import Lidar
 from torchelev.sim.exact.scenes import boxes
-from torchelev.sim.exact.trajectories import pose
+from torchelev.sim.poses import pose
 from torchelev.state import MapState
 
 RESULTS = File(__file__).parents[1] / "results"

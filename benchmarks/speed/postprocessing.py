@@ -21,11 +21,11 @@ import scipy.ndimage as ndimage
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.quality import plane_scenes
 from benchmarks.speed import meter
 from torchelev import filters, planes
 from torchelev.app.results import markdown_table, write_json
 from torchelev.layers import Layer
+from torchelev.sim.exact import plane_scenes
 
 RESOLUTION = 0.04  # [m]
 SIZES = ((1, 200), (1, 250), (1, 512), (256, 64))  # maps, cells along a side

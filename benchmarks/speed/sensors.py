@@ -20,7 +20,7 @@ from benchmarks.speed import meter
 from torchelev.app.results import markdown_table, slug, write_json
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact.sensors import NonRepetitiveLidar
-from torchelev.sim.exact.trajectories import pose
+from torchelev.sim.poses import pose
 from torchelev.sim.sensors import tracing
 from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor
@@ -65,7 +65,7 @@ def rounds(look: Any) -> list[tuple[int, int]]:
     search, done = tracing.search, []
 
     def counted(field: HeightField, rays: tracing.Rays, count: int) -> tuple[Tensor, Tensor]:
-        done.append((len(rays.number), count))
+        done.append((len(rays.ray), count))
         return search(field, rays, count)
 
     tracing.search = counted

@@ -1,4 +1,4 @@
-"""The settings of TerrainNav, all in one place, so that an experiment is fixed before its first run."""
+"""The settings of TerrainNav."""
 
 from __future__ import annotations
 
@@ -6,110 +6,84 @@ import math
 from dataclasses import dataclass, field
 
 from torchelev.errors import require
+from torchelev.sim import CourseConfig
 
 PERCEPTION = ("map", "truth", "blind")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CourseConfig:
-    """The ground: square tiles with obstacles that a robot must walk around, and some that it can walk over."""
-
-    num_tiles: int = 64
-    length: float = 12.0  # [m] side of a tile
-    resolution: float = 0.05  # [m]
-    seed: int = 0
-    spacing: float = 2.0  # [m] between the sites of obstacles
-    jitter: float = 0.15  # [m] how far a site is off its lattice, each way
-    half_diagonal: tuple[float, float] = (0.5, 0.75)  # [m] of an obstacle's footprint
-    block_height: tuple[float, float] = (0.3, 0.7)  # [m] too high to climb
-    pit_depth: tuple[float, float] = (0.5, 1.0)  # [m] deep enough to fall into
-    step_height: tuple[float, float] = (0.06, 0.15)  # [m] low enough to walk over
-    shares: tuple[float, float, float] = (0.4, 0.3, 0.2)  # of the sites: blocks, pits, steps; the rest is free
-    roughness: float = 0.03  # [m] amplitude of the ground's waves
-    distance: tuple[float, float] = (4.0, 6.0)  # [m] from start to goal
-    clearance: float = 0.5  # [m] level ground around starts and goals
-    num_routes: int = 256  # pairs of start and goal per tile
-
-    def __post_init__(self) -> None:
-        room = self.spacing - 2 * (self.half_diagonal[1] + self.jitter)
-        require(room >= 0, "course.spacing", "must leave a gap between obstacles", f"{room:.2f} m", "raise it")
-        require(sum(self.shares) <= 1, "course.shares", "must not exceed 1 together", self.shares, "lower one")
-        require(self.num_tiles >= 1, "course.num_tiles", "must be positive", self.num_tiles, "give one or more")
-
-
-@dataclass(frozen=True, kw_only=True)
 class BodyConfig:
-    """A base that follows velocity commands over the ground, and where it cannot."""
+    """A base that follows velocity commands over the ground, and the limits of the ground it can cross."""
 
-    length: float = 0.6  # [m] of the footprint
-    width: float = 0.4  # [m]
-    body_height: float = 0.45  # [m] of the base over the ground under its feet
-    max_speed: float = 1.0  # [m/s] forward; a third of it backward
-    max_yaw_rate: float = 1.5  # [rad/s]
-    response: float = 0.2  # [s] in which the velocity follows the command
-    max_climb: float = 0.22  # [m] ground this much above the feet blocks the way
-    max_drop: float = 0.3  # [m] ground this much below the feet is a fall
-    reach: float = 0.1  # [m] around the footprint in which ground blocks the way
-    max_slope: float = 0.8  # gradient towards which the speed falls, to a fifth of what it is on the level
+    length: float = 0.6  #: [m] of the footprint
+    width: float = 0.4  #: [m] of the footprint
+    body_height: float = 0.45  #: [m] of the base over the ground under its feet
+    max_speed: float = 1.0  #: [m/s] forward; a third of it backward
+    max_yaw_rate: float = 1.5  #: [rad/s]
+    response: float = 0.2  #: [s] time constant with which the velocity follows the command
+    max_climb: float = 0.22  #: [m] ground higher than this above the feet blocks the robot
+    max_drop: float = 0.3  #: [m] ground deeper than this below the feet is a fall
+    reach: float = 0.1  #: [m] distance around the footprint within which ground can block the robot
+    max_slope: float = 0.8  #: gradient at which the speed would be 0; it never falls below a fifth
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig:
-    """Weights of the reward's terms; see `TerrainNav` for the formula."""
+    """Weights of the terms of the reward; see `TerrainNav` for the formula."""
 
-    progress: float = 1.0  # per metre towards the goal
-    success: float = 5.0
-    fall: float = -5.0
-    stuck: float = -5.0
-    blocked: float = -0.1  # per step
-    time: float = -0.02  # per step
-    action_rate: float = -0.01  # per squared change of the action
+    progress: float = 1.0  #: per metre of progress towards the goal
+    success: float = 5.0  #: once, when the robot reaches the goal
+    fall: float = -5.0  #: once, when the robot falls
+    stuck: float = -5.0  #: once, when the robot is stuck
+    blocked: float = -0.1  #: per step in which the robot is blocked
+    time: float = -0.02  #: per step
+    action_rate: float = -0.01  #: per squared change of the action
 
 
 @dataclass(frozen=True, kw_only=True)
 class SightConfig:
-    """What the robot sees: its map, and the crop of it that a policy reads."""
+    """The robot's depth cameras, its map, and the crop of the map that a policy reads."""
 
-    resolution: float = 0.1  # [m] of the map
-    window: float = 6.0  # [m] side of the map
-    crop_length: float = 3.2  # [m] side of the crop, in the base's yaw frame
-    crop_resolution: float = 0.2  # [m]
-    crop_ahead: float = 0.8  # [m] of the crop's middle before the base
-    camera_yaws_deg: tuple[float, ...] = (45.0, -45.0)  # where each depth camera looks, counted from ahead
-    camera_pixels: tuple[int, int] = (16, 16)  # width, height of each
-    camera_fov_deg: tuple[float, float] = (90.0, 60.0)
-    camera_pitch_deg: float = 32.0  # downwards
-    max_range: float = 5.0  # [m]
-    sensor_errors: str = "depth_camera"  # a preset of torchelev.sim
-    pose_errors: str = "leg_odometry"  # a preset of torchelev.sim
-    truth_noise: float = 0.1  # [m] uniform, each way, on the heights of perception "truth"
+    resolution: float = 0.1  #: [m] of the map
+    window: float = 6.0  #: [m] side of the map; must hold the crop at any heading
+    crop_length: float = 3.2  #: [m] side of the crop, in the base's yaw frame
+    crop_resolution: float = 0.2  #: [m] of the crop
+    crop_ahead: float = 0.8  #: [m] from the base to the centre of the crop
+    camera_yaws_deg: tuple[float, ...] = (45.0, -45.0)  #: [deg] heading of each depth camera, positive to the left
+    camera_pixels: tuple[int, int] = (16, 16)  #: width and height of each camera's image
+    camera_fov_deg: tuple[float, float] = (90.0, 60.0)  #: [deg] horizontal and vertical field of view
+    camera_pitch_deg: float = 32.0  #: [deg] by which the cameras look down
+    max_range: float = 5.0  #: [m] of the cameras
+    sensor_errors: str = "depth_camera"  #: preset of torchelev.sim
+    pose_errors: str = "leg_odometry"  #: preset of torchelev.sim
+    truth_noise: float = 0.1  #: [m] amplitude of the uniform noise on the heights of perception "truth"
 
     def __post_init__(self) -> None:
-        reach = 2 * math.hypot(self.crop_length / 2 + abs(self.crop_ahead), self.crop_length / 2)
-        rule = f"must hold the crop at any heading, {reach:.2f} m and two cells"
-        require(reach + 2 * self.resolution <= self.window, "sight.window", rule, self.window, "enlarge it")
+        extent = 2 * math.hypot(self.crop_length / 2 + abs(self.crop_ahead), self.crop_length / 2)
+        rule = f"must hold the crop at any heading, {extent:.2f} m and two cells"
+        require(extent + 2 * self.resolution <= self.window, "sight.window", rule, self.window, "enlarge it")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainNavConfig:
-    """Everything about the task."""
+    """All settings of the task."""
 
-    course: CourseConfig = field(default_factory=CourseConfig)
-    robot: BodyConfig = field(default_factory=BodyConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
-    sight: SightConfig = field(default_factory=SightConfig)
-    dt: float = 0.2  # [s] between actions
-    substeps: int = 4
-    episode_length: float = 20.0  # [s]
-    goal_radius: float = 0.4  # [m]
-    stuck_after: float = 3.0  # [s] of being blocked without a break
+    course: CourseConfig = field(default_factory=CourseConfig)  #: the ground and the routes on it
+    robot: BodyConfig = field(default_factory=BodyConfig)  #: how the robot moves
+    reward: RewardConfig = field(default_factory=RewardConfig)  #: weights of the reward
+    sight: SightConfig = field(default_factory=SightConfig)  #: what the robot sees
+    dt: float = 0.2  #: [s] between actions
+    substeps: int = 4  #: simulation steps in each `dt`
+    episode_length: float = 20.0  #: [s] after which an episode is truncated
+    goal_radius: float = 0.4  #: [m] distance within which the goal is reached
+    stuck_after: float = 3.0  #: [s] of being blocked without interruption that end an episode
 
     def __post_init__(self) -> None:
         for name in ("dt", "substeps", "episode_length", "goal_radius", "stuck_after"):
             value = getattr(self, name)
-            require(value > 0, name, "must be positive", value, "see its default")
+            require(value > 0, name, "must be positive", value, "raise it")
 
     @property
     def max_episode_length(self) -> int:
-        """Steps after which an episode is truncated."""
+        """Number of steps after which an episode is truncated."""
         return round(self.episode_length / self.dt)

@@ -1,6 +1,6 @@
-"""How TerrainNav's base moves: it follows velocity commands, slows on slopes, is blocked by steps and falls off ledges.
+"""Motion of TerrainNav's base: it follows velocity commands, slows on slopes, is blocked by steps and falls off ledges.
 
-No physics engine: four substeps of kinematics over the height field, for all environments at once.
+This is kinematics over a height field, without a physics engine, for all environments at once.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from torchelev.sim.terrains.heightfield import HeightField
 
 
 class RobotState(NamedTuple):
-    """Where the bases are and how they move."""
+    """Position and motion of B bases."""
 
-    xy: Tensor  # (B, 2) [m] tile frame
-    yaw: Tensor  # (B,) [rad]
-    velocity: Tensor  # (B, 2) forward [m/s], yaw rate [rad/s]
-    blocked: Tensor  # (B,) bool: a step too high, now
-    fallen: Tensor  # (B,) bool
+    xy: Tensor  #: (B, 2) [m] tile frame
+    yaw: Tensor  #: (B,) [rad]
+    velocity: Tensor  #: (B, 2) forward speed [m/s], yaw rate [rad/s]
+    blocked: Tensor  #: (B,) bool, whether a step that is too high blocks the robot now
+    fallen: Tensor  #: (B,) bool, whether the robot has fallen
 
 
 class Ground:
-    """The tiles as feet meet them: the ground's height and the highest within `reach`."""
+    """Height of the ground, and the highest ground within `reach` [m], on each tile."""
 
     def __init__(self, field: HeightField, reach: float) -> None:
         radius = max(1, round(reach / field.resolution))
@@ -36,14 +36,14 @@ class Ground:
 
 
 def contacts(xy: Tensor, yaw: Tensor, cfg: BodyConfig) -> Tensor:
-    """Return the footprint's corners and the middles of its sides (B, 8, 2) [m]; the corners are the feet."""
+    """Return the corners of the footprint, which are the feet, and the centres of its sides (B, 8, 2) [m]."""
     points = _footprint(cfg.length / 2, cfg.width / 2, xy.device)
     cos, sin = yaw.cos()[:, None], yaw.sin()[:, None]
     x, y = cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]
     return torch.stack([x, y], -1) + xy[:, None]
 
 
-@functools.cache  # a list becomes a tensor on a GPU by a copy that the host waits for
+@functools.cache  # making a GPU tensor from a list synchronises with the host
 def _footprint(a: float, b: float, device: torch.device) -> Tensor:
     points = [(a, b), (a, -b), (-a, b), (-a, -b), (a, 0), (-a, 0), (0, b), (0, -b)]
     with torch.inference_mode(False):
@@ -51,7 +51,7 @@ def _footprint(a: float, b: float, device: torch.device) -> Tensor:
 
 
 def base_pose(xy: Tensor, yaw: Tensor, tile_ids: Tensor, field: HeightField, cfg: BodyConfig) -> Tensor:
-    """Return T_map_base (B, 4, 4): over the feet, tilted as the plane through them."""
+    """Return T_map_base (B, 4, 4): above the feet, tilted like the plane through them."""
     feet = field.height(tile_ids, contacts(xy, yaw, cfg)[:, :4])
     front, rear, left, right = (feet[:, pair].mean(1) for pair in ((0, 1), (2, 3), (0, 2), (1, 3)))
     zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
@@ -67,12 +67,20 @@ def base_pose(xy: Tensor, yaw: Tensor, tile_ids: Tensor, field: HeightField, cfg
 def advance(
     state: RobotState, action: Tensor, tile_ids: Tensor, ground: Ground, cfg: BodyConfig, dt: float
 ) -> RobotState:
-    """Move for one substep of dt [s]; `action` (B, 2) in [-1, 1]: forward speed and yaw rate.
+    """Move for one substep.
 
-    The velocity approaches the command in `response` seconds. A substep after which ground within `reach` of the
-    footprint lies `max_climb` above the feet is not taken; one after which ground under the footprint lies `max_drop`
-    below them is a fall. Speed falls linearly with the gradient under the feet, as if to 0 at `max_slope`, but not
-    below a fifth.
+    The velocity follows the command with the time constant `response`. The speed decreases linearly with the gradient
+    under the feet, to 0 at `max_slope`, but not below a fifth. A robot does not move if after the substep ground within
+    `reach` of its footprint would lie `max_climb` above its feet (blocked), or if ground under its footprint would lie
+    `max_drop` below them (fallen).
+
+    Args:
+        state: The robots before the substep.
+        action: Forward speed and yaw rate (B, 2), from -1 to 1.
+        tile_ids: The tile of each robot (B,).
+        ground: The tiles.
+        cfg: The body.
+        dt: Duration of the substep [s].
     """
     forward = action[:, 0] * torch.where(action[:, 0] > 0, cfg.max_speed, cfg.max_speed / 3)
     command = torch.stack([forward, action[:, 1] * cfg.max_yaw_rate], -1)
@@ -80,12 +88,12 @@ def advance(
     feet = ground.field.height(tile_ids, contacts(state.xy, state.yaw, cfg)[:, :4])
     support = feet.mean(1)
     gradient = (feet.amax(1) - feet.amin(1)) / cfg.length
-    slowed = velocity[:, 0] * (1 - gradient / cfg.max_slope).clamp(0.2, 1.0)
+    speed = velocity[:, 0] * (1 - gradient / cfg.max_slope).clamp(0.2, 1.0)
     yaw = state.yaw + velocity[:, 1] * dt
-    xy = state.xy + (slowed * dt)[:, None] * torch.stack([yaw.cos(), yaw.sin()], -1)
-    touched = contacts(xy, yaw, cfg)
-    blocked = (ground.highest.height(tile_ids, touched).amax(1) - support > cfg.max_climb) & ~state.fallen
-    fallen = (support - ground.field.height(tile_ids, touched).amin(1) > cfg.max_drop) & ~blocked | state.fallen
+    xy = state.xy + (speed * dt)[:, None] * torch.stack([yaw.cos(), yaw.sin()], -1)
+    points = contacts(xy, yaw, cfg)
+    blocked = (ground.highest.height(tile_ids, points).amax(1) - support > cfg.max_climb) & ~state.fallen
+    fallen = (support - ground.field.height(tile_ids, points).amin(1) > cfg.max_drop) & ~blocked | state.fallen
     stays = blocked | fallen
     return RobotState(
         xy=torch.where(stays[:, None], state.xy, xy),

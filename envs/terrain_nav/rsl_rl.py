@@ -1,8 +1,9 @@
-"""TerrainNav as rsl-rl steps it, and its mirror image."""
+"""TerrainNav for rsl-rl, and its mirror symmetry for data augmentation."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import torch
 from gymnasium.vector import AutoresetMode
@@ -11,15 +12,16 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.terrain_nav.gym import TerrainNavVectorEnv
-from envs.terrain_nav.task import ASIDE, TerrainNav
+from envs.terrain_nav.proprioception import LATERAL
+from envs.terrain_nav.task import TerrainNav
 from torchelev.gym.rsl_rl import GymVecEnv
 
 
 class RslRlTerrainNav(GymVecEnv):
     """A `TerrainNav` for `rsl_rl.runners.OnPolicyRunner` (rsl-rl-lib 5.4 and 5.5).
 
-    Observation groups: "policy" and "map" for the actor, "policy" and "truth" for the critic. `extras` holds
-    "time_outs" (B,) and "log": shares of the last finished episodes that ended in each way.
+    The observation groups are "policy" and "map" for the actor, "policy" and "truth" for the critic. `extras` holds
+    "time_outs" (B,), and in "log" how large a fraction of the last finished episodes ended in each way.
     """
 
     def __init__(self, task: TerrainNav) -> None:
@@ -28,28 +30,30 @@ class RslRlTerrainNav(GymVecEnv):
         super().__init__(env, cfg=dataclasses.asdict(task.cfg))
 
     def get_observations(self) -> TensorDict:
-        """Return the present observations, read anew: a resume changes the task between two steps."""
+        """Return the current observations, computed anew, as resuming a training changes the task between two steps."""
         return self.group(self.task.observe())
 
 
 def mirror(
     env: VecEnv, obs: TensorDict | None = None, actions: Tensor | None = None
 ) -> tuple[TensorDict | None, Tensor | None]:
-    """Append to N samples the same with left and right exchanged (2N): rsl-rl's `data_augmentation_func`.
+    """Append to N samples their mirror images (2N): rsl-rl's `data_augmentation_func`.
 
-    The task looks the same in a mirror as long as the cameras do, so that each step teaches twice. After Mittal et al.,
-    "Symmetry Considerations for Learning Task Symmetric Robot Policies" (ICRA 2024).
+    The task is symmetric in left and right as long as the cameras are. After Mittal et al., "Symmetry Considerations
+    for Learning Task Symmetric Robot Policies" (ICRA 2024).
     """
     if obs is not None:
-        seen = {name: image.flip(-1) for name, image in obs.items() if name != "policy"}  # columns grow with y
-        seen["policy"] = _turned(obs["policy"], ASIDE)
-        obs = torch.cat([obs, TensorDict(seen, batch_size=obs.batch_size)])
+        mirrored = {name: image.flip(-1) for name, image in obs.items() if name != "policy"}  # columns grow with y
+        mirrored["policy"] = _negate(obs["policy"], LATERAL)
+        both: Any = torch.cat([obs, TensorDict(mirrored, batch_size=obs.batch_size)])
+        obs = both
     if actions is not None:
-        actions = torch.cat([actions, _turned(actions, (1,))])
+        actions = torch.cat([actions, _negate(actions, (1,))])
     return obs, actions
 
 
-def _turned(values: Tensor, which: tuple[int, ...]) -> Tensor:
+def _negate(values: Tensor, entries: tuple[int, ...]) -> Tensor:
+    """Return values (..., M) with the sign of some entries changed."""
     sign = torch.ones(values.shape[-1], device=values.device)
-    sign[list(which)] = -1.0
+    sign[list(entries)] = -1.0
     return values * sign

@@ -1,74 +1,72 @@
-"""What TerrainNav's robots see: the map in the loop, the ground itself with white noise, or nothing.
+"""What TerrainNav's robots see: their map, the true ground with white noise, or nothing.
 
-All give an image (B, 4, n, n) of one crop in the base's yaw frame: elevation and upper bound over the ground under the
-base [m], validity, traversability. `sense` looks and draws what is random; `image` only reads.
+Each sight returns an image (B, 4, n, n) of the same crop in the base's yaw frame: elevation and upper bound relative to
+the ground under the base [m], validity, traversability. `sense` takes a measurement and draws all random numbers;
+`image` only reads.
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor, nn
 
 from envs.terrain_nav.config import TerrainNavConfig
-from envs.terrain_nav.course import Course
+from envs.terrain_nav.course import RatedCourse
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, MapImage
-from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, preset
-from torchelev.sim.exact.trajectories import pose
+from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, mount_on_rim, preset
 
-LAYERS = ("elevation", "upper_bound", "validity", "traversability")
+_LAYERS = ("elevation", "upper_bound", "validity", "traversability")
 
 
-def crop(cfg: TerrainNavConfig) -> MapImage:
-    """Return the crop that policies read."""
+def _make_crop(cfg: TerrainNavConfig) -> MapImage:
+    """Return the crop of the map that policies read."""
     sight = cfg.sight
     return MapImage(
         length_x=sight.crop_length,
         length_y=sight.crop_length,
         resolution=sight.crop_resolution,
         offset=(sight.crop_ahead, 0.0),
-        layers=LAYERS,
+        layers=_LAYERS,
         nominal_height=cfg.robot.body_height,
     )
 
 
-class Blind(nn.Module):
-    """Sees nothing: an image of unknown ground."""
+class BlindSight(nn.Module):
+    """No sight: an image of unknown ground. The other sights derive from it."""
 
-    def __init__(self, cfg: TerrainNavConfig, course: Course, num_envs: int, compiled: bool = False) -> None:
+    def __init__(self, cfg: TerrainNavConfig, course: RatedCourse, num_envs: int, compiled: bool = False) -> None:
         super().__init__()
-        self.cfg, self.course, self.num_envs, self.crop = cfg, course, num_envs, crop(cfg)
+        self.cfg, self.course, self.num_envs, self.crop = cfg, course, num_envs, _make_crop(cfg)
         self.generator = torch.Generator(course.field.device)
 
     def reset(self, mask: Tensor) -> None:
-        """Forget, in the environments of `mask` (B,)."""
+        """Begin new episodes in the environments of `mask` (B,) bool."""
 
     def sense(self, T_map_base: Tensor, tile_ids: Tensor, mask: Tensor) -> None:
-        """Look once from where the robots are, those of `mask` (B,)."""
+        """Take a measurement from the poses of the robots, in the environments of `mask` (B,) bool."""
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
-        """Return the crop (B, 4, n, n)."""
+        """Return the image (B, 4, n, n)."""
         return torch.zeros(self.num_envs, *self.crop.shape, device=self.course.field.device)
 
     def get_extra_state(self) -> dict[str, Tensor]:
-        """Return the state of the random numbers."""
+        """Return the state of the random number generator."""
         return {"generator": self.generator.get_state()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """Set the state of the random numbers."""
+        """Set the state of the random number generator."""
         self.generator.set_state(state["generator"].cpu())
 
 
-class Truth(Blind):
-    """Sees the ground itself, each height with uniform noise that is new at each look; traversability has none."""
+class TruthSight(BlindSight):
+    """The true ground, its heights with uniform noise drawn at each measurement, its traversability without noise."""
 
     noise: Tensor
 
     def __init__(
         self,
         cfg: TerrainNavConfig,
-        course: Course,
+        course: RatedCourse,
         num_envs: int,
         compiled: bool = False,
         noise: float | None = None,
@@ -85,27 +83,29 @@ class Truth(Blind):
             self.noise.copy_(torch.where(mask[:, None, None], (2 * u - 1) * self.amplitude, self.noise))
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
-        """Return the crop of the ground: all known, the upper bound is the elevation."""
+        """Return the image of the ground: all cells are known, and the upper bound equals the elevation."""
         xy = self.crop.xy(T_map_base)
         ground = T_map_base[:, 2, 3] - self.cfg.robot.body_height
         shape = self.noise.shape
         elevation = (self.course.field.height(tile_ids, xy) - ground[:, None]).view(shape) + self.noise
-        rating = self.course.traversability.height(tile_ids, xy).view(shape)
-        return torch.stack([elevation, elevation, torch.ones_like(elevation), rating], 1)
+        traversability = self.course.traversability.height(tile_ids, xy).view(shape)
+        return torch.stack([elevation, elevation, torch.ones_like(elevation), traversability], 1)
 
 
-def _mounting(yaw: float, cfg: TerrainNavConfig) -> Tensor:
-    """Return T_base_sensor (4, 4) of a camera at the rim of the robot's body that looks out and down."""
-    place = [cfg.robot.length / 2 * math.cos(yaw), cfg.robot.width / 2 * math.sin(yaw), 0.05]
-    return pose(torch.tensor(place), torch.tensor(yaw), math.radians(cfg.sight.camera_pitch_deg)).float()
+def _mountings(cfg: TerrainNavConfig) -> list[Tensor]:
+    """Return T_base_sensor (4, 4) of the cameras on the rim of the robot's body."""
+    # Headings are rounded to float32, on which the recorded rollout in tests/answers.npz depends.
+    yaws_deg = torch.tensor(cfg.sight.camera_yaws_deg).deg2rad().double().rad2deg().tolist()
+    body, pitch_deg = cfg.robot, cfg.sight.camera_pitch_deg
+    return [mount_on_rim(body.length, body.width, yaw_deg, pitch_deg).float() for yaw_deg in yaws_deg]
 
 
-class Mapped(Blind):
-    """Sees with depth cameras whose points an elevation map fuses, at poses that drift."""
+class MapSight(BlindSight):
+    """An elevation map built from simulated depth cameras, at estimated poses that drift."""
 
     T_estimated: Tensor
 
-    def __init__(self, cfg: TerrainNavConfig, course: Course, num_envs: int, compiled: bool = False) -> None:
+    def __init__(self, cfg: TerrainNavConfig, course: RatedCourse, num_envs: int, compiled: bool = False) -> None:
         super().__init__(cfg, course, num_envs)
         sight, device = cfg.sight, course.field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
@@ -113,21 +113,20 @@ class Mapped(Blind):
         if compiled:
             self.emap.compile()
         camera = DepthCamera(*sight.camera_pixels, *sight.camera_fov_deg, max_range=sight.max_range)
-        mounts = (_mounting(math.radians(yaw), cfg) for yaw in sight.camera_yaws_deg)
-        self.cameras = [MountedSensor(camera, T.to(device)) for T in mounts]
+        self.cameras = [MountedSensor(camera, T.to(device)) for T in _mountings(cfg)]
         sensor, odometry = preset(sight.sensor_errors).sensor, preset(sight.pose_errors).pose
         self.sensor_errors = nn.ModuleList(SensorErrors(sensor, num_envs, device) for _ in self.cameras)
         self.pose_errors = PoseErrors(odometry, num_envs, device)
         self.register_buffer("T_estimated", torch.eye(4, device=device).repeat(num_envs, 1, 1))
 
     def reset(self, mask: Tensor) -> None:
-        """Forget the map; draw new errors."""
+        """Clear the maps and draw new errors."""
         self.emap.reset(mask=mask)
         for errors in (*self.sensor_errors, self.pose_errors):
             errors.reset(mask=mask)
 
     def sense(self, T_map_base: Tensor, tile_ids: Tensor, mask: Tensor) -> None:
-        """Cast rays from where the robots are, and map them from where they believe to be."""
+        """Cast rays from the true poses, and map the points at the estimated ones."""
         dt = torch.where(mask, self.cfg.dt, 0.0)
         estimated = self.pose_errors(T_map_base, dt)
         self.T_estimated.copy_(torch.where(mask[:, None, None], estimated, self.T_estimated))
@@ -136,18 +135,22 @@ class Mapped(Blind):
         self.emap.update(points, T_map_sensor, self.T_estimated, dt)
 
     def look(self, T_map_base: Tensor, tile_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the K cameras' points (B, K, M, 3) and where they are believed to be (B, K, 4, 4)."""
-        clouds = []
+        """Return the points of the K cameras (B, K, M, 3), sensor frame, and their estimated poses (B, K, 4, 4)."""
+        width, height = self.cfg.sight.camera_pixels
+        clouds: list[Tensor] = []
+        poses: list[Tensor] = []
         for camera, errors in zip(self.cameras, self.sensor_errors, strict=True):
+            assert isinstance(errors, SensorErrors)
             mounting = camera.T_base_sensor @ errors.mounting()
             points = camera(self.course.field, tile_ids, T_map_base, T_base_sensor=mounting)
-            shape = (camera.pattern.height, camera.pattern.width)
-            clouds.append(errors(points, camera.T_map_sensor(self.T_estimated), image_shape=shape))
-        return tuple(torch.stack(parts, 1) for parts in zip(*clouds, strict=True))
+            cloud = errors(points, camera.T_map_sensor(self.T_estimated), image_shape=(height, width))
+            clouds.append(cloud.points)
+            poses.append(cloud.T_map_sensor)
+        return torch.stack(clouds, 1), torch.stack(poses, 1)
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
-        """Return the crop of the map."""
+        """Return the image of the map."""
         return self.crop(self.emap, self.T_estimated)
 
 
-SIGHTS: dict[str, type[Blind]] = {"map": Mapped, "truth": Truth, "blind": Blind}
+SIGHTS: dict[str, type[BlindSight]] = {"map": MapSight, "truth": TruthSight, "blind": BlindSight}

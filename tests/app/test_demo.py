@@ -34,7 +34,7 @@ def test_result_is_that_of_a_map_of_the_course(tmp_path):
 def test_person_is_gone_from_the_course_at_the_end():
     scene = demo.course()
     person = torch.tensor([[3.7, 0.85]])
-    assert bool(scene.covered(person, 0.0)) and not bool(scene.covered(person, demo.PERSON_LEAVES + 2))
+    assert bool(scene.is_covered(person, 0.0)) and not bool(scene.is_covered(person, demo.PERSON_LEAVES + 2))
 
 
 def test_cells_at_steps():

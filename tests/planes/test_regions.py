@@ -6,9 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.quality.plane_scenes import RISE, RUN, mixed, noisy, stairs
 from torchelev.planes import PlaneConfig, convex_region, segment
 from torchelev.planes.polygons import crossings, nearest
+from torchelev.sim.exact.plane_scenes import RISE, RUN, mixed, noisy, stairs
 
 pytest.importorskip("cv2")
 

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.quality.plane_scenes import RISE, RUN, SCENES, TREADS, grid, hills, mixed, noisy, ramp, stairs
 from torchelev.planes import PlaneConfig, segment
+from torchelev.sim.exact.plane_scenes import RISE, RUN, SCENES, TREADS, grid, hills, mixed, noisy, ramp, stairs
 
 pytest.importorskip("cv2")
 SEEDS = st.integers(0, 10_000)

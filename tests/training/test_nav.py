@@ -42,7 +42,7 @@ def test_a_vec_env_of_rsl_rl():
         assert bool(done.all()) == (step == 10)
     assert extras["time_outs"].tolist() == [1.0] * 4 and float(extras["log"]["/truncated"]) == 1.0
     assert env.episode_length_buf.tolist() == [0] * 4
-    env.task._put("goal", env.task.xy)
+    env.task.goal.copy_(env.task.xy)
     _, _, done, extras = env.step(torch.zeros(4, 2))
     assert bool(done.all()) and not bool(extras["time_outs"].any()), "a success is no time-out"
     env.episode_length_buf = torch.tensor([1, 2, 3, 4])
@@ -64,7 +64,7 @@ def test_its_steps_are_those_of_the_task():
             assert torch.equal(seen[name], expected), name
         assert torch.equal(reward, outcome.reward) and torch.equal(done, outcome.done.long())
         assert torch.equal(extras["time_outs"], outcome.truncated.float())
-        assert extras["log"] == {f"/{name}": share for name, share in other.shares.items()}
+        assert extras["log"] == {f"/{name}": share for name, share in other.ending_fractions.items()}
     assert env.cfg == dataclasses.asdict(CFG) and env.max_episode_length == 10
     other.reset()
     one.load_state_dict(other.state_dict())

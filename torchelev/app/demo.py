@@ -22,7 +22,8 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.grid import GridConfig
 from torchelev.output_files import MARK, atomic_file, require_writable
 from torchelev.sim import Box, DepthCamera, Scene, Trajectory, mount, outliers, range_noise, walk
-from torchelev.sim.exact.scenes import block, steps, waves
+from torchelev.sim.exact.scenes import block, steps
+from torchelev.sim.waves import natural_waves
 
 if TYPE_CHECKING:
     from torchelev.viz.plot import Panel
@@ -69,7 +70,7 @@ class DemoScan(NamedTuple):
 
 def course() -> Scene:
     """Make the course: stairs up and a ramp down, a person, a bar over the way, walls, rough ground."""
-    relief, steepness = waves(7, amplitude=0.06)
+    relief = natural_waves(7, amplitude=0.06)
     gradient, top = math.tan(math.radians(15.0)), 0.6
 
     def terrain(x: Tensor, y: Tensor) -> Tensor:
@@ -85,7 +86,7 @@ def course() -> Scene:
     return Scene(
         name="course",
         terrain=terrain,
-        steepness=max(0.5, steepness + 0.1),  # ramp and relief lie apart; fading adds the relief's height
+        steepness=max(0.5, relief.steepness + 0.1),  # ramp and relief lie apart; fading adds the relief's height
         boxes=(*climb, platform, *walls, block(1.713, 2.087, 0.413, 0.787, 0.25), bar, *_person()),
     )
 

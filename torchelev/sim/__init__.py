@@ -1,10 +1,11 @@
-"""Made-up worlds with known truth, to test maps in and to train policies in. Needs torch only.
+"""Simulated worlds with known ground truth, to test maps in and to train policies in. Needs torch only.
 
-One robot, exact: scenes in closed form, sensors that see them to below 0.1 mm, noise, paths; float64 on the CPU inside,
-points come back as float32 in the sensor frame.
+For one robot, exact: scenes in closed form (`exact/`), with sensors that see them to below 0.1 mm, noise and
+trajectories. They compute in float64 on the CPU; points are returned as float32 in the sensor frame.
 
-Many robots, fast: terrains as height fields, mounted sensors whose rays are cast at them and at boxes, and errors of
-sensors and poses that each environment draws for itself; float32 on any device.
+For many robots, fast: height fields and courses (`terrains/`), mounted sensors that cast rays at them and at boxes
+(`sensors/`), and errors of sensors and poses that each environment draws for itself (`errors/`). They compute in
+float32 on any device. Environments that robots act in are not here: see `envs/`.
 """
 
 from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors
@@ -13,15 +14,18 @@ from torchelev.sim.errors.presets import ErrorPreset, preset
 from torchelev.sim.exact.noise import dropout, noisy, outliers, range_noise
 from torchelev.sim.exact.scenes import Box, Scene
 from torchelev.sim.exact.sensors import DepthCamera, Lidar, NonRepetitiveLidar, cast
-from torchelev.sim.exact.trajectories import MOUNT, Trajectory, mount, sink, turn_on_the_spot, walk
+from torchelev.sim.exact.trajectories import Trajectory, sink, turn_on_the_spot, walk
+from torchelev.sim.poses import MOUNT, mount, mount_on_rim
 from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor
+from torchelev.sim.terrains.course import Course, CourseConfig, make_course
 from torchelev.sim.terrains.generate import Terrain, TerrainGrid, make_terrain, terrain_grid
 from torchelev.sim.terrains.heightfield import HeightField
 
 __all__ = [
-    "MOUNT", "Box", "Boxes", "DepthCamera", "ErrorPreset", "HeightField", "Lidar", "MountedSensor",
-    "NonRepetitiveLidar", "PoseErrorConfig", "PoseErrors", "Scene", "SensorErrorConfig", "SensorErrors", "Terrain",
-    "TerrainGrid", "Trajectory", "cast", "dropout", "make_terrain", "mount", "noisy", "outliers", "preset",
-    "range_noise", "sink", "terrain_grid", "turn_on_the_spot", "walk",
+    "MOUNT", "Box", "Boxes", "Course", "CourseConfig", "DepthCamera", "ErrorPreset", "HeightField", "Lidar",
+    "MountedSensor", "NonRepetitiveLidar", "PoseErrorConfig", "PoseErrors", "Scene", "SensorErrorConfig",
+    "SensorErrors", "Terrain", "TerrainGrid", "Trajectory", "cast", "dropout", "make_course", "make_terrain",
+    "mount", "mount_on_rim", "noisy", "outliers", "preset", "range_noise", "sink", "terrain_grid",
+    "turn_on_the_spot", "walk",
 ]  # fmt: skip

@@ -62,7 +62,7 @@ class ResumableRunner(OnPolicyRunner):
         """Log an iteration as rsl-rl does, and show it in the bar."""
         with contextlib.redirect_stdout(io.StringIO()):
             self._log(**figures)
-        shown = {name: f"{float(share):.2f}" for name, share in self.env.task.shares.items()}
+        shown = {name: f"{float(share):.2f}" for name, share in self.env.task.ending_fractions.items()}
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         rate = steps / (figures["collect_time"] + figures["learn_time"])
         assert self.bar is not None

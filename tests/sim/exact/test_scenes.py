@@ -50,13 +50,13 @@ def test_a_floating_box_is_no_ground_but_covers():
     scene = scenes.overhang()
     under_bar = torch.tensor([[1.45, 0.0]])
     assert float(scene.truth(under_bar)) == 0.0
-    assert bool(scene.covered(under_bar)) and not bool(scene.covered(torch.tensor([[0.5, 0.0]])))
+    assert bool(scene.is_covered(under_bar)) and not bool(scene.is_covered(torch.tensor([[0.5, 0.0]])))
 
 
 def test_person_goes():
     scene = scenes.person(until=3.0)
     place = torch.tensor([[1.9, 0.0]])
-    assert bool(scene.covered(place, t=2.9)) and not bool(scene.covered(place, t=3.0))
+    assert bool(scene.is_covered(place, t=2.9)) and not bool(scene.is_covered(place, t=3.0))
 
 
 def test_a_box_moves():

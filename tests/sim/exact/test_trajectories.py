@@ -35,11 +35,6 @@ def test_turn_stands_at_the_height_over_the_ground():
     torch.testing.assert_close(path.T_map_sensor[:, 2, 3], torch.full((12,), 0.8 + math.tan(math.radians(15))).double())
 
 
-def test_mount_looks_down():
-    forward = torch.tensor([math.cos(math.radians(35)), 0, -math.sin(math.radians(35))])
-    torch.testing.assert_close(MOUNT[:3, 0], forward.double())
-
-
 def test_walk_visits_the_corners_at_its_speed():
     path = walk(scenes.flat(), PATH, speed=0.5, dt=0.1)
     xy = path.T_map_base[:, :2, 3]

@@ -140,7 +140,7 @@ def test_host_reads_nothing_back(monkeypatch):
     field, T = FLAT.to("meta"), torch.empty(3, 4, 4, device="meta")
     sensors = [MountedSensor(pattern, mount()) for pattern in PATTERNS]
     for sensor in sensors:
-        sensor._on(torch.device("meta"))  # the first call copies the pattern to the device
+        sensor.directions(torch.device("meta"))  # the first call copies the pattern to the device
     for constructor in ("tensor", "as_tensor", "from_numpy"):
         monkeypatch.setattr(torch, constructor, None)
     legs = Boxes(torch.empty(3, 2, 4, 4, device="meta"), torch.empty(3, 2, 3, device="meta"))

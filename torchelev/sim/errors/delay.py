@@ -1,4 +1,4 @@
-"""Clouds that arrive late, each with the pose it was taken at."""
+"""Clouds that arrive late, together with the poses at which they were taken."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ if TYPE_CHECKING:
 
 
 class Cloud(NamedTuple):
-    """What a sensor gives at one instant, for each environment."""
+    """One cloud per environment, and the sensor poses that come with it."""
 
-    points: Float[Tensor, "B M 3"]  #: [m] sensor frame, NaN where nothing came back
-    T_map_sensor: Float[Tensor, "B 4 4"] | None  #: where they were taken, or are accepted to have been
+    points: Float[Tensor, "B M 3"]  #: [m] sensor frame, NaN where there is no return
+    T_map_sensor: Float[Tensor, "B 4 4"] | None  #: poses for the map update; None if none were given
 
 
 class Delay(nn.Module):
-    """A ring of the last clouds and poses of B environments: each gets back the cloud of its own number of calls ago.
+    """Ring buffer of the latest clouds and poses, from which each environment reads with its own latency.
+
+    The first cloud determines the size of the buffer.
 
     Args:
-        longest: the most calls that a cloud can be late.
+        max_latency: Largest latency that can be read [calls].
         num_envs: B.
-        device: where the ring is; it takes its size from the first cloud.
+        device: Where the buffer is stored.
     """
 
     slot: Tensor
@@ -34,54 +36,56 @@ class Delay(nn.Module):
     clouds: Tensor | None
     poses: Tensor | None
 
-    def __init__(self, longest: int, num_envs: int, device: torch.device | str = "cpu") -> None:
+    def __init__(self, max_latency: int, num_envs: int, device: torch.device | str = "cpu") -> None:
         super().__init__()
-        self.longest = longest
+        self.max_latency = max_latency
         self.register_buffer("slot", torch.zeros(1, dtype=torch.int64, device=device), persistent=False)
         self.register_buffer("age", torch.zeros(num_envs, dtype=torch.int64, device=device), persistent=False)
         self.register_buffer("clouds", None, persistent=False)
         self.register_buffer("poses", None, persistent=False)
 
     def reset(self, mask: Bool[Tensor, "B"]) -> None:
-        """Forget the clouds of the environments of `mask`."""
+        """Forget the clouds of the environments in `mask`."""
         self.age.masked_fill_(mask, 0)
 
     def forward(
         self, points: Float[Tensor, "B M 3"], T_map_sensor: Float[Tensor, "B 4 4"], latency: Int[Tensor, "B"]
     ) -> Cloud:
-        """Take in the clouds of now; return those of `latency` (B,) calls ago, or NaN where there was none yet.
+        """Store the current clouds and return those of `latency` calls ago, or NaN if that was before the reset.
 
-        Raises ValueError for another number of points than before.
+        Raises:
+            ValueError: The shape or dtype differs from that of the first cloud.
         """
-        clouds, poses = self._ring(points, T_map_sensor)
+        clouds, poses = self._require_buffers(points, T_map_sensor)
         with torch.no_grad():
             clouds.index_copy_(0, self.slot, points[None])
             poses.index_copy_(0, self.slot, T_map_sensor[None])
-            taken = (self.slot - latency) % (self.longest + 1)
-            there = self.age >= latency
-            self.slot.add_(1).remainder_(self.longest + 1)
+            slot = (self.slot - latency) % (self.max_latency + 1)
+            is_stored = self.age >= latency
+            self.slot.add_(1).remainder_(self.max_latency + 1)
             self.age.add_(1)
-        env = torch.arange(len(taken), device=taken.device)
-        late = clouds[taken, env].masked_fill(~there[:, None, None], float("nan"))
-        return Cloud(late, torch.where(there[:, None, None], poses[taken, env], T_map_sensor))
+        env = torch.arange(len(slot), device=slot.device)
+        delayed = clouds[slot, env].masked_fill(~is_stored[:, None, None], float("nan"))
+        return Cloud(delayed, torch.where(is_stored[:, None, None], poses[slot, env], T_map_sensor))
 
     def get_extra_state(self) -> dict[str, Tensor | None]:
-        """Return the ring, whose size the first cloud decides."""
+        """Return the buffer for `state_dict`, as its size is known only after the first cloud."""
         return {"slot": self.slot, "age": self.age, "clouds": self.clouds, "poses": self.poses}
 
     def set_extra_state(self, state: dict[str, Tensor | None]) -> None:
-        """Take over a ring."""
+        """Restore a copy of the buffer of a `state_dict`."""
         for name, value in state.items():
             setattr(self, name, None if value is None else value.to(self.slot.device, copy=True))
 
-    def _ring(self, points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+    def _require_buffers(self, points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the buffers, which the first call allocates, and refuse input that does not fit into them."""
         if self.clouds is None or self.poses is None:
-            with torch.inference_mode(False):  # else no later call outside of that mode could write into it
-                self.clouds = points.new_zeros((self.longest + 1, *points.shape))
-                self.poses = poses.new_zeros((self.longest + 1, *poses.shape))
+            with torch.inference_mode(False):  # inference tensors could not be written outside of inference mode
+                self.clouds = points.new_zeros((self.max_latency + 1, *points.shape))
+                self.poses = poses.new_zeros((self.max_latency + 1, *poses.shape))
         actual = f"{tuple(points.shape)} {points.dtype}, {poses.dtype}"
-        same = self.clouds.shape[1:] == points.shape and self.clouds.dtype == points.dtype
-        same = same and self.poses.dtype == poses.dtype
+        fits = self.clouds.shape[1:] == points.shape and self.clouds.dtype == points.dtype
+        fits = fits and self.poses.dtype == poses.dtype
         rule = f"must stay {tuple(self.clouds.shape[1:])} {self.clouds.dtype}, {self.poses.dtype}"
-        require(same, "points, T_map_sensor", rule, actual, "make one SensorErrors for each sensor")
+        require(fits, "points, T_map_sensor", rule, actual, "make one SensorErrors for each sensor")
         return self.clouds, self.poses

@@ -1,6 +1,6 @@
-"""What real sensors add to the ideal clouds of many environments, each with its own: noise, gaps, late frames.
+"""Errors of real sensors, for ideal clouds of many environments: noise, gaps, late frames and a bent mounting.
 
-`noise` has a few of these for single clouds, with the same values for all.
+`torchelev.sim.exact.noise` has some of them for a single cloud.
 """
 
 from __future__ import annotations
@@ -15,64 +15,82 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.sim.errors.delay import Cloud, Delay
-from torchelev.sim.errors.draws import DomainRandomization, Range, check_range, limits
-from torchelev.sim.errors.range_errors import across_edge, artefacts, disparity_steps, flying, steps
+from torchelev.sim.errors.draws import DomainRandomization, Range, check_range, range_limits
+from torchelev.sim.errors.range_errors import (
+    add_artefacts,
+    add_flying_points,
+    find_range_across_edge,
+    quantise,
+    quantise_disparity,
+)
+from torchelev.sim.poses import pose_from_rotation_vector
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-SHARES = ("flying", "too_short", "too_long", "outliers", "dropout", "missed_frames")
+_FRACTIONS = ("flying", "too_short", "too_long", "outliers", "dropout", "missed_frames")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorErrorConfig:
-    """A sensor's errors. Each value is a number, or (low, high), from which each environment draws its own at reset.
+    """Errors of a sensor; each value is a number, or a range (low, high) from which every environment draws at reset.
 
-    They act in the order of the fields: what the ray meets, noise, quantisation, losses, latency.
+    They act in the order of the fields: wrong ranges, noise, quantisation, losses, latency.
     """
 
-    flying: Range = 0.0  #: share, of the points at an edge, that come to lie between its two sides
-    flying_step: Range = 0.1  #: [m] an edge is where the ranges of two neighbours differ by more
-    too_short: Range = 0.0  #: share of the points that come back from 0.1 to 1 times their range, as from dust
-    too_long: Range = 0.0  #: share of the points that come back from 1.05 to 2 times their range, as by a mirror
-    range_constant: Range = 0.0  #: [m] 1 sigma along the ray = range_constant + range_quadratic * d^2
-    range_quadratic: Range = 0.0  #: [1/m]
-    range_step: Range = 0.0  #: [m] ranges are multiples of it
+    flying: Range = 0.0  #: fraction of the points at an edge that move to between its two sides
+    flying_step: Range = 0.1  #: [m] two neighbours form an edge if their ranges differ by more than this
+    too_short: Range = 0.0  #: fraction of the points measured at 0.1 to 1 times their range, like dust
+    too_long: Range = 0.0  #: fraction of the points measured at 1.05 to 2 times their range, like mirrors
+    range_constant: Range = 0.0  #: [m] range noise, 1 sigma = range_constant + range_quadratic * d^2
+    range_quadratic: Range = 0.0  #: [1/m] range noise that grows with the squared distance
+    range_step: Range = 0.0  #: [m] ranges are rounded to multiples of this
     point_noise: Range = 0.0  #: [m] 1 sigma of x, y and z each
-    outliers: Range = 0.0  #: share of the points that have `outlier_noise` instead
+    outliers: Range = 0.0  #: fraction of the points with `outlier_noise` in place of `point_noise`
     outlier_noise: Range = 0.0  #: [m] 1 sigma of x, y and z each
-    disparity_step: Range = 0.0  #: [1/m] 1/x are multiples of it, as in stereo: x has steps of disparity_step * x^2 [m]
-    dropout: Range = 0.0  #: share of the points that are lost
-    missed_frames: Range = 0.0  #: share of the clouds that are lost as a whole
-    latency: Range = 0  #: [calls] whole: the cloud that comes out went in so many calls ago
-    clock_offset: bool = False  #: late clouds are taken for current ones, instead of coming with their own pose
-    mounting_position: Range = 0.0  #: [m] 1 sigma of the sensor's place along each axis, drawn at reset
-    mounting_rotation_deg: Range = 0.0  #: [deg] 1 sigma of its turn about each axis, drawn at reset
+    #: [1/m] 1/x is rounded to multiples of this, as in stereo, so that x comes in steps of disparity_step * x^2 [m]
+    disparity_step: Range = 0.0
+    dropout: Range = 0.0  #: fraction of the points that are lost
+    missed_frames: Range = 0.0  #: fraction of the clouds that are lost as a whole
+    latency: Range = 0  #: [calls] integer delay of each cloud
+    clock_offset: bool = False  #: pair late clouds with the current pose, not with the pose at which they were taken
+    mounting_position: Range = 0.0  #: [m] 1 sigma of the true sensor position along each axis, drawn at reset
+    mounting_rotation_deg: Range = 0.0  #: [deg] 1 sigma of the true sensor rotation about each axis, drawn at reset
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            highest = 1.0 if field.name in (*SHARES, "clock_offset") else math.inf
-            check_range(f"SensorErrorConfig.{field.name}", getattr(self, field.name), 0.0, highest)
-        whole = all(end.is_integer() for end in limits(self.latency))
-        require(whole, "SensorErrorConfig.latency", "must be whole numbers", repr(self.latency), "count calls")
-        most = limits(self.too_short)[1] + limits(self.too_long)[1]
-        require(most <= 1, "SensorErrorConfig.too_short, too_long", "must sum to 1 at most", most, "lower one")
+            max_value = 1.0 if field.name in (*_FRACTIONS, "clock_offset") else math.inf
+            check_range(f"SensorErrorConfig.{field.name}", getattr(self, field.name), 0.0, max_value)
+        is_integer = all(limit.is_integer() for limit in range_limits(self.latency))
+        require(is_integer, "SensorErrorConfig.latency", "must be whole numbers", repr(self.latency), "count calls")
+        total = range_limits(self.too_short)[1] + range_limits(self.too_long)[1]
+        require(total <= 1, "SensorErrorConfig.too_short, too_long", "must sum to 1 at most", total, "lower one")
 
 
 class SensorErrors(DomainRandomization):
-    """Errors of B sensors, each with its own values; see `DomainRandomization` for the arguments.
+    """Errors of B sensors, each with its own values.
 
     ```python
     errors = SensorErrors(SensorErrorConfig(range_constant=(0.0, 0.01), latency=(0, 2)), num_envs=B)
     points, T_map_sensor = errors(points, T_map_sensor, image_shape=(h, w))
     errors.reset(mask=dones)
     ```
+
+    Args:
+        cfg: One config, or several kinds of episodes as pairs (share, config), see `DomainRandomization`.
+        num_envs: B.
+        device: Where the errors are drawn and stored.
+        seed: The same seed and the same calls give bitwise equal errors on the same kind of device.
+
+    Raises:
+        TypeError: `cfg` is of another type.
+        ValueError: The shares do not sum to 1, or `num_envs` is not positive.
     """
 
-    config = SensorErrorConfig
-    whole = ("latency",)
-    turned: Tensor
-    shifted: Tensor
+    config_type = SensorErrorConfig
+    integer_fields = ("latency",)
+    mounting_turn: Tensor
+    mounting_shift: Tensor
 
     def __init__(
         self,
@@ -82,24 +100,24 @@ class SensorErrors(DomainRandomization):
         seed: int = 0,
     ) -> None:
         super().__init__(cfg, num_envs, device, seed)
-        self.delay = Delay(self.highest("latency"), num_envs, device)
-        self.register_buffer("turned", torch.zeros(num_envs, 3, device=device))
-        self.register_buffer("shifted", torch.zeros(num_envs, 3, device=device))
+        self.delay = Delay(round(self.max_value("latency")), num_envs, device)
+        self.register_buffer("mounting_turn", torch.zeros(num_envs, 3, device=device))
+        self.register_buffer("mounting_shift", torch.zeros(num_envs, 3, device=device))
         self.reset()
 
     def _restart(self, mask: Bool[Tensor, "B"]) -> None:
         super()._restart(mask)
         self.delay.reset(mask)
-        for buffer in (self.turned, self.shifted):
+        for buffer in (self.mounting_turn, self.mounting_shift):
             buffer.copy_(torch.where(mask[:, None], self.normal(self.num_envs, 3), buffer))
 
     def mounting(self) -> Float[Tensor, "B 4 4"]:
-        """Return T_nominal_true: where each sensor really sits, seen from where it is accepted to sit.
+        """Return the pose of each true sensor in the frame of its nominal mounting, float32.
 
-        T_base_sensor.float() @ mounting() is what to cast rays with; the map is told T_base_sensor. Float32.
+        Cast rays from T_base_sensor.float() @ mounting(), and give the map the nominal T_base_sensor.
         """
-        vector = self.turned * torch.deg2rad(self.value("mounting_rotation_deg", 2))
-        return rigid(vector, self.shifted * self.value("mounting_position", 2))
+        vector = self.mounting_turn * torch.deg2rad(self.value("mounting_rotation_deg", 2))
+        return pose_from_rotation_vector(vector, self.mounting_shift * self.value("mounting_position", 2))
 
     def forward(
         self,
@@ -108,81 +126,76 @@ class SensorErrors(DomainRandomization):
         *,
         image_shape: tuple[int, int] | None = None,
     ) -> Cloud:
-        """Return the cloud that the sensors give now, and the poses that it is said to be taken at.
+        """Return the clouds with errors, and the poses to map them at.
 
         Args:
-            points: ideal points [m] in the sensor frame, x forward; NaN where nothing came back.
-            T_map_sensor: the sensors' poses now. Late clouds come with the poses they were taken at, which does a map
-                no harm; with `clock_offset` they come with these, as if the clocks of sensor and robot differed.
-            image_shape: (h, w) of points that are an image, row by row. None: a single row.
+            points: Ideal points [m] in the sensor frame, x forward; NaN where there is no return.
+            T_map_sensor: Current poses of the sensors. A late cloud is returned with the pose at which it was taken,
+                which does a map no harm. With `clock_offset` it is returned with the current pose, as if the clocks of
+                sensor and robot differed.
+            image_shape: (h, w) of points that form an image, row by row. None: a single row.
 
-        Raises ValueError for shapes that do not fit, and where there is a latency but no pose.
+        Returns:
+            The clouds, and their poses: None if `T_map_sensor` is None.
+
+        Raises:
+            ValueError: A shape does not fit, or there is a latency but no pose.
         """
         self._check(points, T_map_sensor, image_shape)
-        points = self._ranged(points, image_shape or (1, points.shape[1]))
+        points = self._disturb_ranges(points, image_shape or (1, points.shape[1]))
         if self.uses("point_noise", "outlier_noise"):
             points = points + self._point_sigma(points.shape[1])[..., None] * self.normal(*points.shape)
         if self.uses("disparity_step"):
-            points = disparity_steps(points, self.value("disparity_step", 2))
-        points = self._lost(points)
+            points = quantise_disparity(points, self.value("disparity_step", 2))
+        points = self._drop(points)
         if not self.uses("latency") or T_map_sensor is None:
             return Cloud(points, T_map_sensor)
-        late = self.delay(points, T_map_sensor, self.value("latency").long())
-        offset = self.value("clock_offset", 3) > 0
-        return Cloud(late.points, torch.where(offset, T_map_sensor, late.T_map_sensor))
+        delayed = self.delay(points, T_map_sensor, self.value("latency").long())
+        has_offset = self.value("clock_offset", 3) > 0
+        return Cloud(delayed.points, torch.where(has_offset, T_map_sensor, delayed.T_map_sensor))
 
     def _check(self, points: Tensor, T_map_sensor: Tensor | None, image_shape: tuple[int, int] | None) -> None:
         B = self.num_envs
         fits = points.ndim == 3 and points.shape[0] == B and points.shape[2] == 3
         require(fits, "points", f"expected ({B}, M, 3)", tuple(points.shape), "give one cloud per environment")
-        placed = T_map_sensor is not None or not self.uses("latency")
-        require(placed, "T_map_sensor", "must be given where clouds are late", None, "give the poses of now")
+        has_pose = T_map_sensor is not None or not self.uses("latency")
+        require(has_pose, "T_map_sensor", "must be given where clouds are late", None, "give the current poses")
         if T_map_sensor is not None:
             actual = tuple(T_map_sensor.shape)
             require(actual == (B, 4, 4), "T_map_sensor", f"expected ({B}, 4, 4)", actual, "give one per environment")
         if image_shape is not None:
-            whole = image_shape[0] * image_shape[1] == points.shape[1]
-            require(whole, "image_shape", f"must hold {points.shape[1]} points", image_shape, "give (height, width)")
+            fits = image_shape[0] * image_shape[1] == points.shape[1]
+            require(fits, "image_shape", f"must hold {points.shape[1]} points", image_shape, "give (height, width)")
 
-    def _ranged(self, points: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Change the points' ranges; their directions stay."""
+    def _disturb_ranges(self, points: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Change the ranges of the points, not their directions."""
         d = torch.linalg.vector_norm(points, dim=-1)
-        reach = d
+        measured = d
         B, M = d.shape
         if self.uses("flying"):
-            share, step = self.value("flying", 2), self.value("flying_step", 2)
-            reach = flying(d, across_edge(d, shape), self.uniform(B, M), share, step)
+            fraction, step = self.value("flying", 2), self.value("flying_step", 2)
+            measured = add_flying_points(d, find_range_across_edge(d, shape), self.uniform(B, M), fraction, step)
         if self.uses("too_short", "too_long"):
-            reach = artefacts(reach, self.uniform(B, M), self.value("too_short", 2), self.value("too_long", 2))
+            short, long = self.value("too_short", 2), self.value("too_long", 2)
+            measured = add_artefacts(measured, self.uniform(B, M), short, long)
         if self.uses("range_constant", "range_quadratic"):
-            sigma = self.value("range_constant", 2) + self.value("range_quadratic", 2) * reach.square()
-            reach = reach + sigma * self.normal(B, M)
+            sigma = self.value("range_constant", 2) + self.value("range_quadratic", 2) * measured.square()
+            measured = measured + sigma * self.normal(B, M)
         if self.uses("range_step"):
-            reach = steps(reach, self.value("range_step", 2))
-        return points.clone() if reach is d else points * (reach / d.clamp(min=1e-6))[..., None]
+            measured = quantise(measured, self.value("range_step", 2))
+        return points.clone() if measured is d else points * (measured / d.clamp(min=1e-6))[..., None]
 
     def _point_sigma(self, count: int) -> Tensor:
+        """Return the standard deviation (B, M or 1) [m] of each point's noise."""
         if not self.uses("outliers"):
             return self.value("point_noise", 2)
-        outlier = self.uniform(self.num_envs, count) < self.value("outliers", 2)
-        return torch.where(outlier, self.value("outlier_noise", 2), self.value("point_noise", 2))
+        is_outlier = self.uniform(self.num_envs, count) < self.value("outliers", 2)
+        return torch.where(is_outlier, self.value("outlier_noise", 2), self.value("point_noise", 2))
 
-    def _lost(self, points: Tensor) -> Tensor:
+    def _drop(self, points: Tensor) -> Tensor:
+        """Turn lost points and lost clouds into NaN."""
         if not self.uses("dropout", "missed_frames"):
             return points
-        missed = self.uniform(self.num_envs, 1) < self.value("missed_frames", 2)
-        gone = missed | (self.uniform(*points.shape[:2]) < self.value("dropout", 2))
-        return points.masked_fill(gone[..., None], float("nan"))
-
-
-def rigid(vector: Float[Tensor, "B 3"], position: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4 4"]:
-    """Return transforms (B, 4, 4) of rotation vectors [rad] and positions [m], by Rodrigues' formula."""
-    x, y, z = vector.unbind(-1)
-    zero, angle = torch.zeros_like(x), torch.linalg.vector_norm(vector, dim=-1)[:, None, None]
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(-1, 3, 3)
-    T = torch.eye(4, dtype=vector.dtype, device=vector.device).repeat(len(vector), 1, 1)
-    # sin(a) / a and (1 - cos(a)) / a^2, which are 1 and 1/2 at 0.
-    a, b = torch.sinc(angle / math.pi), torch.sinc(angle / (2 * math.pi)).square() / 2
-    T[:, :3, :3] += a * cross + b * cross @ cross
-    T[:, :3, 3] = position
-    return T
+        is_missed = self.uniform(self.num_envs, 1) < self.value("missed_frames", 2)
+        is_lost = is_missed | (self.uniform(*points.shape[:2]) < self.value("dropout", 2))
+        return points.masked_fill(is_lost[..., None], float("nan"))

@@ -1,4 +1,4 @@
-"""Wrong ranges, for many clouds at once: chance comes in as even numbers u from 0 to 1, settings as (B, 1) tensors."""
+"""Errors of measured ranges, batched over clouds: u are uniform random numbers from 0 to 1, settings are (B, 1)."""
 
 from __future__ import annotations
 
@@ -11,51 +11,51 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-def across_edge(d: Float[Tensor, "B M"], shape: tuple[int, int]) -> Float[Tensor, "B M"]:
-    """Return, for each pixel of images (h, w) of ranges, row by row, the range of the neighbour that differs most."""
+def find_range_across_edge(d: Float[Tensor, "B M"], shape: tuple[int, int]) -> Float[Tensor, "B M"]:
+    """Return the range of the neighbouring pixel that differs most, for range images (h, w) stored row by row."""
     image = d.unflatten(1, shape)
-    found = image
+    across = image
     for dim in (1, 2):
-        number = torch.arange(image.shape[dim], device=d.device)
-        for by in (-1, 1):
-            beside = image.index_select(dim, (number + by).clamp(0, image.shape[dim] - 1))
-            # False for NaN: where nothing came back is no edge.
-            found = torch.where((beside - image).abs() > (found - image).abs(), beside, found)
-    return found.flatten(1)
+        index = torch.arange(image.shape[dim], device=d.device)
+        for offset in (-1, 1):
+            neighbour = image.index_select(dim, (index + offset).clamp(0, image.shape[dim] - 1))
+            # The comparison is False for NaN: a missing return makes no edge.
+            across = torch.where((neighbour - image).abs() > (across - image).abs(), neighbour, across)
+    return across.flatten(1)
 
 
-def flying(d: Tensor, beside: Tensor, u: Tensor, share: Tensor, step: Tensor) -> Tensor:
-    """Return ranges (B, M) of which a share lies between d and `beside`, where these differ by more than `step`.
+def add_flying_points(d: Tensor, across: Tensor, u: Tensor, fraction: Tensor, step: Tensor) -> Tensor:
+    """Move a fraction of the ranges (B, M) to between d and `across`, where the two differ by more than `step` [m].
 
-    A pixel at the rim of an object sees both sides, and a stereo matcher or a lidar's beam answers with a mixture.
+    At the rim of an object a pixel sees both sides, and a stereo matcher or a lidar beam measures a mixture of them.
     """
-    flies = (u < share) & ((beside - d).abs() > step)
-    # Below the share, u / share is even between 0 and 1.
-    return torch.where(flies, d + (beside - d) * (u / share.clamp(min=1e-6)), d)
+    is_flying = (u < fraction) & ((across - d).abs() > step)
+    # Given u < fraction, u / fraction is uniform between 0 and 1.
+    return torch.where(is_flying, d + (across - d) * (u / fraction.clamp(min=1e-6)), d)
 
 
-def artefacts(d: Tensor, u: Tensor, short: Tensor, long: Tensor) -> Tensor:
-    """Return ranges (B, M) of which shares are 0.1 to 1 (short) or 1.05 to 2 (long) times what they should be."""
-    # Below a share, u / share is even between 0 and 1.
-    nearer = 0.1 + 0.9 * u / short.clamp(min=1e-6)
-    farther = 1.05 + 0.95 * (u - short) / long.clamp(min=1e-6)
-    return d * torch.where(u < short, nearer, torch.where(u < short + long, farther, 1.0))
+def add_artefacts(d: Tensor, u: Tensor, short_fraction: Tensor, long_fraction: Tensor) -> Tensor:
+    """Scale fractions of the ranges (B, M) by 0.1 to 1 (too short) or by 1.05 to 2 (too long)."""
+    # Given u < fraction, u / fraction is uniform between 0 and 1.
+    short = 0.1 + 0.9 * u / short_fraction.clamp(min=1e-6)
+    long = 1.05 + 0.95 * (u - short_fraction) / long_fraction.clamp(min=1e-6)
+    return d * torch.where(u < short_fraction, short, torch.where(u < short_fraction + long_fraction, long, 1.0))
 
 
-def steps(value: Tensor, step: Tensor) -> Tensor:
-    """Round to multiples of a step, where it is positive."""
+def quantise(value: Tensor, step: Tensor) -> Tensor:
+    """Round to multiples of `step`, where it is positive."""
     return torch.where(step > 0, torch.round(value / step.clamp(min=1e-9)) * step, value)
 
 
-def disparity_steps(points: Float[Tensor, "B M 3"], step: Float[Tensor, "B 1"]) -> Float[Tensor, "B M 3"]:
+def quantise_disparity(points: Float[Tensor, "B M 3"], step: Float[Tensor, "B 1"]) -> Float[Tensor, "B M 3"]:
     """Scale points along their rays so that 1/x is a multiple of `step` [1/m].
 
-    Stereo measures the disparity f b / x in steps of s pixels: step = s / (f b), with the focal length f in pixels and
-    the baseline b [m]. Points whose disparity is rounded to none are lost, and those that are not before the sensor.
+    Stereo measures the disparity f b / x in steps of s pixels: step = s / (f b), with the focal length f [pixels] and
+    the baseline b [m]. Points behind the sensor are lost, and so are points whose disparity rounds to 0.
     """
     x = points[..., 0]
-    # Double where: where there is no step, nothing may divide by it.
-    steps_seen = torch.round(1 / (x.clamp(min=1e-6) * step.clamp(min=1e-9)))
-    scale = 1 / (steps_seen * step.clamp(min=1e-9) * x)
-    scale = torch.where((x > 0) & (steps_seen > 0), scale, float("nan"))
+    # The clamps keep both branches of `where` finite.
+    num_steps = torch.round(1 / (x.clamp(min=1e-6) * step.clamp(min=1e-9)))
+    scale = 1 / (num_steps * step.clamp(min=1e-9) * x)
+    scale = torch.where((x > 0) & (num_steps > 0), scale, float("nan"))
     return points * torch.where(step > 0, scale, 1.0)[..., None]

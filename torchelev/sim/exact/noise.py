@@ -1,4 +1,4 @@
-"""What real sensors add: range noise, missing returns, and returns at wrong ranges along their ray."""
+"""Noise of real sensors for single clouds: range noise, missing returns, and wrong ranges along the ray."""
 
 from __future__ import annotations
 
@@ -9,9 +9,15 @@ from torch import Tensor
 def range_noise(
     points: Tensor, generator: torch.Generator | None = None, *, constant: float = 0.003, quadratic: float = 0.0015
 ) -> Tensor:
-    """Move sensor-frame points (..., 3) [m] along their rays by N(0, sigma), sigma = constant + quadratic * d^2 [m].
+    """Add range noise N(0, sigma^2) with sigma = constant + quadratic * d^2 at distance d.
 
-    The defaults are a stereo depth camera's: 3 mm near, 9 mm at 2 m, 27 mm at 4 m.
+    The defaults are those of a stereo depth camera: 3 mm near the sensor, 9 mm at 2 m, 27 mm at 4 m.
+
+    Args:
+        points: (..., 3) [m] in the sensor frame.
+        generator: Source of random numbers; None is torch's default generator.
+        constant: Noise at distance 0, 1 sigma [m].
+        quadratic: Growth with the squared distance [1/m].
     """
     d = torch.linalg.vector_norm(points, dim=-1, keepdim=True)
     sigma = constant + quadratic * d.square()
@@ -20,9 +26,9 @@ def range_noise(
 
 
 def dropout(points: Tensor, generator: torch.Generator | None = None, *, share: float = 0.05) -> Tensor:
-    """Turn a `share` of the points (..., 3) into NaN: returns that never came."""
-    lost = torch.rand(points.shape[:-1], generator=generator, dtype=points.dtype) < share
-    return points.masked_fill(lost[..., None], float("nan"))
+    """Replace a fraction `share` of the points (..., 3) by NaN: missing returns."""
+    is_lost = torch.rand(points.shape[:-1], generator=generator, dtype=points.dtype) < share
+    return points.masked_fill(is_lost[..., None], float("nan"))
 
 
 def outliers(
@@ -33,21 +39,25 @@ def outliers(
     flying: float = 0.0,
     too_long: float = 0.0,
 ) -> Tensor:
-    """Put shares of the points (N, 3) at wrong ranges along their own rays; NaN stays NaN.
+    """Give fractions of the points wrong ranges along their rays; NaN stays NaN.
 
-    `dust`: anywhere from 0.1 of the range to the range. `flying`: between its range and that of the next point in
-    the cloud, where the two differ, as at the rim of an object. `too_long`: 1.05 to 2 times the range, as by a mirror.
+    Args:
+        points: (N, 3) [m] in the sensor frame, in the order of the scan.
+        generator: Source of random numbers; None is torch's default generator.
+        dust: Fraction measured at 0.1 to 1 times the range.
+        flying: Fraction measured between the point's range and that of the next point, as at the rim of an object.
+        too_long: Fraction measured at 1.05 to 2 times the range, as by a mirror.
     """
-    which, u = (torch.rand(points.shape[:-1], generator=generator, dtype=points.dtype) for _ in range(2))
+    draw, u = (torch.rand(points.shape[:-1], generator=generator, dtype=points.dtype) for _ in range(2))
     d = torch.linalg.vector_norm(points, dim=-1)
     neighbour = torch.where(d.roll(-1).isfinite(), d.roll(-1), d)
     between = 1 + u * (neighbour / d.clamp(min=1e-6) - 1)
-    scale = torch.where(which < dust + flying + too_long, 1.05 + 0.95 * u, 1.0)
-    scale = torch.where(which < dust + flying, between, scale)
-    scale = torch.where(which < dust, 0.1 + 0.9 * u, scale)
+    scale = torch.where(draw < dust + flying + too_long, 1.05 + 0.95 * u, 1.0)
+    scale = torch.where(draw < dust + flying, between, scale)
+    scale = torch.where(draw < dust, 0.1 + 0.9 * u, scale)
     return points * scale[..., None]
 
 
 def noisy(points: Tensor, generator: torch.Generator | None = None, *, lost: float = 0.02) -> Tensor:
-    """Apply the default range noise and lose some returns: an ordinary sensor on an ordinary day."""
+    """Add the default range noise and lose a fraction `lost` of the returns: an ordinary sensor."""
     return dropout(range_noise(points, generator), generator, share=lost)

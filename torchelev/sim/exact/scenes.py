@@ -1,8 +1,8 @@
 """Scenes whose ground height is known exactly.
 
-A scene is a continuous terrain in closed form and boxes. Boxes that stand on the ground (stairs, walls, crates) are
-part of the ground height, so every step is an exact discontinuity and every vertical face is hit exactly; the others
-float or come and go (a bar, a ceiling, a person). Edges lie at odd places: not all on borders of 4 cm cells.
+A scene is a continuous terrain in closed form, with boxes. Grounded boxes (stairs, walls, crates) are part of the
+ground height: their edges are exact steps and their faces exactly vertical. Other boxes float, move or disappear (a
+bar, a ceiling, a person). Edges are placed at odd coordinates, so that they do not all lie on borders of 4 cm cells.
 """
 
 from __future__ import annotations
@@ -14,33 +14,35 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-DEEP = -20.0  # [m] where boxes that stand on the ground begin
+from torchelev.sim.waves import natural_waves
+
+_BOTTOM = -20.0  # [m] lower end of grounded boxes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """An axis-aligned box, from `low` to `high` [m, map frame] at t = 0, there while since <= t < until [s]."""
+    """An axis-aligned box in the map frame, which may move, and which exists while since <= t < until."""
 
-    low: tuple[float, float, float]  #: [m] lowest corner
-    high: tuple[float, float, float]  #: [m] highest corner
+    low: tuple[float, float, float]  #: [m] lowest corner at t = 0
+    high: tuple[float, float, float]  #: [m] highest corner at t = 0
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: [m/s]
-    since: float = -math.inf  #: [s]
-    until: float = math.inf  #: [s]
-    grounded: bool = False  #: its top is ground: part of the scene's height
+    since: float = -math.inf  #: [s] when the box appears
+    until: float = math.inf  #: [s] when the box disappears
+    grounded: bool = False  #: whether the top is part of the ground height
 
     def corners(self, t: float) -> tuple[list[float], list[float]]:
-        """Return the low and the high corner [m] at time t [s]."""
-        shift = [v * t for v in self.velocity]
-        return [a + s for a, s in zip(self.low, shift, strict=True)], [
-            a + s for a, s in zip(self.high, shift, strict=True)
-        ]
+        """Return the lowest and the highest corner [m] at time t [s]."""
+        low, high = (
+            [a + v * t for a, v in zip(corner, self.velocity, strict=True)] for corner in (self.low, self.high)
+        )
+        return low, high
 
     def exists(self, t: float) -> bool:
-        """Tell whether the box is there at time t [s]."""
+        """Tell whether the box exists at time t [s]."""
         return self.since <= t < self.until
 
     def covers(self, x: Tensor, y: Tensor, t: float = 0.0) -> Tensor:
-        """Tell which places (any shape) lie under or over the box."""
+        """Tell which places x, y [m], of any shape, lie within the outline of the box seen from above."""
         low, high = self.corners(t)
         return (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
 
@@ -51,20 +53,24 @@ def _plane(x: Tensor, y: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A terrain and boxes.
+    """A continuous terrain with boxes on it.
 
-    `terrain(x, y) -> z` must be continuous, with a slope of `steepness` or less everywhere: ray casting relies on it.
+    Ray casting relies on the terrain being continuous and nowhere steeper than `steepness`.
     """
 
     name: str = "flat"  #: for tables and pictures
-    terrain: Callable[[Tensor, Tensor], Tensor] = _plane  #: height [m] of the ground at x, y [m]
-    steepness: float = 0.0  #: upper bound of |gradient|
-    boxes: tuple[Box, ...] = field(default_factory=tuple)  #: what stands on the ground
+    terrain: Callable[[Tensor, Tensor], Tensor] = _plane  #: height [m] at x, y [m], of any shape
+    steepness: float = 0.0  #: upper bound of the terrain's |gradient|
+    boxes: tuple[Box, ...] = field(default_factory=tuple)  #: grounded, floating and moving boxes
 
     def height(self, x: Tensor, y: Tensor, t: float = 0.0, below: float = math.inf) -> Tensor:
-        """Return the ground's height [m], any shape: the higher of terrain and boxes that stand on the ground.
+        """Return the height of the ground [m]: the higher one of terrain and grounded boxes.
 
-        Boxes whose top lies above `below` [m] are left out: in a building, the floor one stands on.
+        Args:
+            x: [m] map frame, of any shape.
+            y: [m] map frame, of the shape of `x`.
+            t: Time [s].
+            below: Boxes whose top lies higher are left out [m]. In a building this selects the floor.
         """
         z = self.terrain(x, y)
         for box in self.boxes:
@@ -74,88 +80,61 @@ class Scene:
         return z
 
     def truth(self, xy: Tensor, t: float = 0.0, below: float = math.inf) -> Tensor:
-        """Return `height` at xy (..., 2) [m]: what an elevation map should say."""
+        """Return the `height` at xy (..., 2) [m] in float64: the ground truth of an elevation map."""
         xy = xy.double()
         return self.height(xy[..., 0], xy[..., 1], t, below)
 
-    def covered(self, xy: Tensor, t: float = 0.0) -> Tensor:
-        """Tell which places xy (..., 2) lie under or in a box that is not ground (bar, ceiling, person)."""
-        under = torch.zeros(xy.shape[:-1], dtype=torch.bool)
+    def is_covered(self, xy: Tensor, t: float = 0.0) -> Tensor:
+        """Tell which places xy (..., 2) [m] lie under or in a box that is not grounded (bar, ceiling, person)."""
+        is_covered = torch.zeros(xy.shape[:-1], dtype=torch.bool)
         for box in self.boxes:
             if box.exists(t) and not box.grounded:
-                under = under | box.covers(xy[..., 0], xy[..., 1], t)
-        return under
+                is_covered = is_covered | box.covers(xy[..., 0], xy[..., 1], t)
+        return is_covered
 
 
 def block(x0: float, x1: float, y0: float, y1: float, top: float) -> Box:
-    """Make a box that stands on the ground, up to `top` [m]."""
-    return Box(low=(x0, y0, DEEP), high=(x1, y1, top), grounded=True)
+    """Make a grounded box from x0 to x1 and from y0 to y1, up to `top` [m]."""
+    return Box(low=(x0, y0, _BOTTOM), high=(x1, y1, top), grounded=True)
 
 
 def steps(x0: float, y0: float, y1: float, *, count: int, rise: float, run: float, base: float = 0.0) -> list[Box]:
-    """Make `count` stairs that climb along +x from x0 [m]; each reaches below those after it."""
+    """Make `count` stairs that climb along +x from x = x0 [m], each step reaching under the following ones."""
     end = x0 + count * run
     return [block(x0 + k * run, end, y0, y1, base + (k + 1) * rise) for k in range(count)]
 
 
-def _uniform(generator: torch.Generator, low: float, high: float, count: int) -> Tensor:
-    return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
-
-
-def waves(seed: int, amplitude: float = 0.08, count: int = 6) -> tuple[Callable[[Tensor, Tensor], Tensor], float]:
-    """Return a sum of sines of 0.4 to 3 m length, about +-`amplitude` [m], and a bound of its slope.
-
-    Short waves are lower: the height of each is proportional to its length, as on natural ground.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    length = torch.logspace(math.log10(0.4), math.log10(3.0), count, dtype=torch.float64)
-    heading = _uniform(generator, 0.0, 2 * math.pi, count)
-    phase = _uniform(generator, 0.0, 2 * math.pi, count).tolist()
-    # Peaks of random sines rarely meet: 1.6 root-sum-squares is what the ground reaches in practice.
-    height = length * amplitude / (1.6 * length.square().sum().sqrt())
-    k = 2 * math.pi / length
-    kx, ky, a = (k * heading.cos()).tolist(), (k * heading.sin()).tolist(), height.tolist()
-
-    def terrain(x: Tensor, y: Tensor) -> Tensor:
-        z = torch.zeros_like(x)
-        for i in range(count):
-            z += a[i] * torch.sin(kx[i] * x + ky[i] * y + phase[i])
-        return z
-
-    return terrain, float((k * height).sum())
-
-
 def flat() -> Scene:
-    """Make flat ground at z = 0."""
+    """Return flat ground at z = 0."""
     return Scene(name="flat")
 
 
 def slope(angle_deg: float = 15.0) -> Scene:
-    """Make a plane that rises along +x."""
+    """Return a plane that rises along +x."""
     gradient = math.tan(math.radians(angle_deg))
     return Scene(name="slope", terrain=lambda x, y: gradient * x, steepness=abs(gradient))
 
 
 def rough(seed: int = 0) -> Scene:
-    """Make smooth rough ground of about +-8 cm."""
-    terrain, steepness = waves(seed)
-    return Scene(name="rough", terrain=terrain, steepness=steepness)
+    """Return smooth rough ground of about +-8 cm."""
+    relief = natural_waves(seed)
+    return Scene(name="rough", terrain=relief, steepness=relief.steepness)
 
 
 def stairs(rise: float = 0.17, run: float = 0.29, count: int = 8) -> Scene:
-    """Make stairs that climb along +x from x = 0.613 m to a landing, 12 m wide so that no side is seen."""
+    """Return stairs along +x from x = 0.613 m up to a landing, 12 m wide so that their sides stay out of view."""
     climb = steps(0.613, -6.0, 6.0, count=count, rise=rise, run=run)
     landing = block(0.613 + count * run, 12.0, -6.0, 6.0, count * rise)
     return Scene(name="stairs", boxes=(*climb, landing))
 
 
 def boxes(seed: int = 0, count: int = 24) -> Scene:
-    """Make boxes of 10 to 50 cm height on flat ground, within 4 m, none nearer than 0.7 m to the origin."""
+    """Return flat ground with boxes of 10 to 50 cm height between 0.7 and 4 m from the origin."""
     return Scene(name="boxes", boxes=tuple(crates(seed, count, (-4.0, 4.0, -4.0, 4.0), keep_off=0.7)))
 
 
 def crates(seed: int, count: int, area: tuple[float, float, float, float], keep_off: float = 0.0) -> list[Box]:
-    """Make `count` boxes of 10 to 50 cm within area (x0, x1, y0, y1) [m], `keep_off` [m] or more from the origin."""
+    """Make boxes of 10 to 50 cm height in area (x0, x1, y0, y1) [m], at least `keep_off` [m] from the origin."""
     generator = torch.Generator().manual_seed(seed)
     made: list[Box] = []
     while len(made) < count:
@@ -169,8 +148,8 @@ def crates(seed: int, count: int, area: tuple[float, float, float, float], keep_
 
 
 def mixed(seed: int = 0) -> Scene:
-    """Make rough ground behind (x < -1), a ramp of 15 degrees to the left (y > 1), stairs ahead, boxes to the right."""
-    relief, steepness = waves(seed, amplitude=0.06)
+    """Return rough ground behind (x < -1), a ramp of 15 degrees on the left (y > 1), stairs ahead, boxes right."""
+    relief = natural_waves(seed, amplitude=0.06)
     gradient = math.tan(math.radians(15.0))
 
     def terrain(x: Tensor, y: Tensor) -> Tensor:
@@ -180,12 +159,13 @@ def mixed(seed: int = 0) -> Scene:
     climb = steps(1.217, -0.787, 0.913, count=6, rise=0.17, run=0.29)
     landing = block(1.217 + 6 * 0.29, 4.5, -0.787, 0.913, 6 * 0.17)
     aside = crates(seed + 1, 9, (-0.8, 3.6, -3.7, -1.4))
-    # The relief is faded in over 1 m, which adds its height to its slope.
-    return Scene(name="mixed", terrain=terrain, steepness=gradient + steepness + 0.1, boxes=(*climb, landing, *aside))
+    # Fading the relief in over 1 m adds its height to its slope.
+    steepness = gradient + relief.steepness + 0.1
+    return Scene(name="mixed", terrain=terrain, steepness=steepness, boxes=(*climb, landing, *aside))
 
 
 def wall() -> Scene:
-    """Make walls of 0.5 m and 1 m height and a low obstacle of 12 cm on flat ground, ahead of the origin."""
+    """Return flat ground with walls of 0.5 m and 1 m height and an obstacle of 12 cm ahead of the origin."""
     low = block(1.987, 2.203, -2.5, -0.313, 0.5)
     high = block(2.493, 2.711, 0.307, 2.9, 1.0)
     obstacle = block(1.213, 1.437, -0.191, 0.227, 0.12)
@@ -193,7 +173,7 @@ def wall() -> Scene:
 
 
 def overhang() -> Scene:
-    """Make a bar across the way 1.15 m over flat ground, a ceiling at 2.3 m from x = 3 on, a box behind the bar."""
+    """Return flat ground with a bar across the path at 1.15 m, a box behind it, and a ceiling at 2.3 m from x = 3 m."""
     bar = Box(low=(1.413, -1.5, 1.15), high=(1.527, 1.5, 1.31))
     ceiling = Box(low=(3.007, -4.0, 2.3), high=(8.0, 4.0, 2.5))
     obstacle = block(2.213, 2.531, -0.409, 0.317, 0.15)
@@ -201,16 +181,16 @@ def overhang() -> Scene:
 
 
 def person(until: float = 3.0, x: float = 1.713, y: float = -0.2) -> Scene:
-    """Make flat ground with a person, 0.4 x 0.5 x 1.7 m, who stands at (x, y) and is gone from t = `until` [s] on."""
+    """Return flat ground with a person of 0.4 x 0.5 x 1.7 m at (x, y) [m] who disappears at t = `until` [s]."""
     body = Box(low=(x, y, 0.0), high=(x + 0.4, y + 0.5, 1.7), until=until)
     return Scene(name="person", boxes=(body,))
 
 
 def two_floors(storey: float = 2.72) -> Scene:
-    """Make a lower floor (z = 0), stairs up along +x beside it and an upper floor that lies over the lower one.
+    """Return a lower floor at z = 0, stairs beside it that climb along +x, and an upper floor above the lower one.
 
-    The stairs occupy 1.013 < y < 2.213 from x = -2.32 to 2.32 m, a landing follows; the upper slab (0.2 m thick) spans
-    -6 < x < 6 at y < 0.987 and the landing, so that who comes up can walk back over the way that led to the stairs.
+    The stairs lie at 1.013 < y < 2.213 m from x = -2.32 to 2.32 m, followed by a landing. The upper floor, a slab of
+    0.2 m, covers -6 < x < 6 m beside them: a robot that has climbed the stairs can walk back above its own path.
     """
     rise, run, count = 0.17, 0.29, 16
     assert abs(storey - rise * count) < 1e-9

@@ -1,4 +1,4 @@
-"""Sensors that see a scene exactly: each ray's first hit, on vertical faces too, to well below 0.1 mm."""
+"""Sensors for exact scenes: the first hit of each ray, on vertical faces too, to well below 0.1 mm."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.sim.exact.scenes import Box, Scene
 
-FINEST = 0.02  # [m] shortest step along a ray while looking for the terrain
-BISECTIONS = 12  # 0.02 m / 2^12 = 5 um
-MAX_STEPS = 2000
+_MIN_STEP = 0.02  # [m] along a ray in the search for the terrain
+_BISECTIONS = 12  # 0.02 m / 2^12 = 5 um
+_MAX_STEPS = 2000
 
 
 class _Sensor:
-    """What casts rays: `directions` in its own frame and a range."""
+    """A sensor with a fixed pattern of rays."""
 
     max_range: float
 
@@ -28,12 +28,12 @@ class _Sensor:
         raise NotImplementedError
 
     def cast(self, scene: Scene, T_map_sensor: Tensor, t: float = 0.0) -> Tensor:
-        """Return the points (M, 3) [m] seen at time t [s] in the SENSOR frame, float32, NaN where nothing was hit."""
-        return points_seen(self.directions, scene, T_map_sensor, self.max_range, t)
+        """Return the points (M, 3) [m] seen at time t [s], sensor frame, float32, NaN where nothing is hit."""
+        return _cast_points(self.directions, scene, T_map_sensor, self.max_range, t)
 
 
-def points_seen(directions: Tensor, scene: Scene, T_map_sensor: Tensor, max_range: float, t: float = 0.0) -> Tensor:
-    """Return the points (M, 3) [m] that rays (M, 3) of the sensor frame see, in that frame, NaN where nothing."""
+def _cast_points(directions: Tensor, scene: Scene, T_map_sensor: Tensor, max_range: float, t: float = 0.0) -> Tensor:
+    """Return the points (M, 3) [m] hit by rays (M, 3), both in the sensor frame, NaN where nothing is hit."""
     T = T_map_sensor.double()
     distance = cast(scene, T[:3, 3], directions @ T[:3, :3].T, max_range, t)
     return (directions * distance[:, None]).float()
@@ -41,22 +41,32 @@ def points_seen(directions: Tensor, scene: Scene, T_map_sensor: Tensor, max_rang
 
 @dataclass(frozen=True)
 class DepthCamera(_Sensor):
-    """A pinhole camera. Sensor frame: x forward, y left, z up. Rays row by row from the upper left pixel."""
+    """A pinhole camera; its rays go row by row from the upper left pixel. Sensor frame: x forward, y left, z up."""
 
-    width: int = 160  #: pixels of a row
-    height: int = 120  #: pixels of a column
-    fov_x_deg: float = 86.0  #: [deg] field of view from side to side
-    fov_y_deg: float = 58.0  #: [deg] field of view from top to bottom
-    max_range: float = 8.0  #: [m]
-    pinhole: tuple[float, float, float, float] | None = None  #: fx, fy, cx, cy [pixels], in place of the fields of view
+    width: int = 160  #: [pixels] of a row
+    height: int = 120  #: [pixels] of a column
+    fov_x_deg: float = 86.0  #: [deg] horizontal field of view
+    fov_y_deg: float = 58.0  #: [deg] vertical field of view
+    max_range: float = 8.0  #: [m] beyond which nothing is hit
+    pinhole: tuple[float, float, float, float] | None = None  #: [pixels] fx, fy, cx, cy; replaces the fields of view
 
     @classmethod
     def from_intrinsics(
         cls, fx: float, fy: float, cx: float, cy: float, width: int, height: int, max_range: float = 8.0
     ) -> DepthCamera:
-        """Make a camera of given intrinsics [pixels]; the middle of the upper left pixel is at (0, 0).
+        """Make a camera from its intrinsics; the centre of the upper left pixel is (0, 0).
 
-        Raises ValueError for focal lengths that are not positive.
+        Args:
+            fx: Horizontal focal length [pixels].
+            fy: Vertical focal length [pixels].
+            cx: Column of the principal point [pixels].
+            cy: Row of the principal point [pixels].
+            width: Pixels of a row.
+            height: Pixels of a column.
+            max_range: Range beyond which nothing is hit [m].
+
+        Raises:
+            ValueError: A focal length is not positive.
         """
         require(fx > 0 and fy > 0, "fx, fy", "must be positive", (fx, fy), "give the focal lengths in pixels")
         fov_x, fov_y = (
@@ -77,7 +87,7 @@ class DepthCamera(_Sensor):
 
     @cached_property
     def directions(self) -> Tensor:
-        """Unit vectors (height * width, 3), through the middles of the pixels."""
+        """Unit vectors (height * width, 3) through the pixel centres."""
         u, v = (torch.arange(size, dtype=torch.float64) for size in (self.width, self.height))
         if self.pinhole is None:
             across, down = math.tan(math.radians(self.fov_x_deg) / 2), math.tan(math.radians(self.fov_y_deg) / 2)
@@ -92,13 +102,13 @@ class DepthCamera(_Sensor):
 
 @dataclass(frozen=True)
 class Lidar(_Sensor):
-    """A turning lidar. Sensor frame: x forward, y left, z up. Rays ring by ring from the lowest."""
+    """A spinning lidar; its rays go ring by ring from the lowest. Sensor frame: x forward, y left, z up."""
 
-    rings: int = 32  #: beams, one above the other
-    azimuths: int = 1024  #: measurements of each beam in one turn
+    rings: int = 32  #: number of beams, one above the other
+    azimuths: int = 1024  #: measurements of each beam in a turn
     fov_low_deg: float = -55.0  #: [deg] elevation of the lowest beam
     fov_high_deg: float = 15.0  #: [deg] elevation of the highest beam
-    max_range: float = 20.0  #: [m]
+    max_range: float = 20.0  #: [m] beyond which nothing is hit
 
     @cached_property
     def directions(self) -> Tensor:
@@ -111,23 +121,24 @@ class Lidar(_Sensor):
 
 @dataclass(frozen=True)
 class NonRepetitiveLidar:
-    """A lidar whose every step shows another part of its field of view, as Livox's do: an imitation of their pattern.
+    """A lidar with a non-repetitive scan pattern like Livox's: every step covers another part of the field of view.
 
-    Two prisms that turn at speeds 1 + k and 1 - k deflect the beam by equal angles, which sum to a rose curve: with
-    rho the angle to the sensor's x axis and theta that around it, rho = fov / 2 * cos(k theta) (rhodonea; see Brazeal
-    et al., "A Rigorous Observation Model for the Risley Prism-Based Livox Mid-40 Lidar Sensor", Sensors 2021, and
-    "Symmetries of Scan Patterns of Laser Scanners with Rotational Risley Prisms", Symmetry 2023). With an irrational k
-    no petal comes twice. Real sensors' speeds, channels and timing differ. Sensor frame: x forward, y left, z up.
+    Two prisms that rotate at speeds 1 + k and 1 - k deflect the beam by equal angles. Their sum is a rose curve
+    (rhodonea): with rho the angle from the sensor's x axis and theta the angle around it, rho = fov / 2 * cos(k theta);
+    see Brazeal et al., "A Rigorous Observation Model for the Risley Prism-Based Livox Mid-40 Lidar Sensor" (Sensors
+    2021), and "Symmetries of Scan Patterns of Laser Scanners with Rotational Risley Prisms" (Symmetry 2023). With an
+    irrational k the curve never closes. Speeds, channels and timing of real sensors differ. Sensor frame: x forward,
+    y left, z up.
     """
 
-    rays: int = 1024  #: in a step
-    fov_deg: float = 70.0  #: full cone; chosen
-    turns: float = 4.618  #: of theta in a step; chosen
-    k: float = 3.618033988749895  #: half petals in a turn; chosen, 2 + the golden ratio
-    max_range: float = 20.0  #: [m]
+    rays: int = 1024  #: number of rays in a step
+    fov_deg: float = 70.0  #: [deg] full opening angle of the cone; chosen
+    turns: float = 4.618  #: turns of theta in a step; chosen
+    k: float = 3.618033988749895  #: half petals in a turn; chosen: 2 plus the golden ratio
+    max_range: float = 20.0  #: [m] beyond which nothing is hit
 
     def directions(self, step: int | Tensor) -> Tensor:
-        """Return the unit vectors of a step, float64: (rays, 3), or (B, rays, 3) for steps (B,), on their device."""
+        """Return the unit vectors of a step, float64: (rays, 3), or (B, rays, 3) for steps (B,) on their device."""
         step = step if isinstance(step, Tensor) else torch.full((), step)
         ray = step.to(torch.float64)[..., None] * self.rays + torch.arange(self.rays, device=step.device)
         theta = ray * (2 * math.pi * self.turns / self.rays)
@@ -135,30 +146,35 @@ class NonRepetitiveLidar:
         return torch.stack([rho.cos(), rho.sin() * theta.cos(), rho.sin() * theta.sin()], -1)
 
     def cast(self, scene: Scene, T_map_sensor: Tensor, t: float = 0.0, step: int = 0) -> Tensor:
-        """Return the points (M, 3) [m] seen in a step, as `Lidar.cast` does."""
-        return points_seen(self.directions(step), scene, T_map_sensor, self.max_range, t)
+        """Return the points (rays, 3) [m] seen in a step, sensor frame, float32, NaN where nothing is hit."""
+        return _cast_points(self.directions(step), scene, T_map_sensor, self.max_range, t)
 
 
 def cast(scene: Scene, origin: Tensor, directions: Tensor, max_range: float, t: float = 0.0) -> Tensor:
     """Return the distance (M,) [m] to the first hit of each ray, NaN where there is none within `max_range`.
 
-    `origin` (3,) [m] and unit `directions` (M, 3) in the map frame, float64.
+    Args:
+        scene: The scene to cast into.
+        origin: Common origin (3,) [m] of the rays, map frame, float64.
+        directions: Unit vectors (M, 3), map frame, float64.
+        max_range: Longest distance that is returned [m].
+        t: Time [s].
     """
     nearest = torch.full_like(directions[:, 0], math.inf)
     for box in scene.boxes:
         if box.exists(t):
-            nearest = torch.minimum(nearest, cast_box(box, origin, directions, t))
-    nearest = torch.minimum(nearest, cast_terrain(scene, origin, directions, nearest.clamp(max=max_range)))
+            nearest = torch.minimum(nearest, _cast_box(box, origin, directions, t))
+    nearest = torch.minimum(nearest, _cast_terrain(scene, origin, directions, nearest.clamp(max=max_range)))
     return torch.where(nearest <= max_range, nearest, math.nan)
 
 
-def cast_box(box: Box, origin: Tensor, directions: Tensor, t: float = 0.0) -> Tensor:
-    """Return the distance (M,) to where each ray enters the box (slab method), inf where it misses."""
+def _cast_box(box: Box, origin: Tensor, directions: Tensor, t: float = 0.0) -> Tensor:
+    """Return the distance (M,) [m] at which each ray enters the box (slab method), inf where it misses."""
     low, high = box.corners(t)
     enter = torch.zeros_like(directions[:, 0])
     leave = torch.full_like(enter, math.inf)
     for axis in range(3):
-        # A ray parallel to the slab would divide zero by zero on the face; a tiny slope keeps it outside or inside.
+        # For a ray parallel to the slab and on its face 0 / 0 would be NaN; a tiny slope decides on one side.
         along = directions[:, axis]
         inverse = 1.0 / torch.where(along.abs() < 1e-12, 1e-12, along)
         a, b = (low[axis] - origin[axis]) * inverse, (high[axis] - origin[axis]) * inverse
@@ -166,41 +182,43 @@ def cast_box(box: Box, origin: Tensor, directions: Tensor, t: float = 0.0) -> Te
     return torch.where(enter <= leave, enter, math.inf)
 
 
-def cast_terrain(scene: Scene, origin: Tensor, directions: Tensor, reach: Tensor) -> Tensor:
-    """Return the distance (M,) to the terrain within `reach` (M,), inf where there is none.
+def _cast_terrain(scene: Scene, origin: Tensor, directions: Tensor, reach: Tensor) -> Tensor:
+    """Return the distance (M,) [m] to the terrain within `reach` (M,) [m], inf where there is none.
 
-    With f the height over the terrain and s its steepness, no ray can meet the terrain within f / (s |d_xy| - d_z):
-    that is how far each step goes. Once that is below 2 cm, steps of 2 cm find the crossing, which is then bisected.
+    With f the height over the terrain and s its steepness, a ray of direction d cannot meet the terrain within
+    f / (s |d_xy| - d_z), which is the length of each step. Where that falls below 2 cm, steps of 2 cm find the
+    crossing, which is then bisected.
     """
-    crossed = torch.full_like(reach, math.nan)
+    crossing = torch.full_like(reach, math.nan)
     sinking = scene.steepness * torch.linalg.vector_norm(directions[:, :2], dim=-1) - directions[:, 2]
-    rays = torch.nonzero(sinking > 0)[:, 0]  # the others climb faster than the terrain can
+    rays = torch.nonzero(sinking > 0)[:, 0]  # all others climb faster than the terrain
     along = torch.zeros_like(rays, dtype=reach.dtype)
-    for _ in range(MAX_STEPS):
+    for _ in range(_MAX_STEPS):
         if not len(rays):
             break
-        over = _over_terrain(scene, origin, directions[rays], along)
-        hit = over <= 0
-        crossed[rays[hit]] = along[hit]
-        # Just short of the safe step, so that only a short last step can cross and the bracket stays short.
-        along = along + (0.999 * over / sinking[rays]).clamp(min=FINEST)
-        going = ~hit & (along < reach[rays] + FINEST)
-        rays, along = rays[going], along[going]
-    hits = torch.nonzero(crossed.isfinite())[:, 0]
+        clearance = _height_over_terrain(scene, origin, directions[rays], along)
+        hit = clearance <= 0
+        crossing[rays[hit]] = along[hit]
+        # Slightly less than the safe step: only a step of the minimal length can cross, so the bracket stays short.
+        along = along + (0.999 * clearance / sinking[rays]).clamp(min=_MIN_STEP)
+        continues = ~hit & (along < reach[rays] + _MIN_STEP)
+        rays, along = rays[continues], along[continues]
+    hits = torch.nonzero(crossing.isfinite())[:, 0]
     result = torch.full_like(reach, math.inf)
-    result[hits] = _bisect(scene, origin, directions[hits], crossed[hits])
+    result[hits] = _bisect(scene, origin, directions[hits], crossing[hits])
     return result
 
 
-def _over_terrain(scene: Scene, origin: Tensor, directions: Tensor, along: Tensor) -> Tensor:
+def _height_over_terrain(scene: Scene, origin: Tensor, directions: Tensor, along: Tensor) -> Tensor:
     x, y, z = (origin[i] + directions[:, i] * along for i in range(3))
     return z - scene.terrain(x, y)
 
 
 def _bisect(scene: Scene, origin: Tensor, directions: Tensor, beyond: Tensor) -> Tensor:
-    near, far = (beyond - FINEST).clamp(min=0), beyond
-    for _ in range(BISECTIONS):
+    """Return where rays cross the terrain, at most one minimal step before `beyond` (M,) [m]."""
+    near, far = (beyond - _MIN_STEP).clamp(min=0), beyond
+    for _ in range(_BISECTIONS):
         middle = (near + far) / 2
-        above = _over_terrain(scene, origin, directions, middle) > 0
+        above = _height_over_terrain(scene, origin, directions, middle) > 0
         near, far = torch.where(above, middle, near), torch.where(above, far, middle)
     return (near + far) / 2

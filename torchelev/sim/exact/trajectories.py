@@ -1,7 +1,4 @@
-"""Where the robot is: rigid poses in float64, along a path over a scene, and what a drifting estimator reports.
-
-Base frame: x forward, y left, z up. Sensor frame: the same axes, at the mount, pitched down.
-"""
+"""Robot trajectories over a scene as rigid poses in float64, and the drift of an estimator."""
 
 from __future__ import annotations
 
@@ -13,52 +10,26 @@ import torch
 from torch import Tensor
 
 from torchelev.sim.exact.scenes import Scene
+from torchelev.sim.poses import MOUNT, pose
 
 Point = tuple[float, float]
 
 
 class Trajectory(NamedTuple):
-    """A robot's path, T instants."""
+    """Poses of a robot at T instants."""
 
-    T_map_base: Tensor  #: (T, 4, 4) float64
-    T_map_sensor: Tensor  #: (T, 4, 4) float64
+    T_map_base: Tensor  #: (T, 4, 4) float64, poses of the base
+    T_map_sensor: Tensor  #: (T, 4, 4) float64, poses of the sensor
     times: Tensor  #: (T,) [s]
 
     def then(self, other: Trajectory) -> Trajectory:
-        """Join two paths; the second starts one step after the first ends."""
+        """Append a trajectory, which starts one time step after this one ends."""
         step = self.times[-1] - self.times[-2]
         return Trajectory(
             torch.cat([self.T_map_base, other.T_map_base]),
             torch.cat([self.T_map_sensor, other.T_map_sensor]),
             torch.cat([self.times, other.times - other.times[0] + self.times[-1] + step]),
         )
-
-
-def pose(position: Tensor, yaw: Tensor, pitch: Tensor | float = 0.0, roll: Tensor | float = 0.0) -> Tensor:
-    """Return T (..., 4, 4) float64 from a position (..., 3) [m] and angles (...) [rad], R = Rz(yaw) Ry(pitch) Rx(roll).
-
-    A positive pitch turns the nose down.
-    """
-    angles = torch.broadcast_tensors(*(torch.as_tensor(a, dtype=torch.float64) for a in (yaw, pitch, roll)))
-    (cy, cp, cr), (sy, sp, sr) = [a.cos() for a in angles], [a.sin() for a in angles]
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    T = torch.eye(4, dtype=torch.float64).repeat(*cy.shape, 1, 1)
-    T[..., :3, :3] = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    T[..., :3, 3] = position
-    return T
-
-
-def mount(pitch_deg: float = 35.0, x: float = 0.0, z: float = 0.25) -> Tensor:
-    """Return T_base_sensor (4, 4): a sensor at (x, 0, z) [m] in the base frame, looking down by `pitch_deg`."""
-    angle = torch.tensor(math.radians(pitch_deg), dtype=torch.float64)
-    return pose(torch.tensor([x, 0.0, z], dtype=torch.float64), torch.zeros_like(angle), angle)
-
-
-MOUNT = mount()
 
 
 def turn_on_the_spot(
@@ -71,7 +42,17 @@ def turn_on_the_spot(
     dt: float = 0.1,
     T_base_sensor: Tensor = MOUNT,
 ) -> Trajectory:
-    """Return n poses that turn left at one place, the sensor's mount `height` [m] over the ground of `scene` there."""
+    """Return the trajectory of a robot that turns left on the spot.
+
+    Args:
+        height: Height of the sensor over the ground [m].
+        n: Number of poses.
+        scene: The ground; None is flat ground at z = 0.
+        at: x and y of the place [m].
+        turns: Number of full turns.
+        dt: Time between poses [s].
+        T_base_sensor: Mounting of the sensor (4, 4).
+    """
     ground = 0.0 if scene is None else float(scene.truth(torch.tensor(at)))
     base = torch.tensor([*at, ground + height - float(T_base_sensor[2, 3])], dtype=torch.float64).expand(n, 3)
     T_map_base = pose(base, turns * 2 * math.pi * torch.arange(n, dtype=torch.float64) / n)
@@ -89,16 +70,25 @@ def walk(
     below: float = math.inf,
     T_base_sensor: Tensor = MOUNT,
 ) -> Trajectory:
-    """Return poses of a legged robot that walks along the corners `path` at `speed` [m/s], one each `dt` [s].
+    """Return the trajectory of a legged robot that walks along the straight lines between the corners of a path.
 
-    It turns on the spot at corners (1 rad/s). The base keeps `height` [m] over the ground averaged under its feet and
-    pitches and rolls with it; on top come gait bob (+-1.5 cm), roll and pitch (+-2 deg), times `sway`. `below` [m] is
-    passed to the scene's height: which floor of a building it walks on.
+    At a corner it turns on the spot at 1 rad/s. The base follows the height, pitch and roll of the ground under its
+    footprint. The gait adds +-1.5 cm of height and +-2 degrees of roll and pitch.
+
+    Args:
+        scene: The ground.
+        path: x and y of the corners [m].
+        speed: Walking speed [m/s].
+        dt: Time between poses [s].
+        height: Height of the base over the mean ground under its footprint [m].
+        sway: Scale of the gait's motion; 0 turns it off.
+        below: Boxes whose top lies higher are no ground [m]. In a building this selects the floor.
+        T_base_sensor: Mounting of the sensor (4, 4).
     """
-    xy, yaw = _along(path, speed * dt, dt)
+    xy, yaw = _sample_path(path, speed * dt, dt)
     T = len(yaw)
     times = dt * torch.arange(T, dtype=torch.float64)
-    ground, pitch, roll = _footing(scene, xy, yaw, below)
+    ground, pitch, roll = _fit_ground(scene, xy, yaw, below)
     phase = 2 * math.pi * 1.5 * times  # 1.5 strides a second
     two_degrees = math.radians(2.0)
     z = ground + height + sway * 0.015 * (2 * phase).sin()
@@ -107,28 +97,28 @@ def walk(
     return Trajectory(T_map_base, T_map_base @ T_base_sensor, times)
 
 
-def _along(path: Sequence[Point], stride: float, dt: float) -> tuple[Tensor, Tensor]:
-    """Sample the path: places (T, 2) [m] and headings (T,) [rad]."""
+def _sample_path(path: Sequence[Point], stride: float, dt: float) -> tuple[Tensor, Tensor]:
+    """Return positions (T, 2) [m] and headings (T,) [rad] along the path."""
     corners = torch.tensor(path, dtype=torch.float64)
     legs = corners[1:] - corners[:-1]
     headings = torch.atan2(legs[:, 1], legs[:, 0]).tolist()
-    places, yaws = [corners[:1]], [torch.tensor([headings[0]], dtype=torch.float64)]
+    positions, yaws = [corners[:1]], [torch.tensor([headings[0]], dtype=torch.float64)]
     for k, (leg, heading) in enumerate(zip(legs, headings, strict=True)):
         before = float(yaws[-1][-1])
         turn = math.remainder(heading - before, 2 * math.pi)
         count = math.ceil(abs(turn) / dt - 1e-9)
-        share = torch.arange(1, count + 1, dtype=torch.float64) / max(count, 1)
-        places.append(corners[k].expand(count, 2))
-        yaws.append(before + turn * share)
+        fraction = torch.arange(1, count + 1, dtype=torch.float64) / max(count, 1)
+        positions.append(corners[k].expand(count, 2))
+        yaws.append(before + turn * fraction)
         count = max(1, round(float(leg.norm()) / stride))
-        share = torch.arange(1, count + 1, dtype=torch.float64) / count
-        places.append(corners[k] + share[:, None] * leg)
+        fraction = torch.arange(1, count + 1, dtype=torch.float64) / count
+        positions.append(corners[k] + fraction[:, None] * leg)
         yaws.append(torch.full((count,), before + turn, dtype=torch.float64))
-    return torch.cat(places), torch.cat(yaws)
+    return torch.cat(positions), torch.cat(yaws)
 
 
-def _footing(scene: Scene, xy: Tensor, yaw: Tensor, below: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the ground's mean height, pitch and roll (T,) under a footprint of 0.7 x 0.4 m."""
+def _fit_ground(scene: Scene, xy: Tensor, yaw: Tensor, below: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mean height [m], pitch and roll [rad] (T,) of the ground under a footprint of 0.7 x 0.4 m."""
     forward = torch.linspace(-0.35, 0.35, 8, dtype=torch.float64)
     left = torch.linspace(-0.2, 0.2, 4, dtype=torch.float64)
     f, s = (a.reshape(-1) for a in torch.meshgrid(forward, left, indexing="ij"))
@@ -140,9 +130,9 @@ def _footing(scene: Scene, xy: Tensor, yaw: Tensor, below: float) -> tuple[Tenso
 
 
 def sink(poses: Tensor, total: float = 0.15) -> Tensor:
-    """Return poses (T, 4, 4) as an estimator that loses height evenly reports them: the last is `total` [m] too low.
+    """Return poses (T, 4, 4) whose height drifts down linearly, until the last one is `total` [m] too low.
 
-    Cast with the true poses, map with these.
+    Cast rays from the true poses, and give the map these.
     """
     drifted = poses.clone()
     drifted[:, 2, 3] -= total * torch.linspace(0, 1, len(poses), dtype=poses.dtype)

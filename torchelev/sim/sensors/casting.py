@@ -1,4 +1,4 @@
-"""Rays against height fields and boxes, batched over environments."""
+"""Ray casting against height fields and boxes, batched over environments."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 
-MAX_RAYS = 2**18  # cast at once, which bounds the memory that it takes
+MAX_RAYS = 2**18  # cast at once; bounds the memory
 
 
 class Boxes(NamedTuple):
-    """K boxes in each environment. Those with a half size of zero or less, or without a finite pose, are not there."""
+    """K boxes in each environment; a box with a half size of zero or less, or without a finite pose, is absent."""
 
-    T_map_box: Float[Tensor, "B K 4 4"]  #: the box's frame lies in its middle
-    half_size: Float[Tensor, "B K 3"]  #: [m]
+    T_map_box: Float[Tensor, "B K 4 4"]  #: poses of the boxes' centres
+    half_size: Float[Tensor, "B K 3"]  #: [m] half the side lengths; 0 to pad environments with fewer boxes
 
     def moved(self, T: Float[Tensor, "B 4 4"]) -> Boxes:
-        """Return the boxes, given in frame b, in frame a: `T` is T_a_b."""
+        """Return boxes of frame b in frame a, with `T` = T_a_b."""
         return Boxes(T[:, None].to(self.T_map_box.dtype) @ self.T_map_box, self.half_size)
 
     def joined(self, other: Boxes) -> Boxes:
-        """Return these boxes and the others."""
+        """Return these boxes followed by `other`."""
         T = torch.cat([self.T_map_box, other.T_map_box.to(self.T_map_box.dtype)], 1)
         return Boxes(T, torch.cat([self.half_size, other.half_size.to(self.half_size.dtype)], 1))
 
@@ -45,14 +45,22 @@ def cast(
     max_range: float,
     boxes: Boxes | None = None,
 ) -> Float[Tensor, "B M"]:
-    """Return the distance [m] to the first hit of each ray, float32, inf where there is none within `max_range`.
+    """Return the distance [m] to the first hit of each ray, float32, inf where nothing is hit within `max_range`.
 
-    `origin` [m] and unit `directions` are in the map frame, which is that of the environment's tile. A ray that starts
-    below the ground or inside a box hits at once; rays from an origin that is not finite hit nothing. No hit is inf and
-    not NaN: the nearer of two hits is then their minimum, and comparing needs no exception. There is no gradient. Which
-    rays are cast together changes a distance by rounding alone.
+    A ray that starts below the ground or inside a box has distance 0. Rays from an origin that is not finite hit
+    nothing. Distances have no gradient. They depend on the other rays of the batch only by rounding.
 
-    Raises ValueError or TypeError for shapes, devices and dtypes that do not fit and, on a CPU, for unknown tile ids.
+    Args:
+        field: Terrain tiles.
+        tile_ids: The tile of each environment, int64.
+        origin: Common origin of an environment's rays [m], in the frame of its tile.
+        directions: Unit vectors, in the frame of the tile.
+        max_range: Longest distance that is returned [m].
+        boxes: Boxes in the frame of the tile.
+
+    Raises:
+        TypeError: `tile_ids` is not int64.
+        ValueError: A shape or device does not fit, or, on a CPU, a tile id does not exist.
     """
     _check(field, tile_ids, origin, directions, max_range)
     if boxes is not None:
@@ -60,23 +68,23 @@ def cast(
     if origin.device.type == "cpu":
         keep_freed_memory()
     B, M = directions.shape[:2]
-    some = max(1, MAX_RAYS // max(1, M))
+    chunk = max(1, MAX_RAYS // max(1, M))
     parts = []
     with torch.no_grad():
-        for first in range(0, max(1, B), some):
-            envs = slice(first, first + some)
-            near = None if boxes is None else Boxes(*(value[envs] for value in boxes))
+        for first in range(0, max(1, B), chunk):
+            envs = slice(first, first + chunk)
+            part = None if boxes is None else Boxes(*(value[envs] for value in boxes))
             rays = tile_ids[envs], origin[envs].float(), directions[envs].float()
-            parts.append(_nearest(field, *rays, max_range, near))
+            parts.append(_cast_part(field, *rays, max_range, part))
         return torch.cat(parts)
 
 
-def _nearest(
+def _cast_part(
     field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Tensor, max_range: float, boxes: Boxes | None
 ) -> Tensor:
     nearest = trace(field, tile_ids, origin, directions, max_range)
     if boxes is not None:
-        nearest = torch.minimum(nearest, distance_to_boxes(boxes, origin, directions))
+        nearest = torch.minimum(nearest, _distance_to_boxes(boxes, origin, directions))
     hit = (nearest <= max_range) & origin.isfinite().all(-1, keepdim=True)
     return nearest.masked_fill(~hit, math.inf)
 
@@ -86,11 +94,11 @@ def _check(field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Ten
     fits = tuple(origin.shape) == (B, 3) and directions.ndim == 3 and directions.shape[::2] == (B, 3)
     actual = f"{tuple(origin.shape)} and {tuple(directions.shape)}"
     require(fits, "origin, directions", f"expected ({B}, 3) and ({B}, M, 3)", actual, "give one origin per tile id")
-    whole = tile_ids.dtype == torch.int64
-    require(whole, "tile_ids", "must be int64", tile_ids.dtype, "convert them with .to(torch.int64)", TypeError)
+    is_int64 = tile_ids.dtype == torch.int64
+    require(is_int64, "tile_ids", "must be int64", tile_ids.dtype, "convert them with .to(torch.int64)", TypeError)
     devices = [value.device for value in (tile_ids, origin, directions)]
-    there = all(device == field.device for device in devices)
-    require(there, "tile_ids, origin, directions", f"must be on {field.device}", devices, "move them, or the field")
+    is_same = all(device == field.device for device in devices)
+    require(is_same, "tile_ids, origin, directions", f"must be on {field.device}", devices, "move them, or the field")
     require(0 < max_range < math.inf, "max_range", "must be positive and finite", max_range, "give metres")
     require_indices("tile_ids", tile_ids, field.num_tiles, "number tiles from 0")
 
@@ -102,13 +110,13 @@ def _check_boxes(boxes: Boxes, num_envs: int) -> None:
     require(fits, "boxes", f"expected ({num_envs}, K, 4, 4) and ({num_envs}, K, 3)", actual, "pad with half sizes of 0")
 
 
-def distance_to_boxes(
+def _distance_to_boxes(
     boxes: Boxes, origin: Float[Tensor, "B 3"], directions: Float[Tensor, "B M 3"]
 ) -> Float[Tensor, "B M"]:
-    """Return the distance [m] to where each ray enters the first box, more than HUGE where it meets none.
+    """Return the distance [m] at which each ray enters its first box, more than HUGE where it misses all (slab method).
 
-    Between the planes of a pair of faces a ray is from (-x - h) / d to (-x + h) / d, with its start x, its direction d
-    and the half size h along their normal. It is in the box where it is between all three pairs (slab method).
+    Along the normal of a pair of faces, let x be the ray's origin, d its direction and h the half size. The ray is
+    between the two faces from (-x - h) / d to (-x + h) / d, and inside the box where it is between all three pairs.
     """
     K = boxes.half_size.shape[1]
     if not K:
@@ -117,11 +125,11 @@ def distance_to_boxes(
     offset = origin[:, None] - boxes.T_map_box[..., :3, 3]
     start = (rotation * offset[:, None]).sum(-1).to(origin.dtype)[..., None]
     along = (rotation.to(origin.dtype).flatten(1, 2) @ directions.mT).unflatten(1, (3, K))
-    present = (boxes.half_size > 0).all(-1, keepdim=True)
-    half = torch.where(present, boxes.half_size, math.nan).to(origin.dtype).transpose(1, 2)[..., None]
-    inverse = along.reciprocal_()  # infinite for a ray parallel to a pair of faces: always or never between them
+    is_present = (boxes.half_size > 0).all(-1, keepdim=True)
+    half = torch.where(is_present, boxes.half_size, math.nan).to(origin.dtype).transpose(1, 2)[..., None]
+    inverse = along.reciprocal_()  # inf for a ray parallel to the faces, which is always or never between them
     near, far = inverse * (-start - half), inverse.mul_(half - start)
     enter = torch.minimum(near, far).amax(1).clamp_(min=0)
     leave = torch.maximum(near, far, out=far).amin(1)
-    entry = enter.add_((enter - leave).clamp_(min=0), alpha=HUGE)  # arithmetic: see tracing
+    entry = enter.add_((enter - leave).clamp_(min=0), alpha=HUGE)  # arithmetic in place of a condition: see tracing
     return entry.nan_to_num_(math.inf, math.inf).amin(1)

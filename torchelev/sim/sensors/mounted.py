@@ -1,4 +1,4 @@
-"""A sensor on a robot: a pattern of rays, where it is mounted, and the points that it sees in many environments."""
+"""A sensor mounted on a robot: its ray pattern, its mounting, and the points it sees in many environments."""
 
 from __future__ import annotations
 
@@ -19,25 +19,28 @@ if TYPE_CHECKING:
 
 
 class Pattern(Protocol):
-    """Rays in the sensor frame, as of DepthCamera, Lidar and NonRepetitiveLidar."""
+    """A ray pattern: DepthCamera, Lidar, NonRepetitiveLidar, or your own class with these two members."""
 
-    max_range: float  # [m]
+    @property
+    def max_range(self) -> float:
+        """Range beyond which nothing is hit [m]."""
 
     @property
     def directions(self) -> Tensor | Callable[[Tensor], Tensor]:
-        """Unit vectors (M, 3), or what makes those of a step."""
+        """Unit vectors (M, 3) in the sensor frame, or a function that returns those of a step."""
 
 
 class MountedSensor:
-    """A sensor mounted on the base of the robot of every environment.
+    """A sensor that is mounted on the robot of every environment.
 
     Args:
-        pattern: the rays.
-        T_base_sensor: (4, 4) the mounting; `torchelev.sim.mount` makes one.
-        min_range: nearer hits are not returned, but block the ray [m].
-        max_range: nothing is hit beyond [m]; None: the pattern's.
+        pattern: The rays.
+        T_base_sensor: The mounting (4, 4); see `torchelev.sim.mount`.
+        min_range: Hits nearer than this are not returned, but block the ray [m].
+        max_range: Range beyond which nothing is hit [m]. None: that of the pattern.
 
-    Raises ValueError for a mounting that is no rigid transform and for ranges that are not 0 <= min < max.
+    Raises:
+        ValueError: The mounting is not a rigid transform, or the ranges are not 0 <= min_range < max_range.
     """
 
     def __init__(
@@ -49,13 +52,13 @@ class MountedSensor:
     ) -> None:
         check_pose("T_base_sensor", T_base_sensor, (4, 4), T_base_sensor.device, True)
         max_range = pattern.max_range if max_range is None else max_range
-        rule, hint = "must be 0 <= min < max, finite", "give metres"
-        require(0 <= min_range < max_range < math.inf, "min_range, max_range", rule, (min_range, max_range), hint)
+        fits, actual = 0 <= min_range < max_range < math.inf, (min_range, max_range)
+        require(fits, "min_range, max_range", "must be finite, with 0 <= min < max", actual, "give metres")
         self.pattern, self.T_base_sensor, self.min_range, self.max_range = pattern, T_base_sensor, min_range, max_range
         self._fixed: dict[torch.device, tuple[Tensor, Tensor | None]] = {}
 
     def _on(self, device: torch.device) -> tuple[Tensor, Tensor | None]:
-        """Return mounting and directions, None if those change with the step; copied to a device once."""
+        """Return mounting and directions on a device, copied there once; None for directions that change by step."""
         if device not in self._fixed:
             rays = self.pattern.directions
             fixed = rays.to(device, torch.float32) if isinstance(rays, Tensor) else None
@@ -65,12 +68,12 @@ class MountedSensor:
     def T_map_sensor(
         self, T_map_base: Float[Tensor, "B 4 4"], T_base_sensor: Float[Tensor, "B 4 4"] | None = None
     ) -> Float[Tensor, "B 4 4"]:
-        """Return the sensors' poses. `T_base_sensor` takes the place of the mounting, for each environment its own."""
+        """Return the poses of the sensors; `T_base_sensor` replaces the mounting, with one for each environment."""
         mounting = self._on(T_map_base.device)[0] if T_base_sensor is None else T_base_sensor
         return T_map_base @ mounting.to(T_map_base.dtype)
 
     def directions(self, device: torch.device, step: int | Int[Tensor, "*B"] = 0) -> Float[Tensor, "*B M 3"]:
-        """Return the rays' directions, sensor frame. One step or a fixed pattern gives (M, 3)."""
+        """Return the unit vectors of the rays in the sensor frame, (M, 3) for a single step or a fixed pattern."""
         rays = self._on(device)[1]
         if rays is None:
             make = self.pattern.directions
@@ -90,18 +93,20 @@ class MountedSensor:
         step: int | Int[Tensor, "B"] = 0,
         T_base_sensor: Float[Tensor, "B 4 4"] | None = None,
     ) -> Float[Tensor, "B M 3"]:
-        """Return the points seen [m], sensor frame, float32, NaN where nothing was hit or nearer than `min_range`.
+        """Return the points seen [m], sensor frame, float32; NaN where nothing is hit, or nearer than `min_range`.
 
         Args:
-            field: the terrain.
-            tile_ids: the tile on which each environment stands.
-            T_map_base: the robots; the map frame is that of the tile.
-            boxes: people and other robots, in the map frame.
-            legs: the robot's own, in the base frame: `T_map_box` is then T_base_box.
-            step: which step of a pattern that changes, one for all or one per environment.
-            T_base_sensor: the true mountings, where they differ from the one that everybody believes in.
+            field: Terrain tiles.
+            tile_ids: The tile of each environment, int64.
+            T_map_base: Poses of the robots; the map frame is that of the tile.
+            boxes: Obstacles such as people and other robots, in the map frame.
+            legs: Boxes of the robot itself, in the base frame: here `T_map_box` holds T_base_box.
+            step: Step of a pattern that changes, one for all or one for each environment.
+            T_base_sensor: True mountings, where they differ from the nominal one.
 
-        Raises ValueError or TypeError for shapes that do not fit and, on a CPU, for poses that are not rigid.
+        Raises:
+            TypeError: An argument has the wrong dtype.
+            ValueError: A shape does not fit, or, on a CPU, a pose is not rigid.
         """
         shape = (len(tile_ids), 4, 4)
         check_pose("T_map_base", T_map_base, shape, field.device, False)
@@ -112,15 +117,16 @@ class MountedSensor:
         if legs is not None:
             boxes = legs.moved(T_map_base) if boxes is None else boxes.joined(legs.moved(T_map_base))
         distance = cast(field, tile_ids, T[:, :3, 3], rays @ T[:, :3, :3].mT, self.max_range, boxes)
-        returned = (distance >= self.min_range) & (distance < math.inf)
-        return rays * distance.masked_fill(~returned, math.nan)[..., None]
+        is_returned = (distance >= self.min_range) & (distance < math.inf)
+        return rays * distance.masked_fill(~is_returned, math.nan)[..., None]
 
     def depth(self, points: Float[Tensor, "B M 3"]) -> Float[Tensor, "B h w"]:
-        """Return a camera's points as images of their depth along its viewing direction [m], NaN where there is none.
+        """Return the points of a camera as depth images, along its viewing direction [m], NaN where there is no return.
 
-        Raises TypeError for a pattern that is no image.
+        Raises:
+            TypeError: The pattern is not an image.
         """
         h, w = getattr(self.pattern, "height", None), getattr(self.pattern, "width", None)
-        image = isinstance(h, int) and isinstance(w, int)
-        require(image, "pattern", "must be an image", type(self.pattern).__name__, "mount a DepthCamera", TypeError)
+        is_image = isinstance(h, int) and isinstance(w, int)
+        require(is_image, "pattern", "must be an image", type(self.pattern).__name__, "mount a DepthCamera", TypeError)
         return points[..., 0].unflatten(-1, (h, w))

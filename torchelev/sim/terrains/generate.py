@@ -1,4 +1,4 @@
-"""Tiles of terrain to train on: height fields with their truth in closed form, ordered by kind and difficulty."""
+"""Terrain tiles for training: height fields of given kind and difficulty, with their ground truth in closed form."""
 
 from __future__ import annotations
 
@@ -20,40 +20,46 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Terrain:
-    """K tiles. Each has its own frame with the origin at its centre, where a flat start platform lies at z = 0."""
+    """K tiles, each in its own frame, whose origin is the tile's centre: a flat start platform at z = 0."""
 
-    field: HeightField  #: what is walked on and seen: the truth at the samples, bilinear between
-    kind: tuple[str, ...]  #: of each tile, by name
-    kinds: tuple[str, ...]  #: those that there are
-    kind_ids: Int[Tensor, "K"]  #: of each tile, a number in `kinds`
-    difficulty: Float[Tensor, "K"]  #: 0 to 1
-    random: Float[Tensor, "K R"]  #: each tile's table of chance, 0 to 1
+    field: HeightField  #: the surface to walk on and to see: the truth at the samples, bilinear between them
+    kind: tuple[str, ...]  #: name of each tile's kind
+    kinds: tuple[str, ...]  #: the kinds that `kind_ids` refers to
+    kind_ids: Int[Tensor, "K"]  #: index in `kinds` of each tile
+    difficulty: Float[Tensor, "K"]  #: from 0 (easiest) to 1 (hardest)
+    random: Float[Tensor, "K R"]  #: table of random numbers from 0 to 1 for each tile
 
     def truth(self, tile_ids: Int[Tensor, "B"], xy: Float[Tensor, "B M 2"]) -> Float[Tensor, "B M"]:
-        """Return the ground's height [m] in closed form at places xy [m] of each environment's tile.
+        """Return the true height [m] at xy [m] on each environment's tile, in closed form.
 
-        It has exact edges where the field has none; at the samples both agree. Beyond the rim the rim's height goes on.
+        Its edges are exact, while the field interpolates; at the samples both agree. Beyond the rim of a tile the
+        height of the rim continues.
         """
         half = self.field.resolution * (self.field.heights.shape[1] - 1) / 2
         x, y = xy.clamp(-half, half).unbind(-1)
         difficulty, random = self.difficulty[tile_ids, None], self.random[tile_ids]
         z = torch.zeros_like(x)
-        for number, name in enumerate(self.kinds):
-            here = (self.kind_ids[tile_ids] == number)[:, None]
-            z = torch.where(here, SHAPES[name](x, y, difficulty, random), z)
+        for index, name in enumerate(self.kinds):
+            is_kind = (self.kind_ids[tile_ids] == index)[:, None]
+            z = torch.where(is_kind, SHAPES[name](x, y, difficulty, random), z)
         return z
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TerrainGrid(Terrain):
-    """Tiles of each kind at each level of difficulty, and the rule by which robots change level: see `terrain_grid`."""
+    """Tiles of each kind at each difficulty level, with a curriculum over the levels; see `terrain_grid`."""
 
-    num_levels: int  #: rows of tiles, from the easiest to the hardest
+    num_levels: int  #: number of difficulties, from the easiest to the hardest
 
     def tile_ids(self, level: Int[Tensor, "B"], kind: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        """Return the tiles of levels 0 to num_levels - 1 and kinds, numbers in `kinds`.
+        """Return the tiles of given levels and kinds.
 
-        Raises ValueError for others, of tensors on the CPU.
+        Args:
+            level: From 0 to num_levels - 1.
+            kind: Indices in `kinds`.
+
+        Raises:
+            ValueError: A level or kind does not exist; checked for tensors on the CPU.
         """
         require_indices("level", level, self.num_levels)
         require_indices("kind", kind, len(self.kinds))
@@ -66,14 +72,21 @@ class TerrainGrid(Terrain):
         failure: Bool[Tensor, "B"],
         generator: torch.Generator | None = None,
     ) -> Int[Tensor, "B"]:
-        """Return the next levels: one up after a success, else one down after a failure, never below 0.
+        """Return the next levels: one up after a success, otherwise one down after a failure, but never below 0.
 
-        Who succeeds on the last level goes to a random one, so that none is forgotten (the rule of legged_gym).
+        A robot that succeeds at the last level continues at a random one, so that no level is forgotten (the rule of
+        legged_gym).
+
+        Args:
+            level: Current levels.
+            success: Which robots have mastered their level.
+            failure: Which robots have failed.
+            generator: Source of the random levels; None is torch's default generator.
         """
-        moved = (level + success.long() - (failure & ~success).long()).clamp(min=0)
+        next_level = (level + success.long() - (failure & ~success).long()).clamp(min=0)
         u = torch.rand(level.shape, generator=generator, device=level.device)
-        anywhere = (u * self.num_levels).long().clamp(max=self.num_levels - 1)
-        return torch.where(moved >= self.num_levels, anywhere, moved)
+        random_level = (u * self.num_levels).long().clamp(max=self.num_levels - 1)
+        return torch.where(next_level >= self.num_levels, random_level, next_level)
 
 
 def make_terrain(
@@ -88,14 +101,17 @@ def make_terrain(
     """Make K tiles of one kind.
 
     Args:
-        kind: one of flat, slope, stairs_up, stairs_down, boxes, stepping_stones, gaps, rough, rails: see the table in
-            `terrain_shapes`.
-        difficulty: 0 to 1, of each tile.
-        length: side of a tile [m].
-        resolution: distance of the height field's samples [m].
-        seed: of what chance decides; the same on all devices.
+        kind: One of flat, slope, stairs_up, stairs_down, boxes, stepping_stones, gaps, rough, rails; see the table in
+            `torchelev.sim.terrains.shapes`.
+        difficulty: Of each tile, from 0 to 1.
+        length: Side of a tile [m].
+        resolution: Distance between the samples of the height field [m].
+        seed: Seed of the random shapes; the same seed gives the same tiles on every device.
+        device: Where the tiles are stored.
 
-    Raises ValueError for another kind, a difficulty outside 0 to 1, and a length that is no multiple of the resolution.
+    Raises:
+        ValueError: The kind does not exist, a difficulty is not within 0 to 1, or the length is not a multiple of the
+            resolution.
     """
     difficulty = torch.as_tensor(difficulty)
     kind_ids = torch.zeros(difficulty.shape, dtype=torch.int64)
@@ -111,10 +127,18 @@ def terrain_grid(
     seed: int = 0,
     device: torch.device | str = "cpu",
 ) -> TerrainGrid:
-    """Make a tile of each kind at each of `num_levels` difficulties, from 0 to 1 in equal steps.
+    """Make a tile of each kind at each difficulty level.
 
-    A single level has difficulty 1. A kind may come more than once, for tiles that chance makes different. See
-    `make_terrain` for the other arguments. Raises ValueError as it does, and without kinds or levels.
+    Args:
+        kinds: Names of the kinds, as in `make_terrain`. A repeated kind gives further random tiles of that kind.
+        num_levels: Number of difficulties, from 0 to 1 in equal steps; a single level has difficulty 1.
+        length: Side of a tile [m].
+        resolution: Distance between the samples of the height field [m].
+        seed: Seed of the random shapes; the same seed gives the same tiles on every device.
+        device: Where the tiles are stored.
+
+    Raises:
+        ValueError: There is no kind or no level, or an argument is one that `make_terrain` refuses.
     """
     require(len(kinds) > 0, "kinds", "must not be empty", list(kinds), "name some terrains")
     num_levels = require_count("num_levels", num_levels, "give the number of difficulties")
@@ -133,16 +157,16 @@ def _tiles(
     seed: int,
     device: torch.device | str,
 ) -> dict[str, Any]:
-    """Return a terrain's fields; `kind_ids` (K,) says which of `kinds` each tile is."""
+    """Return the fields of a `Terrain`; `kind_ids` (K,) are indices in `kinds`."""
     for name in kinds:
         require(name in SHAPES, "kind", f"must be one of {', '.join(SHAPES)}", repr(name), "use one of them")
-    within = difficulty.ndim == 1 and len(difficulty) > 0 and bool(((difficulty >= 0) & (difficulty <= 1)).all())
-    require(within, "difficulty", "must be (K,) within 0 to 1", difficulty, "give one number for each tile")
+    fits = difficulty.ndim == 1 and len(difficulty) > 0 and bool(((difficulty >= 0) & (difficulty <= 1)).all())
+    require(fits, "difficulty", "must be (K,) within 0 to 1", difficulty, "give one number for each tile")
     cells = whole_cells("length", length, resolution)
-    # Drawn on the CPU: the tiles are then the same on all devices.
+    # Drawn on the CPU, so that the tiles are the same on all devices.
     random = torch.rand(len(difficulty), TABLE * TABLE, generator=torch.Generator().manual_seed(seed))
     difficulty = difficulty.float().cpu()
-    kind = tuple(kinds[number] for number in kind_ids.tolist())
+    kind = tuple(kinds[index] for index in kind_ids.tolist())
     heights = _heights(kind, difficulty, random, cells + 1, resolution)
     return {
         "field": HeightField(heights.to(device), resolution),
@@ -155,7 +179,8 @@ def _tiles(
 
 
 def _heights(kind: tuple[str, ...], difficulty: Tensor, random: Tensor, samples: int, resolution: float) -> Tensor:
-    along = ((torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * resolution).float()
-    x, y = (a.reshape(1, -1) for a in torch.meshgrid(along, along, indexing="ij"))
+    """Return the heights (K, samples, samples) [m] of the tiles."""
+    axis = ((torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * resolution).float()
+    x, y = (a.reshape(1, -1) for a in torch.meshgrid(axis, axis, indexing="ij"))
     tiles = zip(kind, difficulty[:, None, None], random[:, None], strict=True)
-    return torch.cat([SHAPES[name](x, y, hard, table) for name, hard, table in tiles]).view(-1, samples, samples)
+    return torch.cat([SHAPES[name](x, y, level, table) for name, level, table in tiles]).view(-1, samples, samples)

@@ -1,4 +1,4 @@
-"""Terrain as heights on a grid, many tiles at once, and the bounds that let rays skip the air over it."""
+"""Terrain as heights on a grid, many tiles at once, with the bounds by which rays skip the free space above it."""
 
 from __future__ import annotations
 
@@ -15,39 +15,40 @@ from torchelev.errors import require
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-BLOCKS = (1, 2, 4, 8, 16, 32)  # [cells] edges of the blocks whose highest points are kept
-MOST_SAMPLES = 2**24 - 2**14  # float32 counts the samples of a tile and its rim exactly
+BLOCKS = (1, 2, 4, 8, 16, 32)  # [cells] side lengths of the blocks with bounds
+_MAX_SAMPLES = 2**24 - 2**14  # of a tile; with its rim float32 still counts them exactly
 
 
 class Bounds(NamedTuple):
-    """The highest point near each block of cells, for L sizes of blocks and last for the tile as a whole.
+    """The highest point near each block of cells, at L levels: one for each block size, and one for the whole tile.
 
-    `highest` holds the tiles of one size, row by row, then those of the next.
+    `highest` holds all tiles of the first level, row by row, then those of the next levels.
     """
 
-    highest: Float[Tensor, "T"]  #: [m] within the block and the eight around it
-    edge: Float[Tensor, "L 1"]  #: [cells] of a block
-    reach: Float[Tensor, "L 1"]  #: [cells] from one block ahead to its far side
-    last: Float[Tensor, "2 L 1"]  #: number of the last block along x and y
-    row: Float[Tensor, "L 1"]  #: blocks along y
-    first: Int[Tensor, "L 1"]  #: where tile 0 begins in `highest`
-    size: Int[Tensor, "L 1"]  #: blocks in a tile
+    highest: Float[Tensor, "T"]  #: [m] highest point in the block and in its eight neighbours
+    edge: Float[Tensor, "L 1"]  #: [cells] side length of a block
+    reach: Float[Tensor, "L 1"]  #: [cells] how far ahead of a ray the bound one block ahead holds
+    last: Float[Tensor, "2 L 1"]  #: index of the last block along x and y
+    row: Float[Tensor, "L 1"]  #: number of blocks along y
+    first: Int[Tensor, "L 1"]  #: index of tile 0 in `highest`
+    size: Int[Tensor, "L 1"]  #: number of blocks in a tile
 
 
 class HeightField:
-    """K tiles of terrain, each in its own frame, whose origin lies in the middle of the tile.
+    """K terrain tiles, each in its own frame, whose origin is the centre of the tile.
 
     Sample [k, i, j] is the height at x = (i - (H - 1) / 2) * resolution, and y likewise with j. Between samples the
-    surface is bilinear; beyond the rim the rim's height goes on. Cells lie between samples, numbered from 0, which is
-    the one before the first sample, to H (W), the one behind the last; those two go on for ever. With its bounds a tile
-    takes 2.4 times the memory of its samples.
+    surface is bilinear. Beyond the rim of a tile the height of the rim continues. Cells lie between the samples. Their
+    indices run from 0, before the first sample, to H (W), behind the last one; these two extend to infinity. With its
+    bounds a tile takes 2.4 times the memory of its samples.
 
     Args:
-        heights: (K, H, W) [m], at least 2 x 2 samples a tile. They are copied.
-        resolution: distance of the samples [m].
+        heights: (K, H, W) [m], at least 2 x 2 samples for each tile. They are copied.
+        resolution: Distance between samples [m].
 
-    Raises ValueError or TypeError for another shape, heights that are not finite, and a resolution that is not
-    positive.
+    Raises:
+        TypeError: `heights` is not a tensor.
+        ValueError: The shape does not fit, a height is not finite, or the resolution is not positive.
     """
 
     def __init__(self, heights: Float[Tensor, "K H W"], resolution: float) -> None:
@@ -55,16 +56,16 @@ class HeightField:
         require(isinstance(heights, Tensor), "heights", "must be a tensor", actual, "use torch.as_tensor", TypeError)
         fits = heights.ndim == 3 and heights.shape[0] >= 1 and min(heights.shape[1:]) >= 2
         require(fits, "heights", "must be (K, H, W) with H, W >= 2", tuple(heights.shape), "give K tiles of samples")
-        few = heights.shape[1] * heights.shape[2] <= MOST_SAMPLES
-        require(few, "heights", f"must have at most {MOST_SAMPLES} samples a tile", tuple(heights.shape), "cut it up")
+        fits = heights.shape[1] * heights.shape[2] <= _MAX_SAMPLES
+        require(fits, "heights", f"must have at most {_MAX_SAMPLES} samples a tile", tuple(heights.shape), "split it")
         require(bool(heights.isfinite().all()), "heights", "must be finite", "NaN or inf", "fill the holes")
         require(0 < resolution < math.inf, "resolution", "must be positive", resolution, "give metres per sample")
         self.resolution = float(resolution)
         self.padded = F.pad(heights.float()[:, None], (1, 1, 1, 1), mode="replicate")[:, 0].contiguous()
         size = self.padded.new_tensor(self.padded.shape[1:])
-        self.middle = (size - 1) / 2  # (2,) [cells] the frame's origin, from the padded rim
-        self.last = size - 2  # (2,) number of the last cell
-        self.bounds = highest_near(self.heights)
+        self.middle = (size - 1) / 2  # (2,) [cells] origin of the tile frame, counted from the padded rim
+        self.last = size - 2  # (2,) index of the last cell
+        self.bounds = _compute_bounds(self.heights)
 
     @property
     def heights(self) -> Float[Tensor, "K H W"]:
@@ -73,12 +74,12 @@ class HeightField:
 
     @property
     def device(self) -> torch.device:
-        """Where the tiles are."""
+        """Where the tiles are stored."""
         return self.padded.device
 
     @property
     def num_tiles(self) -> int:
-        """K."""
+        """Number of tiles K."""
         return self.padded.shape[0]
 
     def to(self, device: torch.device | str) -> HeightField:
@@ -90,38 +91,45 @@ class HeightField:
         return moved
 
     def height(self, tile_ids: Int[Tensor, "B"], xy: Float[Tensor, "B M 2"]) -> Float[Tensor, "B M"]:
-        """Return the surface's height [m] at places xy [m] of each environment's tile; at NaN, of the tile's middle.
+        """Return the height of the surface [m] at xy [m] on each environment's tile; NaN counts as 0.
 
-        Raises ValueError for shapes that do not fit.
+        Raises:
+            ValueError: The shapes do not fit.
         """
         fits = tile_ids.ndim == 1 and xy.ndim == 3 and xy.shape[::2] == (len(tile_ids), 2)
         actual = f"{tuple(tile_ids.shape)} and {tuple(xy.shape)}"
-        require(fits, "tile_ids, xy", "must be (B,) and (B, M, 2)", actual, "give one tile and M places each")
+        require(
+            fits,
+            "tile_ids, xy",
+            "must be (B,) and (B, M, 2)",
+            actual,
+            "give one tile and M points for each environment",
+        )
         offset = (xy / self.resolution).to(self.padded.dtype).nan_to_num(0.0)  # NaN would become an index
-        place = offset.movedim(-1, 0) + self.middle[:, None, None]
-        cell = place.floor()
+        position = offset.movedim(-1, 0) + self.middle[:, None, None]
+        cell = position.floor()
         a, b, c, d = self.surface(cell, tile_ids[:, None])
-        u, v = place - cell
+        u, v = position - cell
         return a + b * u + (c + d * u) * v
 
     def surface(self, cell: Float[Tensor, "2 *N"], tile: Int[Tensor, "*N"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return a, b, c, d (*N) of the surface z = a + b u + c v + d u v [m], u and v counted in the cell from 0 to 1.
+        """Return a, b, c, d (*N) of the surface z = a + b u + c v + d u v [m], with u and v from 0 to 1 in the cell.
 
         Cells may lie beyond the rim.
         """
         cell = torch.minimum(cell.clamp(min=0), self.last.view(2, *[1] * (cell.ndim - 1)))
         W = self.padded.shape[2]
-        here = torch.add(cell[1], cell[0], alpha=W).to(torch.int64) + tile * (self.padded.shape[1] * W)
-        a = self._at(here)
-        b, c = self._at(here + W) - a, self._at(here + 1) - a
-        return a, b, c, self._at(here + (W + 1)) - a - b - c
+        index = torch.add(cell[1], cell[0], alpha=W).to(torch.int64) + tile * (self.padded.shape[1] * W)
+        a = self._at(index)
+        b, c = self._at(index + W) - a, self._at(index + 1) - a
+        return a, b, c, self._at(index + (W + 1)) - a - b - c
 
-    def _at(self, sample: Tensor) -> Tensor:
-        return self.padded.view(-1).index_select(0, sample.flatten()).view(sample.shape)
+    def _at(self, index: Tensor) -> Tensor:
+        return self.padded.view(-1).index_select(0, index.flatten()).view(index.shape)
 
 
-def highest_near(heights: Float[Tensor, "K H W"]) -> Bounds:
-    """Compute the bounds of tiles."""
+def _compute_bounds(heights: Float[Tensor, "K H W"]) -> Bounds:
+    """Return the bounds of tiles."""
     K = len(heights)
     samples = F.pad(heights[:, None], (1, 1, 1, 1), mode="replicate")
     cells = F.max_pool2d(samples, 2, 1)

@@ -19,7 +19,7 @@ from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.errors import require, require_positive
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField, PoseErrors, preset
-from torchelev.sim.exact.trajectories import pose
+from torchelev.sim.poses import pose
 from training.traversability.maps.sight import Sight
 from training.traversability.maps.terrain import LOOK_INTERVAL, Footing, walks
 

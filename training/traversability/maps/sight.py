@@ -11,23 +11,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.robot import RobotConfig
-from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, SensorErrors, preset
-from torchelev.sim.exact.trajectories import pose
+from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, SensorErrors, mount, mount_on_rim, preset
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 SETS = (("front", "hind"), ("front", "hind", "left", "right"), ("lidar",), ("front", "hind", "lidar"))
-YAWS = {"front": 0.0, "hind": math.pi, "left": math.pi / 2, "right": -math.pi / 2}
+YAWS_DEG = {"front": 0.0, "hind": 180.0, "left": 90.0, "right": -90.0}
 PITCHES = (20.0, 45.0)  # [deg] by which cameras look down
 FOV = (86.0, 58.0)  # [deg] of a camera
 CAMERA_RANGE, LIDAR_RANGE = 5.0, 12.0  # [m]
-
-
-def camera_mounting(yaw: float, pitch: float, robot: RobotConfig) -> Tensor:
-    """Return T_base_sensor (4, 4) of a camera at the rim of the body that looks out, and down by `pitch` [rad]."""
-    place = [robot.length / 2 * math.cos(yaw), robot.width / 2 * math.sin(yaw), 0.05]
-    return pose(torch.tensor(place), torch.tensor(yaw), pitch)
 
 
 class Sight:
@@ -42,13 +35,13 @@ class Sight:
         rng: np.random.Generator,
     ) -> None:
         names = SETS[int(rng.integers(len(SETS)))]
-        pitch = math.radians(rng.uniform(*PITCHES))
+        pitch_deg = rng.uniform(*PITCHES)
         camera, lidar = DepthCamera(*camera_pixels, *FOV, CAMERA_RANGE), Lidar(*lidar_rays, max_range=LIDAR_RANGE)
-        top = pose(torch.tensor([0.0, 0.0, 0.1 + 0.2 * robot.length]), torch.tensor(0.0))
+        top = mount(0.0, z=0.1 + 0.2 * robot.length)
         self.sensors = [
             MountedSensor(lidar, top)
             if name == "lidar"
-            else MountedSensor(camera, camera_mounting(YAWS[name], pitch, robot))
+            else MountedSensor(camera, mount_on_rim(robot.length, robot.width, YAWS_DEG[name], pitch_deg))
             for name in names
         ]
         kinds = ["spinning_lidar" if name == "lidar" else "depth_camera" for name in names]

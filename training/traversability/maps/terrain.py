@@ -10,13 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from envs.terrain_nav import CourseConfig
-from envs.terrain_nav.config import BodyConfig
-from envs.terrain_nav.course import make_course
+from envs.terrain_nav import BodyConfig
 from envs.terrain_nav.robot import base_pose
 from torchelev.robot import RobotConfig
-from torchelev.sim import HeightField, make_terrain
-from torchelev.sim.errors.error_models import rigid
+from torchelev.sim import CourseConfig, HeightField, make_course, make_terrain
+from torchelev.sim.poses import pose_from_rotation_vector
 
 # Fixed before the first training. "obstacles" are the blocks, pits and steps of TerrainNav's course.
 KINDS = ("slope", "stairs_up", "stairs_down", "boxes", "gaps", "rough", "rails", "obstacles")
@@ -111,7 +109,7 @@ def walks(footing: Footing, num: int, looks: int, rng: np.random.Generator) -> T
     chosen = hardest.argmin(0) * num + torch.arange(num)
     poses = torch.stack([footing.pose(torch.arange(num), xy[chosen, k], yaw[chosen, k]) for k in range(looks)])
     turn = torch.from_numpy(rng.normal(0, SWAY, (looks * num, 3)))
-    return poses @ rigid(turn, torch.zeros_like(turn)).view_as(poses)
+    return poses @ pose_from_rotation_vector(turn, torch.zeros_like(turn)).view_as(poses)
 
 
 def _candidates(num: int, looks: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
