@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from torch import Tensor
-
 from torchelev.filters.layer_tools import radius_cells
 from torchelev.filters.registry import register
 from torchelev.layers import Layer
 from torchelev.ops.masks import where_finite
 from torchelev.ops.windows import window_moments
-from torchelev.stages.surface import known_ground
+from torchelev.stages.surface import known_ground, solve_gradient
 
 # In units of the window's radius.
 _MIN_TRACE = 1e-6  # below it there is a single cell
@@ -50,21 +48,8 @@ def curvature(layer: Layer, *, resolution: float, radius: float = 0.15) -> Layer
     ss = (n_uuuu + 2 * n_uuvv + n_vvvv) * w - ms * ms
     uz, vz, sz = h_u * w - mu * mz, h_v * w - mv * mz, (h_uu + h_vv) * w - ms * mz
     # Subtract from s the plane that fits it best; kappa follows from the covariance of the rest with z.
-    p, q = _gradient_of_s(uu, vv, uv, us, vs, r)
+    p, q = solve_gradient(uu, uv, vv, us, vs, _MIN_DETERMINANT * r**4, _MIN_TRACE * r**2)
     spread = ss - p * us - q * vs
     is_determined = spread > _MIN_SPREAD * r**4
     bend = where_finite(is_determined, sz - p * uz - q * vz, 0.0) / where_finite(is_determined, spread, 1.0)
     return 2 * bend / resolution**2, known & is_determined
-
-
-def _gradient_of_s(uu: Tensor, vv: Tensor, uv: Tensor, us: Tensor, vs: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Solve [uu uv; uv vv] (p, q) = (us, vs), along their line if the cells lie on one.
-
-    `fit_plane` solves the same for heights; the covariances of s follow from the cells' own moments.
-    """
-    det, trace = uu * vv - uv * uv, uu + vv
-    is_regular = det > _MIN_DETERMINANT * radius**4
-    safe_det, safe_trace = where_finite(is_regular, det, 1.0), trace.clamp(min=_MIN_TRACE * radius**2)
-    p = where_finite(is_regular, (vv * us - uv * vs) / safe_det, us / safe_trace)
-    q = where_finite(is_regular, (uu * vs - uv * us) / safe_det, vs / safe_trace)
-    return p, q

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @register
 def gaussian(layer: Layer, *, resolution: float, sigma: float = 0.1) -> Layer:
-    """Return the Gaussian-weighted mean of the known cells around each known cell.
+    """Return the Gaussian mean of the known cells around each known cell.
 
     sum w h / sum w over the known cells with |dx|, |dy| <= 3 sigma, w = exp(-(dx^2 + dy^2) / (2 sigma^2)): a normalised
     convolution (Knutsson and Westin 1993). At the border of the known area all neighbours lie on one side, which shifts

@@ -37,9 +37,7 @@ class PlaneConfig:
     max_inclination: float = 0.6  #: [rad] of local planes and of regions
     max_roughness: float = 0.01  #: [m] root mean square distance of cells from their plane; keep it above the noise
     max_distance: float = 0.025  #: [m] of any cell from its region's plane
-    max_curvature: float = (
-        2.0  #: [1/m] change of slope between neighbouring cells of a region; lower cuts at soft edges
-    )
+    max_curvature: float = 2.0  #: [1/m] change of slope between neighbouring cells; lower it to cut at softer edges
     min_area: float = 0.04  #: [m^2] projected onto x and y; smaller regions are dropped
     margin: float = 0.03  #: [m] between the inset and the region's border; raise it for large feet
 
