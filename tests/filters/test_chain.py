@@ -2,40 +2,15 @@
 
 import copy
 import dataclasses
-import inspect
 
 import numpy as np
 import pytest
 import torch
 
+from tests.filters.registered import CALLS
 from tests.helpers import mapped, scan, small_config
 from torchelev import ElevationMap, ElevationMapConfig
-from torchelev.errors import require_positive
-from torchelev.filters import FILTERS, Filter, FilterChain, FilterConfig, as_layer, as_nan, register, registry
-from torchelev.filters.registry import radius_cells
-
-CALLS = []
-
-
-def parameters_of(name):
-    return inspect.signature(FILTERS[name]).parameters.values()
-
-
-@register
-def counted_offset(layer, *, by: float = 1.0):
-    CALLS.append(by)
-    return layer[0] + by, layer[1]
-
-
-@register
-def difference(a, b):
-    return a[0] - b[0], a[1] & b[1]
-
-
-@register
-def in_cells(layer, *, resolution, length: float):
-    require_positive(length=length)
-    return torch.full_like(layer[0], length / resolution), layer[1]
+from torchelev.filters import FilterChain, FilterConfig
 
 
 def step(layer, filter, inputs=(), **settings):
@@ -48,127 +23,6 @@ def filtered(*filters, num_envs=2):
     cloud, T = scan(0, num_envs)
     emap.update(cloud, T, T, 0.3)
     return emap
-
-
-def test_a_filter_gets_and_gives_zero_where_nothing_is_known():
-    values = torch.tensor([[[1.0, torch.nan]]])
-    known = torch.tensor([[[True, False]]])
-    out, still = FILTERS["counted_offset"]((values, known), by=2.0)
-    assert out.tolist() == [[[3.0, 0.0]]] and torch.equal(still, known)
-
-
-@register
-def logarithm(layer):
-    return layer[0].log(), layer[1]
-
-
-def test_what_is_not_finite_is_unknown():
-    values, known = FILTERS["logarithm"](as_layer(torch.tensor([[[0.0, 1.0, -1.0]]])))
-    assert values.tolist() == [[[0.0, 0.0, 0.0]]] and known.tolist() == [[[False, True, False]]]
-    marked = torch.tensor([[[5.0, torch.nan, 5.0]]]), torch.ones(1, 1, 3, dtype=torch.bool)
-    values, known = FILTERS["box"](marked, resolution=0.1, radius=0.1)
-    assert values.tolist() == [[[5.0, 0.0, 5.0]]] and known.tolist() == [[[True, False, True]]]
-
-
-SINGLE = sorted(
-    name
-    for name in FILTERS
-    if sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters_of(name)) == 1 and name != "in_cells"
-)
-
-
-@pytest.mark.parametrize("name", SINGLE)
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_computed_in_float32(name, dtype):
-    values = torch.rand(2, 9, 8, generator=torch.Generator().manual_seed(1)).to(dtype)
-    values[0, 2:5, 3:5] = torch.nan
-    step = Filter(name)
-    half, known = step(as_layer(values), resolution=0.05)
-    full, expected = step(as_layer(values.float()), resolution=0.05)
-    assert half.dtype == dtype and torch.equal(known, expected)
-    torch.testing.assert_close(half, full.to(dtype))
-
-
-@pytest.mark.parametrize("name", SINGLE)
-def test_no_map_at_all(name):
-    values, known = Filter(name)(as_layer(torch.zeros(0, 3, 5)), resolution=0.05)
-    assert values.shape == known.shape == (0, 3, 5)
-
-
-def test_many_maps_are_filtered_in_parts(monkeypatch):
-    layer = as_layer(torch.randn(7, 3, 5, generator=torch.Generator().manual_seed(0)))
-    whole = FILTERS["counted_offset"](layer)
-    calls = len(CALLS)
-    monkeypatch.setattr(registry, "CPU_CELLS", 31)
-    parts = FILTERS["counted_offset"](layer)
-    assert len(CALLS) - calls == 4, "two maps of 15 cells at a time"
-    assert torch.equal(whole[0], parts[0]) and torch.equal(whole[1], parts[1])
-    assert FILTERS["counted_offset"](as_layer(torch.zeros(0, 3, 5)))[0].shape == (0, 3, 5)
-
-
-def test_layers_from_and_to_values_with_nan():
-    values = torch.tensor([[[1.0, torch.nan, torch.inf]]])
-    layer = as_layer(values)
-    assert layer[0].tolist() == [[[1.0, 0.0, 0.0]]] and layer[1].tolist() == [[[True, False, False]]]
-    torch.testing.assert_close(as_nan(layer), torch.tensor([[[1.0, torch.nan, torch.nan]]]), equal_nan=True)
-
-
-def test_gradients_pass_a_filter_and_stop_where_nothing_is_known():
-    values = torch.tensor([[[1.0, torch.nan]]], requires_grad=True)
-    out, _ = FILTERS["counted_offset"]((values, torch.tensor([[[True, False]]])))
-    out.sum().backward()
-    assert values.grad.tolist() == [[[1.0, 0.0]]]
-
-
-def test_a_module_gives_the_resolution_to_those_that_ask():
-    layer = as_layer(torch.zeros(1, 2, 2))
-    assert Filter("in_cells", length=1.0)(layer, resolution=0.25)[0].unique().tolist() == [4.0]
-    assert Filter("counted_offset", by=3.0)(layer, resolution=0.25)[0].unique().tolist() == [3.0]
-    assert repr(Filter("counted_offset", by=3.0)) == "Filter(counted_offset, by=3.0)"
-
-
-def test_windows_in_cells():
-    assert [radius_cells(0.1, r) for r in (0.02, 0.04, 0.08, 0.5)] == [5, 2, 1, 1]
-    with pytest.raises(ValueError, match="radius: must be a positive number"):
-        radius_cells(0.0, 0.1)
-
-
-@pytest.mark.parametrize(
-    "build, message",
-    [
-        (lambda: Filter("no_such"), "filter: must be a filter's name, got 'no_such'; there are .*counted_offset"),
-        (lambda: Filter("counted_offset", to=1.0), "filter counted_offset: must be given settings .*to; it takes by"),
-        (lambda: Filter("in_cells"), "filter in_cells: needs length"),
-        (lambda: Filter("difference").try_out(1, 0.1), "filter difference: takes 2 layers, got 1 inputs"),
-        (lambda: FILTERS["difference"]((torch.zeros(1, 2, 2), torch.ones(1, 2, 2))), "known must be bool"),
-        (lambda: FILTERS["difference"](), "expected one or more layers of one shape"),
-        (lambda: FILTERS["difference"](as_layer(torch.zeros(1, 2, 2)), as_layer(torch.zeros(1, 3, 2))), "of one shape"),
-        (lambda: FILTERS["difference"](as_layer(torch.zeros(2, 2))), r"expected values \(B, H, W\)"),
-    ],
-)
-def test_what_does_not_fit_is_refused(build, message):
-    with pytest.raises(ValueError, match=message):
-        build()
-
-
-def test_a_name_is_registered_once(monkeypatch):
-    monkeypatch.setattr("torchelev.filters.registry.FILTERS", dict(FILTERS))
-
-    def difference(a):
-        return a
-
-    with pytest.raises(ValueError, match="must have a name of its own, got 'difference'"):
-        register(difference)
-    difference.__qualname__ = "difference"
-    register(difference)  # a function defined again, as in a notebook, replaces itself
-
-
-def test_a_setting_must_not_be_named_as_a_key():
-    def keyed(a, *, inputs: int = 1):
-        return a
-
-    with pytest.raises(ValueError, match="keyed: must have no setting named layer, filter, inputs, got inputs"):
-        register(keyed)
 
 
 def test_a_formula_names_its_inputs():
@@ -249,26 +103,6 @@ def test_filters_of_a_config_are_checked():
 def test_settings_of_numpy_and_lists_become_plain():
     cfg = step("b", "counted_offset", by=np.float32(0.5), more=[1, 2])
     assert dict(cfg.settings) == {"by": 0.5, "more": (1, 2)} and type(dict(cfg.settings)["by"]) is float
-
-
-def test_what_a_filter_returns_is_checked(monkeypatch):
-    monkeypatch.setattr(registry, "FILTERS", dict(FILTERS))
-    wrong = {
-        "alone": lambda layer: layer[0],
-        "nothing": lambda layer: None,
-        "numpy_pair": lambda layer: (layer[0].numpy(), layer[1].numpy()),
-        "float_mask": lambda layer: (layer[0], layer[0]),
-        "cropped": lambda layer: (layer[0][:, 1:], layer[1][:, 1:]),
-    }
-    for name, function in wrong.items():
-        function.__name__ = name
-        with pytest.raises((TypeError, ValueError), match=f"filter {name}"):
-            register(function)(as_layer(torch.zeros(1, 3, 3)))
-
-
-def test_a_tensor_is_no_layer():
-    with pytest.raises(TypeError, match="gaussian, layer 0: must be a layer .*got Tensor; make one .*as_layer"):
-        FILTERS["gaussian"](torch.zeros(2, 3, 3), resolution=0.1)
 
 
 def test_a_map_reads_the_layers_of_its_filters():

@@ -1,6 +1,5 @@
 """Slope, normals, steps, roughness, deviation, curvature, and the traversability made of them."""
 
-import functools
 import math
 
 import numpy as np
@@ -10,32 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import reference
+from tests.filters.terrains import random_layer, terrain, whole
 from torchelev.filters import geometry
 from torchelev.filters.registry import FILTERS, Filter
 
 SEEDS = st.integers(0, 10_000)
+
+
 NAMES = ("slope", "normal_x", "normal_y", "normal_z", "roughness", "standard_deviation", "step_height", "curvature")
+
+
 SIZES = st.tuples(st.integers(1, 2), st.integers(1, 8), st.integers(1, 7))
+
+
 SHARES = st.sampled_from([0.3, 0.7, 1.0])
-
-
-def random_layer(seed, shape=(2, 7, 6), share=0.7, dtype=torch.float64):
-    rng = np.random.default_rng(seed)
-    values, known = rng.uniform(-0.3, 0.3, shape), rng.uniform(size=shape) < share
-    return torch.from_numpy(values).to(dtype), torch.from_numpy(known)
-
-
-def whole(values):
-    """A layer of which all is known."""
-    return values, torch.ones_like(values, dtype=torch.bool)
-
-
-def terrain(function, resolution, length=2.4, shift=0.0):
-    """A layer of z = function(x, y), and where its cells are: the centre of the map at `shift` cells."""
-    count = round(length / resolution)
-    x = (torch.arange(count, dtype=torch.float64) + 0.5 + shift - count / 2) * resolution
-    x, y = torch.meshgrid(x, x, indexing="ij")
-    return whole(function(x, y)[None].double()), x, y
 
 
 def window(values, known, b, i, j, radius):
@@ -144,9 +131,6 @@ def test_gradients_are_finite_on_level_ground(name):
     assert torch.isfinite(gradient).all()
 
 
-# Closed forms ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("altitude", [0.0, 800.0])
 def test_a_plane(altitude):
     """z = 0.3 x - 0.4 y: slope atan(0.5), whatever is unknown and however high, and all but steps are 0."""
@@ -181,50 +165,6 @@ def test_a_step():
     assert float(deviation[0, 2, 2]) == pytest.approx(0, abs=1e-4)
 
 
-@pytest.mark.parametrize("resolution", [0.02, 0.04, 0.08])
-def test_curvature_of_quadratics(resolution):
-    """A bowl of radius 0.5 m bends by 2 / m, a bump by less than 0; a gutter by half, a saddle not at all."""
-    shapes = {2.0: lambda x, y: x * x + y * y, -2.0: lambda x, y: -x * x - y * y + 0.3 * x}
-    shapes |= {1.0: lambda x, y: x * x, 0.0: lambda x, y: x * x - y * y + 3 * x * y}
-    for bend, function in shapes.items():
-        layer, _, _ = terrain(function, resolution, 1.6)
-        result, _ = FILTERS["curvature"](layer, resolution=resolution, radius=0.16)
-        inner = round(0.16 / resolution)
-        torch.testing.assert_close(
-            result[:, inner:-inner, inner:-inner],
-            torch.full_like(result, bend)[:, inner:-inner, inner:-inner],
-            atol=1e-9,
-            rtol=0,
-        )
-
-
-@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-9), (torch.float32, 0.02)])
-def test_curvature_of_a_bowl_with_unknown_cells(dtype, tolerance):
-    (z, _), _, _ = terrain(lambda x, y: x * x + y * y + 300 * (dtype == torch.float64), 0.04, 1.6)
-    known = random_layer(5, z.shape, 0.5)[1]
-    result, _ = FILTERS["curvature"]((z.to(dtype), known), resolution=0.04, radius=0.16)
-    torch.testing.assert_close(result[known], torch.full_like(result[known], 2.0), atol=tolerance, rtol=0)
-
-
-def test_a_line_of_cells_bends_along_itself():
-    """z = x^2, of which a row is known, or one that lies across: 2 / m."""
-    x = torch.arange(7, dtype=torch.float64) * 0.1
-    row, known = torch.zeros(1, 7, 7, dtype=torch.float64), torch.zeros(1, 7, 7, dtype=torch.bool)
-    row[0, :, 3], known[0, :, 3] = x * x, True
-    diagonal = torch.diag(2 * x * x)[None], torch.eye(7, dtype=torch.bool)[None]
-    for layer in ((row, known), (row.mT, known.mT), diagonal):
-        result, _ = FILTERS["curvature"](layer, resolution=0.1, radius=0.2)
-        torch.testing.assert_close(result[layer[1]], torch.full((7,), 2.0, dtype=torch.float64))
-
-
-def test_what_little_is_known_does_not_bend():
-    """Two or three cells of an alpine valley: no plane is left over to bend."""
-    z = torch.tensor([[[5.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 0.0]]])
-    known = torch.zeros(1, 3, 3, dtype=torch.bool)
-    known[0, 0, 0] = known[0, 1, 1] = known[0, 0, 1] = True
-    assert not FILTERS["curvature"]((z, known), resolution=0.1, radius=0.1)[0].any()
-
-
 def hills(x, y):
     return 0.1 * torch.sin(2 * math.pi * x / 1.6) * torch.cos(2 * math.pi * y / 2.0)
 
@@ -244,60 +184,6 @@ def test_the_same_at_2_4_and_8_cm(name):
     for resolution in (0.02, 0.04):
         difference = (found[resolution] - found[0.08]).abs().max() / found[0.08].abs().max()
         assert difference < INDEPENDENT[name]
-
-
-# Traversability -------------------------------------------------------------------------------------------------------
-
-
-def rated(s, h, r, **settings):
-    layers = [whole(torch.tensor([[[value]]])) for value in (s, h, r)]
-    return float(geometry.traversability_three_part(*layers, **settings)[0])
-
-
-def test_three_part_traversability_by_hand():
-    limits = dict(critical_slope=0.5, critical_step=0.2, critical_roughness=0.1)
-    assert rated(0.0, 0.0, 0.0, **limits) == pytest.approx(1)
-    assert rated(0.25, 0.05, 0.02, **limits) == pytest.approx((0.5 + 0.75 + 0.8) / 3)
-    weights = dict(weight_slope=2, weight_step=1, weight_roughness=1)
-    assert rated(0.25, 0.05, 0.02, **limits, **weights) == pytest.approx((2 * 0.5 + 0.75 + 0.8) / 4)
-    assert rated(0.51, 0.0, 0.0, **limits) == rated(0.0, 0.21, 0.0, **limits) == rated(0.0, 0.0, 0.11, **limits) == 0
-    assert rated(0.4999, 0.0, 0.0, **limits) == pytest.approx(2 / 3, abs=1e-3)
-
-
-@given(SEEDS)
-def test_three_part_traversability(seed):
-    """Known where all three parts are, and within 0 and 1."""
-    layers = [random_layer(seed + k, share=0.8) for k in range(3)]
-    layers = [(values.abs(), known) for values, known in layers]
-    result, known = geometry.traversability_three_part(*layers, critical_step=0.25, critical_roughness=0.25)
-    assert torch.equal(known, functools.reduce(torch.logical_and, (mask for _, mask in layers)))
-    assert ((result >= 0) & (result <= 1)).all() and (result > 0).any() and (result[known] == 0).any()
-
-
-def test_gradient_of_three_part_traversability():
-    layers = [random_layer(k, (1, 3, 3), 1.0) for k in range(3)]
-    parts = [(0.1 * values.abs()).requires_grad_() for values, _ in layers]
-    known = layers[0][1]
-
-    def rate(*parts):
-        return geometry.traversability_three_part(*((p, known) for p in parts), critical_roughness=0.1)[0]
-
-    assert torch.autograd.gradcheck(rate, parts)
-
-
-@pytest.mark.parametrize(
-    "settings", [{"critical_slope": 0.0}, {"critical_step": -1.0}, {"critical_roughness": math.inf}]
-)
-def test_refuses_critical_values(settings):
-    with pytest.raises(ValueError, match=next(iter(settings))):
-        rated(0.0, 0.0, 0.0, **settings)
-
-
-@pytest.mark.parametrize("weights", [(0, 0, 0), (-1, 1, 1), (math.nan, 1, 1), (math.inf, 1, 1)])
-def test_refuses_weights(weights):
-    names = ("weight_slope", "weight_step", "weight_roughness")
-    with pytest.raises(ValueError, match="weights"):
-        rated(0.0, 0.0, 0.0, **dict(zip(names, weights, strict=True)))
 
 
 @pytest.mark.parametrize("name", NAMES)

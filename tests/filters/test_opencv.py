@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.filters.filter_cases import SEEDS, SHARES, assert_batch_is_single, random_layer
 from torchelev import filters
 from torchelev.filters import opencv
-from torchelev.filters.registry import masked
+from torchelev.filters.layer_tools import zero_unknown
 
 SHAPES = st.tuples(st.integers(1, 3), st.integers(1, 12), st.integers(1, 11))
 SERVED = {
@@ -38,7 +38,7 @@ def filtered(name, layer):
 
 def by_tensors(name, layer):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(opencv, "serves", lambda values: False)
+        patch.setattr(opencv, "is_usable", lambda values: False)
         return filtered(name, layer)
 
 
@@ -47,7 +47,7 @@ def by_tensors(name, layer):
 def test_the_same_as_tensor_operations(name, seed, shape, share, altitude):
     values, known = random_layer(seed, shape, share, torch.float32)
     layer = values + altitude, known
-    assert opencv.serves(layer[0])
+    assert opencv.is_usable(layer[0])
     got, expected = filtered(name, layer), by_tensors(name, layer)
     assert torch.equal(got[1], expected[1])
     torch.testing.assert_close(got[0], expected[0], atol=2e-6 if altitude == 0 else 1e-4, rtol=1e-5)
@@ -96,14 +96,14 @@ def test_known_heights_that_are_not_finite_count_as_unknown(bad, B):
     values, known = random_layer(5, (B, 7, 6), 0.8, torch.float32)
     known[-1, 2, 1 : 1 + len(bad)] = True
     values[-1, 2, 1 : 1 + len(bad)] = torch.tensor(bad)
-    kept, there = opencv.masked(values, known)
+    kept, there = opencv.zero_unknown(values, known)
     assert torch.equal(there, known & values.isfinite()) and not there[-1, 2, 1]
     assert torch.equal(kept, torch.where(there, values, 0.0))
 
 
 def test_heights_whose_sum_float32_does_not_hold_stay_known():
     values, known = torch.full((1, 9, 8), 3e38), torch.ones(1, 9, 8, dtype=torch.bool)
-    kept, there = opencv.masked(values, known)
+    kept, there = opencv.zero_unknown(values, known)
     assert there.all() and torch.equal(kept, values)
 
 
@@ -120,19 +120,19 @@ def test_far_within_the_unknown_nothing_divides_by_zero(name, B):
 
 @pytest.mark.parametrize("shape", [(0, 4, 4), (1, 0, 4), (1, 4, 0)])
 def test_serves_no_empty_images(shape):
-    assert not opencv.serves(torch.zeros(shape))
-    kept, there = masked((torch.zeros(shape), torch.zeros(shape, dtype=torch.bool)))
+    assert not opencv.is_usable(torch.zeros(shape))
+    kept, there = zero_unknown((torch.zeros(shape), torch.zeros(shape, dtype=torch.bool)))
     assert kept.shape == there.shape == shape
 
 
 def test_serves_plain_float32_on_a_cpu_without_gradient():
     values = torch.zeros(1, 3, 3)
-    assert opencv.serves(values)
-    assert not opencv.serves(values.double()) and not opencv.serves(values.to("meta"))
+    assert opencv.is_usable(values)
+    assert not opencv.is_usable(values.double()) and not opencv.is_usable(values.to("meta"))
     learns = values.clone().requires_grad_()
-    assert not opencv.serves(learns)
+    assert not opencv.is_usable(learns)
     with torch.no_grad():
-        assert opencv.serves(learns)
+        assert opencv.is_usable(learns)
         smooth, _ = filtered("gaussian", (learns, torch.ones(1, 3, 3, dtype=torch.bool)))
     assert not smooth.requires_grad
 
@@ -147,15 +147,15 @@ def test_serves_no_tensors_of_functorch():
 
 def test_an_opencv_that_does_not_load_counts_as_none(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)  # an import of it raises ImportError
-    opencv._installed.cache_clear()
-    assert not opencv.serves(torch.zeros(1, 3, 3))
+    opencv.is_installed.cache_clear()
+    assert not opencv.is_usable(torch.zeros(1, 3, 3))
     monkeypatch.undo()
-    opencv._installed.cache_clear()
-    assert opencv.serves(torch.zeros(1, 3, 3))
+    opencv.is_installed.cache_clear()
+    assert opencv.is_usable(torch.zeros(1, 3, 3))
 
 
 def test_without_opencv_tensors_do_it(monkeypatch):
     layer = random_layer(3, (2, 7, 6), 0.8, torch.float32)
     expected = by_tensors("gaussian", layer)
-    monkeypatch.setattr(opencv, "_installed", lambda: False)
+    monkeypatch.setattr(opencv, "is_installed", lambda: False)
     assert torch.equal(filtered("gaussian", layer)[0], expected[0])

@@ -21,8 +21,7 @@ from tests.filters.filter_cases import (
     random_layer,
     resolution_spread,
 )
-from torchelev.filters.order import lowest_of_windows, merging, run, sorting
-from torchelev.filters.smoothing import box, gaussian, median, running_sums
+from torchelev.filters.smoothing import box, gaussian, median
 
 ALL = [gaussian, box, median]
 
@@ -67,36 +66,6 @@ def test_literal_values():
     e, e2 = math.exp(-0.5 / 0.16), math.exp(-1 / 0.16)
     expected = (9 + e * (2 + 4 + 5 + 7) + e2 * (1 + 3 + 6)) / (1 + 4 * e + 3 * e2)
     assert gaussian(layer, resolution=0.1, sigma=0.04)[0][0, 1, 1] == pytest.approx(expected, abs=1e-6)
-
-
-@given(st.integers(1, 17), st.integers(0, 9), SEEDS)
-def test_running_sums(width, more, seed):
-    values = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, width + more)))
-    torch.testing.assert_close(running_sums(values, width, 1), values.unfold(1, width, 1).sum(-1), atol=1e-12, rtol=0)
-
-
-@given(st.integers(1, 12))
-def test_sorting(count):
-    """A network sorts everything if it sorts all zeros and ones."""
-    bits = torch.cartesian_prod(*[torch.arange(2)] * count).view(-1, count).unbind(-1)
-    assert torch.equal(torch.stack(run(sorting(count), list(bits))), torch.stack(bits).sort(0).values)
-
-
-@given(st.integers(1, 14), st.integers(1, 14), st.integers(1, 28))
-def test_merging(first, second, keep):
-    steps = [torch.arange(n + 1)[:, None] > torch.arange(n) for n in (first, second)]
-    pairs = [(a, b) for a in steps[0].int() for b in steps[1].int()]
-    inputs = [torch.stack([torch.cat([a.flip(0), b.flip(0)])[k] for a, b in pairs]) for k in range(first + second)]
-    expected = torch.stack(inputs).sort(0).values[:keep]
-    assert torch.equal(torch.stack(run(merging(first, second, keep), inputs)), expected)
-
-
-@pytest.mark.parametrize("width, keep", [(1, 1), (3, 5), (5, 13), (7, 49), (9, 41)])
-def test_lowest_of_windows(width, keep):
-    rimmed = torch.from_numpy(np.random.default_rng(1).normal(size=(2, width + 3, width + 4)))
-    windows = rimmed.unfold(1, width, 1).unfold(2, width, 1).flatten(3)
-    expected = windows.sort(-1).values[..., :keep].movedim(-1, 0)
-    assert torch.equal(torch.stack(lowest_of_windows(rimmed, width, keep)), expected)
 
 
 @pytest.mark.parametrize("function", ALL)

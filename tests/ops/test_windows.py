@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev.ops.operators import padded
-from torchelev.ops.windows import neighbours, window_maximum, window_moments
+from torchelev.ops.windows import gaussian_sum, neighbours, sliding_maximum, sliding_sum, window_maximum, window_moments
 
 SIZES = st.tuples(st.integers(1, 2), st.integers(1, 7), st.integers(1, 6))
 
@@ -24,8 +24,8 @@ def test_window_moments_are_sums_over_the_window(seed, shape, radius):
     values = np.random.default_rng(seed).normal(size=shape)
     rim = radius + seed % 2
     layer = padded(torch.from_numpy(values), rim, 0.0)
-    moments = window_moments([(layer, 2), (layer, 0), (layer, 1)], rim, radius)
-    powers = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0)] + [(0, 0)] + [(0, 0), (0, 1), (1, 0)]
+    moments = window_moments([(layer, 2), (layer, 0), (layer, 1), (layer, 4)], rim, radius)
+    powers = [(a, b) for order in (2, 0, 1, 4) for a in range(order + 1) for b in range(order + 1 - a)]
     assert len(moments) == len(powers)
     for moment, (a, b) in zip(moments, powers, strict=True):
         for cell in np.ndindex(*shape):
@@ -55,3 +55,23 @@ def test_neighbours():
 def test_gradients(function):
     values = torch.randn(2, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
     assert torch.autograd.gradcheck(function, (values,))
+
+
+@given(st.integers(1, 17), st.integers(0, 9), st.integers(0, 10_000))
+def test_sliding_maximum(width, more, seed):
+    values = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, width + more)))
+    assert torch.equal(sliding_maximum(values, width, 1), values.unfold(1, width, 1).amax(-1))
+
+
+@given(st.integers(1, 17), st.integers(0, 9), st.integers(0, 10_000))
+def test_sliding_sum(width, more, seed):
+    values = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, width + more)))
+    torch.testing.assert_close(sliding_sum(values, width, 1), values.unfold(1, width, 1).sum(-1), atol=1e-12, rtol=0)
+
+
+@given(st.integers(1, 6), st.floats(0.3, 4), st.integers(0, 10_000))
+def test_gaussian_sum(radius, sigma, seed):
+    values = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, 2 * radius + 4)))
+    weight = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=torch.float64) / sigma) ** 2)
+    expected = values.unfold(1, 2 * radius + 1, 1) @ weight
+    torch.testing.assert_close(gaussian_sum(values, radius, sigma, 1), expected, atol=1e-12, rtol=0)

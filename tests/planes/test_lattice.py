@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.planes.lattice import borders, components, insets, interior, same
+from torchelev.planes.lattice import components, interior, same_label, trace_borders, trace_insets
 
 pytest.importorskip("cv2")
 SEEDS = st.integers(0, 10_000)
@@ -66,7 +66,7 @@ def polygons(outlines):
 @given(SEEDS)
 def test_components_are_those_of_a_flood(seed):
     labels = random_labels(seed)
-    found, count = components(*same(labels))
+    found, count = components(*same_label(labels))
     expected, number = flood(labels)
     assert count == number
     pairs = set(zip(found.ravel().tolist(), expected.ravel().tolist(), strict=True))
@@ -84,8 +84,8 @@ def test_components_hang_together_over_joined_sides_alone():
 @given(SEEDS)
 def test_borders_are_the_sides_of_the_cells(seed):
     """Every side once, the region on its left, one polygon around each region; so the areas are right too."""
-    labels, count = components(*same(random_labels(seed)))
-    outlines = borders(interior(labels), labels)
+    labels, count = components(*same_label(random_labels(seed)))
+    outlines = trace_borders(interior(labels), labels)
     area = np.zeros(count)
     for label in range(count):
         mine = np.flatnonzero(outlines.label == label)
@@ -100,7 +100,7 @@ def test_borders_of_a_ring_by_hand():
     """A corner of the ring is the first region; the cell in its hole the second, listed as hole and as region."""
     labels = np.zeros((3, 3), int)
     labels[1, 1] = 1
-    outlines = borders(interior(labels), labels)
+    outlines = trace_borders(interior(labels), labels)
     found = {
         (int(label), int(area)): {tuple(p) for p in polygon.tolist()}
         for polygon, label, area in zip(polygons(outlines), outlines.label, outlines.area, strict=True)
@@ -130,8 +130,8 @@ def surrounds(polygon, point):
 def test_insets_lie_far_enough_inside(seed, margin):
     """Corners lie in the region, the margin from its border; a cell's middle that does so, too, lies in an inset."""
     widths = np.random.default_rng(seed).integers(1, 5, 2)
-    labels, count = components(*same(np.kron(random_labels(seed), np.ones(widths, int))))
-    outlines = insets(interior(labels), labels, margin)
+    labels, count = components(*same_label(np.kron(random_labels(seed), np.ones(widths, int))))
+    outlines = trace_insets(interior(labels), labels, margin)
     traced = polygons(outlines) if len(outlines.label) else []
     for label in range(count):
         sides = np.array(list(border_sides(labels, label)))
@@ -149,7 +149,7 @@ def test_insets_of_a_square_with_a_hole_by_hand():
     """9 x 9 cells without the middle one, 1 cell taken off: a square from 1 to 8; the hole grows from 1 to 3 cells."""
     labels = np.zeros((9, 9), int)
     labels[4, 4] = -1
-    outlines = insets(interior(labels), labels, 1.0)
+    outlines = trace_insets(interior(labels), labels, 1.0)
     assert outlines.label.tolist() == [0, 0]
     outer, hole = sorted(zip(outlines.area, polygons(outlines), strict=True), key=lambda pair: -pair[0])
     assert outer[0] == 2 * 14**2 and {tuple(p) for p in outer[1].tolist()} == {(2, 2), (16, 2), (16, 16), (2, 16)}
@@ -158,5 +158,7 @@ def test_insets_of_a_square_with_a_hole_by_hand():
 
 def test_nothing_has_no_polygons():
     labels = np.full((4, 5), -1)
-    assert components(*same(labels))[1] == 0
-    assert (borders(interior(labels), labels).label < 0).all() and len(insets(interior(labels), labels, 1.0).label) == 0
+    assert components(*same_label(labels))[1] == 0
+    assert (trace_borders(interior(labels), labels).label < 0).all() and len(
+        trace_insets(interior(labels), labels, 1.0).label
+    ) == 0

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.planes.polygons import crossings, free_polygon, nearest, sides
+from torchelev.planes.polygons import free_polygon, nearest_points, ray_crosses, sides
 
 SEEDS = st.integers(0, 10_000)
 SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 2.0], [0.0, 2.0]])
@@ -18,7 +18,7 @@ def star(rng, radius):
 
 
 def is_inside(border, point):
-    return crossings(border, point).sum() % 2 == 1
+    return ray_crosses(border, point).sum() % 2 == 1
 
 
 def cross(a, b):
@@ -35,7 +35,7 @@ def test_sides_go_around_each_polygon():
 
 @pytest.mark.parametrize("point, inside", [((1, 1), 1), ((5, 1), 0), ((-1, 1), 0), ((1, 3), 0), ((3.9, 0.1), 1)])
 def test_crossings_tell_the_inside(point, inside):
-    assert crossings(sides([SQUARE]), np.array(point)).sum() % 2 == inside
+    assert ray_crosses(sides([SQUARE]), np.array(point)).sum() % 2 == inside
 
 
 @given(SEEDS)
@@ -52,13 +52,13 @@ def test_crossings_agree_with_the_winding(seed):
     "point, expected", [((1, -3), (1, 0)), ((9, 9), (4, 2)), ((3.5, 1), (4, 1)), ((-1, -1), (0, 0))]
 )
 def test_nearest_of_a_rectangle(point, expected):
-    found = nearest(sides([SQUARE]), np.array(point, float))
+    found = nearest_points(sides([SQUARE]), np.array(point, float))
     best = np.argmin(np.hypot(*(found - point).T))
     np.testing.assert_allclose(found[best], expected)
 
 
 def test_nearest_of_a_side_without_length():
-    np.testing.assert_array_equal(nearest(np.ones((1, 2, 2)), np.zeros(2)), [[1, 1]])
+    np.testing.assert_array_equal(nearest_points(np.ones((1, 2, 2)), np.zeros(2)), [[1, 1]])
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.25])
@@ -83,7 +83,7 @@ def test_free_polygon_is_convex_around_the_seed_and_free(seed, margin):
     hole = star(rng, 0.2)[::-1] + rng.uniform(-0.3, 0.3, 2)
     border = sides([star(rng, 3.0), hole])
     for point in rng.uniform(-1, 1, (4, 2)):
-        clearance = np.hypot(*(nearest(border, point) - point).T).min()
+        clearance = np.hypot(*(nearest_points(border, point) - point).T).min()
         if not is_inside(border, point) or clearance < margin + 1e-3:
             continue
         found = free_polygon(border, point, margin)
@@ -95,9 +95,9 @@ def test_free_polygon_is_convex_around_the_seed_and_free(seed, margin):
         assert depth.min(1).max() <= 1e-9  # every point of the border lies outside of a side
         normal = np.column_stack([along[:, 1], -along[:, 0]]) / np.hypot(*along.T)[:, None]
         feet = point + ((found - point) * normal).sum(1)[:, None] * normal + margin * normal
-        reached = [np.hypot(*(nearest(border, foot) - foot).T).min() for foot in feet]
+        reached = [np.hypot(*(nearest_points(border, foot) - foot).T).min() for foot in feet]
         assert max(reached) < 1e-6  # every side is a tangent where the circle touched the border
         assert cross(along, (feet - margin * normal)[:, None] - found).min() > -1e-6 or margin > 0
-        away = [np.hypot(*(nearest(sides([found]), b) - b).T).min() for b in onto.reshape(-1, 2)]
+        away = [np.hypot(*(nearest_points(sides([found]), b) - b).T).min() for b in onto.reshape(-1, 2)]
         assert min(away) >= margin - 1e-9
         assert len(found) >= 3 and is_inside(border, found.mean(0))

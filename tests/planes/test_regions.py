@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev.planes import PlaneConfig, convex_region, segment
-from torchelev.planes.polygons import crossings, nearest
+from torchelev.planes.polygons import nearest_points, ray_crosses
 from torchelev.sim.exact.plane_scenes import RISE, RUN, mixed, noisy, stairs
 
 pytest.importorskip("cv2")
@@ -19,7 +19,7 @@ def rings():
 
 
 def is_inside(border, xy):
-    return crossings(border, np.asarray(xy, float)).sum() % 2 == 1
+    return ray_crosses(border, np.asarray(xy, float)).sum() % 2 == 1
 
 
 def block(cells=slice(5, 15), **cfg):
@@ -52,10 +52,10 @@ def test_no_foothold_is_nearer(rings, x, y):
     insets = [p for region in rings.regions for p in (*region.inset, *region.inset_holes)]
     assert foothold.distance <= np.hypot(*(np.concatenate(insets)[:, :2] - (x, y)).T).min() + 1e-12
     region, xy = foothold.region, foothold.point[:2]
-    to_inset = np.hypot(*(nearest(region.inset_border, xy) - xy).T).min()
+    to_inset = np.hypot(*(nearest_points(region.inset_border, xy) - xy).T).min()
     assert is_inside(region.inset_border, xy) or to_inset < 1e-9
     assert abs((foothold.point - region.point) @ region.normal) < 1e-9
-    to_border = np.hypot(*(nearest(region.border, xy) - xy).T).min()
+    to_border = np.hypot(*(nearest_points(region.border, xy) - xy).T).min()
     assert is_inside(region.border, xy) and to_border > 0.03 - 1e-4
 
 
@@ -97,7 +97,7 @@ def test_convex_regions_lie_inside_around_the_foothold(rings, seed):
     for _ in range(30):  # random points of the polygon, a little towards the foothold
         share = rng.dirichlet(np.ones(len(p)))
         assert is_inside(region.border, xy + 0.999 * (share @ p - xy))
-    assert np.hypot(*(nearest(region.border, xy) - xy).T).min() <= np.hypot(*(p - xy).T).min() + 1e-9
+    assert np.hypot(*(nearest_points(region.border, xy) - xy).T).min() <= np.hypot(*(p - xy).T).min() + 1e-9
 
 
 def test_convex_regions_on_a_ring_leave_its_hole_out(rings):
@@ -105,7 +105,10 @@ def test_convex_regions_on_a_ring_leave_its_hole_out(rings):
     for turn in np.linspace(0, 6, 12):
         polygon = convex_region(ring, (2 + 1.1 * np.cos(turn), -2.5 + 1.1 * np.sin(turn)))
         away = np.hypot(
-            *(nearest(np.stack([polygon, np.roll(polygon, -1, 0)], 1)[..., :2], np.array([2, -2.5])) - (2, -2.5)).T
+            *(
+                nearest_points(np.stack([polygon, np.roll(polygon, -1, 0)], 1)[..., :2], np.array([2, -2.5]))
+                - (2, -2.5)
+            ).T
         ).min()
         assert 0.5 < away < 0.7 and np.hypot(*(polygon[:, :2] - (2, -2.5)).T).max() < 1.65
 

@@ -1,13 +1,16 @@
-"""Filters from layers to layers, batched over maps, each a function that is known by its name.
+"""Filters: functions from layers to a layer, batched over maps and registered by name.
 
-A layer is (values, known), both (B, H, W), as `as_layer` makes of values with NaN. A filter is called itself, as a
-module, or in a chain that a map's config holds:
+A layer is a pair (values, known) of (B, H, W) tensors; `as_layer` makes one from values with NaN. Call a filter as a
+function, as a module, or list it in a map's config:
 
 ```python
 smooth = filters.gaussian(layer, resolution=0.04, sigma=0.1)
 smooth = filters.Filter("gaussian", sigma=0.1)(layer, resolution=0.04)
 cfg = ElevationMapConfig(filters=(FilterConfig(layer="smooth", filter="gaussian", settings={"sigma": 0.1}),))
 ```
+
+The stages of the map update and its traversability are not filters; see `torchelev.stages` and
+`torchelev.traversability`.
 """
 
 from torchelev.filters.chain import FilterChain, FilterConfig
@@ -15,9 +18,7 @@ from torchelev.filters.distances.distance import signed_distance
 from torchelev.filters.distances.distance_field import SignedDistanceField
 from torchelev.filters.expressions.expression import Expression, expression
 from torchelev.filters.extrema import closing, dilation, erosion, maximum, minimum, opening
-from torchelev.filters.footholds import foothold_score
 from torchelev.filters.geometry import (
-    curvature,
     normal_x,
     normal_y,
     normal_z,
@@ -25,7 +26,6 @@ from torchelev.filters.geometry import (
     slope,
     standard_deviation,
     step_height,
-    traversability_three_part,
 )
 from torchelev.filters.inpainting.inpaint import (
     fill_from,
@@ -35,7 +35,10 @@ from torchelev.filters.inpainting.inpaint import (
     inpaint_nearest,
     inpaint_telea,
 )
-from torchelev.filters.registry import FILTERS, Filter, as_layer, as_nan, register
+from torchelev.filters.layer_tools import as_layer, as_nan
+from torchelev.filters.mean_curvature import curvature
+from torchelev.filters.ratings import foothold_score, traversability_three_part
+from torchelev.filters.registry import FILTERS, Filter, register
 from torchelev.filters.smoothing import box, gaussian, median
 from torchelev.filters.virtual_floor import smooth_ground, virtual_floor
 

@@ -1,4 +1,4 @@
-"""Filters in order: each makes a named layer from the map's layers and from those made before it."""
+"""Filter chains: each filter makes a named layer from the map's layers and from layers made before it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import nn
 
 from torchelev.errors import require
 from torchelev.filters.expressions.expression import Expression
-from torchelev.filters.registry import KEYS, Filter
+from torchelev.filters.registry import ENTRY_KEYS, Filter
 from torchelev.layers import LAYERS, Layer
 
 
@@ -22,13 +22,14 @@ class FilterConfig:
     In YAML it is an entry of the list `filters`: `- {layer: smooth, filter: gaussian, inputs: elevation, sigma: 0.1}`.
     """
 
-    layer: str  #: the name of what it makes
-    filter: str  #: the name of the filter, see FILTERS
-    inputs: tuple[str, ...] | str = ()  #: what it reads; left out: elevation, or what a formula names
-    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  #: kept as pairs, as a config is hashed
+    layer: str  #: name of the layer it makes
+    filter: str  #: name of the filter, see `FILTERS`
+    #: names of the layers it reads; default: elevation, and for an expression the layers in its formula
+    inputs: tuple[str, ...] | str = ()
+    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  #: kept as pairs, so that the config is hashable
 
     def __post_init__(self) -> None:
-        settings = {name: _plain(value) for name, value in dict(self.settings).items()}
+        settings = {name: _hashable(value) for name, value in dict(self.settings).items()}
         for name in ("layer", "filter"):
             value = getattr(self, name)
             require(isinstance(value, str), f"filters.{name}", "must be a name", repr(value), "give text", TypeError)
@@ -42,43 +43,53 @@ class FilterConfig:
         object.__setattr__(self, "settings", tuple(sorted(settings.items())))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entry that YAML has."""
+        """Return the YAML entry as a dict."""
         return {"layer": self.layer, "filter": self.filter, "inputs": list(self.inputs), **dict(self.settings)}
 
 
-def _plain(value: Any) -> Any:
-    """Return what can be hashed and written: tuples for lists, Python's numbers for NumPy's."""
+def _hashable(value: Any) -> Any:
+    """Return a setting as a tuple if it is a list, and as a Python number if it is a NumPy one."""
     if isinstance(value, list):
         return tuple(value)
     return value.item() if isinstance(value, np.generic) else value
 
 
 def filters_from_list(values: object) -> tuple[FilterConfig, ...]:
-    """Read a list of entries. Raises ValueError for what is none, with its number."""
+    """Read the list `filters` of a config file.
+
+    Raises:
+        ValueError: if an entry does not name its layer and filter; the text says which entry.
+    """
     hint = "write one as {layer: smooth, filter: gaussian, sigma: 0.1}"
     require(isinstance(values, list), "config.filters", "must be a list", type(values).__name__, hint)
     assert isinstance(values, list)
     for number, entry in enumerate(values):
-        named = isinstance(entry, dict) and all(isinstance(entry.get(key), str) for key in ("layer", "filter"))
-        require(named, f"config.filters[{number}]", "must name its layer and its filter", repr(entry), hint)
+        is_named = isinstance(entry, dict) and all(isinstance(entry.get(key), str) for key in ("layer", "filter"))
+        require(is_named, f"config.filters[{number}]", "must name its layer and its filter", repr(entry), hint)
     return tuple(_from_dict(entry) for entry in values)
 
 
 def _from_dict(entry: dict[str, Any]) -> FilterConfig:
-    settings = {name: value for name, value in entry.items() if name not in KEYS}
-    return FilterConfig(**{name: entry[name] for name in KEYS if name in entry}, settings=settings)
+    settings = {name: value for name, value in entry.items() if name not in ENTRY_KEYS}
+    return FilterConfig(**{key: entry[key] for key in ENTRY_KEYS if key in entry}, settings=settings)
 
 
 class FilterChain(nn.Module):
-    """Filters in order.
-
-    Each reads the map's layers and those that filters before it make. Raises ValueError when built for a filter,
-    setting or layer that does not exist (a layer made later, or by itself, does not exist yet), naming what there is.
+    """Filters in order, each reading the map's layers and the layers made before it.
 
     ```python
     chain = FilterChain([FilterConfig(layer="smooth", filter="gaussian", settings={"sigma": 0.1})], resolution=0.04)
     values, known = chain({"elevation": (elevation, known)})["smooth"]
     ```
+
+    Args:
+        filters: in the order in which they run.
+        resolution: [m] of a cell.
+        given: names of the layers that exist before the chain.
+
+    Raises:
+        ValueError: if a filter, a setting or an input layer does not exist, naming those that do; if a new layer's
+            name is taken or no identifier.
     """
 
     def __init__(
@@ -91,12 +102,12 @@ class FilterChain(nn.Module):
         for cfg in filters:
             self._append(cfg, [*given, *self.inputs])
 
-    def _append(self, cfg: FilterConfig, there: list[str]) -> None:
+    def _append(self, cfg: FilterConfig, available: list[str]) -> None:
         where = f"filters.{cfg.layer}"
-        usable = cfg.layer.isidentifier() and cfg.layer not in there
-        require(usable, where, "must be a name of its own, of letters and digits", repr(cfg.layer), "choose another")
-        missing = [str(name) for name in cfg.inputs if name not in there]
-        hint = f"there are {', '.join(there)}"
+        is_valid = cfg.layer.isidentifier() and cfg.layer not in available
+        require(is_valid, where, "must be a name of its own, of letters and digits", repr(cfg.layer), "rename it")
+        missing = [str(name) for name in cfg.inputs if name not in available]
+        hint = f"there are {', '.join(available)}"
         require(not missing, where, "must read layers that are made before it", ", ".join(missing), hint)
         try:
             step = Filter(cfg.filter, **dict(cfg.settings))
@@ -110,7 +121,13 @@ class FilterChain(nn.Module):
         return name in self.inputs
 
     def read(self, name: str, given: Callable[[str], Layer], made: dict[str, Layer]) -> Layer:
-        """Return a layer, running only what it needs; `made` holds what was made before, and gets what is made."""
+        """Return a layer by name, running only the filters that it depends on.
+
+        Args:
+            name: of a layer of the chain or of the map.
+            given: returns a layer of the map by name.
+            made: layers of the chain that exist already; new ones are added.
+        """
         if name not in self.inputs:
             return given(name)
         if name not in made:
@@ -120,7 +137,7 @@ class FilterChain(nn.Module):
         return made[name]
 
     def forward(self, layers: Mapping[str, Layer]) -> dict[str, Layer]:
-        """Return all layers that the chain makes."""
+        """Return all layers of the chain, from the map's layers by name."""
         made: dict[str, Layer] = {}
         for name in self.inputs:
             self.read(name, layers.__getitem__, made)

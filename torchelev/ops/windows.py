@@ -1,8 +1,12 @@
-"""Sums and maxima over the square window around each cell, along one dimension after the other."""
+"""Sums and maxima over the window around each cell, along one dimension after the other.
+
+Every tensor window of the library is here; `filters/opencv.py` has the windows that OpenCV computes on the host.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 
 import torch
@@ -32,15 +36,14 @@ def shifted(values: Tensor, rim: int, i: int = 0, j: int = 0) -> Tensor:
 
 
 def _line_sums(values: Tensor, rim: int, radius: int, dim: int, order: int) -> list[Tensor]:
-    """Sum k^power * values over k = -radius .. radius along one dimension, for each power up to the order of 0 to 2."""
+    """Sum k^power * values over k = -radius .. radius along one dimension, for each power from 0 to the order."""
     middle, steps = _line(values, rim, dim, 0), range(1, radius + 1)
     sides = [(_line(values, rim, dim, -k), _line(values, rim, dim, k)) for k in steps]
-    both = [before + after for before, after in sides]
-    sums = [functools.reduce(torch.add, both, middle)]
-    if order >= 1:
-        sums.append(_weighted(steps, [after - before for before, after in sides]))
-    if order >= 2:
-        sums.append(_weighted([k * k for k in steps], both))
+    even = [before + after for before, after in sides]
+    odd = [after - before for before, after in sides] if order >= 1 else []
+    sums = [functools.reduce(torch.add, even, middle)]
+    for power in range(1, order + 1):
+        sums.append(_weighted([k**power for k in steps], odd if power % 2 else even))
     return sums
 
 
@@ -56,7 +59,7 @@ def window_moments(layers: list[tuple[Tensor, int]], rim: int, radius: int) -> l
     """Sum u^a v^b * values over the (2 * radius + 1)^2 window around each cell.
 
     u and v count cells from the window's centre along H and W. For each layer (B, H + 2 * rim, W + 2 * rim) with its
-    order, 0 to 2, all moments (B, H, W) with a + b <= order: (0, 0), (0, 1), ... (1, 0), ... The rim is at least the
+    order, all moments (B, H, W) with a + b <= order: (0, 0), (0, 1), ... (1, 0), ... The rim is at least the
     radius.
     """
     lines = [line for v, order in layers for line in _line_sums(v, rim, radius, -2, order)]
@@ -81,3 +84,49 @@ def neighbours(values: Tensor, fill: float) -> list[Tensor]:
     rimmed = padded(values, 1, fill)
     rows = [_line(rimmed, 1, -2, i) for i in (-1, 0, 1)]
     return [_line(rows[1 + i], 1, -1, j) for i, j in AROUND]
+
+
+def sliding_sum(values: Tensor, width: int, dim: int) -> Tensor:
+    """Return the sum of every `width` neighbours along a dimension, which shrinks by width - 1.
+
+    Sums of 1, 2, 4, ... neighbours, each of two before it; those that make up the width are added.
+    """
+    length = values.shape[dim] - width + 1
+    parts, start, span = [], 0, 1
+    while span <= width:
+        if width & span:
+            parts.append(values.narrow(dim, start, length))
+            start += span
+        if 2 * span <= width:
+            rest = values.shape[dim] - span
+            values = values.narrow(dim, 0, rest) + values.narrow(dim, span, rest)
+        span *= 2
+    return functools.reduce(torch.add, parts)
+
+
+def sliding_maximum(values: Tensor, width: int, dim: int) -> Tensor:
+    """Return the maximum of every `width` neighbours along a dimension, which shrinks by width - 1.
+
+    Maxima of 1, 2, 4, ... neighbours; two overlapping ones cover the width.
+    """
+    span, length = 1, values.shape[dim] - width + 1
+    while 2 * span <= width:
+        rest = values.shape[dim] - span
+        values = torch.maximum(values.narrow(dim, 0, rest), values.narrow(dim, span, rest))
+        span *= 2
+    if span == width:
+        return values
+    return torch.maximum(values.narrow(dim, 0, length), values.narrow(dim, width - span, length))
+
+
+def gaussian_sum(values: Tensor, radius: int, sigma: float, dim: int) -> Tensor:
+    """Sum exp(-k^2 / (2 sigma^2)) * values over |k| <= radius cells along a dimension, which shrinks by 2 radius.
+
+    Neither a convolution nor a matrix product: GPUs may round those to ten bits.
+    """
+    total = _line(values, radius, dim, 0).clone()
+    for k in range(1, radius + 1):
+        weight = math.exp(-0.5 * (k / sigma) ** 2)
+        for step in (-k, k):
+            total.add_(_line(values, radius, dim, step), alpha=weight)
+    return total

@@ -1,4 +1,7 @@
-"""Planar regions of maps, with their polygons: `segment`, and what planners and controllers ask of the result."""
+"""Planar regions of maps: `segment` finds them with their polygons, and `Planes` answers planners and controllers.
+
+The plane of a single window, as normals need it, is in `torchelev.stages.surface`.
+"""
 
 from torchelev.planes.regions import Foothold, Planes, Region, convex_region
 from torchelev.planes.segmentation import PlaneConfig, segment

@@ -1,4 +1,4 @@
-"""Growing regions onto their border cells, merging what lies on one plane, and leaving out what is too small."""
+"""Regions grow onto their border cells, borders are smoothed, and what is far away or too small is dropped."""
 
 from __future__ import annotations
 
@@ -6,160 +6,118 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchelev.planes.lattice import components, same
-from torchelev.planes.sums import RegionPlanes, Surface, distances, find_runs, fit_planes, region_moments, rimmed
+from torchelev.planes.lattice import components, same_label
+from torchelev.planes.region_planes import RegionPlanes, distances
+from torchelev.planes.sums import Surface, pad_cells
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Int
     from numpy import ndarray
 
-MAX_MERGES = 20  # rounds of pairs
-SETTLING = 2  # rounds, each of which moves a border by a cell
+_SMOOTHING_ROUNDS = 2  # each moves a border by at most one cell
 
 
 def grow(
-    labels: Int[ndarray, "P"], plane: RegionPlanes, surface: Surface, reach: float, rounds: int, contested: bool
+    labels: Int[ndarray, "P"],
+    plane: RegionPlanes,
+    surface: Surface,
+    max_distance: float,
+    rounds: int,
+    may_take_over: bool,
 ) -> Int[ndarray, "P"]:
-    """Give cells at the border of regions to the region whose plane is nearest, if nearer than `reach` [m].
+    """Give cells next to regions to the region with the nearest plane, one ring of cells per round.
 
-    One ring of cells in each round. `contested`: also cells that have a region, where a neighbour's plane is nearer.
+    Args:
+        labels: region of each cell, -1 for none.
+        plane: the regions' planes.
+        surface: the map.
+        max_distance: [m] of a cell from the plane that takes it.
+        rounds: number of rings.
+        may_take_over: whether cells may also leave a region for a neighbour whose plane is nearer.
     """
-    form = plane.forms()
+    weights = plane.distance_weights()
     stride = surface.shape[1] + 1
     cell = np.flatnonzero(labels >= 0)
-    best = np.full(labels.size, reach)
-    best[cell] = np.abs(distances(surface, cell, form[labels[cell]])) if contested else 0.0
+    best = np.full(labels.size, max_distance)
+    best[cell] = np.abs(distances(surface, cell, weights[labels[cell]])) if may_take_over else 0.0
     best[~surface.known] = -1.0
-    labels, fresh = labels.copy(), labels >= 0
+    labels, is_new = labels.copy(), labels >= 0
     for _ in range(rounds):
-        before, taken = labels.copy(), np.zeros(labels.size, bool)
+        before, is_taken = labels.copy(), np.zeros(labels.size, bool)
         for step in (-stride, stride, -1, 1):
-            # Offers to each cell from a neighbour that changed in the last round.
+            # Neighbours that changed in the last round offer their label.
             offer = np.roll(before, step)
-            cell = np.flatnonzero(np.roll(fresh, step) & (offer != before) & (best > 0))
+            cell = np.flatnonzero(np.roll(is_new, step) & (offer != before) & (best > 0))
             offered = offer[cell]
-            distance = np.abs(distances(surface, cell, form[offered]))
-            better = distance < best[cell]
-            cell = cell[better]
-            labels[cell], best[cell], taken[cell] = offered[better], distance[better], True
-        if not contested:
-            best[taken] = 0.0
-        fresh = taken
+            distance = np.abs(distances(surface, cell, weights[offered]))
+            is_better = distance < best[cell]
+            cell = cell[is_better]
+            labels[cell], best[cell], is_taken[cell] = offered[is_better], distance[is_better], True
+        if not may_take_over:
+            best[is_taken] = 0.0
+        is_new = is_taken
     return labels
 
 
-def settle(labels: Int[ndarray, "P"], plane: RegionPlanes, surface: Surface, reach: float) -> Int[ndarray, "P"]:
-    """Let cells at a border that lie on both planes, nearer than `reach` [m], go with the most cells of their windows.
+def smooth_borders(
+    labels: Int[ndarray, "P"], plane: RegionPlanes, surface: Surface, max_distance: float
+) -> Int[ndarray, "P"]:
+    """Give border cells that lie within `max_distance` [m] of both planes to the majority in their window.
 
-    Along a crease each cell's own noise would fray the border.
+    Along a crease the cells' own noise would otherwise fray the border.
     """
-    form, stride = plane.forms(), surface.shape[1] + 1
-    for _ in range(SETTLING):
+    weights, stride = plane.distance_weights(), surface.shape[1] + 1
+    for _ in range(_SMOOTHING_ROUNDS):
         offers = [np.roll(labels, step) for step in (-stride, stride, -1, 1)]
         cells = [np.flatnonzero((offer != labels) & (np.minimum(offer, labels) >= 0)) for offer in offers]
         cell = np.concatenate(cells)
         offered = np.concatenate([offer[at] for offer, at in zip(offers, cells, strict=True)])
-        on_both = np.abs(distances(surface, cell, form[offered])) <= reach
-        cell, offered = cell[on_both], offered[on_both]
-        outvoted = _majority(labels.reshape(-1, stride), cell, offered, surface.radius) > 0
+        is_on_both = np.abs(distances(surface, cell, weights[offered])) <= max_distance
+        cell, offered = cell[is_on_both], offered[is_on_both]
+        is_outvoted = _majority(labels.reshape(-1, stride), cell, offered, surface.radius) > 0
         labels = labels.copy()
-        labels[cell[outvoted]] = offered[outvoted]
+        labels[cell[is_outvoted]] = offered[is_outvoted]
     return labels
 
 
 def _majority(
     labels: Int[ndarray, "H+1 W+1"], cell: Int[ndarray, "N"], offered: Int[ndarray, "N"], radius: int
 ) -> Int[ndarray, "N"]:
-    """Return by how many cells the offered label leads in the window around each cell."""
-    around = np.pad(labels.astype(np.int32), radius, constant_values=-1)
-    stride = around.shape[1]
+    """Return by how many cells the offered label leads the cell's own in the window around it."""
+    rimmed = np.pad(labels.astype(np.int32), radius, constant_values=-1)
+    stride = rimmed.shape[1]
     row, column = np.divmod(cell, labels.shape[1])
-    here = row * stride + column  # the window's first cell
-    around, own, offered = around.ravel(), labels.ravel()[cell].astype(np.int32), offered.astype(np.int32)
+    corner = row * stride + column  # the window's first cell
+    rimmed, own, offered = rimmed.ravel(), labels.ravel()[cell].astype(np.int32), offered.astype(np.int32)
     lead = np.zeros(len(cell), np.int16)
     for step in (i * stride + j for i in range(2 * radius + 1) for j in range(2 * radius + 1)):
-        label = around[here + step]
+        label = rimmed[corner + step]
         lead += (label == offered).view(np.int8)
         lead -= (label == own).view(np.int8)
     return lead
 
 
-def merge(labels: Int[ndarray, "P"], surface: Surface, roughness: float, number: int) -> Int[ndarray, "P"]:
-    """Merge neighbouring regions where the cells of each lie on the plane of both, no rougher than allowed.
-
-    In each round those pairs that are each other's best. Returns labels, some of which no cell has.
-    """
-    sums = region_moments(surface, find_runs(labels), number)
-    pairs = _neighbours(labels, surface.shape[1] + 1, number)
-    now = np.arange(number)
-    for _ in range(MAX_MERGES):
-        cost = _union_roughness(sums, pairs, surface.weight)
-        fits = cost <= roughness
-        first, second = _best_of_both(pairs[:, fits], cost[fits], number)
-        if len(first) == 0:
-            break
-        sums[:, first] += sums[:, second]
-        into = np.arange(number)
-        into[second] = first
-        now, pairs = into[now], _once(into[pairs], number)
-    return np.append(now, -1)[labels]
-
-
-def _neighbours(labels: Int[ndarray, "P"], stride: int, number: int) -> Int[ndarray, "2 E"]:
-    """Return the pairs of regions that share a side of a cell."""
-    pairs = []
-    for step in (1, stride):
-        here, there = labels[:-step], labels[step:]
-        side = np.flatnonzero((here != there) & (here >= 0) & (there >= 0))
-        pairs.append(np.stack([here[side], there[side]]))
-    return _once(np.concatenate(pairs, 1), number)
-
-
-def _once(pairs: Int[ndarray, "2 N"], number: int) -> Int[ndarray, "2 E"]:
-    """Return each pair of two different labels once, the lower first."""
-    low, high = pairs.min(0), pairs.max(0)
-    return np.stack(np.divmod(np.unique((low * number + high)[low != high]), max(number, 1)))
-
-
-def _union_roughness(sums: Float[ndarray, "12 K"], pairs: Int[ndarray, "2 E"], weight: float) -> Float[ndarray, "E"]:
-    """Return the rougher region's root mean square distance from the plane of both, for each pair [m]."""
-    both = sums[:, pairs[0]] + sums[:, pairs[1]]
-    a, b, c, d = fit_planes(both, None, weight).forms().T
-    worst = np.zeros(pairs.shape[1])
-    for member in pairs:
-        n, x, y, z, xx, xy, yy, xz, yz, zz = sums[:10, member]
-        square = a * a * xx + b * b * yy + c * c * zz + d * d * n
-        square += 2 * (a * b * xy + a * c * xz + b * c * yz + d * (a * x + b * y + c * z))
-        worst = np.maximum(worst, square / n)
-    return np.sqrt(worst)
-
-
-def _best_of_both(pairs: Int[ndarray, "2 E"], cost: Float[ndarray, "E"], number: int) -> Int[ndarray, "2 M"]:
-    """Return the pairs each of which is the cheapest for both of its regions."""
-    dearest_first = np.argsort(-np.tile(cost, 2), kind="stable")
-    best = np.empty(number, np.int64)
-    best[pairs.ravel()[dearest_first]] = dearest_first % max(len(cost), 1)  # the last one stays
-    here = np.arange(len(cost))
-    return pairs[:, (best[pairs[0]] == here) & (best[pairs[1]] == here)]
-
-
-def near(labels: Int[ndarray, "P"], plane: RegionPlanes, surface: Surface, reach: float) -> Int[ndarray, "P"]:
-    """Take the label from cells further than `reach` [m] from their region's plane."""
+def drop_distant(
+    labels: Int[ndarray, "P"], plane: RegionPlanes, surface: Surface, max_distance: float
+) -> Int[ndarray, "P"]:
+    """Remove the label from cells more than `max_distance` [m] from their region's plane."""
     cell = np.flatnonzero(labels >= 0)
-    far = np.abs(distances(surface, cell, plane.forms()[labels[cell]])) > reach
+    is_distant = np.abs(distances(surface, cell, plane.distance_weights()[labels[cell]])) > max_distance
     labels = labels.copy()
-    labels[cell[far]] = -1
+    labels[cell[is_distant]] = -1
     return labels
 
 
-def connected(labels: Int[ndarray, "P"], shape: tuple[int, int], min_cells: float) -> tuple[ndarray, ndarray]:
-    """Label anew (P,) what hangs together and is large enough, and tell which label (K,) it had."""
+def relabel_components(
+    labels: Int[ndarray, "P"], shape: tuple[int, int], min_cells: float
+) -> tuple[Int[ndarray, "P"], Int[ndarray, "K"]]:
+    """Give each connected part of at least `min_cells` a label of its own; return also the label it had."""
     image = labels.reshape(shape[0] + 1, -1)[:-1, :-1]
-    pieces, number = components(*same(image))
+    pieces, number = components(*same_label(image))
     size = np.bincount(pieces.ravel() + 1, minlength=number + 1)
-    large = size >= min_cells
-    large[0] = False
-    was = np.empty(number + 1, np.int64)
-    was[pieces.ravel() + 1] = image.ravel()
-    rank = np.where(large, np.cumsum(large) - 1, -1)
-    return rimmed(rank[pieces + 1], -1).ravel(), was[large]
+    is_large = size >= min_cells
+    is_large[0] = False
+    previous = np.empty(number + 1, np.int64)
+    previous[pieces.ravel() + 1] = image.ravel()
+    rank = np.where(is_large, np.cumsum(is_large) - 1, -1)
+    return pad_cells(rank[pieces + 1], -1).ravel(), previous[is_large]

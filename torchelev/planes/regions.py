@@ -1,4 +1,4 @@
-"""Planar regions and their polygons, and what planners and controllers ask of them."""
+"""Planar regions and their polygons, with the queries of planners and controllers."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A planar region: the plane n . (x - point) = 0 and its polygons on it, all NumPy float64 in the map frame [m].
+    """A planar region: the plane n . (x - point) = 0 and its polygons, NumPy float64 in the map frame [m].
 
-    Polygons do not repeat their first point. Seen from above, those that surround ground are counter-clockwise and
-    those that leave ground out clockwise. They run along the sides of the region's cells; the inset's corners lie half
-    a cell apart. They may touch themselves in a corner where two cells do.
+    Polygons lie on the plane and do not repeat their first point. Seen from above, outer polygons are counter-clockwise
+    and holes clockwise. They run along the sides of the region's cells; corners of the inset are half a cell apart.
+    They may touch themselves at a corner where two cells do.
     """
 
     label: int  #: of its cells in `Planes.labels`
-    normal: Float[ndarray, "3"]  #: unit, up
-    point: Float[ndarray, "3"]  #: on the plane, above the cells' mean x and y
-    boundary: Float[ndarray, "K 3"] = field(repr=False)  #: [m] outer polygon, counter-clockwise, map frame
-    holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  #: [m] polygons inside the boundary, clockwise
-    #: what is left of the region a margin away from its border and holes
+    normal: Float[ndarray, "3"]  #: unit vector, upwards
+    point: Float[ndarray, "3"]  #: [m] on the plane, at the cells' mean x and y
+    boundary: Float[ndarray, "K 3"] = field(repr=False)  #: [m] outer polygon
+    holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  #: [m] polygons inside the boundary
+    #: [m] outer polygons of the part that keeps `PlaneConfig.margin` from boundary and holes
     inset: list[Float[ndarray, "_ 3"]] = field(repr=False)
-    inset_holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  #: what to leave out of the inset
+    inset_holes: list[Float[ndarray, "_ 3"]] = field(repr=False)  #: [m] holes of the inset
     area: float  #: [m^2] of its cells, projected onto x and y
     roughness: float  #: [m] root mean square distance of its cells from the plane
 
     @property
     def bounding_box(self) -> tuple[Float[ndarray, "2"], Float[ndarray, "2"]]:
-        """The lowest and the highest x and y [m]."""
+        """The lowest and the highest x and y [m] of the boundary."""
         return self.boundary[:, :2].min(0), self.boundary[:, :2].max(0)
 
     @property
     def T_map_plane(self) -> Float[ndarray, "4 4"]:
-        """A frame on the plane at `point`: z is the normal, x lies above or below the map's x axis."""
+        """The pose of the plane at `point`: z is the normal, and x has no component along the map's y axis."""
         x = np.array([self.normal[2], 0.0, -self.normal[0]])
         x /= np.linalg.norm(x)
         T = np.eye(4)
@@ -53,24 +53,24 @@ class Region:
         return T
 
     def onto(self, xy: Float[ndarray, "... 2"]) -> Float[ndarray, "... 3"]:
-        """Return the points of the plane above or below x and y [m]."""
+        """Return the points [m] of the plane at x and y."""
         gradient = -self.normal[:2] / self.normal[2]
         z = self.point[2] + (np.asarray(xy, float) - self.point[:2]) @ gradient
         return np.concatenate([xy, z[..., None]], -1)
 
     @cached_property
     def border(self) -> Float[ndarray, "S 2 2"]:
-        """The sides of boundary and holes, in x and y."""
+        """The sides [m] of boundary and holes, in x and y."""
         return polygons.sides([self.boundary, *self.holes])
 
     @cached_property
     def inset_border(self) -> Float[ndarray, "S 2 2"]:
-        """The sides of the inset and its holes, in x and y."""
+        """The sides [m] of the inset and its holes, in x and y."""
         return polygons.sides([*self.inset, *self.inset_holes])
 
 
 class Foothold(NamedTuple):
-    """Where a foot can stand."""
+    """A point where a foot can stand."""
 
     point: Float[ndarray, "3"]  #: [m] map frame, on the region's plane, in its inset
     region: Region  #: the region that carries it
@@ -81,31 +81,38 @@ class Foothold(NamedTuple):
 class Planes:
     """The planar regions of one map."""
 
-    labels: Int[ndarray, "H W"]  #: int32, -1: none
+    labels: Int[ndarray, "H W"]  #: int32, region of each cell; -1: none
     regions: tuple[Region, ...] = field(repr=False)  #: regions[k] has label k
 
     def nearest_foothold(self, xy: Any) -> Foothold | None:
-        """Return the point of the regions' insets that is nearest to (x, y) [m] in x and y; None if there is no inset.
+        """Return the point in any region's inset that is nearest to (x, y), measured in x and y.
 
-        Raises ValueError unless xy is two finite numbers.
+        Args:
+            xy: (2,) or (3,) [m], map frame; z is ignored.
+
+        Returns:
+            The foothold, or None if no region has an inset.
+
+        Raises:
+            ValueError: if `xy` is not two or three finite numbers.
         """
         xy = _as_xy("xy", xy)
-        side, owner = self._insets
+        side, owner = self._inset_sides
         if len(side) == 0:
             return None
-        crossed = np.bincount(owner, polygons.crossings(side, xy), len(self.regions))
-        around = np.flatnonzero(crossed % 2)
-        if len(around):
-            region = self.regions[around[0]]
+        num_crossings = np.bincount(owner, polygons.ray_crosses(side, xy), len(self.regions))
+        containing = np.flatnonzero(num_crossings % 2)
+        if len(containing):
+            region = self.regions[containing[0]]
             return Foothold(region.onto(xy), region, 0.0)
-        closest = polygons.nearest(side, xy)
-        distance = np.hypot(*(closest - xy).T)
+        nearest = polygons.nearest_points(side, xy)
+        distance = np.hypot(*(nearest - xy).T)
         best = int(np.argmin(distance))
         region = self.regions[owner[best]]
-        return Foothold(region.onto(closest[best]), region, float(distance[best]))
+        return Foothold(region.onto(nearest[best]), region, float(distance[best]))
 
     @cached_property
-    def _insets(self) -> tuple[ndarray, ndarray]:
+    def _inset_sides(self) -> tuple[ndarray, ndarray]:
         """The sides of all insets, and the label of each."""
         side = [region.inset_border for region in self.regions]
         owner = np.repeat(np.arange(len(side)), [len(s) for s in side])
@@ -113,29 +120,38 @@ class Planes:
 
 
 def convex_region(region: Region, foothold_xy: Any, margin: float = 0.0) -> Float[ndarray, "V 3"]:
-    """Return a convex polygon on the region's plane around a foothold, inside its boundary and free of its holes.
+    """Return a convex polygon on the region's plane around a foothold, inside its boundary and clear of its holes.
 
-    A circle grows around the foothold; where it touches the border, the tangent becomes a side, and what lies behind
-    it no longer counts, until no border is left in front. So each side touches the border, or stays `margin` [m] away
-    from where it would. Counter-clockwise from above, the first point not repeated, map frame [m].
+    A circle grows around the foothold. Where it touches the border, the tangent becomes a side of the polygon, and the
+    border behind it no longer counts, until no border is left. So each side touches the border, or keeps `margin` from
+    the tangent.
 
-    Raises ValueError unless the foothold lies in the region and further than the margin from its border; what
-    `nearest_foothold` returns does, for a margin below that of the inset.
+    Args:
+        region: contains the foothold.
+        foothold_xy: (2,) or (3,) [m], map frame; z is ignored. What `nearest_foothold` returns is valid for margins
+            below that of the inset.
+        margin: [m] between the polygon and the border.
+
+    Returns:
+        (V, 3) [m], map frame, counter-clockwise from above, without repeating the first point.
+
+    Raises:
+        ValueError: if the foothold is outside the region or within the margin of its border, or the margin is negative.
     """
     xy = _as_xy("foothold_xy", foothold_xy)
     require(0 <= margin < math.inf, "margin", "must not be negative", margin, "give 0 for none")
-    distance = np.hypot(*(polygons.nearest(region.border, xy) - xy).T).min()
-    inside = polygons.crossings(region.border, xy).sum() % 2 == 1
-    free = inside and distance > max(margin, 1e-6)
-    actual = f"{tuple(xy.tolist())}, {distance:.3g} m {'inside' if inside else 'outside'}"
+    distance = np.hypot(*(polygons.nearest_points(region.border, xy) - xy).T).min()
+    is_inside = polygons.ray_crosses(region.border, xy).sum() % 2 == 1
+    is_free = is_inside and distance > max(margin, 1e-6)
+    actual = f"{tuple(xy.tolist())}, {distance:.3g} m {'inside' if is_inside else 'outside'}"
     rule = f"must lie in the region, more than {margin:g} m from its border"
-    require(free, "foothold_xy", rule, actual, "take the x and y of nearest_foothold, or a smaller margin")
+    require(is_free, "foothold_xy", rule, actual, "take the x and y of nearest_foothold, or a smaller margin")
     return region.onto(polygons.free_polygon(region.border, xy, margin))
 
 
 def _as_xy(name: str, xy: Any) -> Float[ndarray, "2"]:
     point = np.asarray(xy.detach().cpu() if isinstance(xy, Tensor) else xy, np.float64)
     point = point[:2] if point.shape == (3,) else point  # a foothold's own point
-    good = point.shape == (2,) and bool(np.isfinite(point).all())
-    require(good, name, "must be two finite numbers, x and y [m]", xy, "give (x, y) in the map frame")
+    is_valid = point.shape == (2,) and bool(np.isfinite(point).all())
+    require(is_valid, name, "must be two finite numbers, x and y [m]", xy, "give (x, y) in the map frame")
     return point

@@ -73,14 +73,25 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
     mu, mv, mz = n_u * w, n_v * w, s_z * w
     uu, uv, vv = n_uu * w - mu * mu, n_uv * w - mu * mv, n_vv * w - mv * mv
     uz, vz, zz = s_uz * w - mu * mz, s_vz * w - mv * mz, s_zz * w - mz * mz
-    det, trace = uu * vv - uv * uv, uu + vv
-    is_regular = det > 1e-4
-    # Both are far above these limits, or zero but for rounding.
-    safe_det, safe_trace = det.clamp(min=1e-4), trace.clamp(min=1e-2)
-    gu = torch.where(is_regular, (vv * uz - uv * vz) / safe_det, uz / safe_trace)
-    gv = torch.where(is_regular, (uu * vz - uv * uz) / safe_det, vz / safe_trace)
+    gu, gv = solve_gradient(uu, uv, vv, uz, vz)
     residual = (zz - gu * uz - gv * vz).clamp(min=0)
     return Plane(spans_plane(uu, uv, vv, radius), gu / resolution, gv / resolution, residual)
+
+
+def solve_gradient(
+    uu: Tensor, uv: Tensor, vv: Tensor, uz: Tensor, vz: Tensor, min_det: float = 1e-4, min_trace: float = 1e-2
+) -> tuple[Tensor, Tensor]:
+    """Solve [uu uv; uv vv] (g_u, g_v) = (uz, vz), given the covariances of cells' places and heights.
+
+    Cells on a line, whose determinant is below `min_det`, have their gradient along it.
+    """
+    det, trace = uu * vv - uv * uv, uu + vv
+    is_regular = det > min_det
+    # Both are far above these limits, or zero but for rounding.
+    safe_det, safe_trace = det.clamp(min=min_det), trace.clamp(min=min_trace)
+    gu = torch.where(is_regular, (vv * uz - uv * vz) / safe_det, uz / safe_trace)
+    gv = torch.where(is_regular, (uu * vz - uv * uz) / safe_det, vz / safe_trace)
+    return gu, gv
 
 
 @stored

@@ -1,1 +1,1 @@
-"""Pictures of maps: panels of layers, and the live view."""
+"""Pictures of map layers: panels with axes, and images whose pixels are cells. Reports are in `torchelev.app`."""

@@ -1,7 +1,7 @@
-"""Draw map layers as a picture: panels side by side, metres on the axes, grey where nothing is known.
+"""Map layers as panels side by side: metres on the axes, unknown cells grey.
 
-Needs matplotlib (``pip install 'torchelev[io]'``). The figure is built on the Agg canvas itself, so that drawing
-never opens a window and never changes the backend of the program that calls it.
+Needs matplotlib (``pip install 'torchelev[io]'``). Figures use the Agg canvas directly, so that drawing neither opens a
+window nor changes the calling program's backend.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from PIL.PngImagePlugin import PngInfo
 from torchelev.output_files import MARK, atomic_file
 
 UNKNOWN_COLOR = "#d9d9d9"
-MAX_BYTES = 300_000
+MAX_BYTES = 300_000  # of a PNG
 
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
     """One layer to draw.
 
-    `values` is (H, W) as `ElevationMap.layer` gives it (i grows with +x, j with +y), NaN where unknown. Limits left at
-    None follow the values, less the outermost 1 % at either end, so that one stray cell does not bleach the picture.
+    By default the colours span the 1st to the 99th percentile of the values, so that a single outlier does not wash out
+    the picture.
     """
 
     title: str  #: above the panel
-    values: NDArray  #: (H, W), NaN where unknown
-    unit: str = ""  #: beside the colour bar
-    cmap: str = "viridis"  #: Matplotlib's name of the colours
-    vmin: float | None = None  #: value of the lowest colour; None: the lowest value
-    vmax: float | None = None  #: value of the highest colour; None: the highest value
+    values: NDArray  #: (H, W), as from `ElevationMap.layer`: i grows with +x, j with +y, NaN where unknown
+    unit: str = ""  #: of the values, beside the colour bar
+    cmap: str = "viridis"  #: name of a matplotlib colour map
+    vmin: float | None = None  #: value of the lowest colour; None: the 1st percentile
+    vmax: float | None = None  #: value of the highest colour; None: the 99th percentile
 
 
 def save_layers(
@@ -50,10 +50,17 @@ def save_layers(
     path_xy: NDArray | None = None,
     title: str | None = None,
 ) -> None:
-    """Write `panels` into one PNG, x to the right and y up, as on paper.
+    """Write panels as one PNG, x to the right and y up.
 
-    `extent` is (x_min, x_max, y_min, y_max) [m], the outer borders of the map in the map frame. `path_xy` (T, 2) [m] is
-    drawn over every panel, its last point as a dot. Raises ValueError if there is no panel or one is not 2-D.
+    Args:
+        path: of the file.
+        panels: at least one.
+        extent: (x_min, x_max, y_min, y_max) [m], the map's borders in the map frame.
+        path_xy: (T, 2) [m] a path to draw over every panel, its last point as a dot.
+        title: above all panels.
+
+    Raises:
+        ValueError: if there is no panel, or a panel's values are not (H, W).
     """
     figure = draw_layers(panels, extent=extent, path_xy=path_xy, title=title)
     with atomic_file(path) as file:
@@ -67,9 +74,9 @@ def draw_layers(
     path_xy: NDArray | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Draw what `save_layers` writes and return the matplotlib figure. Arguments as there."""
+    """Return what `save_layers` writes as a matplotlib figure. Arguments and errors as there."""
     _check_panels(panels)
-    rows, columns = _tidy_grid(len(panels))
+    rows, columns = _arrange(len(panels))
     width, height = _panel_size(extent)
     figure = Figure(figsize=(columns * width, rows * height + (0.4 if title else 0.0)), layout="compressed")
     FigureCanvasAgg(figure)
@@ -92,8 +99,8 @@ def _check_panels(panels: Sequence[Panel]) -> None:
             raise ValueError(f"panel '{panel.title}': expected values (H, W), got {np.shape(panel.values)}")
 
 
-def _tidy_grid(count: int) -> tuple[int, int]:
-    """Rows and columns for `count` panels: one row up to three, then as wide as three or four."""
+def _arrange(count: int) -> tuple[int, int]:
+    """Return rows and columns for panels: one row up to three panels, then two to four columns."""
     if count <= 3:
         return 1, count
     columns = 4 if count % 4 == 0 and count > 4 else 3 if count > 4 else 2
@@ -101,18 +108,18 @@ def _tidy_grid(count: int) -> tuple[int, int]:
 
 
 def _panel_size(extent: tuple[float, float, float, float]) -> tuple[float, float]:
-    """Inches for one panel with its colour bar, in the shape of the map but never a thread."""
+    """Return width and height [inches] of a panel with its colour bar, in the map's aspect ratio within limits."""
     x_min, x_max, y_min, y_max = extent
-    shape = (y_max - y_min) / (x_max - x_min)
-    shape = min(max(shape, 0.35), 2.5)
-    return 3.2 / max(1.0, shape**0.5) + 1.0, 3.3 * shape / max(1.0, shape**0.5) + 0.75
+    aspect = (y_max - y_min) / (x_max - x_min)
+    aspect = min(max(aspect, 0.35), 2.5)
+    return 3.2 / max(1.0, aspect**0.5) + 1.0, 3.3 * aspect / max(1.0, aspect**0.5) + 0.75
 
 
 def _draw_panel(figure: Figure, ax: Axes, panel: Panel, extent, path_xy: NDArray | None) -> None:
     values = np.ma.masked_invalid(np.asarray(panel.values, dtype=float))
-    vmin, vmax = limits(panel, values)
+    vmin, vmax = color_limits(panel, values)
     ax.set_facecolor(UNKNOWN_COLOR)
-    # imshow takes rows downwards; the map's first index is x. Transposed and with its origin below, x runs right, y up.
+    # The map's first index is x, imshow's runs down: transposed and with the origin below, x runs right and y up.
     image = ax.imshow(
         values.T, origin="lower", extent=extent, cmap=panel.cmap, vmin=vmin, vmax=vmax, interpolation="nearest"
     )
@@ -123,8 +130,8 @@ def _draw_panel(figure: Figure, ax: Axes, panel: Panel, extent, path_xy: NDArray
     bar.set_label(f"[{panel.unit}]" if panel.unit else "")
 
 
-def limits(panel: Panel, values: np.ma.MaskedArray) -> tuple[float, float]:
-    """Return a panel's limits, those that it leaves open from its values."""
+def color_limits(panel: Panel, values: np.ma.MaskedArray) -> tuple[float, float]:
+    """Return the values of a panel's lowest and highest colour, by default percentiles of its values."""
     known = values.compressed()
     low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
     vmin = float(low) if panel.vmin is None else panel.vmin
@@ -148,14 +155,14 @@ def _label_outer(axes, columns: int) -> None:
 
 
 def png_info() -> PngInfo:
-    """Return the entry that tells whose picture a PNG is."""
+    """Return a PNG's metadata, which names this library."""
     info = PngInfo()
     info.add_text("Software", MARK)
     return info
 
 
 def _small_png(figure: Figure) -> bytes:
-    """PNG below `MAX_BYTES`: in full colour if that fits, else with a palette (bands in the bars), then coarser."""
+    """Return a PNG below `MAX_BYTES`: in full colour if that fits, else with a palette, then at lower resolutions."""
     for dpi, colors in ((110, None), (90, None), (100, 256), (75, 256), (55, 256)):
         raw, small = io.BytesIO(), io.BytesIO()
         figure.savefig(raw, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.1)

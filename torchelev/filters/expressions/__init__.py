@@ -1,1 +1,1 @@
-"""The expression language of the filter chain: arithmetic over layers."""
+"""New layers from formulas over layers: the language's parser and its operations."""

@@ -1,1 +1,1 @@
-"""Filling holes: by harmonic interpolation, by the nearest or lowest neighbours, or with OpenCV."""
+"""Filters that fill holes. What a height scan fills is in `torchelev.observations.fill`."""

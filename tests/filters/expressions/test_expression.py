@@ -1,4 +1,4 @@
-"""Layers from formulas."""
+"""Formulas over layers, against NumPy and by hand."""
 
 import copy
 import math
@@ -14,6 +14,7 @@ from torchelev.filters.expressions.expression import Expression, expression
 from torchelev.filters.registry import FILTERS, Filter
 
 SEEDS = st.integers(0, 10_000)
+
 
 # Formulas over a, b and c within -2 and 2, and what NumPy makes of them: NaN or inf stand for unknown.
 FORMULAS = {
@@ -170,8 +171,6 @@ def test_gradients_are_finite_where_functions_have_none(formula, dtype):
     assert not gradient[~known].any() and known.any()
 
 
-# Refusals -------------------------------------------------------------------------------------------------------------
-
 BAD = {
     "": "must be text",
     "  ": "must be text",
@@ -221,10 +220,10 @@ BAD = {
     "a = b": "cannot be read",
     "a\0": "cannot be read",
     "a" * 2000: "must have at most 1000 characters",
-    "-" * 900 + "a": "must hold at most 100 operations|cannot be read",
+    "-" * 900 + "a": "must nest at most 100 operations|cannot be read",
     "not " * 240 + "a": "must not hold|cannot be read",
     "(" * 400 + "a" + ")" * 400: "cannot be read",
-    "+".join("a" * 400): "must hold at most 100 operations",
+    "+".join("a" * 400): "must nest at most 100 operations",
 }
 
 
@@ -265,9 +264,6 @@ def test_refuses_layers_that_do_not_fit():
     layers["b"] = tuple(v[:, 1:] for v in layers["b"])
     with pytest.raises(ValueError, match="one shape"):
         Expression("a + b")(layers)
-
-
-# As an object ---------------------------------------------------------------------------------------------------------
 
 
 def test_copies_and_prints():

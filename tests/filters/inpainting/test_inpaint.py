@@ -1,4 +1,4 @@
-"""In-painting: minimum, nearest, diffusion, OpenCV's two, and another layer."""
+"""Every in-painting filter against loops, by hand, and what they share."""
 
 import math
 
@@ -19,8 +19,16 @@ from tests.filters.filter_cases import (
     random_layer,
     resolution_spread,
 )
+from tests.filters.inpainting.references import (
+    EIGHT,
+    around,
+    assert_filled,
+    diffusion_reference,
+    minimum_reference,
+    nearest_reference,
+)
 from torchelev import filters
-from torchelev.filters.inpainting.holes import compressed, join, lowest_of_border, nearest_known
+from torchelev.filters.inpainting.holes import nearest_known
 from torchelev.filters.inpainting.inpaint import (
     fill_from,
     inpaint_diffusion,
@@ -31,39 +39,12 @@ from torchelev.filters.inpainting.inpaint import (
 )
 
 FILLING = [inpaint_minimum, inpaint_nearest, inpaint_diffusion]
+
+
 OPENCV = [inpaint_telea, inpaint_navier_stokes]
+
+
 DTYPES = [torch.float64, torch.float32]  # by tensors; by OpenCV
-EIGHT = [(u, v) for u in (-1, 0, 1) for v in (-1, 0, 1) if (u, v) != (0, 0)]
-FOUR = [(0, 1), (1, 0), (0, -1), (-1, 0)]
-
-
-def around(shape, cell, steps):
-    cells = [(cell[0] + u, cell[1] + v) for u, v in steps]
-    return [(u, v) for u, v in cells if 0 <= u < shape[0] and 0 <= v < shape[1]]
-
-
-def holes(known):
-    """The holes of a map (H, W): lists of cells, by a walk from neighbour to neighbour."""
-    found, seen = [], known.copy()
-    for start in np.ndindex(*known.shape):
-        hole, todo = [], [start] if not seen[start] else []
-        while todo:
-            cell = todo.pop()
-            if not seen[cell]:
-                seen[cell] = True
-                hole.append(cell)
-                todo += around(known.shape, cell, EIGHT)
-        found += [hole] if hole else []
-    return found
-
-
-def minimum_reference(values, known):
-    out = np.where(known, values, np.nan)
-    for hole in holes(known):
-        border = [values[c] for cell in hole for c in around(known.shape, cell, EIGHT) if known[c]]
-        for cell in hole if border else []:
-            out[cell] = min(border)
-    return out
 
 
 def minimum_within(values, known, start, steps):
@@ -78,42 +59,7 @@ def minimum_within(values, known, start, steps):
     return lowest
 
 
-def nearest_reference(values, known):
-    out = np.where(known, values, np.nan)
-    cells = np.argwhere(known)  # in the order of i, then j
-    for cell in np.argwhere(~known) if len(cells) else []:
-        out[tuple(cell)] = values[tuple(cells[((cells - cell) ** 2).sum(1).argmin()])]
-    return out
-
-
-def diffusion_reference(values, known):
-    """The linear system, dense."""
-    unknown = [tuple(cell) for cell in np.argwhere(~known)]
-    if not known.any() or not unknown:
-        return np.where(known, values, np.nan)
-    number = {cell: k for k, cell in enumerate(unknown)}
-    A, right = np.zeros((len(unknown),) * 2), np.zeros(len(unknown))
-    for cell, k in number.items():
-        for other in around(known.shape, cell, FOUR):
-            A[k, k] += 1
-            if known[other]:
-                right[k] += values[other]
-            else:
-                A[k, number[other]] -= 1
-    out = np.where(known, values, 0.0)
-    for cell, height in zip(unknown, np.linalg.solve(A, right), strict=True):
-        out[cell] = height
-    return out
-
-
 REFERENCES = dict(zip(FILLING, [minimum_reference, nearest_reference, diffusion_reference], strict=True))
-
-
-def assert_filled(got, layer, reference, atol=0.0):
-    values, known = (part.numpy() for part in layer)
-    expected = np.stack([reference(v, k) for v, k in zip(values, known, strict=True)])
-    np.testing.assert_array_equal(got[1].numpy(), ~np.isnan(expected))
-    np.testing.assert_allclose(got[0].numpy(), np.nan_to_num(expected), atol=atol, rtol=0)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -155,80 +101,6 @@ def test_minimum_by_hand(dtype):
     assert torch.equal(near, expected)
 
 
-def spiral(size):
-    """A corridor one cell wide that winds to the middle between walls: the hole with the longest way through it."""
-    known = np.ones((size, size), bool)
-    i, j, (u, v), turned = 0, 0, (0, 1), 0
-    while turned < 2:
-        known[i, j] = False
-        ahead, beyond = (i + u, j + v), (i + 2 * u, j + 2 * v)
-        blocked = not (0 <= ahead[0] < size and 0 <= ahead[1] < size)
-        if not blocked and 0 <= beyond[0] < size and 0 <= beyond[1] < size:
-            blocked = not known[beyond]
-        if blocked:
-            u, v, turned = v, -u, turned + 1
-        else:
-            i, j, turned = *ahead, 0
-    return known
-
-
-@pytest.fixture(params=[True, False])
-def stops(request, monkeypatch):
-    """As a CPU does, and as a device whose host may not wait."""
-    monkeypatch.setattr("torchelev.filters.inpainting.holes._stops", lambda device: request.param)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("mirror", [[], [0], [1], [0, 1]])
-def test_the_border_of_a_spiral_is_all_of_it_whatever_its_direction(mirror, dtype, stops):
-    """The lowest wall is at its inner end, or outside of its outer one."""
-    known = torch.from_numpy(spiral(41)).flip(mirror)
-    assert len(holes(known.numpy())) == 1 and 600 < (~known).sum() < 1200
-    for cell in (known.nonzero()[0], known.nonzero()[len(known.nonzero()) // 2]):
-        heights = torch.where(known, 1.0, 0.0).to(dtype)
-        heights[tuple(cell)] = 0.5
-        filled, _ = inpaint_minimum((heights[None], known[None]))
-        assert (filled[0][~known] == 0.5).all()
-
-
-@given(SEEDS, st.integers(1, 60), st.floats(0.1, 1.5))
-def test_parts_of_graphs(seed, count, edges):
-    """Any graph, of which maps make few: each node gets the lowest that is connected to it."""
-    rng = np.random.default_rng(seed)
-    a, b = torch.from_numpy(rng.integers(0, count, (2, int(edges * count))))
-    reach = np.eye(count, dtype=int)
-    reach[a, b] = reach[b, a] = 1
-    connected = np.linalg.matrix_power(reach.astype(float), count) > 0
-    assert join(a, b, count).tolist() == connected.argmax(1).tolist()
-
-
-@pytest.mark.parametrize("order", ["up", "down", "star", "random"])
-def test_parts_of_the_worst_graphs_within_all_steps(order, monkeypatch):
-    """A chain in any order, and a star whose middle is the highest: the rounds suffice that never stop early."""
-    monkeypatch.setattr("torchelev.filters.inpainting.holes._stops", lambda device: False)
-    nodes = {"up": torch.arange(1000), "down": torch.arange(1000).flip(0)}.get(order)
-    nodes = torch.randperm(1000, generator=torch.Generator().manual_seed(0)) if nodes is None else nodes
-    a, b = (torch.arange(999), torch.full((999,), 999)) if order == "star" else (nodes[1:], nodes[:-1])
-    assert (join(a, b, 1000) == 0).all()
-
-
-def test_a_chain_is_followed_to_its_end(stops):
-    assert (compressed(torch.arange(-1, 999).clamp(min=0)) == 0).all()
-
-
-def test_of_equally_low_border_cells_the_first_is_taken(stops):
-    known = torch.tensor([[[True, True, True, True], [True, False, False, True], [True, True, True, True]]])
-    heights = torch.tensor([[[2.0, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]])
-    assert lowest_of_border(heights, known)[0, 1].tolist() == [4, 1, 1, 7]
-
-
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.6, 0.9, 1.0])
-def test_all_steps_give_the_same_as_stopping(share, stops):
-    layer = random_layer(3, (2, 13, 11), share)
-    assert_filled(inpaint_minimum(layer), layer, minimum_reference)
-    assert_filled(inpaint_nearest(layer), layer, nearest_reference)
-
-
 @given(SEEDS, SHAPES, SHARES)
 def test_nearest_is_exact_and_ties_go_to_the_first(seed, shape, share):
     layer = random_layer(seed, shape, share)
@@ -263,31 +135,6 @@ def test_diffusion_solves_its_equations(seed, shape, share):
     layer = random_layer(seed, shape, share)
     got = inpaint_diffusion(layer, tolerance=1e-9, iterations=100)
     assert_filled(got, layer, diffusion_reference, 1e-8)
-
-
-LARGE = {
-    "few": lambda i, j, random: random < 0.002,
-    "speckled": lambda i, j, random: random < 0.3,
-    "frame": lambda i, j, random: (i == 0) | (i == 39) | (j == 0) | (j == 35),
-    "one side": lambda i, j, random: i == 0,
-    "corridors": lambda i, j, random: ((j % 5 == 0) & (random < 0.9)) | ((i == 7) & (j == 7)),
-    "a shadow": lambda i, j, random: (abs(i - 20) > 9) | (abs(j - 15) > 12),
-}
-
-
-@pytest.mark.parametrize("case", LARGE)
-@pytest.mark.parametrize("dtype, altitude", [(torch.float64, 0.0), (torch.float32, 300.0)])
-def test_diffusion_is_right_to_its_tolerance(case, dtype, altitude):
-    """At the default tolerance of 1 mm, whatever the shape of the holes, within the default number of steps."""
-    i, j = np.meshgrid(np.arange(40), np.arange(36), indexing="ij")
-    rng = np.random.default_rng(1)
-    known = LARGE[case](i, j, rng.random((40, 36)))
-    heights = altitude + 0.03 * i + 0.5 * (j > i) + rng.normal(0, 0.05, known.shape)
-    layer = torch.from_numpy(heights)[None].to(dtype), torch.from_numpy(known)[None]
-    got, found = inpaint_diffusion(layer)
-    error = np.abs(got[0].double().numpy() - diffusion_reference(layer[0][0].double().numpy(), known))
-    assert error.max() < 1e-3 and found.all() and 0 < known.sum() < known.size
-    assert inpaint_diffusion(layer, iterations=1)[0].sub(got).abs().max() > 0 or error[~known].max() < 1e-9
 
 
 @given(SEEDS, st.sampled_from([0.1, 0.5, 0.9]), st.sampled_from(FILLING))
@@ -446,25 +293,6 @@ def test_never_waits():
         assert_never_waits(function)
     assert_never_waits(lambda layer: inpaint_minimum(layer, iterations=3))
     assert_never_waits(fill_from, 2)
-
-
-def test_diffusion_of_a_map_does_not_depend_on_the_others():
-    """The easy one stands still while the hard one goes on."""
-    i, j = np.meshgrid(np.arange(40), np.arange(36), indexing="ij")
-    random = np.random.default_rng(1).random((40, 36))
-    known = torch.from_numpy(np.stack([LARGE[case](i, j, random) for case in ("a shadow", "few", "one side")]))
-    heights = torch.from_numpy(np.stack([0.3 * np.sin(0.3 * i) * np.cos(0.2 * j)] * 3))
-    assert_batch_is_single(lambda layer: inpaint_diffusion(layer, tolerance=0.01), (heights, known), atol=1e-12)
-
-
-def test_gradient_of_diffusion_grows_with_what_comes_in():
-    values, known = random_layer(3, (2, 6, 5), 0.4)
-    values = torch.where(known, values, 0.0).requires_grad_()
-    filled, _ = inpaint_diffusion((values, known), tolerance=1e-9)
-    (one,) = torch.autograd.grad(filled.sum(), values, retain_graph=True)
-    (many,) = torch.autograd.grad(1000 * filled.sum(), values)
-    torch.testing.assert_close(many, 1000 * one, atol=1e-4, rtol=0)
-    assert one.sum() == pytest.approx(60, abs=1e-6)  # all cells rise with all known ones
 
 
 @pytest.mark.parametrize("shape", [(2, 0, 5), (2, 5, 0)])
