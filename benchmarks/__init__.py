@@ -1,4 +1,4 @@
-"""Measurements of speed and quality, one command each. All write to `benchmarks/results`; no test or training needs them."""
+"""Measurements of speed and quality, one command each, with their results in `benchmarks/results`."""
 
 from pathlib import Path
 

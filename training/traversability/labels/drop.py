@@ -43,7 +43,7 @@ MODEL = """
 class Posture(NamedTuple):
     """A robot before it is let go, in the tile's frame."""
 
-    position: Float[Tensor, "3"]  # [m] the middle of the body's belly
+    position: Float[Tensor, 3]  # [m] the middle of the body's belly
     rotation: Float[Tensor, "3 3"]
     balls: Float[Tensor, "4 3"]  # [m] the feet's middles
 
@@ -63,7 +63,7 @@ class Outcome(NamedTuple):
 
 def rest_heights(
     field: HeightField, tile: int, xy: Float[Tensor, "P 2"], radius: float, points: int = 10
-) -> Float[Tensor, "P"]:
+) -> Float[Tensor, P]:
     """Return the heights [m] of the middles of balls that touch the ground from above at places xy [m]."""
     k = torch.arange(-points, points + 1) / points
     around = torch.cartesian_prod(k, k)

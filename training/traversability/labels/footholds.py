@@ -63,7 +63,7 @@ class Lattice(NamedTuple):
         return torch.add((y / SPACING).round_(), (x / SPACING).round_(), alpha=W).sub_(i * W + j).int()
 
 
-def read(values: Float[Tensor, "N"], node: Int[Tensor, "*M"]) -> Float[Tensor, "*M"]:
+def read(values: Float[Tensor, N], node: Int[Tensor, "*M"]) -> Float[Tensor, "*M"]:
     """Return values of nodes."""
     return values.index_select(0, node.flatten()).view(node.shape)
 
@@ -81,10 +81,10 @@ def lattice_around(xy: Float[Tensor, "M 2"], margin: float) -> Lattice:
 class Sole(NamedTuple):
     """The ground under a foot at each of N places, as far as it carries."""
 
-    support: Float[Tensor, "N"]  # share of the foot's area
+    support: Float[Tensor, N]  # share of the foot's area
     gradient: Float[Tensor, "2 N"]  # of the plane
-    roughness: Float[Tensor, "N"]  # [m]
-    height: Float[Tensor, "N"]  # [m] of the plane below the foot's middle
+    roughness: Float[Tensor, N]  # [m]
+    height: Float[Tensor, N]  # [m] of the plane below the foot's middle
 
 
 def sole(z: Float[Tensor, "13 N"], points: Float[Tensor, "13 2"], tolerance: float) -> Sole:
@@ -110,7 +110,7 @@ def sole(z: Float[Tensor, "13 N"], points: Float[Tensor, "13 2"], tolerance: flo
     return Sole(n / len(z), -torch.stack([gx, gy]), residual.clamp(min=0).sqrt(), height)
 
 
-def enough_support(ground: Sole) -> Bool[Tensor, "N"]:
+def enough_support(ground: Sole) -> Bool[Tensor, N]:
     """Tell where enough of the foot stands on something: support >= 0.75.
 
     What lies deeper below the highest point than a foot spans on the steepest ground, 2 r tan(max_slope), carries
@@ -119,12 +119,12 @@ def enough_support(ground: Sole) -> Bool[Tensor, "N"]:
     return ground.support >= SUPPORT
 
 
-def gentle_sole(ground: Sole, robot: RobotConfig) -> Bool[Tensor, "N"]:
+def gentle_sole(ground: Sole, robot: RobotConfig) -> Bool[Tensor, N]:
     """Tell where a foot does not slide: |gradient| <= tan(max_slope), so that this limit is one of friction too."""
     return ground.gradient.square().sum(0) <= math.tan(robot.max_slope) ** 2
 
 
-def smooth_sole(ground: Sole, robot: RobotConfig) -> Bool[Tensor, "N"]:
+def smooth_sole(ground: Sole, robot: RobotConfig) -> Bool[Tensor, N]:
     """Tell where a foot does not rest on bumps: roughness <= r / 6, what a ball of radius r evens out.
 
     Over its disc the ball's own underside has a standard deviation of 0.24 r around its mean.
@@ -132,7 +132,7 @@ def smooth_sole(ground: Sole, robot: RobotConfig) -> Bool[Tensor, "N"]:
     return ground.roughness <= ROUGHNESS * robot.foot_radius
 
 
-def carrying(z: Float[Tensor, "13 N"], robot: RobotConfig) -> tuple[Bool[Tensor, "N"], Sole]:
+def carrying(z: Float[Tensor, "13 N"], robot: RobotConfig) -> tuple[Bool[Tensor, N], Sole]:
     """Return where the ground under feet carries them, and what it is like."""
     tolerance = 2 * robot.foot_radius * math.tan(robot.max_slope) + 1e-6
     ground = sole(z, disc(robot.foot_radius).to(z), tolerance)
@@ -143,7 +143,7 @@ class Footholds(NamedTuple):
     """The two soles that a foot may take instead of each of N nominal ones: the nearest, then the other level's."""
 
     sole: Float[Tensor, "N 2 5"]  # x, y, z [m] in the tile's frame, dz/dx, dz/dy
-    levels: Int[Tensor, "N"]  # how many of the two there are: 0, 1 or 2
+    levels: Int[Tensor, N]  # how many of the two there are: 0, 1 or 2
 
 
 def footholds(field: HeightField, tile: int, lattice: Lattice, robot: RobotConfig) -> Footholds:
@@ -160,7 +160,7 @@ def footholds(field: HeightField, tile: int, lattice: Lattice, robot: RobotConfi
     return Footholds(table[chosen], levels)
 
 
-def within_reach(height: Float[Tensor, "H W"], reach: int, span: float) -> tuple[Int[Tensor, "N 2"], Int[Tensor, "N"]]:
+def within_reach(height: Float[Tensor, "H W"], reach: int, span: float) -> tuple[Int[Tensor, "N 2"], Int[Tensor, N]]:
     """Return the nodes that feet may take, and how many, for each node that has a rim of `reach` nodes.
 
     `height` [m] is -inf where ground does not carry. A level is all good ground within reach at most `span` [m] below

@@ -31,7 +31,7 @@ CHUNK = 2**14  # stances at once, so that they stay in the processor's cache
 
 def stand(
     field: HeightField,
-    tile_ids: Int[Tensor, "B"],
+    tile_ids: Int[Tensor, B],
     xy: Float[Tensor, "B M 2"],
     robots: Sequence[RobotConfig],
     headings: int = 8,
@@ -55,7 +55,7 @@ def stand(
 
 def verdicts(
     field: HeightField,
-    tile_ids: Int[Tensor, "B"],
+    tile_ids: Int[Tensor, B],
     xy: Float[Tensor, "B M 2"],
     robots: Sequence[RobotConfig],
     headings: int = 8,

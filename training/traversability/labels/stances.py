@@ -46,14 +46,14 @@ class Ground(NamedTuple):
 
     lattice: Lattice
     feet: Footholds
-    line: Float[Tensor, "N"]  # [m] highest ground around a point of a line from foot to foot
-    body: Float[Tensor, "N"]  # [m] highest ground around a point under the body
+    line: Float[Tensor, N]  # [m] highest ground around a point of a line from foot to foot
+    body: Float[Tensor, N]  # [m] highest ground around a point under the body
 
 
 class Stances(NamedTuple):
     """N stances, of those that a robot tried the one that failed last."""
 
-    verdict: Int[Tensor, "N"]  # a number in VERDICTS
+    verdict: Int[Tensor, N]  # a number in VERDICTS
     feet: Float[Tensor, "N 4 3"]  # [m] tile frame, the footholds; where the verdict is "stands"
 
 
@@ -74,7 +74,7 @@ def ground_around(field: HeightField, tile: int, xy: Float[Tensor, "M 2"], robot
     return Ground(lattice, footholds(field, tile, lattice, robot), line, body)
 
 
-def corners(xy: Float[Tensor, "N 2"], theta: Float[Tensor, "N"], robot: RobotConfig) -> Float[Tensor, "N 4 2"]:
+def corners(xy: Float[Tensor, "N 2"], theta: Float[Tensor, N], robot: RobotConfig) -> Float[Tensor, "N 4 2"]:
     """Return the feet's nominal places [m], in the order of CORNERS."""
     points = xy.new_tensor(CORNERS) * xy.new_tensor([robot.length / 2, robot.width / 2])
     return _turned(xy, theta, points).permute(2, 1, 0)
@@ -86,7 +86,7 @@ def _turned(xy: Tensor, theta: Tensor, points: Tensor) -> Tensor:
     return torch.stack([x * cos - y * sin + xy[:, 0], x * sin + y * cos + xy[:, 1]])
 
 
-def stances(ground: Ground, xy: Float[Tensor, "N 2"], theta: Float[Tensor, "N"], robot: RobotConfig) -> Stances:
+def stances(ground: Ground, xy: Float[Tensor, "N 2"], theta: Float[Tensor, N], robot: RobotConfig) -> Stances:
     """Let robots try their footholds at places xy [m] and headings theta [rad], until a choice stands."""
     nominal = corners(xy, theta, robot)
     node = ground.lattice.node(*nominal.unbind(-1))
@@ -124,12 +124,12 @@ def plane_through(feet: Float[Tensor, "N 4 3"]) -> StancePlane:
     return StancePlane(middle.t(), torch.stack([(yy * xz - xy * yz) / det, (xx * yz - xy * xz) / det]))
 
 
-def gentle(plane: StancePlane, robot: RobotConfig) -> Bool[Tensor, "N"]:
+def gentle(plane: StancePlane, robot: RobotConfig) -> Bool[Tensor, N]:
     """Tell which bodies are not too steep: atan |gradient of the plane through the feet| <= max_slope."""
     return plane.gradient.square().sum(0) <= math.tan(robot.max_slope) ** 2
 
 
-def low_steps(ground: Ground, soles: Float[Tensor, "N 4 5"], robot: RobotConfig) -> Bool[Tensor, "N"]:
+def low_steps(ground: Ground, soles: Float[Tensor, "N 4 5"], robot: RobotConfig) -> Bool[Tensor, N]:
     """Tell which stances have no step above step_height between neighbouring feet.
 
     h_0 to h_K is the ground along the line from the lower foot to the higher one, m_k = max(h_0, ... h_k). The step is
@@ -143,7 +143,7 @@ def low_steps(ground: Ground, soles: Float[Tensor, "N 4 5"], robot: RobotConfig)
     return low
 
 
-def highest_step(ground: Ground, a: Float[Tensor, "5 N"], b: Float[Tensor, "5 N"], points: int) -> Float[Tensor, "N"]:
+def highest_step(ground: Ground, a: Float[Tensor, "5 N"], b: Float[Tensor, "5 N"], points: int) -> Float[Tensor, N]:
     """Return the highest step [m] on the way from the lower to the higher of two soles."""
     swap = a[2] > b[2]
     (x, y, low, *_), (end_x, end_y, high, *_) = torch.where(swap, b, a), torch.where(swap, a, b)
@@ -157,8 +157,8 @@ def highest_step(ground: Ground, a: Float[Tensor, "5 N"], b: Float[Tensor, "5 N"
 
 
 def clear(
-    ground: Ground, plane: StancePlane, xy: Float[Tensor, "N 2"], theta: Float[Tensor, "N"], robot: RobotConfig
-) -> Bool[Tensor, "N"]:
+    ground: Ground, plane: StancePlane, xy: Float[Tensor, "N 2"], theta: Float[Tensor, N], robot: RobotConfig
+) -> Bool[Tensor, N]:
     """Tell which bodies are clear of the ground: max over the body's rectangle of z - plane <= clearance.
 
     The rectangle is read at points about 8 cm apart, each for the ground around it, and so up to 3 cm too wide.

@@ -1,36 +1,36 @@
-"""Ground that goes on unseen, or ends, behind an edge at x = 0, and the maps of a robot that walks up to it."""
+"""Ground that continues or drops, unseen, behind an edge at x = 0, and the maps of a robot that walks up to it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.sim import DepthCamera, Scene, mount, noisy, walk
+from torchelev.sim import Box, DepthCamera, Scene, mount, noisy, walk
 from torchelev.sim.exact.scenes import block
 
 GRID = GridConfig(resolution=0.04, length_x=12.0, length_y=4.0)
 CAMERA, T_BASE_CAMERA = DepthCamera(max_range=8.0), mount(pitch_deg=30.0)
 DT, SPEED = 0.2, 0.5  # [s], [m/s]
 FROM, TO = -2.8, -0.6  # [m] of the walk along x
-VIEWS = (2.4, 2.0, 1.6, 1.2, 0.8)  # [m] from robot to edge where the map is looked at
+VIEWS = (2.4, 2.0, 1.6, 1.2, 0.8)  # [m] distances from the edge at which the map is used
 
 
 class Case(NamedTuple):
-    """A scene whose edge lies at x = 0, wide enough that there is no way around."""
+    """A scene whose edge lies at x = 0 and leaves no way around."""
 
     kind: str
     scene: Scene
-    goal: float  # [m] x of a place beyond that the robot could walk to, were there no drop
-    safe: bool
+    goal: float  # [m] x of the goal beyond the edge
+    safe: bool  # the ground continues
 
 
 def hump(u: list[float]) -> Case:
-    """Make a hump of 15 to 25 cm, no steeper than 22 degrees; what lies behind its top is in its shadow."""
+    """Return a hump of 15 to 25 cm, at most 22 degrees steep, that hides the ground behind it."""
     height = 0.15 + 0.1 * u[0]
     length = math.pi * height / math.tan(math.radians(15 + 7 * u[1]))  # of a raised cosine
     k = 2 * math.pi / length
@@ -42,7 +42,7 @@ def hump(u: list[float]) -> Case:
 
 
 def brow(u: list[float]) -> Case:
-    """Make level ground that begins to fall by 12 to 20 degrees, 0.4 to 0.8 m down to level ground."""
+    """Return level ground that falls at 12 to 20 degrees by 0.4 to 0.8 m, and is level again."""
     gradient, fall = math.tan(math.radians(12 + 8 * u[0])), 0.4 + 0.4 * u[1]
 
     def terrain(x: Tensor, y: Tensor) -> Tensor:
@@ -52,29 +52,29 @@ def brow(u: list[float]) -> Case:
 
 
 def step_down(u: list[float]) -> Case:
-    """Make a step down of 5 to 10 cm."""
-    return Case("step down", below(0.05 + 0.05 * u[0]), 1.0, True)
+    """Return a step down of 5 to 10 cm."""
+    return Case("step down", _below(0.05 + 0.05 * u[0]), 1.0, True)
 
 
 def trench(u: list[float]) -> Case:
-    """Make a trench 0.5 to 1.2 m wide and 0.8 to 2 m deep; the far side is as high as the near one."""
+    """Return a trench 0.5 to 1.2 m wide and 0.8 to 2 m deep, with sides of the same height."""
     width = 0.5 + 0.7 * u[0]
     beyond = block(width, 9.0, -9.0, 9.0, 0.0)
-    return Case("trench", below(0.8 + 1.2 * u[1], beyond), width + 0.8, False)
+    return Case("trench", _below(0.8 + 1.2 * u[1], beyond), width + 0.8, False)
 
 
 def cliff(u: list[float]) -> Case:
-    """Make a cliff of 0.6 to 2 m; the camera sees the ground at its foot."""
-    return Case("cliff", below(0.6 + 1.4 * u[0]), 1.2, False)
+    """Return a cliff of 0.6 to 2 m; the camera sees the ground at its foot."""
+    return Case("cliff", _below(0.6 + 1.4 * u[0]), 1.2, False)
 
 
 def abyss(u: list[float]) -> Case:
-    """Make a cliff of 5 to 10 m: nothing is seen of its foot within the map."""
-    return Case("abyss", below(5.0 + 5.0 * u[0]), 1.2, False)
+    """Return a cliff of 5 to 10 m, whose foot the camera does not see within the map."""
+    return Case("abyss", _below(5.0 + 5.0 * u[0]), 1.2, False)
 
 
-def below(depth: float, *boxes: Any) -> Scene:
-    """Make ground at z = 0 up to x = 0, and `depth` [m] lower from there on."""
+def _below(depth: float, *boxes: Box) -> Scene:
+    """Return ground at z = 0 for x < 0 and `depth` [m] lower beyond."""
 
     def terrain(x: Tensor, y: Tensor) -> Tensor:
         return torch.full_like(x, -depth)
@@ -86,7 +86,7 @@ KINDS: tuple[Callable[[list[float]], Case], ...] = (hump, brow, step_down, trenc
 
 
 def views(case: Case, generator: torch.Generator) -> dict[float, tuple[ElevationMap, float]]:
-    """Walk up to the edge and return a copy of the map at each of VIEWS, and where the robot is."""
+    """Walk up to the edge; return a copy of the map and the robot's x [m] at each of VIEWS."""
     emap, shots = ElevationMap(ElevationMapConfig(grid=GRID)), {}
     path = walk(case.scene, [(FROM, 0.0), (TO, 0.0)], speed=SPEED, dt=DT, T_base_sensor=T_BASE_CAMERA)
     for T_base, T_sensor, t in zip(*path, strict=True):
@@ -95,12 +95,11 @@ def views(case: Case, generator: torch.Generator) -> dict[float, tuple[Elevation
         x = float(T_base[0, 3])
         view = next((v for v in VIEWS if abs(x + v) < SPEED * DT / 2), None)
         if view is not None:
-            shots[view] = (copy_of(emap), x)
+            shots[view] = (_copy(emap), x)
     return shots
 
 
-def copy_of(emap: ElevationMap) -> ElevationMap:
-    """Return a map that keeps what this one holds now."""
+def _copy(emap: ElevationMap) -> ElevationMap:
     copy = ElevationMap(emap.cfg)
     copy.load_state_dict(emap.state_dict())
     return copy

@@ -1,4 +1,4 @@
-"""Draws what `benchmarks.quality.occlusion` shows: the side view of each scene, and the cost with the way on it."""
+"""The figure: the side view of each scene, and below it the cost from above with the planned path."""
 
 from __future__ import annotations
 
@@ -8,26 +8,24 @@ from pathlib import Path as File
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
-from benchmarks.quality.occlusion_scenes import GRID, Case
+from benchmarks.quality.occlusion.scenes import GRID, Case
 from torchelev import ElevationMap
 from torchelev.planning.planner import Path
 from torchelev.planning.traversal_cost import traversal_cost
 from torchelev.viz.plot import UNKNOWN_COLOR
 
-SPAN = (-1.7, 2.6)  # [m] of x that is drawn
-EYE = 0.8  # [m] of the camera over the ground
+SPAN = (-1.7, 2.6)  # [m] drawn range of x
+EYE = 0.8  # [m] height of the camera
 RULE = "upper bound"
-
-Scene = tuple[Case, ElevationMap, float, dict[str, Path]]  # with where the robot is [m], and what each rule planned
+Scene = tuple[Case, ElevationMap, float, dict[str, Path]]  # with the robot's x [m] and the path of each rule
 
 
 def draw(out: str | File, scenes: Sequence[Scene]) -> None:
-    """Write the picture: a column for each scene, its section above, its cost from above below."""
+    """Draw a column for each scene: its side view and its cost."""
     figure = Figure(figsize=(3.9 * len(scenes), 5.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(scenes), sharex=True, squeeze=False, height_ratios=(1.25, 1))
     for column, (case, emap, x, plans) in zip(axes.T, scenes, strict=True):
         _section(column[0], case, emap, x, plans)
@@ -41,7 +39,7 @@ def draw(out: str | File, scenes: Sequence[Scene]) -> None:
 
 
 def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str, Path]) -> None:
-    """Draw the ground along y = 0, what the map holds of it and what each rule decides."""
+    """Draw the ground and the map along y = 0, and the decision of each rule."""
     line = np.linspace(*SPAN, 800)
     truth = case.scene.truth(torch.from_numpy(np.stack([line, 0 * line], -1)))
     middle = GRID.width // 2
@@ -60,8 +58,8 @@ def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str
     ax.text(0.98, 0.97, verdicts, transform=ax.transAxes, fontsize=8, ha="right", va="top")
 
 
-def _cost(ax: Axes, emap: ElevationMap, x: float, goal: float, path: Path):
-    """Draw the cost and the way that was found."""
+def _cost(ax: Axes, emap: ElevationMap, x: float, goal: float, path: Path) -> AxesImage:
+    """Draw the cost and the planned path."""
     xy, half = emap.cell_centers()[0], GRID.resolution / 2
     extent = (
         float(xy[0, 0, 0]) - half,
