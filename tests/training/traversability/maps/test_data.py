@@ -1,4 +1,4 @@
-"""Maps to learn traversability from: labels lie where the maps' cells are, seeds decide everything, files are kept."""
+"""Labelled maps: labels lie where the cells are, seeds decide everything, files are kept."""
 
 import dataclasses
 import math
@@ -14,25 +14,16 @@ from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
 from training.traversability.maps.data import batch_seed, data_set, label_cells, make_batch, rated_cells
 from training.traversability.maps.mapping import (
-    EXACT_NOISE,
     DataConfig,
     blank_map,
-    exact_maps,
-    tile_places,
+    tile_cell_centers,
     walk_and_map,
 )
-from training.traversability.maps.sight import Sight
 from training.traversability.maps.terrain import (
     KINDS,
     LENGTH,
     RESOLUTION,
-    RIM,
-    SHARES,
     UNSEEN_KINDS,
-    Footing,
-    draw_robot,
-    make_tiles,
-    walks,
 )
 
 TINY = DataConfig(num_maps=2, window=2.0, looks=(3, 3), headings=2, camera_pixels=(16, 12), lidar_rays=(8, 64))
@@ -66,26 +57,13 @@ def test_labels_lie_where_the_map_has_the_ground_that_they_are_of(seed, monkeypa
     ground = float(maps.elevation[maps.validity].median())
     high = maps.validity & (maps.elevation > ground + 0.3)
     assert int(high.sum()) > 10, "the robot sees the box"
-    distance = from_box(tile_places(emap, T_tile_map))
+    distance = from_box(tile_cell_centers(emap, T_tile_map))
     # Some points fly between the box and what is behind it.
     assert float(distance[high].median()) < 0.05 and float((distance[high] < 0.15).float().mean()) > 0.75
     assert float(maps.label[high & maps.rated].median()) < 0.5
     away = maps.rated & (distance > math.hypot(0.3, 0.2) + robot.foot_reach + 0.1)
     assert int(away.sum()) > 500 and float(maps.label[away].amin()) == 1.0
     assert float(maps.label[maps.rated & (distance == 0)].amax()) == 0.0
-
-
-def test_a_cells_true_place_is_the_one_relative_to_the_robot():
-    emap = blank_map(0.1, 4.0, 1)
-    T_map_base = pose((10.0, 0.0, 3.0))
-    T_tile_base = pose((1.0, 2.0, 0.0), yaw=math.pi / 2)
-    emap.update(torch.full((1, 1, 3), torch.nan), T_map_base, T_map_base, dt=0.0)
-    places = tile_places(emap, T_tile_base @ torch.linalg.inv(T_map_base))[0].view(-1, 2)
-    cells = emap.cell_centers()[0].view(-1, 2)
-    at = int(((cells - torch.tensor([11.05, 0.05])).norm(dim=1)).argmin())
-    # One metre ahead of the robot, who looks along +y in the tile.
-    torch.testing.assert_close(cells[at], torch.tensor([11.05, 0.05], dtype=torch.float64))
-    torch.testing.assert_close(places[at], torch.tensor([0.95, 3.05], dtype=torch.float64))
 
 
 def test_rated_cells_equal_a_loop():
@@ -134,17 +112,6 @@ def test_kinds_resolution_and_robot_can_be_fixed():
     assert not set(UNSEEN_KINDS) & set(KINDS)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_exact_maps_know_the_true_heights_to_their_variance(seed):
-    field = make_tiles(("boxes", "stairs_up"), np.random.default_rng(seed))
-    emap, T_tile_map = exact_maps(field, 0.05, TINY, np.random.default_rng(seed))
-    truth = field.height(torch.arange(2), tile_places(emap, T_tile_map).float().flatten(1, 2)).view(2, 40, 40)
-    errors, state = (emap.state.elevation - truth).std((1, 2)), emap.state
-    assert state.validity.all() and (state.variance.amax((1, 2)) == state.variance.amin((1, 2))).all()
-    torch.testing.assert_close(errors, state.variance[:, 0, 0].sqrt(), rtol=0.1, atol=1e-5)
-    assert (errors < EXACT_NOISE).all() and errors[0] != errors[1]
-
-
 def test_exact_batches_are_rated_everywhere(tmp_path):
     (maps,) = data_set(tmp_path, "held_out_exact", 1, 0, TINY, resolution=0.1)
     assert maps.validity.all() and maps.rated.all()
@@ -167,77 +134,3 @@ def test_a_data_set_is_kept_and_only_what_lacks_is_made(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"must be of the same settings, got other headings; remove the folder"):
         data_set(tmp_path, "train", 1, 0, other, resolution=0.1)
     assert not list(tmp_path.glob("*.tmp"))
-
-
-@pytest.mark.parametrize("bad", [{"num_maps": 0}, {"headings": 0}, {"looks": (3, 2)}, {"looks": (0, 2)}, {"window": 0}])
-def test_settings_that_make_no_maps_are_refused(bad):
-    with pytest.raises(ValueError, match="must be"):
-        DataConfig(**bad)
-
-
-# The world -----------------------------------------------------------------------------------------------------------
-
-
-def test_robots_are_of_all_sizes():
-    rng = np.random.default_rng(0)
-    robots = [draw_robot(rng) for _ in range(200)]
-    lengths = [robot.length for robot in robots]
-    assert min(lengths) < 0.45 and max(lengths) > 0.95
-    for name, (low, high) in SHARES.items():
-        shares = [getattr(robot, name) / robot.length for robot in robots]
-        assert (
-            low <= min(shares) + 1e-9 < low + (high - low) / 8 and high - (high - low) / 8 < max(shares) <= high + 1e-9
-        )
-    assert all(0.3 <= robot.max_slope <= 0.7 for robot in robots)
-
-
-def test_robots_walk_within_the_tile_and_above_the_ground():
-    rng, robot = np.random.default_rng(1), RobotConfig()
-    field = make_tiles(("obstacles", "gaps"), rng)
-    path = walks(Footing(field, robot), 2, 12, rng)
-    assert path.shape == (12, 2, 4, 4)
-    xy, z = path[..., :2, 3], path[..., 2, 3]
-    assert float(xy.abs().amax()) <= LENGTH / 2 - RIM + 1e-6
-    ground = field.height(torch.arange(2), xy.transpose(0, 1).float()).t()
-    assert float((z - ground).amin()) > 0.09
-    step = (xy[1:] - xy[:-1]).norm(dim=-1)
-    assert float(step.amax()) <= 0.3 + 1e-6, "1 m/s"
-    eye = path[..., :3, :3] @ path[..., :3, :3].mT
-    torch.testing.assert_close(eye, torch.eye(3, dtype=torch.float64).expand_as(eye), atol=1e-5, rtol=0)
-
-
-def test_no_body_is_within_a_wall():
-    field = torch.zeros(1, 401, 401)
-    field[:, 200:] = 3.0
-    robot = RobotConfig(length=0.6, width=0.4, clearance=0.2)
-    footing = Footing(HeightField(field, RESOLUTION), robot)
-    at = torch.tensor([[-2.0, 0.0], [-0.25, 0.0], [2.0, 0.0]])
-    z = torch.stack([footing.pose(torch.tensor([0]), xy[None], torch.zeros(1))[0, 2, 3] for xy in at])
-    assert float(z[0]) == pytest.approx(0.32) and float(z[2]) == pytest.approx(3.32), "0.2 + 0.2 * 0.6 above the ground"
-    assert float(z[1]) == pytest.approx(3.1), "at the wall's foot, over the wall"
-
-
-def test_robots_take_the_easiest_of_some_walks():
-    robot = RobotConfig()
-    half = torch.zeros(1, 401, 401)
-    half[:, :200] = torch.rand(1, 200, 401, generator=torch.Generator().manual_seed(0)) * 0.5
-    starts = [
-        float(walks(Footing(HeightField(half, RESOLUTION), robot), 1, 5, np.random.default_rng(k))[0, 0, 0, 3])
-        for k in range(20)
-    ]
-    assert sum(x > 0 for x in starts) >= 16
-
-
-def test_every_set_of_sensors_sees_the_ground_from_the_believed_poses():
-    field, robot = HeightField(torch.zeros(1, 401, 401), RESOLUTION), RobotConfig()
-    counts = set()
-    for seed in range(12):
-        sight = Sight(robot, 1, (16, 12), (8, 64), np.random.default_rng(seed))
-        T_tile_base, T_map_base = pose((0.0, 0.0, 0.5)), pose((5.0, 5.0, 2.5), yaw=1.0)
-        for _ in range(4):  # clouds may come late
-            points, T_map_sensor = sight.look(field, T_tile_base, T_map_base)
-        ground = points.double() @ T_map_sensor[..., :3, :3].mT + T_map_sensor[..., None, :3, 3]
-        seen = ground[..., 2][ground[..., 2].isfinite()]
-        assert abs(float(seen.median()) - 2.0) < 0.1
-        counts.add(points.shape[1])
-    assert counts == {1, 2, 3, 4}
