@@ -23,7 +23,7 @@ from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
 SPEED = "speed-2-x-intel-r-xeon-r-processor-2-threads"
-SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
+_SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
 
 
 def load(name: str, folder: Path = benchmarks.RESULTS) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def _accuracy() -> str:
     rows = load("accuracy")["rows"]
     cells = {(r["scene"], f"{r['motion']} {r['noise']}"): f"{r['rmse']:.1f} / {r['rmse_mean']:.1f}" for r in rows}
     scenes = list(dict.fromkeys(r["scene"] for r in rows))
-    table = markdown_table(["scene", *SHOWN], [[scene, *(cells[scene, case] for case in SHOWN)] for scene in scenes])
+    table = markdown_table(["scene", *_SHOWN], [[scene, *(cells[scene, case] for case in _SHOWN)] for scene in scenes])
     failed = [f"*{r['scene']} {r['motion']} {r['noise']}*" for r in rows if not r["holds"]]
     verdict = f"not {', '.join(failed)}" if failed else "all of them"
     return f"{table}\n\n{len(rows) - len(failed)} of {len(rows)} cases hold their bars: {verdict}."
@@ -126,7 +126,7 @@ def _block() -> str:
     return block.table(load("block", training.RESULTS)["profiles"])
 
 
-TABLES = {
+_TABLES = {
     "accuracy": _accuracy,
     "features": _features,
     "changes": _changes,
@@ -146,7 +146,7 @@ TABLES = {
 
 def with_tables(text: str) -> str:
     """Return the README's text with new tables."""
-    for name, table in TABLES.items():
+    for name, table in _TABLES.items():
         pattern = rf"(<!-- {name} -->\n).*?(<!-- end -->)"
         text, count = re.subn(pattern, functools.partial(_insert, table()), text, flags=re.DOTALL)
         assert count == 1, f"README.md must hold <!-- {name} --> ... <!-- end --> once"

@@ -19,7 +19,7 @@ class Job(NamedTuple):
     """A training: `python -m MODULE ARGUMENTS --out FOLDER`, finished when FOLDER holds result.json."""
 
     module: str
-    arguments: dict[str, object]  # by option; None leaves an option out
+    arguments: dict[str, object]  #: by option; None leaves an option out
     folder: Path
 
 

@@ -14,7 +14,7 @@ from benchmarks.speed import meter
 from benchmarks.speed.meter import fresh_compiler
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 
-SCAN_POINTS = 187  # of a height scan
+_SCAN_POINTS = 187  # of a height scan
 Figure = tuple[str, Callable[[], Any]]  # its name and the call that measures it
 
 
@@ -78,7 +78,7 @@ def many_robots(device: str, robots: int, points: int, seconds: float) -> Iterat
     yield "many robots, bytes per robot", lambda: kept + meter.peak_bytes(drive, device) / robots
     yield "many robots, needed bytes per robot", lambda: meter.needed_memory(cfg, points)
     emap = drive.emap
-    xy = (emap.center[:, None, :2] + torch.rand(robots, SCAN_POINTS, 2).to(device) - 0.5).float()
+    xy = (emap.center[:, None, :2] + torch.rand(robots, _SCAN_POINTS, 2).to(device) - 0.5).float()
     sample = torch.compile(lambda state, xy: emap.sample(xy, state=state))
     with torch.no_grad():
         yield "height scans", lambda: meter.milliseconds(lambda: emap.sample(xy), seconds)

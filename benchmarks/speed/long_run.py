@@ -40,7 +40,7 @@ CASES = {"one robot": (1, 250, BPEARL, 100_000), "256 robots": (256, 64, MANY_PO
 Case = tuple[int, int, int, int]  # robots, cells along each side, points, updates
 BLOCKS = 100
 ROUNDS = 30  # in which this process and a new one are timed in turn
-REFERENCE = 20  # updates of this process per update of the reference process
+_REFERENCE = 20  # updates of this process per update of the reference process
 
 
 def resident_bytes() -> int:
@@ -124,7 +124,7 @@ def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) ->
     with _new_process(case) as time_reference:
         for _ in tqdm(range(math.ceil(updates / size)), desc=name, disable=None):
             values["ms"].append(milliseconds(timer, size))
-            values["reference_ms"].append(time_reference(max(1, size // REFERENCE)))
+            values["reference_ms"].append(time_reference(max(1, size // _REFERENCE)))
             values["resident_bytes"].append(resident_bytes())
             values["graphs"].append(counters["stats"]["unique_graphs"])
             values["updates"] = size * len(values["ms"])

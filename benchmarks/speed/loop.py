@@ -31,12 +31,12 @@ from benchmarks import RESULTS
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 from torchelev.app.results import markdown_table, write_json
 
-PERIOD = 0.02  # [s]
-POLICIES = ("default", "PASSIVE")
-BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends when this process does
+_PERIOD = 0.02  # [s]
+_POLICIES = ("default", "PASSIVE")
+_BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends when this process does
 
 
-def loop(step: Callable[[], Any], count: int, period: float = PERIOD) -> list[float]:
+def loop(step: Callable[[], Any], count: int, period: float = _PERIOD) -> list[float]:
     """Call a step at a fixed rate and return the time of each call [s]; after a late call the rate stays the same."""
     times = []
     due = time.perf_counter()
@@ -49,7 +49,7 @@ def loop(step: Callable[[], Any], count: int, period: float = PERIOD) -> list[fl
     return times
 
 
-def figures(times: list[float], period: float = PERIOD) -> dict[str, float]:
+def figures(times: list[float], period: float = _PERIOD) -> dict[str, float]:
     """Return p50, p99 and max [ms] by nearest rank, and the fraction of calls that took longer than the period."""
     ordered = sorted(times)
     p50, p99 = (1e3 * ordered[math.ceil(q * len(ordered)) - 1] for q in (0.5, 0.99))
@@ -58,9 +58,9 @@ def figures(times: list[float], period: float = PERIOD) -> dict[str, float]:
 
 
 @contextlib.contextmanager
-def busy_process() -> Iterator[None]:
+def _busy_process() -> Iterator[None]:
     """Keep one core busy with another process."""
-    process = subprocess.Popen([sys.executable, "-c", BUSY])
+    process = subprocess.Popen([sys.executable, "-c", _BUSY])
     try:
         yield
     finally:
@@ -78,7 +78,7 @@ def measure(count: int, threads: int, compiled: bool = True, points: int = BPEAR
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # slow updates are what is measured
         idle = figures(loop(drive, count))
-        with busy_process():
+        with _busy_process():
             time.sleep(0.2)  # until the other process runs
             return {"idle": idle, "busy": figures(loop(drive, count))}
 
@@ -110,9 +110,9 @@ def table(rows: dict[str, dict[str, dict[str, float]]]) -> str:
 def main(seconds: float, threads: int, out: Path) -> None:
     """Measure, write JSON and print the table."""
     torch.set_num_threads(threads)  # for the description of the machine
-    count = max(1, round(seconds / PERIOD))
-    rows = {policy: measure_apart(policy, count, threads) for policy in POLICIES}
-    write_json(out / "loop.json", {"points": BPEARL, "hertz": 1 / PERIOD, "threads": threads, "rows": rows})
+    count = max(1, round(seconds / _PERIOD))
+    rows = {policy: measure_apart(policy, count, threads) for policy in _POLICIES}
+    write_json(out / "loop.json", {"points": BPEARL, "hertz": 1 / _PERIOD, "threads": threads, "rows": rows})
     click.echo(table(rows))
 
 

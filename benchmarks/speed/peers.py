@@ -14,7 +14,7 @@ import scipy.ndimage as ndimage
 from numpy.typing import NDArray
 
 RESOLUTION = 0.04  # [m]
-WINDOW = (5, 5)  # [cells]
+_WINDOW = (5, 5)  # [cells]
 Peer = Callable[[NDArray, NDArray], NDArray]
 
 
@@ -34,7 +34,7 @@ def cv_gaussian(values: NDArray, known: NDArray) -> NDArray:
 
 def cv_box(values: NDArray, known: NDArray) -> NDArray:
     """Average windows of 5 x 5 cells."""
-    return _masked_mean(values, known, lambda v: cv2.blur(v, WINDOW, borderType=cv2.BORDER_CONSTANT))
+    return _masked_mean(values, known, lambda v: cv2.blur(v, _WINDOW, borderType=cv2.BORDER_CONSTANT))
 
 
 def scipy_median(values: NDArray, known: NDArray) -> NDArray:
@@ -44,12 +44,12 @@ def scipy_median(values: NDArray, known: NDArray) -> NDArray:
 
 def cv_dilation(values: NDArray, known: NDArray) -> NDArray:
     """Take the maximum of windows of 5 x 5 cells; unknown cells count as lowest."""
-    return cv2.dilate(np.where(known, values, np.float32(-1e9)), np.ones(WINDOW, np.uint8))
+    return cv2.dilate(np.where(known, values, np.float32(-1e9)), np.ones(_WINDOW, np.uint8))
 
 
 def cv_erosion(values: NDArray, known: NDArray) -> NDArray:
     """Take the minimum of windows of 5 x 5 cells; unknown cells count as highest."""
-    return cv2.erode(np.where(known, values, np.float32(1e9)), np.ones(WINDOW, np.uint8))
+    return cv2.erode(np.where(known, values, np.float32(1e9)), np.ones(_WINDOW, np.uint8))
 
 
 def cv_step(values: NDArray, known: NDArray) -> NDArray:
@@ -59,9 +59,9 @@ def cv_step(values: NDArray, known: NDArray) -> NDArray:
 
 def cv_deviation(values: NDArray, known: NDArray) -> NDArray:
     """Compute the standard deviation of windows of 5 x 5 cells from the means of values and of squares."""
-    number = np.maximum(cv2.blur(known.astype(np.float32), WINDOW, borderType=cv2.BORDER_CONSTANT), 1e-6)
-    mean = cv2.blur(values, WINDOW, borderType=cv2.BORDER_CONSTANT) / number
-    square = cv2.blur(values * values, WINDOW, borderType=cv2.BORDER_CONSTANT) / number
+    number = np.maximum(cv2.blur(known.astype(np.float32), _WINDOW, borderType=cv2.BORDER_CONSTANT), 1e-6)
+    mean = cv2.blur(values, _WINDOW, borderType=cv2.BORDER_CONSTANT) / number
+    square = cv2.blur(values * values, _WINDOW, borderType=cv2.BORDER_CONSTANT) / number
     return np.sqrt(np.maximum(square - mean * mean, 0))
 
 

@@ -116,7 +116,7 @@ def measure(seconds: float) -> list[dict[str, Any]]:
     return rows
 
 
-def measure_planes(seconds: float) -> list[dict[str, Any]]:
+def _measure_planes(seconds: float) -> list[dict[str, Any]]:
     """Time the segmentation of single maps of 250 x 250 cells."""
     elevations = {name: plane_scenes.noisy(scene(RESOLUTION)) for name, scene in plane_scenes.SCENES.items()}
     runs = {name: partial(planes.segment, z, RESOLUTION) for name, z in elevations.items()}
@@ -156,7 +156,7 @@ def main() -> None:
         "--out", type=Path, default=path, help="JSON file (default: benchmarks/results/postprocessing.json)"
     )
     options = parser.parse_args()
-    rows, scenes = measure(options.seconds), measure_planes(options.seconds)
+    rows, scenes = measure(options.seconds), _measure_planes(options.seconds)
     write_json(options.out, {"resolution": RESOLUTION, "rows": rows, "planes": scenes})
     print(f"{table(rows)}\n\n{planes_table(scenes)}")
 

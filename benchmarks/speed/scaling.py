@@ -17,7 +17,7 @@ POINTS = [1000, 3000, 6276, 15000, 43074, 100000, 200000, 407040]
 ROBOTS = [1, 4, 16, 64, 256, 1024, 4096]
 CELLS = [125, 250, 500, 1000]  # along each side
 RAYS = [1.2, 1.7, 2.4, 3.4, 4.8, 6.8, 19.2, 38.4]  # [m] horizontal length of the longest ray; the window ends at 5 m
-STEEPNESS = 0.5  # slope of the long rays: above the exclusion ramp at any distance
+_STEEPNESS = 0.5  # slope of the long rays: above the exclusion ramp at any distance
 
 
 def points(seconds: float) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def rays(seconds: float) -> dict[str, Any]:
             far = cloud[:, ::2]
             reach = length * (0.9 + 0.1 * torch.rand(far[..., :1].shape, generator=generator))
             far[..., :2] *= reach / far[..., :2].norm(dim=-1, keepdim=True)
-            far[..., 2:] = STEEPNESS * reach
+            far[..., 2:] = _STEEPNESS * reach
         drive.watch(8)
         work = {name: drive.seen[name] for name in ("points_used", "drift_points", "cells_bounded")}
         assert min(work.values()) > 0, f"rays of {length} m: nothing to do, {work}"

@@ -32,7 +32,7 @@ from torchelev.sim.terrains.generate import terrain_grid
 from torchelev.sim.terrains.heightfield import HeightField
 from torchelev.sim.terrains.shapes import SHAPES
 
-LEVELS = 8
+_LEVELS = 8
 SENSORS = {
     "camera 32 x 16, 8 m": MountedSensor(DepthCamera(width=32, height=16), mount(35.0, 0.3, 0.1)),
     "lidar 16 x 32, 20 m": MountedSensor(Lidar(rings=16, azimuths=32), mount(0.0, 0.0, 0.25)),
@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=6.0, help="time per case [s] (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="JSON file (default: in benchmarks/results)")
     options = parser.parse_args()
-    grid = terrain_grid(list(SHAPES), LEVELS, device=options.device)
+    grid = terrain_grid(list(SHAPES), _LEVELS, device=options.device)
     start = time.perf_counter()
     field = HeightField(grid.field.heights, grid.field.resolution)
     built = time.perf_counter() - start

@@ -25,7 +25,7 @@ from torchelev.stages.fusion import fuse
 from torchelev.stages.visibility import clean_up
 from torchelev.state import MapState, Measurement, map_layers
 
-Stage = Callable[[MapState, Measurement], Any]
+_Stage = Callable[[MapState, Measurement], Any]
 
 
 def stages(seconds: float) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def stages(seconds: float) -> dict[str, Any]:
     def transform() -> Measurement:
         return measure.measure(cloud[:, None], T[:, None], T, drive.dt, None, grid, cfg.sensor, torch.float32)
 
-    all_stages: dict[str, Stage] = {
+    all_stages: dict[str, _Stage] = {
         "point transform, gates, noise": lambda state, m: transform(),
         "recenter": lambda state, m: recenter.recenter(state, m, grid),
         "age": lambda state, m: age.age(state, m, cfg.aging),
@@ -86,7 +86,7 @@ def parts(seconds: float) -> dict[str, Any]:
     return {"rows": rows}
 
 
-def _compiled_alone(stage: Stage, inputs: list[tuple[MapState, Measurement]]) -> Callable[[], None]:
+def _compiled_alone(stage: _Stage, inputs: list[tuple[MapState, Measurement]]) -> Callable[[], None]:
     """Compile a stage on its own and call it with each input; masks are stored as bytes, as in the whole update."""
 
     def on_bytes(state: MapState, m: Measurement) -> Any:

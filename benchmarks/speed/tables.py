@@ -9,11 +9,11 @@ from benchmarks.speed.workload import BPEARL, SENSORS
 from torchelev.app.results import markdown_table
 
 TARGETS = {6276: 2.5, 43074: 6.0, 407040: 20.0}  # [ms] one robot
-EAGER = 4  # factor on TARGETS for updates that are not compiled
+_EAGER = 4  # factor on TARGETS for updates that are not compiled
 MANY = 45.0  # [ms] 256 robots
 FLAT = 1.15  # largest growth of the time per robot beyond 256 robots
-MEMORY = 1.5  # factor on the minimum memory of map, points and polar table
-FRACTION = 0.15  # of an update's time: reset, recenter, sample
+_MEMORY = 1.5  # factor on the minimum memory of map, points and polar table
+_FRACTION = 0.15  # of an update's time: reset, recenter, sample
 GROWTH = {"points": 1.0, "cells": 1.1, "rays": 0.1}  # largest exponents, the last in absolute value
 IMPORT, FIRST_UPDATE = 0.3, 60  # [s]
 
@@ -24,7 +24,7 @@ class Check(NamedTuple):
     case: str
     value: float
     limit: float
-    form: str  # format of both
+    form: str  #: format of both
     remark: str = ""
 
 
@@ -58,7 +58,7 @@ def _points(values: dict[str, Any]) -> Iterator[Check]:
         yield Check(f"one robot, {n:,} points", full[n]["median"], limit, "{:.1f} ms")
     for n, row in eager.items():
         remark = f", {row['median'] / full[n]['median']:.1f} x compiled"
-        yield Check(f"eager, {n:,} points", row["median"], EAGER * TARGETS[n], "{:.1f} ms", remark)
+        yield Check(f"eager, {n:,} points", row["median"], _EAGER * TARGETS[n], "{:.1f} ms", remark)
     yield Check("growth with points", values["exponent_from_43074"], GROWTH["points"], "exponent {:.2f}")
     yield Check("graphs compiled for 8 numbers of points (for one: 3)", values["graphs"], 3, "{:.0f}")
 
@@ -70,7 +70,7 @@ def _robots(values: dict[str, Any]) -> Iterator[Check]:
     yield Check("time per robot beyond 256", slowest / rows[256]["ms_per_robot"], FLAT, "{:.2f} x that at 256")
     largest = max(row["bytes_per_robot"] for row in rows.values())
     memory = largest / values["needed_bytes_per_robot"]
-    yield Check("memory per robot, of any number", memory, MEMORY, "{:.2f} x the need on paper")
+    yield Check("memory per robot, of any number", memory, _MEMORY, "{:.2f} x the need on paper")
 
 
 def _cells(values: dict[str, Any]) -> Iterator[Check]:
@@ -84,7 +84,7 @@ def _rays(values: dict[str, Any]) -> Iterator[Check]:
 def _parts(values: dict[str, Any]) -> Iterator[Check]:
     for row in values["rows"]:
         for name, fraction in row["shares"].items():
-            yield Check(f"{name}, robots: {row['robots']}", 100 * fraction, 100 * FRACTION, "{:.0f} % of an update")
+            yield Check(f"{name}, robots: {row['robots']}", 100 * fraction, 100 * _FRACTION, "{:.0f} % of an update")
 
 
 def _start(values: dict[str, Any]) -> Iterator[Check]:

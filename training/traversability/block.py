@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
 ROBOT = RobotConfig()
 HEIGHTS = (0.1, 0.15, 0.25, 0.4)  # [m] of the blocks; the robot's step height is 0.2 m
-SIDE = 1.2  # [m] of the block
+_SIDE = 1.2  # [m] of the block
 SPACING, NOISE = 0.02, 0.005  # [m] between the points, and 1 sigma of their height
 GRID = GridConfig(resolution=0.04, length_x=5.0, length_y=5.0)
-APPROACH = 1.2  # [m] length of the line on the ground before the block
-SCANS = 3
+_APPROACH = 1.2  # [m] length of the line on the ground before the block
+_SCANS = 3
 HEADINGS = 16
 Head = LearnedTraversabilityConfig | TraversabilityConfig
 HEADS: dict[str, Head] = {
@@ -52,7 +52,7 @@ HEADS: dict[str, Head] = {
 def _block(height: float) -> Float[Tensor, "H W"]:
     """Return the heights [m] of 6 x 6 m of ground with a block in the middle."""
     axis = (torch.arange(301) - 150) * SPACING
-    inside = axis.abs() <= SIDE / 2
+    inside = axis.abs() <= _SIDE / 2
     return torch.where(inside[:, None] & inside, height, 0.0)
 
 
@@ -62,7 +62,7 @@ def _map(heights: Float[Tensor, "H W"], head: Head) -> ElevationMap:
     axis = (torch.arange(len(heights)) - len(heights) // 2) * SPACING
     x, y = torch.meshgrid(axis, axis, indexing="ij")
     emap = ElevationMap(ElevationMapConfig(grid=GRID, traversability=head))
-    for _ in range(SCANS):
+    for _ in range(_SCANS):
         z = heights + NOISE * torch.randn(heights.shape, generator=generator) - 1.0
         emap.update(torch.stack([x, y, z], -1).view(1, -1, 3), torch.eye(4)[None], torch.eye(4)[None], dt=0.0)
     return emap
@@ -74,10 +74,10 @@ def _profile(height: float) -> dict[str, Any]:
     middle = GRID.width // 2
     maps = {name: _map(heights, head) for name, head in HEADS.items()}
     centers = maps["learned"].cell_centers()[0, :, middle].float()
-    line = (centers[:, 0] >= -SIDE / 2 - APPROACH) & (centers[:, 0] <= 0)
+    line = (centers[:, 0] >= -_SIDE / 2 - _APPROACH) & (centers[:, 0] <= 0)
     stands = can_stand(HeightField(heights[None], SPACING), torch.tensor([0]), centers[line][None], [ROBOT], HEADINGS)
     ratings = {name: emap.rate().traversability[0, line, middle].tolist() for name, emap in maps.items()}
-    from_edge = centers[line, 0] + SIDE / 2
+    from_edge = centers[line, 0] + _SIDE / 2
     return {"height": height, "x": from_edge.tolist(), "label": stands[0].float().mean(-1).tolist(), **ratings}
 
 

@@ -16,8 +16,8 @@ from sklearn.metrics import average_precision_score, roc_auc_score
 
 from torchelev.errors import require
 
-Floats = NDArray[np.floating]
-Bools = NDArray[np.bool_]
+_Floats = NDArray[np.floating]
+_Bools = NDArray[np.bool_]
 
 SAFE = 0.5  # lowest label and score of safe ground
 _RECALL = 0.95
@@ -28,13 +28,13 @@ _INFLATION_REACH = 0.5  # [m] from unsafe ground
 class RatedMap(NamedTuple):
     """The scores and labels of one map, (H, W) each."""
 
-    score: Floats
-    label: Floats
-    rated: Bools  # cells that count
-    resolution: float  # [m]
+    score: _Floats
+    label: _Floats
+    rated: _Bools  #: cells that count
+    resolution: float  #: [m]
 
 
-def _pool(maps: Iterable[RatedMap]) -> tuple[Floats, Floats]:
+def _pool(maps: Iterable[RatedMap]) -> tuple[_Floats, _Floats]:
     """Return the scores and labels (N,) of all cells that count."""
     pairs = [(m.score[m.rated], m.label[m.rated]) for m in maps]
     return np.concatenate([score for score, _ in pairs]), np.concatenate([label for _, label in pairs])
@@ -80,13 +80,13 @@ _RANKED = (
 )
 
 
-def intersection_over_union(found: Bools, safe: Bools) -> float | None:
+def intersection_over_union(found: _Bools, safe: _Bools) -> float | None:
     """Return |found and safe| / |found or safe|; None if the union is empty."""
     either = int((found | safe).sum())
     return float((found & safe).sum() / either) if either else None
 
 
-def calibration_error(score: Floats, label: Floats, bins: int = _BINS) -> float | None:
+def calibration_error(score: _Floats, label: _Floats, bins: int = _BINS) -> float | None:
     """Return the expected calibration error: sum over bins of n / N |mean score - mean label| (Naeini et al. 2015).
 
     The bins divide 0 to 1 evenly. A label is the fraction of headings at which the robot can stand, so a score of 0.8
@@ -99,12 +99,12 @@ def calibration_error(score: Floats, label: Floats, bins: int = _BINS) -> float 
     return float(np.abs(gaps).sum() / len(score))
 
 
-def threshold_at_safe_recall(score: Floats, recall: float = _RECALL) -> float:
+def threshold_at_safe_recall(score: _Floats, recall: float = _RECALL) -> float:
     """Return the highest threshold at or above which a fraction `recall` of the safe cells lies."""
     return float(np.sort(score)[len(score) - math.ceil(recall * len(score) - 1e-9)])
 
 
-def threshold_at_unsafe_recall(score: Floats, recall: float = _RECALL) -> float:
+def threshold_at_unsafe_recall(score: _Floats, recall: float = _RECALL) -> float:
     """Return the lowest threshold below which a fraction `recall` of the unsafe cells lies."""
     highest_left = np.sort(score)[math.ceil(recall * len(score) - 1e-9) - 1]
     return float(np.nextafter(highest_left, highest_left.dtype.type(np.inf)))

@@ -29,9 +29,9 @@ class FitConfig:
 
     steps: int = 4000
     batches_per_step: int = 4
-    learning_rate: float = 3e-3  # initial; decays to 0 along half a cosine
+    learning_rate: float = 3e-3  #: initial; decays to 0 along half a cosine
     weight_decay: float = 1e-4
-    seed: int = 0  # of the initial weights and the order of the batches
+    seed: int = 0  #: of the initial weights and the order of the batches
 
     def __post_init__(self) -> None:
         require_positive(steps=self.steps, batches_per_step=self.batches_per_step, learning_rate=self.learning_rate)

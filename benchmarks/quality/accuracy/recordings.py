@@ -35,9 +35,9 @@ class SimulatedRun(NamedTuple):
     """The noiseless scans of a scene along a path."""
 
     scene: Scene
-    clean: list[Tensor]  # T scans (M, 3) [m], sensor frame
-    T_map_sensor: Tensor  # (T, 4, 4)
-    T_map_base: Tensor  # (T, 4, 4)
+    clean: list[Tensor]  #: T scans (M, 3) [m], sensor frame
+    T_map_sensor: Tensor  #: (T, 4, 4)
+    T_map_base: Tensor  #: (T, 4, 4)
 
 
 @functools.cache

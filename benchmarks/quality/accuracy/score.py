@@ -12,16 +12,16 @@ from benchmarks.quality.accuracy.recordings import GRID, SimulatedRun, corrupt, 
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.sim.exact.scenes import Scene
 
-RADIUS = 2.5  # [m] around the robot's last position in which cells are scored
+_RADIUS = 2.5  # [m] around the robot's last position in which cells are scored
 
 
 class _Cells(NamedTuple):
     """Statistics of the points in each cell of the window, (H, W) each."""
 
-    mean: Tensor  # [m]
-    maximum: Tensor  # [m]
-    count: Tensor
-    is_reliable: Tensor  # holds more correct points than outliers
+    mean: Tensor  #: [m]
+    maximum: Tensor  #: [m]
+    num_points: Tensor
+    is_reliable: Tensor  #: holds more correct points than outliers
 
 
 def _bin_points(emap: ElevationMap, recording: SimulatedRun, scans: list[Tensor]) -> _Cells:
@@ -64,14 +64,14 @@ class Score:
     scene: str
     motion: str
     noise: str
-    rmse: float  # [mm] of the map
-    rmse_mean: float  # [mm] of the per-cell mean
-    rmse_max: float  # [mm] of the per-cell maximum
-    ratio: float  # rmse divided by rmse_mean, both at least 1 mm
-    bias: float  # [mm] mean error of the map
-    coverage: float  # fraction of the cells with points that the map knows
-    wrong_5cm: float  # fraction of cells more than 5 cm outside the true heights of their 3 x 3 neighborhood
-    wrong_5cm_mean: float  # the same for the per-cell mean
+    rmse: float  #: [mm] of the map
+    rmse_mean: float  #: [mm] of the per-cell mean
+    rmse_max: float  #: [mm] of the per-cell maximum
+    ratio: float  #: rmse divided by rmse_mean, both at least 1 mm
+    bias: float  #: [mm] mean error of the map
+    coverage: float  #: fraction of the cells with points that the map knows
+    wrong_5cm: float  #: fraction of cells more than 5 cm outside the true heights of their 3 x 3 neighborhood
+    wrong_5cm_mean: float  #: the same for the per-cell mean
 
 
 def score(name: str, motion: str, kind: str, cfg: ElevationMapConfig | None = None) -> Score:
@@ -82,8 +82,8 @@ def score(name: str, motion: str, kind: str, cfg: ElevationMapConfig | None = No
     plain = _bin_points(emap, recording, scans)
     xy = emap.cell_centers()[0]
     truth = recording.scene.truth(xy)
-    near = (xy - recording.T_map_base[-1, :2, 3]).norm(dim=-1) <= RADIUS
-    measured = near & (plain.count > 0)
+    near = (xy - recording.T_map_base[-1, :2, 3]).norm(dim=-1) <= _RADIUS
+    measured = near & (plain.num_points > 0)
     if kind == "outliers":
         measured &= plain.is_reliable
     elevation = emap.layer("elevation")[0].double()

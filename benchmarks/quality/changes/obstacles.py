@@ -18,7 +18,7 @@ SETTLED = 600  # scans of empty ground before an obstacle, at 10 Hz
 WATCHED = 40  # scans with the obstacle
 # Fractions of the points that are kept: about 2 or 0.5 points per cell.
 FRACTIONS = {"box": (1.0,), "person": (0.15, 0.03), "wall": (0.12, 0.03)}
-PLATE = (0.15, 0.15, 0.015)  # [m] half sizes
+_PLATE = (0.15, 0.15, 0.015)  # [m] half sizes
 RATES = (1e-7, 1e-5, 1e-4, 1e-3)  # [m^2/s] variance rates of aging; the first is the default
 
 
@@ -77,9 +77,9 @@ def plate_scans(sensor: MountedSensor, rate: float, seeds: int, settled: int, co
     world = World(sensor, seeds, compiled, amplitude=0.0, aging=AgingConfig(variance_rate=rate))
     for _ in range(settled):
         world.scan(None, 0.1)
-    boxes, flat = world.ahead(PLATE), world.above_ground()
+    boxes, flat = world.ahead(_PLATE), world.above_ground()
     hit, shown = torch.zeros_like(world.emap.state.validity), []
     for _ in range(WATCHED):
         hit |= hits(world, world.scan(boxes, 0.1), boxes, above=0.0, beside=0.0) > 0
-        shown.append(torch.where(hit, world.above_ground(), math.nan).nanmean((1, 2)) >= 0.8 * 2 * PLATE[2])
+        shown.append(torch.where(hit, world.above_ground(), math.nan).nanmean((1, 2)) >= 0.8 * 2 * _PLATE[2])
     return scans_until(shown) | {"rmse_mm": 1e3 * float(flat[hit].square().nanmean().sqrt())}

@@ -27,7 +27,7 @@ SENSORS = {
 }
 OBSTACLES = {"box": (0.15, 0.15, 0.15), "person": (0.15, 0.25, 0.85), "wall": (0.1, 1.0, 0.5)}  # [m] half sizes
 PERSON = OBSTACLES["person"]
-AHEAD = 2.5  # [m] from the sensor to an obstacle
+_AHEAD = 2.5  # [m] from the sensor to an obstacle
 
 
 class World:
@@ -73,7 +73,7 @@ class World:
     def ahead(self, half: tuple[float, float, float]) -> Boxes:
         """Return an obstacle 2.5 m ahead of each sensor, shifted at random by up to half a cell."""
         x, y = (torch.rand(2, self.seeds, generator=self.generator) - 0.5) * GRID.resolution
-        return self.box(AHEAD + half[0] + x, y, half)
+        return self.box(_AHEAD + half[0] + x, y, half)
 
     def box(self, x: Tensor, y: Tensor, half: tuple[float, float, float]) -> Boxes:
         """Return an upright box of half sizes `half` [m] on the ground of each robot, at (x, y), (B,) each [m]."""

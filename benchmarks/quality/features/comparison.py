@@ -29,12 +29,12 @@ class Feature:
     name: str
     record: Callable[[], SimulatedRun]
     measure: Callable[[SimulatedRun, ElevationMapConfig], tuple[Figures, ElevationMap]]
-    off: str  # dotted name of the setting that is None when the feature is off
-    bars: dict[str, tuple[str, float]]  # targets with the feature on: metric -> ("<=" or ">=", limit)
-    shown: tuple[str, ...] = ()  # metrics in the figure besides the first target's
+    off: str  #: dotted name of the setting that is None when the feature is off
+    bars: dict[str, tuple[str, float]]  #: targets with the feature on: metric -> ("<=" or ">=", limit)
+    shown: tuple[str, ...] = ()  #: metrics in the figure besides the first target's
 
 
-TOO_LONG = 0.01  # fraction of the returns
+_TOO_LONG = 0.01  # fraction of the returns
 
 _LEFT = {"left [%]": ("<=", 1.0)}
 _REMOVED = {"removed [%]": ("<=", 0.5)}
@@ -48,17 +48,17 @@ _AT_END = ("bar at the end [%]", "ceiling at the end [%]")
 FEATURES = (
     Feature("drift compensation", rec.record_drift, seam_step, "drift", _SEAM),
     Feature("cleanup: person", rec.record_person, cells_left, "raycast", _LEFT),
-    Feature("cleanup: person, 1 % too long", partial(rec.record_person, TOO_LONG), cells_left, "raycast", _LEFT),
+    Feature("cleanup: person, 1 % too long", partial(rec.record_person, _TOO_LONG), cells_left, "raycast", _LEFT),
     Feature("cleanup: static", rec.record_static, wrongly_removed, "raycast", _REMOVED),
     Feature(
-        "cleanup: static, 1 % too long", partial(rec.record_static, TOO_LONG), wrongly_removed, "raycast", _REMOVED
+        "cleanup: static, 1 % too long", partial(rec.record_static, _TOO_LONG), wrongly_removed, "raycast", _REMOVED
     ),
     Feature("exclusion area", rec.record_overhang, overhang_cells, "sensor.exclusion", _OVERHANG, _AT_END),
     Feature("edges", rec.record_walls, wall_tops, "fusion.edges", _WALLS),
     Feature("overlap clearance: up", partial(rec.record_floors, True), other_floor, "overlap", _FLOOR),
     Feature("overlap clearance: down", partial(rec.record_floors, False), other_floor, "overlap", _FLOOR),
     Feature("upper bound", rec.record_hidden, bounds, "raycast", _BOUNDS),
-    Feature("upper bound, 1 % too long", partial(rec.record_hidden, TOO_LONG), bounds, "raycast", _BOUNDS),
+    Feature("upper bound, 1 % too long", partial(rec.record_hidden, _TOO_LONG), bounds, "raycast", _BOUNDS),
 )
 
 

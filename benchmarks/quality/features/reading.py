@@ -16,7 +16,7 @@ from torchelev.grid import GridConfig
 from torchelev.sim import Box
 
 GRID = GridConfig(resolution=0.04, length_x=10.0, length_y=10.0)
-HALF_WORLD = 400  # [cells] half the side of the lattice
+_HALF_WORLD = 400  # [cells] half the side of the lattice
 Watch = Callable[[ElevationMap, int], None]
 Figures = dict[str, float]
 
@@ -34,9 +34,9 @@ def fuse(recording: SimulatedRun, cfg: ElevationMapConfig, watch: Watch | None =
 class Cells(NamedTuple):
     """The cells of a map and their errors."""
 
-    xy: Tensor  # (H, W, 2) [m]
-    elevation: Tensor  # (H, W) [m], NaN where unknown
-    error: Tensor  # (H, W) [m], elevation minus truth
+    xy: Tensor  #: (H, W, 2) [m]
+    elevation: Tensor  #: (H, W) [m], NaN where unknown
+    error: Tensor  #: (H, W) [m], elevation minus truth
 
 
 def cells_of(emap: ElevationMap, recording: SimulatedRun, k: int = -1) -> Cells:
@@ -47,13 +47,13 @@ def cells_of(emap: ElevationMap, recording: SimulatedRun, k: int = -1) -> Cells:
 
 def world_index(xy: Tensor) -> tuple[Tensor, Tensor]:
     """Return the indices on the lattice of places (..., 2) [m]."""
-    cell = torch.floor(xy / GRID.resolution).long() + HALF_WORLD
+    cell = torch.floor(xy / GRID.resolution).long() + _HALF_WORLD
     return cell[..., 0], cell[..., 1]
 
 
 def blank_world() -> Tensor:
     """Return an empty mask on the lattice of cells that is fixed to the world, while the map's window moves."""
-    return torch.zeros(2 * HALF_WORLD, 2 * HALF_WORLD, dtype=torch.bool)
+    return torch.zeros(2 * _HALF_WORLD, 2 * _HALF_WORLD, dtype=torch.bool)
 
 
 def percent(part: Tensor, of: Tensor) -> float:

@@ -15,17 +15,17 @@ from torchelev.sim.exact import scenes
 
 DT = 0.2  # [s]
 CAMERA = DepthCamera(max_range=6.0)
-DOME = Lidar(rings=48, azimuths=720, fov_low_deg=-60.0, fov_high_deg=60.0, max_range=10.0)
+_DOME = Lidar(rings=48, azimuths=720, fov_low_deg=-60.0, fov_high_deg=60.0, max_range=10.0)
 
 
 class SimulatedScan(NamedTuple):
     """One scan, with the poses as the robot estimates them."""
 
-    points: Tensor  # (1, N, 3) [m] sensor frame
-    T_map_sensor: Tensor  # (1, 4, 4)
-    T_map_base: Tensor  # (1, 4, 4)
-    t: float  # [s]
-    below: float  # [m] height below which the ground is: what is above belongs to another floor
+    points: Tensor  #: (1, N, 3) [m] sensor frame
+    T_map_sensor: Tensor  #: (1, 4, 4)
+    T_map_base: Tensor  #: (1, 4, 4)
+    t: float  #: [s]
+    below: float  #: [m] height below which the ground is: what is above belongs to another floor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,8 +34,8 @@ class SimulatedRun:
 
     scene: Scene
     frames: list[SimulatedScan]
-    exact: list[Tensor]  # the noiseless points (N, 3) [m] of each scan in the true map frame
-    T_true_sensor: Tensor  # (T, 4, 4)
+    exact: list[Tensor]  #: the noiseless points (N, 3) [m] of each scan in the true map frame
+    T_true_sensor: Tensor  #: (T, 4, 4)
 
     def truth(self, xy: Tensor, k: int = -1) -> Tensor:
         """Return the height of the ground (...) [m] at places (..., 2) [m] at scan k."""
@@ -122,7 +122,7 @@ def record_overhang() -> SimulatedRun:
     """Record a walk under a bar and a ceiling, past an obstacle, with a lidar that sees from -60 to 60 degrees."""
     scene = scenes.overhang()
     path = walk(scene, [(-1.5, -0.85), (4.0, -0.85)], dt=DT, T_base_sensor=mount(0.0))
-    return _record(scene, path, sensor=DOME)
+    return _record(scene, path, sensor=_DOME)
 
 
 def _staggered_wall(x: float, y0: float, y1: float, top: float) -> list[Box]:

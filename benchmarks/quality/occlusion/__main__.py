@@ -29,7 +29,7 @@ from torchelev import ElevationMap
 from torchelev.app.results import markdown_table, write_json
 
 PICTURED = (("hump", 0.8), ("cliff", 0.4), ("abyss", 0.5))  # kind, and its size within the range from 0 to 1
-PICTURED_AT = 1.2  # [m] before the edge
+_PICTURED_AT = 1.2  # [m] before the edge
 Rows = list[dict[str, Any]]
 
 
@@ -82,7 +82,7 @@ def _pictured(kind: str, size: float) -> tuple[Case, ElevationMap, float]:
     """Return a scene of the figure, its map and the robot's x [m]."""
     (make,) = (make for make in KINDS if make.__name__ == kind)
     case = make([size, size])
-    emap, x = views(case, torch.Generator().manual_seed(0))[PICTURED_AT]
+    emap, x = views(case, torch.Generator().manual_seed(0))[_PICTURED_AT]
     return case, emap, x
 
 

@@ -17,9 +17,9 @@ from torchelev.planning.planner import Path
 from torchelev.planning.traversal_cost import traversal_cost
 from torchelev.viz.plot import UNKNOWN_COLOR
 
-SPAN = (-1.7, 2.6)  # [m] drawn range of x
+_SPAN = (-1.7, 2.6)  # [m] drawn range of x
 EYE = 0.8  # [m] height of the camera
-RULE = "upper bound"
+_RULE = "upper bound"
 Scene = tuple[Case, ElevationMap, float, dict[str, Path]]  # with the robot's x [m] and the path of each rule
 
 
@@ -29,7 +29,7 @@ def draw(out: str | File, scenes: Sequence[Scene]) -> None:
     axes = figure.subplots(2, len(scenes), sharex=True, squeeze=False, height_ratios=(1.25, 1))
     for column, (case, emap, x, plans) in zip(axes.T, scenes, strict=True):
         _section(column[0], case, emap, x, plans)
-        image = _cost(column[1], emap, x, case.goal, plans[RULE])
+        image = _cost(column[1], emap, x, case.goal, plans[_RULE])
     figure.colorbar(image, ax=axes[1], pad=0.01, label="cost of each metre")
     axes[0, 0].set_ylabel("z [m]")
     axes[1, 0].set_ylabel("y [m]")
@@ -40,7 +40,7 @@ def draw(out: str | File, scenes: Sequence[Scene]) -> None:
 
 def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str, Path]) -> None:
     """Draw the ground and the map along y = 0, and the decision of each rule."""
-    line = np.linspace(*SPAN, 800)
+    line = np.linspace(*_SPAN, 800)
     truth = case.scene.truth(torch.from_numpy(np.stack([line, 0 * line], -1)))
     middle = GRID.width // 2
     at = emap.cell_centers()[0, :, middle, 0].numpy()
@@ -52,7 +52,7 @@ def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str
     ax.plot(at, elevation, ".", color="navy", markersize=4, label="elevation")
     ax.plot(x, EYE, "v", color="crimson", markersize=9, label="camera")
     ax.plot(case.goal, float(case.scene.truth(torch.tensor([case.goal, 0.0]))), "k*", markersize=9, label="goal")
-    ax.set(xlim=SPAN, ylim=(-1.6, 1.0))
+    ax.set(xlim=_SPAN, ylim=(-1.6, 1.0))
     verdicts = "\n".join(f"{rule}: {'goes' if path.reached[0] else 'stops'}" for rule, path in plans.items())
     ax.set_title(f"{case.kind}: {'safe' if case.safe else 'a drop'}", fontweight="bold")
     ax.text(0.98, 0.97, verdicts, transform=ax.transAxes, fontsize=8, ha="right", va="top")
@@ -74,5 +74,5 @@ def _cost(ax: Axes, emap: ElevationMap, x: float, goal: float, path: Path) -> Ax
         ax.plot(*path.xy[0].T, color="white", linewidth=2)
     ax.plot(x, 0, "v", color="crimson", markersize=8)
     ax.plot(goal, 0, "k*", markersize=9)
-    ax.set(xlim=SPAN, ylim=(-1.3, 1.3), xlabel="x [m]; grey: impassable", aspect="auto")
+    ax.set(xlim=_SPAN, ylim=(-1.3, 1.3), xlabel="x [m]; grey: impassable", aspect="auto")
     return image

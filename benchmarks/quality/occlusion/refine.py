@@ -13,7 +13,7 @@ from torchelev.sim import Lidar
 from torchelev.sim.exact.scenes import boxes
 from torchelev.sim.exact.trajectories import pose
 
-GOALS = ((-1.0, 3.5), (-2.0, 2.0), (1.5, 3.5), (-3.0, 3.0))  # [m] between boxes
+_GOALS = ((-1.0, 3.5), (-2.0, 2.0), (1.5, 3.5), (-3.0, 3.0))  # [m] between boxes
 
 
 def refine(emap: ElevationMap, xy: Tensor, steps: int = 100, rate: float = 0.01) -> Tensor:
@@ -61,7 +61,7 @@ def refined_costs(number: int = 24) -> list[dict[str, Any]]:
         T = pose(torch.tensor([[0.0, y, 1.0]], dtype=torch.float64), torch.zeros(1))
         emap.update(lidar.cast(scene, T[0])[None], T, dt=0.0)
     rows: list[dict[str, Any]] = []
-    for goal in GOALS:
+    for goal in _GOALS:
         path = plan(emap, torch.zeros(1, 2), torch.tensor([goal]))
         last = int(path.count[0]) - 1
         planned = path.xy[:, torch.linspace(0, last, number).round().long()]

@@ -25,8 +25,8 @@ class Case(NamedTuple):
 
     kind: str
     scene: Scene
-    goal: float  # [m] x of the goal beyond the edge
-    safe: bool  # the ground continues
+    goal: float  #: [m] x of the goal beyond the edge
+    safe: bool  #: the ground continues
 
 
 def hump(u: list[float]) -> Case:

@@ -52,10 +52,10 @@ from torchelev.io import MappingRun
 from torchelev.io.export import SavedMap, take
 
 SIZE = 20.0  # [m] side of the maps
-REPEATS = 7  # of a mapping, for the median time
+_REPEATS = 7  # of a mapping, for the median time
 
 
-def _map(case: Case, head: Head | None = None, repeats: int = REPEATS) -> tuple[SavedMap, float]:
+def _map(case: Case, head: Head | None = None, repeats: int = _REPEATS) -> tuple[SavedMap, float]:
     """Map a case like the command line; return the map and the median time of an update [ms]."""
     options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=False)
     cfg = load_config(None, case.resolution, SIZE)

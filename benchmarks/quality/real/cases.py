@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchelev.io import Frame, Recording, open_recording, read_poses
 from torchelev.stages.measure import ExclusionConfig, above_ramp
 
-ROBOT_RADIUS = 0.6  # [m] around the lidar of `offroad`, within which it sees the robot itself
+_ROBOT_RADIUS = 0.6  # [m] around the lidar of `offroad`, within which it sees the robot itself
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Case:
 
     name: str
     recording: Recording
-    held_out: NDArray  # (N, 3) [m], map frame
-    resolution: float  # [m] of the map
-    driven: NDArray | None = None  # (T, 3) [m] positions of the lidar on the driven path, inside the window
+    held_out: NDArray  #: (N, 3) [m], map frame
+    resolution: float  #: [m] of the map
+    driven: NDArray | None = None  #: (T, 3) [m] positions of the lidar on the driven path, inside the window
 
 
 class _OneScan(Recording):
@@ -40,7 +40,7 @@ def read_cases(root: Path, seed: int) -> list[Case]:
     chosen = np.random.default_rng(seed).random(len(field.points)) < 0.1
     mapped = _OneScan(field._replace(points=field.points[~chosen]))
     driven = _interpolate(read_poses(root / "offroad" / "driven_path.txt").T_map_sensor[:, :3, 3], step=0.02)
-    driven = driven[np.linalg.norm((driven - field.T_map_sensor[:3, 3])[:, :2], axis=1) > ROBOT_RADIUS]
+    driven = driven[np.linalg.norm((driven - field.T_map_sensor[:3, 3])[:, :2], axis=1) > _ROBOT_RADIUS]
     second, tenth = below_ramp(car[1]), below_ramp(field._replace(points=field.points[chosen]))
     return [
         Case("parked_car", car[:1], second, 0.2),

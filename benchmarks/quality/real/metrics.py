@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from torchelev.io.export import SavedMap
 
-LIDAR_HEIGHT = 0.48  # [m] of the lidar of `offroad` above the ground, from the recording's notes
+_LIDAR_HEIGHT = 0.48  # [m] of the lidar of `offroad` above the ground, from the recording's notes
 FLAT_SPAN, FLAT_POINTS = 0.10, 3  # largest height difference [m] and fewest held-out points of a flat cell
 
 
@@ -62,7 +62,7 @@ def driven_figures(elevation: NDArray, driven: NDArray, saved: SavedMap) -> dict
     The true height is that of the lidar minus its height above the ground, 0.48 m.
     """
     cell = np.unique(_locate(driven, saved)[0])
-    ground = mean_map(driven, saved).ravel()[cell] - LIDAR_HEIGHT
+    ground = mean_map(driven, saved).ravel()[cell] - _LIDAR_HEIGHT
     value = elevation.ravel()[cell]
     known = np.isfinite(value)
     error = np.abs(value - ground)[known]

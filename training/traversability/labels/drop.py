@@ -43,17 +43,17 @@ _MODEL = """
 class Posture(NamedTuple):
     """The pose of a robot before it is released, in the tile's frame."""
 
-    position: Float[Tensor, 3]  # [m] middle of the body's underside
+    position: Float[Tensor, 3]  #: [m] middle of the body's underside
     rotation: Float[Tensor, "3 3"]
-    balls: Float[Tensor, "4 3"]  # [m] centers of the feet
+    balls: Float[Tensor, "4 3"]  #: [m] centers of the feet
 
 
 class Outcome(NamedTuple):
     """How a robot moved after its release."""
 
-    moved: float  # [m]
-    tilted: float  # [rad]
-    touched: bool  # the body touched the ground
+    moved: float  #: [m]
+    tilted: float  #: [rad]
+    touched: bool  #: the body touched the ground
 
     def stood(self, robot: RobotConfig) -> bool:
         """Tell whether the robot stayed in place, on its feet only."""

@@ -43,7 +43,7 @@ def disc(radius: float) -> Float[Tensor, "13 2"]:
 class Lattice(NamedTuple):
     """A rectangle of nodes at the places (i, j) * SPACING in the tile's frame."""
 
-    first: tuple[int, int]  # (i, j) of node [0, 0]
+    first: tuple[int, int]  #: (i, j) of node [0, 0]
     shape: tuple[int, int]
 
     def widen(self, nodes: int) -> Lattice:
@@ -81,10 +81,10 @@ def lattice_around(xy: Float[Tensor, "M 2"], margin: float) -> Lattice:
 class Sole(NamedTuple):
     """The supporting ground under a foot at each of N places."""
 
-    support: Float[Tensor, "N"]  # fraction of the foot's area
-    gradient: Float[Tensor, "2 N"]  # of the fitted plane
-    roughness: Float[Tensor, "N"]  # [m] standard deviation around the plane
-    height: Float[Tensor, "N"]  # [m] of the plane at the foot's center
+    support: Float[Tensor, "N"]  #: fraction of the foot's area
+    gradient: Float[Tensor, "2 N"]  #: of the fitted plane
+    roughness: Float[Tensor, "N"]  #: [m] standard deviation around the plane
+    height: Float[Tensor, "N"]  #: [m] of the plane at the foot's center
 
 
 def fit_sole(z: Float[Tensor, "13 N"], points: Float[Tensor, "13 2"], tolerance: float) -> Sole:
@@ -144,8 +144,8 @@ def check_soles(z: Float[Tensor, "13 N"], robot: RobotConfig) -> tuple[Bool[Tens
 class Footholds(NamedTuple):
     """The two footholds that a foot may take at each of N nominal places: the nearest, and that on the other level."""
 
-    sole: Float[Tensor, "N 2 5"]  # x, y, z [m] in the tile's frame, dz/dx, dz/dy
-    levels: Int[Tensor, "N"]  # number of footholds: 0, 1 or 2
+    sole: Float[Tensor, "N 2 5"]  #: x, y, z [m] in the tile's frame, dz/dx, dz/dy
+    levels: Int[Tensor, "N"]  #: number of footholds: 0, 1 or 2
 
 
 def find_footholds(field: HeightField, tile: int, lattice: Lattice, robot: RobotConfig) -> Footholds:

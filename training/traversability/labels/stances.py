@@ -46,21 +46,21 @@ class Ground(NamedTuple):
 
     lattice: Lattice
     feet: Footholds
-    line: Float[Tensor, "N"]  # [m] highest ground around a point on the line from foot to foot
-    body: Float[Tensor, "N"]  # [m] highest ground around a point under the body
+    line: Float[Tensor, "N"]  #: [m] highest ground around a point on the line from foot to foot
+    body: Float[Tensor, "N"]  #: [m] highest ground around a point under the body
 
 
 class Stances(NamedTuple):
     """The outcome for N robots: the latest criterion that a choice of footholds reached, and the choice tried last."""
 
-    verdict: Int[Tensor, "N"]  # index of VERDICTS
-    feet: Float[Tensor, "N 4 3"]  # [m] tile frame, the footholds; valid where the verdict is "stands"
+    verdict: Int[Tensor, "N"]  #: index of VERDICTS
+    feet: Float[Tensor, "N 4 3"]  #: [m] tile frame, the footholds; valid where the verdict is "stands"
 
 
 class StancePlane(NamedTuple):
     """The planes through the feet of N robots."""
 
-    middle: Float[Tensor, "3 N"]  # [m] mean of the feet
+    middle: Float[Tensor, "3 N"]  #: [m] mean of the feet
     gradient: Float[Tensor, "2 N"]
 
 

@@ -36,16 +36,16 @@ _EXACT_SPLITS = ("train_exact", "held_out_exact")  # maps of the true heights
 class MappedTerrain(NamedTuple):
     """B maps of one resolution for one robot, and the labels of their cells."""
 
-    elevation: Float[Tensor, "B H W"]  # [m]
+    elevation: Float[Tensor, "B H W"]  #: [m]
     validity: Bool[Tensor, "B H W"]
-    variance: Float[Tensor, "B H W"]  # [m^2]
-    upper_bound: Float[Tensor, "B H W"]  # [m]
+    variance: Float[Tensor, "B H W"]  #: [m^2]
+    upper_bound: Float[Tensor, "B H W"]  #: [m]
     bounded: Bool[Tensor, "B H W"]
-    label: Float[Tensor, "B H W"]  # fraction of the headings at which the robot can stand there; 0 where not rated
-    rated: Bool[Tensor, "B H W"]  # cells that count in training and metrics, see `rated_cells`
-    resolution: float  # [m]
+    label: Float[Tensor, "B H W"]  #: fraction of the headings at which the robot can stand there; 0 where not rated
+    rated: Bool[Tensor, "B H W"]  #: cells that count in training and metrics, see `rated_cells`
+    resolution: float  #: [m]
     robot: RobotConfig
-    kinds: tuple[str, ...]  # of the terrain, one for each map
+    kinds: tuple[str, ...]  #: of the terrain, one for each map
 
     @property
     def maps(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

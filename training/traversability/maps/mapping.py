@@ -34,13 +34,13 @@ _EXACT_SHIFT = 1.0  # [m] largest distance of their center from the tile's along
 class DataConfig:
     """Settings of the maps."""
 
-    num_maps: int = 2  # per batch, which shares robot, resolution and sensors
-    window: float = 4.0  # [m] side of a map, rounded to whole cells
-    looks: tuple[int, int] = (10, 20)  # smallest and largest number
-    headings: int = 8  # per label
-    camera_pixels: tuple[int, int] = (64, 48)  # width, height
-    lidar_rays: tuple[int, int] = (32, 256)  # rings, azimuths
-    robot: RobotConfig | None = None  # None: each batch draws its own
+    num_maps: int = 2  #: per batch, which shares robot, resolution and sensors
+    window: float = 4.0  #: [m] side of a map, rounded to whole cells
+    looks: tuple[int, int] = (10, 20)  #: smallest and largest number
+    headings: int = 8  #: per label
+    camera_pixels: tuple[int, int] = (64, 48)  #: width, height
+    lidar_rays: tuple[int, int] = (32, 256)  #: rings, azimuths
+    robot: RobotConfig | None = None  #: None: each batch draws its own
 
     def __post_init__(self) -> None:
         require_positive(window=self.window)
@@ -52,10 +52,10 @@ class DataConfig:
 class Look(NamedTuple):
     """The scans of a batch of robots at one instant."""
 
-    points: Float[Tensor, "B S N 3"]  # [m] sensor frame
-    T_map_sensor: Float[Tensor, "B S 4 4"]  # as estimated
-    T_map_base: Float[Tensor, "B 4 4"]  # as estimated
-    T_tile_base: Float[Tensor, "B 4 4"]  # true
+    points: Float[Tensor, "B S N 3"]  #: [m] sensor frame
+    T_map_sensor: Float[Tensor, "B S 4 4"]  #: as estimated
+    T_map_base: Float[Tensor, "B 4 4"]  #: as estimated
+    T_tile_base: Float[Tensor, "B 4 4"]  #: true
 
 
 def walk_and_look(field: HeightField, robot: RobotConfig, cfg: DataConfig, rng: np.random.Generator) -> Iterator[Look]:
