@@ -65,7 +65,11 @@ def make_runner(
 @click.command()
 @click.option("--num-envs", type=_POSITIVE, default=256, show_default=True, help="Number of parallel robots.")
 @click.option(
-    "--iterations", type=_POSITIVE, default=140, show_default=True, help="In total, including those before --resume."
+    "--iterations",
+    type=_POSITIVE,
+    default=140,
+    show_default=True,
+    help="Iterations in total, including those before --resume.",
 )
 @click.option(
     "--perception",
@@ -74,14 +78,14 @@ def make_runner(
     show_default=True,
     help="What the policy sees: the map, the true ground with white noise, or nothing.",
 )
-@click.option("--seed", default=0, show_default=True, help="Of weights, starts, goals and noise.")
+@click.option("--seed", default=0, show_default=True, help="Seed of weights, starts, goals and noise.")
 @click.option("--device", default=None, help="Default: a GPU if there is one, else the CPU.")
 @click.option(
     "--out", type=click.Path(path_type=Path), default=Path("runs/nav"), show_default=True, help="Output folder."
 )
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
 @click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Compile the map's update.")
-@click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Of the evaluation.")
+@click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Episodes of the evaluation.")
 def main(
     num_envs: int,
     iterations: int,

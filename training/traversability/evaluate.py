@@ -1,6 +1,6 @@
 """Compare learned traversability heads with the analytic ones on held-out ground.
 
-    python -m training.traversability.evaluate --weights runs/traversability/weights.pt
+    python -m training.traversability.evaluate --weights weights.pt
 
 Without --weights, the shipped weights are evaluated. With --paper-weights, the paper's filter takes part.
 """
@@ -160,7 +160,13 @@ def _cell(values: list[float | None]) -> str:
 
 
 @click.command(help=__doc__)
-@click.option("--weights", "paths", type=click.Path(path_type=Path), multiple=True, help="Repeat for several seeds.")
+@click.option(
+    "--weights",
+    "paths",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Weights to evaluate; repeat for several seeds.",
+)
 @click.option(
     "--data",
     type=click.Path(path_type=Path),

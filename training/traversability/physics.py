@@ -115,7 +115,7 @@ def summarize(rows: list[Row]) -> dict[str, Any]:
     "--drops", type=click.IntRange(2), default=8, show_default=True, help="Largest number of stances per tile."
 )
 @click.option("--robot", type=RobotType(), help="length=0.7,width=0.4,... or a YAML file. Default: random.")
-@click.option("--seed", default=0, show_default=True, help="Of terrain, robots and stances.")
+@click.option("--seed", default=0, show_default=True, help="Seed of terrain, robots and stances.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default=_RESULT, help="JSON file to write.")
 def main(tiles: int, drops: int, robot: RobotConfig | None, seed: int, out: Path) -> None:
     """Simulate, write JSON and print the table."""

@@ -25,7 +25,7 @@ _PICTURED = ("analytic (defaults)", "paper (at 4 cm)")
 @click.option(
     "--robot", type=RobotType(), default=None, help="length=0.7,width=0.4,... or a YAML file. Default: any robot."
 )
-@click.option("--seed", default=0, show_default=True, help="Of data, initial weights and order.")
+@click.option("--seed", default=0, show_default=True, help="Seed of data, initial weights and order.")
 @click.option(
     "--batches", type=_POSITIVE, default=300, show_default=True, help="Training batches of two maps from sensors."
 )
@@ -33,7 +33,7 @@ _PICTURED = ("analytic (defaults)", "paper (at 4 cm)")
     "--exact-batches", type=_POSITIVE, default=100, show_default=True, help="Further batches of the true heights."
 )
 @click.option(
-    "--steps", type=_POSITIVE, default=4000, show_default=True, help="In total, including those before --resume."
+    "--steps", type=_POSITIVE, default=4000, show_default=True, help="Steps in total, including those before --resume."
 )
 @click.option(
     "--evaluation-batches", type=_POSITIVE, default=20, show_default=True, help="Evaluation batches per resolution."

@@ -88,7 +88,7 @@ def _pictured(kind: str, size: float) -> tuple[Case, ElevationMap, float]:
 
 @click.command(help=__doc__)
 @click.option("--each", default=12, show_default=True, help="Random scenes of each kind of ground.")
-@click.option("--seed", default=0, show_default=True, help="Of scenes and noise.")
+@click.option("--seed", default=0, show_default=True, help="Seed of scenes and noise.")
 def main(each: int, seed: int) -> None:
     """Measure, write JSON and figure and print the table."""
     scenes = list(tqdm(_trials(each, seed), total=each * len(KINDS), unit="scene"))

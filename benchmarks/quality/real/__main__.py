@@ -120,7 +120,7 @@ def _percent(row: dict[str, Any], key: str) -> str:
 @click.command(help=__doc__)
 @click.argument("recordings_root", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--threads", default=1, show_default=True, help="CPU threads.")
-@click.option("--seed", default=0, show_default=True, help="Of the held-out points.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the held-out points.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "real.json", help="JSON file to write.")
 def main(recordings_root: Path, threads: int, seed: int, out: Path) -> None:
     """Measure, print the table and write JSON."""

@@ -1,6 +1,5 @@
 """The command: it trains, evaluates, draws, resumes, and refuses what does not fit."""
 
-import functools
 import json
 
 import pytest
@@ -9,12 +8,8 @@ from click.testing import CliRunner
 
 import training.traversability.evaluate as evaluation
 import training.traversability.train as training
+from tests.training.traversability.small import TINY
 from training.resume import CHECKPOINT
-from training.traversability.maps.data import DataConfig
-
-TINY = functools.partial(
-    DataConfig, num_maps=2, window=2.0, looks=(2, 2), headings=2, camera_pixels=(16, 12), lidar_rays=(8, 64)
-)
 
 
 def invoke(main, *arguments):

@@ -1,24 +1,16 @@
 """The fit: its losses, its order of batches, and a resume that makes no difference."""
 
-import functools
 import os
 import signal
 
 import pytest
 import torch
 
+from tests.training.traversability.small import made_up
 from torchelev.robot import RobotConfig
 from torchelev.traversability.net import TraversabilityNet
 from training.resume import CHECKPOINT
-from training.traversability.maps.data import MappedTerrain
 from training.traversability.trainer import FitConfig, Trainer, losses, mean_over_maps
-
-
-def made_up(seed, num_maps=2, cells=14):
-    """Maps of noise; what counts here is that they differ."""
-    draw = functools.partial(torch.rand, num_maps, cells, cells, generator=torch.Generator().manual_seed(seed))
-    layers = [0.3 * draw(), draw() < 0.8, 0.01 * draw(), draw(), draw() < 0.5]
-    return MappedTerrain(*layers, draw(), draw() < 0.9, 0.1, RobotConfig(), ("rough",) * num_maps)
 
 
 def trainer(batches=3, **settings):

@@ -10,11 +10,11 @@ import torch
 import training.traversability.maps.data as data
 import training.traversability.maps.mapping as mapping
 from tests.helpers import pose
+from tests.training.traversability.small import TINY
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
 from training.traversability.maps.data import batch_seed, data_set, label_cells, make_batch, rated_cells
 from training.traversability.maps.mapping import (
-    DataConfig,
     blank_map,
     tile_cell_centers,
     walk_and_map,
@@ -26,8 +26,9 @@ from training.traversability.maps.terrain import (
     UNSEEN_KINDS,
 )
 
-TINY = DataConfig(num_maps=2, window=2.0, looks=(3, 3), headings=2, camera_pixels=(16, 12), lidar_rays=(8, 64))
 BOX = (0.8, 1.1, -0.4, -0.1)  # [m] x from, to, y from, to: too small to stand on
+
+SMALL = TINY(looks=(3, 3))
 
 
 def flat_tile_with_a_box(height=0.8):
@@ -51,7 +52,7 @@ def test_labels_lie_where_the_map_has_the_ground_that_they_are_of(seed, monkeypa
     path = torch.stack([pose((-0.5 + 0.1 * k, -1.2 + 0.1 * k, 0.5), yaw=0.9) for k in range(8)])
     monkeypatch.setattr(mapping, "walks", lambda *_: path)
     field, robot, rng = flat_tile_with_a_box(), RobotConfig(length=0.6, width=0.4), np.random.default_rng(seed)
-    cfg = dataclasses.replace(TINY, num_maps=1, window=4.0, camera_pixels=(64, 48), lidar_rays=(32, 256))
+    cfg = dataclasses.replace(SMALL, num_maps=1, window=4.0, camera_pixels=(64, 48), lidar_rays=(32, 256))
     emap, T_tile_map = walk_and_map(field, robot, 0.05, cfg, rng)
     maps = label_cells(emap, T_tile_map, field, robot, 4, ("box",))
     ground = float(maps.elevation[maps.validity].median())
@@ -93,8 +94,8 @@ def equal(a, b):
 
 
 def test_a_seed_makes_the_same_maps_and_another_makes_others():
-    first = make_batch([0, 1], TINY)
-    assert equal(first, make_batch([0, 1], TINY)) and not equal(first, make_batch([0, 2], TINY))
+    first = make_batch([0, 1], SMALL)
+    assert equal(first, make_batch([0, 1], SMALL)) and not equal(first, make_batch([0, 2], SMALL))
     H = round(2.0 / first.resolution)
     assert first.elevation.shape == first.label.shape == (2, H, H) and len(first.kinds) == 2
     assert set(first.kinds) <= set(KINDS) and 0.02 <= first.resolution <= 0.1
@@ -107,15 +108,15 @@ def test_a_seed_makes_the_same_maps_and_another_makes_others():
 
 def test_kinds_resolution_and_robot_can_be_fixed():
     robot = RobotConfig(length=0.5, width=0.3)
-    maps = make_batch(5, dataclasses.replace(TINY, robot=robot), UNSEEN_KINDS, 0.08)
+    maps = make_batch(5, dataclasses.replace(SMALL, robot=robot), UNSEEN_KINDS, 0.08)
     assert maps.kinds == ("stepping_stones",) * 2 and maps.resolution == 0.08 and maps.robot == robot
     assert not set(UNSEEN_KINDS) & set(KINDS)
 
 
 def test_exact_batches_are_rated_everywhere(tmp_path):
-    (maps,) = data_set(tmp_path, "held_out_exact", 1, 0, TINY, resolution=0.1)
+    (maps,) = data_set(tmp_path, "held_out_exact", 1, 0, SMALL, resolution=0.1)
     assert maps.validity.all() and maps.rated.all()
-    assert equal(maps, make_batch(batch_seed("held_out_exact", 0, 0), TINY, KINDS, 0.1, exact=True))
+    assert equal(maps, make_batch(batch_seed("held_out_exact", 0, 0), SMALL, KINDS, 0.1, exact=True))
 
 
 def test_splits_and_data_sets_have_seeds_of_their_own():
@@ -126,11 +127,11 @@ def test_splits_and_data_sets_have_seeds_of_their_own():
 def test_a_data_set_is_kept_and_only_what_lacks_is_made(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(data, "make_batch", lambda seed, *rest: made.append(seed) or make_batch(seed, *rest))
-    first = data_set(tmp_path, "train", 1, 0, TINY, resolution=0.1)
-    again = data_set(tmp_path, "train", 2, 0, TINY, resolution=0.1)
+    first = data_set(tmp_path, "train", 1, 0, SMALL, resolution=0.1)
+    again = data_set(tmp_path, "train", 2, 0, SMALL, resolution=0.1)
     assert len(made) == 2 and made[0] != made[1] and equal(first[0], again[0])
-    assert equal(again[1], make_batch(batch_seed("train", 0, 1), TINY, KINDS, 0.1))
-    other = dataclasses.replace(TINY, headings=3)
+    assert equal(again[1], make_batch(batch_seed("train", 0, 1), SMALL, KINDS, 0.1))
+    other = dataclasses.replace(SMALL, headings=3)
     with pytest.raises(ValueError, match=r"must be of the same settings, got other headings; remove the folder"):
         data_set(tmp_path, "train", 1, 0, other, resolution=0.1)
     assert not list(tmp_path.glob("*.tmp"))

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.helpers import pose
+from tests.training.traversability.small import TINY
 from training.traversability.maps.mapping import (
     EXACT_NOISE,
     DataConfig,
@@ -18,7 +19,7 @@ from training.traversability.maps.terrain import (
     make_tiles,
 )
 
-TINY = DataConfig(num_maps=2, window=2.0, looks=(3, 3), headings=2, camera_pixels=(16, 12), lidar_rays=(8, 64))
+SMALL = TINY(looks=(3, 3))
 
 
 def test_a_cells_true_place_is_the_one_relative_to_the_robot():
@@ -37,7 +38,7 @@ def test_a_cells_true_place_is_the_one_relative_to_the_robot():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_exact_maps_know_the_true_heights_to_their_variance(seed):
     field = make_tiles(("boxes", "stairs_up"), np.random.default_rng(seed))
-    emap, T_tile_map = exact_maps(field, 0.05, TINY, np.random.default_rng(seed))
+    emap, T_tile_map = exact_maps(field, 0.05, SMALL, np.random.default_rng(seed))
     truth = field.height(torch.arange(2), tile_cell_centers(emap, T_tile_map).float().flatten(1, 2)).view(2, 40, 40)
     errors, state = (emap.state.elevation - truth).std((1, 2)), emap.state
     assert state.validity.all() and (state.variance.amax((1, 2)) == state.variance.amin((1, 2))).all()
