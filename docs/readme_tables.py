@@ -1,58 +1,60 @@
-"""Write the README's tables from the results, so that no number stands there without its run.
+"""Write the README's tables from the results of benchmarks and trainings, so that every number comes from a run.
 
     python -m docs.readme_tables
 
-Each table stands between <!-- name --> and <!-- end -->.
+Each table is between <!-- name --> and <!-- end -->.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from pathlib import Path
 from typing import Any
 
-from benchmarks.speed import long_run as long_runs
-from benchmarks.speed import tables as speed_tables
+import benchmarks
+import training
+from benchmarks.quality.changes import report as changes
+from benchmarks.speed import growth, head, long_run, loop, postprocessing, sight, tables
 from torchelev.app.results import markdown_table
+from training.nav import experiment
+from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
 SPEED = "speed-2-x-intel-r-xeon-r-processor-2-threads"
-SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
+_SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
 
 
-def load(name: str) -> dict[str, Any]:
+def load(name: str, folder: Path = benchmarks.RESULTS) -> dict[str, Any]:
     """Read a result."""
-    return json.loads((RESULTS / f"{name}.json").read_text())
+    return json.loads((folder / f"{name}.json").read_text())
 
 
-def accuracy() -> str:
-    """Tabulate map / mean [mm] by scene, and count the cases that hold."""
+def _accuracy() -> str:
+    """Tabulate the RMSE of map / mean [mm] by scene, and count the cases that meet their targets."""
     rows = load("accuracy")["rows"]
     cells = {(r["scene"], f"{r['motion']} {r['noise']}"): f"{r['rmse']:.1f} / {r['rmse_mean']:.1f}" for r in rows}
     scenes = list(dict.fromkeys(r["scene"] for r in rows))
-    table = markdown_table(["scene", *SHOWN], [[scene, *(cells[scene, case] for case in SHOWN)] for scene in scenes])
+    table = markdown_table(["scene", *_SHOWN], [[scene, *(cells[scene, case] for case in _SHOWN)] for scene in scenes])
     failed = [f"*{r['scene']} {r['motion']} {r['noise']}*" for r in rows if not r["holds"]]
     verdict = f"not {', '.join(failed)}" if failed else "all of them"
     return f"{table}\n\n{len(rows) - len(failed)} of {len(rows)} cases hold their bars: {verdict}."
 
 
-def features() -> str:
-    """Tabulate the figures that have a bar."""
+def _features() -> str:
+    """Tabulate the figures that have a target."""
     rows = [list(r.values()) for r in load("features")["rows"] if r["bar"]]
     return markdown_table(["feature", "figure", "on", "off", "baseline", "bar", ""], rows)
 
 
-def changes() -> str:
+def _changes() -> str:
     """Tabulate how soon changes show."""
-    from benchmarks.quality import changes as new
-
-    return new.tables(load("changes"))
+    return changes.tables(load("changes"))
 
 
-def real() -> str:
-    """Tabulate held-out errors on flat cells."""
+def _real() -> str:
+    """Tabulate the errors at held-out points on flat cells."""
     head = ["recording", "cell", "method", "median", "p90", "coverage", "ms / scan"]
     rows = []
     for r in load("real")["rows"]:
@@ -63,107 +65,96 @@ def real() -> str:
     return markdown_table(head, rows)
 
 
-def speed() -> str:
-    """Tabulate the sensors, the stages, the robots, and the targets."""
-    picture = f"![Time against points, robots, cells and ray length](benchmarks/results/{SPEED}.png)"
-    return f"{speed_tables.report(load(SPEED))}\n\n{picture}"
-
-
-def loop() -> str:
-    """Tabulate a 50 Hz loop, idle and beside a busy process."""
-    from benchmarks.speed import loop as loops
-
-    return loops.table(load("loop")["rows"])
-
-
-def long_run() -> str:
-    """Tabulate growth over long runs."""
-    cases = {name: values for name, values in load("long_run").items() if name in long_runs.CASES}
-    return long_runs.table(cases)
-
-
-def nav() -> str:
-    """Tabulate what policies reach, by what they were trained with."""
-    from training.nav import experiment as nav_experiment
-
-    return nav_experiment.table(json.loads((nav_experiment.RESULTS / "nav.json").read_text()))
-
-
-def sight() -> str:
-    """Tabulate what sight costs while a policy learns."""
-    from benchmarks.speed import sight as costs
-
-    return costs.table(load("sight")["rows"])
-
-
-def postprocessing() -> str:
-    """Tabulate filters and planes."""
-    from benchmarks.speed import postprocessing as times
-
-    result = load("postprocessing")
-    return f"{times.table(result['rows'])}\n\n{times.planes_table(result['planes'])}"
-
-
-def occlusion() -> str:
-    """Tabulate who was right over whole walks [%], by rule and kind of ground."""
+def _occlusion() -> str:
+    """Tabulate how often each rule for unknown ground is right over whole walks [%]."""
     right = load("occlusion")["right [%]"]
     kinds = list(next(iter(right.values())))
-    rows = [[rule, *(f"{shares[kind]['whole walk']:.0f}" for kind in kinds)] for rule, shares in right.items()]
+    rows = [[rule, *(f"{rates[kind]['whole walk']:.0f}" for kind in kinds)] for rule, rates in right.items()]
     return markdown_table(["rule for unknown ground", *kinds], rows)
 
 
-def traversability() -> str:
-    """Tabulate how good the heads are, on held-out ground and on a kind that was never trained on."""
-    from training.traversability import evaluate as heads
+def _speed() -> str:
+    """Tabulate sensors, stages, robots and targets."""
+    picture = f"![Time against points, robots, cells and ray length](benchmarks/results/{SPEED}.png)"
+    return f"{tables.report(load(SPEED))}\n\n{picture}"
 
-    result = json.loads((ROOT / "training" / "results" / "traversability.json").read_text())
-    names = {
+
+def _loop() -> str:
+    """Tabulate a 50 Hz loop, on an idle machine and beside a busy process."""
+    return loop.table(load("loop")["rows"])
+
+
+def _long_run() -> str:
+    """Tabulate growth over long runs."""
+    return growth.table({name: values for name, values in load("long_run").items() if name in long_run.CASES})
+
+
+def _sight() -> str:
+    """Tabulate what perception costs in a training."""
+    return sight.table(load("sight")["rows"])
+
+
+def _head() -> str:
+    """Tabulate what the traversability heads cost."""
+    return head.table(load("head")["rows"])
+
+
+def _postprocessing() -> str:
+    """Tabulate the times of filters and plane segmentation."""
+    result = load("postprocessing")
+    return f"{postprocessing.table(result['rows'])}\n\n{postprocessing.planes_table(result['planes'])}"
+
+
+def _nav() -> str:
+    """Tabulate the success of policies by what they were trained with."""
+    return experiment.table(load("nav", training.RESULTS))
+
+
+def _traversability() -> str:
+    """Tabulate the quality of the traversability heads on each split."""
+    result = load("traversability", training.RESULTS)
+    titles = {
         "held_out": "Kinds of ground that it trained on",
         "unseen": "Stepping stones, which it never saw",
         "held_out_exact": "Maps of the true heights, to at most 1 cm of white noise, of the kinds that it trained on",
     }
-    return "\n\n".join(f"{name}:\n\n{heads.table(result, split)}" for split, name in names.items())
+    return "\n\n".join(f"{title}:\n\n{evaluate.table(result, split)}" for split, title in titles.items())
 
 
-def head() -> str:
-    """Tabulate what the heads cost."""
-    from benchmarks.speed import head as costs
-
-    return costs.table(load("head")["rows"])
+def _block() -> str:
+    """Tabulate the ratings beside a sharp step."""
+    return block.table(load("block", training.RESULTS)["profiles"])
 
 
-def block() -> str:
-    """Tabulate what the heads say beside a sharp step."""
-    from training.traversability import block as steps
-
-    return steps.table(json.loads((steps.RESULTS / "block.json").read_text())["profiles"])
-
-
-TABLES = {
-    "accuracy": accuracy,
-    "features": features,
-    "changes": changes,
-    "real": real,
-    "speed": speed,
-    "loop": loop,
-    "long_run": long_run,
-    "nav": nav,
-    "sight": sight,
-    "postprocessing": postprocessing,
-    "occlusion": occlusion,
-    "traversability": traversability,
-    "head": head,
-    "block": block,
+_TABLES = {
+    "accuracy": _accuracy,
+    "features": _features,
+    "changes": _changes,
+    "real": _real,
+    "speed": _speed,
+    "loop": _loop,
+    "long_run": _long_run,
+    "nav": _nav,
+    "sight": _sight,
+    "postprocessing": _postprocessing,
+    "occlusion": _occlusion,
+    "traversability": _traversability,
+    "head": _head,
+    "block": _block,
 }
 
 
 def with_tables(text: str) -> str:
-    """Return the README with its tables made anew."""
-    for name, table in TABLES.items():
+    """Return the README's text with new tables."""
+    for name, table in _TABLES.items():
         pattern = rf"(<!-- {name} -->\n).*?(<!-- end -->)"
-        text, count = re.subn(pattern, lambda m, t=table: m[1] + t() + "\n" + m[2], text, flags=re.DOTALL)
+        text, count = re.subn(pattern, functools.partial(_insert, table()), text, flags=re.DOTALL)
         assert count == 1, f"README.md must hold <!-- {name} --> ... <!-- end --> once"
     return text
+
+
+def _insert(table: str, match: re.Match[str]) -> str:
+    return f"{match[1]}{table}\n{match[2]}"
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Accuracy, features and behaviour against ground truth. Results are in `benchmarks/results`."""
+"""How close maps, features and plans come to the ground truth: one folder per benchmark, each a command."""

@@ -1,1 +1,1 @@
-"""Time and memory. Results are in `benchmarks/results`."""
+"""How long updates, sensors, filters and training steps take, and how much memory an update needs."""

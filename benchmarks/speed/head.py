@@ -1,26 +1,25 @@
-"""What the heads cost: `python -m benchmarks.speed.head`
+"""Time an update with the analytic and with the learned traversability head.
 
-A compiled update of 43,074 points on 250 x 250 cells with the analytic head and with the learned one, and the learned
-head alone on the map that this made, compiled too, in turn; two CPU threads. Writes benchmarks/results/head.json.
-The learned head may take 4 ms.
+    python -m benchmarks.speed.head
+
+Times in turn a compiled update of 43,074 points on 250 x 250 cells with each head, and the compiled learned head alone
+on the resulting map. The learned head may take 4 ms. Writes benchmarks/results/head.json.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import click
 import torch
 
+from benchmarks import RESULTS
 from benchmarks.speed.meter import interleaved
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 from torchelev import ElevationMap, LearnedTraversabilityConfig, RobotConfig, TraversabilityNet
 from torchelev.app.results import markdown_table, write_json
-
-RESULTS = Path(__file__).parents[1] / "results"
 
 
 def measure(seconds: float) -> dict[str, Any]:
@@ -30,11 +29,12 @@ def measure(seconds: float) -> dict[str, Any]:
     drives = {"analytic": Drive(cfg, BPEARL), "learned": Drive(learned, BPEARL)}
     for drive in drives.values():
         drive.warm_up()
-    return interleaved({**drives, "learned, alone": alone(drives["learned"].emap)}, seconds, rounds=20)
+    runs: dict[str, Callable[[], Any]] = {**drives, "learned, alone": _alone(drives["learned"].emap)}
+    return interleaved(runs, seconds, rounds=20)
 
 
-def alone(emap: ElevationMap) -> Callable[[], Any]:
-    """Return the learned rating of a map as a compiled call, as a user would make it who needs no gradients."""
+def _alone(emap: ElevationMap) -> Callable[[], Any]:
+    """Return a compiled call of the learned head on a map, without gradients."""
     net, robot, state = TraversabilityNet.from_pretrained().requires_grad_(False), RobotConfig(), emap.state
     layers = state.elevation, state.validity, state.variance, state.upper_bound, state.bounded
     compiled = torch.compile(lambda *given: net(*given, resolution=emap.cfg.grid.resolution, robot=robot))
@@ -48,16 +48,16 @@ def alone(emap: ElevationMap) -> Callable[[], Any]:
 
 
 def table(rows: dict[str, Any]) -> str:
-    """Tabulate milliseconds, and what the learned head takes more."""
+    """Tabulate the times [ms], and how much longer the learned head takes."""
     lines = [[name, f"{row['median']:.1f}", f"{row['min']:.1f}"] for name, row in rows.items()]
     more = [f"{rows['learned'][kind] - rows['analytic'][kind]:.1f}" for kind in ("median", "min")]
     return markdown_table(["update with the head", "median ms", "min ms"], [*lines, ["learned, more", *more]])
 
 
-@click.command()
-@click.option("--seconds", default=20.0, show_default=True, help="For each.")
+@click.command(help=__doc__)
+@click.option("--seconds", default=20.0, show_default=True, help="Time per row [s].")
 def main(seconds: float) -> None:
-    """Time updates with the analytic and the learned head."""
+    """Measure, write JSON and print the table."""
     rows = measure(seconds)
     write_json(RESULTS / "head.json", {"rows": rows})
     click.echo(table(rows))

@@ -1,9 +1,13 @@
-"""How long the updates of a 50 Hz loop take, alone and beside one busy process: `python -m benchmarks.speed.loop`
+"""Time the updates of a 50 Hz loop, on an idle machine and beside a busy process.
 
-A map of 10 x 10 m at 4 cm takes a scan of 43,074 points every 20 ms, compiled. Each condition runs in a process of its
-own, in turn: threads that spin while they wait, OpenMP's default, and `OMP_WAIT_POLICY=PASSIVE`, each idle and beside a
-process that keeps one core busy at equal priority. Writes p50, p99 and max [ms], and the share of late updates, those
-that ended after the next scan was due, into benchmarks/results/loop.json.
+    python -m benchmarks.speed.loop
+
+A compiled map of 10 x 10 m at 4 cm fuses a scan of 43,074 points every 20 ms. The loop runs in a new process for each
+OpenMP wait policy: the default, by which waiting threads spin, and OMP_WAIT_POLICY=PASSIVE. Each is timed on an idle
+machine and beside a process that keeps one core busy at equal priority.
+
+Writes p50, p99 and max [ms] and the fraction of late updates to benchmarks/results/loop.json; an update is late if it
+ends after the next scan was due.
 """
 
 from __future__ import annotations
@@ -23,17 +27,17 @@ from typing import Any
 import click
 import torch
 
+from benchmarks import RESULTS
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 from torchelev.app.results import markdown_table, write_json
 
-RESULTS = Path(__file__).parents[1] / "results"
-PERIOD = 0.02  # [s]
-POLICIES = ("default", "PASSIVE")
-BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends when this process does
+_PERIOD = 0.02  # [s]
+_POLICIES = ("default", "PASSIVE")
+_BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends when this process does
 
 
-def loop(step: Callable[[], Any], count: int, period: float = PERIOD) -> list[float]:
-    """Call a step at a fixed rate and return how long each call took [s]; a late call is not caught up with."""
+def loop(step: Callable[[], Any], count: int, period: float = _PERIOD) -> list[float]:
+    """Call a step at a fixed rate and return the time of each call [s]; after a late call the rate stays the same."""
     times = []
     due = time.perf_counter()
     for _ in range(count):
@@ -45,8 +49,8 @@ def loop(step: Callable[[], Any], count: int, period: float = PERIOD) -> list[fl
     return times
 
 
-def figures(times: list[float], period: float = PERIOD) -> dict[str, float]:
-    """Return p50, p99 and max [ms] by nearest rank, and the share of calls that took longer than the period."""
+def figures(times: list[float], period: float = _PERIOD) -> dict[str, float]:
+    """Return p50, p99 and max [ms] by nearest rank, and the fraction of calls that took longer than the period."""
     ordered = sorted(times)
     p50, p99 = (1e3 * ordered[math.ceil(q * len(ordered)) - 1] for q in (0.5, 0.99))
     late = sum(t > period for t in times) / len(times)
@@ -54,9 +58,9 @@ def figures(times: list[float], period: float = PERIOD) -> dict[str, float]:
 
 
 @contextlib.contextmanager
-def busy_process() -> Iterator[None]:
-    """Keep one core busy in a process of its own."""
-    process = subprocess.Popen([sys.executable, "-c", BUSY])
+def _busy_process() -> Iterator[None]:
+    """Keep one core busy with another process."""
+    process = subprocess.Popen([sys.executable, "-c", _BUSY])
     try:
         yield
     finally:
@@ -65,22 +69,22 @@ def busy_process() -> Iterator[None]:
 
 
 def measure(count: int, threads: int, compiled: bool = True, points: int = BPEARL) -> dict[str, dict[str, float]]:
-    """Time the loop, idle, then beside a busy process, in this process."""
+    """Time the loop in this process, on an idle machine and then beside a busy process."""
     torch.set_num_threads(threads)
     drive = Drive(full_config(), points, compiled=compiled)
     if compiled:
         drive.emap.warm_up(points)
     drive.watch(8)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # that updates have become slow is what is measured
+        warnings.simplefilter("ignore", RuntimeWarning)  # slow updates are what is measured
         idle = figures(loop(drive, count))
-        with busy_process():
-            time.sleep(0.2)  # until it runs
+        with _busy_process():
+            time.sleep(0.2)  # until the other process runs
             return {"idle": idle, "busy": figures(loop(drive, count))}
 
 
 def measure_apart(policy: str, count: int, threads: int) -> dict[str, dict[str, float]]:
-    """Time the loop in a process whose OpenMP threads wait as the policy says."""
+    """Time the loop in a new process with an OpenMP wait policy."""
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     if policy != "default":
         environment["OMP_WAIT_POLICY"] = policy
@@ -90,7 +94,7 @@ def measure_apart(policy: str, count: int, threads: int) -> dict[str, dict[str, 
 
 
 def table(rows: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Tabulate the figures of each policy and condition."""
+    """Tabulate the times of each policy and condition."""
     lines = [
         [policy, name, *(f"{row[key]:.1f}" for key in ("p50", "p99", "max")), f"{100 * row['late']:.1f}"]
         for policy, conditions in rows.items()
@@ -99,16 +103,16 @@ def table(rows: dict[str, dict[str, dict[str, float]]]) -> str:
     return markdown_table(["OMP_WAIT_POLICY", "beside it", "p50 [ms]", "p99 [ms]", "max [ms]", "late [%]"], lines)
 
 
-@click.command()
-@click.option("--seconds", default=30.0, show_default=True, help="Time for each condition.")
+@click.command(help=__doc__)
+@click.option("--seconds", default=30.0, show_default=True, help="Time per condition [s].")
 @click.option("--threads", default=2, show_default=True, help="CPU threads.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Where to write.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
 def main(seconds: float, threads: int, out: Path) -> None:
-    """Time a 50 Hz loop of updates, idle and beside a busy process."""
-    torch.set_num_threads(threads)  # of the machine's description
-    count = max(1, round(seconds / PERIOD))
-    rows = {policy: measure_apart(policy, count, threads) for policy in POLICIES}
-    write_json(out / "loop.json", {"points": BPEARL, "hertz": 1 / PERIOD, "threads": threads, "rows": rows})
+    """Measure, write JSON and print the table."""
+    torch.set_num_threads(threads)  # for the description of the machine
+    count = max(1, round(seconds / _PERIOD))
+    rows = {policy: measure_apart(policy, count, threads) for policy in _POLICIES}
+    write_json(out / "loop.json", {"points": BPEARL, "hertz": 1 / _PERIOD, "threads": threads, "rows": rows})
     click.echo(table(rows))
 
 

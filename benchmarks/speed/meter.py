@@ -1,4 +1,4 @@
-"""How the speed benchmarks measure: torch's timer, torch's record of allocations, and the bytes an update must move."""
+"""How the speed benchmarks measure: times, memory, and the bytes that an update must move at least."""
 
 from __future__ import annotations
 
@@ -7,47 +7,68 @@ import math
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.utils.benchmark as bench
 from torch.profiler import ProfilerActivity, profile
 
-from torchelev import ElevationMapConfig
+from torchelev import ElevationMapConfig, compiled_update
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.state import blank_state
 
+Name = TypeVar("Name")
+Value = TypeVar("Value")
+
+
+def fresh_compiler() -> None:
+    """Forget compiled updates: torch compiles the one for a second number of robots for any number."""
+    torch._dynamo.reset()
+    compiled_update.graphs_of.cache_clear()
+
+
+def progress(values: Iterable[Value], name: str) -> Iterator[Value]:
+    """Yield the values and show a progress bar if stderr is a terminal."""
+    from tqdm import tqdm  # which a GPU machine may lack
+
+    yield from tqdm(list(values), desc=name, disable=None, leave=False)
+
 
 def milliseconds(run: Callable[[], Any], seconds: float) -> dict[str, float]:
-    """Time a callable by torch's benchmark tool: median, minimum and interquartile range [ms]."""
+    """Time a callable with torch's benchmark timer: median, minimum and interquartile range [ms]."""
     return interleaved({"": run}, seconds, rounds=1)[""]
 
 
-def interleaved(runs: dict[Any, Callable[[], Any]], seconds: float, rounds: int = 5) -> dict[Any, dict[str, float]]:
-    """Time several callables in turn, `seconds` each in all, so that a shared machine's bad minutes hit them alike."""
+def interleaved(
+    runs: Mapping[Name, Callable[[], Any]], seconds: float, rounds: int = 5
+) -> dict[Name, dict[str, float]]:
+    """Time several callables in turn, so that the load of a shared machine affects all alike.
+
+    Each gets `seconds` in total, divided over `rounds`.
+    """
     threads = torch.get_num_threads()
     timers = {name: bench.Timer("run()", globals={"run": run}, num_threads=threads) for name, run in runs.items()}
-    # How many calls one time is the mean of is fixed for all rounds, or their minima would mean different things.
+    # Each time is the mean of this many calls in all rounds, so that their minima are comparable.
     calls = {name: max(1, round(1e-3 / timer.timeit(1).mean)) for name, timer in timers.items()}
-    times: dict[Any, list[float]] = {name: [] for name in runs}
+    times: dict[Name, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
         for name, timer in timers.items():
             end = time.perf_counter() + seconds / rounds
             while not times[name] or time.perf_counter() < end:
                 times[name].append(timer.timeit(calls[name]).mean)
-    return {name: summary(values) for name, values in times.items()}
+    return {name: _summary(values) for name, values in times.items()}
 
 
-def summary(times: list[float]) -> dict[str, float]:
+def _summary(times: list[float]) -> dict[str, float]:
     """Return median, minimum and interquartile range [ms] of times [s]."""
     quarters = statistics.quantiles(times, n=4) if len(times) > 1 else [times[0]] * 3
     return {"median": 1e3 * quarters[1], "min": 1e3 * min(times), "iqr": 1e3 * (quarters[2] - quarters[0])}
 
 
 def peak_bytes(run: Callable[[], Any], device: str = "cpu") -> int:
-    """Return the most memory that a call holds at once beyond what was there before."""
+    """Return the peak memory that a call allocates beyond what was allocated before."""
     if device != "cpu":
         torch.cuda.synchronize()
         before = torch.cuda.memory_allocated()
@@ -69,20 +90,20 @@ def peak_bytes(run: Callable[[], Any], device: str = "cpu") -> int:
 
 
 def copy_bandwidth(device: str = "cpu", megabytes: int = 256) -> float:
-    """Return the bytes per second that copying a large tensor reads and writes."""
+    """Return the memory bandwidth of copying a large tensor [bytes/s], reads and writes together."""
     source = torch.ones(megabytes * 2**18, device=device)
     target = torch.empty_like(source)
     return 2 * source.nbytes / (milliseconds(lambda: target.copy_(source), 1.0)["min"] / 1e3)
 
 
 def state_bytes(cfg: ElevationMapConfig) -> int:
-    """Return the size of one robot's map."""
+    """Return the size of one robot's map [bytes]."""
     state = blank_state(cfg.grid, 1, "meta", torch.float32)
     return sum(value.nbytes for value in (*state[:-1], *state.statistics))
 
 
 def table_bytes(cfg: ElevationMapConfig) -> int:
-    """Return the size of one robot's polar table."""
+    """Return the size of one robot's polar table [bytes]."""
     if cfg.raycast is None:
         return 0
     polar = PolarGrid.of(cfg.grid, cfg.raycast)
@@ -90,17 +111,17 @@ def table_bytes(cfg: ElevationMapConfig) -> int:
 
 
 def needed_memory(cfg: ElevationMapConfig, points: int) -> int:
-    """Return the bytes that one robot needs on paper: its map, its points and its polar table."""
+    """Return the minimum memory of one robot [bytes]: map, points and polar table."""
     return state_bytes(cfg) + 12 * points + table_bytes(cfg)
 
 
 def needed_traffic(cfg: ElevationMapConfig, points: int) -> int:
-    """Return the bytes that an update of one robot must move: map and table in and out once, points in."""
+    """Return the minimum traffic of one robot's update [bytes]: map and table in and out once, points in once."""
     return 2 * state_bytes(cfg) + 12 * points + 2 * table_bytes(cfg)
 
 
-def exponent(sizes: list[float], times: list[float]) -> float:
-    """Fit times = a * sizes^p by least squares of the logarithms, and return p."""
+def exponent(sizes: Sequence[float], times: Sequence[float]) -> float:
+    """Fit times = a * sizes^p by least squares of the logarithms and return p."""
     x, y = ([math.log(v) for v in values] for values in (sizes, times))
     mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
     return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / sum((a - mean_x) ** 2 for a in x)

@@ -1,19 +1,19 @@
-"""How long filters and planes take, beside the OpenCV or SciPy calls that give the same.
+"""Time filters and plane segmentation beside the OpenCV or SciPy calls that give the same.
 
     python -m benchmarks.speed.postprocessing                   # benchmarks/results/postprocessing.json, eight minutes
     python -m benchmarks.speed.postprocessing --seconds 0.3     # quicker, rougher
 
-Maps of stairs, boxes and noise with holes, 4 cm cells. A peer gets NumPy arrays and returns what our filter returns,
-on known cells: where OpenCV knows no masks, it smooths values and mask and divides. `differs` is the 99th percentile of
-the difference [m].
+The maps hold stairs, boxes, noise and holes, in cells of 4 cm. `differs` is the 99th percentile, over known cells, of
+the absolute difference between a filter and its OpenCV or SciPy peer [m].
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,19 +21,19 @@ import scipy.ndimage as ndimage
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.speed import meter
+from benchmarks import RESULTS
+from benchmarks.speed import meter, peers
+from benchmarks.speed.peers import RESOLUTION, Peer
 from torchelev import filters, planes
 from torchelev.app.results import markdown_table, write_json
 from torchelev.layers import Layer
 from torchelev.sim.exact import plane_scenes
 
-RESOLUTION = 0.04  # [m]
-SIZES = ((1, 200), (1, 250), (1, 512), (256, 64))  # maps, cells along a side
-Peer = Callable[[NDArray, NDArray], NDArray]  # values (H, W) float32, 0 where unknown, and known (H, W) -> (H, W)
+SIZES = ((1, 200), (1, 250), (1, 512), (256, 64))  # number of maps, cells along each side
 
 
 def ground(maps: int, cells: int, seed: int = 0) -> Layer:
-    """Return steps, boxes and waves with 5 mm of noise, and holes of many sizes: a tenth is unknown."""
+    """Return steps, boxes and waves with 5 mm of noise, and holes of many sizes that cover a tenth of the map."""
     generator = np.random.default_rng(seed)
     x, y = np.meshgrid(*[np.arange(cells) * RESOLUTION] * 2, indexing="ij")
     heights = np.empty((maps, cells, cells), np.float32)
@@ -50,111 +50,47 @@ def ground(maps: int, cells: int, seed: int = 0) -> Layer:
     return torch.from_numpy(np.where(known, heights, 0).astype(np.float32)), torch.from_numpy(known)
 
 
-# What gives the same by OpenCV or SciPy -----------------------------------------------------------------------------
+class Case(NamedTuple):
+    """A filter, the OpenCV or SciPy call to compare with, and whether both give the same."""
+
+    ours: Callable[[Layer], Any]
+    peer: Peer | None = None
+    same: bool = False
 
 
-def masked_mean(values: NDArray, known: NDArray, blur: Callable[[NDArray], NDArray]) -> NDArray:
-    """Blur values and mask, and divide."""
-    return blur(values) / np.maximum(blur(known.astype(np.float32)), 1e-6)
-
-
-def cv_gaussian(values: NDArray, known: NDArray) -> NDArray:
-    """The default sigma, 0.1 m, up to three of them."""
-    width = 2 * round(0.3 / RESOLUTION) + 1
-    blur = functools.partial(
-        cv2.GaussianBlur, ksize=(width, width), sigmaX=0.1 / RESOLUTION, borderType=cv2.BORDER_CONSTANT
-    )
-    return masked_mean(values, known, blur)
-
-
-def cv_box(values: NDArray, known: NDArray) -> NDArray:
-    """Windows of 5 x 5."""
-    return masked_mean(values, known, lambda v: cv2.blur(v, (5, 5), borderType=cv2.BORDER_CONSTANT))
-
-
-def scipy_median(values: NDArray, known: NDArray) -> NDArray:
-    """Windows of 3 x 3, unknown cells too: no library's median knows masks."""
-    return ndimage.median_filter(values, 3)
-
-
-def cv_dilation(values: NDArray, known: NDArray) -> NDArray:
-    """Windows of 5 x 5; unknown is lowest."""
-    return cv2.dilate(np.where(known, values, np.float32(-1e9)), np.ones((5, 5), np.uint8))
-
-
-def cv_erosion(values: NDArray, known: NDArray) -> NDArray:
-    """Windows of 5 x 5; unknown is highest."""
-    return cv2.erode(np.where(known, values, np.float32(1e9)), np.ones((5, 5), np.uint8))
-
-
-def cv_step(values: NDArray, known: NDArray) -> NDArray:
-    """Highest less lowest."""
-    return cv_dilation(values, known) - cv_erosion(values, known)
-
-
-def cv_deviation(values: NDArray, known: NDArray) -> NDArray:
-    """Means of values and of squares."""
-    number = np.maximum(cv2.blur(known.astype(np.float32), (5, 5), borderType=cv2.BORDER_CONSTANT), 1e-6)
-    mean = cv2.blur(values, (5, 5), borderType=cv2.BORDER_CONSTANT) / number
-    square = cv2.blur(values * values, (5, 5), borderType=cv2.BORDER_CONSTANT) / number
-    return np.sqrt(np.maximum(square - mean * mean, 0))
-
-
-def scipy_inpaint_minimum(values: NDArray, known: NDArray) -> NDArray:
-    """The lowest border cell of each hole, by labels."""
-    labels, count = ndimage.label(~known, np.ones((3, 3)))
-    if not count:
-        return values
-    lowest = ndimage.grey_erosion(np.where(known, values, 1e9), size=(3, 3))
-    filling = ndimage.minimum(lowest, labels, np.arange(count + 1))
-    return np.where(known, values, filling[labels])
-
-
-def scipy_inpaint_nearest(values: NDArray, known: NDArray) -> NDArray:
-    """The index of the nearest known cell."""
-    i, j = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return values[i, j]
-
-
-def cv_inpaint(values: NDArray, known: NDArray, method: int) -> NDArray:
-    """OpenCV's own, on 16 bits: to the millimetre."""
-    low = values.min()
-    millimetres = np.round((values - low) * 1000).astype(np.uint16)
-    return cv2.inpaint(millimetres, (~known).astype(np.uint8), 5, method) / 1000 + low
-
-
-def cv_distance(values: NDArray, known: NDArray) -> NDArray:
-    """The distance to the nearest step of 0.1 m or unknown cell, without half cells."""
-    edge = ~known | (cv2.dilate(values, np.ones((3, 3))) - cv2.erode(values, np.ones((3, 3))) > 0.1)
-    return cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * RESOLUTION
-
-
-def cases() -> dict[str, tuple[Callable[[Layer], Any], Peer | None, bool]]:
-    """Return each filter, its peer, and whether both give the same."""
-    at = {"resolution": RESOLUTION}
+def cases() -> dict[str, Case]:
+    """Return the filters by name."""
     formula = filters.Expression("0.5 * (1 - abs(z) / 0.6) + 0.5 * min(z ** 2, 1)")
-    telea, stokes = (functools.partial(cv_inpaint, method=m) for m in (cv2.INPAINT_TELEA, cv2.INPAINT_NS))
-    ours: dict[str, tuple[Callable[[Layer], Any], Peer | None, bool]] = {
-        "inpaint_minimum": (filters.inpaint_minimum, scipy_inpaint_minimum, True),
-        "inpaint_nearest": (filters.inpaint_nearest, scipy_inpaint_nearest, False),
-        "inpaint_diffusion": (filters.inpaint_diffusion, None, False),
-        "inpaint_telea": (lambda z: filters.inpaint_telea(z, **at), telea, False),
-        "inpaint_navier_stokes": (lambda z: filters.inpaint_navier_stokes(z, **at), stokes, False),
-        "gaussian": (lambda z: filters.gaussian(z, **at), cv_gaussian, True),
-        "box": (lambda z: filters.box(z, **at), cv_box, True),
-        "median": (lambda z: filters.median(z, **at), scipy_median, False),
-        "dilation": (lambda z: filters.dilation(z, **at), cv_dilation, True),
-        "erosion": (lambda z: filters.erosion(z, **at), cv_erosion, True),
-        "step_height": (lambda z: filters.step_height(z, **at), cv_step, True),
-        "standard_deviation": (lambda z: filters.standard_deviation(z, **at), cv_deviation, True),
-        "slope": (lambda z: filters.slope(z, **at), None, False),
-        "roughness": (lambda z: filters.roughness(z, **at), None, False),
-        "curvature": (lambda z: filters.curvature(z, **at), None, False),
-        "signed_distance": (lambda z: filters.signed_distance(z, **at), cv_distance, False),
-        "expression": (lambda z: formula({"z": z}), None, False),
-        "planes": (lambda z: planes.segment(filters.as_nan(z), RESOLUTION), None, False),
+    telea, navier_stokes = (partial(peers.cv_inpaint, method=m) for m in (cv2.INPAINT_TELEA, cv2.INPAINT_NS))
+
+    def metric(function: Callable[..., Any]) -> Callable[[Layer], Any]:
+        return partial(function, resolution=RESOLUTION)
+
+    return {
+        "inpaint_minimum": Case(filters.inpaint_minimum, peers.scipy_inpaint_minimum, True),
+        "inpaint_nearest": Case(filters.inpaint_nearest, peers.scipy_inpaint_nearest),
+        "inpaint_diffusion": Case(filters.inpaint_diffusion),
+        "inpaint_telea": Case(metric(filters.inpaint_telea), telea),
+        "inpaint_navier_stokes": Case(metric(filters.inpaint_navier_stokes), navier_stokes),
+        "gaussian": Case(metric(filters.gaussian), peers.cv_gaussian, True),
+        "box": Case(metric(filters.box), peers.cv_box, True),
+        "median": Case(metric(filters.median), peers.scipy_median),
+        "dilation": Case(metric(filters.dilation), peers.cv_dilation, True),
+        "erosion": Case(metric(filters.erosion), peers.cv_erosion, True),
+        "step_height": Case(metric(filters.step_height), peers.cv_step, True),
+        "standard_deviation": Case(metric(filters.standard_deviation), peers.cv_deviation, True),
+        "slope": Case(metric(filters.slope)),
+        "roughness": Case(metric(filters.roughness)),
+        "curvature": Case(metric(filters.curvature)),
+        "signed_distance": Case(metric(filters.signed_distance), peers.cv_distance),
+        "expression": Case(lambda layer: formula({"z": layer})),
+        "planes": Case(lambda layer: planes.segment(filters.as_nan(layer), RESOLUTION)),
     }
-    return ours
+
+
+def _on_each(peer: Peer, layer: Layer) -> list[NDArray]:
+    """Call a peer on each map of a layer."""
+    return [peer(values, known) for values, known in zip(layer[0].numpy(), layer[1].numpy(), strict=True)]
 
 
 def measure(seconds: float) -> list[dict[str, Any]]:
@@ -162,11 +98,10 @@ def measure(seconds: float) -> list[dict[str, Any]]:
     rows = []
     for maps, cells in SIZES:
         layer = ground(maps, cells)
-        arrays = list(zip(layer[0].numpy(), layer[1].numpy(), strict=True))
         for name, (ours, peer, same) in cases().items():
-            runs: dict[str, Callable[[], Any]] = {"ours": lambda run=ours, z=layer: run(z)}
+            runs: dict[str, Callable[[], Any]] = {"ours": partial(ours, layer)}
             if peer is not None:
-                runs["peer"] = lambda run=peer, a=arrays: [run(values, known) for values, known in a]
+                runs["peer"] = partial(_on_each, peer, layer)
             times = meter.interleaved(runs, seconds)
             row = {"filter": name, "maps": maps, "cells": cells, **times}
             if peer is not None:
@@ -181,22 +116,22 @@ def measure(seconds: float) -> list[dict[str, Any]]:
     return rows
 
 
-def measure_planes(seconds: float) -> list[dict[str, Any]]:
+def _measure_planes(seconds: float) -> list[dict[str, Any]]:
     """Time the segmentation of single maps of 250 x 250 cells."""
     elevations = {name: plane_scenes.noisy(scene(RESOLUTION)) for name, scene in plane_scenes.SCENES.items()}
-    runs = {name: lambda z=z: planes.segment(z, RESOLUTION) for name, z in elevations.items()}
+    runs = {name: partial(planes.segment, z, RESOLUTION) for name, z in elevations.items()}
     times = meter.interleaved(runs, seconds)
     return [{"scene": name, "regions": len(runs[name]()[0].regions)} | times[name] for name in runs]
 
 
 def planes_table(rows: list[dict[str, Any]]) -> str:
-    """Tabulate the times of planes."""
+    """Tabulate the times of plane segmentation."""
     lines = [[r["scene"], str(r["regions"]), f"{r['median']:.1f}", f"{r['min']:.1f}"] for r in rows]
     return markdown_table(["planes of 250 x 250 cells", "regions", "median ms", "min ms"], lines)
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Tabulate medians, and the ratio to the peer in brackets."""
+    """Tabulate the median times [ms], with the ratio to the peer in brackets."""
     found = {(row["filter"], row["maps"], row["cells"]): row for row in rows}
     head = ["ms (ratio to OpenCV or SciPy)", *(f"{maps} x {cells} x {cells}" for maps, cells in SIZES)]
     lines = []
@@ -208,12 +143,20 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=2.0, help="for each filter, peer and size")
-    parser.add_argument("--out", default="benchmarks/results/postprocessing.json")
+    """Measure, write JSON and print the tables."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.speed.postprocessing",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    seconds_help = "time per filter, peer and size [s] (default: %(default)s)"
+    parser.add_argument("--seconds", type=float, default=2.0, help=seconds_help)
+    path = RESULTS / "postprocessing.json"
+    parser.add_argument(
+        "--out", type=Path, default=path, help="JSON file (default: benchmarks/results/postprocessing.json)"
+    )
     options = parser.parse_args()
-    rows, scenes = measure(options.seconds), measure_planes(options.seconds)
+    rows, scenes = measure(options.seconds), _measure_planes(options.seconds)
     write_json(options.out, {"resolution": RESOLUTION, "rows": rows, "planes": scenes})
     print(f"{table(rows)}\n\n{planes_table(scenes)}")
 

@@ -1,11 +1,11 @@
-"""Speed and scale on this machine: time, memory and growth of an update, start-up, and whether the targets are met.
+"""Measure speed and scaling on this machine, and check the targets.
 
     python -m benchmarks.speed.run                      # all sections, under ten minutes: JSON, plots, tables
-    python -m benchmarks.speed.run points robots        # these sections alone; the others stay as they were
-    python -m benchmarks.speed.run --against old.json   # measure, and flag what became slower
-    python -m benchmarks.speed.run --compare new.json --against old.json    # compare two files without measuring
+    python -m benchmarks.speed.run points robots        # only these sections; the others keep their results
+    python -m benchmarks.speed.run --against old.json   # measure and report regressions
+    python -m benchmarks.speed.run --compare new.json --against old.json    # compare two files, measure nothing
 
-Each finished section is written at once; --resume goes on with the sections missing from this commit's file.
+Each section is written as soon as it is finished; --resume measures only the sections that this commit's file lacks.
 """
 
 from __future__ import annotations
@@ -13,53 +13,48 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
-from benchmarks.speed import meter
-from benchmarks.speed import plots as speed_plots
-from benchmarks.speed import tables as speed_tables
-from benchmarks.speed.sections import SECTIONS, fresh_compiler
+from benchmarks import RESULTS
+from benchmarks.speed import meter, plots, tables
+from benchmarks.speed.sections import SECTIONS
 from benchmarks.speed.workload import full_config
 from torchelev.app.results import commit, machine, slug, write_json
 
-SLOWER = 1.3  # a ratio of times above it is a regression, if medians and minima agree on it
+SLOWER = 1.3  # ratio of times above which both medians and minima must lie for a regression
 
 
-def default_path(folder: str) -> Path:
-    """Return where this machine's result lies: one file per processor and number of threads."""
-    return Path(folder) / f"speed-{slug(machine()['processor'])}-{torch.get_num_threads()}-threads.json"
+def _path(folder: Path) -> Path:
+    """Return the path of this machine's result: one file per processor and number of threads."""
+    return folder / f"speed-{slug(machine()['processor'])}-{torch.get_num_threads()}-threads.json"
 
 
 def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[str, Any]:
-    """Run sections, writing the file after each."""
+    """Run sections and write the file after each."""
     result = json.loads(path.read_text()) if path.exists() else {}
     result["copy_gigabytes_per_second"] = meter.copy_bandwidth() / 1e9
     result["config"] = full_config().to_dict()
     for name in names:
-        stamp = {"commit": commit(), "seconds": seconds}
+        revision = commit()
+        stamp = {"commit": revision, "seconds": seconds}
         measured = result.setdefault("measured", {})
-        known = stamp["commit"] != "unknown" and "+" not in stamp["commit"]
-        if resume and known and measured.get(name) == stamp:
-            print(f"{name}: measured at {stamp['commit']}, skipped", file=sys.stderr)
+        is_reproducible = revision != "unknown" and "+" not in revision
+        if resume and is_reproducible and measured.get(name) == stamp:
+            print(f"{name}: measured at {revision}, skipped", file=sys.stderr)
             continue
-
-        def track(values: Iterable, name: str = name) -> Iterator:
-            yield from tqdm(list(values), desc=name, disable=None, leave=False)
-
-        fresh_compiler()
-        result[name] = SECTIONS[name](seconds, track)
+        meter.fresh_compiler()
+        result[name] = SECTIONS[name](seconds)
         measured[name] = stamp
         write_json(path, result)
-    return json.loads(path.read_text())  # with the machine
+    return json.loads(path.read_text())  # includes the machine
 
 
 def timings(values: Any, path: str = "") -> Iterator[tuple[str, dict[str, float]]]:
-    """Find every time in a result, with its place."""
+    """Yield every time of a result with its path."""
     if isinstance(values, dict):
         if {"median", "min"} <= values.keys():
             yield path, values
@@ -72,9 +67,9 @@ def timings(values: Any, path: str = "") -> Iterator[tuple[str, dict[str, float]
 
 
 def regressions(new: dict[str, Any], old: dict[str, Any], limit: float = SLOWER) -> tuple[list[str], int]:
-    """List what takes more than `limit` times as long as before, and count what could be compared.
+    """Describe each time that grew by more than the factor `limit`, and count the times that both results hold.
 
-    Both median and minimum must say so: one alone is noise.
+    Both median and minimum must have grown: one alone is noise.
     """
     before = dict(timings(old))
     common = [(place, time, before[place]) for place, time in timings(new) if place in before]
@@ -88,53 +83,60 @@ def regressions(new: dict[str, Any], old: dict[str, Any], limit: float = SLOWER)
 
 
 def compare(new: dict[str, Any], old: dict[str, Any], name: Path) -> int:
-    """Print what became slower; return 1 if something did, 2 if nothing could be compared."""
+    """Print the regressions; return 1 if there are any, 2 if nothing could be compared."""
     slower, count = regressions(new, old)
-    print(f"\n{len(slower)} of {count} times are more than {SLOWER} times as long as in {name}", *slower, sep="\n")
+    print(f"\n{len(slower)} of {count} times grew by more than a factor of {SLOWER} since {name}", *slower, sep="\n")
     return 2 if count == 0 else int(bool(slower))
 
 
-def existing(path: str) -> Path:
-    """Accept the path of a file that exists."""
+def _existing(path: str) -> Path:
+    """Accept only the path of an existing file."""
     if not Path(path).is_file():
         raise argparse.ArgumentTypeError(f"no such file: {path}")
     return Path(path)
 
 
 def main() -> int:
-    """Measure, write JSON, plots and tables; with --against, fail if something became slower."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}; default: all")
-    parser.add_argument("--out", default="benchmarks/results", help="folder for the results (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="time for each figure [s] (default: %(default)s)")
-    parser.add_argument(
-        "--resume", action="store_true", help="skip the sections measured at this commit for as many --seconds"
-    )
-    parser.add_argument("--against", type=existing, metavar="OLD.json", help="flag what became slower than there")
-    parser.add_argument(
-        "--compare", type=existing, metavar="NEW.json", help="measure nothing, compare this with --against"
-    )
-    args = parser.parse_args()
-    unknown = [name for name in args.sections if name not in SECTIONS]
-    if unknown:
-        parser.error(f"unknown section {', '.join(unknown)}: there are {', '.join(SECTIONS)}")
-    if args.compare and not args.against:
-        parser.error("--compare needs --against OLD.json")
-    old = json.loads(args.against.read_text()) if args.against else None
+    """Measure, write JSON, plots and tables; with --against, fail on a regression."""
+    args = _arguments()
     if args.compare:
-        return compare(json.loads(args.compare.read_text()), old, args.against)
+        return compare(json.loads(args.compare.read_text()), json.loads(args.against.read_text()), args.against)
     torch.set_num_threads(args.threads)
-    path = default_path(args.out)
+    path = _path(args.out)
+    old = json.loads(args.against.read_text()) if args.against else None  # read first: it may be the file written below
     names = args.sections or list(SECTIONS)
     try:
         result = measure(path, names, args.seconds, args.resume)
     except KeyboardInterrupt:
-        print(f"\ninterrupted: finished sections are in {path}; --resume goes on", file=sys.stderr)
+        print(f"\ninterrupted: finished sections are in {path}; continue with --resume", file=sys.stderr)
         return 130
-    speed_plots.draw(result, path.with_suffix(".png"))
-    print(f"{speed_tables.report(result)}\n\nwrote {path} and its picture")
+    plots.draw(result, path.with_suffix(".png"))
+    print(f"{tables.report(result)}\n\nwrote {path} and its picture")
     return compare({name: result[name] for name in names}, old, args.against) if old is not None else 0
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.speed.run",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"any of {', '.join(SECTIONS)} (default: all)")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="output folder (default: benchmarks/results)")
+    parser.add_argument("--threads", type=int, default=2, help="CPU threads (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="time per row [s] (default: %(default)s)")
+    parser.add_argument(
+        "--resume", action="store_true", help="skip sections measured at this commit with these --seconds"
+    )
+    parser.add_argument("--against", type=_existing, metavar="OLD.json", help="report regressions since this result")
+    parser.add_argument("--compare", type=_existing, metavar="NEW.json", help="measure nothing; compare with --against")
+    args = parser.parse_args()
+    unknown = [name for name in args.sections if name not in SECTIONS]
+    if unknown:
+        parser.error(f"unknown section {', '.join(unknown)}; choose from {', '.join(SECTIONS)}")
+    if args.compare and not args.against:
+        parser.error("--compare needs --against OLD.json")
+    return args
 
 
 if __name__ == "__main__":

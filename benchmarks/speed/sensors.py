@@ -1,9 +1,9 @@
-"""How long simulated sensors take to see terrain: rays per second, boxes, rounds of a cast, memory of a tile.
+"""Time the ray casting of simulated sensors, with and without boxes, and measure the memory of a terrain tile.
 
     python -m benchmarks.speed.sensors                   # benchmarks/results/sensors.json, one minute
     python -m benchmarks.speed.sensors --device cuda     # benchmarks/results/sensors-NAME.json
 
-The robots stand at random places of all kinds of terrain, from easy to hard.
+The robots stand at random places on all kinds of terrain, easy to hard.
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from benchmarks import RESULTS
 from benchmarks.speed import meter
 from torchelev.app.results import markdown_table, slug, write_json
 from torchelev.sim import DepthCamera, Lidar, mount
@@ -28,18 +32,18 @@ from torchelev.sim.terrains.generate import terrain_grid
 from torchelev.sim.terrains.heightfield import HeightField
 from torchelev.sim.terrains.shapes import SHAPES
 
-LEVELS = 8
+_LEVELS = 8
 SENSORS = {
     "camera 32 x 16, 8 m": MountedSensor(DepthCamera(width=32, height=16), mount(35.0, 0.3, 0.1)),
     "lidar 16 x 32, 20 m": MountedSensor(Lidar(rings=16, azimuths=32), mount(0.0, 0.0, 0.25)),
     "rosette 512, 20 m": MountedSensor(NonRepetitiveLidar(rays=512), mount(20.0, 0.3, 0.1)),
 }
 CASES = [(name, robots, boxes) for name in SENSORS for robots, boxes in ((64, 0), (64, 12), (256, 0))]
-HEIGHT = 0.55  # [m] of the base over the ground
+HEIGHT = 0.55  # [m] of the base above the ground
 
 
 def standing(field: HeightField, robots: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Return tiles (B,) and poses (B, 4, 4) of robots at random places within 3 m of the middle of a tile."""
+    """Return tiles (B,) and poses (B, 4, 4) of robots within 3 m of their tile's center along each axis."""
     generator = torch.Generator().manual_seed(seed)
     tiles = torch.arange(robots) % field.num_tiles
     xy = 6.0 * torch.rand(robots, 2, generator=generator) - 3.0
@@ -49,8 +53,8 @@ def standing(field: HeightField, robots: int, seed: int = 0) -> tuple[Tensor, Te
     return tiles.to(field.device), T_map_base.float().to(field.device)
 
 
-def limbs(robots: int, count: int, device: str) -> Boxes | None:
-    """Return boxes of a leg's size in a circle around the base, base frame."""
+def _legs(robots: int, count: int, device: str) -> Boxes | None:
+    """Return boxes of a leg's size in a circle around the base, in the base frame."""
     if not count:
         return None
     angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
@@ -60,8 +64,8 @@ def limbs(robots: int, count: int, device: str) -> Boxes | None:
     return Boxes(T_base_box.expand(robots, count, 4, 4), half_size.expand(robots, count, 3))
 
 
-def rounds(look: Any) -> list[tuple[int, int]]:
-    """Return how many rays each round of a cast searched, and over how many cells along each axis."""
+def rounds(cast: Callable[[], Any]) -> list[tuple[int, int]]:
+    """Return, for each round of a cast, how many rays it searched and over how many cells along each axis."""
     search, done = tracing.search, []
 
     def counted(field: HeightField, rays: tracing.Rays, count: int) -> tuple[Tensor, Tensor]:
@@ -70,7 +74,7 @@ def rounds(look: Any) -> list[tuple[int, int]]:
 
     tracing.search = counted
     try:
-        look()
+        cast()
     finally:
         tracing.search = search
     return done
@@ -78,29 +82,33 @@ def rounds(look: Any) -> list[tuple[int, int]]:
 
 def measure(field: HeightField, seconds: float) -> list[dict[str, Any]]:
     """Time all cases in turn."""
-    looks = {}
+    casts: dict[tuple[str, int, int], Callable[[], Tensor]] = {}
     for name, robots, boxes in CASES:
         tiles, T = standing(field, robots)
-        legs, sensor, step = limbs(robots, boxes, str(field.device)), SENSORS[name], torch.zeros_like(tiles)
-        looks[name, robots, boxes] = lambda a=sensor, b=tiles, c=T, d=legs, e=step: a(field, b, c, legs=d, step=e)
-    times = meter.interleaved(looks, seconds)
+        legs, step = _legs(robots, boxes, str(field.device)), torch.zeros_like(tiles)
+        casts[name, robots, boxes] = partial(SENSORS[name], field, tiles, T, legs=legs, step=step)
+    times = meter.interleaved(casts, seconds)
     rows = []
-    for (name, robots, boxes), look in looks.items():
-        time_of, rays = times[name, robots, boxes], look().shape[:2].numel()
+    for (name, robots, boxes), cast in casts.items():
+        time_of, rays = times[name, robots, boxes], cast().shape[:2].numel()
         row = {"sensor": name, "robots": robots, "boxes": boxes, "rays": rays} | time_of
-        hits = float(look()[..., 0].isfinite().float().mean())
-        rows.append(row | {"rays_per_second": 1e3 * rays / time_of["median"], "hits": hits, "rounds": rounds(look)})
+        hits = float(cast()[..., 0].isfinite().float().mean())
+        rows.append(row | {"rays_per_second": 1e3 * rays / time_of["median"], "hits": hits, "rounds": rounds(cast)})
     return rows
 
 
 def main() -> None:
-    """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seconds", type=float, default=6.0, help="for each case")
-    parser.add_argument("--out", help="the result, by default in benchmarks/results")
+    """Measure, write JSON and print the table."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.speed.sensors",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=6.0, help="time per case [s] (default: %(default)s)")
+    parser.add_argument("--out", type=Path, help="JSON file (default: in benchmarks/results)")
     options = parser.parse_args()
-    grid = terrain_grid(list(SHAPES), LEVELS, device=options.device)
+    grid = terrain_grid(list(SHAPES), _LEVELS, device=options.device)
     start = time.perf_counter()
     field = HeightField(grid.field.heights, grid.field.resolution)
     built = time.perf_counter() - start
@@ -109,7 +117,7 @@ def main() -> None:
     name = "" if options.device == "cpu" else "-" + slug(torch.cuda.get_device_name())
     tile = {"samples": list(field.heights.shape[1:]), "resolution": field.resolution, "bytes": held}
     result = {"tiles": field.num_tiles, "tile": tile, "seconds_to_build": built, "cases": rows}
-    write_json(options.out or f"benchmarks/results/sensors{name}.json", result)
+    write_json(options.out or RESULTS / f"sensors{name}.json", result)
     head = ["sensor", "robots", "boxes", "ms, median", "iqr", "M rays/s", "hits", "rounds"]
     table = [
         [r["sensor"], str(r["robots"]), str(r["boxes"]), f"{r['median']:.1f}", f"{r['iqr']:.1f}",

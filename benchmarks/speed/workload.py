@@ -1,7 +1,7 @@
-"""What the speed benchmarks run: robots that drive to and fro over ground with a box, every stage on.
+"""The workload of the speed benchmarks: robots that drive back and forth over ground with a box, every stage on.
 
-Sizes are those of the paper's tables: 10 x 10 m at 4 cm and its sensors' numbers of points, or, for many robots, what
-policies are trained on: 64 x 64 cells of 4 cm and 512 points.
+One robot has the sizes of the paper's tables, 10 x 10 m at 4 cm and the points of its sensors; many robots have those
+of policy training, 64 x 64 cells of 4 cm and 512 points each.
 """
 
 from __future__ import annotations
@@ -21,49 +21,61 @@ SENSORS = [
     ("Bpearl", 43074, 19.99, 20),
 ]
 BPEARL = 43074
-MANY_POINTS = 512  # of each of many robots
+MANY_POINTS = 512  # per robot, with many robots
 
 
 def full_config(cells: int = 250) -> ElevationMapConfig:
-    """Return the default map at 4 cm, of cells x cells, with the body box on too."""
+    """Return the default configuration at 4 cm with `cells` x `cells` cells, and the body box."""
     body = BodyConfig(lower=(-0.6, -0.3, -0.7), upper=(0.6, 0.3, 0.3))
     length = 0.04 * cells
     return ElevationMapConfig(grid=GridConfig(length_x=length, length_y=length), sensor=SensorConfig(body=body))
 
 
 def baseline_config() -> ElevationMapConfig:
-    """Return transform, noise and height update alone, as the paper's baseline."""
+    """Return the paper's baseline: point transform, noise and height update only."""
     cfg = full_config()
     fusion, sensor = replace(cfg.fusion, edges=None), replace(cfg.sensor, exclusion=None, body=None)
     return replace(cfg, fusion=fusion, sensor=sensor, drift=None, raycast=None, overlap=None, traversability=None)
 
 
-def cloud(robots: int, points: int, phase: int, reach: float, generator: torch.Generator) -> Tensor:
-    """Make scans (B, N, 3): ground, a box that comes and goes, an overhang, the robot's body, outliers and NaN."""
+def _cloud(robots: int, points: int, phase: int, reach: float, generator: torch.Generator) -> Tensor:
+    """Make scans (B, N, 3): ground, a box in every second scan, an overhang, the robot's body, outliers and NaN."""
     size = (robots, points)
     azimuth = torch.rand(size, generator=generator) * 2 * math.pi
-    azimuth = torch.where(azimuth < 1, 0.4 * azimuth, azimuth)  # denser towards the box, or 512 points show no edge
+    azimuth = torch.where(
+        azimuth < 1, 0.4 * azimuth, azimuth
+    )  # denser towards the box, so that 512 points show its edges
     lowest = 0.8 / reach
-    fall = lowest + 0.9 * torch.rand(size, generator=generator)  # downward slope of the ray
-    r = 0.8 / fall
+    slope = lowest + 0.9 * torch.rand(size, generator=generator)  # of the ray, downwards
+    r = 0.8 / slope
     z = -0.8 + 0.005 * torch.randn(size, generator=generator)
     x, y = r * azimuth.cos(), r * azimuth.sin()
     near = min(1.5, 0.45 * reach)
     hits_box = (phase % 2 == 0) & (azimuth < 0.4) & (r > near)
     scale = torch.where(hits_box, near / r, 1.0)
-    xyz = torch.stack([x * scale, y * scale, torch.where(hits_box, -fall * near, z)], -1)
-    which = torch.rand(size, generator=generator)
-    xyz[which < 0.01] *= 0.7  # dust
-    overhang = (which > 0.01) & (which < 0.02)
+    xyz = torch.stack([x * scale, y * scale, torch.where(hits_box, -slope * near, z)], -1)
+    kind = torch.rand(size, generator=generator)
+    xyz[kind < 0.01] *= 0.7  # dust
+    overhang = (kind > 0.01) & (kind < 0.02)
     xyz[overhang] = xyz[overhang] * torch.tensor([1.0, 1.0, -1.2])
-    body = (which > 0.02) & (which < 0.03)
+    body = (kind > 0.02) & (kind < 0.03)
     xyz[body] = 0.3 * (torch.rand(int(body.sum()), 3, generator=generator) - 0.5)
-    xyz[which > 0.99] = torch.nan
+    xyz[kind > 0.99] = torch.nan
     return xyz
 
 
 class Drive:
-    """Robots on their way: every call fuses the next scan of each."""
+    """Robots that drive; each call fuses the next scan of every robot.
+
+    Args:
+        cfg: the map's configuration.
+        points: number of points of a scan.
+        robots: number of environments.
+        compiled: compile the map's update.
+        device: where the map and the scans are.
+        scans: number of scans; they repeat.
+        reach: longest horizontal distance of a point [m]; None: a little beyond the window's border.
+    """
 
     def __init__(
         self,
@@ -80,8 +92,8 @@ class Drive:
         if compiled:
             self.emap.compile()
         reach = 0.57 * cfg.grid.length_x if reach is None else reach
-        self.clouds = [cloud(robots, points, k, reach, generator).to(device) for k in range(scans)]
-        # To and fro by a cell a step, sinking and rising by a millimetre.
+        self.clouds = [_cloud(robots, points, k, reach, generator).to(device) for k in range(scans)]
+        # Back and forth by one cell per step; the height changes by a millimetre.
         steps = torch.arange(280, dtype=torch.float64)
         T = torch.eye(4, dtype=torch.float64).repeat(280, 1, 1)
         T[:, 0, 3], T[:, 2, 3] = 0.04 * (steps % 40 - 20).abs(), 0.8 + 0.001 * (steps % 7)
@@ -96,23 +108,23 @@ class Drive:
         self.emap.update(points, T, T, self.dt)
 
     def next_scan(self) -> tuple[Tensor, Tensor]:
-        """Return the scans and the poses."""
+        """Return the next scans (B, N, 3) and poses (B, 4, 4)."""
         k, self.step = self.step, self.step + 1
         return self.clouds[k % len(self.clouds)], self.poses[k % len(self.poses)]
 
     def watch(self, updates: int) -> None:
-        """Run some updates and note what each stage did."""
+        """Run updates and record the largest value of each statistic."""
         for _ in range(updates):
             self()
             for name, value in self.emap.statistics._asdict().items():
                 self.seen[name] = max(self.seen.get(name, 0.0), float(value.abs().max()))
 
     def warm_up(self) -> None:
-        """Fill the map and refuse a run in which some stage has nothing to do."""
+        """Fill the map; raise AssertionError if a stage had nothing to do."""
         self.watch(8)
-        # Raise a part of the map by a floor, so that overlap clearance has work.
-        part = [slice(3 * n // 10, 7 * n // 20) for n in self.emap.elevation.shape[1:]]
-        self.emap.elevation[:, part[0], part[1]] += 3.0
+        # Raise a part of the map by a floor, so that overlap clearance has something to clear.
+        part = [slice(3 * n // 10, 7 * n // 20) for n in self.emap.state.elevation.shape[1:]]
+        self.emap.state.elevation[:, part[0], part[1]] += 3.0
         self.watch(24)
         idle = [name for name, value in self.seen.items() if value == 0]
         assert not idle, f"stages without effect in the warm-up: {idle}"

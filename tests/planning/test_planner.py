@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from benchmarks.quality.occlusion import decide, piece_costs, refine
-from benchmarks.quality.occlusion_scenes import VIEWS, abyss, cliff, hump, step_down, views
+from benchmarks.quality.occlusion.refine import piece_costs, refine
+from benchmarks.quality.occlusion.rules import decide
+from benchmarks.quality.occlusion.scenes import VIEWS, abyss, cliff, hump, step_down, views
 from tests.planning.maps import CORNER, RESOLUTION, ground_map, place, random_map
 from tests.planning.test_cost_to_go import dijkstra
 from tests.test_gpu import OneDevice, forbid_reading

@@ -1,1 +1,1 @@
-"""Train and evaluate policies for TerrainNav: `python -m training.nav`."""
+"""Training, evaluation and export of policies for TerrainNav."""

@@ -1,4 +1,4 @@
-"""Export a trained policy to TorchScript and ONNX, and check that both act as it does."""
+"""Export a trained policy to TorchScript and ONNX, and check that both return its actions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,20 @@ import torch
 from torchelev.errors import require
 from training.nav.runner import ResumableRunner
 
-TOLERANCE = 1e-4
+_TOLERANCE = 1e-4  # largest difference of an action
 
 
 def export(runner: ResumableRunner, folder: Path) -> None:
-    """Write policy.pt and policy.onnx. Raises ValueError if either acts otherwise on random observations."""
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of each operator of packages that are missing
+    """Write policy.pt and policy.onnx to a folder.
+
+    Raises:
+        ValueError: an exported policy returns other actions than the trained one.
+    """
+    logging.getLogger("torch.onnx").setLevel(
+        logging.ERROR
+    )  # it warns about operators of packages that are not installed
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporters, about their own deprecations
+        warnings.simplefilter("ignore")  # the exporters warn about their own deprecations
         runner.export_policy_to_jit(str(folder), "policy.pt")
         runner.export_policy_to_onnx(str(folder), "policy.onnx")
     actor = runner.get_inference_policy(device="cpu")
@@ -28,17 +34,21 @@ def export(runner: ResumableRunner, folder: Path) -> None:
     with torch.inference_mode():
         expected = actor(observation).numpy()
         scripted = torch.jit.load(str(folder / "policy.pt"))(observation["policy"], [observation["map"]]).numpy()
-    for name, got in (("policy.pt", scripted), ("policy.onnx", _run_onnx(folder / "policy.onnx", observation))):
-        error = float(np.abs(got - expected[: len(got)]).max())
-        require(error < TOLERANCE, name, "must act as the policy does", f"an error of {error:.2g}", "report it")
+    for name, actual in (("policy.pt", scripted), ("policy.onnx", run_onnx(folder / "policy.onnx", observation))):
+        error = float(np.abs(actual - expected[: len(actual)]).max())
+        require(error < _TOLERANCE, name, "must act as the policy does", f"an error of {error:.2g}", "report it")
     actor.to(runner.device)
 
 
-def _run_onnx(path: Path, observation: Any) -> np.ndarray:
+def run_onnx(path: Path, observation: Any) -> np.ndarray:
+    """Return the actions (8, 2) of an ONNX policy for the first eight observations."""
     from onnx.reference import ReferenceEvaluator
 
     session = ReferenceEvaluator(str(path))
-    names = session.input_names
-    rows = [session.run(None, {names[0]: p[None].numpy(), names[1]: m[None].numpy()})[0]
-            for p, m in zip(observation["policy"][:8], observation["map"][:8], strict=True)]  # fmt: skip
-    return np.concatenate(rows)
+    actions = []
+    for policy, crop in zip(observation["policy"][:8], observation["map"][:8], strict=True):
+        inputs = dict(zip(session.input_names, (policy[None].numpy(), crop[None].numpy()), strict=True))
+        outputs = session.run(None, inputs)
+        assert isinstance(outputs, list)
+        actions.append(outputs[0])
+    return np.concatenate(actions)

@@ -1,8 +1,7 @@
-"""Train a policy for TerrainNav: `python -m training.nav --num-envs 256 --iterations 120`."""
+"""The command that trains a policy for TerrainNav: `python -m training.nav`."""
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,17 @@ import torch
 from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.config import PERCEPTION
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
-from torchelev.output_files import atomic_file
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export
-from training.nav.runner import CHECKPOINT, ResumableRunner
+from training.nav.runner import ResumableRunner
+from training.resume import checkpoint_path, write_result
 
-POSITIVE = click.IntRange(1)
-TRAIN_SEED, HELD_OUT_SEED = 1, 1001  # of the courses
+_POSITIVE = click.IntRange(1)
+_TRAIN_SEED, _HELD_OUT_SEED = 1, 1001  # of the courses
 
 
 def ppo_config(num_steps: int = 24, save_interval: int = 10) -> dict[str, Any]:
-    """Return rsl-rl's configuration: PPO, and a small network over the map for actor and critic each."""
+    """Return rsl-rl's configuration: PPO, with a small convolutional network for the actor and one for the critic."""
     cnn = {"output_channels": [8, 16], "kernel_size": 3, "stride": 2, "padding": "zeros", "activation": "elu"}
     model = {"class_name": "CNNModel", "hidden_dims": [128, 64], "activation": "elu", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.7}
@@ -49,14 +48,14 @@ def ppo_config(num_steps: int = 24, save_interval: int = 10) -> dict[str, Any]:
 
 
 def task_config(held_out: bool = False) -> TerrainNavConfig:
-    """Return the task on the course to train on, or on the one that training never sees."""
-    return TerrainNavConfig(course=CourseConfig(seed=HELD_OUT_SEED if held_out else TRAIN_SEED))
+    """Return the task on the training course, or on the held-out one."""
+    return TerrainNavConfig(course=CourseConfig(seed=_HELD_OUT_SEED if held_out else _TRAIN_SEED))
 
 
 def make_runner(
     num_envs: int, perception: str, seed: int, device: str, log_dir: Path | None, compiled: bool = True
 ) -> ResumableRunner:
-    """Build task, environment and runner, all seeded."""
+    """Return a runner with its environments, all seeded."""
     rank = int(os.environ.get("RANK", "0"))
     torch.manual_seed(seed + 1000 * rank)
     task = TerrainNav(task_config(), num_envs, device, perception, seed + 1000 * rank, compiled)
@@ -64,15 +63,29 @@ def make_runner(
 
 
 @click.command()
-@click.option("--num-envs", type=POSITIVE, default=256, show_default=True, help="Robots at once.")
-@click.option("--iterations", type=POSITIVE, default=140, show_default=True, help="In all, those of --resume included.")
-@click.option("--perception", type=click.Choice(PERCEPTION), default="map", show_default=True)
-@click.option("--seed", default=0, show_default=True)
-@click.option("--device", default=None, help="Default: a GPU if there is one.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/nav"), show_default=True)
-@click.option("--resume", is_flag=True, help="Go on from OUT/checkpoint.pt.")
-@click.option("--compile/--no-compile", "compiled", default=True, help="Compile the map's update.")
-@click.option("--episodes", type=POSITIVE, default=256, show_default=True, help="Of the final evaluation.")
+@click.option("--num-envs", type=_POSITIVE, default=256, show_default=True, help="Number of parallel robots.")
+@click.option(
+    "--iterations",
+    type=_POSITIVE,
+    default=140,
+    show_default=True,
+    help="Iterations in total, including those before --resume.",
+)
+@click.option(
+    "--perception",
+    type=click.Choice(PERCEPTION),
+    default="map",
+    show_default=True,
+    help="What the policy sees: the map, the true ground with white noise, or nothing.",
+)
+@click.option("--seed", default=0, show_default=True, help="Seed of weights, starts, goals and noise.")
+@click.option("--device", default=None, help="Default: a GPU if there is one, else the CPU.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("runs/nav"), show_default=True, help="Output folder."
+)
+@click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
+@click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Compile the map's update.")
+@click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Episodes of the evaluation.")
 def main(
     num_envs: int,
     iterations: int,
@@ -84,48 +97,44 @@ def main(
     compiled: bool,
     episodes: int,
 ) -> None:
-    """Train with rsl-rl's PPO, then evaluate on held-out ground with the map in the loop, and export.
+    """Train a policy for TerrainNav with rsl-rl's PPO.
 
-    OUT receives TensorBoard logs, checkpoints, result.json, episode.png, policy.pt and policy.onnx. policy.pt
+    Then evaluate it on held-out ground with the map in the loop, draw an episode and export the policy.
+
+    Writes TensorBoard logs, checkpoints, result.json, episode.png, policy.pt and policy.onnx to OUT. policy.pt
     (TorchScript) takes the observation "policy" (B, 12) and a list of "map" (B, 4, 16, 16); policy.onnx takes "obs"
     (1, 12) and "map" (1, 4, 16, 16). Both return actions (B, 2).
     """
     device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
-    checkpoint = out / CHECKPOINT
-    if resume and not checkpoint.exists():
-        raise click.UsageError(f"--resume: there is no {checkpoint}; leave --resume out to begin")
-    if not resume and checkpoint.exists():
-        raise click.UsageError(f"--out: {out} holds a training; add --resume, or choose another folder")
+    checkpoint = checkpoint_path(out, resume)
     runner = make_runner(num_envs, perception, seed, device, out, compiled)
     if resume:
         try:
             runner.resume(checkpoint)
         except ValueError as error:
             raise click.UsageError(str(error)) from None
-    left = iterations - runner.current_learning_iteration
-    if left <= 0:
+    remaining = iterations - runner.current_learning_iteration
+    if remaining <= 0:
         click.echo(f"{checkpoint} has {runner.current_learning_iteration} iterations already: only evaluating it.")
     else:
         try:
-            runner.learn(left, init_at_random_ep_len=not resume)
+            runner.learn(remaining, init_at_random_ep_len=not resume)
         except KeyboardInterrupt:
-            raise click.ClickException(f"stopped; {checkpoint} is saved, go on with --resume") from None
+            raise click.ClickException(f"stopped; {checkpoint} is saved, continue with --resume") from None
     runner.close()
     if int(os.environ.get("RANK", "0")) == 0:
-        finish(runner, out, episodes, compiled)
+        _finish(runner, out, episodes, compiled)
 
 
-def finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> dict[str, float | None]:
-    """Evaluate with the map in the loop, draw an episode, export; return the evaluation."""
+def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> None:
+    """Evaluate with the map in the loop, draw an episode and export the policy."""
     policy = runner.get_inference_policy(device=runner.device)
     result = evaluate(policy, task_config(held_out=True), "map", episodes, runner.device, compiled)
     click.echo(" ".join(f"{name} {value:.3f}" for name, value in result.items() if value is not None))
     picture(policy, task_config(held_out=True), out / "episode.png", runner.device)
     export(runner, out)
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
-    with atomic_file(out / "result.json") as file:
-        file.write((json.dumps({"training": training, "evaluation": result}, indent=1) + "\n").encode())
+    write_result(out / "result.json", {"training": training, "evaluation": result})
     click.echo(f"Wrote result.json, episode.png, policy.pt and policy.onnx to {out}.")
-    return result

@@ -1,1 +1,1 @@
-"""The training of the learned traversability head: labels, maps, fit and evaluation."""
+"""Training and evaluation of the learned traversability head."""

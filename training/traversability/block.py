@@ -1,8 +1,10 @@
-"""Does the learned head see a sharp step? `python -m training.traversability.block`
+"""Compare the traversability heads beside a sharp step.
 
-Flat ground with a block of 1.2 m, 10 to 40 cm high, mapped from above with 5 mm of noise and no other error: what the
-heads say along the block's middle line, from the ground onto the block, beside where the robot stands on the true
-ground. Writes training/results/block.json and block.png.
+    python -m training.traversability.block
+
+Flat ground with a square block of 1.2 m, 10 to 40 cm high, is mapped from above with 5 mm of noise. Compared are the
+ratings along the block's middle line, from the ground onto the block, with the fraction of headings at which the robot
+can stand on the true ground. Writes training/results/block.json and block.png.
 """
 
 from __future__ import annotations
@@ -13,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchelev import (
@@ -26,95 +27,96 @@ from torchelev import (
 )
 from torchelev.app.results import markdown_table, write_json
 from torchelev.sim import HeightField
-from training.traversability.labels.labels import stand
+from training import RESULTS
+from training.traversability.labels.labels import can_stand
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-RESULTS = Path(__file__).parents[1] / "results"
 ROBOT = RobotConfig()
-HEIGHTS = (0.1, 0.15, 0.25, 0.4)  # [m] of blocks; the robot's steps are 0.2 m
-SIDE, SPACING, NOISE = 1.2, 0.02, 0.005  # [m] of the block, between points, of the points
+HEIGHTS = (0.1, 0.15, 0.25, 0.4)  # [m] of the blocks; the robot's step height is 0.2 m
+_SIDE = 1.2  # [m] of the block
+SPACING, NOISE = 0.02, 0.005  # [m] between the points, and 1 sigma of their height
 GRID = GridConfig(resolution=0.04, length_x=5.0, length_y=5.0)
-FAR = 1.2  # [m] of the line on the ground before the block's edge
-SCANS = 3
+_APPROACH = 1.2  # [m] length of the line on the ground before the block
+_SCANS = 3
 HEADINGS = 16
-HEADS = {
+Head = LearnedTraversabilityConfig | TraversabilityConfig
+HEADS: dict[str, Head] = {
     "learned": LearnedTraversabilityConfig(robot=ROBOT),
     "analytic": TraversabilityConfig(critical_slope=ROBOT.max_slope, critical_step=ROBOT.step_height),
 }
 
 
-def block(height: float) -> Float[Tensor, "H W"]:
-    """Return the samples of 6 m of ground, the block in its middle."""
+def _block(height: float) -> Float[Tensor, "H W"]:
+    """Return the heights [m] of 6 x 6 m of ground with a block in the middle."""
     axis = (torch.arange(301) - 150) * SPACING
-    inside = axis.abs() <= SIDE / 2
+    inside = axis.abs() <= _SIDE / 2
     return torch.where(inside[:, None] & inside, height, 0.0)
 
 
-def mapped(heights: Float[Tensor, "H W"], head: Any) -> ElevationMap:
+def _map(heights: Float[Tensor, "H W"], head: Head) -> ElevationMap:
     """Map the ground from above."""
     generator = torch.Generator().manual_seed(0)
     axis = (torch.arange(len(heights)) - len(heights) // 2) * SPACING
     x, y = torch.meshgrid(axis, axis, indexing="ij")
     emap = ElevationMap(ElevationMapConfig(grid=GRID, traversability=head))
-    for _ in range(SCANS):
+    for _ in range(_SCANS):
         z = heights + NOISE * torch.randn(heights.shape, generator=generator) - 1.0
         emap.update(torch.stack([x, y, z], -1).view(1, -1, 3), torch.eye(4)[None], torch.eye(4)[None], dt=0.0)
     return emap
 
 
-def profile(height: float) -> dict[str, Any]:
-    """Return the label and each head's rating of the cells of the line."""
-    heights = block(height)
+def _profile(height: float) -> dict[str, Any]:
+    """Return the label and the rating of each head along the line."""
+    heights = _block(height)
     middle = GRID.width // 2
-    maps = {name: mapped(heights, head) for name, head in HEADS.items()}
+    maps = {name: _map(heights, head) for name, head in HEADS.items()}
     centers = maps["learned"].cell_centers()[0, :, middle].float()
-    line = (centers[:, 0] >= -SIDE / 2 - FAR) & (centers[:, 0] <= 0)
-    stands = stand(HeightField(heights[None], SPACING), torch.tensor([0]), centers[line][None], [ROBOT], HEADINGS)
+    line = (centers[:, 0] >= -_SIDE / 2 - _APPROACH) & (centers[:, 0] <= 0)
+    stands = can_stand(HeightField(heights[None], SPACING), torch.tensor([0]), centers[line][None], [ROBOT], HEADINGS)
     ratings = {name: emap.rate().traversability[0, line, middle].tolist() for name, emap in maps.items()}
-    before = centers[line, 0] + SIDE / 2
-    return {"height": height, "x": before.tolist(), "label": stands[0].float().mean(-1).tolist(), **ratings}
+    from_edge = centers[line, 0] + _SIDE / 2
+    return {"height": height, "x": from_edge.tolist(), "label": stands[0].float().mean(-1).tolist(), **ratings}
 
 
-def row(found: dict[str, Any], name: str) -> list[str]:
-    """Return how far a head is off, and what it says where the robot stands at no heading."""
-    label, says = np.array(found["label"]), np.array(found[name])
-    nowhere = says[label == 0]
-    share = f"{(nowhere >= 0.5).sum()} of {len(nowhere)}" if len(nowhere) else ""
-    mean = f"{nowhere.mean():.2f}" if len(nowhere) else ""
-    return [f"{100 * found['height']:.0f} cm", name, f"{np.abs(says - label).mean():.2f}", mean, share]
+def row(profile: dict[str, Any], name: str) -> list[str]:
+    """Return the row of a head: its mean error, and its rating where the robot can stand at no heading."""
+    label, rating = np.array(profile["label"]), np.array(profile[name])
+    unsafe = rating[label == 0]
+    high = f"{(unsafe >= 0.5).sum()} of {len(unsafe)}" if len(unsafe) else ""
+    mean = f"{unsafe.mean():.2f}" if len(unsafe) else ""
+    return [f"{100 * profile['height']:.0f} cm", name, f"{np.abs(rating - label).mean():.2f}", mean, high]
 
 
 def table(profiles: list[dict[str, Any]]) -> str:
-    """Tabulate every head on every block."""
+    """Tabulate the heads on each block."""
     header = ["block", "head", "mean error", "mean rating where no heading stands", "of these at 0.5 and more"]
-    return markdown_table(header, [row(found, name) for found in profiles for name in HEADS])
+    return markdown_table(header, [row(profile, name) for profile in profiles for name in HEADS])
 
 
-def draw(profiles: list[dict[str, Any]], path: Path) -> None:
-    """Draw label and ratings over the way onto each block."""
+def _draw(profiles: list[dict[str, Any]], path: Path) -> None:
+    """Draw label and ratings along the line onto each block."""
     figure = Figure(figsize=(3 * len(profiles), 2.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(profiles), sharey=True)
-    for ax, found in zip(axes, profiles, strict=True):
-        ax.axvspan(0, max(found["x"]), color="0.9", label="block")
-        ax.plot(found["x"], found["label"], "k", drawstyle="steps-mid", label="truth")
+    for ax, profile in zip(axes, profiles, strict=True):
+        ax.axvspan(0, max(profile["x"]), color="0.9", label="block")
+        ax.plot(profile["x"], profile["label"], "k", drawstyle="steps-mid", label="truth")
         for name in HEADS:
-            ax.plot(found["x"], found[name], label=name)
-        ax.set(title=f"block of {100 * found['height']:.0f} cm", xlabel="from its edge [m]", ylim=(-0.03, 1.03))
+            ax.plot(profile["x"], profile[name], label=name)
+        ax.set(title=f"block of {100 * profile['height']:.0f} cm", xlabel="from its edge [m]", ylim=(-0.03, 1.03))
     axes[0].set_ylabel("traversability")
     axes[-1].legend(fontsize=8)
     figure.savefig(path, dpi=80)
 
 
-@click.command()
+@click.command(help=__doc__)
 def main() -> None:
-    """Rate the ground before and on blocks."""
-    profiles = [profile(height) for height in HEIGHTS]
+    """Measure, write JSON and figure and print the table."""
+    profiles = [_profile(height) for height in HEIGHTS]
     write_json(RESULTS / "block.json", {"robot": vars(ROBOT), "profiles": profiles})
-    draw(profiles, RESULTS / "block.png")
+    _draw(profiles, RESULTS / "block.png")
     click.echo(table(profiles))
 
 

@@ -1,4 +1,9 @@
-"""How good is a learned head? `python -m training.traversability.evaluate --weights runs/traversability/weights.pt`"""
+"""Compare learned traversability heads with the analytic ones on held-out ground.
+
+    python -m training.traversability.evaluate --weights weights.pt
+
+Without --weights, the shipped weights are evaluated. With --paper-weights, the paper's filter takes part.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +29,7 @@ from training.traversability.robot import RobotType
 
 RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
 SPLITS = {"held_out": KINDS, "unseen": UNSEEN_KINDS, "held_out_exact": KINDS}
-EVALUATION_SEED = 0  # of the maps: the same for all weights
+_EVALUATION_SEED = 0  # of the maps, the same for all weights
 COLUMNS = {
     "average_precision": "AP safe",
     "average_precision_unsafe": "AP unsafe",
@@ -35,7 +40,6 @@ COLUMNS = {
     "inflation_cm": "inflation at 0.5 [cm]",
     "inflation_at_recall_cm": "inflation at recall [cm]",
 }
-LOWER_IS_BETTER = ("calibration_error", "false_safe", "inflation_cm", "inflation_at_recall_cm")
 
 
 def learned(net: TraversabilityNet) -> Score:
@@ -45,12 +49,12 @@ def learned(net: TraversabilityNet) -> Score:
 
 @torch.no_grad()
 def score(head: Score, batches: list[MappedTerrain]) -> list[Tensor]:
-    """Return what a head says of each batch."""
+    """Return the scores of each batch (B, H, W)."""
     return [head(maps) for maps in batches]
 
 
-def as_maps(scores: list[Tensor], batches: list[MappedTerrain]) -> list[tuple[str, RatedMap, np.ndarray]]:
-    """Return each map's kind of ground, its scores, and where it knows the elevation."""
+def _split(scores: list[Tensor], batches: list[MappedTerrain]) -> list[tuple[str, RatedMap, np.ndarray]]:
+    """Return for each map the kind of ground, its scores and labels, and which cells are known."""
     rows = []
     for values, maps in zip(scores, batches, strict=True):
         layers = zip(maps.kinds, values, maps.label, maps.rated, maps.validity, strict=True)
@@ -61,8 +65,8 @@ def as_maps(scores: list[Tensor], batches: list[MappedTerrain]) -> list[tuple[st
 
 
 def metrics(scores: list[Tensor], batches: list[MappedTerrain]) -> dict[str, Any]:
-    """Return the metrics over all rated cells, over those whose elevation is known, and by kind of ground."""
-    rows = as_maps(scores, batches)
+    """Return the metrics over all rated cells, over the known ones among them, and by kind of ground."""
+    rows = _split(scores, batches)
     known = [m._replace(rated=m.rated & valid) for _, m, valid in rows]
     kinds = {kind: measure([m for name, m, _ in rows if name == kind]) for kind in sorted({kind for kind, *_ in rows})}
     return measure([m for _, m, _ in rows]) | {"known": measure(known), "kinds": kinds}
@@ -70,7 +74,7 @@ def metrics(scores: list[Tensor], batches: list[MappedTerrain]) -> dict[str, Any
 
 @torch.no_grad()
 def confidence(net: TraversabilityNet, batches: list[MappedTerrain]) -> dict[str, float | None]:
-    """Return whether a net's confidence says how often it is right, for all rated cells and for unknown ones."""
+    """Return mean confidence and fraction of correct answers, on known and unknown cells, and the calibration error."""
     confident, right, known = [], [], []
     for maps in batches:
         rating = net(*maps.maps, resolution=maps.resolution, robot=maps.robot)
@@ -78,8 +82,8 @@ def confidence(net: TraversabilityNet, batches: list[MappedTerrain]) -> dict[str
         agrees = (rating.traversability >= SAFE) == (maps.label >= SAFE)
         right.append(agrees[maps.rated].double().numpy())
         known.append(maps.validity[maps.rated].numpy())
-    p, y, seen = (np.concatenate(parts) for parts in (confident, right, known))
-    parts = {"known": seen, "unknown": ~seen}
+    p, y, is_known = (np.concatenate(parts) for parts in (confident, right, known))
+    parts = {"known": is_known, "unknown": ~is_known}
     means = {f"{name}_{where}": _mean(values[mask]) for where, mask in parts.items() for name, values in
              (("confidence", p), ("right", y))}  # fmt: skip
     return {"calibration_error": calibration_error(p, y)} | means
@@ -96,10 +100,18 @@ def evaluate(
     cfg: DataConfig | None = None,
     paper_weights: Path | None = None,
 ) -> dict[str, Any]:
-    """Measure nets and baselines on ground that training never sees: result[split][resolution][head][metric].
+    """Measure nets and baselines on held-out ground.
 
-    The maps are made, or read from the folder `data`; "held_out_exact" are of the true heights. A net's name becomes
-    "learned (name)".
+    Args:
+        nets: by name; a name becomes "learned (name)".
+        data: folder of the maps; missing ones are made.
+        num_batches: number of batches for each split and resolution.
+        cfg: how maps are made; None: the default.
+        paper_weights: file of the paper's filter; None: it is left out.
+
+    Returns:
+        `result[split][resolution][head][metric]`, and the settings in `result["config"]`. The maps of the split
+        "held_out_exact" are of the true heights.
     """
     cfg = cfg or DataConfig()
     scores = {f"learned ({name})": learned(net) for name, net in nets.items()} | baselines(paper_weights)
@@ -107,31 +119,32 @@ def evaluate(
     for split, kinds in SPLITS.items():
         result[split] = {}
         for resolution in RESOLUTIONS:
-            batches = data_set(data, split, num_batches, EVALUATION_SEED, cfg, kinds, resolution)
+            batches = data_set(data, split, num_batches, _EVALUATION_SEED, cfg, kinds, resolution)
             bar = tqdm(scores.items(), desc=f"{split}, {100 * resolution:g} cm", unit="head")
             here = {name: metrics(score(head, batches), batches) for name, head in bar}
             for name, net in nets.items():
                 here[f"learned ({name})"]["confidence"] = confidence(net, batches)
             result[split][f"{100 * resolution:g} cm"] = here
     robot = None if cfg.robot is None else dataclasses.asdict(cfg.robot)
-    settings = {"batches": num_batches, "maps_of_a_batch": cfg.num_maps, "robot": robot, "seed": EVALUATION_SEED}
+    settings = {"batches": num_batches, "maps_of_a_batch": cfg.num_maps, "robot": robot, "seed": _EVALUATION_SEED}
     return {"config": settings} | result
 
 
-def best_of(heads: dict[str, Any], name: str) -> str:
-    """Return the variant of a family with the highest average precision."""
+def _best_variant(heads: dict[str, Any], name: str) -> str:
+    """Return the head of a family with the highest average precision."""
     return max((head for head in heads if family(head) == name), key=lambda head: heads[head]["average_precision"] or 0)
 
 
 def table(result: dict[str, Any], split: str = "held_out") -> str:
-    """Tabulate each family of heads: learned ones by mean, lowest and highest over seeds, others by the best variant.
+    """Tabulate each family of heads.
 
-    The best is that of the highest average precision at that resolution.
+    Learned heads: mean, lowest and highest over the seeds. Others: the variant with the highest average precision at
+    that resolution.
     """
     lines = []
     for resolution, heads in result[split].items():
         for name in dict.fromkeys(family(head) for head in heads):
-            variant = best_of(heads, name)
+            variant = _best_variant(heads, name)
             runs = [values for head, values in heads.items() if family(head) == name] if name == "learned" else []
             cells = [_cell([run[column] for run in runs or [heads[variant]]]) for column in COLUMNS]
             lines.append([resolution, name if runs else variant, *cells])
@@ -146,20 +159,41 @@ def _cell(values: list[float | None]) -> str:
     return mean if len(numbers) == 1 else f"{mean} ({min(numbers):.3f} to {max(numbers):.3f})"
 
 
-@click.command()
-@click.option("--weights", "paths", type=click.Path(path_type=Path), multiple=True, help="Of several seeds: repeat it.")
-@click.option("--data", type=click.Path(path_type=Path), default=Path("runs/traversability/data"), show_default=True)
-@click.option("--batches", type=click.IntRange(1), default=20, show_default=True, help="At each resolution and split.")
-@click.option("--robot", type=RobotType(), default=None, help="length=0.7,width=0.4,... or a YAML file. Default: any.")
-@click.option("--paper-weights", type=click.Path(path_type=Path, exists=True), default=None, help="A file (npz).")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/traversability/evaluation.json"))
+@click.command(help=__doc__)
+@click.option(
+    "--weights",
+    "paths",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Weights to evaluate; repeat for several seeds.",
+)
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path),
+    default=Path("runs/traversability/data"),
+    show_default=True,
+    help="Folder of the maps; missing ones are made.",
+)
+@click.option(
+    "--batches", type=click.IntRange(1), default=20, show_default=True, help="Batches per resolution and split."
+)
+@click.option(
+    "--robot", type=RobotType(), default=None, help="length=0.7,width=0.4,... or a YAML file. Default: any robot."
+)
+@click.option(
+    "--paper-weights", type=click.Path(path_type=Path, exists=True), default=None, help="The paper's filter (npz)."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("runs/traversability/evaluation.json"),
+    show_default=True,
+    help="JSON file to write.",
+)
 def main(
     paths: tuple[Path, ...], data: Path, batches: int, robot: RobotConfig | None, paper_weights: Path | None, out: Path
 ) -> None:
-    """Measure learned heads beside the analytic ones, and the paper's filter if a file of its weights is given.
-
-    Without --weights, those shipped with the package.
-    """
+    """Evaluate, write JSON and print the tables."""
     try:
         nets = {path.parent.name or path.stem: TraversabilityNet.from_pretrained(path) for path in paths}
         nets = nets or {"shipped": TraversabilityNet.from_pretrained()}

@@ -1,4 +1,4 @@
-"""Maps, their labels, and what the heads say of them, side by side."""
+"""A figure of maps, their labels and the ratings of the heads."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from torchelev.viz.plot import UNKNOWN_COLOR
 from training.traversability.heads import Score
 from training.traversability.maps.data import MappedTerrain
 
-Layers = dict[str, tuple[Tensor, Tensor]]  # values and where to show them, both (H, W)
+Layers = dict[str, tuple[Tensor, Tensor]]  # values and mask of the cells to show, (H, W) each
 
 
 @torch.no_grad()
-def layers_of(net: TraversabilityNet, others: dict[str, Score], maps: MappedTerrain, number: int) -> Layers:
-    """Return what is drawn of one map."""
+def _layers(net: TraversabilityNet, others: dict[str, Score], maps: MappedTerrain, number: int) -> Layers:
+    """Return the layers of one map to draw."""
     rating = net(*maps.maps, resolution=maps.resolution, robot=maps.robot)
     everywhere = torch.ones_like(maps.validity)
     shown = {
@@ -34,34 +34,32 @@ def layers_of(net: TraversabilityNet, others: dict[str, Score], maps: MappedTerr
 
 
 def picture(net: TraversabilityNet, others: dict[str, Score], batches: Sequence[MappedTerrain], path: Path) -> None:
-    """Draw one map of each kind of ground, a row each, x to the right and y up; grey is unknown or not rated."""
+    """Draw a row for one map of each kind of ground, x to the right and y up; gray is unknown or not rated."""
     rows: dict[str, tuple[MappedTerrain, int]] = {}
     for maps in batches:
         for number, kind in enumerate(maps.kinds):
             rows.setdefault(kind, (maps, number))
-    _draw({kind: layers_of(net, others, *where) for kind, where in rows.items()}, rows, path)
+    _draw({kind: _layers(net, others, *where) for kind, where in rows.items()}, rows, path)
 
 
 def _draw(rows: dict[str, Layers], sources: dict[str, tuple[MappedTerrain, int]], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = len(next(iter(rows.values())))
     figure = Figure(figsize=(1.9 * columns, 2.0 * len(rows)), layout="compressed", dpi=80)
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(rows), columns, squeeze=False)
     for line, (kind, layers) in zip(axes, rows.items(), strict=True):
         maps = sources[kind][0]
         for ax, (name, layer) in zip(line, layers.items(), strict=True):
-            _panel(ax, *layer, share=name != "elevation [m]")
+            _panel(ax, *layer, is_rating=name != "elevation [m]")
         line[0].set_ylabel(f"{kind}\n{100 * maps.resolution:.2g} cm, robot {maps.robot.length:.2f} m", fontsize=7)
     for ax, name in zip(axes[0], next(iter(rows.values())), strict=True):
         ax.set_title(name, fontsize=8)
     figure.savefig(path)
 
 
-def _panel(ax: Any, values: Tensor, mask: Tensor, share: bool) -> None:
+def _panel(ax: Any, values: Tensor, mask: Tensor, is_rating: bool) -> None:
     shown = np.ma.masked_array(values.double().numpy(), ~mask.numpy()).T
-    limits = {"vmin": 0.0, "vmax": 1.0, "cmap": "RdYlGn"} if share else {"cmap": "viridis"}
+    limits = {"vmin": 0.0, "vmax": 1.0, "cmap": "RdYlGn"} if is_rating else {"cmap": "viridis"}
     ax.imshow(shown, origin="lower", interpolation="nearest", **limits)
     ax.set(xticks=[], yticks=[], facecolor=UNKNOWN_COLOR)

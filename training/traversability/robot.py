@@ -1,4 +1,4 @@
-"""A robot as an option of the command line."""
+"""A robot as a command-line option."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torchelev.robot import RobotConfig
 
 
 class RobotType(click.ParamType):
-    """`length=0.7,width=0.4` or a YAML file of the same names; what is left out keeps its default."""
+    """`length=0.7,width=0.4` or a YAML file with the same names; other fields keep their defaults."""
 
     name = "robot"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> RobotConfig:
-        """Return the robot, or fail with what is wrong about it."""
+        """Return the robot; raise click.BadParameter if a name or value is wrong."""
         if isinstance(value, RobotConfig):
             return value
         names = [field.name for field in dataclasses.fields(RobotConfig)]

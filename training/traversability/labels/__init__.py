@@ -1,1 +1,1 @@
-"""The labels: where a robot can stand on the true ground, and the physics that checks them."""
+"""Where a robot can stand on the true ground, by geometry, and the physics simulation that checks it."""

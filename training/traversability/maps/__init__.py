@@ -1,1 +1,1 @@
-"""The maps that heads are trained on: tiles of ground, walks, sensors, and the data set made of them."""
+"""The simulated maps of training and evaluation: terrain, walks, sensors, and the data set on disk."""

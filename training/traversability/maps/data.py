@@ -1,4 +1,4 @@
-"""What a learned head sees and should say: maps of simulated ground, and the labels of their cells."""
+"""The data of training and evaluation: maps of simulated ground with labelled cells, and their files."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ from torchelev.errors import require
 from torchelev.output_files import atomic_file
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
-from training.traversability.labels.labels import stand
-from training.traversability.maps.mapping import DataConfig, exact_maps, tile_places, walk_and_map
+from training.traversability.labels.labels import can_stand
+from training.traversability.maps.mapping import DataConfig, exact_maps, tile_cell_centers, walk_and_map
 from training.traversability.maps.terrain import KINDS, LENGTH, draw_robot, make_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-VERSION = 1  # of maps and labels; raise it where their making changes, so that kept ones are refused
-RATED_REACH = 0.3  # [m] around known cells in which unknown ones are rated
+VERSION = 1  # of maps and labels; increase it when their computation changes, so that old files are refused
+_RATED_REACH = 0.3  # [m] from known cells within which unknown cells are rated
 RESOLUTIONS = (0.02, 0.1)  # [m]
 SPLITS = {"train": 0, "held_out": 1, "unseen": 2, "train_exact": 3, "held_out_exact": 4}
-EXACT_SPLITS = ("train_exact", "held_out_exact")  # of maps that know the truth
+_EXACT_SPLITS = ("train_exact", "held_out_exact")  # maps of the true heights
 
 
 class MappedTerrain(NamedTuple):
-    """B maps of one resolution, for one robot, and the truth of their cells."""
+    """B maps of one resolution for one robot, and the labels of their cells."""
 
-    elevation: Float[Tensor, "B H W"]  # [m]
+    elevation: Float[Tensor, "B H W"]  #: [m]
     validity: Bool[Tensor, "B H W"]
-    variance: Float[Tensor, "B H W"]  # [m^2]
-    upper_bound: Float[Tensor, "B H W"]  # [m]
+    variance: Float[Tensor, "B H W"]  #: [m^2]
+    upper_bound: Float[Tensor, "B H W"]  #: [m]
     bounded: Bool[Tensor, "B H W"]
-    label: Float[Tensor, "B H W"]  # share of the headings at which the robot stands there; 0 where not rated
-    rated: Bool[Tensor, "B H W"]  # cells that count, see `rated_cells`
-    resolution: float  # [m]
+    label: Float[Tensor, "B H W"]  #: fraction of the headings at which the robot can stand there; 0 where not rated
+    rated: Bool[Tensor, "B H W"]  #: cells that count in training and metrics, see `rated_cells`
+    resolution: float  #: [m]
     robot: RobotConfig
-    kinds: tuple[str, ...]  # of the terrain, one for each map
+    kinds: tuple[str, ...]  #: of the terrain, one for each map
 
     @property
     def maps(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What a head sees, in the order of its arguments."""
+        """The inputs of a head, in the order of its arguments."""
         return self.elevation, self.validity, self.variance, self.upper_bound, self.bounded
 
 
@@ -60,14 +60,14 @@ def make_batch(
     resolution: float | None = None,
     exact: bool = False,
 ) -> MappedTerrain:
-    """Make maps of ground of random kinds; the same seed makes the same maps.
+    """Make maps of random kinds of ground; the same seed makes the same maps.
 
     Args:
-        seed: of everything that chance decides.
-        cfg: how many maps, of what.
-        kinds: to draw the ground from.
-        resolution: of the maps [m]; None: drawn from 2 to 10 cm, evenly in its logarithm, in whole millimetres.
-        exact: maps that know the truth, in place of those that a robot makes.
+        seed: of all random choices.
+        cfg: number and settings of the maps.
+        kinds: kinds of ground to draw from.
+        resolution: of the maps [m]; None: log-uniform from 2 to 10 cm, in whole millimeters.
+        exact: make maps of the true heights instead of maps from a simulated robot's sensors.
     """
     cfg = cfg or DataConfig()
     rng = np.random.default_rng(seed)
@@ -90,14 +90,14 @@ def label_cells(
     headings: int,
     kinds: tuple[str, ...],
 ) -> MappedTerrain:
-    """Read maps, and label their rated cells by where the robot stands on the true ground."""
+    """Copy the maps' layers and label their rated cells by where the robot can stand on the true ground."""
     grid, state = emap.cfg.grid, emap.state
-    xy = tile_places(emap, T_tile_map)
+    xy = tile_cell_centers(emap, T_tile_map)
     rated = rated_cells(state.validity, state.bounded, grid.resolution) & (xy.abs().amax(-1) <= LENGTH / 2)
     label = torch.zeros_like(state.elevation)
     for b in range(len(label)):  # the number of rated cells differs
         places = xy[b][rated[b]].float()
-        stands = stand(field, torch.tensor([b]), places[None], [robot], headings)
+        stands = can_stand(field, torch.tensor([b]), places[None], [robot], headings)
         label[b][rated[b]] = stands[0].float().mean(-1)
     return MappedTerrain(
         elevation=state.elevation.clone(),
@@ -114,8 +114,8 @@ def label_cells(
 
 
 def rated_cells(validity: Tensor, bounded: Tensor, resolution: float) -> Bool[Tensor, "B H W"]:
-    """Return the cells that count in training and metrics: known, bounded, or within 0.3 m of known along both axes."""
-    reach = round(RATED_REACH / resolution)
+    """Return the cells that count in training and metrics: bounded, or within 0.3 m of a known cell along both axes."""
+    reach = round(_RATED_REACH / resolution)
     near = F.max_pool2d(validity.float()[:, None], 2 * reach + 1, 1, reach)[:, 0] > 0
     return near | bounded
 
@@ -124,7 +124,7 @@ def rated_cells(validity: Tensor, bounded: Tensor, resolution: float) -> Bool[Te
 
 
 def batch_seed(split: str, seed: int, index: int) -> list[int]:
-    """Return the seed of a batch: splits, data sets and batches are independent of each other."""
+    """Return the seed of a batch, different for every split, data set and batch."""
     return [SPLITS[split], seed, index]
 
 
@@ -137,9 +137,19 @@ def data_set(
     kinds: Sequence[str] = KINDS,
     resolution: float | None = None,
 ) -> list[MappedTerrain]:
-    """Return the batches 0 .. count - 1 of a data set: those that `folder` has, and the rest made and kept there.
+    """Return the first `count` batches of a data set: read from `folder`, or made and written there.
 
-    Raises ValueError for a file of other settings.
+    Args:
+        folder: where the batches are kept.
+        split: a key of SPLITS.
+        count: number of batches.
+        seed: of the data set.
+        cfg: settings of the maps.
+        kinds: kinds of ground to draw from.
+        resolution: of the maps [m]; None: random.
+
+    Raises:
+        ValueError: a file was made with other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
     settings = dataclasses.asdict(cfg) | {"kinds": list(kinds), "resolution": resolution, "version": VERSION}
@@ -148,22 +158,22 @@ def data_set(
     for index in tqdm(range(count), desc=f"data {name}", unit="batch"):
         path = folder / f"{name}-{index:04d}.pt"
         if not path.exists():
-            batch = make_batch(batch_seed(split, seed, index), cfg, kinds, resolution, split in EXACT_SPLITS)
+            batch = make_batch(batch_seed(split, seed, index), cfg, kinds, resolution, split in _EXACT_SPLITS)
             save_atomically({"settings": settings, **batch._asdict(), "robot": dataclasses.asdict(batch.robot)}, path)
         batches.append(_load(path, settings))
     return batches
 
 
 def save_atomically(values: dict[str, Any], path: Path) -> None:
-    """Write a file by `torch.save`, so that a kill meanwhile leaves the older one."""
+    """Write a file by `torch.save`; an interruption leaves an older file intact."""
     with atomic_file(path) as file:
         torch.save(values, file)
 
 
 def _load(path: Path, settings: dict[str, Any]) -> MappedTerrain:
     values = torch.load(path, weights_only=True)
-    there = values.pop("settings")
-    differ = [name for name in settings if settings[name] != there.get(name)]
+    actual = values.pop("settings")
+    differ = [name for name in settings if settings[name] != actual.get(name)]
     hint = "remove the folder, or give the settings that it was made with"
     require(not differ, str(path), "must be of the same settings", f"other {', '.join(differ)}", hint)
     return MappedTerrain(**values | {"robot": RobotConfig(**values["robot"])})

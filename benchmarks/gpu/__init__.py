@@ -1,0 +1,1 @@
+"""Agreement with the CPU, host synchronisation and speed on one GPU. Needs torch and numpy only."""

@@ -1,0 +1,101 @@
+"""Times of updates and height scans on a GPU, and the figures to compare them with the memory's bandwidth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import torch
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
+
+from benchmarks.speed import meter
+from benchmarks.speed.meter import fresh_compiler
+from benchmarks.speed.workload import BPEARL, Drive, full_config
+
+_SCAN_POINTS = 187  # of a height scan
+Figure = tuple[str, Callable[[], Any]]  # its name and the call that measures it
+
+
+def _captured(drive: Drive) -> Callable[[], None]:
+    """Return a drive whose update is one CUDA graph, captured by torch: one launch instead of hundreds."""
+    points, T = (value.clone() for value in drive.next_scan())
+    side_stream = torch.cuda.Stream()
+    side_stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side_stream):  # compile and warm up outside the graph
+        for _ in range(3):
+            drive.emap.update(points, T, T, drive.dt)
+    torch.cuda.current_stream().wait_stream(side_stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        drive.emap.update(points, T, T, drive.dt)
+
+    def replay() -> None:
+        scan, pose = drive.next_scan()
+        points.copy_(scan)
+        T.copy_(pose)
+        graph.replay()
+
+    return replay
+
+
+def one_robot(device: str, seconds: float) -> Iterator[Figure]:
+    """Time the paper's case, one robot: eager, compiled, captured."""
+    for name, compiled in (("eager", False), ("compiled", True)):
+        fresh_compiler()
+        drive = Drive(full_config(), BPEARL, device=device, compiled=compiled)
+        drive.warm_up()
+        yield f"one robot, {name}", partial(meter.milliseconds, drive, seconds)
+        yield f"one robot, {name}, slowest kernels", partial(_slowest_kernels, drive)
+    if device != "cpu":
+        yield "one robot, captured", lambda: meter.milliseconds(_captured(drive), seconds)
+        yield "one robot, captured, waiting for each", lambda: meter.milliseconds(_waiting(_captured(drive)), seconds)
+
+
+def _waiting(run: Callable[[], None]) -> Callable[[], None]:
+    """Make the host wait after each call, which measures latency instead of throughput."""
+
+    def run_and_wait() -> None:
+        run()
+        torch.cuda.synchronize()
+
+    return run_and_wait
+
+
+def many_robots(device: str, robots: int, points: int, seconds: float) -> Iterator[Figure]:
+    """Time thousands of robots, and measure the traffic and bandwidth to compare the time with."""
+    fresh_compiler()
+    cfg = full_config(64)
+    drive = Drive(cfg, points, robots=robots, device=device, scans=2)
+    drive.warm_up()
+    yield "many robots, update", lambda: meter.milliseconds(drive, seconds)
+    yield "many robots, slowest kernels", lambda: _slowest_kernels(drive)
+    yield "many robots", lambda: {"robots": robots, "points": points, "cells": cfg.grid.num_cells}
+    yield "many robots, expected bytes", lambda: robots * meter.needed_traffic(cfg, points)
+    yield "copy, bytes per second", lambda: meter.copy_bandwidth(device)
+    kept = meter.state_bytes(cfg) + 12 * points
+    yield "many robots, bytes per robot", lambda: kept + meter.peak_bytes(drive, device) / robots
+    yield "many robots, needed bytes per robot", lambda: meter.needed_memory(cfg, points)
+    emap = drive.emap
+    xy = (emap.center[:, None, :2] + torch.rand(robots, _SCAN_POINTS, 2).to(device) - 0.5).float()
+    sample = torch.compile(lambda state, xy: emap.sample(xy, state=state))
+    with torch.no_grad():
+        yield "height scans", lambda: meter.milliseconds(lambda: emap.sample(xy), seconds)
+        yield "height scans, compiled", lambda: meter.milliseconds(lambda: sample(emap.state, xy), seconds)
+    if device != "cpu":
+        yield "many robots, captured", lambda: meter.milliseconds(_captured(drive), seconds)
+    yield "reset", lambda: meter.milliseconds(emap.reset, seconds)
+
+
+def _slowest_kernels(drive: Drive) -> dict[str, float]:
+    """Return the 20 slowest kernels of an update with their times [ms]; on a CPU, the operators."""
+    on_gpu = drive.dt.device.type == "cuda"
+    activities = [ProfilerActivity.CPU, ProfilerActivity.CUDA] if on_gpu else [ProfilerActivity.CPU]
+    with profile(activities=activities) as record:
+        drive()
+    kind = DeviceType.CUDA if on_gpu else DeviceType.CPU  # an operator's entry repeats its kernels' time
+    events = [event for event in record.key_averages() if event.device_type == kind]
+    field = "self_device_time_total" if on_gpu else "self_cpu_time_total"
+    times: dict[str, float] = {event.key[:80]: getattr(event, field) for event in events}  # [us]
+    return {key: round(times[key] / 1e3, 4) for key in sorted(times, key=times.__getitem__, reverse=True)[:20]}

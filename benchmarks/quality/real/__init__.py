@@ -1,0 +1,1 @@
+"""Maps of real scans, compared with points that were held out."""

@@ -1,0 +1,45 @@
+"""How long it takes to import torchelev and to run the first compiled update."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from typing import Any
+
+import torch
+
+from benchmarks.speed.meter import progress
+
+_IMPORT = "import time, torch; t = time.perf_counter(); import torchelev; print(time.perf_counter() - t)"
+_FIRST_UPDATE = """
+import time, torch
+from benchmarks.speed.workload import BPEARL, Drive, full_config
+torch.set_num_threads({threads})
+drive = Drive(full_config(), BPEARL, scans=1)
+t = time.perf_counter()
+drive()
+print(time.perf_counter() - t)
+"""
+
+
+def start(seconds: float) -> dict[str, Any]:
+    """Time the import and the first compiled update, with an empty and a filled compiler cache, in new processes."""
+    imports = [float(_run_python(_IMPORT)[0]) for _ in progress(range(5), "start")]
+    first = _FIRST_UPDATE.format(threads=torch.get_num_threads())
+    with tempfile.TemporaryDirectory() as cache:
+        runs = [_run_python(first, TORCHINDUCTOR_CACHE_DIR=cache) for _ in progress(range(2), "start")]
+    (cold, messages), (cached, _) = runs
+    result = {"import_seconds": statistics.median(imports), "first_update_seconds": float(cold)}
+    announced = messages.count("compiling the update")
+    return result | {"cached_first_update_seconds": float(cached), "announced": announced}
+
+
+def _run_python(code: str, **environment: str) -> tuple[str, str]:
+    """Run code in a new process; return its stdout and stderr."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | environment
+    )
+    return done.stdout.strip(), done.stderr

@@ -1,0 +1,45 @@
+"""The command of the speed benchmarks: one section alone, and regressions between two results."""
+
+import json
+import subprocess
+import sys
+
+from benchmarks.speed import run, scaling
+from benchmarks.speed.run import regressions
+from docs.readme_tables import ROOT
+
+
+def test_regressions_need_median_and_minimum():
+    old = {"points": {"full": [{"points": n, "median": 2.0, "min": 1.0} for n in (10, 20, 30)]}, "new": {}}
+    new = {
+        "points": {"full": [{"points": n, "median": m, "min": k} for n, m, k in ((10, 4, 1), (20, 4, 2), (30, 2, 1))]}
+    }
+    assert regressions(old, old) == ([], 3)
+    (found,), count = regressions(new, old)
+    assert found == "/points/full/points 20: median 2.000 -> 4.000 ms (2.00 x), min 1.000 -> 2.000 ms (2.00 x)"
+    assert count == 3
+
+
+def test_one_section_into_a_new_folder(tmp_path, monkeypatch, capsys, eager):
+    monkeypatch.setattr(scaling, "RAYS", [1.2, 4.8])
+    monkeypatch.setattr(sys, "argv", ["run", "rays", "--out", str(tmp_path), "--seconds", "0.001"])
+    assert run.main() == 0
+    assert "growth with ray length" in capsys.readouterr().out
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png"}
+
+
+def run_compare(new, old):
+    command = [sys.executable, "-m", "benchmarks.speed.run", "--compare", str(new), "--against", str(old)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+
+
+def test_compare_fails_on_a_regression(tmp_path):
+    fast, slow = tmp_path / "fast.json", tmp_path / "slow.json"
+    fast.write_text(json.dumps({"update": {"median": 1.0, "min": 0.9}}))
+    slow.write_text(json.dumps({"update": {"median": 3.0, "min": 2.9}}))
+    other = tmp_path / "other.json"
+    other.write_text("{}")
+    worse, better, none = run_compare(slow, fast), run_compare(fast, slow), run_compare(fast, other)
+    assert (worse.returncode, better.returncode, none.returncode) == (1, 0, 2), worse.stderr
+    assert "/update: median 1.000 -> 3.000 ms (3.00 x)" in worse.stdout
+    assert "no such file" in run_compare(fast, tmp_path / "missing.json").stderr

@@ -1,0 +1,27 @@
+"""Tables and figure of a speed result, and the verdicts on its targets."""
+
+from benchmarks.speed import plots, tables
+from benchmarks.speed.run import timings
+from docs.readme_tables import SPEED, load
+
+
+def test_committed_result_has_its_table_and_picture(tmp_path):
+    result = load(SPEED)
+    assert len(list(timings(result))) > 40
+    assert "| case | measured | target |" in tables.report(result)
+    plots.draw(result, tmp_path / "speed.png")
+    assert (tmp_path / "speed.png").stat().st_size > 10_000
+
+
+def test_time_neither_grows_nor_falls_with_ray_length():
+    verdicts = [tables.verdicts({"rays": {"exponent": p}}).splitlines()[-1] for p in (-0.2, 0.05, 0.2)]
+    assert [row.split("|")[-2].strip() for row in verdicts] == ["missed", "met", "missed"]
+
+
+def test_eager_updates_may_take_four_times_what_compiled_ones_may():
+    rows = [{"points": n, "median": limit} for n, limit in tables.TARGETS.items()]
+    slow = [row | {"median": factor * row["median"]} for row, factor in zip(rows, (3.9, 4.1, 4.0), strict=True)]
+    result = {"points": {"full": rows, "eager": slow, "exponent_from_43074": 0.5, "graphs": 3}}
+    verdicts = [row for row in tables.verdicts(result).splitlines() if "eager" in row]
+    assert [row.split("|")[-2].strip() for row in verdicts] == ["met", "missed", "met"]
+    assert "9.8 ms, 3.9 x compiled" in verdicts[0]

@@ -1,0 +1,54 @@
+"""How a training stops and resumes: the output folder is checked, and Ctrl-C waits for the running step."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from torchelev.output_files import atomic_file
+
+CHECKPOINT = "checkpoint.pt"
+
+
+def checkpoint_path(folder: Path, resume: bool) -> Path:
+    """Return the path of the checkpoint in an output folder.
+
+    Raises:
+        click.UsageError: it is missing although the training is to resume, or it exists although it is to begin.
+    """
+    path = folder / CHECKPOINT
+    if resume and not path.exists():
+        raise click.UsageError(f"--resume: there is no {path}; leave --resume out to begin")
+    if not resume and path.exists():
+        raise click.UsageError(f"--out: {folder} holds a training; add --resume, or choose another folder")
+    return path
+
+
+@contextlib.contextmanager
+def deferred_interrupt(unit: str) -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C wait for the end of the running `unit`; yield a function that tells whether it was pressed."""
+    pressed: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        pressed.append(number)
+        tqdm.write(f"Stopping after this {unit}; continue with --resume.")
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def write_result(path: Path, values: dict[str, Any]) -> None:
+    """Write a result as JSON; an interruption leaves an older file intact."""
+    with atomic_file(path) as file:
+        file.write((json.dumps(values, indent=1) + "\n").encode())
