@@ -34,7 +34,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev import LearnedTraversabilityConfig as Head
-from torchelev.app.cli import MapOptions, fuse_all, load_config, new_map
+from torchelev.app.config_file import load_config
+from torchelev.app.map_command import MapOptions, fuse_all, new_map
 from torchelev.app.results import markdown_table, write_json
 from torchelev.io import Frame, MappingRun, Recording, open_recording, read_poses
 from torchelev.io.export import SavedMap, take
