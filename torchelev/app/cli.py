@@ -11,7 +11,7 @@ import click
 from torchelev import __version__
 from torchelev.app.map_command import MapRequest, run_map
 
-MAP_HELP = """Build an elevation map from RECORDING, a folder of scans with poses.
+_MAP_HELP = """Build an elevation map from RECORDING, a folder of scans with poses.
 
 RECORDING, or its subfolder scans/, holds one file per scan. File names set the
 order; numbers in them count by value, so 2 comes before 10. Maps written there
@@ -62,7 +62,7 @@ def main() -> None:
     """Build elevation maps from point clouds and depth images."""
 
 
-@main.command("map", help=MAP_HELP, short_help="Build an elevation map from a folder of scans with poses.")
+@main.command("map", help=_MAP_HELP, short_help="Build an elevation map from a folder of scans with poses.")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option(
     "--poses",
@@ -135,7 +135,7 @@ def main() -> None:
     help="Frame of the points in .pcd files: the sensor frame, or the frame in which VIEWPOINT is given.",
 )
 def map_command(**options: Any) -> None:
-    """Run `torchelev map`; its help text is `MAP_HELP`."""
+    """Run `torchelev map`; its help text is `_MAP_HELP`."""
     sys.exit(run_map(MapRequest(**options)))
 
 

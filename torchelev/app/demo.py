@@ -50,7 +50,7 @@ class DemoResult:
         )
 
 
-class DemoScan(NamedTuple):
+class _DemoScan(NamedTuple):
     """One depth image with its poses."""
 
     points: Tensor  #: (N, 3) [m] sensor frame
@@ -58,7 +58,7 @@ class DemoScan(NamedTuple):
     T_map_base: Tensor  #: (4, 4)
 
 
-class HitCells:
+class _HitCells:
     """Cells that were hit since they entered the window: what the map could know at best."""
 
     def __init__(self, resolution: float, reach: float = 12.0) -> None:
@@ -66,7 +66,7 @@ class HitCells:
         self.half = round(reach / resolution)
         self.cells = torch.zeros(2 * self.half, 2 * self.half, dtype=torch.bool)
 
-    def add(self, scan: DemoScan, window: Tensor) -> None:
+    def add(self, scan: _DemoScan, window: Tensor) -> None:
         """Add the cells that a scan hit; drop those outside the window, given by its cell centres (H, W, 2) [m]."""
         T = scan.T_map_sensor
         points = scan.points[scan.points.isfinite().all(-1)].double()
@@ -104,7 +104,7 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
     path = walk(scene, ROUTE, speed=SPEED, dt=DT, T_base_sensor=T_BASE_CAMERA)
     num_scans = len(path.times) if seconds is None else min(len(path.times), max(1, round(seconds / DT)))
     emap = ElevationMap(ElevationMapConfig(grid=GRID), num_envs=1)
-    hit, update_ms = HitCells(GRID.resolution), []
+    hit, update_ms = _HitCells(GRID.resolution), []
     for k in tqdm(range(num_scans), desc="walking and mapping", unit="scan", disable=not progress):
         scan = _observe(scene, path, k, generator)
         update_ms.append(_fuse(emap, scan))
@@ -115,21 +115,21 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
     return result
 
 
-def _observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator) -> DemoScan:
+def _observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator) -> _DemoScan:
     """Simulate the depth image of step k: range noise, and 1 % of the pixels at wrong depths."""
     points = CAMERA.cast(scene, path.T_map_sensor[k], float(path.times[k]))
     points = outliers(range_noise(points, generator), generator, dust=0.005, flying=0.005)
-    return DemoScan(points, path.T_map_sensor[k], path.T_map_base[k])
+    return _DemoScan(points, path.T_map_sensor[k], path.T_map_base[k])
 
 
-def _fuse(emap: ElevationMap, scan: DemoScan) -> float:
+def _fuse(emap: ElevationMap, scan: _DemoScan) -> float:
     """Fuse one scan and return the time it took [ms]."""
     start = time.perf_counter()
     emap.update(scan.points[None], scan.T_map_sensor[None], scan.T_map_base[None], DT)
     return 1e3 * (time.perf_counter() - start)
 
 
-def _assess(emap: ElevationMap, scene: Scene, hit: HitCells, update_ms: list[float], t: float) -> DemoResult:
+def _assess(emap: ElevationMap, scene: Scene, hit: _HitCells, update_ms: list[float], t: float) -> DemoResult:
     """Compare the map with the ground truth at time t [s]."""
     xy, elevation = emap.cell_centers()[0], emap.layer("elevation")[0].double()
     error = (elevation - scene.truth(xy, t)).abs()

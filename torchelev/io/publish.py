@@ -1,4 +1,4 @@
-"""Publish layers at a fixed rate: copies in CPU memory, made without waiting for the device."""
+"""Publish layers at a limited rate: copies in CPU memory, made without waiting for the device."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Published(NamedTuple):
 
 
 class Publisher:
-    """Copy layers to CPU memory at a user-defined rate (paper, Sec. II-A).
+    """Copy layers to CPU memory, at most at a user-defined rate (paper, Sec. II-A).
 
     Call `offer` as often as you like, for example after each update: it starts a copy when one is due and returns
     immediately. `take` returns the newest finished copy. Use one publisher per rate.
