@@ -1,10 +1,10 @@
-"""`python -m torchelev`."""
+"""Entry point of `python -m torchelev`."""
 
 import sys
 
 
 def run() -> None:
-    """Start the command line, or say what to install for it."""
+    """Start the command line; without its packages, print how to install them."""
     try:
         from torchelev.app.cli import main
     except ModuleNotFoundError as error:

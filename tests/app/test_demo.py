@@ -7,6 +7,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("tqdm")
 
 from torchelev.app import demo
+from torchelev.app.demo_course import make_course
 
 
 @pytest.fixture(autouse=True)
@@ -15,12 +16,11 @@ def small_camera(monkeypatch):
     monkeypatch.setattr(demo, "CAMERA", demo.DepthCamera(width=40, height=30, max_range=6.0))
 
 
-def test_demo_maps_draws_and_measures(tmp_path, capsys):
+def test_demo_maps_draws_and_measures(tmp_path):
     out = tmp_path / "demo.png"
-    assert demo.main(["--out", str(out), "--seconds", "2", "--quiet"]) == 0
+    printed = str(demo.run_demo(out, seconds=2, progress=False))
     assert out.read_bytes().startswith(b"\x89PNG")
-    printed = capsys.readouterr().out
-    for word in ("RMSE", "p95", "coverage", "ms per update", str(out)):
+    for word in ("RMSE", "p95", "coverage", "ms per update"):
         assert word in printed
 
 
@@ -31,13 +31,7 @@ def test_result_is_that_of_a_map_of_the_course(tmp_path):
     assert result.p95 < 0.15 and result.coverage > 0.95
 
 
-def test_person_is_gone_from_the_course_at_the_end():
-    scene = demo.course()
-    person = torch.tensor([[3.7, 0.85]])
-    assert bool(scene.is_covered(person, 0.0)) and not bool(scene.is_covered(person, demo.PERSON_LEAVES + 2))
-
-
-def test_cells_at_steps():
-    scene = demo.course()
+def test_finds_the_cells_at_steps():
+    scene = make_course()
     xy = torch.tensor([[[0.0, 0.413], [0.0, -0.2]]], dtype=torch.float64)
-    assert demo.at_step(scene, xy, 0.0).tolist() == [[True, False]]
+    assert demo.find_steps(scene, xy, 0.0).tolist() == [[True, False]]

@@ -48,7 +48,7 @@ def test_npz_keeps_the_name_it_is_given(tmp_path, emap):
 
 def test_refuses_another_npz(tmp_path):
     np.savez(tmp_path / "cloud.npz", points=np.zeros((2, 3)))
-    with pytest.raises(ValueError, match=r"cloud\.npz: no map, axes, center"):
+    with pytest.raises(ValueError, match=r"cloud\.npz: not a map, axes, center"):
         load_npz(tmp_path / "cloud.npz")
 
 
@@ -118,7 +118,7 @@ def test_takes_bfloat16_as_float32(emap):
 
 def test_refuses_what_is_no_npz(tmp_path):
     (tmp_path / "map.npz").write_text("elevation")
-    with pytest.raises(ValueError, match=r"map\.npz: must be an \.npz file, got another"):
+    with pytest.raises(ValueError, match=r"map\.npz: must be an \.npz file, got another format"):
         load_npz(tmp_path / "map.npz")
 
 

@@ -17,10 +17,9 @@ def map_of(heights, resolution=0.5, corner=(0, 0)):
     heights = torch.tensor(heights)
     emap = small_map(cells=tuple(heights.shape), resolution=resolution)
     known = torch.isfinite(heights)
-    state = emap.state._replace(
-        corner=torch.tensor([corner]), elevation=torch.where(known, heights, 0.0)[None], validity=known[None]
-    )
-    emap._store(state)
+    emap.corner.copy_(torch.tensor([corner]))
+    emap.elevation.copy_(torch.where(known, heights, 0.0))
+    emap.validity.copy_(known)
     return emap
 
 

@@ -51,7 +51,7 @@ def test_round_numbers_in_float64(tmp_path):
 
 def test_bytes_that_are_no_coordinates(tmp_path):
     np.random.default_rng(0).integers(0, 256, 16_000, dtype=np.uint8).tofile(tmp_path / "0.bin")
-    with pytest.raises(RecordingError, match="no coordinates in metres"):
+    with pytest.raises(RecordingError, match="not coordinates in metres"):
         read_cloud(tmp_path / "0.bin")
 
 

@@ -60,12 +60,12 @@ GOOD = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        (GOOD + "# note\n" + "1 0 0 0 0 1.1 0 0 0 0 1 0\n", "line 3: the 3x3 part is no rotation"),
-        (GOOD + "1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 2: the 3x3 part is no rotation"),
-        ("0 0 0 0 0 0 0 0 0 0 0 0\n", "line 1: the 3x3 part is no rotation"),
+        (GOOD + "# note\n" + "1 0 0 0 0 1.1 0 0 0 0 1 0\n", "line 3: the 3x3 part is not a rotation"),
+        (GOOD + "1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 2: the 3x3 part is not a rotation"),
+        ("0 0 0 0 0 0 0 0 0 0 0 0\n", "line 1: the 3x3 part is not a rotation"),
         ("\n" + GOOD + "1 0 0 0 0 1 0 0 0 0 1\n", "line 3 holds 11 numbers"),
         (GOOD + "0 0 0 0 0 0 0 1\n", "line 2 holds 8 numbers, the lines before it 12"),
-        (GOOD + GOOD.replace("1", "one"), "line 2 is not made of numbers"),
+        (GOOD + GOOD.replace("1", "one"), "line 2 holds more than numbers"),
         (GOOD + GOOD.replace("1", "nan"), "line 2 holds NaN"),
         ("0 0 0 0 0 0 0 0\n", "line 1: the quaternion"),
         ("0 0 0 0 0 0 0.5 0.5\n", "line 1: the quaternion"),
@@ -81,7 +81,7 @@ def test_refuses_with_the_line_number(tmp_path, text, problem):
 
 def test_refuses_what_is_no_text(tmp_path):
     (tmp_path / "poses.txt").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(RecordingError, match="is no text"):
+    with pytest.raises(RecordingError, match="is not a text file"):
         read_poses(tmp_path / "poses.txt")
     with pytest.raises(RecordingError, match="no such pose file"):
         read_poses(tmp_path / "gone.txt")

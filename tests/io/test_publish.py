@@ -159,7 +159,7 @@ def device(monkeypatch):
         def wait_stream(self, other):
             device.calls.append(f"wait for {other}")
 
-    def pinned_like(value):
+    def allocate_pinned(value):
         device.pinned += 1
         return torch.full(value.shape, -7.0, dtype=value.dtype)
 
@@ -167,7 +167,7 @@ def device(monkeypatch):
     monkeypatch.setattr(torch.cuda, "Event", Event)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: "the updates")
     monkeypatch.setattr(torch.cuda, "stream", lambda stream: contextlib.nullcontext())
-    monkeypatch.setattr(publish, "_pinned_like", pinned_like)
+    monkeypatch.setattr(publish, "allocate_pinned", allocate_pinned)
     device.tensor = OnDevice
     return device
 

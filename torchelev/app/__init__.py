@@ -1,1 +1,1 @@
-"""The command line, the demo, and the reports that they write. Nothing in the library imports it."""
+"""The command line, its demo and the reports they print. Library code never imports this package."""

@@ -1,4 +1,4 @@
-"""What is said and drawn of a map that was made from a recording."""
+"""What `torchelev map` prints and draws of a finished map."""
 
 from __future__ import annotations
 
@@ -9,46 +9,47 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.io.mapping import MappingRun
+from torchelev.io import MappingRun
 
 if TYPE_CHECKING:
     from torchelev.viz.plot import Panel
 
 
-def summary(run: MappingRun, num_scans: int) -> list[str]:
-    """Lines on scans, window, coverage, points and time of a run over `num_scans` scans."""
+def summarize(run: MappingRun, num_scans: int) -> list[str]:
+    """Return lines on scans, window, coverage, points and time; `num_scans` is the length of the recording."""
     grid = run.emap.cfg.grid
     x, y = run.emap.center[0, :2].tolist()
+    size = f"{grid.length_x:g} x {grid.length_y:g} m, {grid.resolution:g} m cells"
     coverage = 100 * float(run.emap.layer("validity")[0].mean())
-    share = 100 * run.counts["points_used"] / max(run.num_points, 1)
+    used = run.counts["points_used"]
+    used_percent = 100 * used / max(run.num_points, 1)
     rejected = {k.removeprefix("rejected_"): n for k, n in run.counts.items() if k.startswith("rejected_") and n}
-    parts = ", ".join(f"{name} {n:,}" for name, n in sorted(rejected.items(), key=lambda item: -item[1]))
+    reasons = ", ".join(f"{name} {n:,}" for name, n in sorted(rejected.items(), key=lambda item: -item[1]))
     return [
         f"scans     {run.num_scans} of {num_scans}, {run.num_points:,} points",
-        f"window    {grid.length_x:g} x {grid.length_y:g} m, cells of {grid.resolution:g} m, around ({x:.2f}, {y:.2f})",
+        f"window    {size}, centred on ({x:.2f}, {y:.2f})",
         f"coverage  {coverage:.1f} % of the window's cells",
-        f"points    {run.counts['points_used']:,} used ({share:.1f} %); not used: {parts or 'none'}",
+        f"points    {used:,} used ({used_percent:.1f} %); rejected: {reasons or 'none'}",
         f"time      {np.median(run.update_ms):.1f} ms per scan (median; slowest {max(run.update_ms):.1f} ms)",
     ]
 
 
-def hints(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]:
-    """Lines on options that were not given and that this recording calls for."""
-    grid, lines = run.emap.cfg.grid, []
-    reach = float(np.ptp(np.array(run.sensor_xy), axis=0).max())
-    if not fixed and reach > min(grid.length_x, grid.length_y):
-        size = math.ceil(reach + grid.length_x)
-        lines.append(f"note      the path spans {reach:.0f} m; this is its last part, --fixed --size {size} keeps all")
+def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]:
+    """Return notes on options that were not given and would help with this recording."""
+    grid, notes = run.emap.cfg.grid, []
+    span = float(np.ptp(np.array(run.sensor_xy), axis=0).max())
+    if not fixed and span > min(grid.length_x, grid.length_y):
+        size = math.ceil(span + grid.length_x)
+        notes.append(
+            f"note      the path spans {span:.0f} m and the map shows its end; use --fixed --size {size} to keep it all"
+        )
     if not knows_base:
-        lines.append("note      overlap clearance is off: it needs --sensor-height or --extrinsics")
-    return lines
+        notes.append("note      overlap clearance is off; give --sensor-height or --extrinsics to turn it on")
+    return notes
 
 
-def map_panels(layers: dict[str, NDArray], filters: Sequence[str] = ()) -> list[Panel]:
-    """The four layers (H, W) that tell most, and those of filters.
-
-    Elevation and upper bound share their colours, so that they compare.
-    """
+def choose_panels(layers: dict[str, NDArray], filters: Sequence[str] = ()) -> list[Panel]:
+    """Return panels of the four main layers (H, W) and of filters; heights share one colour scale."""
     from torchelev.viz.plot import Panel
 
     elevation, traversability = layers["elevation"], layers["traversability"]

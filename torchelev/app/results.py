@@ -1,4 +1,4 @@
-"""What every benchmark writes: JSON with machine, versions and commit, and markdown tables."""
+"""Results of benchmarks and trainings: JSON with machine, versions and commit, and Markdown tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 
 
 def machine() -> dict[str, Any]:
-    """Describe what a result was measured on."""
+    """Return the machine, the versions and the commit that a result belongs to."""
     return {
         "processor": _processor(),
         "threads": torch.get_num_threads(),
@@ -32,7 +32,7 @@ def _processor() -> str:
 
 
 def commit() -> str:
-    """Return the checkout's commit, with "+changes" if the working tree differs from it."""
+    """Return the short hash of the checkout's commit, followed by "+changes" if the working tree differs from it."""
     try:
         name = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
         paths = ["torchelev", "envs", "training/**.py", "benchmarks/**.py"]
@@ -44,18 +44,18 @@ def commit() -> str:
 
 
 def write_json(path: str | Path, values: dict[str, Any]) -> None:
-    """Write a result with the machine it was measured on."""
+    """Write a result as JSON, with the machine it was measured on; create the folder if needed."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    described = {"machine": None} | values | {"machine": machine()}  # values read from a file hold another machine's
+    described = {"machine": None} | values | {"machine": machine()}  # not the machine of an older file
     Path(path).write_text(json.dumps(described, indent=1) + "\n")
 
 
 def slug(name: str) -> str:
-    """Return a name fit for a file: small letters and digits, joined by hyphens."""
+    """Return a name in lower case for use in file names: letters and digits, joined by hyphens."""
     return "-".join(re.findall(r"[a-z0-9]+", name.lower()))
 
 
 def markdown_table(head: list[str], rows: list[list[str]]) -> str:
-    """Format a table."""
+    """Format a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,7 +1,7 @@
-"""Recordings: folders of scans or depth images with poses.
+"""Recordings in (scans with poses), maps out (export, map_file, grid_map, publish). Plots are in `torchelev.viz`.
 
-Files in KITTI's `.bin` and numpy's formats need numpy alone; `.ply`, `.pcd`, depth PNGs and YAML import a package where
-they are read (``pip install 'torchelev[io]'``).
+`.bin`, `.npy` and `.npz` files need NumPy only. `.ply`, `.pcd`, depth images and YAML need the packages of
+``torchelev[io]``, which are imported on first use.
 """
 
 from torchelev.io.clouds import read_cloud

@@ -1,4 +1,4 @@
-"""Read one point cloud, format by extension, as (N, 3) float32 [m] in the sensor frame."""
+"""Read point clouds; the file's suffix tells the format."""
 
 from __future__ import annotations
 
@@ -9,21 +9,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.frames import transform
 from torchelev.io.errors import RecordingError
 from torchelev.io.layout import FileLayout, read_bin
 
 
 def read_cloud(path: str | Path, layout: FileLayout | None = None) -> NDArray[np.float32]:
-    """Read a cloud: `.bin` (KITTI), `.npy`, `.npz`, `.ply` or `.pcd` -> (N, 3) float32 [m].
+    """Read a point cloud: `.bin` (KITTI), `.npy`, `.npz`, `.ply` or `.pcd`.
 
-    Columns or fields beyond x, y, z are dropped; points with NaN are kept, the map ignores them. `layout` says how
-    numbers are laid out that a file does not describe. Raises RecordingError for an unknown extension, for a file
-    that is missing, cut short or not what its name says, and for one that looks like another layout.
+    Args:
+        path: the file.
+        layout: what the file leaves open; None: see `FileLayout`.
+
+    Returns:
+        Points x, y, z (N, 3) [m] in the sensor frame. Other columns and fields are dropped, points with NaN are kept.
+
+    Raises:
+        RecordingError: unknown suffix, or a file that is missing, damaged or contradicts its layout.
     """
     path = Path(path)
-    reader = CLOUD_READERS.get(path.suffix.lower())
+    reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise RecordingError(path, f"unknown format '{path.suffix}'", f"convert it to one of {known_formats()}")
+        raise RecordingError(
+            path, f"unknown format '{path.suffix}'", f"convert it to one of {' '.join(CLOUD_SUFFIXES)}"
+        )
     if not path.is_file():
         raise RecordingError(path, "no such file")
     try:
@@ -32,14 +41,9 @@ def read_cloud(path: str | Path, layout: FileLayout | None = None) -> NDArray[np
         return np.ascontiguousarray(reader(path, layout or FileLayout()), dtype=np.float32)
     except RecordingError:
         raise
-    except Exception as error:  # parsers of damaged files raise what they like
+    except Exception as error:  # for a damaged file, parsers raise all kinds of exceptions
         detail = str(error) or type(error).__name__
         raise RecordingError(path, f"cannot be read ({detail})", "copy or export it again") from error
-
-
-def known_formats() -> str:
-    """Name the suffixes of the clouds that can be read."""
-    return " ".join(sorted(CLOUD_READERS))
 
 
 def _read_bin(path: Path, layout: FileLayout) -> NDArray:
@@ -47,11 +51,10 @@ def _read_bin(path: Path, layout: FileLayout) -> NDArray:
 
 
 def _read_npy(path: Path, layout: FileLayout) -> NDArray:
-    # numpy takes any junk for a pickle and says so: its message would mislead.
     try:
         array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise RecordingError(path, "cut short or no .npy file", "save it again with numpy.save") from error
+    except (ValueError, OSError, EOFError) as error:  # NumPy's own message blames pickle, which would mislead
+        raise RecordingError(path, "cut short or not a .npy file", "save it again with numpy.save") from error
     return _columns(path, array)
 
 
@@ -59,17 +62,17 @@ def _read_npz(path: Path, layout: FileLayout) -> NDArray:
     try:
         with zipfile.ZipFile(path) as archive:
             keys = [name.removesuffix(".npy") for name in archive.namelist()]
-        key = _cloud_key(path, keys)
+        key = _choose_key(path, keys)
         with np.load(path, allow_pickle=False) as arrays:
             array = arrays[key]
     except RecordingError:
         raise
     except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
-        raise RecordingError(path, "cut short or no .npz file", "save it again with numpy.savez") from error
+        raise RecordingError(path, "cut short or not a .npz file", "save it again with numpy.savez") from error
     return _columns(path, array)
 
 
-def _cloud_key(path: Path, keys: list[str]) -> str:
+def _choose_key(path: Path, keys: list[str]) -> str:
     for key in ("points", "xyz"):
         if key in keys:
             return key
@@ -79,7 +82,7 @@ def _cloud_key(path: Path, keys: list[str]) -> str:
 
 
 def _columns(path: Path, array: NDArray) -> NDArray:
-    """(..., C >= 3) or structured with x, y, z -> (N, 3)."""
+    """Return x, y, z (N, 3) of an array (..., C >= 3) or of a structured array with these fields."""
     if array.dtype.names:
         return _fields(path, array)
     if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":
@@ -103,7 +106,7 @@ def _read_ply(path: Path, layout: FileLayout) -> NDArray:
     try:
         data = plyfile.PlyData.read(path)
     except (plyfile.PlyParseError, UnicodeDecodeError, ValueError) as error:
-        raise RecordingError(path, f"cut short or no .ply file ({error})", "export it again") from error
+        raise RecordingError(path, f"cut short or not a .ply file ({error})", "export it again") from error
     if "vertex" not in data:
         raise RecordingError(path, "no element 'vertex'", "the cloud needs vertices with x, y and z")
     return _fields(path, data["vertex"].data)
@@ -112,43 +115,42 @@ def _read_ply(path: Path, layout: FileLayout) -> NDArray:
 def _read_pcd(path: Path, layout: FileLayout) -> NDArray:
     from pypcd4 import PointCloud
 
-    # pypcd4 leaves checking to numpy, pydantic and lzf: what a broken file raises depends on where it breaks.
     try:
         cloud = PointCloud.from_path(path)
-        count = cloud.metadata.points
-    except Exception as error:
+        num_points = cloud.metadata.points
+    except Exception as error:  # raised by pypcd4, NumPy, pydantic or lzf, depending on what is damaged
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise RecordingError(path, f"cut short or no .pcd file ({detail})", "export it again") from error
-    if len(cloud.pc_data) != count:
-        raise RecordingError(path, f"cut short: {len(cloud.pc_data)} of {count} points", "copy the file again")
-    return _from_viewpoint(path, _fields(path, cloud.pc_data), cloud.metadata.viewpoint, layout.pcd_frame)
+        raise RecordingError(path, f"cut short or not a .pcd file ({detail})", "export it again") from error
+    if len(cloud.pc_data) != num_points:
+        raise RecordingError(path, f"cut short: {len(cloud.pc_data)} of {num_points} points", "copy the file again")
+    return _to_sensor_frame(path, _fields(path, cloud.pc_data), cloud.metadata.viewpoint, layout.pcd_frame)
 
 
-def _from_viewpoint(path: Path, points: NDArray, viewpoint: tuple[float, ...], frame: str | None) -> NDArray:
-    """Return points (N, 3) in the sensor's frame; where VIEWPOINT says something, programs differ in what it is."""
+def _to_sensor_frame(path: Path, points: NDArray, viewpoint: tuple[float, ...], frame: str | None) -> NDArray:
+    """Return points (N, 3) in the sensor frame.
+
+    VIEWPOINT is the sensor's pose, but programs differ on whether the points are in its frame or in the sensor's.
+    """
     position, quat_wxyz = np.array(viewpoint[:3]), np.array(viewpoint[3:])
     is_identity = np.allclose(position, 0) and np.allclose(np.abs(quat_wxyz), [1, 0, 0, 0])
     if is_identity or frame == "sensor":
         return points
-    problem = f"VIEWPOINT {' '.join(f'{v:g}' for v in viewpoint)}: are the points in the sensor's frame, or in its?"
     if frame is None:
+        numbers = " ".join(f"{v:g}" for v in viewpoint)
+        problem = f"VIEWPOINT {numbers}: the points may be in the sensor's frame or in the frame of this pose"
         raise RecordingError(path, problem, "say which with --pcd-frame sensor or --pcd-frame viewpoint")
     norm = np.linalg.norm(quat_wxyz)
     if not abs(norm - 1) < 0.02:
         raise RecordingError(path, f"VIEWPOINT's quaternion has length {norm:g}, not 1", "use --pcd-frame sensor")
-    w, x, y, z = quat_wxyz / norm
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    return (points - position) @ rotation
+    T_view_sensor = transform(position, quat_wxyz / norm).numpy()
+    return (points - position) @ T_view_sensor[:3, :3]
 
 
-CLOUD_READERS: dict[str, Callable[[Path, FileLayout], NDArray]] = {
+_READERS: dict[str, Callable[[Path, FileLayout], NDArray]] = {
     ".bin": _read_bin,
     ".npy": _read_npy,
     ".npz": _read_npz,
     ".pcd": _read_pcd,
     ".ply": _read_ply,
 }
+CLOUD_SUFFIXES = tuple(_READERS)

@@ -1,4 +1,4 @@
-"""The one error that reading a recording raises."""
+"""The error that reading a recording raises."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class RecordingError(ValueError):
-    """A recording cannot be read: one line with the file, what is wrong with it, and what to do."""
+    """A recording cannot be read. The message is one line: file, problem, hint."""
 
     def __init__(self, path: str | Path, problem: str, hint: str = "") -> None:
         line = f"{path}: {problem}" + (f"; {hint}" if hint else "")

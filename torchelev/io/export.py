@@ -1,4 +1,4 @@
-"""Take a map out: layers as arrays and where they lie, `.npz` of them or of the whole map, `.ply` mesh and cloud."""
+"""Export a map: layers as NumPy arrays with their geometry, `.npz` files, and `.ply` meshes and clouds."""
 
 from __future__ import annotations
 
@@ -18,11 +18,9 @@ if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
 __all__ = [
-    "AXES",
     "SavedMap",
     "load_map",
     "load_npz",
-    "map_extent",
     "save_cloud",
     "save_map",
     "save_mesh",
@@ -33,39 +31,43 @@ __all__ = [
     "triangulate",
 ]
 
-AXES = "layer[i, j]: i grows with +x, j with +y of the map frame; cell centre = center + (i + 0.5 - H/2) * resolution"
-FACTS = ("resolution", "center", "axes", "config")  # what an .npz holds beside the layers
-
-MEND = "write it with save_npz"
+_AXES = "layer[i, j]: i grows with +x, j with +y of the map frame; cell centre = center + (i + 0.5 - H/2) * resolution"
+_GEOMETRY = ("resolution", "center", "axes", "config")  # arrays of an .npz beside the layers
+_HINT = "write it with save_npz"
 
 
 class SavedMap(NamedTuple):
-    """One map as `save_npz` wrote it."""
+    """The layers of one environment and their geometry."""
 
     layers: dict[str, NDArray]  #: name -> (H, W), NaN where unknown
     resolution: float  #: [m]
     center: NDArray[np.float64]  #: (3,) [m], map frame
     config: dict[str, Any]  #: for ElevationMapConfig.from_dict
-    axes: str = AXES  #: how tensor indices relate to the map frame's axes
+    axes: str = _AXES  #: how tensor indices relate to the map frame's axes
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Outer borders x_min, x_max, y_min, y_max [m], map frame."""
-        return map_extent(next(iter(self.layers.values())).shape, self.center, self.resolution)
-
-
-def map_extent(shape: tuple[int, ...], center: NDArray, resolution: float) -> tuple[float, float, float, float]:
-    """Outer borders x_min, x_max, y_min, y_max [m] of a map of `shape` (H, W) around `center`."""
-    half_x, half_y = shape[0] * resolution / 2, shape[1] * resolution / 2
-    x, y = float(center[0]), float(center[1])
-    return x - half_x, x + half_x, y - half_y, y + half_y
+        """The outer borders x_min, x_max, y_min, y_max [m], map frame."""
+        H, W = next(iter(self.layers.values())).shape
+        half_x, half_y = H * self.resolution / 2, W * self.resolution / 2
+        x, y = float(self.center[0]), float(self.center[1])
+        return x - half_x, x + half_x, y - half_y, y + half_y
 
 
 def take(emap: ElevationMap, env: int = 0, layers: Sequence[str] | None = None) -> SavedMap:
-    """Copy environment `env` to the host as numpy arrays, layers in the map's precision (bfloat16 as float32).
+    """Copy one environment to NumPy arrays.
 
-    `layers` are names as of `ElevationMap.layer`; None takes all, those of configured filters too. Raises KeyError for
-    an unknown layer, ValueError for an environment that does not exist.
+    Args:
+        emap: the map.
+        env: the environment.
+        layers: names as in `ElevationMap.layer`; None: all, including those of configured filters.
+
+    Returns:
+        The layers in the map's precision (bfloat16 as float32) and their geometry.
+
+    Raises:
+        KeyError: a layer does not exist.
+        ValueError: the environment does not exist.
     """
     require(0 <= env < emap.num_envs, "env", f"must lie in [0, {emap.num_envs})", env, "environments count from 0")
     arrays = {name: as_array(emap.layer(name)[env].clone()) for name in (emap.layers if layers is None else layers)}
@@ -74,52 +76,96 @@ def take(emap: ElevationMap, env: int = 0, layers: Sequence[str] | None = None) 
 
 
 def save_npz(path: str | Path, emap: ElevationMap, env: int = 0) -> None:
-    """Write environment `env`: each layer (H, W) by its name, and the geometry.
+    """Write the layers (H, W) of one environment, by their names, to an `.npz` that plain NumPy reads.
 
-    Beside the layers: `resolution` [m], `center` (3,) [m] in the map frame, `axes` (the convention in words) and
-    `config` (JSON). Plain numpy reads it; `load_npz` gives it back as a SavedMap. Raises ValueError for a
-    filter's layer with one of these names.
+    Beside the layers it holds `resolution` [m], `center` (3,) [m] in the map frame, `axes` (the index convention in
+    words) and `config` (JSON). `load_npz` reads it back.
+
+    Args:
+        path: the file to write, under this name as it is.
+        emap: the map.
+        env: the environment.
+
+    Raises:
+        ValueError: the environment does not exist, or a filter's layer has a reserved name.
+        WriteError: the file cannot be written; an existing one is left as it was.
     """
     saved = take(emap, env)
-    clash = [name for name in (*FACTS, "file") if name in saved.layers]  # savez has a parameter of that name
-    rule = f"must not be named {', '.join(FACTS)}, file"
+    clash = [name for name in (*_GEOMETRY, "file") if name in saved.layers]  # `file` is an argument of NumPy's savez
+    rule = f"must not be named {', '.join(_GEOMETRY)}, file"
     require(not clash, "layers", rule, ", ".join(clash), "rename the filter's layer")
     config = np.array(json.dumps(saved.config))
-    arrays: dict[str, Any] = dict(saved.layers, resolution=saved.resolution, center=saved.center, axes=AXES)
+    arrays: dict[str, Any] = dict(saved.layers, resolution=saved.resolution, center=saved.center, axes=_AXES)
     with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
         np.savez_compressed(file, config=config, **arrays)
 
 
 def load_npz(path: str | Path) -> SavedMap:
-    """Read what `save_npz` wrote. Raises ValueError if the file holds no map."""
-    arrays = read_npz(path, MEND)
-    missing = set(FACTS) - set(arrays)
+    """Read a file of `save_npz`.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The layers and their geometry.
+
+    Raises:
+        ValueError: not a file of `save_npz`, or a damaged one.
+    """
+    arrays = read_npz(path, _HINT)
+    missing = set(_GEOMETRY) - set(arrays)
     if missing:
-        raise ValueError(f"{path}: no map, {', '.join(sorted(missing))} missing; {MEND}")
-    facts = {name: arrays.pop(name) for name in FACTS}
+        raise ValueError(f"{path}: not a map, {', '.join(sorted(missing))} missing; {_HINT}")
+    geometry = {name: arrays.pop(name) for name in _GEOMETRY}
     shapes = {array.shape for array in arrays.values()}
-    require(len(shapes) == 1 and len(next(iter(shapes))) == 2, str(path), "must hold layers (H, W)", shapes, MEND)
+    require(len(shapes) == 1 and len(next(iter(shapes))) == 2, str(path), "must hold layers (H, W)", shapes, _HINT)
     try:
-        resolution, config = float(facts["resolution"]), json.loads(str(facts["config"]))
+        resolution, config = float(geometry["resolution"]), json.loads(str(geometry["config"]))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: damaged resolution or config ({error}); {MEND}") from error
-    center = facts["center"]
-    good = isinstance(config, dict) and resolution > 0 and center.shape == (3,) and center.dtype.kind == "f"
-    require(good, str(path), "must have a resolution, a center (3,) and a config", "others", MEND)
-    return SavedMap(arrays, resolution, facts["center"], config, str(facts["axes"]))
+        raise ValueError(f"{path}: damaged resolution or config ({error}); {_HINT}") from error
+    center = geometry["center"]
+    is_valid = isinstance(config, dict) and resolution > 0 and center.shape == (3,) and center.dtype.kind == "f"
+    actual = f"{resolution}, {center.dtype} {center.shape} and a {type(config).__name__}"
+    require(is_valid, str(path), "must have a positive resolution, a float center (3,) and a config", actual, _HINT)
+    return SavedMap(arrays, resolution, center, config, str(geometry["axes"]))
 
 
 def to_points(emap: ElevationMap, env: int = 0, layer: str = "elevation") -> NDArray[np.float64]:
-    """Return the known cells of environment `env` as points (K, 3) [m], map frame: centre x, y and the layer's value.
+    """Return the known cells of one environment as points.
 
-    In float64, so that points far from the origin keep their place. Raises as `take`.
+    Args:
+        emap: the map.
+        env: the environment.
+        layer: gives the points' z and which cells are known.
+
+    Returns:
+        Points (K, 3) float64 [m], map frame: x and y of the cell centre, and the layer's value.
+
+    Raises:
+        KeyError: the layer does not exist.
+        ValueError: the environment does not exist.
     """
     saved = take(emap, env, (layer,))
     return _known_points(saved.layers[layer], saved.center, saved.resolution)
 
 
 def save_cloud(path: str | Path, emap: ElevationMap, env: int = 0, layer: str = "elevation") -> int:
-    """Write environment `env` as a point cloud (binary `.ply`, the points of `to_points`). Returns their number."""
+    """Write one environment as a point cloud, a binary `.ply`; see `to_points`.
+
+    Args:
+        path: the file to write.
+        emap: the map.
+        env: the environment.
+        layer: gives the points' z.
+
+    Returns:
+        The number of points.
+
+    Raises:
+        KeyError: the layer does not exist.
+        ValueError: the environment does not exist.
+        WriteError: the file cannot be written; an existing one is left as it was.
+    """
     points = to_points(emap, env, layer)
     _write_ply(path, points)
     return len(points)
@@ -128,19 +174,40 @@ def save_cloud(path: str | Path, emap: ElevationMap, env: int = 0, layer: str = 
 def to_mesh(
     emap: ElevationMap, env: int = 0, layer: str = "elevation"
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return environment `env` as a triangle mesh: vertices (V, 3) [m], map frame, triangles (F, 3); see `triangulate`.
+    """Return one environment as a triangle mesh; see `triangulate`.
 
-    Raises as `take`.
+    Args:
+        emap: the map.
+        env: the environment.
+        layer: gives the vertices' z and which cells are known.
+
+    Returns:
+        Vertices (V, 3) float64 [m], map frame, and triangles (F, 3), indices of vertices.
+
+    Raises:
+        KeyError: the layer does not exist.
+        ValueError: the environment does not exist.
     """
     saved = take(emap, env, (layer,))
     return triangulate(saved.layers[layer], saved.center, saved.resolution)
 
 
 def save_mesh(path: str | Path, emap: ElevationMap, env: int = 0, layer: str = "elevation") -> int:
-    """Write environment `env` as a triangle mesh (binary `.ply`, metres, map frame, normals up).
+    """Write one environment as a triangle mesh, a binary `.ply` in metres in the map frame; see `to_mesh`.
 
-    Vertices are the centres of known cells, in float64 so that a mesh far from the origin keeps its shape. Returns the
-    number of triangles.
+    Args:
+        path: the file to write.
+        emap: the map.
+        env: the environment.
+        layer: gives the vertices' z.
+
+    Returns:
+        The number of triangles.
+
+    Raises:
+        KeyError: the layer does not exist.
+        ValueError: the environment does not exist.
+        WriteError: the file cannot be written; an existing one is left as it was.
     """
     vertices, triangles = to_mesh(emap, env, layer)
     _write_ply(path, vertices, triangles)
@@ -148,21 +215,28 @@ def save_mesh(path: str | Path, emap: ElevationMap, env: int = 0, layer: str = "
 
 
 def triangulate(heights: NDArray, center: NDArray, resolution: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Join cell centres to triangles: vertices (V, 3) [m], triangles (F, 3) counter-clockwise seen from above.
+    """Triangulate a height map: two triangles between each four neighbouring cell centres that are all known.
 
-    `heights` (H, W) [m], NaN where unknown. Only quads whose four corners are known become triangles, so that holes
-    stay holes.
+    Unknown cells leave holes.
+
+    Args:
+        heights: (H, W) [m], NaN where unknown.
+        center: (3,) [m] of the map; z is ignored.
+        resolution: [m].
+
+    Returns:
+        Vertices (V, 3) [m] at the known cells' centres, and triangles (F, 3), counter-clockwise seen from above.
     """
-    known = np.isfinite(heights)
-    number = np.where(known, np.cumsum(known.ravel()).reshape(known.shape) - 1, -1)
-    quads = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
+    is_known = np.isfinite(heights)
+    index = np.where(is_known, np.cumsum(is_known.ravel()).reshape(heights.shape) - 1, -1)
+    quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1).reshape(-1, 4)
     quads = quads[(quads >= 0).all(axis=1)]
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     return _known_points(heights, center, resolution), triangles
 
 
 def _known_points(heights: NDArray, center: NDArray, resolution: float) -> NDArray[np.float64]:
-    """Return the centres of the known cells (K, 3), row by row."""
+    """Return the centres of the known cells (K, 3) in float64, precise far from the origin, row by row."""
     i, j = np.nonzero(np.isfinite(heights))
     x = center[0] + (i + 0.5 - heights.shape[0] / 2) * resolution
     y = center[1] + (j + 0.5 - heights.shape[1] / 2) * resolution

@@ -1,10 +1,11 @@
-"""The GridMap convention of ROS: the one place where axes flip.
+"""Convert maps to and from ROS's GridMap convention, without importing ROS.
 
-`GridMap` has the fields of the message grid_map_msgs/GridMap by their names, less its header: frame and time are the
-caller's. Nothing of ROS is imported; `from_grid_map` reads a received message as well.
+`GridMap` has the same fields as the message grid_map_msgs/GridMap, except for the header: frame and timestamp are up to
+the caller. `from_grid_map` also reads received messages.
 
-A layer of a GridMap is a matrix whose element (0, 0) is the cell with the largest x and the largest y. Rows go along
--x, columns along -y, and it is stored column by column (grid_map_core's GridMapMath, grid_map_ros' GridMapMsgHelpers):
+A layer of a GridMap is a matrix whose element (0, 0) is the cell with the largest x and y. The row index grows along
+-x, the column index along -y, and values are stored column by column (grid_map_core's GridMapMath, grid_map_ros'
+GridMapMsgHelpers):
 
     matrix[r, c] = layer[H - 1 - r, W - 1 - c]        data[c * H + r] = matrix[r, c]
 """
@@ -23,36 +24,36 @@ from torchelev.io.export import take
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
-COLUMN, ROW = "column_index", "row_index"
-SLACK = 1e-3  # cells by which a length may miss a whole number
+_COLUMN, _ROW = "column_index", "row_index"
+_TOLERANCE = 1e-3  # [cells] by which a length may differ from a whole number of cells
 
 
 class Point(NamedTuple):
-    """As geometry_msgs/Point [m]."""
+    """Same fields as geometry_msgs/Point [m]."""
 
     x: float  #: [m]
     y: float  #: [m]
-    z: float = 0.0  #: GridMap has none: heights are absolute
+    z: float = 0.0  #: [m] 0 in a GridMap, whose heights are absolute
 
 
 class Quaternion(NamedTuple):
-    """As geometry_msgs/Quaternion; a GridMap does not turn."""
+    """Same fields as geometry_msgs/Quaternion; the identity in a GridMap."""
 
-    x: float = 0.0  #: of the unit quaternion x, y, z, w
-    y: float = 0.0  #: see x
-    z: float = 0.0  #: see x
-    w: float = 1.0  #: see x
+    x: float = 0.0  #: vector part, x
+    y: float = 0.0  #: vector part, y
+    z: float = 0.0  #: vector part, z
+    w: float = 1.0  #: scalar part
 
 
 class Pose(NamedTuple):
-    """As geometry_msgs/Pose."""
+    """Same fields as geometry_msgs/Pose."""
 
     position: Point  #: of the map's centre
     orientation: Quaternion = Quaternion()  #: of the map
 
 
 class GridMapInfo(NamedTuple):
-    """As grid_map_msgs/GridMapInfo."""
+    """Same fields as grid_map_msgs/GridMapInfo."""
 
     resolution: float  #: [m]
     length_x: float  #: [m]
@@ -61,43 +62,43 @@ class GridMapInfo(NamedTuple):
 
 
 class Dimension(NamedTuple):
-    """As std_msgs/MultiArrayDimension."""
+    """Same fields as std_msgs/MultiArrayDimension."""
 
     label: str  #: "column_index" or "row_index"
     size: int  #: number of entries
-    stride: int  #: entries of this dimension and all faster ones
+    stride: int  #: product of the sizes of this and all faster dimensions
 
 
 class Layout(NamedTuple):
-    """As std_msgs/MultiArrayLayout: the slow dimension first."""
+    """Same fields as std_msgs/MultiArrayLayout."""
 
-    dim: list[Dimension]  #: outermost first
+    dim: list[Dimension]  #: slowest first
     data_offset: int = 0  #: entries before the first
 
 
 class Float32MultiArray(NamedTuple):
-    """As std_msgs/Float32MultiArray."""
+    """Same fields as std_msgs/Float32MultiArray."""
 
-    layout: Layout  #: of the data
+    layout: Layout  #: dimensions of the data
     data: NDArray[np.float32]  #: (H * W,)
 
 
 class GridMap(NamedTuple):
-    """As grid_map_msgs/GridMap, less its header."""
+    """Same fields as grid_map_msgs/GridMap, except for the header."""
 
-    info: GridMapInfo  #: frame, size and pose
+    info: GridMapInfo  #: resolution, size and pose
     layers: list[str]  #: names, in the order of the data
-    basic_layers: list[str]  #: must be known for a cell to count as valid
+    basic_layers: list[str]  #: layers that must be known for a cell to be valid
     data: list[Float32MultiArray]  #: one per layer, NaN where unknown
-    outer_start_index: int = 0  #: row of the buffer that holds the first row
-    inner_start_index: int = 0  #: column of the buffer that holds the first column
+    outer_start_index: int = 0  #: row of the circular buffer with the matrix's first row
+    inner_start_index: int = 0  #: column of the circular buffer with the matrix's first column
 
 
 class MapLayers(NamedTuple):
-    """What `from_grid_map` found, in torchelev's convention."""
+    """Layers of a GridMap in torchelev's convention."""
 
     layers: dict[str, NDArray[np.float32]]  #: name -> (H, W): i grows with +x, j with +y
-    center: NDArray[np.float64]  #: (3,) [m]
+    center: NDArray[np.float64]  #: (3,) [m], frame of the GridMap
     resolution: float  #: [m]
 
 
@@ -107,15 +108,28 @@ def to_grid_map(
     layers: Sequence[str] = ("elevation",),
     basic_layers: Sequence[str] = (),
 ) -> GridMap:
-    """Copy layers of one environment into the GridMap convention, in float32, NaN where unknown.
+    """Copy layers of one environment to a GridMap, in float32, NaN where unknown.
 
-    The pose is the window's centre, without its z, as GridMap's own converter writes it. Raises KeyError for an unknown
-    layer, ValueError for an environment that does not exist and for basic layers that are not among the layers.
+    The pose is the window's centre with z = 0, as in GridMap's own converter.
+
+    Args:
+        emap: the map.
+        env: the environment.
+        layers: names as in `ElevationMap.layer`.
+        basic_layers: those of the layers that must be known for a cell to be valid.
+
+    Returns:
+        The GridMap.
+
+    Raises:
+        KeyError: a layer does not exist.
+        ValueError: the environment does not exist, or a basic layer is not among the layers.
     """
-    names = not isinstance(layers, str)
-    require(names, "layers", "must be a sequence of names", repr(layers), f"give ({layers!r},)")
-    among = set(basic_layers) <= set(layers)
-    require(among, "basic_layers", "must be among the layers", list(basic_layers), f"layers are {', '.join(layers)}")
+    is_sequence = not isinstance(layers, str)
+    require(is_sequence, "layers", "must be a sequence of names", repr(layers), f"give ({layers!r},)")
+    is_subset = set(basic_layers) <= set(layers)
+    names = ", ".join(layers)
+    require(is_subset, "basic_layers", "must be among the layers", list(basic_layers), f"layers are {names}")
     taken, grid = take(emap, env, layers), emap.cfg.grid
     center = Point(float(taken.center[0]), float(taken.center[1]))
     lengths = grid.height * grid.resolution, grid.width * grid.resolution
@@ -125,53 +139,63 @@ def to_grid_map(
 
 
 def from_grid_map(grid_map: GridMap) -> MapLayers:
-    """Read a GridMap, or a received message grid_map_msgs/GridMap, wherever its circular buffer starts.
+    """Read a GridMap or a received message grid_map_msgs/GridMap, with any start of its circular buffer.
 
-    The orientation is not read: a GridMap's axes are those of its frame. Raises ValueError for a message whose sizes or
-    storage order do not fit.
+    The orientation is ignored: a GridMap is aligned with its frame.
+
+    Args:
+        grid_map: the GridMap or message.
+
+    Returns:
+        The layers in torchelev's convention.
+
+    Raises:
+        ValueError: sizes or storage order are inconsistent.
     """
     info = grid_map.info
-    same = len(grid_map.layers) == len(grid_map.data)
+    is_complete = len(grid_map.layers) == len(grid_map.data)
     actual = f"{len(grid_map.layers)} layers and {len(grid_map.data)} data"
-    require(same, "grid_map", "must have data for each layer", actual, "check its publisher")
+    require(is_complete, "grid_map", "must have data for each layer", actual, "check its publisher")
     start = int(grid_map.outer_start_index), int(grid_map.inner_start_index)
     layers = {}
     for name, array in zip(grid_map.layers, grid_map.data, strict=True):
-        matrix = _matrix(name, array)
+        matrix = _to_matrix(name, array)
         _require_size(name, matrix.shape, info)
-        layers[name] = _flipped(np.roll(matrix, (-start[0], -start[1]), (0, 1)))
+        layers[name] = _flip(np.roll(matrix, (-start[0], -start[1]), (0, 1)))
     position = info.pose.position
     return MapLayers(layers, np.array([position.x, position.y, position.z], dtype=np.float64), float(info.resolution))
 
 
-def _flipped(layer: NDArray) -> NDArray[np.float32]:
-    """Turn torchelev's [i, j] into GridMap's matrix, or back: both axes run the other way."""
+def _flip(layer: NDArray) -> NDArray[np.float32]:
+    """Convert between torchelev's [i, j] and GridMap's matrix: both axes are reversed."""
     return np.ascontiguousarray(layer[::-1, ::-1], dtype=np.float32)
 
 
 def _to_multi_array(layer: NDArray) -> Float32MultiArray:
     rows, columns = layer.shape
-    layout = Layout([Dimension(COLUMN, columns, rows * columns), Dimension(ROW, rows, rows)])
-    return Float32MultiArray(layout, _flipped(layer).ravel(order="F"))
+    layout = Layout([Dimension(_COLUMN, columns, rows * columns), Dimension(_ROW, rows, rows)])
+    return Float32MultiArray(layout, _flip(layer).ravel(order="F"))
 
 
-def _matrix(name: str, array: Float32MultiArray) -> NDArray[np.float32]:
-    """Return a layer's matrix as it lies in the circular buffer."""
+def _to_matrix(name: str, array: Float32MultiArray) -> NDArray[np.float32]:
+    """Return a layer's matrix as stored in the circular buffer."""
     labels = [dim.label for dim in array.layout.dim]
-    known = labels in ([COLUMN, ROW], [ROW, COLUMN])
+    is_known = labels in ([_COLUMN, _ROW], [_ROW, _COLUMN])
     hint = "label them as grid_map_ros does"
-    require(known, f"grid_map, {name}", f"dimensions must be {COLUMN}, {ROW}", ", ".join(labels) or "none", hint)
+    require(is_known, f"grid_map, {name}", f"dimensions must be {_COLUMN}, {_ROW}", ", ".join(labels) or "none", hint)
     sizes = tuple(int(dim.size) for dim in array.layout.dim)
     data = np.asarray(array.data, dtype=np.float32)[array.layout.data_offset :]
-    fits = data.size == sizes[0] * sizes[1] > 0
-    require(fits, f"grid_map, {name}", f"must have {sizes[0]} x {sizes[1]} values", data.size, "check its publisher")
+    has_size = data.size == sizes[0] * sizes[1] > 0
+    require(
+        has_size, f"grid_map, {name}", f"must have {sizes[0]} x {sizes[1]} values", data.size, "check its publisher"
+    )
     slow_first = data.reshape(sizes)
-    return slow_first if labels == [ROW, COLUMN] else slow_first.T
+    return slow_first if labels == [_ROW, _COLUMN] else slow_first.T
 
 
 def _require_size(name: str, shape: tuple[int, ...], info: GridMapInfo) -> None:
     require(info.resolution > 0, "grid_map, resolution", "must be positive", info.resolution, "give metres")
-    cells = info.length_x / info.resolution, info.length_y / info.resolution
-    fits = all(abs(number - size) < SLACK for number, size in zip(cells, shape, strict=True))
-    expected = f"must have {cells[0]:g} rows and {cells[1]:g} columns, as its lengths say"
-    require(fits, f"grid_map, {name}", expected, f"{shape[0]} and {shape[1]}", "check its publisher")
+    expected = info.length_x / info.resolution, info.length_y / info.resolution
+    has_size = all(abs(number - size) < _TOLERANCE for number, size in zip(expected, shape, strict=True))
+    rule = f"must have {expected[0]:g} rows and {expected[1]:g} columns, as its lengths say"
+    require(has_size, f"grid_map, {name}", rule, f"{shape[0]} and {shape[1]}", "check its publisher")

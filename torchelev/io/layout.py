@@ -1,4 +1,4 @@
-"""What files do not say of themselves: how their numbers are laid out, and what gives a wrong guess away."""
+"""What files leave open: column layout, quaternion order, time unit. Defaults, and checks that expose a wrong one."""
 
 from __future__ import annotations
 
@@ -12,33 +12,38 @@ from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
 
-HEAD_BYTES = 480 * 40  # that layouts are told from; a whole number of points of every layout below
-MIN_POINTS = 32  # fewer tell nothing
-TILT_STEADY, TILT_TURNING = 10.0, 25.0  # [deg] a sensor on a robot keeps its tilt within the first
-MIN_STEP, MAX_STEP = 1e-4, 10.0  # [s] between scans of any sensor that drives
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-BIN_HINT = "say which with --bin-layout (float32x5: nuScenes)"
+XYZW_COLUMNS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}  # by order: columns that hold x, y, z, w
+_HEAD_BYTES = 480 * 40  # of a `.bin`, inspected to detect its layout; a whole number of points of every layout below
+_MIN_POINTS = 32  # with fewer, nothing is detected
+_STEADY_TILT, _TURNING_TILT = 10.0, 25.0  # [deg] the tilt of a sensor on a robot varies by less than the first
+_MIN_STEP, _MAX_STEP = 1e-4, 10.0  # [s] plausible times between scans
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_BIN_HINT = "with --bin-layout (float32x5: nuScenes)"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileLayout:
-    """The layout of a recording's files; None: as told from the files, or refused where they contradict it."""
+    """What a recording's files leave open. With None a file is read by the default, or refused if it contradicts it."""
 
-    bin: str | None = None  #: of `.bin`: float32 or float64, x, and numbers per point; None: float32x4, as KITTI
-    quaternions: Literal["xyzw", "wxyz"] | None = None  #: of pose files with 8 columns; None: xyzw, as TUM
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None  #: of their times; None: s, or of times since 1970 any
-    pcd_frame: Literal["sensor", "viewpoint"] | None = None  #: of `.pcd`: sensor, or that in which VIEWPOINT is
+    #: of `.bin` files: float32 or float64, "x", numbers per point. None: float32x4, as KITTI
+    bin: str | None = None
+    #: order of quaternions in pose files with 8 columns. None: as their comments say, or xyzw, as TUM
+    quaternions: Literal["xyzw", "wxyz"] | None = None
+    #: of timestamps in pose files. None: s, or for times since 1970 detected from their size
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    #: of `.pcd` points: the sensor's, or the frame in which VIEWPOINT is given. None: VIEWPOINT must be the identity
+    pcd_frame: Literal["sensor", "viewpoint"] | None = None
 
     def __post_init__(self) -> None:
         if self.bin is not None:
-            parse_bin(self.bin)
+            _parse_bin(self.bin)
 
 
-class BinLayout(NamedTuple):
-    """Numbers of a `.bin`, x y z first."""
+class _BinLayout(NamedTuple):
+    """Numbers of each point of a `.bin`, x y z first."""
 
-    dtype: str  #: NumPy's name of a value's type, such as "<f4"
-    columns: int  #: values of each point
+    dtype: str
+    columns: int
 
     @property
     def num_bytes(self) -> int:
@@ -48,138 +53,138 @@ class BinLayout(NamedTuple):
         return f"float{8 * np.dtype(self.dtype).itemsize}x{self.columns}"
 
 
-KITTI = BinLayout("<f4", 4)
-OTHERS = [BinLayout("<f4", columns) for columns in (3, 5, 6)] + [BinLayout("<f8", columns) for columns in (3, 4, 5, 6)]
-
-
-def parse_bin(text: str) -> BinLayout:
-    """Return the layout that `text` names, such as float32x5. Raises ValueError for anything else."""
-    match = re.fullmatch(r"float(32|64)x(\d{1,2})", text)
-    if match is None or int(match[2]) < 3:
-        raise ValueError(f"--bin-layout: must be float32 or float64, x, and 3 or more numbers per point, got {text!r}")
-    return BinLayout(f"<f{int(match[1]) // 8}", int(match[2]))
+_KITTI = _BinLayout("<f4", 4)
+_OTHER_LAYOUTS = [_BinLayout("<f4", n) for n in (3, 5, 6)] + [_BinLayout("<f8", n) for n in (3, 4, 5, 6)]
 
 
 def read_bin(path: Path, layout: str | None = None) -> NDArray:
-    """Read x y z (N, 3) of a `.bin`; without a `layout` it must be KITTI's by its size and its values."""
-    chosen, size = KITTI if layout is None else parse_bin(layout), path.stat().st_size
+    """Read x y z (N, 3) of a `.bin`; without a `layout` its size and values must fit KITTI's."""
+    chosen, size = _KITTI if layout is None else _parse_bin(layout), path.stat().st_size
     if size % chosen.num_bytes:
-        problem = f"cut short: {size} bytes are no whole number of points of {chosen}"
-        fitting = ", ".join(str(other) for other in OTHERS if size % other.num_bytes == 0)
-        hint = f"; {fitting} would fit: {BIN_HINT}" if fitting and layout is None else ""
+        problem = f"cut short: {size} bytes are not a whole number of points of {chosen}"
+        fitting = ", ".join(str(other) for other in _OTHER_LAYOUTS if size % other.num_bytes == 0)
+        hint = f"; {fitting} would fit: say which {_BIN_HINT}" if fitting and layout is None else ""
         raise RecordingError(path, problem, f"expected x y z first; copy the file again{hint}")
     if layout is None:
-        with np.errstate(invalid="ignore"):  # random bits are signalling NaN too
+        with np.errstate(invalid="ignore"):  # other layouts read as float32 can give signalling NaN
             _require_kitti(path, size)
     return np.fromfile(path, dtype=chosen.dtype).reshape(-1, chosen.columns)[:, :3]
 
 
+def _parse_bin(text: str) -> _BinLayout:
+    match = re.fullmatch(r"float(32|64)x(\d{1,2})", text)
+    if match is None or int(match[2]) < 3:
+        raise ValueError(f"--bin-layout: must be float32 or float64, x, and 3 or more numbers per point, got {text!r}")
+    return _BinLayout(f"<f{int(match[1]) // 8}", int(match[2]))
+
+
 def _require_kitti(path: Path, size: int) -> None:
-    """Refuse a file whose values are of another layout."""
-    raw = np.fromfile(path, dtype=np.uint8, count=min(size, HEAD_BYTES))
-    kitti = _values(raw, KITTI)
-    if len(kitti) < MIN_POINTS:
+    """Refuse a `.bin` whose first values fit another layout clearly better."""
+    head = np.fromfile(path, dtype=np.uint8, count=min(size, _HEAD_BYTES))
+    if len(_values(head, _KITTI)) < _MIN_POINTS:
         return
-    for other in OTHERS:
-        values = _values(raw, other)
-        fits = size % other.num_bytes == 0 and _plausible(values[:, :3]) > 0.97
-        if fits and other.dtype == "<f8":
-            empty = not kitti[:, [0, 2]].any()  # the low halves of round numbers
-            better = _plausible(kitti) < 0.9 or empty
-        else:
-            better = _structure(values) > 0.1 + _structure(kitti)
-        if fits and better:
-            likely = max((o for o in OTHERS if o.dtype == other.dtype and size % o.num_bytes == 0),
-                         key=lambda o: _structure(_values(raw, o)) - 0.01 * o.columns)  # fmt: skip
+    fitting = [other for other in _OTHER_LAYOUTS if size % other.num_bytes == 0]
+    for other in fitting:
+        if _fits_better(head, other):
+            same_dtype = [layout for layout in fitting if layout.dtype == other.dtype]
+            likely = max(same_dtype, key=lambda layout: _contrast(_values(head, layout)) - 0.01 * layout.columns)
             problem = f"does not look like KITTI's float32 x y z intensity but like {likely}"
-            raise RecordingError(path, problem, BIN_HINT.replace("which", "so") + ", or float32x4 if it is KITTI's")
-    if _plausible(kitti[:, :3]) < 0.9:
-        raise RecordingError(path, "holds numbers that are no coordinates in metres", BIN_HINT)
+            raise RecordingError(path, problem, f"say so {_BIN_HINT}, or float32x4 if it is KITTI's")
+    if _plausible_fraction(_values(head, _KITTI)[:, :3]) < 0.9:
+        raise RecordingError(path, "holds numbers that are not coordinates in metres", f"say which {_BIN_HINT}")
 
 
-def _values(raw: NDArray, layout: BinLayout) -> NDArray:
-    """Return the first points (N, C) of a layout."""
-    count = len(raw) // layout.num_bytes
-    return raw[: count * layout.num_bytes].view(layout.dtype).reshape(count, layout.columns)
+def _fits_better(head: NDArray, other: _BinLayout) -> bool:
+    """Tell whether another layout explains the values clearly better than KITTI's."""
+    values, kitti = _values(head, other), _values(head, _KITTI)
+    if _plausible_fraction(values[:, :3]) <= 0.97:
+        return False
+    if other.dtype == "<f8":
+        has_empty_halves = not kitti[:, [0, 2]].any()  # round float64 numbers have zeros in their lower 4 bytes
+        return _plausible_fraction(kitti) < 0.9 or has_empty_halves
+    return _contrast(values) > 0.1 + _contrast(kitti)
 
 
-def _plausible(values: NDArray) -> float:
-    """Return the share of the values that coordinates may have [m]: random bits have any exponent."""
+def _values(head: NDArray, layout: _BinLayout) -> NDArray:
+    """Return the whole points (N, C) in the file's first bytes."""
+    num_points = len(head) // layout.num_bytes
+    return head[: num_points * layout.num_bytes].view(layout.dtype).reshape(num_points, layout.columns)
+
+
+def _plausible_fraction(values: NDArray) -> float:
+    """Return the fraction of values that can be coordinates [m]; misread bits give numbers of any exponent."""
     size = np.abs(values)
     return float(np.mean((size == 0) | ~np.isfinite(values) | ((size > 1e-12) & (size < 1e5))))
 
 
-def _structure(values: NDArray) -> float:
-    """Return how much columns differ (0 to 1): read at a wrong period, each is a mixture of all the numbers.
+def _contrast(values: NDArray) -> float:
+    """Return how much columns differ, 0 to 1; with a wrong number of columns, each one mixes all quantities.
 
-    The share of the ranks' variance, of values and of sizes, that lies between columns.
+    This is the fraction of the variance of ranks (of values, or of absolute values) that lies between columns.
     """
     values = np.nan_to_num(values.astype(np.float64), posinf=0, neginf=0)
-    return max(_between(values), _between(np.abs(values)))
+    return max(_variance_between(values), _variance_between(np.abs(values)))
 
 
-def _between(values: NDArray) -> float:
+def _variance_between(values: NDArray) -> float:
     _, index, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks = (np.cumsum(counts) - counts / 2)[index].reshape(values.shape)
     total = ranks.var()
     return float(ranks.mean(axis=0).var() / total) if total > 0 else 0.0
 
 
-def quaternion_order(path: Path, comments: str, quaternions: NDArray, order: str | None) -> str:
-    """Return xyzw or wxyz for the columns (T, 4) of a pose file: as told, as its comments say, else xyzw.
+def detect_quaternion_order(path: Path, comments: str, quaternions: NDArray, order: str | None) -> str:
+    """Return the order of quaternions (T, 4) in a pose file, "xyzw" or "wxyz".
 
-    Raises RecordingError if read as xyzw the sensor turns over or hangs upside down, and read as wxyz it does not: an
-    order that is wrong passes every other check.
+    `order` takes precedence, then the column names in the file's comments, then the default, xyzw. Since a wrong order
+    passes every other check, raise RecordingError if the sensor would turn over or hang upside down read as xyzw, but
+    not read as wxyz.
     """
     if order is not None:
         return order
     names = re.findall(r"\bq_?[wx]\b", comments.lower())
     if len(names) == 2:
         return "wxyz" if names[0].endswith("w") else "xyzw"
-    ups = {name: _up_in_sensor(quaternions[:, columns]) for name, columns in ORDERS.items()}
+    ups = {name: _up_in_sensor(quaternions[:, columns]) for name, columns in XYZW_COLUMNS.items()}
     tilt = {name: _largest_angle(up) for name, up in ups.items()}
-    mean = {name: float(up[:, 2].mean()) for name, up in ups.items()}
-    steady = tilt["wxyz"] < TILT_STEADY
-    turning = tilt["xyzw"] > TILT_TURNING
-    hanging = mean["xyzw"] < -0.8 and mean["wxyz"] > 0.8
-    if steady and (turning or hanging):
-        does = "turns over as it moves" if turning else "hangs upside down"
-        problem = f"read as qx qy qz qw the sensor {does}, read as qw qx qy qz it keeps its tilt"
+    mean_up = {name: float(up[:, 2].mean()) for name, up in ups.items()}
+    turns_over = tilt["xyzw"] > _TURNING_TILT
+    hangs = mean_up["xyzw"] < -0.8 and mean_up["wxyz"] > 0.8
+    if tilt["wxyz"] < _STEADY_TILT and (turns_over or hangs):
+        motion = "turns over as it moves" if turns_over else "hangs upside down"
+        problem = f"read as qx qy qz qw the sensor {motion}, read as qw qx qy qz it keeps its tilt"
         raise RecordingError(path, problem, "say which with --quaternions wxyz (or xyzw)")
     return "xyzw"
 
 
-ORDERS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}  # columns of x y z w
-
-
 def _up_in_sensor(quat_xyzw: NDArray) -> NDArray:
-    """Return the map's z axis in the sensor's frame (T, 3): the last row of each rotation."""
+    """Return the map's z axis in the sensor frame (T, 3): the last row of each rotation matrix."""
     x, y, z, w = quat_xyzw.T
     return np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
 
 
 def _largest_angle(directions: NDArray) -> float:
-    """Return the largest angle [deg] between the directions (T, 3) and their mean."""
+    """Return the largest angle [deg] between directions (T, 3) and their mean."""
     mean = directions.mean(axis=0)
     cosine = directions @ mean / max(float(np.linalg.norm(mean)), 1e-9)
     return float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
 
 
-def seconds(path: Path, times: NDArray, unit: str | None) -> NDArray:
-    """Return times (T,) in seconds. Without a `unit` times since 1970 tell theirs by their size, others are seconds."""
+def to_seconds(times: NDArray, unit: str | None) -> NDArray:
+    """Return times (T,) in seconds; without a `unit`, they are in s, or since 1970 in the unit that fits their size."""
     if unit is not None:
-        return times * UNITS[unit]
-    # Seconds since 1970 are about 2e9, the other units' thousands of times more.
+        return times * _SECONDS[unit]
+    # Seconds since 1970 are about 2e9; in ms, us or ns the number is larger by powers of 1000.
     digits = np.log10(max(float(np.abs(times).max()), 1.0))
     return times / 1000.0 ** max(0.0, np.floor((digits - 8) / 3))
 
 
 def require_plausible_steps(path: Path, steps: NDArray) -> None:
-    """Refuse times between scans (T,) [s], the first of which does not count, that no sensor on a robot has."""
+    """Refuse times since the previous scan (T,) [s] that no real sensor has; the first is ignored."""
     forward = steps[1:][steps[1:] > 0]
     if len(steps) > 1 and not len(forward):
         raise RecordingError(path, "all poses have the same time", "give the time between scans with --dt")
-    middle = float(np.median(forward)) if len(forward) else 1.0
-    if not MIN_STEP <= middle <= MAX_STEP:
-        problem = f"{middle:.3g} s between scans (median): are the times in another unit?"
+    median = float(np.median(forward)) if len(forward) else 1.0
+    if not _MIN_STEP <= median <= _MAX_STEP:
+        problem = f"{median:.3g} s between scans (median): are the timestamps in another unit?"
         raise RecordingError(path, problem, "say so with --time-unit ms, us or ns (or s if it is right), or give --dt")

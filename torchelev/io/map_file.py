@@ -1,4 +1,4 @@
-"""A whole map in one file: every environment, and everything that the next update reads."""
+"""Save and load a whole map: all environments, with everything that the next update needs."""
 
 from __future__ import annotations
 
@@ -23,17 +23,23 @@ from torchelev.state import MapState, Statistics
 from torchelev.traversability.net import TraversabilityNet
 
 FORMAT, VERSION = "torchelev map", 2
-NEW_LAYERS = {"has_normal", "rated", "challenger", "challenger_support"}  # since version 2
-DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
+_NEW_LAYERS = {"has_normal", "rated", "challenger", "challenger_support"}  # absent from version 1
+_DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
 
 
 def save_map(path: str | Path, emap: ElevationMap) -> None:
-    """Write the whole map: all environments, the layers that only an update reads too, config and precision.
+    """Write a whole map, with all environments, its config and its precision, as an `.npz` without pickled objects.
 
-    The file is an `.npz` without pickled objects: `header` (JSON: format, version, dtype, config), each field of
-    `MapState` by its name, and each of `Statistics` as `last_<name>`; NaN-free, as the map holds them; and the learned
-    head's weights, if there is one, as `head_<name>`. Raises WriteError, an OSError, if the file cannot be written; an
-    older one is whole then.
+    The arrays are `header` (JSON: format, version, dtype, config), each field of `MapState` by its name, each field of
+    `Statistics` as `last_<name>`, and the weights of a learned head as `head_<name>`. As in the map's state, unknown
+    cells have validity 0, not NaN.
+
+    Args:
+        path: the file to write, under this name as it is.
+        emap: the map.
+
+    Raises:
+        WriteError: the file cannot be written; an existing one is left as it was.
     """
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
@@ -47,12 +53,20 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
 def load_map(
     path: str | Path, device: torch.device | str = "cpu", env_ids: Sequence[int] | Tensor | None = None
 ) -> ElevationMap:
-    """Read what `save_map` wrote into a new map on any device; it goes on as the saved one would have.
+    """Read a file of `save_map` into a new map, which continues where the saved one stopped.
 
-    `env_ids` (K,): the environments to load, in this order, None for all; repeated ids give copies. To the bit the
-    same on the device that the map was saved from, elsewhere up to that device's rounding.
+    Updates then give the same bits on the device type that the map was saved from, and agree up to rounding on others.
 
-    Raises ValueError for another file, a damaged one, one of a newer version, and ids out of range.
+    Args:
+        path: the file.
+        device: of the new map.
+        env_ids: (K,) environments to load, in this order; repeated ids give copies. None: all.
+
+    Returns:
+        The map.
+
+    Raises:
+        ValueError: not a file of `save_map`, a damaged one, one of a newer version, or ids out of range.
     """
     arrays = read_npz(path, "write it with save_map")
     header = _header(path, arrays)
@@ -62,7 +76,7 @@ def load_map(
         emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, head=head)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
-    emap = emap.to(DTYPES[header["dtype"]])
+    emap = emap.to(_DTYPES[header["dtype"]])
     for name, value in _head(emap).items():
         found = _array(path, arrays, f"head_{name}", value, tuple(value.shape))
         value.copy_(torch.from_numpy(found))
@@ -74,78 +88,79 @@ def load_map(
 
 
 def _head(emap: ElevationMap) -> dict[str, Tensor]:
-    """Return the learned head's weights by name, if there is one."""
+    """Return the weights of the learned head by name; empty without one."""
     return {} if emap.head is None else dict(emap.head.state_dict())
 
 
 def as_array(value: Tensor) -> NDArray:
-    """Return a tensor as a numpy array; bfloat16, which NumPy lacks, as float32, which holds its values exactly."""
+    """Copy a tensor to a NumPy array; bfloat16, which NumPy lacks, becomes float32 without loss."""
     value = value.detach().cpu()
     return (value.float() if value.dtype == torch.bfloat16 else value).numpy()
 
 
 def read_npz(path: str | Path, hint: str) -> dict[str, NDArray]:
-    """Read every array of an `.npz`. Raises ValueError for another file and for one that is damaged."""
+    """Read all arrays of an `.npz`; raise ValueError, ending with `hint`, for a damaged file or another format."""
     with Path(path).open("rb") as file:
-        require(zipfile.is_zipfile(file), str(path), "must be an .npz file", "another, or one cut short", hint)
+        actual = "another format or a truncated file"
+        require(zipfile.is_zipfile(file), str(path), "must be an .npz file", actual, hint)
         file.seek(0)
         try:
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
-        except Exception as error:  # what zipfile, zlib and numpy raise depends on which byte is damaged
+        except Exception as error:  # zipfile, zlib and NumPy raise all kinds, depending on the damaged byte
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise ValueError(f"{path}: damaged, or no .npz file ({reason}); {hint}") from error
+            raise ValueError(f"{path}: damaged, or not an .npz file ({reason}); {hint}") from error
 
 
 def _tensors(state: MapState) -> dict[str, Tensor]:
-    """Return the state's tensors by the names that they have in a file."""
+    """Return the tensors of a state by their names in the file."""
     layers = {name: getattr(state, name) for name in MapState._fields[:-1]}
     return layers | {f"last_{name}": value for name, value in state.statistics._asdict().items()}
 
 
 def _header(path: str | Path, arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return the file's header, of a version that can be read."""
+    """Return the header; raise ValueError if this is not a map or its version cannot be read."""
     try:
         header = json.loads(str(arrays["header"]))
     except (KeyError, json.JSONDecodeError):
         header = None
-    ours = isinstance(header, dict) and header.get("format") == FORMAT and "config" in header
-    hint = "write it with save_map; what save_npz wrote is read by load_npz"
-    require(ours, str(path), "must be a whole map", f"an .npz with {', '.join(arrays) or 'nothing'}", hint)
+    is_map = isinstance(header, dict) and header.get("format") == FORMAT and "config" in header
+    hint = "write it with save_map, or read files of save_npz with load_npz"
+    require(is_map, str(path), "must be a whole map", f"an .npz with {', '.join(arrays) or 'nothing'}", hint)
     assert isinstance(header, dict)
     version = header.get("version")
-    known = isinstance(version, int) and 1 <= version <= VERSION
-    require(known, str(path), f"must be of format version 1 to {VERSION}", version, "read it with a newer torchelev")
-    kinds = ", ".join(DTYPES)
-    require(str(header.get("dtype")) in DTYPES, str(path), f"must be of {kinds}", header.get("dtype"), "save it again")
+    is_readable = isinstance(version, int) and 1 <= version <= VERSION
+    require(
+        is_readable, str(path), f"must be of format version 1 to {VERSION}", version, "read it with a newer torchelev"
+    )
+    dtype, names = header.get("dtype"), ", ".join(_DTYPES)
+    require(str(dtype) in _DTYPES, str(path), f"dtype must be one of {names}", dtype, "save it again")
     return header
 
 
 def _num_envs(path: str | Path, arrays: dict[str, NDArray]) -> int:
     corner = arrays.get("corner")
-    fits = corner is not None and corner.ndim == 2 and len(corner) > 0
-    require(fits, str(path), "must have a corner (B, 2)", "none", "save it again")
+    is_valid = corner is not None and corner.ndim == 2 and len(corner) > 0
+    actual = "none" if corner is None else corner.shape
+    require(is_valid, str(path), "must have an array corner (B, 2)", actual, "save it again")
     assert corner is not None
     return len(corner)
 
 
 def _ids(env_ids: Sequence[int] | Tensor | None, num_envs: int) -> Tensor:
-    """Return the ids of the environments to load (K,), on the CPU."""
+    """Return the environments to load, (K,) int64 on the CPU."""
     ids = torch.arange(num_envs) if env_ids is None else torch.as_tensor(env_ids).cpu()
-    whole = ids.ndim == 1 and len(ids) > 0 and not ids.is_floating_point() and ids.dtype != torch.bool
-    require(whole, "env_ids", "must be a list of numbers", f"{tuple(ids.shape)} {ids.dtype}", "None loads all")
+    are_ids = ids.ndim == 1 and len(ids) > 0 and not ids.is_floating_point() and ids.dtype != torch.bool
+    require(are_ids, "env_ids", "must be a list of ints", f"{tuple(ids.shape)} {ids.dtype}", "None loads all")
     checks.require_indices("env_ids", ids, num_envs, f"the file has {num_envs} environments")
     return ids.to(torch.int64)
 
 
 def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Tensor, version: int) -> MapState:
-    """Return the chosen environments of the arrays, each of the shape that it has in `like`.
-
-    Layers that files of version 1 do not have are blank.
-    """
+    """Return the state of environments `ids` from a file's arrays; what version 1 lacks is taken from `like`."""
     B, values = len(arrays["corner"]), {}
     for name, blank in _tensors(like).items():
-        if version < VERSION and name in NEW_LAYERS:
+        if version < VERSION and name in _NEW_LAYERS:
             values[name] = blank[:1].expand(len(ids), *blank.shape[1:])
             continue
         values[name] = torch.from_numpy(_array(path, arrays, name, blank, (B, *blank.shape[1:])))[ids]
@@ -154,8 +169,8 @@ def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Te
 
 
 def _array(path: str | Path, arrays: dict[str, NDArray], name: str, like: Tensor, shape: tuple[int, ...]) -> NDArray:
-    """Return an array of the file, which must have this shape, numbers of the kind in `like`."""
-    require(name in arrays, str(path), f"must have {name}", "none", "save it again")
+    """Return an array of the file; it must have this shape and the kind of numbers that `like` has."""
+    require(name in arrays, str(path), f"must have an array {name}", "none", "save it again")
     array, where = arrays[name], f"{path}, {name}"
     require(array.shape == shape, where, f"expected {shape}", array.shape, "save it again")
     kind = "f" if like.is_floating_point() else {torch.bool: "b", torch.uint8: "u"}.get(like.dtype, "i")

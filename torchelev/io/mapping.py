@@ -1,4 +1,4 @@
-"""Feed a recording to a map, one scan after the other, and count what happened."""
+"""Feed a recording to a map scan by scan, and count what happens to its points."""
 
 from __future__ import annotations
 
@@ -17,39 +17,57 @@ if TYPE_CHECKING:
 
 
 class MappingRun:
-    """A map that is being made from a recording, and its counts.
+    """Build one map from a recording and keep statistics.
 
-    What was mapped stays usable after any exception: `emap` holds the scans up to the last finished `add`.
+    If `add` raises, the map still holds all scans added before.
+
+    Args:
+        emap: the map to update; its first environment is used.
+
+    Attributes:
+        emap: the map.
+        counts: number of points used and rejected, by reason, and of cells cleared, by stage, over all scans.
+        num_points: points of all scans.
+        update_ms: [ms] duration of each scan's update.
+        sensor_xy: (2,) [m] position of the sensor at each scan, map frame.
     """
 
     def __init__(self, emap: ElevationMap) -> None:
         self.emap = emap
-        self.counts: Counter[str] = Counter()  # points by what became of them, cells cleared by each stage
+        self.counts: Counter[str] = Counter()
         self.num_points = 0
         self.update_ms: list[float] = []
         self.sensor_xy: list[NDArray[np.float64]] = []
 
     @property
     def num_scans(self) -> int:
+        """The number of scans added so far."""
         return len(self.update_ms)
 
     def center_on(self, position: NDArray[np.float64]) -> None:
-        """Move the empty window onto a point (3,) [m] of the map frame: an update without points."""
-        nothing = torch.full((1, 1, 3), torch.nan, device=self.emap.device)
-        self.emap.update(nothing, self._pose(np.eye(4)), self._pose(translation(position)), dt=0.0)
+        """Move the empty window to a point (3,) [m] of the map frame, by an update without points."""
+        no_points = torch.full((1, 1, 3), torch.nan, device=self.emap.device)
+        T_map_base = np.eye(4)
+        T_map_base[:3, 3] = position
+        self.emap.update(no_points, self._to_tensor(np.eye(4)), self._to_tensor(T_map_base), dt=0.0)
 
     def add(self, frame: Frame, T_map_base: NDArray[np.float64] | None) -> None:
-        """Fuse one scan. With `T_map_base` (4, 4) the window follows it, without it stays."""
+        """Fuse one scan.
+
+        Args:
+            frame: the scan.
+            T_map_base: (4, 4) pose of the robot's base, which the window follows; None: the window stays.
+        """
         points = torch.from_numpy(frame.points)[None].to(self.emap.device)
-        base = None if T_map_base is None else self._pose(T_map_base)
+        base = None if T_map_base is None else self._to_tensor(T_map_base)
         start = time.perf_counter()
-        self.emap.update(points, self._pose(frame.T_map_sensor), base, dt=frame.dt)
-        self._count(len(frame.points))  # reads the statistics, which waits for a GPU to finish
+        self.emap.update(points, self._to_tensor(frame.T_map_sensor), base, dt=frame.dt)
+        self._count(len(frame.points))  # reading the statistics waits for a GPU to finish
         self.update_ms.append(1e3 * (time.perf_counter() - start))
         self.sensor_xy.append(frame.T_map_sensor[:2, 3])
 
-    def _pose(self, matrix: NDArray[np.float64]) -> torch.Tensor:
-        return torch.from_numpy(matrix)[None].to(self.emap.device)
+    def _to_tensor(self, pose: NDArray[np.float64]) -> torch.Tensor:
+        return torch.from_numpy(pose)[None].to(self.emap.device)
 
     def _count(self, num_points: int) -> None:
         statistics = self.emap.statistics
@@ -61,28 +79,27 @@ class MappingRun:
 def base_poses(
     T_map_sensor: NDArray[np.float64], T_base_sensor: NDArray[np.float64] | None, sensor_height: float | None
 ) -> NDArray[np.float64]:
-    """Where the robot stood at each scan, (T, 4, 4).
+    """Return the poses of the robot's base at each scan: T_map_base = T_map_sensor (T_base_sensor)^-1.
 
-    From the sensor's mount `T_base_sensor` (4, 4) if it is known; else straight below the sensor by `sensor_height`
-    [m], level and facing +x of the map; else at the sensor itself.
+    Args:
+        T_map_sensor: (T, 4, 4) poses of the sensor.
+        T_base_sensor: (4, 4) pose of the sensor on the robot. If None, the base is taken to be level, aligned with the
+            map frame, and straight below the sensor.
+        sensor_height: [m] of the sensor above the base, read if T_base_sensor is None; None: 0.
+
+    Returns:
+        T_map_base, (T, 4, 4).
     """
     if T_base_sensor is not None:
-        return T_map_sensor @ inverse(T_base_sensor)
+        return T_map_sensor @ _invert(T_base_sensor)
     poses = np.tile(np.eye(4), (len(T_map_sensor), 1, 1))
     poses[:, :3, 3] = T_map_sensor[:, :3, 3] - [0.0, 0.0, sensor_height or 0.0]
     return poses
 
 
-def inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of a rigid transform (4, 4), whose last row is 0 0 0 1 to the bit."""
-    turned_back = transform[:3, :3].T
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = turned_back, -turned_back @ transform[:3, 3]
-    return result
-
-
-def translation(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The transform (4, 4) that only moves to `position` (3,) [m]."""
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    return pose
+def _invert(transform: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Invert a rigid transform (4, 4); unlike np.linalg.inv, this keeps the last row 0 0 0 1 exact."""
+    rotation = transform[:3, :3].T
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = rotation, -rotation @ transform[:3, 3]
+    return inverse

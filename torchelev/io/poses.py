@@ -1,4 +1,4 @@
-"""Read pose files: one sensor pose per line, KITTI or TUM, told apart by the number of columns."""
+"""Read poses: KITTI and TUM files, told apart by their number of columns, and single transforms."""
 
 from __future__ import annotations
 
@@ -8,149 +8,158 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.frames import transform
 from torchelev.io.errors import RecordingError
-from torchelev.io.layout import ORDERS, FileLayout, quaternion_order, seconds
+from torchelev.io.layout import XYZW_COLUMNS, FileLayout, detect_quaternion_order, to_seconds
 
-KITTI_COLUMNS, TUM_COLUMNS = 12, 8
-# Files rounded to three decimals are off by 0.001 or so; a matrix further off than this is something else.
-RIGID_TOLERANCE = 0.02
-FORMATS = "12 numbers a line (KITTI: the upper 3x4 of the pose) or 8 (TUM: t x y z qx qy qz qw)"
-
-TRANSFORM = "give 12 numbers (the upper 3x4 of T_base_sensor, row by row) or a file with them"
+_KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
+_TOLERANCE = 0.02  # rotations rounded to three decimals are off by about 0.001; larger errors have other causes
+_POSE_HINT = "expected 12 numbers per line (KITTI: the upper 3x4 of the pose) or 8 (TUM: t x y z qx qy qz qw)"
+_TRANSFORM_HINT = "give 12 numbers (the upper 3x4 of T_base_sensor, row by row) or a file with them"
+_NOT_A_ROTATION = "the 3x3 part is not a rotation matrix, or is mirrored"
 
 
 class Poses(NamedTuple):
-    """Poses of a sensor in the map frame and, where the file has them, their times."""
+    """Poses of a sensor in the map frame."""
 
     T_map_sensor: NDArray[np.float64]  #: (T, 4, 4), translation in [m]
-    times: NDArray[np.float64] | None  #: (T,) [s]
+    times: NDArray[np.float64] | None  #: (T,) [s]; None if the file has no timestamps
 
 
 def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:
-    """Read a KITTI or TUM file. Blank lines and lines that start with '#' do not count; commas are spaces.
+    """Read a pose file, one pose per line: 12 numbers (KITTI) or 8 (TUM).
 
-    Rotations are replaced by the nearest rotation matrix, since files rounded to a few decimals exist. `layout` says
-    the order of quaternions and the unit of times. Raises RecordingError with the line number where a line is no pose,
-    and for quaternions that look like w x y z.
+    Blank lines and lines that start with `#` are skipped; commas count as spaces. Each rotation is replaced by the
+    nearest rotation matrix, because files are often rounded to a few decimals.
+
+    Args:
+        path: the file.
+        layout: order of quaternions and unit of timestamps; None: see `FileLayout`.
+
+    Returns:
+        The poses.
+
+    Raises:
+        RecordingError: a line is not a pose, or quaternions look like w x y z; the message names the line.
     """
     path, layout = Path(path), layout or FileLayout()
-    numbers, rows = _read_rows(path)
-    if rows.shape[1] == KITTI_COLUMNS:
-        matrices = rows.reshape(-1, 3, 4)
-        return Poses(_rigid(path, numbers, matrices[:, :, :3], matrices[:, :, 3]), None)
-    comments = "\n".join(line.partition("#")[2] for line in _text(path).splitlines())
-    order = quaternion_order(path, comments, rows[:, 4:], layout.quaternions)
-    rotations = _from_quaternions(path, numbers, rows[:, 4:][:, ORDERS[order]])
-    return Poses(_rigid(path, numbers, rotations, rows[:, 1:4]), seconds(path, rows[:, 0], layout.time_unit))
+    lines, rows = _read_rows(path)
+    if rows.shape[1] == _KITTI_COLUMNS:
+        T_map_sensor = np.tile(np.eye(4), (len(rows), 1, 1))
+        T_map_sensor[:, :3] = rows.reshape(-1, 3, 4)
+        return Poses(_make_rigid(path, lines, T_map_sensor), None)
+    comments = "\n".join(line.partition("#")[2] for line in _read_text(path).splitlines())
+    order = detect_quaternion_order(path, comments, rows[:, 4:], layout.quaternions)
+    quat_xyzw = rows[:, 4:][:, XYZW_COLUMNS[order]]
+    norm = np.linalg.norm(quat_xyzw, axis=1, keepdims=True)
+    _require_lines(path, lines, np.abs(norm[:, 0] - 1) <= _TOLERANCE, "the quaternion is not of length 1")
+    T_map_sensor = transform(rows[:, 1:4], np.roll(quat_xyzw / norm, 1, axis=1)).numpy()
+    return Poses(_make_rigid(path, lines, T_map_sensor), to_seconds(rows[:, 0], layout.time_unit))
+
+
+def read_transform(text_or_path: str | Path) -> NDArray[np.float64]:
+    """Read one rigid transform.
+
+    Args:
+        text_or_path: 12 or 16 numbers, row by row, or a file with them, or a YAML file with a key `T_base_sensor`.
+
+    Returns:
+        The transform (4, 4), with the nearest rotation matrix.
+
+    Raises:
+        RecordingError: there are not as many numbers, or they are not a rigid transform.
+    """
+    numbers = _parse_numbers(str(text_or_path))
+    if numbers is None:
+        numbers = _read_numbers(Path(text_or_path))
+    if len(numbers) not in (12, 16):
+        raise RecordingError(text_or_path, f"holds {len(numbers)} numbers", _TRANSFORM_HINT)
+    result = np.eye(4)
+    result[:3] = np.array(numbers[:12]).reshape(3, 4)
+    rotation = _nearest_rotation(result[:3, :3])
+    if np.abs(result[:3, :3] - rotation).max() > _TOLERANCE:
+        raise RecordingError(text_or_path, _NOT_A_ROTATION, _TRANSFORM_HINT)
+    result[:3, :3] = rotation
+    return result
 
 
 def _read_rows(path: Path) -> tuple[list[int], NDArray[np.float64]]:
-    """Line numbers (T,) and values (T, 8 or 12)."""
-    lines = [(number, line.split("#")[0]) for number, line in enumerate(_text(path).splitlines(), start=1)]
-    rows = {number: _numbers(path, number, line) for number, line in lines if line.strip()}
+    """Return line numbers (T,) and the numbers on these lines (T, 8 or 12)."""
+    lines = [(number, line.split("#")[0]) for number, line in enumerate(_read_text(path).splitlines(), start=1)]
+    rows = {number: _parse_line(path, number, line) for number, line in lines if line.strip()}
     if not rows:
-        raise RecordingError(path, "holds no pose", f"expected {FORMATS}")
-    columns = len(next(iter(rows.values())))
+        raise RecordingError(path, "holds no pose", _POSE_HINT)
+    num_columns = len(next(iter(rows.values())))
     for number, row in rows.items():
-        if len(row) not in (KITTI_COLUMNS, TUM_COLUMNS):
-            raise RecordingError(path, f"line {number} holds {len(row)} numbers", f"expected {FORMATS}")
-        if len(row) != columns:
-            raise RecordingError(path, f"line {number} holds {len(row)} numbers, the lines before it {columns}")
+        if len(row) not in (_KITTI_COLUMNS, _TUM_COLUMNS):
+            raise RecordingError(path, f"line {number} holds {len(row)} numbers", _POSE_HINT)
+        if len(row) != num_columns:
+            raise RecordingError(path, f"line {number} holds {len(row)} numbers, the lines before it {num_columns}")
     return list(rows), np.array(list(rows.values()), dtype=np.float64)
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     if not path.is_file():
         raise RecordingError(path, "no such pose file", "give one with --poses")
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise RecordingError(path, "is no text file", f"expected {FORMATS}") from error
+        raise RecordingError(path, "is not a text file", _POSE_HINT) from error
 
 
-def _numbers(path: Path, number: int, line: str) -> list[float]:
+def _parse_line(path: Path, number: int, line: str) -> list[float]:
     try:
         row = [float(word) for word in line.replace(",", " ").split()]
     except ValueError as error:
-        raise RecordingError(path, f"line {number} is not made of numbers ({error})", f"expected {FORMATS}") from error
+        raise RecordingError(path, f"line {number} holds more than numbers ({error})", _POSE_HINT) from error
     if not np.isfinite(row).all():
         raise RecordingError(path, f"line {number} holds NaN or inf", "remove the pose together with its scan")
     return row
 
 
-def _from_quaternions(path: Path, numbers: list[int], quat_xyzw: NDArray) -> NDArray:
-    """Rotation matrices (T, 3, 3) of (T, 4) quaternions in TUM's order x y z w."""
-    norm = np.linalg.norm(quat_xyzw, axis=1)
-    _refuse_first(path, numbers, np.abs(norm - 1) > RIGID_TOLERANCE, "the quaternion qx qy qz qw is not of length 1")
-    x, y, z, w = (quat_xyzw / norm[:, None]).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _rigid(path: Path, numbers: list[int], rotations: NDArray, translations: NDArray) -> NDArray[np.float64]:
-    """Poses (T, 4, 4) with each rotation replaced by the nearest one; refuse what is no rotation."""
-    nearest = nearest_rotation(rotations)
-    off = np.abs(rotations - nearest).max(axis=(1, 2))
-    _refuse_first(path, numbers, off > RIGID_TOLERANCE, "the 3x3 part is no rotation matrix (or a mirrored one)")
-    poses = np.tile(np.eye(4), (len(rotations), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = nearest, translations
+def _make_rigid(path: Path, lines: list[int], poses: NDArray) -> NDArray[np.float64]:
+    """Return the poses (T, 4, 4) with the nearest rotation matrices; refuse those that are far from one."""
+    rotations = _nearest_rotation(poses[:, :3, :3])
+    error = np.abs(poses[:, :3, :3] - rotations).max(axis=(1, 2))
+    _require_lines(path, lines, error <= _TOLERANCE, _NOT_A_ROTATION)
+    poses[:, :3, :3] = rotations
     return poses
 
 
-def read_transform(text_or_path: str | Path) -> NDArray[np.float64]:
-    """One transform (4, 4): 12 or 16 numbers, given as text or as a file, or YAML with a key `T_base_sensor`.
-
-    Raises RecordingError if that is no rigid transform.
-    """
-    words = _words(str(text_or_path))
-    if words is None:
-        words = _file_words(Path(text_or_path))
-    if len(words) not in (12, 16):
-        raise RecordingError(text_or_path, f"holds {len(words)} numbers", TRANSFORM)
-    matrix = np.array(words[:12]).reshape(3, 4)
-    if np.abs(matrix[:, :3] - nearest_rotation(matrix[:, :3])).max() > RIGID_TOLERANCE:
-        raise RecordingError(text_or_path, "the 3x3 part is no rotation matrix (or a mirrored one)", TRANSFORM)
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = nearest_rotation(matrix[:, :3]), matrix[:, 3]
-    return transform
-
-
-def _file_words(path: Path) -> list[float]:
-    import yaml
-
-    if not path.is_file():
-        raise RecordingError(path, "neither numbers nor a file", TRANSFORM)
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RecordingError(path, "is neither text nor YAML", TRANSFORM) from error
-    words = _words(data.get("T_base_sensor") if isinstance(data, dict) else data)
-    if words is None:
-        raise RecordingError(path, "holds no transform", TRANSFORM)
-    return words
-
-
-def _words(data: object) -> list[float] | None:
-    """Finite numbers in text or nested lists, or None if there is anything else."""
-    try:
-        split = data.replace(",", " ").split() if isinstance(data, str) else data
-        words = np.array(split, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
-        return None
-    return words.tolist() if np.isfinite(words).all() else None
-
-
-def nearest_rotation(matrices: NDArray) -> NDArray[np.float64]:
-    """Rotation matrices (..., 3, 3) nearest to `matrices` in the Frobenius norm: U diag(1, 1, det UV') V'."""
+def _nearest_rotation(matrices: NDArray) -> NDArray[np.float64]:
+    """Return the rotation matrices (..., 3, 3) nearest in the Frobenius norm: U diag(1, 1, det UV') V'."""
     u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
     u[..., :, 2] *= np.linalg.det(u @ vt)[..., None]
     return u @ vt
 
 
-def _refuse_first(path: Path, numbers: list[int], bad: NDArray[np.bool_], problem: str) -> None:
-    if bad.any():
-        raise RecordingError(path, f"line {numbers[int(bad.argmax())]}: {problem}", f"expected {FORMATS}")
+def _require_lines(path: Path, lines: list[int], holds: NDArray[np.bool_], problem: str) -> None:
+    """Raise RecordingError for the first line (T,) where a rule does not hold."""
+    if not holds.all():
+        raise RecordingError(path, f"line {lines[int(holds.argmin())]}: {problem}", _POSE_HINT)
+
+
+def _read_numbers(path: Path) -> list[float]:
+    """Read a transform's numbers from text or YAML."""
+    import yaml
+
+    if not path.is_file():
+        raise RecordingError(path, "neither numbers nor a file", _TRANSFORM_HINT)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise RecordingError(path, "is neither text nor YAML", _TRANSFORM_HINT) from error
+    numbers = _parse_numbers(data.get("T_base_sensor") if isinstance(data, dict) else data)
+    if numbers is None:
+        raise RecordingError(path, "holds no transform", _TRANSFORM_HINT)
+    return numbers
+
+
+def _parse_numbers(data: object) -> list[float] | None:
+    """Return the numbers in text or nested lists; None if anything there is not a finite number."""
+    try:
+        values = data.replace(",", " ").split() if isinstance(data, str) else data
+        numbers = np.array(values, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return None
+    return numbers.tolist() if np.isfinite(numbers).all() else None

@@ -1,43 +1,45 @@
-"""A recording: scans and the poses they were taken from, read one at a time."""
+"""A recording: scans and the sensor's poses, read one scan at a time."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.io.clouds import CLOUD_READERS, known_formats, read_cloud
+from torchelev.io.clouds import read_cloud
 from torchelev.io.depth import Intrinsics, check_size, read_depth, read_intrinsics
 from torchelev.io.errors import RecordingError
 from torchelev.io.layout import FileLayout, require_plausible_steps
 from torchelev.io.poses import Poses, read_poses
-from torchelev.output_files import is_own_output
+from torchelev.io.scan_files import find_scans
 
-# Files that lie beside scans and are none; anything else that we cannot read is reported, not skipped.
-BESIDE_SCANS = {"", ".txt", ".csv", ".json", ".yaml", ".yml", ".md", ".log", ".png", ".jpg", ".jpeg"}
-POSE_FILES = ("poses.txt", "groundtruth.txt")
-SCANS_FOLDER = "scans"  # wins over scans beside it
-TIME_TOLERANCE = 0.02  # [s] between a scan named by its time and its pose, as TUM's own tools allow
+_POSE_FILES = ("poses.txt", "groundtruth.txt")
+_TIME_TOLERANCE = 0.02  # [s] between a scan's timestamp and its pose's, as in TUM's own tools
+_DEFAULT_DT = 0.1  # [s]
 
 
 class Frame(NamedTuple):
     """One scan of a recording."""
 
-    points: NDArray[np.float32]  #: (N, 3) [m], sensor frame; NaN where the sensor saw nothing
+    points: NDArray[np.float32]  #: (N, 3) [m], sensor frame; NaN where there was no return
     T_map_sensor: NDArray[np.float64]  #: (4, 4)
-    dt: float  #: [s] since the scan before, 0 for the first
+    dt: float  #: [s] since the previous scan, 0 for the first
     name: str  #: file name, for messages
 
 
 class Recording(Sequence[Frame]):
-    """Scans with poses. Indexing reads one scan from disk; nothing is kept.
+    """Scans with poses. Indexing reads a scan from disk; a slice is a shorter recording.
 
-    `files` (T), `T_map_sensor` (T, 4, 4) and `dt` (T,) [s] are known from the start. `read` takes a file to its points
-    (N, 3) [m]. `note` says how scans found their poses, where that may be a mistake.
+    Args:
+        files: T paths.
+        T_map_sensor: (T, 4, 4) poses of the sensor.
+        dt: (T,) [s] since the previous scan.
+        read: reads the points (N, 3) [m] of a file.
+        note: a warning on how scans were matched with poses, or "".
     """
 
     def __init__(
@@ -58,8 +60,15 @@ class Recording(Sequence[Frame]):
         path = self.files[index]
         return Frame(self._read(path), self.T_map_sensor[index], float(self.dt[index]), path.name)
 
-    def moved(self, T_base_sensor: NDArray[np.float64]) -> Recording:
-        """The same scans, for a pose file that has the poses of the robot's base: T_map_base T_base_sensor."""
+    def apply_mount(self, T_base_sensor: NDArray[np.float64]) -> Recording:
+        """Return the recording with poses of the base turned into poses of the sensor: T_map_base T_base_sensor.
+
+        Args:
+            T_base_sensor: (4, 4) pose of the sensor on the robot.
+
+        Returns:
+            The same scans with the sensor's poses.
+        """
         return Recording(self.files, self.T_map_sensor @ T_base_sensor, self.dt, self._read, self.note)
 
 
@@ -70,177 +79,113 @@ def open_recording(
     dt: float | None = None,
     layout: FileLayout | None = None,
 ) -> Recording:
-    """Open a folder of scans, or of depth PNGs if `intrinsics` is given.
+    """Open a folder of point clouds, or of depth images if `intrinsics` is given.
 
-    `folder` holds `scans/`, the scans themselves or one sub-folder that does; maps and pictures that this package wrote
-    are no scans. `poses` defaults to a `poses.txt` there or one folder up.
-    Scans in the order of their names (numbers by value) take the poses in the order of their lines; a file with more
-    poses than scans is indexed by the scans' numbers, and scans named by their time take the pose nearest in time, at
-    most 20 ms off. `dt` [s] is the time between scans; None takes it from the poses' times, or 0.1. `layout` says what
-    files do not say of themselves. Raises RecordingError if a scan has no pose, a file cannot be read or looks like
-    another layout, or there is nothing to read.
+    Scans are sorted by name, numbers by value. If their names are timestamps and the poses have timestamps of the same
+    clock, each scan takes the pose nearest in time, within 20 ms. Otherwise scans and poses are paired in order; if
+    there are more poses than scans, numbered scans take the pose of their number. Files that torchelev wrote are
+    ignored.
+
+    Args:
+        folder: holds the scans, a folder `scans/` with them, or exactly one other subfolder with them.
+        poses: the pose file, see `read_poses`; None: `poses.txt` or `groundtruth.txt` in `folder` or its parent.
+        intrinsics: the camera of depth images, see `read_intrinsics`; None: the scans are point clouds.
+        dt: [s] between scans; None: from the poses' timestamps, or 0.1.
+        layout: what the files leave open; None: see `FileLayout`.
+
+    Returns:
+        The recording. Scans are read when indexed.
+
+    Raises:
+        RecordingError: there are no scans, a scan has no pose, or a file cannot be read or contradicts its layout.
     """
     layout = layout or FileLayout()
     camera = None if intrinsics is None else read_intrinsics(intrinsics)
     files = find_scans(Path(folder), depth=camera is not None)
     pose_file = Path(poses) if poses is not None else _find_poses(Path(folder))
-    matrices, times, note = _assign(files, pose_file, read_poses(pose_file, layout))
+    T_map_sensor, times, note = _assign_poses(files, pose_file, read_poses(pose_file, layout))
 
     def read(path: Path) -> NDArray:
-        return read_cloud(path, layout) if camera is None else _depth_points(path, camera)
+        return read_cloud(path, layout) if camera is None else _read_depth_points(path, camera)
 
-    return Recording(files, matrices, _steps(files, pose_file, times, dt), read, note)
-
-
-def find_scans(folder: Path, depth: bool = False) -> list[Path]:
-    """Scans of `folder`/scans, of `folder` or of its one sub-folder with some, in natural order (2 before 10)."""
-    if not folder.is_dir():
-        problem = "is a file, not a folder" if folder.exists() else "no such folder"
-        raise RecordingError(folder, problem, "give the folder that holds the scans")
-    for place in _places(folder, depth):
-        files = [path for path in place.iterdir() if _is_candidate(path)]
-        scans = [path for path in files if _is_scan(path, depth)]
-        if scans:
-            _refuse_others(scans, [] if depth else files)
-            return sorted(scans, key=_natural_key)
-        if place == folder:
-            _refuse_unreadable(files, depth)
-    wanted = "depth .png" if depth else known_formats()
-    found = sorted({path.suffix or path.name for path in folder.rglob("*") if path.is_file()})
-    problem = f"holds no scan, only {' '.join(found[:8])}" if found else "holds no scan"
-    raise RecordingError(folder, problem, f"expected files of one format among {wanted}")
-
-
-def _places(folder: Path, depth: bool) -> Iterator[Path]:
-    """Where scans may be, by precedence."""
-    own = folder / SCANS_FOLDER
-    if own.is_dir() and any(_is_scan(path, depth) for path in own.iterdir()):
-        yield own
-    yield folder
-    yield from _subfolders(folder, depth)
-
-
-def _is_candidate(path: Path) -> bool:
-    """Tell whether a path is a file that may be a scan. Raises RecordingError for a link that leads nowhere."""
-    if path.name.startswith("."):
-        return False
-    is_data = path.suffix.lower() in CLOUD_READERS or path.suffix.lower() == ".png"
-    if is_data and path.is_symlink() and not path.exists():
-        raise RecordingError(path, "a link to a file that does not exist", "copy the file, or remove link and pose")
-    return path.is_file() and not is_own_output(path)
-
-
-def _subfolders(folder: Path, depth: bool) -> list[Path]:
-    """The one sub-folder with scans, if there is one; several are a choice for the user."""
-    places = [p for p in sorted(folder.iterdir()) if p.is_dir() and any(_is_scan(f, depth) for f in p.iterdir())]
-    if len(places) > 1:
-        names = " ".join(place.name for place in places)
-        raise RecordingError(folder, f"scans in several folders: {names}", "give one of them")
-    return places
-
-
-def _is_scan(path: Path, depth: bool) -> bool:
-    suffixes = {".png"} if depth else CLOUD_READERS.keys()
-    return path.suffix.lower() in suffixes and _is_candidate(path)
-
-
-def _refuse_unreadable(files: list[Path], depth: bool) -> None:
-    """Say what stands in the way where a folder has files and no scan among them."""
-    images = [path for path in files if path.suffix.lower() == ".png"]
-    if images and not depth:
-        raise RecordingError(images[0], "depth images need the camera's intrinsics", "give them with --intrinsics")
-    if depth and any(path.suffix.lower() in CLOUD_READERS for path in files):
-        raise RecordingError(files[0].parent, "holds clouds, not depth .png", "leave --intrinsics away")
-    _refuse_others([], files)
-
-
-def _refuse_others(scans: list[Path], files: list[Path]) -> None:
-    for path in sorted(files):
-        if path.suffix.lower() not in BESIDE_SCANS | CLOUD_READERS.keys():
-            hint = f"convert it to one of {known_formats()}, or move it away"
-            raise RecordingError(path, f"unknown format '{path.suffix}'", hint)
-    suffixes = sorted({path.suffix.lower() for path in scans})
-    if len(suffixes) > 1:
-        raise RecordingError(scans[0].parent, f"holds scans of several formats: {' '.join(suffixes)}", "keep one")
-
-
-def _natural_key(path: Path) -> list:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.stem)]
+    return Recording(files, T_map_sensor, _compute_steps(files, pose_file, times, dt), read, note)
 
 
 def _find_poses(folder: Path) -> Path:
     for place in (folder, folder.resolve().parent):
-        for name in POSE_FILES:
+        for name in _POSE_FILES:
             if (place / name).is_file():
                 return place / name
-    raise RecordingError(folder, f"no pose file ({' or '.join(POSE_FILES)}) in it or beside it", "give it with --poses")
+    names = " or ".join(_POSE_FILES)
+    raise RecordingError(folder, f"no pose file ({names}) in it or beside it", "give it with --poses")
 
 
-def _assign(files: list[Path], pose_file: Path, poses: Poses) -> tuple[NDArray, NDArray | None, str]:
-    """Give each scan its pose: (T, 4, 4), times (T,) [s] or None, and a note where poses are left over."""
-    index, note = _index_by_time(files, pose_file, poses.times), ""
+def _assign_poses(files: list[Path], pose_file: Path, poses: Poses) -> tuple[NDArray, NDArray | None, str]:
+    """Return each scan's pose (T, 4, 4), its time (T,) [s] if known, and a note if poses are left over."""
+    index, note = _match_times(files, pose_file, poses.times), ""
     if index is None:
-        count = len(poses.T_map_sensor)
-        index = _index_by_order(files, pose_file, count)
-        if count > len(files):
-            numbers = f"{files[0].name} takes line {index[0] + 1}, {files[-1].name} line {index[-1] + 1}"
-            note = f"{pose_file}: {count} poses for {len(files)} scans; each takes that of its number: {numbers}"
+        num_poses = len(poses.T_map_sensor)
+        index = _match_order(files, pose_file, num_poses)
+        if num_poses > len(files):
+            lines = f"{files[0].name} takes line {index[0] + 1}, {files[-1].name} line {index[-1] + 1}"
+            note = f"{pose_file}: {num_poses} poses for {len(files)} scans; each scan takes that of its number: {lines}"
     return poses.T_map_sensor[index], None if poses.times is None else poses.times[index], note
 
 
-def _index_by_time(files: list[Path], pose_file: Path, times: NDArray | None) -> NDArray | None:
-    """Indices (T,) of the poses nearest in time, or None if names or poses tell no common time."""
-    stamps = [_seconds(path.stem) for path in files]
+def _match_times(files: list[Path], pose_file: Path, times: NDArray | None) -> NDArray | None:
+    """Return the indices (T,) of the poses nearest in time; None without timestamps of a common clock."""
+    stamps = [_parse_timestamp(path.stem) for path in files]
     if times is None or None in stamps:
         return None
     scan_times = np.array(stamps, dtype=np.float64)
     if scan_times.max() < times.min() - 1 or scan_times.min() > times.max() + 1:
-        return None  # two clocks
+        return None  # different clocks
     index = np.array([np.abs(times - t).argmin() for t in scan_times])
-    late = np.abs(times[index] - scan_times)
-    if late.max() > TIME_TOLERANCE:
-        scan, gap = files[int(late.argmax())].name, late.max()
-        problem = f"no pose for scan {scan}: the nearest is {gap:.3f} s away, at most {TIME_TOLERANCE} s is allowed"
+    gaps = np.abs(times[index] - scan_times)
+    if gaps.max() > _TIME_TOLERANCE:
+        name, gap = files[int(gaps.argmax())].name, gaps.max()
+        problem = f"no pose for scan {name}: the nearest is {gap:.3f} s away, at most {_TIME_TOLERANCE} s is allowed"
         raise RecordingError(pose_file, problem, "add its pose or remove the scan")
     return index
 
 
-def _seconds(stem: str) -> float | None:
-    """The time [s] a scan is named by, written in s, ms, us or ns since 1970 or with a decimal point; else None."""
+def _parse_timestamp(stem: str) -> float | None:
+    """Return the time [s] in a file name: a decimal number, or s, ms, us or ns since 1970; None for other names."""
     if not re.fullmatch(r"\d+\.\d+|\d{10,19}", stem):
         return None
     value = float(stem)
     return value / 10 ** (3 * int(max(0, np.floor((np.log10(max(value, 1.0)) - 8) / 3))))
 
 
-def _index_by_order(files: list[Path], pose_file: Path, count: int) -> NDArray:
-    if count == len(files):
-        return np.arange(count)
-    if count > len(files) and all(path.stem.isdigit() for path in files):
+def _match_order(files: list[Path], pose_file: Path, num_poses: int) -> NDArray:
+    """Return the indices (T,) of poses in the scans' order, or by the scans' numbers if there are more poses."""
+    if num_poses == len(files):
+        return np.arange(num_poses)
+    if num_poses > len(files) and all(path.stem.isdigit() for path in files):
         index = np.array([int(path.stem) for path in files])
-        if index.max() < count:
+        if index.max() < num_poses:
             return index
-    scan = f"no pose for scan {files[count].name}: " if count < len(files) else ""
-    raise RecordingError(pose_file, f"{scan}{count} poses for {len(files)} scans", "write one line for each scan")
+    scan = f"no pose for scan {files[num_poses].name}: " if num_poses < len(files) else ""
+    raise RecordingError(pose_file, f"{scan}{num_poses} poses for {len(files)} scans", "write one line for each scan")
 
 
-def _steps(files: list[Path], pose_file: Path, times: NDArray | None, dt: float | None) -> NDArray[np.float64]:
-    """Time [s] since the scan before, (T,), 0 for the first."""
+def _compute_steps(files: list[Path], pose_file: Path, times: NDArray | None, dt: float | None) -> NDArray[np.float64]:
+    """Return the times since the previous scan (T,) [s], 0 for the first."""
     if dt is not None or times is None:
-        steps = np.full(len(files), 0.1 if dt is None else dt)
+        steps = np.full(len(files), _DEFAULT_DT if dt is None else dt)
     else:
         steps = np.diff(times, prepend=times[:1])
     steps[0] = 0.0
     if (steps < 0).any():
-        scan = files[int((steps < 0).argmax())].name
-        raise RecordingError(pose_file, f"the pose of scan {scan} is older than that of the scan before it", "sort it")
+        name = files[int((steps < 0).argmax())].name
+        raise RecordingError(pose_file, f"the pose of scan {name} is older than that of the scan before it", "sort it")
     if dt is None and times is not None:
         require_plausible_steps(pose_file, steps)
     return steps
 
 
-def _depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
-    """Points (H * W, 3) [m] of a depth image in the optical frame: x right, y down, z forward."""
+def _read_depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
+    """Read a depth image as points (H * W, 3) [m] in the camera frame: x right, y down, z forward."""
     import torch
 
     from torchelev.clouds import depth_to_points

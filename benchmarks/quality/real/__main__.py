@@ -46,7 +46,8 @@ from benchmarks.quality.real.metrics import (
     traversable_fraction,
 )
 from torchelev import LearnedTraversabilityConfig as Head
-from torchelev.app.cli import MapOptions, fuse_all, load_config, new_map
+from torchelev.app.config_file import load_config
+from torchelev.app.map_command import MapOptions, fuse_all, new_map
 from torchelev.app.results import markdown_table, write_json
 from torchelev.io import MappingRun
 from torchelev.io.export import SavedMap, take
