@@ -15,7 +15,8 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-Layer = tuple[Tensor, Tensor]  # values and where they are known, both (B, H, W)
+Layer = tuple[Tensor, Tensor]  # values, and the mask of where they are known, (B, H, W) both
+MODES = ("bilinear", "nearest")  # how to sample a layer
 
 
 def normal_component(gx: Tensor, gy: Tensor, axis: int) -> Tensor:

@@ -215,7 +215,7 @@ def chunks_of(drive: Drive) -> list[tuple[MapState, Measurement]]:
             map_layers(lambda layer, envs=envs: layer[envs], state),
             Measurement(*(None if value is None else value[envs] for value in measurement)),
         )
-        for envs in emap._chunks()
+        for envs in emap.chunks
     ]
 
 

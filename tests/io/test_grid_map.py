@@ -20,7 +20,7 @@ def map_of(heights, resolution=0.5, corner=(0, 0)):
     state = emap.state._replace(
         corner=torch.tensor([corner]), elevation=torch.where(known, heights, 0.0)[None], validity=known[None]
     )
-    emap._store(state)
+    emap.load_state(state)
     return emap
 
 

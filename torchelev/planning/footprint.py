@@ -153,7 +153,7 @@ def _ground(
     rated = cfg.layer != "traversability" or emap.cfg.traversability is not None
     hint = "give ElevationMapConfig a TraversabilityConfig, or FootprintConfig another layer"
     require(rated, "traversability", "must not be switched off", "None", hint)
-    values, known = emap._read(cfg.layer, state)
+    values, known = emap.read_layer(cfg.layer, state)
     uv, fits = _locate(emap, polygons, cfg, (emap.state if state is None else state).corner)
     cells = polygon_cells(torch.where(fits[..., None, None], uv, 0.0), cfg.cells(emap.cfg.grid) + 1)
     cells = cells._replace(inside=cells.inside & fits[..., None, None])

@@ -101,7 +101,7 @@ def plan(
     value = cost_to_go(cost, target, resolution=grid.resolution, rounds=rounds)
     way = descend(value, cost, start, resolution=grid.resolution, max_cells=longest)
     reached = way.reached & starts
-    rated = emap._read("traversability", state)[1]
+    rated = emap.read_layer("traversability", state)[1]
     radius = cfg.stand_radius / grid.resolution
     below = disc(start, cost, radius) if standing is None else standing_cells(emap, standing, state)
     reason = find_reason(cost, value, rated, below, ((start, starts), (goal, goals)), reached)
