@@ -1,10 +1,10 @@
-"""`python -m torchelev`."""
+"""The command line: `python -m torchelev`."""
 
 import sys
 
 
 def run() -> None:
-    """Start the command line, or say what to install for it."""
+    """Run the command line, or say which packages it lacks."""
     try:
         from torchelev.app.cli import main
     except ModuleNotFoundError as error:

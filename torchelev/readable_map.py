@@ -16,7 +16,8 @@ from torchelev.map_buffers import MapBuffers
 from torchelev.pipeline import rate_surface
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
-from torchelev.traversability.net import Rating, TraversabilityNet, Weights
+from torchelev.traversability.net import Rating, TraversabilityNet
+from torchelev.traversability.weight_file import Weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

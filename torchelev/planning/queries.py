@@ -58,7 +58,7 @@ def height_profile(
     start, end = (check_xy(name, xy, emap.num_envs, emap.device).double() for name, xy in both)
     hint = "give each line a start and an end"
     require(start.shape == end.shape, "end", f"expected {tuple(start.shape)}", tuple(end.shape), hint)
-    require_count("num_points", num_points, "give 2 for the ends alone", least=2)
+    require_count("num_points", num_points, "give 2 for the ends alone", minimum=2)
     finite = torch.isfinite(start + end).all(-1, keepdim=True)
     start, way = torch.where(finite, start, torch.nan), torch.where(finite, end - start, 0.0)
     share = torch.arange(num_points, device=emap.device, dtype=torch.float64) / (num_points - 1)
