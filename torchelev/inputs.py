@@ -18,8 +18,8 @@ from torchelev.ops.transforms import require_reverse_mode
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-Result = TypeVar("Result")
-ResultOut = TypeVar("ResultOut", covariant=True)
+_Result = TypeVar("_Result")
+_ResultOut = TypeVar("_ResultOut", covariant=True)
 
 
 class Inputs(NamedTuple):
@@ -32,7 +32,7 @@ class Inputs(NamedTuple):
     variance: Float[Tensor, "B S N"] | None  #: [m^2] of each point's height; None: the noise model's
 
 
-class TakesInputs(Protocol[ResultOut]):
+class TakesInputs(Protocol[_ResultOut]):
     """The signature of `update` and `measure`.
 
     `dt` is required but follows `T_map_base`, which may be left out. Two overloads make type checkers ask for it.
@@ -47,16 +47,16 @@ class TakesInputs(Protocol[ResultOut]):
         dt: float | Tensor,
         *,
         variance: Tensor | None = None,
-    ) -> ResultOut: ...
+    ) -> _ResultOut: ...
     @overload
     def __call__(
         self, points: Tensor, T_map_sensor: Tensor, *, dt: float | Tensor, variance: Tensor | None = None
-    ) -> ResultOut: ...
+    ) -> _ResultOut: ...
 
 
-def requires_dt(method: Callable[..., Result]) -> TakesInputs[Result]:
+def requires_dt(method: Callable[..., _Result]) -> TakesInputs[_Result]:
     """Return the method as it is, typed such that type checkers ask for `dt`."""
-    return cast(TakesInputs[Result], method)
+    return cast(TakesInputs[_Result], method)
 
 
 def check_inputs(

@@ -67,7 +67,7 @@ def require_writable(path: str | Path, num_bytes: int = 0) -> None:
         raise WriteError(path, _describe(error)) from error
     finally:
         _remove(probe)
-    limits = {"the disk has": free, "the size limit of files (ulimit -f) is": _get_size_limit()}
+    limits = {"the disk has": free, "the size limit of files (ulimit -f) is": get_size_limit()}
     for what, limit in limits.items():
         if limit is not None and limit < num_bytes:
             need = f"up to {num_bytes / 1e6:.3g} MB are needed"
@@ -119,7 +119,7 @@ def _describe(error: OSError) -> str:
     return error.strerror or str(error) or type(error).__name__
 
 
-def _get_size_limit() -> int | None:
+def get_size_limit() -> int | None:
     """Return the largest file [bytes] that this process may write; None: no limit."""
     try:
         import resource

@@ -55,11 +55,6 @@ class Pace:
         if times.num_slow >= PATIENCE:
             _warn(median, times.best)
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no update was noted yet."""
-        return not self._times
-
 
 def _warn(median: float, best: float) -> None:
     global has_warned
