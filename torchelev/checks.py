@@ -66,7 +66,7 @@ def given_or_default(kind: type[Config], cfg: object) -> Config:
     """Return a config of this kind: the given one, or the defaults for None."""
     cfg = kind() if cfg is None else cfg
     hint = f"give {kind.__name__}(...)"
-    require(isinstance(cfg, kind), "cfg", f"must be a {kind.__name__}", type(cfg).__name__, hint, TypeError)
+    require(isinstance(cfg, kind), "cfg", f"must be a {kind.__name__}", repr(cfg), hint, TypeError)
     assert isinstance(cfg, kind)
     return cfg
 

@@ -78,7 +78,7 @@ def check_inputs(
     require_full_precision(dtype)
     require_reverse_mode((points, T_map_sensor, T_map_base, dt, variance))
     cloud = _check_points(points, num_envs, device)
-    B, S, N, _ = cloud.shape
+    B, S = num_envs, cloud.shape[1]  # not the cloud's B, which the compiler may take for variable
     shape = (B, S, 4, 4) if points.ndim == 4 else (B, 4, 4)
     T_map_sensor = checks.check_pose("T_map_sensor", T_map_sensor, shape, device, check_values).view(B, S, 4, 4)
     if T_map_base is not None:
@@ -88,7 +88,7 @@ def check_inputs(
         variance = checks.check_tensor("variance", variance, device, checks.FLOATS)
         fits = variance.shape == points.shape[:-1]
         require(fits, "variance", f"expected {tuple(points.shape[:-1])}", tuple(variance.shape), "give one per point")
-        variance = variance.view(B, S, N)
+        variance = variance.view(cloud.shape[:-1])
     return Inputs(cloud, T_map_sensor, T_map_base, dt, variance)
 
 
