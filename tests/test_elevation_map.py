@@ -361,12 +361,6 @@ def test_chunks_change_nothing(chunk):
     assert differences(whole.state, parts.state) == []
 
 
-def test_many_maps_are_updated_in_equal_parts():
-    assert [(c.start, c.stop) for c in ElevationMap(small_config(), 10, chunk=4)._chunks()] == [(0, 4), (4, 8), (8, 12)]
-    assert len(ElevationMap(small_config((256, 256)), 8)._chunks()) == 2
-    assert len(ElevationMap(small_config(), 8, device="meta")._chunks()) == 1
-
-
 def test_same_clouds_same_map_to_the_bit():
     """On a CPU, with several threads; sums do not depend on which thread was first."""
     torch.set_num_threads(2)

@@ -46,7 +46,7 @@ def test_world_fixed_cells_keep_their_value_to_the_bit():
     """Each environment moves by its own shift, with NaN clouds; a cell of the world never changes its bits."""
     emap = small_map(3, raycast=None, overlap=None)
     state = random_state(np.random.default_rng(0), emap.cfg.grid, 3, dtype=torch.float32)
-    emap._store(state)
+    emap.load_state(state)
     before, places = emap.layer("elevation"), emap.cell_centers()
     T = pose(num_envs=3)
     T[:, :2, 3] = torch.tensor([[0.31, -0.2], [-0.47, 0.0], [0.0, 0.12]])

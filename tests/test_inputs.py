@@ -235,7 +235,7 @@ def test_readers_refuse_and_change_nothing(emap, case):
 @pytest.mark.parametrize(
     "make, error, text",
     [
-        (lambda: ElevationMap({"grid": {}}), TypeError, "cfg: .*ElevationMapConfig.*got dict"),
+        (lambda: ElevationMap({"grid": {}}), TypeError, r"cfg: .*ElevationMapConfig, got \{.grid.: \{\}\}; give"),
         (lambda: ElevationMap(ElevationMapConfig(), num_envs=0), ValueError, "num_envs: .*positive.*got 0"),
         (lambda: ElevationMap(ElevationMapConfig(), num_envs=True), ValueError, "num_envs: .*positive.*got True"),
         (lambda: ElevationMap(ElevationMapConfig(), num_envs=2.0), ValueError, "num_envs: .*got 2.0"),

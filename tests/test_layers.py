@@ -18,7 +18,7 @@ def filled(seed=0, num_envs=2, known=0.7, corner=((-7, 3), (1, -6)), dtype=torch
     """A map with a random state, its windows away from the origin."""
     emap = small_map(num_envs, (7, 6), dtype=dtype)
     state = random_state(np.random.default_rng(seed), emap.cfg.grid, num_envs, known, dtype)
-    emap._store(state._replace(corner=torch.tensor(corner[:num_envs])))
+    emap.load_state(state._replace(corner=torch.tensor(corner[:num_envs])))
     return emap
 
 

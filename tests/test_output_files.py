@@ -124,7 +124,7 @@ def test_what_cannot_be_written_is_known_before(tmp_path, monkeypatch):
             require_writable(path)
     with pytest.raises(WriteError, match=r"the disk has .* MB, up to 1e\+24 MB are needed"):
         require_writable(tmp_path / "map.npz", 10**30)
-    monkeypatch.setattr(output_files, "_size_limit", lambda: 5000)
+    monkeypatch.setattr(output_files, "get_size_limit", lambda: 5000)
     require_writable(tmp_path / "map.npz", 5000)
     with pytest.raises(WriteError, match=r"ulimit -f\) is 0.005 MB"):
         require_writable(tmp_path / "map.npz", 5001)

@@ -275,7 +275,7 @@ def test_an_inlier_never_raises_a_variance(seed, noise, edges):
     fusion = FusionConfig() if edges else FusionConfig(edges=None)
     emap = small_map(2, dtype=torch.float64, drift=None, fusion=fusion, sensor=SensorConfig(noise_factor=0.0))
     T = pose(num_envs=2)
-    emap._store(
+    emap.load_state(
         emap.state._replace(
             validity=torch.rand(2, 12, 10, generator=torch.Generator().manual_seed(seed)) < 0.8,
             variance=torch.from_numpy(rng.uniform(1e-6, 1e-2, (2, 12, 10))),

@@ -21,7 +21,7 @@ from torchelev.stages.overlap import clear_other_floors
 from torchelev.stages.recenter import recenter
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
-from torchelev.traversability.net import Weights
+from torchelev.traversability.weight_file import Weights
 
 
 def compiled_update(

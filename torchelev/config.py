@@ -1,4 +1,4 @@
-"""The whole configuration: one frozen dataclass per stage, each defined beside its stage."""
+"""The configuration of a map: one frozen dataclass per stage, each defined beside its stage."""
 
 from __future__ import annotations
 
@@ -23,27 +23,31 @@ from torchelev.traversability.heads import LearnedTraversabilityConfig, Traversa
 
 @dataclass(frozen=True, kw_only=True)
 class ElevationMapConfig:
-    """All stages; None switches drift, raycast, overlap or traversability off (and `fusion.edges`).
+    """Configuration of all stages of a map.
 
-    `filters` make further layers when they are read, see `torchelev.filters`.
+    `drift`, `raycast`, `overlap`, `traversability` and `fusion.edges` can be None, which switches that stage off.
+
+    Raises:
+        TypeError: if a field has the wrong type.
+        ValueError: if a setting is out of range.
     """
 
     grid: GridConfig = field(default_factory=GridConfig)  #: size of the window and its cells
     sensor: SensorConfig = field(default_factory=SensorConfig)  #: noise model, range, exclusion area and body box
-    aging: AgingConfig = field(default_factory=AgingConfig)  #: how fast an unmeasured cell loses certainty
-    #: drift compensation; None switches it off: for poses without height drift
+    aging: AgingConfig = field(default_factory=AgingConfig)  #: process noise of cells that are not measured
+    #: drift compensation; None if the poses do not drift in height
     drift: DriftConfig | None = field(default_factory=DriftConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)  #: Kalman update and outlier gate
-    #: visibility clean-up and upper bound; None switches both off: for static scenes
+    #: visibility clean-up and upper bound; None if nothing moves and no upper bound is needed
     raycast: RaycastConfig | None = field(default_factory=RaycastConfig)
-    #: overlap clearance; None switches it off: for buildings of one floor
+    #: overlap clearance; None if there is one floor only
     overlap: OverlapConfig | None = field(default_factory=OverlapConfig)
-    surface: SurfaceConfig = field(default_factory=SurfaceConfig)  #: reach of the planes of normals
-    #: the analytic or the learned head; None: no rating
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)  #: window of the planes that normals are fitted to
+    #: the analytic head, or the learned one for a legged robot; None for no traversability
     traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
         default_factory=TraversabilityConfig
     )
-    filters: tuple[FilterConfig, ...] = ()  #: further layers, made when they are read
+    filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
 
     def __post_init__(self) -> None:
         if isinstance(self.filters, list):
@@ -61,21 +65,25 @@ class ElevationMapConfig:
 
     @property
     def drift_gate(self) -> float:
-        """The traversability from which on a cell measures the height drift: the setting, or else the head's own."""
+        """The least traversability of cells that measure the height drift: the setting, or the head's default."""
         if self.drift is not None and self.drift.min_traversability is not None:
             return self.drift.min_traversability
         return (self.traversability or TraversabilityConfig).drift_gate
 
     def to_dict(self) -> dict[str, Any]:
-        """Return nested plain dicts, as written to YAML and to `state_dict`."""
+        """Return the config as nested plain dicts, as YAML files and `state_dict` hold it."""
         filters = [step.to_dict() for step in self.filters]
         return dataclasses.asdict(dataclasses.replace(self, filters=())) | {"filters": filters}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ElevationMapConfig:
-        """Build a config from nested dicts; what is left out keeps its default.
+        """Build a config from nested dicts.
 
-        Raises ValueError for an unknown key, naming it and what exists.
+        Args:
+            values: settings by group and name; settings that are left out keep their defaults.
+
+        Raises:
+            ValueError: if there is no such setting, naming those that exist, or its value does not fit.
         """
         if not isinstance(values, dict) or "filters" not in values:
             return _build(cls, values, "config")
@@ -83,22 +91,24 @@ class ElevationMapConfig:
         return dataclasses.replace(_build(cls, stages, "config"), filters=filters_from_list(values["filters"]))
 
 
-def _settings(cls: type) -> dict[str, Any]:
-    """Return the types of a config's settings."""
+def _setting_types(cls: type) -> dict[str, Any]:
+    """Return the type of each of a config's settings, by name."""
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
 def _build(cls: type, values: object, where: str) -> Any:
+    """Return a config of this type from its plain dict; errors call it `where`."""
     require(isinstance(values, dict), where, "must be a mapping", type(values).__name__, "see ElevationMapConfig")
     assert isinstance(values, dict)
-    hints = _settings(cls)
+    hints = _setting_types(cls)
     for name in values:
         require(name in hints, f"{where}.{name}", "is not a setting", repr(name), f"there are {', '.join(hints)}")
-    return cls(**{name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()})
+    return cls(**{name: _convert(hints[name], value, f"{where}.{name}") for name, value in values.items()})
 
 
-def _value(hint: Any, value: object, where: str) -> Any:
+def _convert(hint: Any, value: object, where: str) -> Any:
+    """Return a setting of this type from its plain value."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     if value is None:
         require(type(None) in options, where, "cannot be switched off", "None", "leave it out to keep its default")
@@ -107,7 +117,9 @@ def _value(hint: Any, value: object, where: str) -> Any:
     kind = kinds[0]
     if dataclasses.is_dataclass(kind):
         names = set(value) if isinstance(value, dict) else set()
-        kind = max(kinds, key=lambda k: len(names & set(_settings(k))))  # of several, by their settings' names
+        kind = max(
+            kinds, key=lambda k: len(names & set(_setting_types(k)))
+        )  # of several types, the one with these settings
         return _build(typing.cast(type, kind), value, where)
     if isinstance(value, list):
         return tuple(value)
@@ -117,7 +129,7 @@ def _value(hint: Any, value: object, where: str) -> Any:
 
 
 def differing_fields(a: dict[str, Any], b: dict[str, Any], where: str = "") -> list[str]:
-    """List the dotted names of the settings in which two configs' dicts differ."""
+    """Return the dotted names of the settings in which the dicts of two configs differ."""
     names = []
     for key in sorted(a.keys() | b.keys()):
         left, right = a.get(key), b.get(key)

@@ -1,4 +1,4 @@
-"""Poses are 4 x 4 matrices everywhere; this makes them from what simulators give."""
+"""Poses from positions and quaternions, as simulators give them. Everywhere else a pose is a 4 x 4 matrix."""
 
 from __future__ import annotations
 
@@ -18,14 +18,20 @@ if TYPE_CHECKING:
 def transform(
     position: Float[Tensor, "B 3"] | ArrayLike, quat_wxyz: Float[Tensor, "B 4"] | ArrayLike
 ) -> Float[Tensor, "B 4 4"]:
-    """Return T_a_b (..., 4, 4) of a frame b at `position` [m], turned by the unit quaternion (w, x, y, z).
+    """Return the pose T_a_b of frame b in frame a, which takes b-frame coordinates to frame a.
 
-    NumPy arrays and lists are taken too, and give a tensor in CPU memory: of the arrays' precision, of float64 for
-    lists and whole numbers.
+    Args:
+        position: (..., 3) origin of frame b in frame a [m]; tensor, NumPy array or list.
+        quat_wxyz: (..., 4) rotation of frame b in frame a, a unit quaternion (w, x, y, z).
 
-    Raises ValueError for shapes that do not fit and, for CPU tensors, for a quaternion that is not normalised.
+    Returns:
+        (..., 4, 4), on the device of the tensors. Of arrays a CPU tensor of their precision, of lists and integers one
+        of float64.
+
+    Raises:
+        ValueError: if the shapes do not fit, the values are not numbers or, on the CPU, a quaternion is not normalised.
     """
-    position, quat_wxyz = _floats("position", position), _floats("quat_wxyz", quat_wxyz)
+    position, quat_wxyz = _to_floats("position", position), _to_floats("quat_wxyz", quat_wxyz)
     actual = f"{tuple(position.shape)} and {tuple(quat_wxyz.shape)}"
     fits = position.shape[-1:] == (3,) and quat_wxyz.shape == (*position.shape[:-1], 4)
     require(fits, "position, quat_wxyz", "must be (..., 3) and (..., 4)", actual, "give one quaternion per position")
@@ -43,8 +49,8 @@ def transform(
     return torch.stack([torch.stack(torch.broadcast_tensors(*row), -1) for row in rows], -2)
 
 
-def _floats(name: str, values: Tensor | ArrayLike) -> Tensor:
-    """Return a tensor as it is, all else as a floating-point tensor of its own."""
+def _to_floats(name: str, values: Tensor | ArrayLike) -> Tensor:
+    """Return a tensor as it is, and anything else as a new floating-point tensor."""
     if isinstance(values, Tensor):
         return values
     array = np.array(values)

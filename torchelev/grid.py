@@ -1,4 +1,7 @@
-"""Where cells are: the lattice, the window on it, and moving that window with the robot."""
+"""The lattice of cells and the window on it: which cell a point lies in, and where cells lie.
+
+Cell k of an axis spans k * resolution to (k + 1) * resolution in the map frame, wherever the window is.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,9 @@ if TYPE_CHECKING:
 class GridConfig:
     """Size of the window and of its cells."""
 
-    resolution: float = 0.04  #: [m]
-    length_x: float = 10.0  #: [m]
-    length_y: float = 10.0  #: [m]
+    resolution: float = 0.04  #: [m] side of a cell; coarser is faster, finer shows smaller steps
+    length_x: float = 10.0  #: [m] of the window along x, a whole number of cells; larger maps farther, and is slower
+    length_y: float = 10.0  #: [m] of the window along y, a whole number of cells
 
     def __post_init__(self) -> None:
         require_positive(**{"grid.resolution": self.resolution})
@@ -29,43 +32,51 @@ class GridConfig:
 
     @property
     def height(self) -> int:
-        """Cells along x (H)."""
+        """H, number of cells along x."""
         return round(self.length_x / self.resolution)
 
     @property
     def width(self) -> int:
-        """Cells along y (W)."""
+        """W, number of cells along y."""
         return round(self.length_y / self.resolution)
 
     @property
     def num_cells(self) -> int:
-        """H * W."""
+        """H * W, number of cells."""
         return self.height * self.width
 
 
 def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig) -> tuple[Tensor, Tensor]:
-    """Return the flat cell number, int32, of each place (x, y), both (B, ...), and whether it lies in the window.
+    """Find the cells that points lie in.
 
-    x and y count from a lattice corner that lies at `offset` in the window. Outside, the number is the nearest cell's.
+    Args:
+        x: (B, ...) [m] from a corner of the lattice.
+        y: (B, ...) [m] from that corner.
+        offset: position of that corner in the window [m].
+        grid: the window.
+
+    Returns:
+        Flat cell numbers (B, ...) int32, of the nearest cell for points outside the window, and a mask of the points
+        inside.
     """
     first = torch.round(offset / grid.resolution).view(-1, 2, *[1] * (x.ndim - 1))
     # Divide before adding whole cells: the result is then the same wherever the window is.
     i = torch.floor(x / grid.resolution) + first[:, 0]
     j = torch.floor(y / grid.resolution) + first[:, 1]
     near_i, near_j = i.clamp(0, grid.height - 1), j.clamp(0, grid.width - 1)
-    # In integers: float32 counts no farther than 2^24 cells.
+    # In integers: float32 is exact up to 2^24 only.
     slot = near_i.to(torch.int32) * grid.width + near_j.to(torch.int32)
     return slot, (i == near_i) & (j == near_j)
 
 
 def window_center(corner: Int[Tensor, "B 2"], grid: GridConfig) -> Float[Tensor, "B 2"]:
-    """Return the windows' centres [m], map frame, float64."""
+    """Return the centres of the windows [m], map frame, float64."""
     size = torch.stack([corner.new_full((), cells) for cells in (grid.height, grid.width)])
     return (corner.double() + size.double() / 2) * grid.resolution
 
 
 def cell_centers(corner: Int[Tensor, "B 2"], grid: GridConfig) -> Float[Tensor, "B H W 2"]:
-    """Return the cell centres [m], map frame, float64: (k + 0.5) * resolution for cell number k."""
+    """Return the centres of the cells [m], map frame, float64: (k + 0.5) * resolution for cell k."""
     x = torch.arange(grid.height, device=corner.device) + corner[:, 0, None]
     y = torch.arange(grid.width, device=corner.device) + corner[:, 1, None]
     x, y = ((k.double() + 0.5) * grid.resolution for k in (x, y))

@@ -1,4 +1,4 @@
-"""Reading the map: layers by name, and samples at points."""
+"""The layers that can be read from a state, by name, and how they are sampled at points."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-Layer = tuple[Tensor, Tensor]  # values and where they are known, both (B, H, W)
+Layer = tuple[Tensor, Tensor]  # values, and the mask of where they are known, (B, H, W) both
+MODES = ("bilinear", "nearest")  # how to sample a layer
 
 
 def normal_component(gx: Tensor, gy: Tensor, axis: int) -> Tensor:
-    """Return x, y or z of a plane's unit normal (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2)."""
+    """Return component x, y or z of a plane's unit normal, (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2)."""
     component = (-gx, -gy, torch.ones_like(gx))[axis]
     return component / (1 + gx.square() + gy.square()).sqrt()
 
@@ -49,39 +50,46 @@ LAYERS: dict[str, Callable[[MapState], Layer]] = {
 }
 
 
-class Corners(NamedTuple):
-    """The K cells that each point is read from; a cell's number H * W stands for nothing."""
+class _Corners(NamedTuple):
+    """The K cells that each of M points is read from."""
 
-    cell: Int[Tensor, "B KM"]  #: flat cell number of each corner
-    weight: Float[Tensor, "B K M"]  #: bilinear weight of each corner, 0 outside the window
+    cell: Int[Tensor, "B KM"]  # flat cell number; H * W for a cell outside the window, or not known
+    weight: Float[Tensor, "B K M"]  # of the cell in the mean
 
 
 def sample_layer(
     layer: Layer, uv: Float[Tensor, "B M 2"], grid: GridConfig, mode: str
 ) -> tuple[Float[Tensor, "B M"], Bool[Tensor, "B M"]]:
-    """Sample a layer at `uv`, in cells from the window's corner. Returns values (0 where not valid) and validity.
+    """Sample a layer at points.
 
-    Bilinear: weights of the known ones of the four surrounding cells, renormalised; valid from a weight of one half.
-    Nearest: the cell that holds the point.
+    Args:
+        layer: values and mask.
+        uv: points, in cells from the window's corner.
+        grid: the window.
+        mode: "bilinear": the mean of the known ones of the four surrounding cells by their bilinear weights, valid if
+            these sum to at least one half. "nearest": the cell that holds the point.
+
+    Returns:
+        Values, 0 where not valid, and the mask of where they are.
     """
     return sample_layers([layer], uv, grid, mode)[0]
 
 
 def sample_layers(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridConfig, mode: str) -> list[Layer]:
-    """Sample several layers at the same points; those that are known where another is share its look-up."""
-    around = _corners(uv, grid, mode)
-    found: list[tuple[Tensor, Corners]] = []
+    """Sample several layers at the same points. Layers that share a mask share the look-up of their known cells."""
+    around = _find_corners(uv, grid, mode)
+    found: list[tuple[Tensor, _Corners]] = []
     sampled = []
     for values, known in layers:
         corners = next((corners for mask, corners in found if mask is known), None)
         if corners is None:
-            corners = _known(around, known)
+            corners = _drop_unknown(around, known)
             found.append((known, corners))
-        sampled.append(_weighted_mean(values, corners))
+        sampled.append(_average(values, corners))
     return sampled
 
 
-def _corners(uv: Tensor, grid: GridConfig, mode: str) -> Corners:
+def _find_corners(uv: Tensor, grid: GridConfig, mode: str) -> _Corners:
     finite = torch.isfinite(uv).all(-1, keepdim=True)
     far = min(1e6, torch.finfo(uv.dtype).max)
     u, v = torch.where(finite, uv.clamp(-far, far), -far).unbind(-1)
@@ -95,22 +103,23 @@ def _corners(uv: Tensor, grid: GridConfig, mode: str) -> Corners:
         weight = torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], 1)
     inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
     cell = (i * grid.width + j).to(torch.int64)
-    return Corners(_unless(inside, cell, grid.num_cells).flatten(1), weight)
+    return _Corners(_choose(inside, cell, grid.num_cells).flatten(1), weight)
 
 
-def _known(corners: Corners, known: Bool[Tensor, "B H W"]) -> Corners:
-    """Leave out the cells that are not known: what they hold must not reach values or gradients."""
+def _drop_unknown(corners: _Corners, known: Bool[Tensor, "B H W"]) -> _Corners:
+    """Give unknown cells a weight of 0, and read 0 in their place: their values must not reach gradients."""
     found = F.pad(known.flatten(1), (0, 1)).gather(1, corners.cell)
-    index = _unless(found, corners.cell, known[0].numel())
-    return Corners(index, corners.weight * found.view_as(corners.weight))
+    index = _choose(found, corners.cell, known[0].numel())
+    return _Corners(index, corners.weight * found.view_as(corners.weight))
 
 
-def _unless(mask: Tensor, index: Tensor, nothing: int) -> Tensor:
-    """Return the index where the mask is true, else `nothing`; `torch.where` takes five times as long on a CPU."""
-    return (index - nothing) * mask + nothing
+def _choose(mask: Tensor, index: Tensor, default: int) -> Tensor:
+    """Return the index where the mask is true, else the default: on a CPU five times as fast as `torch.where`."""
+    return (index - default) * mask + default
 
 
-def _weighted_mean(values: Tensor, corners: Corners) -> Layer:
+def _average(values: Tensor, corners: _Corners) -> Layer:
+    """Return the weighted mean over the known corners of each point, and where their weight suffices."""
     corner = F.pad(values.flatten(1), (0, 1)).gather(1, corners.cell).view_as(corners.weight)
     total = corners.weight.sum(1)
     valid = total >= 0.5

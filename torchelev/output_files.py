@@ -1,4 +1,4 @@
-"""Write files whole or not at all: into a temporary file beside the target, which is renamed when it is complete."""
+"""Write files completely or not at all: to a temporary file beside the target, which is renamed when complete."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
-MARK = "torchelev"  # in the head of the pictures and meshes that are written, so that they are not taken for scans
-HEAD = 4096  # [bytes] within which the mark stands
-MAP_ARRAYS = ({"resolution", "center", "axes", "config"}, {"header", "corner", "elevation"})  # save_npz, save_map
+MARK = "torchelev"  # in the header of pictures and meshes that this package writes, which tells them from scans
+_HEADER_BYTES = 4096  # that hold the mark
+_MAP_ARRAYS = ({"resolution", "center", "axes", "config"}, {"header", "corner", "elevation"})  # save_npz, save_map
 
 
 class WriteError(OSError):
-    """A file cannot be written; one that was there before is as it was."""
+    """A file cannot be written. A file that was there before is unchanged."""
 
     def __init__(self, path: str | Path, reason: str) -> None:
         super().__init__(f"{path}: cannot be written ({reason}); an older file is left as it was")
@@ -26,15 +26,22 @@ class WriteError(OSError):
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `path`, and rename it to `path` when the block has ended without an error.
+    """Open a temporary file beside `path`, and rename it to `path` if the block ends without an error.
 
-    A link stays a link, and its target is replaced. An older file passes on its permissions.
+    A link is followed: its target is replaced. An older file passes on its permissions.
 
-    Raises WriteError if `path` is a folder or a device, and if writing fails; the older file is whole then, and the
-    temporary one is removed.
+    Args:
+        path: file to write.
+
+    Yields:
+        The temporary file, open for writing bytes.
+
+    Raises:
+        WriteError: if `path` is a folder or a device, or writing fails. The temporary file is removed then, and an
+            older file is unchanged.
     """
-    target = _target(path)
-    unfinished = _temporary(target)
+    target = _resolve(path)
+    unfinished = _name_temporary(target)
     try:
         with unfinished.open("xb") as file:
             yield file
@@ -44,23 +51,23 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
             unfinished.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(unfinished, target)
     except OSError as error:
-        raise WriteError(path, _reason(error)) from error
+        raise WriteError(path, _describe(error)) from error
     finally:
         _remove(unfinished)
 
 
 def require_writable(path: str | Path, num_bytes: int = 0) -> None:
-    """Raise WriteError if a file of `num_bytes` could not be written to `path`; leaves the folder as it was."""
-    target = _target(path)
-    probe = _temporary(target)
+    """Raise WriteError if a file of `num_bytes` cannot be written to `path`. Leaves no file behind."""
+    target = _resolve(path)
+    probe = _name_temporary(target)
     try:
         probe.touch(exist_ok=False)
         free = shutil.disk_usage(target.parent).free
     except OSError as error:
-        raise WriteError(path, _reason(error)) from error
+        raise WriteError(path, _describe(error)) from error
     finally:
         _remove(probe)
-    limits = {"the disk has": free, "the size limit of files (ulimit -f) is": _size_limit()}
+    limits = {"the disk has": free, "the size limit of files (ulimit -f) is": get_size_limit()}
     for what, limit in limits.items():
         if limit is not None and limit < num_bytes:
             need = f"up to {num_bytes / 1e6:.3g} MB are needed"
@@ -68,30 +75,30 @@ def require_writable(path: str | Path, num_bytes: int = 0) -> None:
 
 
 def is_own_output(path: Path) -> bool:
-    """Tell whether this package wrote a picture, a mesh or a map: outputs that lie beside scans are none."""
+    """Tell whether this package wrote a file: a picture, mesh or map that lies beside scans is no scan."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".npz":
             with zipfile.ZipFile(path) as archive:
                 names = {name.removesuffix(".npy") for name in archive.namelist()}
-            return any(arrays <= names for arrays in MAP_ARRAYS)
+            return any(arrays <= names for arrays in _MAP_ARRAYS)
         if suffix in (".ply", ".png"):
             with path.open("rb") as file:
-                return MARK.encode() in file.read(HEAD)
+                return MARK.encode() in file.read(_HEADER_BYTES)
     except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
-        pass  # whoever reads it says what is wrong with it
+        pass  # its reader will say what is wrong with it
     return False
 
 
-def _target(path: str | Path) -> Path:
-    """Return where the links of `path` lead, which is a regular file or nothing yet."""
+def _resolve(path: str | Path) -> Path:
+    """Follow the links of `path` to a regular file, or to where none is yet."""
     try:
         target = Path(os.path.realpath(path))
         kind = target.stat().st_mode
     except FileNotFoundError:
         return target
     except OSError as error:
-        raise WriteError(path, _reason(error)) from error
+        raise WriteError(path, _describe(error)) from error
     if stat.S_ISDIR(kind):
         raise WriteError(path, "it is a folder")
     if not stat.S_ISREG(kind):
@@ -99,21 +106,21 @@ def _target(path: str | Path) -> Path:
     return target
 
 
-def _temporary(target: Path) -> Path:
-    return target.with_name(f".{uuid4().hex}.tmp")  # short: the target's name may be as long as names can be
+def _name_temporary(target: Path) -> Path:
+    return target.with_name(f".{uuid4().hex}.tmp")  # short: the target's name may have the maximum length
 
 
 def _remove(path: Path) -> None:
-    with suppress(OSError):  # also raised for a file that is not there if the disk is read-only
+    with suppress(OSError):  # a read-only disk raises even if there is no such file
         path.unlink()
 
 
-def _reason(error: OSError) -> str:
+def _describe(error: OSError) -> str:
     return error.strerror or str(error) or type(error).__name__
 
 
-def _size_limit() -> int | None:
-    """Return the largest size [bytes] of a file that this process may write, None if there is no limit."""
+def get_size_limit() -> int | None:
+    """Return the largest file [bytes] that this process may write; None: no limit."""
     try:
         import resource
     except ImportError:  # Windows

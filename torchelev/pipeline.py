@@ -17,7 +17,7 @@ from torchelev.stages.surface import known_ground, normals
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MapState, Measurement, map_layers, tally
 from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all, traversability
-from torchelev.traversability.net import Weights
+from torchelev.traversability.weight_file import Weights
 
 
 def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:

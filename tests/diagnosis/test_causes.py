@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.helpers import nans, small_map
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.diagnosis.pose_hypotheses import quaternion, rotation
+from torchelev.diagnosis.pose_hypotheses import to_quaternion, to_rotation
 from torchelev.sim import DepthCamera, Lidar, mount, range_noise, walk
 from torchelev.sim.exact import scenes as library
 
@@ -59,7 +59,7 @@ def transposed(T):
 def reordered(T, shift):
     """The pose that results if the order of the quaternion's entries is mistaken."""
     T = T.clone()
-    T[0, :3, :3] = torch.from_numpy(rotation(np.roll(quaternion(T[0, :3, :3].numpy()), shift)))
+    T[0, :3, :3] = torch.from_numpy(to_rotation(np.roll(to_quaternion(T[0, :3, :3].numpy()), shift)))
     return T
 
 

@@ -7,12 +7,12 @@ import torch
 
 from tests.helpers import mapped, scan
 from torchelev.diagnosis import pace
-from torchelev.diagnosis.pace import IN_A_ROW, RECENT, Pace
+from torchelev.diagnosis.pace import PATIENCE, WINDOW, Pace
 
 
 @pytest.fixture(autouse=True)
 def _not_warned(monkeypatch):
-    monkeypatch.setattr(pace, "_warned", False)
+    monkeypatch.setattr(pace, "has_warned", False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -26,7 +26,7 @@ def noted(times, num_points=1000, watch=None):
 
 
 USUAL = [0.008, 0.009, 0.01] * 20
-ENOUGH = RECENT // 2 + IN_A_ROW  # until the median, and then for so many updates
+ENOUGH = WINDOW // 2 + PATIENCE  # until the median, and then for so many updates
 
 
 def test_updates_of_nine_times_their_usual_are_told_once_with_the_cure():
@@ -72,18 +72,18 @@ def test_larger_clouds_and_fewer_threads_are_told_apart():
 def test_updates_are_timed_by_the_maps_clock():
     emap, (cloud, T) = mapped(), scan(5)
     ticks = iter([t for k in range(40) for t in (k, k + (0.01 if k < 20 else 0.2))])
-    emap._pace = Pace(lambda: next(ticks))
+    emap.pace = Pace(lambda: next(ticks))
     for _ in range(19 + ENOUGH):
         emap.update(cloud, T, T, dt=0.1)
     with pytest.warns(RuntimeWarning, match="update: the last 9 updates took 200 ms"):
         emap.update(points=cloud, T_map_sensor=T, T_map_base=T, dt=0.1)
 
 
-def test_updates_elsewhere_are_not_timed():
-    emap, (cloud, _) = mapped(), scan(5)
-    emap._pace = Pace()
+def test_updates_elsewhere_are_not_timed(monkeypatch):
+    emap, (cloud, _), noted = mapped(), scan(5), []
+    monkeypatch.setattr(emap.pace, "note", lambda seconds, num_points: noted.append(num_points))
     elsewhere = torch.empty(cloud.shape, device="meta")
     pace.paced(lambda *_: None)(emap, elsewhere)
-    assert not emap._pace.recent
+    assert not noted
     pace.paced(lambda *_: None)(emap, cloud)
-    assert emap._pace.recent
+    assert noted == [600]

@@ -151,7 +151,7 @@ def test_a_layer_made_in_inference_mode_can_be_read_outside():
     emap = filtered(step("b", "counted_offset"))
     with torch.inference_mode():
         emap.layer("b")
-    assert not emap._filtered["b"][0].is_inference()
+    assert not emap.read_layer("b")[0].is_inference()
     xy = torch.zeros(2, 1, 2, requires_grad=True)
     emap.sample(xy, "b")[0].sum().backward()
     assert xy.grad.isfinite().all()

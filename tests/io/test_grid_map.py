@@ -17,9 +17,10 @@ def map_of(heights, resolution=0.5, corner=(0, 0)):
     heights = torch.tensor(heights)
     emap = small_map(cells=tuple(heights.shape), resolution=resolution)
     known = torch.isfinite(heights)
-    emap.corner.copy_(torch.tensor([corner]))
-    emap.elevation.copy_(torch.where(known, heights, 0.0))
-    emap.validity.copy_(known)
+    state = emap.state._replace(
+        corner=torch.tensor([corner]), elevation=torch.where(known, heights, 0.0)[None], validity=known[None]
+    )
+    emap.load_state(state)
     return emap
 
 

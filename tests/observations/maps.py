@@ -53,7 +53,7 @@ def random_map(seed, num_envs=2, known=0.6, cells=(20, 18), dtype=torch.float64)
     upper_bound = torch.where(bounded, state.upper_bound, torch.nan)
     corner = torch.tensor([[-10, -9], [70, -33]])[:num_envs]
     layers = dict(elevation=elevation, validity=validity, upper_bound=upper_bound, bounded=bounded)
-    emap._store(state._replace(corner=corner, **layers))
+    emap.load_state(state._replace(corner=corner, **layers))
     return emap, rng
 
 

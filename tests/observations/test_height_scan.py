@@ -197,7 +197,7 @@ def test_a_batch_reads_as_single_maps():
     scan = HeightScan.points(rng.uniform(-0.5, 0.5, (30, 2)), fill="lowest")
     for b in range(2):
         single = small_map(1, (20, 18), dtype=torch.float64)
-        single._store(type(emap.state)(*(v[b : b + 1] for v in emap.state[:-1]), single.statistics))
+        single.load_state(type(emap.state)(*(v[b : b + 1] for v in emap.state[:-1]), single.statistics))
         assert torch.equal(scan(single, T[b : b + 1])[0], scan(emap, T)[0][b : b + 1])
 
 

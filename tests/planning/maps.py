@@ -29,7 +29,7 @@ def random_map(seed, num_envs=2, known=0.7):
     emap = ground_map(num_envs=num_envs)
     state = random_state(np.random.default_rng(seed), emap.cfg.grid, num_envs, known)
     traversability = torch.where(state.validity, state.traversability, torch.nan)
-    emap._store(state._replace(corner=CORNER[:num_envs], traversability=traversability))
+    emap.load_state(state._replace(corner=CORNER[:num_envs], traversability=traversability))
     return emap
 
 

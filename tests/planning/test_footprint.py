@@ -99,7 +99,7 @@ def test_far_from_the_origin_nothing_changes():
 def test_float32_polygons_are_placed_in_float64():
     """In float32, a kilometre away, a cell of 0.1 m is known to a thousandth."""
     emap = small_map(1, CELLS, 0.1)
-    emap._store(random_state(np.random.default_rng(6), emap.cfg.grid, 1, 0.7, torch.float32))
+    emap.load_state(random_state(np.random.default_rng(6), emap.cfg.grid, 1, 0.7, torch.float32))
     emap.corner.copy_(torch.tensor([[80_000, -70_000]]))
     i, j = torch.meshgrid(torch.arange(0.0, 14.0, 0.02), torch.arange(1.0, 12.0), indexing="ij")
     low = (torch.stack([i, j], -1).flatten(0, 1).double() + emap.corner) * 0.1

@@ -23,7 +23,7 @@ def random_map(seed, num_envs=2, known=0.7, cells=(12, 10)):
     emap = small_map(num_envs, cells, dtype=torch.float64)
     state = random_state(np.random.default_rng(seed), emap.cfg.grid, num_envs, known)
     elevation = torch.where(state.validity, state.elevation, torch.nan)
-    emap._store(state._replace(corner=CORNER[:num_envs], elevation=elevation))
+    emap.load_state(state._replace(corner=CORNER[:num_envs], elevation=elevation))
     return emap
 
 

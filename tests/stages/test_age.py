@@ -29,7 +29,7 @@ def test_agrees_with_the_reference(seed, rate):
 
 def test_each_environment_has_its_own_dt():
     emap = small_map(2, aging=AgingConfig(variance_rate=0.01))
-    emap._store(random_state(np.random.default_rng(0), emap.cfg.grid, 2, known=1.0))
+    emap.load_state(random_state(np.random.default_rng(0), emap.cfg.grid, 2, known=1.0))
     before = emap.layer("variance"), emap.layer("time")
     emap.update(nans(2), pose(num_envs=2), None, torch.tensor([0.0, 2.0]))
     grown, passed = emap.layer("variance") - before[0], emap.layer("time") - before[1]
@@ -40,7 +40,7 @@ def test_each_environment_has_its_own_dt():
 
 def test_the_variance_grows_to_its_maximum():
     emap = small_map(1, aging=AgingConfig(variance_rate=0.4), fusion=FusionConfig(max_variance=0.5))
-    emap._store(random_state(np.random.default_rng(0), emap.cfg.grid, known=1.0))
+    emap.load_state(random_state(np.random.default_rng(0), emap.cfg.grid, known=1.0))
     for _ in range(2):
         emap.update(nans(1), pose(), None, 1.0)
     assert (emap.layer("variance") == 0.5).all()

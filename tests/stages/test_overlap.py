@@ -45,7 +45,7 @@ def test_agrees_with_the_reference(seed, radius, height, base_height, max_base_h
 def upstairs_map():
     """A map at z = 0 of which everything is known, and a robot 3 m above it."""
     emap = small_map(1)
-    emap._store(random_state(np.random.default_rng(0), emap.cfg.grid, known=1.0))
+    emap.load_state(random_state(np.random.default_rng(0), emap.cfg.grid, known=1.0))
     return emap, pose((0, 0, 3.0))
 
 

@@ -40,7 +40,7 @@ def test_normals_of_a_plane(gx, gy, altitude):
     x, y = emap.cell_centers()[0].unbind(-1)
     z = gx * x + gy * y + altitude
     state = emap.state._replace(elevation=z[None].float(), validity=(x < 0.35)[None])
-    emap._store(rate_surface(state, emap.cfg))
+    emap.load_state(rate_surface(state, emap.cfg))
     n = torch.stack([emap.layer(f"normal_{axis}") for axis in "xyz"], -1)
     known = emap.validity
     expected = torch.tensor([-gx, -gy, 1.0]) / math.sqrt(1 + gx * gx + gy * gy)
@@ -94,7 +94,7 @@ def test_cells_that_span_no_plane_have_neither_normal_nor_rating():
     rows = (torch.arange(30) % 5 == 0)[:, None].expand(30, 30)
     state = emap.state._replace(elevation=-1.19 * x[None].float(), validity=rows[None].clone())
     state = rate_surface(state, emap.cfg)
-    emap._store(state)
+    emap.load_state(state)
     for name in ("traversability", "normal_x", "normal_y", "normal_z"):
         assert emap.layer(name).isnan().all()
         values, valid = emap.sample(emap.cell_centers().flatten(1, 2), layer=name)

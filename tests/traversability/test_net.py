@@ -12,7 +12,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from tests.filters.filter_cases import SEEDS, SHAPES, SHARES, hill, in_large_cells
 from torchelev.robot import RobotConfig
 from torchelev.traversability.features import complete, extremes, features
-from torchelev.traversability.net import TraversabilityNet, best_in_reach, rate
+from torchelev.traversability.net import TraversabilityNet
+from torchelev.traversability.rate import rate
 from torchelev.traversability.stances import Way, in_cells, stances
 from torchelev.traversability.weight_file import RANGES, VERSION, conditions, ratios
 
@@ -302,15 +303,6 @@ def test_flat_ground_is_seen_as_flat():
     middle = seen[0, :, seen.shape[2] // 2, seen.shape[3] // 2]
     torch.testing.assert_close(middle[:5], torch.ones(5, dtype=torch.float64))  # shares of known cells
     torch.testing.assert_close(middle[5:], torch.zeros(13, dtype=torch.float64), atol=1e-12, rtol=0)
-
-
-def test_a_foot_takes_the_best_in_reach():
-    cell = torch.ones(1, 1, 12, 12)
-    cell[0, 0, 3, 4] = 0.2
-    best = best_in_reach(cell, in_cells(ROBOT, 0.04))  # a reach of 2 cells
-    expected = torch.ones(8, 8)
-    expected[:4, :5] = 0.2  # within 2 cells of (1, 2)
-    torch.testing.assert_close(best[0, 0], expected)
 
 
 def test_robots_at_the_ends_of_the_ranges_are_told_by_ones():

@@ -1,1 +1,4 @@
-"""What looks wrong in the inputs of a map, with the likely cause and a fix, and warnings about the pace of updates."""
+"""Diagnosis: what looks wrong with a map's inputs, the likely cause and a fix; and a warning when updates slow down.
+
+The errors that refuse inputs outright are in `torchelev.inputs` and `torchelev.checks`.
+"""

@@ -1,4 +1,4 @@
-"""Says once when updates on a CPU take many times as long as they did: threads that wait for busy cores."""
+"""A warning, once per process, when updates on a CPU become many times slower: threads wait for busy cores."""
 
 from __future__ import annotations
 
@@ -14,51 +14,55 @@ from typing import Any, TypeVar, cast
 
 import torch
 
-RECENT = 9  # updates whose median counts; less than half of them may compile
-SLOWER = 5.0  # times the best median
-IN_A_ROW = 5  # updates with such a median
+WINDOW = 9  # updates per median; more than half of them must be slow, so that compiling a few does not count
+PATIENCE = 5  # slow medians in a row before the warning
+_SLOW = 5.0  # times the best median
 
-_warned = False
+has_warned = False
 Update = TypeVar("Update", bound=Callable[..., None])
 
 
 @dataclass
-class Recent:
-    """Updates of one kind."""
+class _Times:
+    """Durations of similar updates."""
 
-    times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))  #: [s]
-    best: float = math.inf  #: [s] the lowest median so far
-    slow: int = 0  #: how many of the last updates in a row had a median many times that
+    last: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))  #: [s]
+    best: float = math.inf  #: [s] lowest median so far
+    num_slow: int = 0  #: slow medians in a row
 
 
 class Pace:
-    """How long updates take, apart for each order of the number of points and each number of threads."""
+    """Durations of updates, compared among those of as many threads and about as many points.
+
+    Args:
+        clock: returns the time [s]; another one for tests.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.clock = clock
-        self.recent: dict[tuple[int, int], Recent] = {}
+        self._times: dict[tuple[int, int], _Times] = {}
 
     def note(self, seconds: float, num_points: int) -> None:
-        """Take in one update; warn, once in a process, if updates have become many times slower."""
+        """Take in an update's duration, and warn if updates have become many times slower."""
         kind = num_points.bit_length(), torch.get_num_threads()
-        recent = self.recent.setdefault(kind, Recent())
-        recent.times.append(seconds)
-        if len(recent.times) < RECENT:
+        times = self._times.setdefault(kind, _Times())
+        times.last.append(seconds)
+        if len(times.last) < WINDOW:
             return
-        median = statistics.median(recent.times)
-        recent.best = min(median, recent.best)
-        recent.slow = recent.slow + 1 if median > SLOWER * recent.best else 0
-        if recent.slow >= IN_A_ROW:
-            _warn(median, recent.best)
+        median = statistics.median(times.last)
+        times.best = min(median, times.best)
+        times.num_slow = times.num_slow + 1 if median > _SLOW * times.best else 0
+        if times.num_slow >= PATIENCE:
+            _warn(median, times.best)
 
 
 def _warn(median: float, best: float) -> None:
-    global _warned
-    if _warned:
+    global has_warned
+    if has_warned:
         return
-    _warned = True
+    has_warned = True
     warnings.warn(
-        f"update: the last {RECENT} updates took {1e3 * median:.3g} ms (median), {median / best:.0f} times the best, "
+        f"update: the last {WINDOW} updates took {1e3 * median:.3g} ms (median), {median / best:.0f} times the best, "
         f"{1e3 * best:.3g} ms. The likely cause: other processes are busy on the same cores, and OpenMP's threads spin "
         "while they wait for each other. Set OMP_WAIT_POLICY=PASSIVE in the environment before torch is imported, or "
         f"call torch.set_num_threads with the number of free cores (now {torch.get_num_threads()}).",
@@ -68,16 +72,16 @@ def _warn(median: float, best: float) -> None:
 
 
 def paced(update: Update) -> Update:
-    """Let a map's `update` note how long it takes on a CPU. On a GPU, where it returns early, nothing is noted."""
+    """Note in a map's `pace` how long its `update` takes on a CPU. A GPU returns early, so nothing is noted there."""
 
     @functools.wraps(update)
     def timed(emap: Any, /, *args: Any, **kwargs: Any) -> None:
-        if torch.compiler.is_compiling():  # of the caller's own graph, which no clock belongs in
+        if torch.compiler.is_compiling():  # a graph of the caller's own cannot contain a clock
             return update(emap, *args, **kwargs)
-        start = emap._pace.clock()
+        start = emap.pace.clock()
         update(emap, *args, **kwargs)
         points: Any = args[0] if args else kwargs["points"]
         if points.device.type == "cpu":
-            emap._pace.note(emap._pace.clock() - start, points.numel() // 3)
+            emap.pace.note(emap.pace.clock() - start, points.numel() // 3)
 
     return cast(Update, timed)

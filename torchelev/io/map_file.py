@@ -17,9 +17,10 @@ from torchelev import checks
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.map_buffers import name_tensors, state_of
 from torchelev.output_files import atomic_file
 from torchelev.pipeline import rate_surface
-from torchelev.state import MapState, Statistics
+from torchelev.state import MapState
 from torchelev.traversability.net import TraversabilityNet
 
 FORMAT, VERSION = "torchelev map", 2
@@ -44,7 +45,7 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
     header |= {"head": None if emap.head is None else emap.head.config}
-    arrays: dict[str, Any] = {name: as_array(value) for name, value in _tensors(emap.state).items()}
+    arrays: dict[str, Any] = {name: as_array(value) for name, value in name_tensors(emap.state).items()}
     arrays |= {f"head_{name}": as_array(value) for name, value in _head(emap).items()}
     with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
@@ -82,8 +83,8 @@ def load_map(
         value.copy_(torch.from_numpy(found))
     state = _state(path, arrays, emap.state, ids, header["version"])
     if header["version"] < VERSION:
-        state = rate_surface(state, emap.cfg, emap._weights)
-    emap._store(state)
+        state = rate_surface(state, emap.cfg, None if emap.head is None else emap.head.weights)
+    emap.load_state(state)
     return emap
 
 
@@ -110,12 +111,6 @@ def read_npz(path: str | Path, hint: str) -> dict[str, NDArray]:
         except Exception as error:  # zipfile, zlib and NumPy raise all kinds, depending on the damaged byte
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(f"{path}: damaged, or not an .npz file ({reason}); {hint}") from error
-
-
-def _tensors(state: MapState) -> dict[str, Tensor]:
-    """Return the tensors of a state by their names in the file."""
-    layers = {name: getattr(state, name) for name in MapState._fields[:-1]}
-    return layers | {f"last_{name}": value for name, value in state.statistics._asdict().items()}
 
 
 def _header(path: str | Path, arrays: dict[str, NDArray]) -> dict[str, Any]:
@@ -159,13 +154,12 @@ def _ids(env_ids: Sequence[int] | Tensor | None, num_envs: int) -> Tensor:
 def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Tensor, version: int) -> MapState:
     """Return the state of environments `ids` from a file's arrays; what version 1 lacks is taken from `like`."""
     B, values = len(arrays["corner"]), {}
-    for name, blank in _tensors(like).items():
+    for name, blank in name_tensors(like).items():
         if version < VERSION and name in _NEW_LAYERS:
             values[name] = blank[:1].expand(len(ids), *blank.shape[1:])
             continue
         values[name] = torch.from_numpy(_array(path, arrays, name, blank, (B, *blank.shape[1:])))[ids]
-    statistics = Statistics(*(values.pop(f"last_{name}") for name in Statistics._fields))
-    return MapState(statistics=statistics, **values)
+    return state_of(values)
 
 
 def _array(path: str | Path, arrays: dict[str, NDArray], name: str, like: Tensor, shape: tuple[int, ...]) -> NDArray:

@@ -93,7 +93,7 @@ class MapImage:
         uv = self._pattern.place(T_map_base, base, state.corner, grid.resolution, state.elevation.dtype)
         reference = base[..., 2].to(uv.dtype) - self.nominal_height
         sources = dict.fromkeys("elevation" if name == "validity" else name for name in self.layers)
-        sampled = read_points([emap._read(name, state) for name in sources], uv, grid, self.mode)
+        sampled = read_points([emap.read_layer(name, state) for name in sources], uv, grid, self.mode)
         read = dict(zip(sources, sampled, strict=True))
         images = torch.stack([_channel(name, read, reference) for name in self.layers], 1)
         return torch.where(torch.isfinite(reference)[:, None], images, 0.0).unflatten(-1, self.shape[1:])

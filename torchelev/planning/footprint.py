@@ -159,7 +159,7 @@ def _read_ground(
     is_rated = cfg.layer != "traversability" or emap.cfg.traversability is not None
     hint = "give ElevationMapConfig a TraversabilityConfig, or FootprintConfig another layer"
     require(is_rated, "traversability", "must not be switched off", "None", hint)
-    values, known = emap._read(cfg.layer, state)
+    values, known = emap.read_layer(cfg.layer, state)
     uv, is_usable = _to_cells(emap, polygons, cfg, (emap.state if state is None else state).corner)
     cells = rasterize(torch.where(is_usable[..., None, None], uv, 0.0), cfg.max_cells(emap.cfg.grid) + 1)
     cells = cells._replace(inside=cells.inside & is_usable[..., None, None])

@@ -109,7 +109,7 @@ def plan(
     value = cost_to_go(cost, target, resolution=grid.resolution, rounds=rounds)
     path = descend(value, cost, start.cell, resolution=grid.resolution, max_cells=max_cells)
     reached = path.reached & start.is_inside
-    rated = emap._read("traversability", state)[1]
+    rated = emap.read_layer("traversability", state)[1]
     radius = cfg.stand_radius / grid.resolution
     below = mark_disc(start.cell, cost, radius) if standing is None else mark_standing_cells(emap, standing, state)
     reason = find_reason(cost, value, rated, below, start, goal, reached)

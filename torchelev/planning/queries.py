@@ -108,7 +108,7 @@ def submap(
     h, w = (whole_cells(n, length, grid.resolution) for n, length in (("length_x", length_x), ("length_y", length_y)))
     hint = "give names such as ('elevation',)"
     require(not isinstance(layers, str) and len(layers) > 0, "layers", "must be one or more names", repr(layers), hint)
-    found = {name: emap._read(name, state) for name in layers}
+    found = {name: emap.read_layer(name, state) for name in layers}
     first = _find_first_cell(emap, center_xy, (h, w))
     corner = (emap.state if state is None else state).corner
     cell = _number_cells(emap, first - corner, (h, w))

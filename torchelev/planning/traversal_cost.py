@@ -104,7 +104,7 @@ def traversal_cost(
         shape = tuple(state.elevation.shape)
         fits = tuple(confidence.shape) == shape
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
-    rated, bound = emap._read("traversability", state), emap._read("upper_bound", state)
+    rated, bound = emap.read_layer("traversability", state), emap.read_layer("upper_bound", state)
     below = None if standing is None else mark_standing_cells(emap, standing, state)
     return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, below)
 

@@ -19,7 +19,9 @@ from torchelev.ops.windows import window_maximum
 from torchelev.robot import RobotConfig
 from torchelev.stages.surface import Ground, fit_plane
 from torchelev.state import MapState
-from torchelev.traversability.net import Rating, TraversabilityNet, Weights, rate
+from torchelev.traversability.net import Rating, TraversabilityNet
+from torchelev.traversability.rate import rate
+from torchelev.traversability.weight_file import Weights
 
 __all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "TraversabilityConfig", "TraversabilityNet"]
 

@@ -1,4 +1,4 @@
-"""The learned head's weights: their shapes, their file, and the robots that they are trained for."""
+"""The learned head's weights: their shapes, the file that holds them, and the robots that they are trained for."""
 
 from __future__ import annotations
 
@@ -19,30 +19,33 @@ from torchelev.traversability.features import NUM_FEATURES
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-RESOLUTIONS = (0.02, 0.1)  # [m]
-ROUNDING = 1e-6  # of ratios
-VERSION = 2  # of the file
-CONFIG = {"cell_channels", "stance_channels", "ranges"}
+RESOLUTIONS = (0.02, 0.1)  # [m] limits for every head
+VERSION = 2  # of the file format
+_TOLERANCE = 1e-6  # relative, of limits
+_CONFIG_KEYS = {"cell_channels", "stance_channels", "ranges"}
 
 
 class Weights(NamedTuple):
-    """The head's parameters: C channels of each cell, D with those of its surroundings, S of each stance."""
+    """The head's parameters, layer by layer (see `rate`).
 
-    cell: Float[Tensor, "C F"]  #: of the features of a cell
-    cell_bias: Float[Tensor, "C"]  #: added to it
-    cell_condition: Float[Tensor, "C N"]  #: of the robot's ratios
-    foot: Float[Tensor, "S D"]  #: of a cell with a foot on it
-    center: Float[Tensor, "S D"]  #: of the cell under the body's centre
-    attitude: Float[Tensor, "S 3"]  #: of its slope, step and belly
-    stance_bias: Float[Tensor, "S"]  #: added to them
-    stance_condition: Float[Tensor, "S N"]  #: of the robot's ratios
-    mixed: Float[Tensor, "C S+2"]  #: of the means over headings, the last two of `stands` and `complete`
-    mixed_bias: Float[Tensor, "C"]  #: added to it
-    answer: Float[Tensor, "2 C"]  #: of the mixed channels, for both answers
-    answer_bias: Float[Tensor, "2"]  #: added to it
+    F features, C channels of a cell, D of a cell and the minima in a foot's reach, S of a stance, N ratios of a robot.
+    """
+
+    cell: Float[Tensor, "C F"]  #: first layer: the features of a cell
+    cell_bias: Float[Tensor, "C"]  #: first layer
+    cell_condition: Float[Tensor, "C N"]  #: first layer: the robot's ratios, added to the bias
+    foot: Float[Tensor, "S D"]  #: second layer: the cell under each foot
+    center: Float[Tensor, "S D"]  #: second layer: the cell under the body's centre
+    attitude: Float[Tensor, "S 3"]  #: second layer: the body's slope, step and belly
+    stance_bias: Float[Tensor, "S"]  #: second layer
+    stance_condition: Float[Tensor, "S N"]  #: second layer: the robot's ratios, added to the bias
+    mixed: Float[Tensor, "C S+2"]  #: third layer: means over the headings of S channels, `stands` and `complete`
+    mixed_bias: Float[Tensor, "C"]  #: third layer
+    answer: Float[Tensor, "2 C"]  #: output: logits of traversability and confidence
+    answer_bias: Float[Tensor, "2"]  #: output
 
     def detached(self) -> Weights:
-        """Return the weights without gradient."""
+        """Return the weights without gradients."""
         return Weights(*(value.detach() for value in self))
 
 
@@ -67,7 +70,7 @@ def weight_shapes(cell_channels: int, stance_channels: int) -> dict[str, tuple[i
 
 
 def ratios(robot: RobotConfig, resolution: float) -> dict[str, float]:
-    """Return what windows and dimensionless heights leave open of a robot's and the cells' sizes."""
+    """Return a robot's proportions, which tell the head what its windows and dimensionless heights do not."""
     return {
         "robot.width / length": robot.width / robot.length,
         "robot.clearance / step_height": robot.clearance / robot.step_height,
@@ -75,11 +78,11 @@ def ratios(robot: RobotConfig, resolution: float) -> dict[str, float]:
         "robot.foot_reach / length": robot.foot_reach / robot.length,
         "tan(robot.max_slope) * length / step_height": math.tan(robot.max_slope) * robot.length / robot.step_height,
         "resolution / robot.length": resolution / robot.length,
-        "robot.step_height": robot.step_height,  # [m] noise and drift have lengths of their own
+        "robot.step_height": robot.step_height,  # [m] as sensor noise and drift do not scale with the robot
     }
 
 
-# Of the robots that weights are trained for unless they say otherwise.
+# Limits of the ratios of the robots that a head is trained for by default.
 RANGES = {
     "robot.width / length": (0.4, 0.8),
     "robot.clearance / step_height": (0.85, 3.4),
@@ -92,67 +95,69 @@ RANGES = {
 
 
 def conditions(robot: RobotConfig, resolution: float) -> list[float]:
-    """Return the ratios' logarithms, -1 to 1 over RANGES."""
+    """Return the logarithms of the ratios, scaled to -1 and 1 at the limits in RANGES."""
     logs = ((math.log(ratio), *map(math.log, RANGES[name])) for name, ratio in ratios(robot, resolution).items())
     return [(2 * value - low - high) / (high - low) for value, low, high in logs]
 
 
 def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotConfig, resolution: float) -> None:
-    """Raise ValueError for a resolution that no head is made for, or a robot outside of the ranges."""
+    """Refuse a resolution outside RESOLUTIONS, and a robot whose ratios are outside the ranges."""
     low, high = RESOLUTIONS
-    within = low * (1 - ROUNDING) <= resolution <= high * (1 + ROUNDING)
-    require(within, "resolution", f"must be {low:g} to {high:g} m", resolution, "resample the map")
+    fits = low * (1 - _TOLERANCE) <= resolution <= high * (1 + _TOLERANCE)
+    require(fits, "resolution", f"must be {low:g} to {high:g} m", resolution, "resample the map")
     hint = "train a head for this robot: python -m training.traversability --robot ..."
     for name, ratio in ratios(robot, resolution).items():
         low, high = ranges[name]
-        within = low * (1 - ROUNDING) <= ratio <= high * (1 + ROUNDING)
-        require(within, name, f"must be within {low:.3g} to {high:.3g}, as trained", f"{ratio:.4g}", hint)
+        fits = low * (1 - _TOLERANCE) <= ratio <= high * (1 + _TOLERANCE)
+        require(fits, name, f"must be within {low:.3g} to {high:.3g}, as trained", f"{ratio:.4g}", hint)
 
 
 def write_weights(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
-    """Write a head's config and weights."""
-    whole = io.BytesIO()  # into a file, torch raises RuntimeError where the disk is full
-    torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, whole)
+    """Write a head's config and weights to a file. Raises WriteError if it cannot be written."""
+    content = io.BytesIO()  # written to a file by torch itself, a full disk would raise RuntimeError
+    torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, content)
     with atomic_file(path) as file:
-        file.write(whole.getbuffer())
+        file.write(content.getbuffer())
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the config and the weights of a file.
+    """Return the config and the weights in a file.
 
-    Raises FileNotFoundError without the file, ValueError if it holds anything else, or weights of another version.
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is damaged, or holds anything else or weights of another version.
     """
     hint = "write it with TraversabilityNet.save"
     missing = "train weights: python -m training.traversability"
     require(path.exists(), str(path), "must be a file of weights", "no file", missing, FileNotFoundError)
     try:
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # what torch raises depends on which byte is damaged
+    except Exception as error:  # the type depends on which byte is damaged
         raise ValueError(message(str(path), "must be a file of weights", type(error).__name__, hint)) from error
     version = found.get("version") if isinstance(found, dict) else None
     require(isinstance(version, int), str(path), "must be a file of weights", "something else", hint)
     require(version == VERSION, str(path), f"must be of version {VERSION}", version, "train with this torchelev")
-    require(_is_whole(found), str(path), "must be a file of weights", "other parts or types", hint)
+    require(_is_complete(found), str(path), "must be a file of weights", "other parts or types", hint)
     return found["config"], found["state_dict"]
 
 
-def _is_whole(found: dict[str, Any]) -> bool:
-    """Tell whether a file's content has all parts, of their types."""
+def _is_complete(found: dict[str, Any]) -> bool:
+    """Tell whether a file's content has all its parts, of the right types."""
     config, state = found.get("config"), found.get("state_dict")
-    if not isinstance(config, dict) or config.keys() != CONFIG or not isinstance(state, dict):
+    if not isinstance(config, dict) or config.keys() != _CONFIG_KEYS or not isinstance(state, dict):
         return False
     ranges = config["ranges"]
-    sizes = all(type(config[name]) is int and config[name] > 0 for name in ("cell_channels", "stance_channels"))
-    tensors = all(isinstance(value, Tensor) for value in state.values())
-    pairs = isinstance(ranges, dict) and ranges.keys() == RANGES.keys()
-    return sizes and tensors and pairs and all(len(pair) == 2 for pair in ranges.values())
+    has_sizes = all(type(config[name]) is int and config[name] > 0 for name in ("cell_channels", "stance_channels"))
+    has_tensors = all(isinstance(value, Tensor) for value in state.values())
+    has_ranges = isinstance(ranges, dict) and ranges.keys() == RANGES.keys()
+    return has_sizes and has_tensors and has_ranges and all(len(pair) == 2 for pair in ranges.values())
 
 
 def require_same_shapes(path: Path, expected: Mapping[str, Tensor], actual: Mapping[str, Tensor]) -> None:
-    """Raise ValueError unless weights have the shapes that they should, and are finite."""
-    shapes, others = ({name: tuple(value.shape) for name, value in each.items()} for each in (expected, actual))
-    differ = [name for name in shapes | others if shapes.get(name) != others.get(name)]
-    text = ", ".join(f"{name} {others.get(name)} instead of {shapes.get(name)}" for name in differ)
-    require(not differ, str(path), "must hold weights of the shapes that its config says", text, "train them again")
-    wild = ", ".join(name for name, value in actual.items() if not bool(torch.isfinite(value).all()))
-    require(not wild, str(path), "must be finite", f"NaN or inf in {wild}", "train them again")
+    """Refuse weights of other names or shapes than expected, and weights that are not finite."""
+    shapes, found = ({name: tuple(value.shape) for name, value in each.items()} for each in (expected, actual))
+    wrong = [name for name in shapes | found if shapes.get(name) != found.get(name)]
+    text = ", ".join(f"{name} {found.get(name)} instead of {shapes.get(name)}" for name in wrong)
+    require(not wrong, str(path), "must hold weights of the shapes that its config says", text, "train them again")
+    bad = ", ".join(name for name, value in actual.items() if not bool(torch.isfinite(value).all()))
+    require(not bad, str(path), "must be finite", f"NaN or inf in {bad}", "train them again")

@@ -511,7 +511,7 @@ def test_a_ray_below_a_challenger_refutes_it(challenger, stays):
     ground = torch.tensor([[[2.0, y, -1.0] for y in (-0.05, 0.0, 0.05) for _ in range(4)]])
     emap.update(ground, T, dt=0.1)
     state = emap.state
-    emap._store(
+    emap.load_state(
         state._replace(
             validity=torch.ones_like(state.validity),
             support=torch.full_like(state.support, 60.0),

@@ -1,0 +1,34 @@
+"""Environments in chunks, which an update works on one after the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from torchelev.grid import GridConfig
+from torchelev.inputs import Inputs
+from torchelev.state import MapState, map_layers
+
+CPU_CELLS = 2**18  # cells per chunk on a CPU; measured: 64 maps of 64 x 64 cells at a time, a third faster than 256
+
+
+def make_chunks(num_envs: int, grid: GridConfig, device: torch.device, max_envs: int | None) -> list[slice]:
+    """Divide the environments into chunks of equal size, up to rounding.
+
+    `max_envs` limits a chunk. None: no limit on a GPU, and on a CPU as many as fit into its caches.
+    """
+    if max_envs is None:
+        max_envs = max(1, CPU_CELLS // grid.num_cells) if device.type == "cpu" else num_envs
+    size = math.ceil(num_envs / math.ceil(num_envs / max_envs))
+    return [slice(first, first + size) for first in range(0, num_envs, size)]
+
+
+def run_in_chunks(update: Callable[..., None], state: MapState, inputs: Inputs, chunks: list[slice]) -> None:
+    """Call `update(state, *inputs)` on each chunk of the environments."""
+    if len(chunks) == 1:
+        return update(state, *inputs)
+    for envs in chunks:
+        part = map_layers(lambda layer, envs=envs: layer[envs], state)
+        update(part, *(None if value is None else value[envs] for value in inputs))

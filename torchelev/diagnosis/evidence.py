@@ -1,0 +1,126 @@
+"""The evidence that a diagnosis rests on: recent inputs, statistics and state of one environment, on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchelev.config import ElevationMapConfig
+from torchelev.diagnosis.history import PastUpdate
+from torchelev.diagnosis.pose_hypotheses import Fit, Scan, explain
+from torchelev.grid import cell_centers
+from torchelev.stages.measure import measure
+from torchelev.state import MapState, Measurement
+
+MIN_POINTS = 20  # points that a fraction or a median must rest on
+GATES = ("invalid", "range", "body", "overhang")  # of the sensor, in their order
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of one environment. Lists have one entry per update."""
+
+    cfg: ElevationMapConfig  #: configuration of the map
+    numbers: list[int]  #: numbers of the updates
+    points: list[list[NDArray]]  #: (n, 3) [m] sensor frame, per sensor; not all are finite
+    poses: list[list[NDArray]]  #: T_map_sensor, per sensor
+    bases: list[NDArray | None]  #: T_map_base; None where none was given
+    dt: NDArray  #: [s]
+    gates: dict[str, int]  #: points of all updates, by the gate that rejected them
+    used: list[NDArray]  #: mask of the points that passed the sensor's gates
+    statistics: dict[str, float]  #: of the last update
+    num_known: int  #: known cells
+    num_near: int  #: known cells within the radius of overlap clearance
+    oldest: float  #: [s] since the last hit of the known cell that waits longest
+    center: NDArray  #: (2,) [m] centre of the window
+
+    @cached_property
+    def num_points(self) -> int:
+        """Number of points of all updates."""
+        return sum(len(cloud) for clouds in self.points for cloud in clouds)
+
+    @cached_property
+    def scans(self) -> list[Scan]:
+        """Each sensor's finite points, with its pose."""
+        updates = enumerate(zip(self.points, self.poses, strict=True))
+        pairs = [(k, cloud, T) for k, update in updates for cloud, T in zip(*update, strict=True)]
+        finite = [(k, cloud[np.isfinite(cloud).all(1)], T) for k, cloud, T in pairs if np.isfinite(T).all()]
+        return [Scan(cloud, T, k) for k, cloud, T in finite if len(cloud)]
+
+    @cached_property
+    def distances(self) -> NDArray:
+        """[m] of the finite points from their sensors."""
+        return np.concatenate([np.linalg.norm(scan.points, axis=1) for scan in self.scans] or [np.zeros(0)])
+
+    @cached_property
+    def is_in_millimetres(self) -> bool:
+        """Whether the points lie hundreds of times as far away as sensors measure."""
+        if len(self.distances) < MIN_POINTS or self.gates["range"] < 0.5 * len(self.distances):
+            return False
+        return float(np.median(self.distances)) >= max(250.0, 2 * self.cfg.sensor.max_distance)
+
+    @cached_property
+    def explained(self) -> tuple[Fit, list[str]]:
+        """How well poses and points fit, and the mistakes that would explain why they do not."""
+        is_comparable = self.scans and not self.is_in_millimetres
+        return explain(self.scans) if is_comparable else (Fit(np.nan, np.nan, np.nan), [])
+
+    @cached_property
+    def positions(self) -> NDArray:
+        """(n, 3) [m] of the base, or of the first sensor where the base is unknown, per update."""
+        poses = [sensors[0] if base is None else base for sensors, base in zip(self.poses, self.bases, strict=True)]
+        return np.array([T[:3, 3] for T in poses])
+
+    @cached_property
+    def travel(self) -> float:
+        """[m] that the robot moved along the map's axis along which it moved most."""
+        return float(np.ptp(self.positions, axis=0).max())
+
+    def used_points(self, k: int) -> NDArray:
+        """Return the points (n, 3) [m] of update k that passed the sensor's gates, map frame."""
+        clouds = [cloud @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(self.points[k], self.poses[k], strict=True)]
+        return np.concatenate(clouds)[self.used[k]]
+
+
+def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[PastUpdate], env: int) -> Evidence:
+    """Read what is known of one environment back to the host."""
+    inputs = [update.inputs for update in updates]
+    measured = [_measure_again(cfg, update, env) for update in updates]
+    known, corner = state.validity[env], state.corner[env].double().cpu().numpy()
+    return Evidence(
+        cfg=cfg,
+        numbers=[update.number for update in updates],
+        points=[list(given.points[env].double().cpu().numpy()) for given in inputs],
+        poses=[list(given.T_map_sensor[env].double().cpu().numpy()) for given in inputs],
+        bases=[None if given.T_map_base is None else given.T_map_base[env].double().cpu().numpy() for given in inputs],
+        dt=np.array([float(given.dt[env]) for given in inputs]),
+        gates={name: sum(int(getattr(m, f"rejected_{name}")) for m in measured) for name in GATES},
+        used=[m.used[0].cpu().numpy() for m in measured],
+        statistics={name: float(value[env]) for name, value in state.statistics._asdict().items()},
+        num_known=int(known.sum()),
+        num_near=_count_near(cfg, state, updates[-1], env),
+        oldest=float(torch.where(known, state.time[env], 0.0).max()),
+        center=corner * cfg.grid.resolution + [cfg.grid.length_x / 2, cfg.grid.length_y / 2],
+    )
+
+
+def _measure_again(cfg: ElevationMapConfig, update: PastUpdate, env: int) -> Measurement:
+    """Return one environment's measurement of an update's thinned points."""
+    inputs = [None if value is None else value[env, None] for value in update.inputs]
+    points, T_map_sensor, T_map_base, dt, variance = inputs
+    assert points is not None and T_map_sensor is not None and dt is not None
+    return measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, torch.float32)
+
+
+def _count_near(cfg: ElevationMapConfig, state: MapState, update: PastUpdate, env: int) -> int:
+    """Count the known cells on which overlap clearance works."""
+    T_map_base = update.inputs.T_map_base
+    if T_map_base is None or cfg.overlap is None:
+        return 0
+    away = cell_centers(state.corner[env, None], cfg.grid)[0] - T_map_base[env, :2, 3]
+    return int((state.validity[env] & (away.norm(dim=-1) <= cfg.overlap.radius)).sum())
