@@ -11,7 +11,12 @@ MACHINE = str(RECORDED.pop("machine"))
 FOLLOWS_CHOICES = ("plan", "path check", "plane", "rollout")
 
 
-@pytest.mark.parametrize("part", PARTS)
+COMPILED = [pytest.mark.compiles, pytest.mark.slow(110)]
+MARKS = {"compiled float32": [*COMPILED, pytest.mark.xdist_group("recorded update")], "compiled float64": COMPILED}
+MARKS["rollout"] = [pytest.mark.slow(6)]
+
+
+@pytest.mark.parametrize("part", [pytest.param(part, marks=MARKS.get(part, ())) for part in PARTS])
 def test_answers_are_those_recorded(part):
     answers = PARTS[part]()
     start = f"{part}: "

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._pytree import tree_leaves
 
+from tests.answers import CELLS, config
 from tests.helpers import (
     differences,
     floats_finite,
@@ -32,8 +33,8 @@ def emap():
     return mapped()
 
 
-def mapped():
-    emap = small_map(B)
+def mapped(**stages):
+    emap = small_map(B, **stages)
     T = random_poses(np.random.default_rng(0), B)
     emap.update(random_clouds(np.random.default_rng(1), T, 200), T, T, 0.1)
     return emap
@@ -132,12 +133,16 @@ def test_dt_is_required(emap, method):
 UNSOUND = {"NaN": torch.nan, "infinite": torch.inf, "far": 1e30}
 
 
-@pytest.mark.parametrize("compiled", [False, True])
+COMPILED = [pytest.mark.compiles, pytest.mark.slow(5), pytest.mark.xdist_group("recorded update")]
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=COMPILED)])
 @pytest.mark.parametrize("of", ["sensor", "base", "both"])
 def test_one_bad_pose_that_was_not_read_leaves_one_robot_out(of, compiled, monkeypatch):
-    """As on a GPU, where the host does not wait to read it."""
+    """As on a GPU, where the host does not wait to read it. The config is that of the recorded answers."""
     monkeypatch.setattr(checks, "readable", lambda *_: False)
-    maps, good = [mapped(), mapped()], pose(num_envs=B)
+    maps, good = [mapped(cells=(CELLS, CELLS), sensor=config().sensor) for _ in range(2)], pose(num_envs=B)
+    assert maps[0].cfg == config()
     before = map_layers(torch.clone, maps[0].state)
     cloud, far = torch.zeros(B, N, 3) - 1, pose((3.0, 0.0, 1.0), num_envs=B)
     bad = {name: torch.cat([far[:1], torch.full((1, 4, 4), value)]) for name, value in UNSOUND.items()}
@@ -321,6 +326,7 @@ def test_poses_far_away(x, y, z):
     assert floats_finite(emap.state) == []
 
 
+@pytest.mark.slow(2)
 @given(st.integers(0, 10_000), st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64]))
 def test_random_garbage_never_poisons_the_map(seed, dtype):
     rng = np.random.default_rng(seed)

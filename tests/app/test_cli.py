@@ -92,6 +92,7 @@ def test_recording_in_map_out(run, recording, tmp_path):
         assert word in out
 
 
+@pytest.mark.slow(2)
 def test_defaults_write_map_here(run, recording, tmp_path):
     assert run("map", recording / "scans", "--poses", recording / "poses.txt")[0] == 0
     assert load_npz(tmp_path / "map.npz").layers["elevation"].shape == (200, 200)
@@ -105,6 +106,7 @@ def test_size_is_rounded_up_to_whole_cells(run, recording, tmp_path):
     assert load_npz(tmp_path / "map.npz").layers["elevation"].shape == (17, 17)
 
 
+@pytest.mark.slow(1)
 def test_config_file_and_options_over_it(run, recording, tmp_path):
     (tmp_path / "cfg.yaml").write_text(
         "grid: {resolution: 0.2, length_x: 4, length_y: 6}\nsensor:\n  noise_factor: 2e-4\nraycast: null\n"
@@ -129,6 +131,7 @@ def test_filters_are_drawn_and_listed(run, recording, tmp_path, monkeypatch):
     assert [line.split("(")[0] for line in out.splitlines()[::2]] == sorted(FILTERS)
 
 
+@pytest.mark.slow(1)
 def test_fixed_window_keeps_its_place(run, recording, tmp_path):
     assert run("map", recording, "--fixed", "--size", 3)[0] == 0
     assert load_npz(tmp_path / "map.npz").center[:2] == pytest.approx([0.375, 0], abs=0.051)
@@ -136,6 +139,7 @@ def test_fixed_window_keeps_its_place(run, recording, tmp_path):
     assert "--fixed --size 2 keeps all" in out
 
 
+@pytest.mark.slow(2)
 def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
     assert run("map", recording, "--size", 8)[0] == 0
     assert load_npz(tmp_path / "map.npz").config["overlap"] is None
@@ -149,6 +153,7 @@ def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
     assert not np.isfinite(load_npz(tmp_path / "map.npz").layers["elevation"]).any()
 
 
+@pytest.mark.slow(2)
 def test_poses_of_the_base_with_extrinsics(run, recording, tmp_path):
     mount = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, -0.1], [0, 0, 1, 0.5], [0, 0, 0, 1]])
     assert run("map", recording, "--size", 8, "--out", "sensor")[0] == 0
@@ -222,6 +227,7 @@ def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
     assert not (tmp_path / "map.npz").exists()  # which may hold an earlier, whole map
 
 
+@pytest.mark.slow(1)
 def test_poses_that_contradict_each_other_are_warned_of(run, recording):
     """Every other scan is a metre higher than its pose says."""
     poses = np.loadtxt(recording / "poses.txt")
@@ -325,6 +331,7 @@ def test_millimetres_are_told_to_be_units(run, recording):
     assert code == 0 and "as of millimetres: check units" in err and "pose" not in err
 
 
+@pytest.mark.slow(3)
 def test_a_second_map_in_the_recordings_folder_takes_the_same_scans(run, recording, tmp_path, monkeypatch):
     monkeypatch.chdir(recording)
     for scans in (recording / "scans", recording):
@@ -373,6 +380,7 @@ def test_outputs_are_checked_before_mapping(run, recording, tmp_path, monkeypatc
     assert run("map", recording, "--out", "/dev/full")[0] == 2
 
 
+@pytest.mark.slow(1)
 def test_the_size_limit_is_checked_before_mapping(recording, tmp_path):
     (tmp_path / "map.npz").write_bytes(b"older")
     command = f"ulimit -f 20; exec {sys.executable} -m torchelev map {recording} --out {tmp_path / 'map'}"
@@ -382,6 +390,7 @@ def test_the_size_limit_is_checked_before_mapping(recording, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["drive", "map.npz"]
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("suffix", [".npz", ".png", ".ply"])
 def test_what_cannot_be_written_is_kept_elsewhere(run, recording, tmp_path, monkeypatch, suffix):
     from torchelev import output_files
@@ -451,6 +460,7 @@ def test_demo_prints_what_it_measured(run, monkeypatch):
     assert str(asked["out"]) == "picture.png" and asked["progress"]
 
 
+@pytest.mark.slow(1)
 def test_runs_as_a_module():
     result = subprocess.run([sys.executable, "-m", "torchelev", "--help"], capture_output=True, text=True, check=True)
     assert "map" in result.stdout and "demo" in result.stdout

@@ -102,6 +102,7 @@ def eager(monkeypatch):
     monkeypatch.setattr(ElevationMap, "compile", lambda self: None)
 
 
+@pytest.mark.slow(3)
 def test_long_run_writes_every_block(tmp_path, monkeypatch, capsys, eager):
     monkeypatch.setattr(long_run, "CASES", {"two robots": (2, 64, 400, 4)})
     monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))
@@ -161,6 +162,7 @@ def test_drives_of_a_long_run_vary_in_length_and_place():
     torch.testing.assert_close(scans[49][1][0, 0, 3].item(), 0.04 * 50)
 
 
+@pytest.mark.slow(6)
 @pytest.mark.parametrize("section", ["rays", "points", "robots", "cells"])
 def test_sections_measure_at_small_sizes(section, monkeypatch, eager):
     small = {"RAYS": [1.2, 4.8], "POINTS": [6276, 43074, 50000], "ROBOTS": [1, 2, 3], "CELLS": [50, 60, 70]}
@@ -171,6 +173,7 @@ def test_sections_measure_at_small_sizes(section, monkeypatch, eager):
     assert len(list(timings(result))) >= 2
 
 
+@pytest.mark.slow(3)
 def test_one_section_into_a_new_folder(tmp_path, monkeypatch, capsys, eager):
     monkeypatch.setattr(speed_sections, "RAYS", [1.2, 4.8])
     monkeypatch.setattr(sys, "argv", ["run", "rays", "--out", str(tmp_path), "--seconds", "0.001"])
@@ -210,6 +213,7 @@ def run_compare(new, old):
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
 
 
+@pytest.mark.slow(10)
 def test_compare_fails_on_a_regression(tmp_path):
     fast, slow = tmp_path / "fast.json", tmp_path / "slow.json"
     fast.write_text(json.dumps({"update": {"median": 1.0, "min": 0.9}}))

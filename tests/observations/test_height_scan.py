@@ -619,6 +619,8 @@ def test_a_pattern_first_read_in_inference_mode_can_be_trained_through():
     assert T.grad[0, 2, 3] == 1 and T.grad[0, 0, 3] == pytest.approx(-0.1)
 
 
+@pytest.mark.compiles
+@pytest.mark.slow(4)
 @pytest.mark.parametrize("warm", [True, False])
 def test_scans_compile_as_one_graph(warm):
     """Also a scan whose pattern has not been on the device before."""

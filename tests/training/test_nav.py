@@ -81,6 +81,7 @@ def test_it_steps_in_inference_mode_and_outside_in_turn():
         env.task.reset()
 
 
+@pytest.mark.slow(1)
 def test_training_changes_the_policy_and_logs(tmp_path):
     runner = make_runner(tmp_path)
     before = weights(runner)
@@ -89,6 +90,7 @@ def test_training_changes_the_policy_and_logs(tmp_path):
     assert (tmp_path / CHECKPOINT).exists() and list(tmp_path.glob("events.out.tfevents*"))
 
 
+@pytest.mark.slow(3)
 def test_a_resumed_training_equals_one_that_never_stopped(tmp_path):
     whole = make_runner(tmp_path / "whole")
     whole.learn(4)
@@ -127,6 +129,7 @@ def invoke(*arguments):
     return CliRunner().invoke(nav.main, [*map(str, arguments), "--no-compile"], catch_exceptions=False)
 
 
+@pytest.mark.slow(10)
 def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkeypatch):
     monkeypatch.setattr(nav, "task_config", lambda held_out=False: CFG)
     out = tmp_path / "run"
@@ -152,6 +155,7 @@ def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkey
     assert missing.exit_code == 2 and "leave --resume out" in missing.output
 
 
+@pytest.mark.slow(1)
 def test_an_export_that_acts_otherwise_is_refused(tmp_path, monkeypatch):
     runner = make_runner(tmp_path, "blind")
     nav_export.export(runner, tmp_path)
@@ -178,6 +182,7 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path):
     assert again.current_learning_iteration == 2
 
 
+@pytest.mark.slow(10)
 def test_two_processes_train_one_policy(tmp_path):
     script = tmp_path / "two.py"
     script.write_text(

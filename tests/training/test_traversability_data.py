@@ -114,6 +114,7 @@ def equal(a, b):
     return tensors and a[7:] == b[7:]
 
 
+@pytest.mark.slow(3)
 def test_a_seed_makes_the_same_maps_and_another_makes_others():
     first = make_batch([0, 1], TINY)
     assert equal(first, make_batch([0, 1], TINY)) and not equal(first, make_batch([0, 2], TINY))
@@ -145,6 +146,7 @@ def test_exact_maps_know_the_true_heights_to_their_variance(seed):
     assert (errors < EXACT_NOISE).all() and errors[0] != errors[1]
 
 
+@pytest.mark.slow(2)
 def test_exact_batches_are_rated_everywhere(tmp_path):
     (maps,) = data_set(tmp_path, "held_out_exact", 1, 0, TINY, resolution=0.1)
     assert maps.validity.all() and maps.rated.all()
@@ -156,6 +158,7 @@ def test_splits_and_data_sets_have_seeds_of_their_own():
     assert len(seeds) == len(data.SPLITS) * 9
 
 
+@pytest.mark.slow(2)
 def test_a_data_set_is_kept_and_only_what_lacks_is_made(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(data, "make_batch", lambda seed, *rest: made.append(seed) or make_batch(seed, *rest))
@@ -217,6 +220,7 @@ def test_no_body_is_within_a_wall():
     assert float(z[1]) == pytest.approx(3.1), "at the wall's foot, over the wall"
 
 
+@pytest.mark.slow(2)
 def test_robots_take_the_easiest_of_some_walks():
     robot = RobotConfig()
     half = torch.zeros(1, 401, 401)
