@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# The slowest tests come first, and each worker gets the next one when it is done: see tests/conftest.py.
-PYTEST := -m pytest --numprocesses auto --dist loadgroup --no-loadscope-reorder
+# Files that take longest come first, in the order of tests/conftest.py; a worker that is done gets the next one.
+PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 # `make matrix` leaves out what needs reinforcement learning, and compares no recorded answers: they are of one torch.
 MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \

@@ -1,5 +1,7 @@
 """What all tests share: hypothesis' profile, one thread, the compiler's backend, and how workers share the tests."""
 
+import collections
+
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
@@ -18,24 +20,16 @@ settings.register_profile(
 settings.load_profile("torchelev")
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Skip what this torch cannot compile; let xdist's workers begin with the slowest tests, so that all end together.
-
-    A file's other tests stay on one worker.
-    """
+    """Skip what this torch cannot compile; let xdist's workers begin with the slowest files, so that all end together."""
+    seconds = collections.Counter()
     for item in items:
         if item.get_closest_marker("compiles") and torch.__version__ < "2.10":
             item.add_marker(pytest.mark.skip(reason="compiled updates need torch 2.10 or later"))
-        if not (item.get_closest_marker("slow") or item.get_closest_marker("xdist_group")):
-            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+        slow = item.get_closest_marker("slow")
+        seconds[item.path] += slow.args[0] if slow else 0
     if hasattr(config, "workerinput"):
-        items.sort(key=_seconds, reverse=True)
-
-
-def _seconds(item):
-    slow = item.get_closest_marker("slow")
-    return slow.args[0] if slow else 0
+        items.sort(key=lambda item: -seconds[item.path])
 
 
 @pytest.fixture(autouse=True)

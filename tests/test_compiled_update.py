@@ -1,27 +1,17 @@
 """Compilation: few graphs, the same results, shared where inputs are alike and apart where they are not."""
 
 import itertools
-import re
 
 import pytest
 import torch
 from torch._dynamo.callback import callback_handler
 from torch._dynamo.testing import CompileCounter
-from torch._inductor import config as inductor_config
-from torch._inductor.codegen.cpp import CppScheduling
-from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
-from torch._inductor.utils import run_and_get_code
 
 import torchelev
-from tests.answers import config
-from tests.helpers import assert_close, differences, mapped, pose, scan, small_config, small_map, snapshot
+from tests.helpers import assert_close, differences, mapped, scan, small_config, small_map, snapshot
 from torchelev import ElevationMap, SensorConfig
 from torchelev.compiled_update import Graphs, graphs_of
 from torchelev.layers import LAYERS
-from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, compiled
-from torchelev.stages.fusion import consensus
-from torchelev.stages.fusion.consensus import resolve_contested
-
 
 pytestmark = pytest.mark.compiles
 
@@ -81,65 +71,6 @@ def test_gradients_through_the_compiled_core():
 
 
 PARTS = len(Graphs._fields)  # of an update, a graph each
-
-
-def graphs():
-    """How many graphs were compiled so far."""
-    return torch._dynamo.utils.counters["stats"]["unique_graphs"]
-
-
-@pytest.mark.slow(5)
-@pytest.mark.xdist_group("recorded update")
-def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
-    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice.
-
-    Nor for another number of contested cells: none, single ones, and tops and grounds of steps. The config is that of
-    the recorded answers, whose graphs it shares where both run in one process.
-    """
-    sides = []
-
-    def spy(points, *others):
-        height, side = resolve_contested(points, *others)
-        if not torch.compiler.is_compiling():
-            sides.append([len(points.cells), int((side > 0).sum()), int((side < 0).sum())])
-        return height, side
-
-    monkeypatch.setattr(consensus, "resolve_contested", spy)
-    maps = {name: ElevationMap(config(), 2) for name in ("eager", "compiled", "twin")}
-    maps["compiled"].compile()
-    maps["twin"].compile()
-    cloud, T = scan(9)
-    before = graphs()
-    for emap in maps.values():
-        emap.update(cloud, T, T, 0.3)
-    assert graphs() - before in (0, PARTS)
-    before = graphs()
-    losses = {name: (torch.ones(1, requires_grad=True) * emap.elevation).sum() for name, emap in maps.items()}
-    for k, number in enumerate((300, 290, 5000, 200, 6000, 100)):
-        cloud, T = scan(k, 2, number)
-        cloud = cloud[:, :150] if number == 200 else cloud
-        T = T[:1].expand(2, 4, 4) if number == 200 else T
-        if number == 6000:  # a block of heights in every cell
-            T = pose(num_envs=2)
-            generator = torch.Generator().manual_seed(0)
-            cloud = torch.rand(2, 6000, 3, generator=generator) * torch.tensor([0.3, 0.3, 0.6])
-            cloud = cloud - torch.tensor([0.15, 0.15, 1.15])
-        cloud = cloud * torch.nan if number == 100 else cloud
-        for emap in maps.values():
-            emap.update(cloud, T, T, 0.3)
-        for name in ("compiled", "twin"):
-            assert_close(maps["eager"].state, maps[name].state, 1e-5)
-            floats = {
-                n for n, v in maps["eager"].state._asdict().items() if n != "statistics" and v.is_floating_point()
-            }
-            rounded = floats | {"drift_error", "drift_correction"}
-            assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
-    assert graphs() == before
-    for loss in losses.values():
-        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-            loss.backward()
-    disputed, tops, grounds = zip(*sides, strict=True)
-    assert 0 in disputed and max(disputed) > 10 and max(tops) > 0 and max(grounds) > 0
 
 
 def test_an_older_torch_is_refused(monkeypatch):
@@ -271,42 +202,6 @@ def test_what_is_compiled_anew_says_so(compile_with, capsys):
         emap.update(cloud, T, T, 0.1)
         assert capsys.readouterr().err.count("compiling the update") == 1
     assert not callback_handler.start_callbacks
-
-
-def test_the_compiler_is_left_as_it_was(monkeypatch, capsys):
-    seen, usual = [], CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
-
-    def fails(*_):
-        seen.append(CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM)
-        raise ArithmeticError("of the compiler")
-
-    monkeypatch.setattr("torch._inductor.compile", fails)
-    with pytest.raises(Exception, match="of the compiler"), announced_compilation():
-        compiled(lambda x: x + 1)(torch.ones(2))
-    assert seen == [KERNEL_ARGUMENTS] and usual > KERNEL_ARGUMENTS
-    assert usual == CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
-    assert "failed" in capsys.readouterr().err
-    assert not callback_handler.start_callbacks
-
-
-@pytest.mark.slow(3)
-def test_eight_bytes_of_a_mask_are_loaded_at_once():
-    """Also where the rest of the mask is fewer than eight, and where the vectors are longer."""
-
-    def chosen(mask, values):
-        return torch.where(mask.bool(), values, -values)
-
-    generator = torch.Generator().manual_seed(0)
-    for number in (8, 64, 2003):
-        mask = torch.randint(2, (number,), generator=generator, dtype=torch.uint8)
-        values = torch.randn(number, generator=generator)
-        with inductor_config.patch(force_disable_caches=True):
-            result, codes = run_and_get_code(compiled(chosen), mask, values)
-        assert torch.equal(result, chosen(mask, values))
-        if isinstance(pick_vec_isa(), VecAVX2):
-            code = "".join(codes)
-            assert "<uint8_t>::loadu_one_fourth(" in code
-            assert re.search(r"<uint8_t>::loadu\(.*<int64_t>\(8L?\)\)", code) is None
 
 
 @pytest.mark.slow(8)
