@@ -1,8 +1,9 @@
 """What the library answers to fixed inputs: every layer, reader, filter, planner, simulated sensor and environment.
 
-    python tests/answers.py    # records tests/answers.npz anew
+    python -m tests.answers    # records tests/answers.npz anew
 
-`tests/test_answers.py` and `tests/test_compiled_answers.py` compare. Reads the library through what users import, so that a recording outlives a redesign.
+`tests/test_answers.py` and `tests/test_compiled_answers.py` compare. Reads the library through what users import, so
+that a recording outlives a redesign.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ settings.load_profile("torchelev")
 
 
 def pytest_collection_modifyitems(config, items):
-    """Skip what this torch cannot compile; let xdist's workers begin with the slowest files, so that all end together."""
+    """Skip what this torch cannot compile; let xdist's workers begin with the slowest files, to end together."""
     seconds = collections.Counter()
     for item in items:
         if item.get_closest_marker("compiles") and torch.__version__ < "2.10":

@@ -1,4 +1,4 @@
-"""What the library answers stays what was recorded, see `answers.py`; compiled updates are in `test_compiled_answers`."""
+"""What the library answers stays what was recorded, see `answers.py`. Compiled: `test_compiled_answers.py`."""
 
 import pytest
 
