@@ -2,15 +2,22 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# Files that take longest come first, in the order of tests/conftest.py; a worker that is done gets the next one.
+PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
+# `make matrix` leaves out what needs reinforcement learning, and compares no recorded answers: they are of one torch.
+MATRIX := 3.10 3.12 3.13
+MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
+	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py
+EXTRAS := io,rl,dev
 
-.PHONY: help demo test lint types setup bench quality clean
+.PHONY: help demo test test-fast test-library matrix lint types setup bench quality clean
 
 help:  ## list the targets
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[io,rl,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	touch $@
 
 setup: $(BIN)/.ready  ## make the environment .venv
@@ -19,7 +26,23 @@ demo: setup  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
 test: setup  ## run all tests, on all cores
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+	$(BIN)/python $(PYTEST)
+
+test-fast: setup  ## run the quick tests, every stage against the reference: under 90 seconds
+	$(BIN)/python $(PYTEST) -m "not slow"
+
+matrix: $(MATRIX:%=on-%)  ## run the library's quick tests on Python 3.10, 3.12 and 3.13, where they are installed
+
+on-%:
+	@for python in python$* $$(ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/$*.*/bin/python 2>/dev/null); do \
+		if $$python -c '' 2>/dev/null; then \
+			exec $(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python EXTRAS=io,dev test-library; \
+		fi; \
+	done; echo "Python $* is not installed here: skipped"
+
+test-library: setup
+	@$(BIN)/python -c 'import sys, torch; print("Python", sys.version.split()[0], "torch", torch.__version__)'
+	$(BIN)/python $(PYTEST) -m "not slow" $(MATRIX_TESTS)
 
 lint: setup  ## check style, and that imports go downwards
 	$(BIN)/ruff check .
@@ -39,4 +62,4 @@ quality: setup  ## measure accuracy and features, five minutes
 	$(BIN)/python -m docs.readme_tables
 
 clean:  ## remove what the targets made
-	rm -rf $(VENV) demo.png
+	rm -rf $(VENV) $(MATRIX:%=.venv-%) demo.png

@@ -1,36 +1,10 @@
-"""What the library answers stays what was recorded, see `answers.py`."""
+"""What the library answers stays what was recorded, see `answers.py`. Compiled: `test_compiled_answers.py`."""
 
-import numpy as np
 import pytest
 
-from tests.answers import FILE, PARTS, machine
-
-RECORDED = dict(np.load(FILE))
-MACHINE = str(RECORDED.pop("machine"))
-# On another CPU sums round otherwise, and a choice between two may go the other way: a way, and all that follows it.
-FOLLOWS_CHOICES = ("plan", "path check", "plane", "rollout")
+from tests.answers import PARTS, assert_recorded
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", [part for part in PARTS if not part.startswith("compiled")])
 def test_answers_are_those_recorded(part):
-    answers = PARTS[part]()
-    start = f"{part}: "
-    expected = {name.removeprefix(start): value for name, value in RECORDED.items() if name.startswith(start)}
-    assert sorted(answers) == sorted(expected)
-    for name, value in answers.items():
-        if machine() == MACHINE:
-            assert value.dtype == expected[name].dtype, name
-            np.testing.assert_array_equal(value, expected[name], err_msg=name)
-        elif not name.startswith(FOLLOWS_CHOICES):
-            assert_close(value, expected[name], name)
-
-
-def assert_close(value, expected, name):
-    """All but 1 % of the values agree to 1e-4 of the answer's range."""
-    assert value.shape == expected.shape and value.dtype == expected.dtype, name
-    value, expected = value.astype(np.float64), expected.astype(np.float64)
-    finite = np.isfinite(expected)
-    tolerance = 1e-4 * max(np.ptp(expected[finite]), 1e-3) if finite.any() else 0.0
-    with np.errstate(invalid="ignore"):
-        agrees = (np.abs(value - expected) <= tolerance) | (~finite & ~np.isfinite(value))
-    assert agrees.mean() >= 0.99, f"{name}: {1 - agrees.mean():.1%} differ"
+    assert_recorded(part)

@@ -1,25 +1,19 @@
 """Compilation: few graphs, the same results, shared where inputs are alike and apart where they are not."""
 
 import itertools
-import re
 
 import pytest
 import torch
 from torch._dynamo.callback import callback_handler
 from torch._dynamo.testing import CompileCounter
-from torch._inductor import config as inductor_config
-from torch._inductor.codegen.cpp import CppScheduling
-from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
-from torch._inductor.utils import run_and_get_code
 
 import torchelev
 from tests.helpers import assert_close, differences, mapped, scan, small_config, small_map, snapshot
 from torchelev import ElevationMap, SensorConfig
 from torchelev.compiled_update import Graphs, graphs_of
 from torchelev.layers import LAYERS
-from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, compiled
-from torchelev.stages.fusion import consensus
-from torchelev.stages.fusion.consensus import resolve_contested
+
+pytestmark = pytest.mark.compiles
 
 
 def core(emap):
@@ -31,6 +25,7 @@ def core(emap):
     return run
 
 
+@pytest.mark.slow(6)
 @pytest.mark.parametrize("with_base", [True, False])
 @pytest.mark.parametrize("sensors", [None, 2])
 def test_the_core_compiles_as_one_graph(with_base, sensors):
@@ -61,6 +56,7 @@ def test_readers_and_resets_compile_as_one_graph():
     assert not emap.validity[0].any() and emap.validity[1].any()
 
 
+@pytest.mark.slow(13)
 def test_gradients_through_the_compiled_core():
     emap = mapped()
     cloud, T = scan(5)
@@ -77,57 +73,6 @@ def test_gradients_through_the_compiled_core():
 PARTS = len(Graphs._fields)  # of an update, a graph each
 
 
-def graphs():
-    """How many graphs were compiled so far."""
-    return torch._dynamo.utils.counters["stats"]["unique_graphs"]
-
-
-def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
-    """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice.
-
-    Nor for another number of contested cells: none, single ones, and tops and grounds of steps.
-    """
-    torch._dynamo.reset()
-    sides = []
-
-    def spy(points, *others):
-        height, side = resolve_contested(points, *others)
-        if not torch.compiler.is_compiling():
-            sides.append([len(points.cells), int((side > 0).sum()), int((side < 0).sum())])
-        return height, side
-
-    monkeypatch.setattr(consensus, "resolve_contested", spy)
-    before = graphs()
-    maps = {name: small_map(2) for name in ("eager", "compiled", "twin")}
-    maps["compiled"].compile()
-    maps["twin"].compile()
-    losses = {name: (torch.ones(1, requires_grad=True) * emap.elevation).sum() for name, emap in maps.items()}
-    for k, number in enumerate((300, 290, 5000, 200, 6000, 100)):
-        cloud, T = scan(k, 2, number)
-        cloud = cloud[:, :150] if number == 200 else cloud
-        T = T[:1].expand(2, 4, 4) if number == 200 else T
-        if number == 6000:  # a block of heights in every cell
-            T = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-            generator = torch.Generator().manual_seed(0)
-            cloud = torch.rand(2, 6000, 3, generator=generator) * torch.tensor([0.3, 0.3, 0.6]) - 0.15
-        cloud = cloud * torch.nan if number == 100 else cloud
-        for emap in maps.values():
-            emap.update(cloud, T, T, 0.3)
-        for name in ("compiled", "twin"):
-            assert_close(maps["eager"].state, maps[name].state, 1e-5)
-            floats = {
-                n for n, v in maps["eager"].state._asdict().items() if n != "statistics" and v.is_floating_point()
-            }
-            rounded = floats | {"drift_error", "drift_correction"}
-            assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
-    assert graphs() == before + PARTS
-    for loss in losses.values():
-        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-            loss.backward()
-    disputed, tops, grounds = zip(*sides, strict=True)
-    assert 0 in disputed and max(disputed) > 10 and max(tops) > 0 and max(grounds) > 0
-
-
 def test_an_older_torch_is_refused(monkeypatch):
     monkeypatch.setattr(torch, "__version__", torch.torch_version.TorchVersion("2.9.1"))
     emap = small_map(1)
@@ -138,6 +83,7 @@ def test_an_older_torch_is_refused(monkeypatch):
     assert emap.validity.any()
 
 
+@pytest.mark.slow(6)
 def test_the_core_exports():
     emap, (cloud, T) = mapped(), scan(5)
 
@@ -150,6 +96,7 @@ def test_the_core_exports():
     torch.testing.assert_close(exported(*inputs), Core()(*inputs))
 
 
+@pytest.mark.slow(119)
 def test_compiled_update_equals_eager_without_what_may_be_left_out():
     """By the real compiler too: one robot, two sensors, variances, no base pose, no drift, no overlap."""
     torch._dynamo.reset()
@@ -166,6 +113,7 @@ def test_compiled_update_equals_eager_without_what_may_be_left_out():
     assert maps[0].validity.any() and maps[0].bounded.any()
 
 
+@pytest.mark.slow(7)
 def test_an_update_that_is_stopped_leaves_a_sound_map(compile_with, monkeypatch):
     """By an error of the second graph: the window has moved, nothing was taken in, and the next scan is."""
     compile_with("eager")
@@ -193,11 +141,13 @@ def test_an_update_that_is_stopped_leaves_a_sound_map(compile_with, monkeypatch)
 PLAIN = {"drift": None, "raycast": None, "overlap": None, "traversability": None}  # quick to trace
 
 
+@pytest.mark.slow(10)
+@torch._dynamo.config.patch(recompile_limit=2)
 def test_configs_of_one_shape_have_their_own_graphs(compile_with):
-    """Nine: of one code object the compiler keeps eight graphs, and refuses the next."""
+    """More than the graphs that the compiler keeps of one code object; it refuses the next."""
     compile_with("eager")
     cloud, T = scan(0, 2, 60)
-    for k in range(9):
+    for k in range(3):
         maps = [small_map(2, **PLAIN, sensor=SensorConfig(noise_floor=1e-4 * (k + 1))) for _ in range(2)]
         maps[1].compile()
         for emap in maps:
@@ -205,25 +155,34 @@ def test_configs_of_one_shape_have_their_own_graphs(compile_with):
         assert_close(maps[0].state, maps[1].state)
 
 
+@pytest.mark.slow(20)
+@torch._dynamo.config.patch(recompile_limit=2)
 def test_inputs_of_every_kind_have_their_own_graphs(compile_with):
-    """More than eight of one config: precisions, sensors, with and without base and variances, numbers of robots."""
+    """Of one config: precisions, sensors, with and without base and variances, numbers of robots."""
     compile_with("eager")
-    for num_envs, sensors, dtype in ((2, 1, torch.float32), (5, 2, torch.float64), (3, 1, torch.bfloat16)):
+    kinds = [(2, 1, torch.float32, *given) for given in itertools.product((True, False), repeat=2)]
+    for num_envs, sensors, dtype, has_base, has_variance in (
+        *kinds,
+        (5, 2, torch.float64, True, True),
+        (3, 1, torch.bfloat16, False, True),
+    ):
         cloud, T = scan(0, num_envs, 60)
         clouds = cloud.to(dtype)[:, None].repeat(1, sensors, 1, 1)
-        for base, variance in itertools.product((T, None), (clouds[..., 0].abs() + 0.01, None)):
-            maps = [small_map(num_envs, **PLAIN) for _ in range(2)]
-            maps[1].compile()
-            for emap in maps:
-                emap.update(clouds, T[:, None].repeat(1, sensors, 1, 1), base, 0.3, variance=variance)
-            assert_close(maps[0].state, maps[1].state)
+        variance = clouds[..., 0].abs() + 0.01 if has_variance else None
+        maps = [small_map(num_envs, **PLAIN) for _ in range(2)]
+        maps[1].compile()
+        for emap in maps:
+            base = T if has_base else None
+            emap.update(clouds, T[:, None].repeat(1, sensors, 1, 1), base, 0.3, variance=variance)
+        assert_close(maps[0].state, maps[1].state)
 
 
+@pytest.mark.slow(10)
 def test_an_update_that_compiles_says_what_it_costs(compile_with, capsys):
     counter = CompileCounter()
     compile_with(counter)
     for number, num_envs in enumerate((2, 2, 3, 5, 1, 7, 2)):
-        emap = small_map(num_envs)
+        emap = small_map(num_envs, **PLAIN)
         emap.compile()
         cloud, T = scan(number, num_envs)
         before = counter.frame_count
@@ -232,9 +191,10 @@ def test_an_update_that_compiles_says_what_it_costs(compile_with, capsys):
     assert counter.frame_count == 3 * PARTS  # of 2, of 2 and more, of 1
 
 
+@pytest.mark.slow(5)
 def test_what_is_compiled_anew_says_so(compile_with, capsys):
     compile_with("eager")
-    emap = small_map(2)
+    emap = small_map(2, **PLAIN)
     emap.compile()
     cloud, T = scan(0, 2)
     for _ in range(2):
@@ -244,43 +204,8 @@ def test_what_is_compiled_anew_says_so(compile_with, capsys):
     assert not callback_handler.start_callbacks
 
 
-def test_the_compiler_is_left_as_it_was(monkeypatch, capsys):
-    seen, usual = [], CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
-
-    def fails(*_):
-        seen.append(CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM)
-        raise ArithmeticError("of the compiler")
-
-    monkeypatch.setattr("torch._inductor.compile", fails)
-    with pytest.raises(Exception, match="of the compiler"), announced_compilation():
-        compiled(lambda x: x + 1)(torch.ones(2))
-    assert seen == [KERNEL_ARGUMENTS] and usual > KERNEL_ARGUMENTS
-    assert usual == CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
-    assert "failed" in capsys.readouterr().err
-    assert not callback_handler.start_callbacks
-
-
-def test_eight_bytes_of_a_mask_are_loaded_at_once():
-    """Also where the rest of the mask is fewer than eight, and where the vectors are longer."""
-
-    def chosen(mask, values):
-        return torch.where(mask.bool(), values, -values)
-
-    generator = torch.Generator().manual_seed(0)
-    for number in (8, 64, 2003):
-        mask = torch.randint(2, (number,), generator=generator, dtype=torch.uint8)
-        values = torch.randn(number, generator=generator)
-        with inductor_config.patch(force_disable_caches=True):
-            result, codes = run_and_get_code(compiled(chosen), mask, values)
-        assert torch.equal(result, chosen(mask, values))
-        if isinstance(pick_vec_isa(), VecAVX2):
-            code = "".join(codes)
-            assert "<uint8_t>::loadu_one_fourth(" in code
-            assert re.search(r"<uint8_t>::loadu\(.*<int64_t>\(8L?\)\)", code) is None
-
-
-@pytest.mark.parametrize("sensors", [None, 2])
-@pytest.mark.parametrize("with_variance", [False, True])
+@pytest.mark.slow(8)
+@pytest.mark.parametrize("sensors, with_variance", [(None, False), (2, True)])
 def test_a_new_number_of_points_compiles_nothing(compile_with, sensors, with_variance):
     """The same graphs for every number of points from 2 on, with the statistics and the map of the eager update."""
     counter = CompileCounter()
@@ -319,10 +244,11 @@ def test_clouds_of_no_or_one_point_run_eagerly(compile_with, sensors):
     assert compiled.validity.any() and counter.frame_count == 0
 
 
+@pytest.mark.slow(3)
 def test_maps_of_equal_configs_share_their_graphs(compile_with):
     counter = CompileCounter()
     compile_with(counter)
-    maps = small_map(2), small_map(2)
+    maps = small_map(2, **PLAIN), small_map(2, **PLAIN)
     for k, emap in enumerate(maps):
         emap.compile()
         cloud, T = scan(k, 2, 300 + k)
@@ -330,6 +256,7 @@ def test_maps_of_equal_configs_share_their_graphs(compile_with):
     assert counter.frame_count == PARTS
 
 
+@pytest.mark.slow(5)
 def test_inference_mode_shares_the_graphs(compile_with):
     """Training steps environments in inference mode, and tries them outside."""
     counter = CompileCounter()
@@ -348,6 +275,7 @@ def test_equal_configs_share_the_compiled_update():
     assert graphs_of(small_config(), (), 1) is not graphs_of(small_config(drift=None), (), 1)
 
 
+@pytest.mark.slow(3)
 def test_no_recompilation_for_new_values():
     """New dt, poses and clouds are data, not constants."""
     emap, counter = mapped(), CompileCounter()
@@ -359,6 +287,7 @@ def test_no_recompilation_for_new_values():
     assert counter.frame_count == 1
 
 
+@pytest.mark.slow(6)
 @pytest.mark.parametrize(
     "num_envs, chunk, sensors, base, variance",
     [(2, None, 1, True, False), (1, None, 2, False, True), (5, 2, 1, True, False)],
@@ -366,7 +295,7 @@ def test_no_recompilation_for_new_values():
 def test_warm_maps_compile_nothing_more_and_are_untouched(compile_with, num_envs, chunk, sensors, base, variance):
     counter = CompileCounter()
     compile_with(counter)
-    emap = ElevationMap(small_config(), num_envs=num_envs, chunk=chunk)
+    emap = ElevationMap(small_config(**PLAIN), num_envs=num_envs, chunk=chunk)
     cloud = torch.randn(num_envs, sensors, 50, 3, generator=torch.Generator().manual_seed(0))
     T = torch.eye(4, dtype=torch.float64).repeat(num_envs, sensors, 1, 1)
     given = dict(variance=torch.full(cloud.shape[:-1], 0.01) if variance else None)

@@ -437,6 +437,7 @@ def test_every_stage_can_be_switched_off():
         assert mapped(1, **chosen).layer("elevation").isfinite().any()
 
 
+@pytest.mark.slow(1)
 def test_importing_does_not_load_the_compiler():
     """Which takes a second; only compiled maps need it."""
     code = (

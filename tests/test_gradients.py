@@ -71,6 +71,7 @@ def test_gradcheck_of_the_other_layers(layer):
     )
 
 
+@pytest.mark.slow(1)
 def test_gradcheck_in_full_without_drift():
     """Every entry of the Jacobian; where drift acts, each point moves every cell."""
     emap, state, cloud, T = scene(2, per_cell=1)

@@ -111,7 +111,8 @@ def test_locate_agrees_with_the_reference(seed, cells):
 def test_point_cells_sum_and_take():
     grid = small_config((2, 2), 1.0).grid
     xy = torch.tensor([[[0.5, 0.5], [0.6, 0.1], [1.5, 0.5], [9.0, 0.0]]])
-    cells = PointCells(*locate(*xy.unbind(-1), torch.zeros(1, 2), grid), grid.num_cells)
+    slot, inside = locate(*xy.unbind(-1), torch.zeros(1, 2), grid)
+    cells = PointCells(slot.to(torch.int64), inside, grid.num_cells)
     totals, number = cells.sums(torch.tensor([[1.0, 2.0, 4.0, 0.0]]), cells.inside.float())
     assert totals.tolist() == [[3, 0, 4, 0]] and number.tolist() == [[2, 0, 1, 0]]
     (at_points,) = cells.take(totals)
@@ -123,7 +124,7 @@ def test_window_corner_is_within_half_a_cell(x, y, cells):
     grid = small_config(cells).grid
     base = torch.tensor([[x, y]], dtype=torch.float64)
     corner = window_corner(base, torch.zeros(1, 2, dtype=torch.int64), grid)
-    center = (corner + torch.tensor(cells) / 2) * 0.1
+    center = (corner + torch.tensor(cells, dtype=torch.float64) / 2) * 0.1
     assert ((center - base).abs() <= 0.05 + 1e-9).all()
 
 

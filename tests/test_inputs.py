@@ -132,24 +132,25 @@ def test_dt_is_required(emap, method):
 UNSOUND = {"NaN": torch.nan, "infinite": torch.inf, "far": 1e30}
 
 
-@pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("of", ["sensor", "base", "both"])
-def test_one_bad_pose_that_was_not_read_leaves_one_robot_out(of, compiled, monkeypatch):
+def test_one_bad_pose_that_was_not_read_leaves_one_robot_out(of, monkeypatch):
     """As on a GPU, where the host does not wait to read it."""
     monkeypatch.setattr(checks, "readable", lambda *_: False)
-    maps, good = [mapped(), mapped()], pose(num_envs=B)
-    before = map_layers(torch.clone, maps[0].state)
+    assert_bad_poses_leave_one_robot_out(mapped(), mapped(), of)
+
+
+def assert_bad_poses_leave_one_robot_out(emap, eager, of):
+    """The second robot of a map gets a bad pose of the sensor, the base or both; the eager map only good ones."""
+    good, before = pose(num_envs=B), map_layers(torch.clone, emap.state)
     cloud, far = torch.zeros(B, N, 3) - 1, pose((3.0, 0.0, 1.0), num_envs=B)
     bad = {name: torch.cat([far[:1], torch.full((1, 4, 4), value)]) for name, value in UNSOUND.items()}
-    maps[1].update(cloud, far, far, 0.1)
-    if compiled:
-        maps[0].compile()
+    eager.update(cloud, far, far, 0.1)
     for T in bad.values():
-        for layer, value in zip(tree_leaves(maps[0].state), tree_leaves(before), strict=True):
+        for layer, value in zip(tree_leaves(emap.state), tree_leaves(before), strict=True):
             layer.copy_(value)
-        maps[0].update(cloud, good if of == "base" else T, good if of == "sensor" else T, 0.1)
-        after, alone = maps[0].state, maps[1].state
-        assert maps[0].statistics.rejected_invalid.tolist() == [0, N]
+        emap.update(cloud, good if of == "base" else T, good if of == "sensor" else T, 0.1)
+        after, alone = emap.state, eager.state
+        assert emap.statistics.rejected_invalid.tolist() == [0, N]
         assert torch.equal(after.corner[1], before.corner[1]) and after.base_height[1] == before.base_height[1]
         assert torch.equal(after.elevation[1], before.elevation[1])
         assert all(value.isfinite().all() for value in tree_leaves(after) if value.is_floating_point())
@@ -321,6 +322,7 @@ def test_poses_far_away(x, y, z):
     assert floats_finite(emap.state) == []
 
 
+@pytest.mark.slow(2)
 @given(st.integers(0, 10_000), st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64]))
 def test_random_garbage_never_poisons_the_map(seed, dtype):
     rng = np.random.default_rng(seed)

@@ -2,6 +2,8 @@
 
 import re
 
+import pytest
+
 from docs.readme_tables import ROOT, with_tables
 
 
@@ -10,6 +12,7 @@ def test_tables_are_those_of_the_results():
     assert with_tables(text) == text, "run python -m docs.readme_tables"
 
 
+@pytest.mark.slow(10)
 def test_its_python_runs_from_the_first_block_to_the_last():
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     runnable = [block for block in blocks if "cuda" not in block]

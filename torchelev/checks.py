@@ -101,7 +101,7 @@ def _require_rigid(name: str, pose: Tensor) -> None:
     error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3))
     refuse(error >= 1e-3, "must be rigid (R R^T = 1)", lambda: f"an error of {error.max():.3g}", hint)
     refuse(np.linalg.det(rotation) <= 0, "must not mirror", lambda: "determinant -1", hint)
-    bad = last_row != (0, 0, 0, 1)
+    bad = np.abs(last_row - (0, 0, 0, 1)) > 1e-6  # an inverse may round
     if bad.any() and (matrix[..., 3] == (0, 0, 0, 1)).all():
         hint = "transpose it: the position is the last column"
     refuse(bad, "must have the last row 0 0 0 1", lambda: " ".join(f"{x:g}" for x in last_row[bad.any(-1)][0]), hint)

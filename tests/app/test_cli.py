@@ -38,6 +38,7 @@ def test_demo_prints_what_it_measured(run, monkeypatch):
     assert (str(asked["out"]), asked["seconds"], asked["progress"]) == ("demo.png", 2.0, False)
 
 
+@pytest.mark.slow(1)
 def test_runs_as_a_module():
     result = subprocess.run([sys.executable, "-m", "torchelev", "--help"], capture_output=True, text=True, check=True)
     assert "map" in result.stdout and "demo" in result.stdout

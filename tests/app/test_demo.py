@@ -16,6 +16,7 @@ def small_camera(monkeypatch):
     monkeypatch.setattr(demo, "CAMERA", demo.DepthCamera(width=40, height=30, max_range=6.0))
 
 
+@pytest.mark.slow(2)
 def test_demo_maps_draws_and_measures(tmp_path):
     out = tmp_path / "demo.png"
     printed = str(demo.run_demo(out, seconds=2, progress=False))
@@ -24,6 +25,7 @@ def test_demo_maps_draws_and_measures(tmp_path):
         assert word in printed
 
 
+@pytest.mark.slow(1)
 def test_result_is_that_of_a_map_of_the_course(tmp_path):
     result = demo.run_demo(tmp_path / "a.png", seconds=2, progress=False)
     assert result.updates == round(2 / demo.DT)

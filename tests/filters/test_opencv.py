@@ -137,6 +137,7 @@ def test_serves_plain_float32_on_a_cpu_without_gradient():
     assert not smooth.requires_grad
 
 
+@pytest.mark.skipif(torch.__version__ < "2.10", reason="older torch cannot map a view of bytes over a batch")
 def test_serves_no_tensors_of_functorch():
     values, known = random_layer(3, (2, 7, 6), 0.8, torch.float32)
     values = values.nan_to_num()

@@ -20,17 +20,20 @@ def without(*names):
     return "".join(f"sys.modules[{name!r}] = None\n" for name in names)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("module", ["torchelev", "torchelev.sim", "torchelev.planes", "torchelev.filters"])
 def test_the_package_imports_no_reinforcement_learning(module):
     done = run(f"import {module}\nprint([name for name in {LIBRARIES} if name in sys.modules])")
     assert done.stdout.strip() == "[]", done.stderr
 
 
+@pytest.mark.slow(1)
 def test_torchelev_gym_imports_no_rsl_rl():
     done = run(f"import torchelev.gym\nprint([name for name in {LIBRARIES} if name in sys.modules])")
     assert done.stdout.strip() == "['gymnasium']", done.stderr
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(
     "module, missing, extra",
     [

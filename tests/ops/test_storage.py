@@ -29,6 +29,7 @@ print(kept_of_a_freed_block(2**24))  # larger: freeing a block alone lets malloc
 """
 
 
+@pytest.mark.slow(1)
 @pytest.mark.skipif(
     not sys.platform.startswith("linux") or not hasattr(ctypes.CDLL(None), "mallinfo2"),
     reason="other allocators keep memory by rules of their own",

@@ -324,6 +324,7 @@ def test_odd_shapes_are_segmented(shape, value):
     assert len(planes.regions) == flat and ((planes.labels == 0) == flat).all()
 
 
+@pytest.mark.slow(2)
 def test_a_large_map_is_segmented():
     (planes,) = segment(noisy(np.tile(hills(0.04), (4, 4))), 0.04)
     assert planes.labels.shape == (1000, 1000) and (planes.labels >= 0).mean() > 0.95

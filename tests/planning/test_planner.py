@@ -250,6 +250,7 @@ def test_maps_far_away_and_batches():
 # Safe occlusions and drops --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("make, goes", [(hump, True), (step_down, True), (cliff, False), (abyss, False)])
 def test_the_upper_bound_tells_a_safe_occlusion_from_a_drop(make, goes):
     """Within 1.2 m of the edge; the map has seen nothing of it before the walk of `benchmarks.quality.occlusion`."""
@@ -283,6 +284,7 @@ def test_waypoints_descend_through_the_rating():
 # Devices, and what is refused -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(2)
 def test_nothing_waits_for_the_device(monkeypatch):
     cfg = ground_map().cfg
     with FakeTensorMode():

@@ -69,6 +69,8 @@ def test_the_analytic_head_rates_under_the_same_interface():
     assert (rating.traversability[~known] == 0).all() and torch.equal(rating.confidence, known.float())
 
 
+@pytest.mark.compiles
+@pytest.mark.slow(10)
 def test_compiled_is_eager_and_maps_of_other_weights_share_the_graph(cfg, tmp_path, compile_with):
     counter = CompileCounter()
     compile_with(counter)

@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given
+from hypothesis import assume, example, given
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.filters.filter_cases import SEEDS, SHAPES, SHARES, hill, in_large_cells
@@ -63,7 +63,7 @@ def test_turns_and_mirrors_with_the_map(turns, mirrored, robot, seed):
     expected = move(logits(net, maps, robot=robot))
     got = logits(net, [move(layer) for layer in maps], robot=robot)
     torch.testing.assert_close(got, expected, atol=1e-9, rtol=0)
-    assert (got.amax((1, 2, 3)) - got.amin((1, 2, 3)) > 1e-3).all()
+    assume((got.amax((1, 2, 3)) - got.amin((1, 2, 3)) > 1e-3).all())  # few random nets answer the same everywhere
 
 
 @given(SEEDS)
@@ -160,6 +160,7 @@ def test_gradients_on_flat_ground_are_finite():
     assert torch.isfinite(flat.grad).all()
 
 
+@pytest.mark.slow(2)
 def test_gradcheck():
     net = random_net(2)
     _, known, variance, _, bounded = random_maps(5, (1, 6, 5), 0.8)
@@ -218,6 +219,8 @@ def test_half_precision_is_rated_in_float32(dtype):
     torch.testing.assert_close(got, logits(net.float(), exact), atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.compiles
+@pytest.mark.slow(26)
 def test_compiles_to_the_same():
     net, maps = random_net(0, torch.float32), random_maps(0, (1, 20, 17), dtype=torch.float32)
 

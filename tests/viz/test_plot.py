@@ -56,6 +56,7 @@ def test_every_panel_count_fits(values, tmp_path):
         assert sum(ax.get_title() != "" for ax in figure.axes) == count
 
 
+@pytest.mark.slow(3)
 def test_a_noisy_picture_stays_small(tmp_path):
     noise = np.random.default_rng(0).normal(size=(400, 300))
     panels = [Panel(title=str(k), values=noise, unit="m") for k in range(6)]

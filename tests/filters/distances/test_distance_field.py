@@ -112,6 +112,7 @@ def test_at_the_points_of_the_grid_the_sample_is_the_field():
     assert valid[:, inner].all()
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_the_gradient_is_the_derivative(seed):
     """Of the interpolation, exactly, wherever a point lies between grid points."""

@@ -146,6 +146,7 @@ def test_no_filled_height_lies_outside_of_the_known_ones(seed, share, function):
         assert filled.min() >= values[known].min() - 1e-3 and filled.max() <= values[known].max() + 1e-3
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("function", FILLING)
 @pytest.mark.parametrize("share", [0.1, 0.6])
 def test_batch_is_single_and_gradients(function, share):

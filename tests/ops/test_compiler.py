@@ -1,0 +1,51 @@
+"""The compiler's options hold while it compiles, and pay off in its code."""
+
+import re
+
+import pytest
+import torch
+from torch._dynamo.callback import callback_handler
+from torch._inductor import config as inductor_config
+from torch._inductor.codegen.cpp import CppScheduling
+from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
+from torch._inductor.utils import run_and_get_code
+
+from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, compiled
+
+pytestmark = pytest.mark.compiles
+
+
+def test_the_compiler_is_left_as_it_was(monkeypatch, capsys):
+    seen, usual = [], CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
+
+    def fails(*_):
+        seen.append(CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM)
+        raise ArithmeticError("of the compiler")
+
+    monkeypatch.setattr("torch._inductor.compile", fails)
+    with pytest.raises(Exception, match="of the compiler"), announced_compilation():
+        compiled(lambda x: x + 1)(torch.ones(2))
+    assert seen == [KERNEL_ARGUMENTS] and usual > KERNEL_ARGUMENTS
+    assert usual == CppScheduling.MAX_FUSED_KERNEL_ARGS_NUM
+    assert "failed" in capsys.readouterr().err
+    assert not callback_handler.start_callbacks
+
+
+@pytest.mark.slow(3)
+def test_eight_bytes_of_a_mask_are_loaded_at_once():
+    """Also where the rest of the mask is fewer than eight, and where the vectors are longer."""
+
+    def chosen(mask, values):
+        return torch.where(mask.bool(), values, -values)
+
+    generator = torch.Generator().manual_seed(0)
+    for number in (8, 64, 2003):
+        mask = torch.randint(2, (number,), generator=generator, dtype=torch.uint8)
+        values = torch.randn(number, generator=generator)
+        with inductor_config.patch(force_disable_caches=True):
+            result, codes = run_and_get_code(compiled(chosen), mask, values)
+        assert torch.equal(result, chosen(mask, values))
+        if isinstance(pick_vec_isa(), VecAVX2):
+            code = "".join(codes)
+            assert "<uint8_t>::loadu_one_fourth(" in code
+            assert re.search(r"<uint8_t>::loadu\(.*<int64_t>\(8L?\)\)", code) is None
