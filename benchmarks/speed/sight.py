@@ -17,7 +17,7 @@ import torch
 from benchmarks import RESULTS
 from benchmarks.speed.meter import interleaved
 from envs.terrain_nav import TerrainNav
-from envs.terrain_nav.sight import Mapped
+from envs.terrain_nav.sight import MapSight
 from envs.terrain_nav.task import NUM_ACTIONS
 from torchelev import HeightScan
 from torchelev.app.results import markdown_table, write_json
@@ -41,7 +41,7 @@ def _step(task: TerrainNav) -> Callable[[], Any]:
 def _parts(task: TerrainNav) -> dict[str, Callable[[], Any]]:
     """Return the parts of a step with the map in the loop as calls, and a height scan of 187 points."""
     sight, pose = task.sight, task.T_map_base
-    assert isinstance(sight, Mapped)
+    assert isinstance(sight, MapSight)
     clouds = sight.look(pose, task.tile_ids)
     scan = HeightScan.isaac_lab()
     return {

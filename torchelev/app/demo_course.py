@@ -37,7 +37,7 @@ def make_course() -> Scene:
     return Scene(
         name="course",
         terrain=terrain,
-        steepness=max(0.5, relief.steepness + 0.1),  # ramp and relief do not overlap; fading adds the height of the relief
+        steepness=max(0.5, relief.steepness + 0.1),  # ramp and relief do not overlap; fading adds to it
         boxes=(*stairs, platform, *walls, block(1.713, 2.087, 0.413, 0.787, 0.25), bar, *_make_person()),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
         return state
     moves = torch.isfinite(m.base).all(1)
     corner, shift = move_corner(state, m.base, m.anchor, moves, grid)
-    layers = move_layers({name: getattr(state, name) for name in LAYERS}, shift, BLANK)
+    layers: dict[str, Any] = move_layers({name: getattr(state, name) for name in LAYERS}, shift, BLANK)
     base_height = torch.where(moves, m.base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **layers)
 

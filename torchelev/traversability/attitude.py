@@ -137,11 +137,11 @@ def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> l
             values = values.narrow(dim - 2, rim + low[dim] + place[dim], size)
         return values
 
-    heights = [at(footing.height, scales.foot), at(footing.height, scales.foot, way.end)]
+    start, end = at(footing.height, scales.foot), at(footing.height, scales.foot, way.end)
     between = [at(footing.highest, scales.stood_on, place) for place in way.places]
     steepness = torch.minimum(at(footing.steepness, scales.foot), at(footing.steepness, scales.foot, way.end))
     # The highest of 3 x 3 cells lies up to a diagonal farther on.
-    step = _unexplained_rise(*heights, between, steepness * (way.spacing + DIAGONAL))
+    step = _unexplained_rise(start, end, between, steepness * (way.spacing + DIAGONAL))
     H, W = (size - 2 * scales.foot for size in footing.height.shape[-2:])
     return [step.narrow(-2, i - low[0], H).narrow(-1, j - low[1], W) for i, j in starts]
 

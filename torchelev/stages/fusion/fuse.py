@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -171,7 +171,7 @@ def update_cells(
     fresh = torch.where(prior.known & ~challenge.won, -support, measured.votes - measured.dissent)
     support = torch.where(founds, fresh, support).clamp(0, cfg.max_support)
     validity = prior.known | takes
-    layers = dict(
+    layers: dict[str, Any] = dict(
         elevation=h,
         variance=torch.where(validity, variance, BLANK["variance"]),
         support=torch.where(measured.kept > 0, support, prior.support),
