@@ -392,6 +392,7 @@ def test_points_of_half_the_bytes(dtype, tolerance):
     assert both.float().mean() > 0.9 * exact.validity.float().mean() and error.median() < tolerance
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("with_base", [True, False])
 @pytest.mark.parametrize("sensors", [None, 2])
 def test_nothing_waits_for_the_device(with_base, sensors):

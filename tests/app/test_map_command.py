@@ -34,6 +34,7 @@ def test_recording_in_map_out(run, recording, tmp_path):
         assert word in out
 
 
+@pytest.mark.slow(2)
 def test_defaults_write_map_here(run, recording, tmp_path):
     assert run("map", recording / "scans", "--poses", recording / "poses.txt")[0] == 0
     assert load_npz(tmp_path / "map.npz").layers["elevation"].shape == (200, 200)
@@ -42,6 +43,7 @@ def test_defaults_write_map_here(run, recording, tmp_path):
     assert (tmp_path / "folder" / "map.ply").exists()
 
 
+@pytest.mark.slow(1)
 def test_fixed_window_keeps_its_place(run, recording, tmp_path):
     assert run("map", recording, "--fixed", "--size", 3)[0] == 0
     assert load_npz(tmp_path / "map.npz").center[:2] == pytest.approx([0.375, 0], abs=0.051)
@@ -49,6 +51,7 @@ def test_fixed_window_keeps_its_place(run, recording, tmp_path):
     assert "--fixed --size 2 to keep it all" in out
 
 
+@pytest.mark.slow(2)
 def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
     assert run("map", recording, "--size", 8)[0] == 0
     assert load_npz(tmp_path / "map.npz").config["overlap"] is None
@@ -62,6 +65,7 @@ def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
     assert not np.isfinite(load_npz(tmp_path / "map.npz").layers["elevation"]).any()
 
 
+@pytest.mark.slow(2)
 def test_poses_of_the_base_with_extrinsics(run, recording, tmp_path):
     mount = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, -0.1], [0, 0, 1, 0.5], [0, 0, 0, 1]])
     assert run("map", recording, "--size", 8, "--out", "sensor")[0] == 0
@@ -130,6 +134,7 @@ def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
     assert not (tmp_path / "map.npz").exists()  # which may hold an earlier, whole map
 
 
+@pytest.mark.slow(1)
 def test_poses_that_contradict_each_other_are_warned_of(run, recording):
     """Every other scan is a metre higher than its pose says."""
     poses = np.loadtxt(recording / "poses.txt")
@@ -235,6 +240,7 @@ def test_millimetres_are_told_to_be_units(run, recording, suffix, poses_too):
     assert err.count("\n") == 1, "the cause is told, not its consequences"
 
 
+@pytest.mark.slow(3)
 def test_a_second_map_in_the_recordings_folder_takes_the_same_scans(run, recording, tmp_path, monkeypatch):
     monkeypatch.chdir(recording)
     for scans in (recording / "scans", recording):

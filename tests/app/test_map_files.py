@@ -22,6 +22,7 @@ def test_outputs_are_checked_before_mapping(run, recording, tmp_path, monkeypatc
     assert run("map", recording, "--out", "/dev/full")[0] == 2
 
 
+@pytest.mark.slow(1)
 def test_the_size_limit_is_checked_before_mapping(recording, tmp_path):
     (tmp_path / "map.npz").write_bytes(b"older")
     command = f"ulimit -f 20; exec {sys.executable} -m torchelev map {recording} --out {tmp_path / 'map'}"
@@ -31,6 +32,7 @@ def test_the_size_limit_is_checked_before_mapping(recording, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["drive", "map.npz"]
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("suffix", [".npz", ".png", ".ply"])
 def test_what_cannot_be_written_is_kept_elsewhere(run, recording, tmp_path, monkeypatch, suffix):
     assert run("map", recording, "--size", 4)[0] == 0

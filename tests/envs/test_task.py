@@ -126,6 +126,7 @@ def rollout(task, steps):
     return seen
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("perception", ["map", "truth"])
 def test_a_restored_state_goes_on_as_if_never_stopped(perception):
     cfg = TerrainNavConfig(course=SMALL, episode_length=1.0)  # so that episodes end meanwhile
@@ -138,6 +139,7 @@ def test_a_restored_state_goes_on_as_if_never_stopped(perception):
             assert torch.equal(a[name], b[name]), name
 
 
+@pytest.mark.slow(1)
 def test_seeds_make_episodes():
     cfg = TerrainNavConfig(course=SMALL)
     seen = []
@@ -151,6 +153,7 @@ def test_seeds_make_episodes():
     assert not torch.equal(seen[0]["policy"], seen[2]["policy"])
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("perception", ["map", "truth", "blind"])
 def test_host_reads_nothing_back_from_the_device(monkeypatch, perception):
     # Tensors on "meta" have no values, so that reading one raises; copying one from the host needs a constructor.

@@ -78,6 +78,7 @@ def test_extrema_of_several_layers(seed, shape, share, count):
     assert_layer(minimum(*layers), np.nanmin(filled, 0), known, 0)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("function", WINDOWED)
 def test_batch_is_single_and_gradients(function):
     def run(layer):

@@ -68,6 +68,7 @@ def test_literal_values():
     assert gaussian(layer, resolution=0.1, sigma=0.04)[0][0, 1, 1] == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("function", ALL)
 def test_batch_is_single_and_gradients(function):
     def run(layer):

@@ -47,6 +47,7 @@ def test_the_virtual_floor_lies_nowhere_below_the_median(seed, share):
     assert (floor >= median(layer, resolution=0.1, radius=0.1)[0] - 1e-9).all()
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("function", FLOORS)
 def test_batch_is_single_and_gradients(function):
     def run(layer):

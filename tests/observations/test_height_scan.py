@@ -250,6 +250,8 @@ def test_gradients_of_feet_and_images():
     assert elevation.grad.isfinite().all() and elevation.grad.any()
 
 
+@pytest.mark.compiles
+@pytest.mark.slow(4)
 @pytest.mark.parametrize("warm", [True, False])
 def test_scans_compile_as_one_graph(warm):
     """Also a scan whose pattern has not been on the device before."""
@@ -271,6 +273,7 @@ def test_scans_compile_as_one_graph(warm):
     torch.testing.assert_close(compiled(T, u, scans, images, feet), expected)
 
 
+@pytest.mark.slow(2)
 def test_nothing_waits_for_the_device():
     with FakeTensorMode():
         emap, T = ElevationMap(num_envs=2), torch.zeros(2, 4, 4, dtype=torch.float64)

@@ -191,6 +191,7 @@ def test_dtypes_and_gradients():
         torch.testing.assert_close(value.double(), to_go(cost, goal), rtol=tolerance, atol=0)
 
 
+@pytest.mark.slow(2)
 def test_nothing_waits_for_the_device():
     with FakeTensorMode():
         cost, goal = torch.ones(2, 9, 8), torch.ones(2, 9, 8, dtype=torch.bool)

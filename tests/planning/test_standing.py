@@ -179,6 +179,7 @@ def test_footprints_at_poses():
 # Devices, and what is refused -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(2)
 def test_nothing_waits_for_the_device(monkeypatch):
     forbid_reading(monkeypatch)
     emap = ElevationMap(num_envs=2, device="meta")

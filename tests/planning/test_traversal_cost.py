@@ -212,6 +212,7 @@ def test_what_the_same_ground_costs_hardly_depends_on_the_cells():
 # Devices, and what is refused -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(2)
 def test_nothing_waits_for_the_device(monkeypatch):
     with FakeTensorMode():
         assert traversal_cost(ElevationMap(num_envs=2), TraversalCostConfig(inflation_radius=0.1)).shape == (

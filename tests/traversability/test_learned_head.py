@@ -172,6 +172,7 @@ def test_maps_of_other_precision(cfg, dtype):
     assert all(part.isfinite().all() and part.dtype == dtype for part in rating)
 
 
+@pytest.mark.slow(2)
 def test_nothing_waits_for_the_device(cfg):
     """On tensors without values."""
     with FakeTensorMode():

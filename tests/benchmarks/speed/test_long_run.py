@@ -14,6 +14,7 @@ from benchmarks.speed import growth, long_run
 from benchmarks.speed.workload import Drive, full_config
 
 
+@pytest.mark.slow(3)
 def test_long_run_writes_every_block(tmp_path, monkeypatch, capsys, eager):
     monkeypatch.setattr(long_run, "CASES", {"two robots": (2, 64, 400, 4)})
     monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))

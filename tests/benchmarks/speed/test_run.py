@@ -20,6 +20,7 @@ def test_regressions_need_median_and_minimum():
     assert count == 3
 
 
+@pytest.mark.slow(3)
 def test_one_section_into_a_new_folder(tmp_path, monkeypatch, capsys, eager):
     monkeypatch.setattr(scaling, "RAYS", [1.2, 4.8])
     monkeypatch.setattr(sys, "argv", ["run", "rays", "--out", str(tmp_path), "--seconds", "0.001"])
@@ -33,6 +34,7 @@ def run_compare(new, old):
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
 
 
+@pytest.mark.slow(10)
 def test_compare_fails_on_a_regression(tmp_path):
     fast, slow = tmp_path / "fast.json", tmp_path / "slow.json"
     fast.write_text(json.dumps({"update": {"median": 1.0, "min": 0.9}}))

@@ -7,6 +7,7 @@ from benchmarks.speed import scaling
 from benchmarks.speed.run import timings
 
 
+@pytest.mark.slow(6)
 @pytest.mark.parametrize("section", ["rays", "points", "robots", "cells"])
 def test_sections_measure_at_small_sizes(section, monkeypatch, eager):
     small = {"RAYS": [1.2, 4.8], "POINTS": [6276, 43074, 50000], "ROBOTS": [1, 2, 3], "CELLS": [50, 60, 70]}

@@ -6,6 +6,7 @@ import training.nav.export as nav_export
 from tests.training.nav.runners import make_runner
 
 
+@pytest.mark.slow(1)
 def test_an_export_that_acts_otherwise_is_refused(tmp_path, monkeypatch):
     runner = make_runner(tmp_path, "blind")
     nav_export.export(runner, tmp_path)

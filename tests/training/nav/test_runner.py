@@ -17,6 +17,7 @@ from training.resume import CHECKPOINT
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.slow(1)
 def test_training_changes_the_policy_and_logs(tmp_path):
     runner = make_runner(tmp_path)
     before = weights(runner)
@@ -25,6 +26,7 @@ def test_training_changes_the_policy_and_logs(tmp_path):
     assert (tmp_path / CHECKPOINT).exists() and list(tmp_path.glob("events.out.tfevents*"))
 
 
+@pytest.mark.slow(3)
 def test_a_resumed_training_equals_one_that_never_stopped(tmp_path):
     whole = make_runner(tmp_path / "whole")
     whole.learn(4)
@@ -76,6 +78,7 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path):
     assert again.current_learning_iteration == 2
 
 
+@pytest.mark.slow(10)
 def test_two_processes_train_one_policy(tmp_path):
     script = tmp_path / "two.py"
     script.write_text(

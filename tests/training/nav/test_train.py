@@ -14,6 +14,7 @@ def invoke(*arguments):
     return CliRunner().invoke(nav.main, [*map(str, arguments), "--no-compile"], catch_exceptions=False)
 
 
+@pytest.mark.slow(10)
 def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkeypatch):
     monkeypatch.setattr(nav, "task_config", lambda held_out=False: CFG)
     out = tmp_path / "run"

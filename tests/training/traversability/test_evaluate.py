@@ -11,6 +11,7 @@ from torchelev.traversability.net import Rating, TraversabilityNet
 from training.traversability.maps.data import make_batch
 
 
+@pytest.mark.slow(2)
 def test_evaluation_names_heads_subsets_and_kinds(tmp_path, monkeypatch):
     monkeypatch.setattr(evaluation, "RESOLUTIONS", (0.08,))
     torch.manual_seed(0)

@@ -23,6 +23,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(evaluation, "RESOLUTIONS", (0.08,))
 
 
+@pytest.mark.slow(6)
 def test_the_commands_train_evaluate_draw_and_resume(tmp_path, tiny):
     out = tmp_path / "run"
     common = ("--out", out, "--batches", 1, "--evaluation-batches", 1, "--steps", 2)
@@ -44,6 +45,7 @@ def test_the_commands_train_evaluate_draw_and_resume(tmp_path, tiny):
     assert found["held_out"]["8 cm"]["learned (run)"] == result["held_out"]["8 cm"]["learned (run)"]
 
 
+@pytest.mark.slow(2)
 def test_the_command_trains_for_one_robot(tmp_path, tiny, monkeypatch):
     monkeypatch.setattr(training, "_finish", lambda *_: None)
     sizes = ("--robot", "length=0.5,width=0.45,foot_radius=0.1")

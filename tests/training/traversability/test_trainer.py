@@ -69,6 +69,7 @@ def test_training_lowers_the_loss(tmp_path):
     assert (tmp_path / CHECKPOINT).exists() and list(tmp_path.glob("events.out.tfevents*"))
 
 
+@pytest.mark.slow(3)
 def test_a_resumed_training_equals_one_that_never_stopped(tmp_path):
     whole = trainer()
     whole.run(tmp_path / "whole")

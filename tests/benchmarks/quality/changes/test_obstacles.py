@@ -38,6 +38,7 @@ def test_scans_are_counted_until_something_first_shows():
     assert obstacles.scans_until([yes, no, no]) == {"median": 2, "most": 4}
 
 
+@pytest.mark.slow(5)
 def test_a_plate_shows_sooner_where_ground_ages_faster(monkeypatch):
     monkeypatch.setattr(obstacles, "WATCHED", 12)
     slow, fast = (

@@ -93,6 +93,7 @@ def equal(a, b):
     return tensors and a[7:] == b[7:]
 
 
+@pytest.mark.slow(3)
 def test_a_seed_makes_the_same_maps_and_another_makes_others():
     first = make_batch([0, 1], SMALL)
     assert equal(first, make_batch([0, 1], SMALL)) and not equal(first, make_batch([0, 2], SMALL))
@@ -113,6 +114,7 @@ def test_kinds_resolution_and_robot_can_be_fixed():
     assert not set(UNSEEN_KINDS) & set(KINDS)
 
 
+@pytest.mark.slow(2)
 def test_exact_batches_are_rated_everywhere(tmp_path):
     (maps,) = data_set(tmp_path, "held_out_exact", 1, 0, SMALL, resolution=0.1)
     assert maps.validity.all() and maps.rated.all()
@@ -124,6 +126,7 @@ def test_splits_and_data_sets_have_seeds_of_their_own():
     assert len(seeds) == len(data.SPLITS) * 9
 
 
+@pytest.mark.slow(2)
 def test_a_data_set_is_kept_and_only_what_lacks_is_made(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(data, "make_batch", lambda seed, *rest: made.append(seed) or make_batch(seed, *rest))

@@ -57,6 +57,7 @@ def test_no_body_is_within_a_wall():
     assert float(z[1]) == pytest.approx(3.1), "at the wall's foot, over the wall"
 
 
+@pytest.mark.slow(2)
 def test_robots_take_the_easiest_of_some_walks():
     robot = RobotConfig()
     half = torch.zeros(1, 401, 401)
