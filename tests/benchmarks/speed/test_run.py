@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from benchmarks.speed import run, scaling
 from benchmarks.speed.run import regressions
 from docs.readme_tables import ROOT

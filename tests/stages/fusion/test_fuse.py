@@ -1,5 +1,6 @@
 """The height update."""
 
+import contextlib
 import dataclasses
 from unittest.mock import patch
 
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import off_borders, pose, random_poses, random_state, scan, small_map
 from torchelev import EdgeConfig, FusionConfig, SensorConfig
-from torchelev.stages.fusion.contested import ContestedCells
+from torchelev.ops import indexing
+from torchelev.stages.fusion import contested
 from torchelev.stages.fusion.fuse import fuse
 
 SEEDS = st.integers(0, 10_000)
@@ -83,14 +85,15 @@ EDGES = [EdgeConfig(), EdgeConfig(min_extreme=1, refinements=2), EdgeConfig(min_
 )
 def test_agrees_with_the_reference_at_steps(seed, num_points, sensors, edges, can_select, altitude):
     """On a CPU, which selects the contested cells, and as on a GPU, which goes through all cells."""
-    with patch.object(ContestedCells, "can_select", lambda self, values: can_select):
+    with patch_selection(can_select):
         compare_with_reference(seed, num_points, sensors, FusionConfig(edges=edges), altitude)
 
 
 @pytest.mark.parametrize("can_select", [True, False])
 def test_no_cell_is_contested(monkeypatch, can_select):
     """Other cells keep their heights: with no points at all, and where all points agree with the map."""
-    monkeypatch.setattr(ContestedCells, "can_select", lambda self, values: can_select)
+    monkeypatch.setattr(indexing, "can_select", lambda values: can_select)
+    monkeypatch.setattr(contested, "can_select", lambda values: can_select)
     emap = small_map(1, CELLS)
     emap.update(torch.empty(1, 0, 3), pose((0.0, 0.0, 1.0)), dt=0.0)
     assert not emap.validity.any()
@@ -99,6 +102,16 @@ def test_no_cell_is_contested(monkeypatch, can_select):
         emap.update(flat, pose((0.0, 0.0, 1.0)), dt=0.0)
     assert emap.elevation[emap.validity].tolist() == pytest.approx([0.0] * 4, abs=1e-6)
     assert emap.statistics.points_used.item() == 20
+
+
+@contextlib.contextmanager
+def patch_selection(can_select):
+    """Select the contested cells, as on a CPU, or go through all of them, as on a GPU."""
+    with (
+        patch.object(indexing, "can_select", lambda values: can_select),
+        patch.object(contested, "can_select", lambda values: can_select),
+    ):
+        yield
 
 
 def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0):

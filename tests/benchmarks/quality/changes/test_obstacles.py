@@ -1,5 +1,6 @@
 """After how many scans obstacles and plates show."""
 
+import pytest
 import torch
 
 from benchmarks.quality.changes import obstacles
