@@ -1,6 +1,7 @@
 """What the tests of filters share: layers, loops over windows, and what must hold of every filter."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -8,6 +9,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 SEEDS = st.integers(0, 10_000)
 SHAPES = st.tuples(st.integers(1, 2), st.integers(1, 8), st.integers(1, 7))
 SHARES = st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0])  # of known cells
+SMALL_MAPS = pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (1, 9, 1), (2, 3, 4)])
+ALL_OR_NOTHING_KNOWN = pytest.mark.parametrize("share", [0.0, 1.0])
 
 
 def random_layer(seed, shape=(2, 7, 6), share=0.7, dtype=torch.float64):
@@ -58,6 +61,13 @@ def assert_gradients(function, *layers):
     apart = [(place * 0.1 + 0.03 * n).double().requires_grad_() for n, place in enumerate(places)]
     masks = [k for _, k in layers]
     assert torch.autograd.gradcheck(lambda *v: function(*zip(v, masks, strict=True))[0], tuple(apart), atol=1e-6)
+
+
+def assert_runs_on_small_maps(function, shape, share):
+    """Windows may be larger than the map: its values are finite, and what is known stays so."""
+    layer = random_layer(1, shape, share, torch.float32)
+    values, known = function(layer, resolution=0.02)
+    assert torch.isfinite(values).all() and torch.equal(known, layer[1])
 
 
 def hill(resolution, altitude=0.0, hole=False):

@@ -9,13 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.filters.filter_cases import (
+    ALL_OR_NOTHING_KNOWN,
     SEEDS,
     SHAPES,
     SHARES,
+    SMALL_MAPS,
     assert_batch_is_single,
     assert_gradients,
     assert_layer,
     assert_never_waits,
+    assert_runs_on_small_maps,
     hill,
     of_windows,
     random_layer,
@@ -113,12 +116,10 @@ def test_float32_keeps_its_precision_at_500_m(function):
 
 
 @pytest.mark.parametrize("function", ALL)
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (1, 9, 1), (2, 3, 4)])
-@pytest.mark.parametrize("share", [0.0, 1.0])
+@SMALL_MAPS
+@ALL_OR_NOTHING_KNOWN
 def test_windows_larger_than_the_map(function, shape, share):
-    layer = random_layer(1, shape, share, torch.float32)
-    values, known = function(layer, resolution=0.02)
-    assert torch.isfinite(values).all() and torch.equal(known, layer[1])
+    assert_runs_on_small_maps(function, shape, share)
 
 
 @pytest.mark.parametrize("function", ALL)

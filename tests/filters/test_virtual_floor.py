@@ -5,11 +5,14 @@ import torch
 from hypothesis import given
 
 from tests.filters.filter_cases import (
+    ALL_OR_NOTHING_KNOWN,
     SEEDS,
     SHARES,
+    SMALL_MAPS,
     assert_batch_is_single,
     assert_gradients,
     assert_never_waits,
+    assert_runs_on_small_maps,
     random_layer,
     resolution_spread,
 )
@@ -59,12 +62,10 @@ def test_batch_is_single_and_gradients(function):
 
 
 @pytest.mark.parametrize("function", FLOORS)
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (1, 9, 1), (2, 3, 4)])
-@pytest.mark.parametrize("share", [0.0, 1.0])
+@SMALL_MAPS
+@ALL_OR_NOTHING_KNOWN
 def test_windows_larger_than_the_map(function, shape, share):
-    layer = random_layer(1, shape, share, torch.float32)
-    values, known = function(layer, resolution=0.02)
-    assert torch.isfinite(values).all() and torch.equal(known, layer[1])
+    assert_runs_on_small_maps(function, shape, share)
 
 
 @pytest.mark.parametrize("function", FLOORS)
