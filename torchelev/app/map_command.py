@@ -190,7 +190,7 @@ def _finish(run: MappingRun, num_scans: int, prefix: Path, stopped: BaseExceptio
 def _write_and_report(
     run: MappingRun, num_scans: int, prefix: Path, options: MapOptions
 ) -> tuple[list[str], KeyboardInterrupt | None]:
-    """Write the map's files and print a summary; return what failed, and a Ctrl-C that came meanwhile."""
+    """Write the map's files and print a summary; return errors, and a Ctrl-C pressed while writing."""
     interrupt = None
     try:
         with defer_interrupts():

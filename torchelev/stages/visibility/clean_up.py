@@ -88,9 +88,9 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
 
     A known cell goes if a ray's height over it is below h - sigma, it was not hit for `min_time`, and |r . n| > alpha_n
     (eq. 3 and 4), with n the cell's normal and r the direction of the lowest ray, the only one that the table keeps.
-    Eq. 4 keeps grazing rays from eroding smooth ground; a ray that `passes_far_below` does not graze, and needs none:
-    what is left of a ghost tilts its own normal, by which it would stay for ever.
-    The upper bound of an unknown cell is the lowest ray height over it so far. None for `cfg`: rays tell nothing.
+    Eq. 4 keeps grazing rays from eroding smooth ground. It is not asked of a ray that `passes_far_below`: the last
+    cells of an obstacle that left have tilted normals, and would stay forever.
+    The upper bound of an unknown cell is the lowest ray height over it so far. None for `cfg`: the stage is skipped.
     """
     if cfg is None:
         return state
