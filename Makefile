@@ -45,7 +45,7 @@ test-library: setup
 	$(BIN)/python $(PYTEST) -m "not slow" $(MATRIX_TESTS)
 
 lint: setup  ## check style, and that imports go downwards
-	$(BIN)/ruff check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/ruff format --check --quiet .
 	$(BIN)/lint-imports
 

@@ -1,10 +1,10 @@
 """The sections that scale an update measure at small sizes."""
 
 import pytest
-from benchmarks.speed.sections import SECTIONS
 
 from benchmarks.speed import scaling
 from benchmarks.speed.run import timings
+from benchmarks.speed.sections import SECTIONS
 
 
 @pytest.mark.slow(6)
