@@ -10,7 +10,7 @@ from torch._inductor.codegen.cpp import CppScheduling
 from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
 from torch._inductor.utils import run_and_get_code
 
-from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, compiled
+from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, choose_bytes_as_integers, compiled
 
 pytestmark = pytest.mark.compiles
 
@@ -49,3 +49,23 @@ def test_eight_bytes_of_a_mask_are_loaded_at_once():
             code = "".join(codes)
             assert "<uint8_t>::loadu_one_fourth(" in code
             assert re.search(r"<uint8_t>::loadu\(.*<int64_t>\(8L?\)\)", code) is None
+
+
+def test_bytes_are_chosen_as_integers_in_graphs_that_the_cache_accepts():
+    """It keeps no graph with a method call on a node without an example value."""
+    graphs = []
+
+    def keep(graph, _):
+        choose_bytes_as_integers(graph)
+        graphs.append(graph)
+        return graph.forward
+
+    def chosen(mask, one, other):
+        return torch.where(mask, torch.where(~mask, one, 7), other)
+
+    mask, one, other = torch.tensor([True, False]), torch.tensor([200, 3]).byte(), torch.tensor([5, 255]).byte()
+    torch._dynamo.reset()
+    assert torch.equal(torch.compile(chosen, backend=keep)(mask, one, other), chosen(mask, one, other))
+    nodes = [node for node in graphs[0].graph.nodes if node.op.startswith("call")]
+    assert all(n.meta["example_value"].dtype == torch.int32 for n in nodes if n.target is torch.where)
+    assert all("example_value" in node.meta for node in nodes)

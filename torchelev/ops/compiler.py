@@ -48,13 +48,19 @@ def choose_bytes_as_integers(graph: torch.fx.GraphModule) -> None:
             continue
         with graph.graph.inserting_before(node):
             mask, *values = node.args
-            values = [
-                graph.graph.call_method("to", (v, torch.int32)) if isinstance(v, torch.fx.Node) else v for v in values
-            ]
+            values = [_converted(v, torch.int32) if isinstance(v, torch.fx.Node) else v for v in values]
             chosen = graph.graph.call_function(torch.where, (mask, *values))
-            node.replace_all_uses_with(graph.graph.call_method("to", (chosen, torch.uint8)))
+            chosen.meta["example_value"] = result.to(torch.int32)
+            node.replace_all_uses_with(_converted(chosen, torch.uint8))
         graph.graph.erase_node(node)
     graph.recompile()
+
+
+def _converted(node: torch.fx.Node, dtype: torch.dtype) -> torch.fx.Node:
+    """Insert a conversion, with an example of its values: of graphs with a node that lacks one there is no cache."""
+    new = node.graph.call_method("to", (node, dtype))
+    new.meta["example_value"] = node.meta["example_value"].to(dtype)
+    return new
 
 
 @contextlib.contextmanager

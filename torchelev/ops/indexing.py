@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Int, Shaped, UInt8
 
 
-def read(values: Shaped[Tensor, "B C"], index: Int[Tensor, "B *I"]) -> Shaped[Tensor, "B *I"]:
-    """Return the value at each index; the values are stored first, not computed anew for each index."""
-    values = realize(values)
+def read(layer: Shaped[Tensor, "B *C"], index: Int[Tensor, "B *I"]) -> Shaped[Tensor, "B *I"]:
+    """Return the layer's value at each flat index; the layer is stored first, not computed anew for each index."""
+    values = realize(layer).flatten(1)  # in this order, or it would be computed by flat index, with divisions
     if index.ndim == 2:
         return values.gather(1, index)
     if torch.compiler.is_compiling():  # a flat index it would store, or divide to find row and column

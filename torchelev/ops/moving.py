@@ -43,7 +43,7 @@ def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[
     j = torch.arange(W, device=shift.device)[None, None, :] + shift[:, 1, None, None]
     entering = (i < 0) | (i >= H) | (j < 0) | (j >= W)
     index = i.clamp(0, H - 1) * W + j.clamp(0, W - 1)
-    values = [read(layer.flatten(1), index) for layer in layers]
+    values = [read(layer, index) for layer in layers]
     # Bytes become numbers here: among these, compiled code chooses so much faster that all of it takes half as long.
     blanked = [torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)]
     return realize_all(*(value.to(layer.dtype) for value, layer in zip(blanked, layers, strict=True)))

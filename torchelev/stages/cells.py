@@ -30,7 +30,7 @@ class PointCells(NamedTuple):
 
     def take(self, *layers: Tensor) -> list[Tensor]:
         """Give each point its cell's value of each layer: (B, H, W) or (B, C) -> (B, M)."""
-        return [read(layer.flatten(1), self.slot) for layer in layers]
+        return [read(layer, self.slot) for layer in layers]
 
 
 @stored

@@ -77,7 +77,7 @@ def has_credible_end(
     """
     end = find_ends(state, m, rays, grid)
     ground = supported_ground(state, cfg, grid.resolution)
-    floor, known = (read(layer.flatten(1), end.slot) for layer in (lowest, ground))
+    floor, known = (read(layer, end.slot) for layer in (lowest, ground))
     near = ground_at_borders(ground, grid).gather(1, end.border)
     z = rays.origin[:, None, 2]
     height, deepest = z + end.reach * rays.slope, z + rays.r * rays.slope.clamp(max=0)
@@ -172,7 +172,7 @@ def horizon(
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
-    fall = torch.where(inside, read(below_sensor.flatten(1), slot), NO_FALL * step) / rho
+    fall = torch.where(inside, read(below_sensor, slot), NO_FALL * step) / rho
     steepest = running_minimum(fall.detach())  # compared with, and so without a gradient
     k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)

@@ -52,7 +52,7 @@ class RayOverCell(NamedTuple):
     incidence: Float[Tensor, "B H W"]  #: |r . n|
 
 
-def look_up(
+def find_lowest_rays(
     state: MapState, m: Measurement, origin: Tensor, table: Tensor, polar: PolarGrid, grid: GridConfig
 ) -> RayOverCell:
     """Gather the lowest ray over each cell, or less than a cell beside it."""
@@ -79,8 +79,7 @@ def lowest_slope(table: Tensor, k: Tensor, azimuth: Tensor, polar: PolarGrid) ->
     a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
     b = a + further
     b = torch.where(b < polar.azimuths, b, b - polar.azimuths)
-    slopes = table.flatten(1)
-    return torch.minimum(*(read(slopes, flat(k, place, polar.azimuths)) for place in (a, b)))
+    return torch.minimum(*(read(table, flat(k, place, polar.azimuths)) for place in (a, b)))
 
 
 def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None) -> MapState:
@@ -98,10 +97,11 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
         table = lowest_slopes(accepted_rays(state, m, rays, grid, cfg), polar, grid)
-        state = clear_and_bound(state, look_up(state, m, rays.origin, table, polar, grid), grid, cfg)
+        state = clear_and_bound(state, find_lowest_rays(state, m, rays.origin, table, polar, grid), grid, cfg)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
 
 
+@stored
 def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: RaycastConfig) -> MapState:
     """Apply the lowest ray of one sensor to every cell (paper, eq. 3 and 4).
 
@@ -112,22 +112,19 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     is_steep = ray.incidence > cfg.min_incidence
     is_old = state.time > cfg.min_time
     gone = ray.found & passes_below & is_old & (is_steep | passes_far_below(state, h - p_z, grid, cfg))
-    return bound(refute_challengers(state, ray, state.validity & ~gone), ray)
+    return bound(refute_challengers(state._replace(validity=state.validity & ~gone), ray), ray)
 
 
-@stored
-def refute_challengers(state: MapState, ray: RayOverCell, validity: Bool[Tensor, "B H W"]) -> MapState:
-    """Keep the cells that are still valid, and forget challengers that a ray passes below.
+def refute_challengers(state: MapState, ray: RayOverCell) -> MapState:
+    """Forget challengers that a ray passes below, and those of cells that are not known.
 
     Nothing stands there: outliers stop no other ray. From a cell's centre to its corner a ray falls by 0.71 of `fall`;
     those that end on an obstacle's top, more than a cell behind, pass higher than that.
     """
     passes_below = ray.found & (ray.height < state.challenger + math.sqrt(0.5) * ray.fall)
-    challenger_support = torch.where(passes_below | ~validity, 0, state.challenger_support)
-    return state._replace(validity=validity, challenger_support=challenger_support)
+    return state._replace(challenger_support=torch.where(passes_below | ~state.validity, 0, state.challenger_support))
 
 
-@stored
 def bound(state: MapState, ray: RayOverCell) -> MapState:
     """Lower the upper bound of unknown cells to the ray's height (paper, Sec. II-H)."""
     bounds = ray.found & ~state.validity
