@@ -217,6 +217,7 @@ def test_a_wrong_frame_is_pointed_out(run, recording, tmp_path):
     assert "the sensor is mounted upside down, which T_map_sensor does not say" in err
 
 
+@pytest.mark.slow(5)
 @pytest.mark.parametrize("suffix", [".bin", ".npy", ".ply"])
 @pytest.mark.parametrize("poses_too", [False, True])
 def test_millimetres_are_told_to_be_units(run, recording, suffix, poses_too):
@@ -259,6 +260,7 @@ def test_the_folder_scans_wins(run, recording):
     assert code == 0 and "4 of 4, 80,000 points" in out, err
 
 
+@pytest.mark.slow(2)
 def test_maps_of_depth_images_beside_them(run, tmp_path):
     cv2.imwrite(str(tmp_path / "0.png"), np.full((60, 80), 2000, np.uint16))
     write_poses(tmp_path / "poses.txt", np.array([[0.0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])[None])

@@ -234,6 +234,7 @@ def sound_scene(seed):
     return scene, sensor, path, ElevationMapConfig(grid=grid), knows_base
 
 
+@pytest.mark.slow(9)
 @pytest.mark.parametrize("seed", range(int(os.environ.get("SOUND_SCENES", 12))))
 def test_random_sound_scenes_are_passed_over(seed):
     """SOUND_SCENES=100 in the environment tries more."""

@@ -110,6 +110,7 @@ def test_range_is_the_limit(path):
     assert one(field, (0.0, 0.0, 1.0), [0.0, 0.0, -1.0], 0.999).isinf().all()
 
 
+@pytest.mark.slow(8)
 @pytest.mark.parametrize("terrain", TERRAINS)
 def test_equals_a_fine_march(terrain):
     """All kinds of rays on one kind of terrain: 3,150 of them, and 22,050 over all terrains."""

@@ -350,6 +350,7 @@ def test_a_neighbour_of_like_height_vouches(step, bounds):
     assert cast(emap, state, np.array([[1.05, 0.05, 0.0]]), T).bounded.any() == bounds
 
 
+@pytest.mark.slow(3)
 @pytest.mark.parametrize("place", PLACES[:3])
 def test_where_rays_end_agrees_with_the_reference(place):
     """Nearly level ground, a third of it unknown and more along the borders; low rays end or leave at any height."""
