@@ -88,6 +88,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow(10)
 @pytest.mark.parametrize("words", MISTAKES)
 def test_a_mistake_is_named_first(walked, words):
     sentences = map_of(walked, MISTAKES[words]).diagnose()
