@@ -1,10 +1,10 @@
 """torchelev: batched, differentiable elevation mapping in PyTorch, for robots that learn."""
 
-from torchelev.clouds import depth_to_points, voxel_filter
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.filters.chain import FilterConfig
 from torchelev.grid import GridConfig
+from torchelev.inputs.clouds import depth_to_points, voxel_filter
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
 from torchelev.robot import RobotConfig

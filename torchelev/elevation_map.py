@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchelev import checks, pipeline
-from torchelev.chunks import make_chunks, run_in_chunks
+from torchelev import pipeline
 from torchelev.compiled_update import compile_ahead, compiled_update
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
 from torchelev.diagnosis.history import InputHistory
 from torchelev.diagnosis.pace import Pace, paced
 from torchelev.errors import require, require_count
-from torchelev.inputs import Inputs, check_inputs, placeholder_inputs, require_full_precision, requires_dt
+from torchelev.inputs import checks
+from torchelev.inputs.chunks import make_chunks, run_in_chunks
+from torchelev.inputs.update_inputs import Inputs, check_inputs, placeholder_inputs, require_full_precision, requires_dt
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import require_reverse_mode

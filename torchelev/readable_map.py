@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev import checks
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.filters.chain import FilterChain
+from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer
 from torchelev.map_buffers import MapBuffers
 from torchelev.pipeline import rate_surface

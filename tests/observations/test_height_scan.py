@@ -14,7 +14,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from tests.helpers import pose, small_map
 from tests.observations.loops import loop_scan
 from tests.observations.maps import BASE, SEEDS, at, flat, ground_map, near, plane, random_base, random_map
-from torchelev import ElevationMap, checks
+from torchelev import ElevationMap
+from torchelev.inputs import checks
 from torchelev.observations.fill import FILLS, MODES
 from torchelev.observations.height_scan import PRESETS, HeightScan
 from torchelev.observations.map_image import CHANNELS, MapImage

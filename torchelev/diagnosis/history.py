@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.inputs import Inputs
+from torchelev.inputs.update_inputs import Inputs
 
 MAX_ENVS = 4  # the first environments: a wrong convention is wrong in all of them
 _MAX_UPDATES = 8

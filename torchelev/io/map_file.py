@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchelev import checks
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.inputs import checks
 from torchelev.map_buffers import name_tensors, state_of
 from torchelev.output_files import atomic_file
 from torchelev.pipeline import rate_surface

@@ -188,7 +188,7 @@ def _read_depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
     """Read a depth image as points (H * W, 3) [m] in the camera frame: x right, y down, z forward."""
     import torch
 
-    from torchelev.clouds import depth_to_points
+    from torchelev.inputs.clouds import depth_to_points
 
     depth = read_depth(path, camera.depth_scale)
     check_size(path, camera, depth.shape)

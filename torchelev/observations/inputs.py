@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_pose, check_tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.inputs.checks import FLOATS, check_pose, check_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, readable, require_indices, require_tensor
 from torchelev.errors import require, require_count, require_positive
+from torchelev.inputs.checks import FLOATS, readable, require_indices, require_tensor
 from torchelev.ops.windows import AROUND, neighbours
 
 if TYPE_CHECKING:

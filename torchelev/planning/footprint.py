@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.grid import GridConfig
+from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.planning.polygons import PolygonCells, convex_hull, rasterize
 from torchelev.planning.standing import MAX_CELL_OFFSET, mark_standing_cells
 from torchelev.state import MapState

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
+from torchelev.inputs.checks import given_or_default, readable
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint
 from torchelev.planning.standing import MAX_CELL_OFFSET, check_polygon, check_poses, transform_polygon
 from torchelev.state import MapState

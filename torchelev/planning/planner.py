@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
+from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.planning.cost_to_go import cost_to_go, descend
 from torchelev.planning.path_reason import Endpoint, Reason, find_reason, read_cell
 from torchelev.planning.standing import mark_standing_cells

@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor, check_xy, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count, whole_cells
+from torchelev.inputs.checks import FLOATS, check_tensor, check_xy, readable
 from torchelev.state import MapState
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_pose, check_tensor, readable
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.inputs.checks import FLOATS, check_pose, check_tensor, readable
 from torchelev.observations.patterns import compute_heading
 from torchelev.planning.polygons import rasterize
 from torchelev.state import MapState

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor, given_or_default
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
+from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default
 from torchelev.layers import Layer
 from torchelev.ops.operators import padded
 from torchelev.ops.windows import window_maximum

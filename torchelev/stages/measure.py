@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FARTHEST
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.inputs.checks import FARTHEST
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
 from torchelev.state import Measurement

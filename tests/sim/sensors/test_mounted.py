@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.helpers import pose, random_poses
 from tests.test_gpu import OneDevice
 from torchelev import ElevationMap
-from torchelev.clouds import depth_to_points
+from torchelev.inputs.clouds import depth_to_points
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact import scenes
 from torchelev.sim.exact.sensors import NonRepetitiveLidar

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import FLOATS, check_tensor
 from torchelev.errors import require, require_positive
 from torchelev.filters.distances.column_distance import column_distances
 from torchelev.filters.layer_tools import check_layers, zero_unknown
+from torchelev.inputs.checks import FLOATS, check_tensor
 from torchelev.layers import Layer
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchelev import checks
 from torchelev.errors import require, require_count
+from torchelev.inputs import checks
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int

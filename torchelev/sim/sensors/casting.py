@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.checks import require_indices
 from torchelev.errors import require
+from torchelev.inputs.checks import require_indices
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.sim.sensors.tracing import HUGE, trace
 from torchelev.sim.terrains.heightfield import HeightField

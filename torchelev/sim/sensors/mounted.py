@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
-from torchelev.checks import check_pose
 from torchelev.errors import require
+from torchelev.inputs.checks import check_pose
 from torchelev.sim.sensors.casting import Boxes, cast
 from torchelev.sim.terrains.heightfield import HeightField
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchelev.checks import require_indices
 from torchelev.errors import require, require_count, whole_cells
+from torchelev.inputs.checks import require_indices
 from torchelev.sim.terrains.heightfield import HeightField
 from torchelev.sim.terrains.shapes import SHAPES, TABLE
 

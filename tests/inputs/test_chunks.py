@@ -4,7 +4,7 @@ import torch
 
 from tests.helpers import small_config
 from torchelev import ElevationMap
-from torchelev.chunks import make_chunks
+from torchelev.inputs.chunks import make_chunks
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 

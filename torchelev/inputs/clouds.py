@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.checks import readable, require_tensor
 from torchelev.errors import require, require_count, require_positive
+from torchelev.inputs.checks import readable, require_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Shaped

@@ -19,7 +19,8 @@ from tests.helpers import (
     small_map,
     snapshot,
 )
-from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig, checks
+from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig
+from torchelev.inputs import checks
 from torchelev.state import Statistics, map_layers
 
 B, N = 2, 30
@@ -365,7 +366,7 @@ def test_every_point_is_counted_once(seed):
 
 def test_checks_of_values_can_be_asked_for_on_other_devices():
     """On devices other than the CPU values are read on request only."""
-    from torchelev.checks import readable
+    from torchelev.inputs.checks import readable
 
     assert readable(torch.zeros(1)) and not readable(torch.zeros(1, device=META))
     assert readable(torch.zeros(1, device=META), always=True)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 
 from torchelev.grid import GridConfig
-from torchelev.inputs import Inputs
+from torchelev.inputs.update_inputs import Inputs
 from torchelev.state import MapState, map_layers
 
 CPU_CELLS = 2**18  # cells per chunk on a CPU; measured: 64 maps of 64 x 64 cells at a time, a third faster than 256

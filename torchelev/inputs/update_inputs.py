@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev import checks
 from torchelev.errors import require
+from torchelev.inputs import checks
 from torchelev.ops.transforms import require_reverse_mode
 
 if TYPE_CHECKING:
