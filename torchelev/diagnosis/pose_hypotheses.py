@@ -12,12 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.frames.camera_axes import CAMERA_AXES
+
 _NUM_PLANES = 80  # random planes per scan (RANSAC)
 _MAX_DISTANCE = 10.0  # [m] of the points from their sensor
 _CELL_SIZE = 0.15  # [m] of the cells in which scans are compared
 _TOLERANCE = 0.08  # [m] within which scans agree in a cell
 _MIN_CELLS = 40  # cells that a comparison of scans must rest on
-_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # takes x right, y down, z forward to x forward, z up
+_OPTICAL = CAMERA_AXES["optical"]  # takes x right, y down, z forward to x forward, y left, z up
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require, require_count, require_positive
+from torchelev.frames.camera_axes import require_axes, turn
 from torchelev.inputs.checks import readable, require_tensor
 
 if TYPE_CHECKING:
@@ -32,8 +33,9 @@ def depth_to_points(
         intrinsics: one matrix in pixels, or one for each image.
         along: "z" for depth along the optical axis (pinhole cameras), "ray" for distance from the camera.
         scale: metres per unit of depth, such as 0.001 for millimetres. Required for integers; None: floats in metres.
-        frame: "optical" has x right, y down, z forward (ROS, OpenCV, RealSense); "opengl" has x right, y up, z
-            backward, as the camera poses of MuJoCo and Isaac do.
+        frame: axes of the pose that goes with the points. "optical" has x right, y down, z forward (ROS, OpenCV,
+            RealSense); "opengl" has x right, y up, z backward, as the camera poses of MuJoCo and Isaac do; "forward"
+            has x forward, y left, z up.
 
     Returns:
         Points (..., h * w, 3), row by row; float32 for integers, else in the dtype of the depth.
@@ -43,8 +45,7 @@ def depth_to_points(
         TypeError: for a dtype that holds no depth.
     """
     require(along in ("z", "ray"), "along", 'must be "z" or "ray"', repr(along), 'pinhole depth images are "z"')
-    hint = "give the axes of the pose that you pass as T_map_sensor"
-    require(frame in ("optical", "opengl"), "frame", 'must be "optical" or "opengl"', repr(frame), hint)
+    require_axes("frame", frame)
     _check_images(depth, intrinsics)
     depth = _in_metres(depth, scale)
     intrinsics = intrinsics.to(depth)
@@ -52,8 +53,7 @@ def depth_to_points(
     u = torch.arange(depth.shape[-1], device=depth.device, dtype=depth.dtype)
     fx, fy, cx, cy = (intrinsics[..., i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     x, y = torch.broadcast_tensors((u - cx) / fx, (v - cy) / fy)
-    z = torch.ones_like(x)
-    rays = torch.stack([x, y, z] if frame == "optical" else [x, -y, -z], -1)
+    rays = torch.stack(turn([x, y, torch.ones_like(x)], "optical", frame), -1)
     if along == "ray":
         rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     hit = torch.isfinite(depth) & (depth > 0)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.frames import transform
+from torchelev.frames import transform_xyzw
 from torchelev.io.errors import RecordingError
 from torchelev.io.layout import XYZW_COLUMNS, FileLayout, detect_quaternion_order, to_seconds
 
@@ -53,7 +53,7 @@ def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:
     quat_xyzw = rows[:, 4:][:, XYZW_COLUMNS[order]]
     norm = np.linalg.norm(quat_xyzw, axis=1, keepdims=True)
     _require_lines(path, lines, np.abs(norm[:, 0] - 1) <= _TOLERANCE, "the quaternion is not of length 1")
-    T_map_sensor = transform(rows[:, 1:4], np.roll(quat_xyzw / norm, 1, axis=1)).numpy()
+    T_map_sensor = transform_xyzw(rows[:, 1:4], quat_xyzw / norm).numpy()
     return Poses(_make_rigid(path, lines, T_map_sensor), to_seconds(rows[:, 0], layout.time_unit))
 
 

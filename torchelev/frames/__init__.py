@@ -1,0 +1,19 @@
+"""Poses from what simulators give: quaternions of either order, rotation matrices, cameras. Elsewhere poses are 4 x 4.
+
+All constructors take tensors, NumPy arrays and lists, and keep float64.
+
+=====================================  ============  =========================================
+from                                   quaternions   cameras
+=====================================  ============  =========================================
+MuJoCo, mjlab                          w, x, y, z    "opengl" (`cam_xmat`, `cam_quat`)
+Isaac Lab 2                            w, x, y, z    `quat_w_ros`: "optical", `quat_w_opengl`:
+                                                     "opengl", `quat_w_world`: "forward"
+Isaac Lab 3                            x, y, z, w    as Isaac Lab 2
+Isaac Gym (legged_gym), ROS, SciPy     x, y, z, w    ROS: "optical" (`*_optical_frame`)
+=====================================  ============  =========================================
+"""
+
+from torchelev.frames.camera_axes import change_axes
+from torchelev.frames.constructors import transform, transform_matrix, transform_xyzw
+
+__all__ = ["change_axes", "transform", "transform_matrix", "transform_xyzw"]
