@@ -7,7 +7,10 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+from matplotlib.ticker import MaxNLocator
+
 from torchelev.app.results import markdown_table
+from torchelev.viz.style import make_figure, save, styled
 
 GROWTH = 1.05  # largest ratio of the last quarter to the first, and of the old process to a new one
 
@@ -46,21 +49,24 @@ def table(result: dict[str, Any]) -> str:
     return markdown_table(head, verdicts(result))
 
 
+@styled()
 def plot(result: dict[str, Any], path: Path) -> None:
     """Draw the time per update and the memory over the updates."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    figure = make_figure(8, 3.9)
     axes = figure.subplots(1, len(result), squeeze=False)
     for ax, (name, values) in zip(axes.flat, result.items(), strict=True):
         updates = [values["block"] * (k + 1) for k in range(len(values["ms"]))]
-        ax.plot(updates, values["ms"], label="time")
-        ax.plot(updates, values["reference_ms"], color="C0", alpha=0.35, label="time of a reference")
+        ax.plot(updates, values["ms"], linewidth=1.2, label="time")
+        ax.plot(updates, values["reference_ms"], color="C0", alpha=0.4, linewidth=1.2, label="time of a reference")
         ax.set(xlabel="updates", ylabel="time per update [ms]", title=name)
         ax.set_ylim(bottom=0)
         memory = ax.twinx()
+        memory.spines["right"].set_visible(True)
+        ax.xaxis.set_major_locator(MaxNLocator(4))
+        ax.xaxis.set_major_formatter(lambda updates, _: f"{updates:,.0f}")
         memory.plot(updates, [b / 1e6 for b in values["resident_bytes"]], color="C1", label="memory")
         memory.set_ylabel("memory of the process [MB]")
         memory.set_ylim(0, 1.3e-6 * max(values["resident_bytes"]))
-        ax.legend(handles=[*ax.lines, *memory.lines], fontsize=8, loc="lower right")
-    figure.savefig(path, dpi=90)
+    handles = [*ax.lines, *memory.lines]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    save(figure, path)

@@ -10,13 +10,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Polygon
 
-from envs.terrain_nav.config import BodyConfig, TerrainNavConfig
+from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.robot import contacts
 from envs.terrain_nav.task import TerrainNav
-from torchelev.viz.plot import UNKNOWN_COLOR
+from torchelev.viz.style import GOAL_COLOR, HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, save, styled
 
+_CONTRAST = 0.6  # [m] above and below the level ground that the colours span
 _OUTLINE = (0, 1, 3, 2)  # indices of the footprint's corners in `contacts`, counted around it
 
 
@@ -52,53 +54,61 @@ def snapshot(task: TerrainNav, env: int = 0) -> Snapshot:
     )
 
 
+@styled()
 def draw(task: TerrainNav, env: int = 0) -> np.ndarray:
     """Return a picture (h, w, 3) uint8 of one environment: the ground on the left, the map on the right."""
-    figure = Figure(figsize=(8, 4), layout="compressed", dpi=80)
+    figure = Figure(figsize=(8, 4), layout="constrained", dpi=80)
     canvas = FigureCanvasAgg(figure)
     shot = snapshot(task, env)
-    _draw_column(figure.subplots(1, 2), shot, [shot.xy], task.cfg.robot)
+    _draw_column(figure.subplots(1, 2), shot, [shot.xy], shot.seen_extent)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+@styled()
 def save_strip(shots: Sequence[Snapshot], path: Path, *, trail: Sequence[np.ndarray], cfg: TerrainNavConfig) -> None:
     """Write an episode as one picture: a column for each moment, the ground above the map.
 
     Args:
         shots: The moments.
-        path: File to write; its suffix decides on the format.
+        path: PNG to write; an SVG is written beside it.
         trail: Positions (2,) [m] of the robot at all steps of the episode.
         cfg: The task.
     """
-    figure = Figure(figsize=(3 * len(shots), 6), layout="compressed", dpi=80)
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, len(shots))
+    figure = make_figure(2.2 * len(shots), 4.4)
+    axes = figure.subplots(2, len(shots), sharex=True, sharey=True)
+    extent = _window(np.array(trail), shots[0].goal)
     for column, shot in zip(axes.T, shots, strict=True):
         walked = trail[: round(shot.seconds / cfg.dt) + 1]
-        _draw_column(column, shot, walked, cfg.robot)
-    figure.savefig(path)
+        image = _draw_column(column, shot, walked, extent)
+    for ax in axes[1]:
+        ax.set_xlabel("x [m]")
+    for ax, name in zip(axes[:, 0], ("ground", "the robot's map"), strict=True):
+        ax.set_ylabel(f"{name}\ny [m]")
+    figure.colorbar(image, ax=axes, pad=0.01, extend="both").set_label("height above the level ground [m]")
+    save(figure, path)
 
 
-def _draw_column(axes: Sequence[Axes], shot: Snapshot, walked: Sequence[np.ndarray], robot: BodyConfig) -> None:
+def _window(trail: np.ndarray, goal: np.ndarray, margin: float = 1.2) -> tuple[float, float, float, float]:
+    """Return the square (x_min, x_max, y_min, y_max) [m] around the path and the goal."""
+    places = np.vstack([trail, goal])
+    middle, half = (places.max(0) + places.min(0)) / 2, np.ptp(places, axis=0).max() / 2 + margin
+    return middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half
+
+
+def _draw_column(
+    axes: Sequence[Axes], shot: Snapshot, walked: Sequence[np.ndarray], extent: tuple[float, float, float, float]
+) -> AxesImage:
+    """Draw the ground and the map of one moment, both within `extent` [m], and return the image of the ground."""
     level = float(np.median(shot.truth))
-    _draw_heights(axes[0], shot.truth, shot.truth_extent, level)
-    axes[0].set_title(f"ground, {shot.seconds:.1f} s", fontsize=9)
+    limits = {"vmin": -_CONTRAST, "vmax": _CONTRAST}
+    image = draw_cells(axes[0], shot.truth - level, shot.truth_extent, HEIGHTS, **limits)
     seen = np.full((1, 1), np.nan) if shot.seen is None else shot.seen
-    _draw_heights(axes[1], seen, shot.seen_extent, level)
-    axes[1].set_title("the robot's map" if shot.seen is not None else "no map", fontsize=9)
+    draw_cells(axes[1], seen - level, shot.seen_extent, HEIGHTS, **limits)
+    axes[0].set_title(f"{shot.seconds:.1f} s")
     for ax in axes:
-        ax.plot(*np.array(walked).T, color="tab:red", linewidth=1)
-        ax.add_patch(Polygon(shot.footprint, facecolor="none", edgecolor="tab:red", linewidth=1.5))
-        ax.plot(*shot.goal, marker="*", color="tab:orange", markersize=12, clip_on=True)
-        ax.tick_params(labelsize=7)
-    axes[1].set_xlim(shot.seen_extent[:2])
-    axes[1].set_ylim(shot.seen_extent[2:])
-
-
-def _draw_heights(ax: Axes, heights: np.ndarray, extent: tuple[float, float, float, float], level: float) -> None:
-    """Draw heights (H, W) [m], with colours for 0.6 m below to 0.6 m above `level` [m]."""
-    ax.set_facecolor(UNKNOWN_COLOR)
-    low, high = level - 0.6, level + 0.6
-    image = heights.T
-    ax.imshow(image, cmap="terrain", vmin=low, vmax=high, origin="lower", extent=extent, interpolation="nearest")
+        ax.plot(*np.array(walked).T, color=ROBOT_COLOR)
+        ax.add_patch(Polygon(shot.footprint, facecolor="none", edgecolor=ROBOT_COLOR, linewidth=2))
+        ax.plot(*shot.goal, marker="*", color=GOAL_COLOR, markeredgecolor="black", markersize=13, clip_on=True)
+        ax.set(xlim=extent[:2], ylim=extent[2:])
+    return image

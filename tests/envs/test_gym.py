@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 import envs  # noqa: F401  (registers)
 from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
-from envs.terrain_nav.render import snapshot
+from envs.terrain_nav.render import save_strip, snapshot
 
 CFG = TerrainNavConfig(course=CourseConfig(num_tiles=2, num_routes=8), episode_length=1.0)
 ID = "torchelev/TerrainNav-v0"
@@ -143,3 +143,21 @@ def test_environments_without_a_seed_differ():
     seen = [gymnasium.make(ID, cfg=CFG, perception="blind").reset()[0]["policy"] for _ in range(3)]
     assert (seen[0] != seen[1]).any() and (seen[1] != seen[2]).any()
     gymnasium.make(ID, cfg=CFG, perception="blind").reset(seed=2**62)
+
+
+@pytest.mark.slow(2)
+def test_a_strip_shows_ground_and_map_in_one_extent(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("envs.terrain_nav.render.save", lambda figure, path: drawn.append(figure))
+    task = TerrainNav(CFG, 1)
+    shots = [snapshot(task)]
+    task.advance(torch.ones(1, 2))
+    task.sense()
+    shots.append(snapshot(task))
+    save_strip(shots, tmp_path / "strip.png", trail=[shot.xy for shot in shots], cfg=CFG)
+    axes = [ax for ax in drawn[0].axes if ax.images]
+    assert len(axes) == 4 and len({(*ax.get_xlim(), *ax.get_ylim()) for ax in axes}) == 1
+    x_min, x_max, y_min, y_max = *axes[0].get_xlim(), *axes[0].get_ylim()
+    places = np.array([*(shot.xy for shot in shots), shots[0].goal])
+    margins = np.concatenate([places.min(0) - [x_min, y_min], [x_max, y_max] - places.max(0)])
+    assert margins.min() == pytest.approx(1.2), "as close as the path and the goal allow"

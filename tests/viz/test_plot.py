@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchelev.viz.plot import MAX_BYTES, Panel, draw_layers, save_layers
+from torchelev.viz.plot import Panel, draw_layers, save_layers
+from torchelev.viz.style import MAX_BYTES
 
 EXTENT = (-2.0, 2.0, 10.0, 13.0)
 

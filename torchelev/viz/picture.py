@@ -17,7 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from torchelev.errors import require, require_count, require_positive
 from torchelev.output_files import atomic_file
-from torchelev.viz.plot import UNKNOWN_COLOR, Panel, color_limits, png_info
+from torchelev.viz.plot import Panel, color_limits
+from torchelev.viz.style import HEIGHTS, UNKNOWN_COLOR, png_info
 
 _FONT_FILE = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 _FONT_SIZE = 12  # [pixels], as all sizes here
@@ -31,7 +32,7 @@ def save_image(
     values: NDArray,
     resolution: float,
     *,
-    cmap: str = "viridis",
+    cmap: str = HEIGHTS,
     vmin: float | None = None,
     vmax: float | None = None,
     scale: int = 1,

@@ -6,7 +6,6 @@ window nor changes the calling program's backend.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,13 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
-from torchelev.output_files import MARK, atomic_file
-
-UNKNOWN_COLOR = "#d9d9d9"
-MAX_BYTES = 300_000  # of a PNG
+from torchelev.output_files import atomic_file
+from torchelev.viz.style import HEIGHTS, ROBOT_COLOR, UNKNOWN_COLOR, small_png, styled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +32,7 @@ class Panel:
     title: str  #: above the panel
     values: NDArray  #: (H, W), as from `ElevationMap.layer`: i grows with +x, j with +y, NaN where unknown
     unit: str = ""  #: of the values, beside the colour bar
-    cmap: str = "viridis"  #: name of a matplotlib colour map
+    cmap: str = HEIGHTS  #: name of a matplotlib colour map
     vmin: float | None = None  #: value of the lowest colour; None: the 1st percentile
     vmax: float | None = None  #: value of the highest colour; None: the 99th percentile
 
@@ -64,9 +59,10 @@ def save_layers(
     """
     figure = draw_layers(panels, extent=extent, path_xy=path_xy, title=title)
     with atomic_file(path) as file:
-        file.write(_small_png(figure))
+        file.write(small_png(figure))
 
 
+@styled()
 def draw_layers(
     panels: Sequence[Panel],
     *,
@@ -87,7 +83,7 @@ def draw_layers(
         ax.set_visible(False)
     _label_outer(axes[: len(panels)], columns)
     if title:
-        figure.suptitle(title, fontsize=12)
+        figure.suptitle(title, fontsize=11)
     return figure
 
 
@@ -141,8 +137,8 @@ def color_limits(panel: Panel, values: np.ma.MaskedArray) -> tuple[float, float]
 
 def _draw_path(ax: Axes, xy: NDArray) -> None:
     ax.plot(xy[:, 0], xy[:, 1], color="white", linewidth=2.4)
-    ax.plot(xy[:, 0], xy[:, 1], color="crimson", linewidth=1.2)
-    ax.plot(*xy[-1, :2], "o", color="crimson", markeredgecolor="white", markersize=5)
+    ax.plot(xy[:, 0], xy[:, 1], color=ROBOT_COLOR, linewidth=1.2)
+    ax.plot(*xy[-1, :2], "o", color=ROBOT_COLOR, markeredgecolor="white", markersize=5)
 
 
 def _label_outer(axes, columns: int) -> None:
@@ -152,23 +148,3 @@ def _label_outer(axes, columns: int) -> None:
         if k + columns >= len(axes):
             ax.set_xlabel("x, map frame [m]")
             ax.tick_params(labelbottom=True)
-
-
-def png_info() -> PngInfo:
-    """Return a PNG's metadata, which names this library."""
-    info = PngInfo()
-    info.add_text("Software", MARK)
-    return info
-
-
-def _small_png(figure: Figure) -> bytes:
-    """Return a PNG below `MAX_BYTES`: in full colour if that fits, else with a palette, then at lower resolutions."""
-    for dpi, colors in ((110, None), (90, None), (100, 256), (75, 256), (55, 256)):
-        raw, small = io.BytesIO(), io.BytesIO()
-        figure.savefig(raw, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.1)
-        picture = Image.open(raw).convert("RGB")
-        picture = picture.quantize(colors, dither=Image.Dither.NONE) if colors else picture
-        picture.save(small, format="png", optimize=True, pnginfo=png_info())
-        if small.tell() < MAX_BYTES:
-            break
-    return small.getvalue()

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from envs.terrain_nav.config import PERCEPTION
 from torchelev.app.results import markdown_table, write_json
+from torchelev.viz.style import make_figure, save, styled
 from training import RESULTS
 from training.jobs import Job, train_all
 from training.nav.evaluate import Policy, evaluate, straight_line
@@ -103,25 +104,25 @@ def _spread(values: list[float]) -> str:
     return f"{100 * _mean(values):.1f} % ({100 * min(values):.1f} to {100 * max(values):.1f})"
 
 
-def _plot(result: dict[str, Any], path: Path) -> None:
+@styled()
+def plot(result: dict[str, Any], path: Path) -> None:
     """Draw the success during training and when deployed."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.6), layout="compressed", dpi=90)
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    colors = dict(zip(PERCEPTION, ("tab:green", "tab:blue", "tab:gray"), strict=True))
+    figure = make_figure(8, 4.2)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1))
+    colors = dict(zip(PERCEPTION, ("C0", "C1", "0.5"), strict=True))
     for row in result["rows"]:
         first = row["seed"] == SEEDS[0]
         name, color = row["perception"], colors[row["perception"]]
-        left.plot(*row["curve"].values(), color=color, linewidth=1, label=NAMES[name] if first else None)
+        left.plot(*row["curve"].values(), color=color, linewidth=1.2, label=NAMES[name] if first else None)
         right.plot(PERCEPTION.index(name), row["deployed"]["success"], "o", color=color)
-    left.set(xlabel="environment steps", ylabel="success while training, as trained", ylim=(0, 1))
-    left.legend(loc="lower right", fontsize=8)
+    left.set(xlabel="environment steps", ylabel="success", title="while training, as trained", ylim=(0, 1))
+    left.legend(loc="lower right")
+    left.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1e3:,.0f}k")
     right.axhline(result["straight_line"]["success"], color="black", linestyle=":", linewidth=1)
-    right.text(-0.3, result["straight_line"]["success"] + 0.02, "straight line", fontsize=8)
-    right.set(ylabel="success, map in the loop, held-out ground", ylim=(0, 1), xlim=(-0.4, 2.4))
-    right.set_xticks(range(3), [NAMES[name].replace(" with ", "\nwith ") for name in PERCEPTION], fontsize=8)
-    figure.savefig(path)
+    right.text(-0.3, result["straight_line"]["success"] - 0.06, "a straight line")
+    right.set(title="on the robot's map, held-out ground", ylim=(0, 1), xlim=(-0.4, 2.4), xlabel="trained with")
+    right.set_xticks(range(3), ["map", "truth", "nothing"])
+    save(figure, path)
 
 
 @click.command(help=__doc__)
@@ -138,7 +139,7 @@ def main(runs: Path, jobs: int) -> None:
     train_all(_jobs(runs), jobs)
     result = _deploy_all(runs)
     write_json(RESULTS / "nav.json", result)
-    _plot(result, RESULTS / "nav.png")
+    plot(result, RESULTS / "nav.png")
     click.echo(table(result))
 
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from torchelev import (
     ElevationMap,
@@ -27,6 +26,7 @@ from torchelev import (
 )
 from torchelev.app.results import markdown_table, write_json
 from torchelev.sim import HeightField
+from torchelev.viz.style import make_figure, save, styled
 from training import RESULTS
 from training.traversability.labels.labels import can_stand
 
@@ -96,9 +96,10 @@ def table(profiles: list[dict[str, Any]]) -> str:
     return markdown_table(header, [row(profile, name) for profile in profiles for name in HEADS])
 
 
-def _draw(profiles: list[dict[str, Any]], path: Path) -> None:
+@styled()
+def draw(profiles: list[dict[str, Any]], path: Path) -> None:
     """Draw label and ratings along the line onto each block."""
-    figure = Figure(figsize=(3 * len(profiles), 2.6), layout="constrained")
+    figure = make_figure(9, 3.2)
     axes = figure.subplots(1, len(profiles), sharey=True)
     for ax, profile in zip(axes, profiles, strict=True):
         ax.axvspan(0, max(profile["x"]), color="0.9", label="block")
@@ -106,9 +107,10 @@ def _draw(profiles: list[dict[str, Any]], path: Path) -> None:
         for name in HEADS:
             ax.plot(profile["x"], profile[name], label=name)
         ax.set(title=f"block of {100 * profile['height']:.0f} cm", xlabel="from its edge [m]", ylim=(-0.03, 1.03))
-    axes[0].set_ylabel("traversability")
-    axes[-1].legend(fontsize=8)
-    figure.savefig(path, dpi=80)
+    axes[0].set_ylabel("traversability [0 to 1]")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    save(figure, path)
 
 
 @click.command(help=__doc__)
@@ -116,7 +118,7 @@ def main() -> None:
     """Measure, write JSON and figure and print the table."""
     profiles = [_profile(height) for height in HEIGHTS]
     write_json(RESULTS / "block.json", {"robot": vars(ROBOT), "profiles": profiles})
-    _draw(profiles, RESULTS / "block.png")
+    draw(profiles, RESULTS / "block.png")
     click.echo(table(profiles))
 
 

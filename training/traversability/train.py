@@ -13,12 +13,11 @@ from training.traversability.heads import baselines
 from training.traversability.maps.data import data_set
 from training.traversability.maps.mapping import DataConfig
 from training.traversability.maps.terrain import KINDS
-from training.traversability.picture import picture
+from training.traversability.picture import PICTURED_HEADS, picture
 from training.traversability.robot import RobotType
 from training.traversability.trainer import FitConfig, Trainer
 
 _POSITIVE = click.IntRange(1)
-_PICTURED = ("analytic (defaults)", "paper (at 4 cm)")
 
 
 @click.command()
@@ -98,7 +97,7 @@ def _finish(
     result = evaluate({out.name: net}, data, num_batches, cfg, paper_weights)
     write_result(out / "result.json", {"training": trainer.settings, **result})
     click.echo(table(result))
-    others = {name: score for name, score in baselines(paper_weights).items() if name in _PICTURED}
+    others = {name: score for name, score in baselines(paper_weights).items() if name in PICTURED_HEADS}
     held_out = data_set(data, "held_out", num_batches, 0, cfg, KINDS, 0.04)
     picture(net, others, held_out, out / "maps.png")
     click.echo(f"Wrote weights.pt, result.json and maps.png to {out}.")

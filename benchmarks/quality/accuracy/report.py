@@ -7,6 +7,9 @@ from pathlib import Path
 
 from benchmarks.quality.accuracy.score import Score, meets
 from torchelev.app.results import markdown_table
+from torchelev.viz.style import make_figure, save, styled
+
+_MOTIONS = {"turn": "camera, turning", "walk": "camera, walking", "lidar": "lidar"}
 
 
 def table(rows: Iterable[Score]) -> str:
@@ -31,19 +34,19 @@ def table(rows: Iterable[Score]) -> str:
     return markdown_table(head, body)
 
 
+@styled()
 def plot(path: Path, rows: list[Score]) -> None:
     """Draw the RMSE of the map beside that of the mean, with a panel for each motion."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    panels = figure.subplots(1, 3, sharex=True)
+    figure = make_figure(8, 5)
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
     for panel, motion in zip(panels, ("turn", "walk", "lidar"), strict=True):
         part = [r for r in rows if r.motion == motion][::-1]
         places = range(len(part))
         panel.barh([k + 0.2 for k in places], [max(r.rmse, 0.1) for r in part], 0.4, label="torchelev")
         panel.barh([k - 0.2 for k in places], [max(r.rmse_mean, 0.1) for r in part], 0.4, label="per-cell mean")
-        panel.set(xscale="log", xlim=(0.1, 100), xlabel="RMSE [mm]", title=motion)
-        panel.set_yticks(list(places), [f"{r.scene}, {r.noise}" for r in part], fontsize=7)
-        panel.grid(alpha=0.3, axis="x")
-    panels[0].legend(fontsize=7)
-    figure.savefig(path, dpi=100)
+        panel.set(xscale="log", xlim=(0.05, 100), xlabel="RMSE [mm]", title=_MOTIONS[motion])
+        panel.set_yticks(list(places), [f"{r.scene}, {r.noise}" for r in part])
+        panel.grid(axis="x")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    save(figure, path)

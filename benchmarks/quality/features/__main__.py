@@ -13,7 +13,7 @@ All three map the same recording of a walk with bob, roll and pitch at 5 Hz: the
 cell is the height of the ground at its center. Each metric is defined in the docstring of its function in
 benchmarks/quality/features; a bar is the target with the feature on.
 
-Prints a table and writes features.json and features.png, which shows the last maps.
+Prints a table and writes features.json and features.png, which shows some of the maps where they differ.
 """
 
 from __future__ import annotations

@@ -31,7 +31,6 @@ class Feature:
     measure: Callable[[SimulatedRun, ElevationMapConfig], tuple[Figures, ElevationMap]]
     off: str  #: dotted name of the setting that is None when the feature is off
     bars: dict[str, tuple[str, float]]  #: targets with the feature on: metric -> ("<=" or ">=", limit)
-    shown: tuple[str, ...] = ()  #: metrics in the figure besides the first target's
 
 
 _TOO_LONG = 0.01  # fraction of the returns
@@ -43,7 +42,6 @@ _SEAM = {"seam [cm]": ("<=", 1.0), "seam mean [cm]": ("<=", 1.0)}
 _WALLS = {name: ("<=", 2.0) for name in ("top cells [cm]", "wall top [cm]", "tall wall top [cm]")}
 _FLOOR = {"other floor [%]": ("<=", 1.0)}
 _BOUNDS = {"bounded [%]": (">=", 60.0), "below truth [%]": ("<=", 1.0)}
-_AT_END = ("bar at the end [%]", "ceiling at the end [%]")
 
 FEATURES = (
     Feature("drift compensation", rec.record_drift, seam_step, "drift", _SEAM),
@@ -53,7 +51,7 @@ FEATURES = (
     Feature(
         "cleanup: static, 1 % too long", partial(rec.record_static, _TOO_LONG), wrongly_removed, "raycast", _REMOVED
     ),
-    Feature("exclusion area", rec.record_overhang, overhang_cells, "sensor.exclusion", _OVERHANG, _AT_END),
+    Feature("exclusion area", rec.record_overhang, overhang_cells, "sensor.exclusion", _OVERHANG),
     Feature("edges", rec.record_walls, wall_tops, "fusion.edges", _WALLS),
     Feature("overlap clearance: up", partial(rec.record_floors, True), other_floor, "overlap", _FLOOR),
     Feature("overlap clearance: down", partial(rec.record_floors, False), other_floor, "overlap", _FLOOR),
@@ -82,7 +80,7 @@ def _meets(value: float, bar: tuple[str, float]) -> bool:
 
 
 class Outcome(NamedTuple):
-    """The figures and the last map of each configuration."""
+    """The figures and the map to draw of each configuration."""
 
     feature: Feature
     figures: dict[str, Figures]

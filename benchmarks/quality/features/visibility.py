@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import torch
@@ -25,11 +26,12 @@ def cells_left(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figure
 
     The person's cells are those that, after any scan until the person left, were more than 10 cm above the ground and
     within 8 cm of the body's positions so far. `left [%]`: how many of them are more than 10 cm too high in the last
-    map, 4 s after the person left; `left after 1 s [%]`: the same after 1 s.
+    map, 4 s after the person left; `left after 1 s [%]`: the same after 1 s, which is the map that is returned.
     """
     bodies = [box for box in recording.scene.boxes if not box.grounded]
     gone, body, marked = max(box.until for box in bodies), blank_world(), blank_world()
     left: dict[float, float] = {}  # [%] by the time since the person left [s]
+    pictured: list[ElevationMap] = []
 
     def watch(emap: ElevationMap, k: int) -> None:
         cells, t = cells_of(emap, recording, k), recording.frames[k].t
@@ -44,14 +46,16 @@ def cells_left(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figure
             marked[:] = marked | (high & body)
         else:
             left[t - gone] = percent(high, marked)
+            if t - gone > 0.95 and not pictured:
+                pictured.append(copy.deepcopy(emap))
 
-    emap = fuse(recording, cfg, watch)
+    fuse(recording, cfg, watch)
     soon = min(left, key=lambda since: abs(since - 1.0))
     return {
         "left [%]": left[max(left)],
         "left after 1 s [%]": left[soon],
         "person's cells": float(marked.sum()),
-    }, emap
+    }, pictured[0]
 
 
 def wrongly_removed(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:

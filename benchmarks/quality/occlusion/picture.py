@@ -8,14 +8,13 @@ from pathlib import Path as File
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from benchmarks.quality.occlusion.scenes import GRID, Case
 from torchelev import ElevationMap
 from torchelev.planning.planner import Path
 from torchelev.planning.traversal_cost import traversal_cost
-from torchelev.viz.plot import UNKNOWN_COLOR
+from torchelev.viz.style import ROBOT_COLOR, draw_cells, make_figure, save, styled
 
 _SPAN = (-1.7, 2.6)  # [m] drawn range of x
 EYE = 0.8  # [m] height of the camera
@@ -23,19 +22,20 @@ _RULE = "upper bound"
 Scene = tuple[Case, ElevationMap, float, dict[str, Path]]  # with the robot's x [m] and the path of each rule
 
 
+@styled()
 def draw(out: str | File, scenes: Sequence[Scene]) -> None:
     """Draw a column for each scene: its side view and its cost."""
-    figure = Figure(figsize=(3.9 * len(scenes), 5.4), layout="constrained")
+    figure = make_figure(3 * len(scenes), 6.2)
     axes = figure.subplots(2, len(scenes), sharex=True, squeeze=False, height_ratios=(1.25, 1))
     for column, (case, emap, x, plans) in zip(axes.T, scenes, strict=True):
         _section(column[0], case, emap, x, plans)
         image = _cost(column[1], emap, x, case.goal, plans[_RULE])
-    figure.colorbar(image, ax=axes[1], pad=0.01, label="cost of each metre")
+    figure.colorbar(image, ax=axes[1], pad=0.01, label="cost of each metre [1 on flat ground]")
     axes[0, 0].set_ylabel("z [m]")
     axes[1, 0].set_ylabel("y [m]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
-    figure.savefig(out, dpi=80)
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    save(figure, out)
 
 
 def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str, Path]) -> None:
@@ -46,16 +46,13 @@ def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str
     at = emap.cell_centers()[0, :, middle, 0].numpy()
     elevation, bound = (emap.layer(name)[0, :, middle].numpy() for name in ("elevation", "upper_bound"))
     ax.plot(line, truth, color="0.6", linewidth=6, solid_capstyle="butt", label="ground")
-    ax.plot(
-        at, np.where(np.isnan(elevation), bound, np.nan), ".", color="darkorange", markersize=4, label="upper bound"
-    )
-    ax.plot(at, elevation, ".", color="navy", markersize=4, label="elevation")
-    ax.plot(x, EYE, "v", color="crimson", markersize=9, label="camera")
+    ax.plot(at, np.where(np.isnan(elevation), bound, np.nan), ".", color="C4", markersize=4, label="upper bound")
+    ax.plot(at, elevation, ".", color="C0", markersize=4, label="elevation")
+    ax.plot(x, EYE, "v", color=ROBOT_COLOR, markersize=9, label="camera")
     ax.plot(case.goal, float(case.scene.truth(torch.tensor([case.goal, 0.0]))), "k*", markersize=9, label="goal")
     ax.set(xlim=_SPAN, ylim=(-1.6, 1.0))
     verdicts = "\n".join(f"{rule}: {'goes' if path.reached[0] else 'stops'}" for rule, path in plans.items())
-    ax.set_title(f"{case.kind}: {'safe' if case.safe else 'a drop'}", fontweight="bold")
-    ax.text(0.98, 0.97, verdicts, transform=ax.transAxes, fontsize=8, ha="right", va="top")
+    ax.set_title(f"{case.kind}: {'safe' if case.safe else 'a drop'}\n{verdicts}", fontsize=9)
 
 
 def _cost(ax: Axes, emap: ElevationMap, x: float, goal: float, path: Path) -> AxesImage:
@@ -68,11 +65,10 @@ def _cost(ax: Axes, emap: ElevationMap, x: float, goal: float, path: Path) -> Ax
         float(xy[0, -1, 1]) + half,
     )
     cost = np.ma.masked_invalid(traversal_cost(emap)[0].numpy())
-    ax.set_facecolor(UNKNOWN_COLOR)
-    image = ax.imshow(cost.T, origin="lower", extent=extent, cmap="viridis", vmin=1, vmax=4, interpolation="nearest")
+    image = draw_cells(ax, cost, extent, "viridis", vmin=1, vmax=4)
     if path.reached[0]:
         ax.plot(*path.xy[0].T, color="white", linewidth=2)
-    ax.plot(x, 0, "v", color="crimson", markersize=8)
+    ax.plot(x, 0, "v", color=ROBOT_COLOR, markersize=8)
     ax.plot(goal, 0, "k*", markersize=9)
     ax.set(xlim=_SPAN, ylim=(-1.3, 1.3), xlabel="x [m]; grey: impassable", aspect="auto")
     return image

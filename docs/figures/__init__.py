@@ -1,0 +1,1 @@
+"""Figures of the documentation that no benchmark or training draws: surfaces, a real scan, a pair of episodes."""

@@ -1,0 +1,59 @@
+"""The style: files come out in both formats, colours stay apart, the caller's settings stay."""
+
+import io
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from PIL import Image
+
+from torchelev.viz import style
+
+RED, GREEN, BLUE = 0.2126, 0.7152, 0.0722  # of the luminance
+
+
+@style.styled()
+def draw(values):
+    figure = style.make_figure(4, 3)
+    ax = figure.subplots()
+    ax.set_title("a title")
+    style.draw_cells(ax, values, (0, 2, 0, 1), style.HEIGHTS, vmin=0, vmax=1)
+    return figure
+
+
+def test_a_figure_is_saved_as_png_and_svg_and_always_the_same(tmp_path):
+    for name in ("a.png", "b.png"):
+        style.save(draw(np.ones((2, 1))), tmp_path / name)
+    assert Image.open(tmp_path / "a.png").size[0] > 300
+    assert (tmp_path / "a.svg").read_text().count("<svg") == 1
+    for suffix in (".png", ".svg"):
+        assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+
+
+def test_settings_hold_within_the_context_alone():
+    before = matplotlib.rcParams["font.size"]
+    with style.styled():
+        assert matplotlib.rcParams["font.size"] == style.SETTINGS["font.size"] != before
+    assert matplotlib.rcParams["font.size"] == before
+
+
+def test_unknown_cells_are_grey_and_x_runs_right():
+    figure = draw(np.array([[np.nan], [1.0]]))  # x is the first index
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    picture = np.asarray(Image.open(buffer).convert("RGB")) / 255
+    for x, color in ((0.5, style.UNKNOWN_COLOR), (1.5, matplotlib.colormaps[style.HEIGHTS](1.0)[:3])):
+        column, row = figure.axes[0].transData.transform((x, 0.5))
+        np.testing.assert_allclose(picture[picture.shape[0] - 1 - int(row), int(column)], to_rgb(color), atol=0.02)
+
+
+@pytest.mark.parametrize("name", [style.HEIGHTS, style.DEVIATIONS, style.RATINGS])
+def test_brightness_alone_tells_values_apart(name):
+    colors = matplotlib.colormaps[name](np.linspace(0, 1, 64))[:, :3]
+    assert (np.diff(colors @ [RED, GREEN, BLUE]) > 0).all()
+
+
+def test_both_ends_of_the_map_of_errors_differ_in_blue_which_red_green_blind_readers_see():
+    low, high = (matplotlib.colormaps[style.ERRORS](value)[2] for value in (0.1, 0.9))
+    assert abs(low - high) > 0.3

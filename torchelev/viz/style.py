@@ -1,0 +1,129 @@
+"""One look for all figures: readable at half width, colours for colour-blind readers, PNG and SVG.
+
+Needs matplotlib (``pip install 'torchelev[io]'``).
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import matplotlib
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from torchelev.output_files import MARK, atomic_file
+
+UNKNOWN_COLOR = "#d9d9d9"  #: cells without a value
+HEIGHTS = "viridis"  #: colour map of heights [m]
+DEVIATIONS = "magma"  #: colour map of standard deviations [m]
+ERRORS = "PuOr_r"  #: colour map of signed differences: purple below, orange above
+RATINGS = "cividis"  #: colour map of traversability, from 0 (dark, impassable) to 1 (light)
+ROBOT_COLOR = "#d55e00"  #: robots, paths and cameras
+GOAL_COLOR = "#e69f00"  #: goals
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  #: of lines (Okabe and Ito)
+MAX_BYTES = 300_000  #: of a PNG
+
+SETTINGS: Mapping[str, Any] = MappingProxyType(
+    {
+        "font.size": 11.0,  # at a width of 8 inches, 8 pixels of x-height on half of a 900 pixel column
+        "axes.titlesize": 11.0,
+        "axes.labelsize": 11.0,
+        "xtick.labelsize": 10.0,
+        "ytick.labelsize": 10.0,
+        "legend.fontsize": 10.0,
+        "axes.prop_cycle": cycler(color=COLORS),
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": False,
+        "grid.alpha": 0.3,
+        "legend.frameon": False,
+        "lines.linewidth": 2.0,
+        "image.interpolation": "nearest",
+        "image.origin": "lower",
+        "svg.hashsalt": MARK,  # the same figure gives the same file
+    }
+)
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw figures in this style within the context, or in a function that this decorates."""
+    settings: Any = dict(SETTINGS)
+    with matplotlib.rc_context(settings):
+        yield
+
+
+def make_figure(width: float, height: float) -> Figure:
+    """Return an empty figure [inches] that opens no window. Draw about 8 inches wide for a full column."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def draw_cells(
+    ax: Axes,
+    values: Any,
+    extent: tuple[float, float, float, float],
+    cmap: str,
+    vmin: float | None = None,
+    vmax: float | None = None,
+) -> AxesImage:
+    """Draw a layer with x to the right and y up, unknown cells grey, and return the image.
+
+    Args:
+        ax: where to draw.
+        values: (H, W) as from `ElevationMap.layer`, NaN where unknown.
+        extent: x_min, x_max, y_min, y_max [m].
+        cmap: name of a matplotlib colour map.
+        vmin: value of the lowest colour; None: the lowest value.
+        vmax: value of the highest colour; None: the highest value.
+    """
+    ax.set_facecolor(UNKNOWN_COLOR)
+    for spine in ax.spines.values():
+        spine.set_visible(True)
+    return ax.imshow(values.T, extent=extent, cmap=cmap, vmin=vmin, vmax=vmax, origin="lower", interpolation="nearest")
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write a figure as a small PNG, and as an SVG beside it.
+
+    Args:
+        figure: from `make_figure`, drawn within `styled`.
+        path: of the PNG.
+    """
+    path = Path(path)
+    with styled():
+        with atomic_file(path) as file:
+            file.write(small_png(figure))
+        with atomic_file(path.with_suffix(".svg")) as file:
+            figure.savefig(file, format="svg", metadata={"Date": None, "Creator": MARK})
+
+
+def png_info() -> PngInfo:
+    """Return a PNG's metadata, which names this library."""
+    info = PngInfo()
+    info.add_text("Software", MARK)
+    return info
+
+
+def small_png(figure: Figure) -> bytes:
+    """Return a PNG below `MAX_BYTES`: in full colour if that fits, else with a palette, then at lower resolutions."""
+    for dpi, colors in ((110, None), (90, None), (100, 256), (75, 256), (55, 256)):
+        raw, small = io.BytesIO(), io.BytesIO()
+        figure.savefig(raw, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.1)
+        picture = Image.open(raw).convert("RGB")
+        picture = picture.quantize(colors, dither=Image.Dither.NONE) if colors else picture
+        picture.save(small, format="png", optimize=True, pnginfo=png_info())
+        if small.tell() < MAX_BYTES:
+            break
+    return small.getvalue()
