@@ -1,0 +1,96 @@
+"""Every example runs as a user would run it, prints what it promises, and has its picture on the page."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted(path.stem for path in (ROOT / "examples").glob("*.py") if path.stem != "stand_ins")
+QUICK = {
+    "gymnasium_observation": "--steps 5",
+    "isaac_lab_term": "--steps 5",
+    "many_robots": "--num-envs 8 --steps 3",
+    "mjlab_term": "--steps 5",
+    "mujoco_depth_camera": "--steps 30",
+    "own_head": "--batches 1 --steps 2",
+    "planning": "--quick",
+    "robot_50hz": "--seconds 1 --eager",
+}
+
+
+def run(name, folder, **environment):
+    """Run an example in an empty folder; return what it prints, and its picture."""
+    command = [sys.executable, ROOT / "examples" / f"{name}.py", *QUICK[name].split(), "--picture", "picture.png"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    result = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout, (folder / "picture.png").read_bytes()
+
+
+def numbers(text):
+    return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
+
+
+def check_mujoco(out):
+    height, true_height, known = numbers(out.splitlines()[-2])
+    assert abs(height - true_height) < 0.02 and known > 500
+    assert "nothing wrong" in out
+
+
+def check_planning(out):
+    narrow, wide = out.splitlines()
+    assert narrow.startswith("as a point") and "cannot be reached safely" in narrow
+    assert wide.startswith("as wide as the robot") and "every footprint along the path is safe" in wide
+
+
+def check_own_head(out):
+    from training.traversability.train import main
+
+    command = next(line for line in out.splitlines() if "python -m training.traversability" in line)
+    given = main.make_context("training", shlex.split(command)[3:]).params
+    assert (given["robot"].length, given["robot"].step_height) == (1.2, 0.3)
+
+
+CHECKS = {
+    "gymnasium_observation": lambda out: "'map': (2, 16, 10)" in out,
+    "isaac_lab_term": lambda out: "observation (8, 187)" in out,
+    "many_robots": lambda out: re.search(r"8 robots, 768 points each(.|\n)* robots per second", out),
+    "mjlab_term": lambda out: "observation (8, 187)" in out,
+    "mujoco_depth_camera": check_mujoco,
+    "own_head": check_own_head,
+    "planning": check_planning,
+    "robot_50hz": lambda out: 0 < numbers(out)[0] <= 51 and "p99" in out,
+}
+
+
+@pytest.mark.slow(8)
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_runs(name, tmp_path):
+    out, picture = run(name, tmp_path)
+    assert CHECKS[name](out) in (None, True) or CHECKS[name](out), out
+    assert picture.startswith(b"\x89PNG")
+
+
+@pytest.mark.slow(8)
+def test_mujoco_casts_rays_where_it_cannot_render(tmp_path):
+    out, _ = run("mujoco_depth_camera", tmp_path, MUJOCO_GL="disable")
+    assert "casting rays in place of rendering" in out
+    check_mujoco(out)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_is_short_and_on_the_page(name):
+    assert len((ROOT / f"examples/{name}.py").read_text().splitlines()) <= 80
+    page = (ROOT / "docs/examples.md").read_text()
+    assert f"](pictures/example_{name}.png)" in page and f"../examples/{name}.py" in page
+    picture = ROOT / f"docs/pictures/example_{name}.png"
+    assert picture.stat().st_size < 200_000
+
+
+def test_stand_ins_are_short():
+    assert len((ROOT / "examples/stand_ins.py").read_text().splitlines()) <= 80
