@@ -7,22 +7,30 @@ PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 # `make matrix` leaves out what needs reinforcement learning, and compares no recorded answers: they are of one torch.
 MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
-	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py
+	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
 EXTRAS := io,rl,dev
 
-.PHONY: help demo test test-fast test-library matrix lint types setup bench quality clean
+.PHONY: help demo test test-fast test-library matrix lint types setup bench quality docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
 
-$(BIN)/.ready: pyproject.toml constraints.txt
+# The demo needs the core and the command line only; `setup` adds the rest.
+$(BIN)/.demo-ready: pyproject.toml constraints.txt
+	@echo "Installing PyTorch and the packages of the command line into $(VENV), nowhere else: 1.2 GB and about five"
+	@echo "minutes with a CPU build of PyTorch; a CUDA build is several times as large."
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt --editable '.[io]'
+	@touch $@
+
+$(BIN)/.ready: $(BIN)/.demo-ready
+	@echo "Installing the packages of tests and trainings into $(VENV): another 0.7 GB."
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[$(EXTRAS)]'
-	touch $@
+	@touch $@
 
 setup: $(BIN)/.ready  ## make the environment .venv
 
-demo: setup  ## simulate a walk, map it, write demo.png
+demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
 test: setup  ## run all tests, on all cores
@@ -61,5 +69,11 @@ quality: setup  ## measure accuracy and features, five minutes
 	$(BIN)/python -m benchmarks.quality.features
 	$(BIN)/python -m docs.readme_tables
 
+docs: setup  ## build the documentation in docs/_build/html, warnings as errors; needs no network once it is set up
+	$(BIN)/python -c 'import sphinx' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints.txt --editable '.[$(EXTRAS),docs]'
+	$(BIN)/python -m sphinx -b html -W --keep-going --quiet -d docs/_build/trees docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
+
 clean:  ## remove what the targets made
-	rm -rf $(VENV) $(MATRIX:%=.venv-%) demo.png
+	rm -rf $(VENV) $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks

@@ -1,8 +1,8 @@
-"""Write the README's tables from the results of benchmarks and trainings, so that every number comes from a run.
+"""Write the tables of the README and of docs/benchmarks.md from the results, so that every number comes from a run.
 
     python -m docs.readme_tables
 
-Each table is between <!-- name --> and <!-- end -->.
+Each table is between <!-- name --> and <!-- end -->. The benchmarks page holds all of them, the README those it likes.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _block() -> str:
     return block.table(load("block", training.RESULTS)["profiles"])
 
 
-_TABLES = {
+TABLES = {
     "accuracy": _accuracy,
     "features": _features,
     "changes": _changes,
@@ -144,19 +144,31 @@ _TABLES = {
 }
 
 
-def with_tables(text: str) -> str:
-    """Return the README's text with new tables."""
-    for name, table in _TABLES.items():
+def with_tables(text: str, to_root: str = "") -> str:
+    """Return a page's text with new tables.
+
+    Args:
+        text: the page.
+        to_root: path from the page to the root, from which the pictures in the tables count.
+    """
+    for name in names_of_tables(text):
+        table = TABLES[name]().replace("](", f"]({to_root}")
         pattern = rf"(<!-- {name} -->\n).*?(<!-- end -->)"
-        text, count = re.subn(pattern, functools.partial(_insert, table()), text, flags=re.DOTALL)
-        assert count == 1, f"README.md must hold <!-- {name} --> ... <!-- end --> once"
+        text = re.sub(pattern, functools.partial(_insert, table), text, flags=re.DOTALL)
     return text
+
+
+def names_of_tables(text: str) -> list[str]:
+    """Return the names of the tables that a page holds, in its order."""
+    return [name for name in re.findall(r"<!-- (\w+) -->\n", text) if name in TABLES]
 
 
 def _insert(table: str, match: re.Match[str]) -> str:
     return f"{match[1]}{table}\n{match[2]}"
 
 
+PAGES = {ROOT / "README.md": "", ROOT / "docs/benchmarks.md": "../", ROOT / "docs/howto/on_a_robot.md": "../../"}
+
 if __name__ == "__main__":
-    readme = ROOT / "README.md"
-    readme.write_text(with_tables(readme.read_text()))
+    for page, to_root in PAGES.items():
+        page.write_text(with_tables(page.read_text(), to_root))

@@ -1,22 +1,32 @@
-"""The README: its tables are those of the results."""
-
-import re
+"""The README and the benchmarks page: their tables are those of the results, and the README's code runs."""
 
 import pytest
 
-from docs.readme_tables import ROOT, with_tables
+from docs.readme_tables import PAGES, ROOT, TABLES, names_of_tables, with_tables
+from tests.docs.markdown import code_blocks, run_blocks
+
+README = ROOT / "README.md"
 
 
-def test_tables_are_those_of_the_results():
-    text = (ROOT / "README.md").read_text()
-    assert with_tables(text) == text, "run python -m docs.readme_tables"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_are_those_of_the_results(page):
+    text = page.read_text()
+    assert with_tables(text, PAGES[page]) == text, "run python -m docs.readme_tables"
+
+
+def test_the_benchmarks_page_has_every_table_once():
+    assert sorted(names_of_tables((ROOT / "docs/benchmarks.md").read_text())) == sorted(TABLES)
+
+
+def test_writes_a_table_in_place_of_an_old_one():
+    old = "<!-- loop -->\nold\n<!-- end -->\nkept\n<!-- other -->\n"
+    new = with_tables(old)
+    assert "p99" in new and "old" not in new and new.endswith("<!-- end -->\nkept\n<!-- other -->\n")
+    assert "(../benchmarks/results/" in with_tables("<!-- speed -->\n<!-- end -->", "../")
 
 
 @pytest.mark.slow(10)
 def test_its_python_runs_from_the_first_block_to_the_last():
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    runnable = [block for block in blocks if "cuda" not in block]
-    assert len(blocks) - len(runnable) == 1 and len(runnable) >= 6
-    names: dict[str, object] = {}
-    for block in runnable:
-        exec(compile(block, "README.md", "exec"), names)
+    blocks = [block for block in code_blocks(README.read_text()) if block.language == "python"]
+    assert len(blocks) >= 5
+    run_blocks(README, blocks)

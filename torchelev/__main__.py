@@ -1,4 +1,4 @@
-"""Entry point of `python -m torchelev`."""
+"""Entry point of the command `torchelev` and of `python -m torchelev`."""
 
 import sys
 
@@ -9,7 +9,7 @@ def run() -> None:
         from torchelev.app.cli import main
     except ModuleNotFoundError as error:
         sys.exit(f"Error: {error}; install the command line's packages with: pip install 'torchelev[io]'")
-    main(prog_name="python -m torchelev")
+    main()
 
 
 if __name__ == "__main__":

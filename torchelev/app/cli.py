@@ -32,8 +32,8 @@ convert them with its calibration first.
 
 \b
 Example: a folder drive/ with scans/000000.bin, ... and poses.txt
-  python -m torchelev map drive
-  python -m torchelev map drive/scans --poses drive/poses.txt \\
+  torchelev map drive
+  torchelev map drive/scans --poses drive/poses.txt \\
       --resolution 0.05 --size 30 --device cuda --out maps/drive
 
 Some formats leave their layout open: use --bin-layout, --quaternions,

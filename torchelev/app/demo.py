@@ -1,6 +1,6 @@
 """The demo: a simulated robot walks a course with a depth camera; its map is drawn beside the ground truth.
 
-Run ``make demo`` or ``python -m torchelev demo``. Needs ``torchelev[io]``.
+Run ``make demo`` or ``torchelev demo``. Needs ``torchelev[io]``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchelev.app.demo_course import LANDMARKS, ROUTE, make_course
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.grid import GridConfig
-from torchelev.output_files import MARK, atomic_file, require_writable
+from torchelev.output_files import atomic_file, require_writable
 from torchelev.sim import DepthCamera, Scene, Trajectory, mount, outliers, range_noise, walk
 
 if TYPE_CHECKING:
@@ -42,12 +42,16 @@ class DemoResult:
     ms_per_update: float  #: [ms] median
     updates: int  #: number of scans fused
 
-    def __str__(self) -> str:
+    @property
+    def accuracy(self) -> str:
+        """The errors as a line of text."""
         return (
             f"RMSE {100 * self.rmse:.2f} cm ({100 * self.rmse_off_steps:.2f} cm away from steps), "
-            f"p95 {100 * self.p95:.2f} cm, coverage {100 * self.coverage:.1f} % of the cells seen, "
-            f"{self.ms_per_update:.1f} ms per update"
+            f"p95 {100 * self.p95:.2f} cm, coverage {100 * self.coverage:.1f} % of the cells seen"
         )
+
+    def __str__(self) -> str:
+        return f"{self.accuracy}, {self.ms_per_update:.1f} ms per update"
 
 
 class _DemoScan(NamedTuple):
@@ -155,24 +159,28 @@ def find_steps(scene: Scene, xy: Tensor, t: float) -> Tensor:
 def _draw(out: str | Path, emap: ElevationMap, scene: Scene, path_xy: Tensor, t: float, result: DemoResult) -> None:
     """Write the picture: ground truth, elevation, error, deviation, traversability and upper bound."""
     from torchelev.viz.plot import draw_layers
+    from torchelev.viz.style import small_png
 
     xy = emap.cell_centers()[0]
     low, high = xy[0, 0] - GRID.resolution / 2, xy[-1, -1] + GRID.resolution / 2
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-    title = f"A simulated walk: {result.updates} scans in one map\n{result}"
+    title = f"A simulated walk: {result.updates} scans in one map\n{result.accuracy}"
     figure = draw_layers(_make_panels(emap, scene.truth(xy, t)), extent=extent, path_xy=path_xy.numpy(), title=title)
     box = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
     for name, x, y in LANDMARKS:
-        figure.axes[0].text(x, y, name, color="white", fontsize=7, ha="center", va="center", bbox=box)
-    file_format = Path(out).suffix.removeprefix(".") or "png"
-    metadata = {"Software": MARK} if file_format == "png" else None
+        figure.axes[0].text(x, y, name, color="white", fontsize=8, ha="center", va="center", bbox=box)
+    suffix = Path(out).suffix.removeprefix(".") or "png"
     with atomic_file(out) as file:
-        figure.savefig(file, format=file_format, metadata=metadata, dpi=110, bbox_inches="tight", pad_inches=0.1)
+        if suffix == "png":
+            file.write(small_png(figure))
+        else:
+            figure.savefig(file, format=suffix, bbox_inches="tight", pad_inches=0.1)
 
 
 def _make_panels(emap: ElevationMap, truth: Tensor) -> list[Panel]:
     """Return the panels of the picture; heights share one colour scale."""
     from torchelev.viz.plot import Panel
+    from torchelev.viz.style import DEVIATIONS, ERRORS, RATINGS
 
     layers = {name: emap.layer(name)[0].double() for name in ("elevation", "variance", "traversability", "upper_bound")}
     deviation = (1e3 * layers["variance"].sqrt()).numpy()
@@ -186,9 +194,9 @@ def _make_panels(emap: ElevationMap, truth: Tensor) -> list[Panel]:
     return [
         show_heights("ground truth and the robot's path", truth),
         show_heights("elevation (grey: unknown)", layers["elevation"]),
-        Panel(title="error: elevation - ground truth", values=error, unit="cm", cmap="RdBu_r", vmin=-5.0, vmax=5.0),
-        Panel(title="standard deviation", values=deviation, unit="mm", cmap="magma", vmin=0.0, vmax=50.0),
-        Panel(title="traversability", values=traversability, unit="1: flat, 0: impassable", cmap="RdYlGn",
+        Panel(title="error: elevation - ground truth", values=error, unit="cm", cmap=ERRORS, vmin=-5.0, vmax=5.0),
+        Panel(title="standard deviation", values=deviation, unit="mm", cmap=DEVIATIONS, vmin=0.0, vmax=50.0),
+        Panel(title="traversability", values=traversability, unit="0: impassable, 1: flat", cmap=RATINGS,
               vmin=0.0, vmax=1.0),
         show_heights("upper bound of unseen ground", layers["upper_bound"]),
     ]  # fmt: skip

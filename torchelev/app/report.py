@@ -51,14 +51,15 @@ def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]
 def choose_panels(layers: dict[str, NDArray], filters: Sequence[str] = ()) -> list[Panel]:
     """Return panels of the four main layers (H, W) and of filters; heights share one colour scale."""
     from torchelev.viz.plot import Panel
+    from torchelev.viz.style import DEVIATIONS, RATINGS
 
     elevation, traversability = layers["elevation"], layers["traversability"]
     known = elevation[np.isfinite(elevation)]
     low, high = (float(v) for v in np.percentile(known, [1, 99])) if known.size else (None, None)
     return [
         Panel(title="elevation", values=elevation, unit="m", vmin=low, vmax=high),
-        Panel(title="standard deviation", values=np.sqrt(layers["variance"]), unit="m", cmap="magma", vmin=0.0),
-        Panel(title="traversability", values=traversability, unit="0 to 1", cmap="RdYlGn", vmin=0.0, vmax=1.0),
+        Panel(title="standard deviation", values=np.sqrt(layers["variance"]), unit="m", cmap=DEVIATIONS, vmin=0.0),
+        Panel(title="traversability", values=traversability, unit="0 to 1", cmap=RATINGS, vmin=0.0, vmax=1.0),
         Panel(title="upper bound", values=layers["upper_bound"], unit="m", vmin=low, vmax=high),
         *(Panel(title=name, values=layers[name]) for name in filters),
     ]

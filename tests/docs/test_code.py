@@ -1,0 +1,24 @@
+"""The python of every page runs, from its first block to its last."""
+
+import pytest
+
+from tests.docs.markdown import DOCS, code_blocks, pages, run_blocks
+
+PAGES = {
+    str(path.relative_to(DOCS)): [b for b in code_blocks(path.read_text()) if b.language == "python"]
+    for path in pages()
+}
+
+
+@pytest.mark.slow(10)
+@pytest.mark.parametrize("page", [page for page, blocks in PAGES.items() if blocks])
+def test_its_python_runs(page, tmp_path, monkeypatch, compile_with):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    compile_with("eager")  # the real compiler takes minutes
+    run_blocks(DOCS / page, [block for block in PAGES[page] if block.not_run is None])
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_says_why_a_block_does_not_run(page):
+    assert all(block.not_run != "" for block in PAGES[page]), "write <!-- not run: REASON -->"
