@@ -53,7 +53,8 @@ def _escape(line: str) -> str:
 
 
 def _process(app: Sphinx, what: str, name: str, obj: object, options: Any, lines: list[str]) -> None:
-    lines[:] = to_rst(lines)
+    # Napoleon takes what stands before a colon in an attribute's first line for its type, so that line is left empty.
+    lines[:] = [*([""] if what == "attribute" else []), *to_rst(lines)]
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -73,7 +73,8 @@ def _default(field: dataclasses.Field[Any]) -> str:
 
 
 def _with_unit(default: str, unit: str | None) -> str:
-    return f"{default} {unit.replace('^2', '²')}" if unit else default
+    comma = "," if default == "required" else ""
+    return f"{default}{comma} {unit.replace('^2', '²')}" if unit else default
 
 
 def _sentence(comment: str) -> str:
@@ -88,7 +89,7 @@ class Fields(SphinxDirective):
     has_content = True
     option_spec = {"heads": directives.unchanged}
 
-    def run(self) -> list[nodes.Node]:
+    def run(self) -> list[nodes.Element]:
         """Return the table; a field without a sentence, or one that is gone, is an error."""
         cls = pydoc.locate(self.arguments[0])
         if not inspect.isclass(cls):
@@ -97,7 +98,10 @@ class Fields(SphinxDirective):
         notes = read_notes("\n".join(self.content))
         if notes and set(notes) != set(comments(cls)):
             raise self.error(f"{cls.__name__}: say a sentence about each of {sorted(set(notes) ^ set(comments(cls)))}")
-        return self.parse_text_to_nodes(table(cls, self._heads(cls, bool(notes)), notes))
+        parsed = self.parse_text_to_nodes(table(cls, self._heads(cls, bool(notes)), notes))
+        for node in parsed:
+            node["classes"].append("fields")
+        return parsed
 
     def _heads(self, cls: type, noted: bool) -> list[str]:
         if "heads" in self.options:

@@ -14,7 +14,10 @@ CODE = ("code-block", "code", "sourcecode")
 _FENCE = re.compile(r"^(\s*)(`{3,}|~{3,}|:{3,})\s*(.*?)\s*$")
 _NOT_RUN = re.compile(r"<!--\s*not run:(.*?)-->")
 _LINK = re.compile(r"\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)")
-_FILE = re.compile(r"\{(?:image|figure|include|literalinclude)\}\s+(\S+)|^\s*:link:\s+(\S+)$", re.MULTILINE)
+_FILE = re.compile(
+    r"\{(?:image|figure|include|literalinclude)\}\s+(\S+)|^\s*:link:\s+(\S+)$(?!\n\s*:link-type: (?:ref|any))",
+    re.MULTILINE,
+)
 
 
 class Block(NamedTuple):
@@ -88,6 +91,11 @@ def links(text: str) -> list[str]:
     """Return the relative targets of a page's links, pictures and includes, without anchors."""
     prose = re.sub(r"^(`{3,})[\w ]*\n.*?^\1\s*$", "", text, flags=re.DOTALL | re.MULTILINE)
     prose = re.sub(r"(`+)[^`\n](?:.*?[^`\n])?\1(?!`)", "", prose)
-    found = _LINK.findall(prose) + [a or b for a, b in _FILE.findall(text)]
+    found = _LINK.findall(prose) + [file or _page(link) for file, link in _FILE.findall(text)]
     targets = [target.partition("#")[0] for target in found if not re.match(r"[a-z]+:", target)]
     return [target for target in targets if target]
+
+
+def _page(link: str) -> str:
+    """Return the file of a card's link, which may leave `.md` out."""
+    return link if "." in link.rpartition("/")[2] or ":" in link else f"{link}.md"

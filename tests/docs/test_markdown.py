@@ -63,5 +63,6 @@ def test_blocks_share_their_names_and_errors_name_the_line(tmp_path):
 
 
 def test_finds_relative_links_outside_of_code():
-    text = '[a](b.md#c) ![d](e.png "f") [g](https://h.i) [j](#k) `[l](m.md)`\n```python\n[n](o.md)\n```\n:link: p.md\n'
-    assert sorted(links(text + "```{include} ../Q.md\n```\n")) == ["../Q.md", "b.md", "e.png", "p.md"]
+    text = '[a](b.md#c) ![d](e.png "f") [g](https://h.i) [j](#k) `[l](m.md)`\n```python\n[n](o.md)\n```\n'
+    text += ":link: p\n:link: r.md\n:link: s\n:link-type: ref\n"
+    assert sorted(links(text + "```{include} ../Q.md\n```\n")) == ["../Q.md", "b.md", "e.png", "p.md", "r.md"]
