@@ -2,7 +2,8 @@
 
     python -m docs.readme_tables
 
-Each table is between <!-- name --> and <!-- end -->. The benchmarks page holds all of them, the README those it likes.
+Each table is between <!-- name --> and <!-- end -->. docs/benchmarks.md holds every table, the other
+pages a selection.
 """
 
 from __future__ import annotations

@@ -32,6 +32,7 @@ class MapScan(ManagerTermBase):
         super().__init__(env)
         self.emap = ElevationMap(CFG, num_envs=env.num_envs, device=env.device)
         self.scan = HeightScan.mjlab(standing_height=0.5)  # your robot's base above flat ground [m]
+        self.updated = -1
 
     def reset(self, env_ids=None):
         self.emap.reset(None if env_ids is None or isinstance(env_ids, slice) else env_ids)
@@ -44,7 +45,9 @@ class MapScan(ManagerTermBase):
         # a distance of -1; NaN points are ignored.
         points = (rays.hit_pos_w - rays.pos_w[:, None]) @ T_map_sensor[:, :3, :3]
         points = points.where((rays.distances >= 0)[..., None], torch.nan)
-        self.emap.update(points, T_map_sensor, T_map_base, dt=env.step_dt)
+        if self.updated != env.common_step_counter:  # another observation group may ask again within the step
+            self.updated = env.common_step_counter
+            self.emap.update(points, T_map_sensor, T_map_base, dt=env.step_dt)
         values, valid = self.scan(self.emap, T_map_base)
         return values  # or torch.cat([values, valid.float()], -1), to tell the policy what is known
 

@@ -58,7 +58,7 @@ for target in (sensor, viewer):
     threading.Thread(target=target, daemon=True).start()
 milliseconds, last, end = [], time.perf_counter(), time.perf_counter() + args.seconds
 while last < end:
-    points, T_map_sensor, T_map_base = slot.get()  # the newest scan; waits for it
+    points, T_map_sensor, T_map_base = slot.get()  # waits for a scan
     start = time.perf_counter()
     emap.update(points, T_map_sensor, T_map_base, dt=start - last)  # better: the difference of their time stamps
     observation, valid = height_scan(emap, T_map_base)  # (1, 187), for the policy

@@ -37,12 +37,12 @@ class Environment:
         self.tile_ids = torch.arange(num_envs)
         self.origins = self.tile_ids[:, None] * torch.tensor([10.0, -10.0, 0.0], dtype=torch.float64)
         self.camera = MountedSensor(DepthCamera(width=80, height=60, max_range=5.0), mount(pitch_deg=35, x=0.3, z=0.2))
-        self.walked = 0.0
+        self.walked, self.common_step_counter = 0.0, 0
         self.step()
 
     def step(self, distance=0.05):
         """Walk ahead and measure."""
-        self.walked += distance
+        self.walked, self.common_step_counter = self.walked + distance, self.common_step_counter + 1
         yaw = torch.linspace(-0.5, 0.5, self.num_envs, dtype=torch.float64)
         xy = self.walked * torch.stack([yaw.cos(), yaw.sin()], -1)
         z = self.terrain.truth(self.tile_ids, xy[:, None].float()).double() + 0.5

@@ -59,7 +59,7 @@ def check_own_head(out):
 CHECKS = {
     "gymnasium_observation": lambda out: "'map': (2, 16, 10)" in out,
     "isaac_lab_term": lambda out: "observation (8, 187)" in out,
-    "many_robots": lambda out: re.search(r"8 robots, 768 points each(.|\n)* robots per second", out),
+    "many_robots": lambda out: bool(re.search(r"8 robots, 768 points each(.|\n)* robots per second", out)),
     "mjlab_term": lambda out: "observation (8, 187)" in out,
     "mujoco_depth_camera": check_mujoco,
     "own_head": check_own_head,
@@ -72,7 +72,7 @@ CHECKS = {
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_runs(name, tmp_path):
     out, picture = run(name, tmp_path)
-    assert CHECKS[name](out) in (None, True) or CHECKS[name](out), out
+    assert CHECKS[name](out) is not False, out
     assert picture.startswith(b"\x89PNG")
 
 
