@@ -8,7 +8,7 @@ PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
 	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
-EXTRAS := io,rl,dev
+EXTRAS := io,rl,dev,docs
 
 .PHONY: help demo test test-fast test-library matrix lint types setup bench quality docs clean
 
@@ -70,8 +70,6 @@ quality: setup  ## measure accuracy and features, five minutes
 	$(BIN)/python -m docs.readme_tables
 
 docs: setup  ## build the documentation in docs/_build/html, warnings as errors; needs no network once it is set up
-	$(BIN)/python -c 'import sphinx' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check \
-		--constraint constraints.txt --editable '.[$(EXTRAS),docs]'
 	$(BIN)/python -m sphinx -b html -W --keep-going --quiet -d docs/_build/trees docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 

@@ -29,7 +29,7 @@ def to_rst(lines: list[str]) -> list[str]:
             result.append(f"   {line}".rstrip())
         elif equation < 0 and _starts_equation(lines, number):
             equation = indent
-            result += [f"{' ' * (indent - 4)}::", "", line]
+            result += [f"{' ' * (indent - 4)}.. code-block:: text", "", line]
         else:
             result.append(line if equation >= 0 else _escape(line))
     return result

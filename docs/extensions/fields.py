@@ -79,7 +79,7 @@ def _with_unit(default: str, unit: str | None) -> str:
 
 def _sentence(comment: str) -> str:
     """Return a comment with its first letter raised, unless it is code, a symbol or nothing."""
-    return comment[:1].upper() + comment[1:] if re.match(r"[a-z]+[ ,:;]", comment) else comment
+    return comment[:1].upper() + comment[1:] if re.match(r"[a-z]{2,}[ ,:;]", comment) else comment
 
 
 class Fields(SphinxDirective):

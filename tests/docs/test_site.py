@@ -12,7 +12,7 @@ pytest.importorskip("sphinx", reason="needs pip install -e '.[docs]'")
 LOADS = re.compile(r"<(?:script|img|link|iframe|source)\b[^>]*?(?:src|href)=\"((?:https?:)?//[^\"]+)")
 
 
-@pytest.mark.slow(40)
+@pytest.mark.slow(30)
 def test_builds_without_warnings_and_loads_from_no_other_host(tmp_path):
     options = ["-b", "html", "-W", "--keep-going", "-q", "-d", tmp_path / "trees"]
     build = [sys.executable, "-m", "sphinx", *options, DOCS, tmp_path / "html"]

@@ -18,7 +18,8 @@ _REASONS = {
     "invalid": "are NaN or infinite, or their pose or variance is: check what makes them",
     "range": "are too near or too far: check their unit, and sensor.min_distance and sensor.max_distance",
     "body": "lie in the robot's body box: check sensor.body and T_map_base",
-    "overhang": "lie above the exclusion ramp: check that the pose's z axis points up, and sensor.exclusion",
+    "overhang": "lie above the exclusion ramp: check that the pose's z axis points up, that points with optical axes "
+    "have a pose with such axes, and sensor.exclusion",
 }
 
 

@@ -26,7 +26,7 @@ class FilterConfig:
     filter: str  #: name of the filter, see `FILTERS`
     #: names of the layers it reads; default: elevation, and for an expression the layers in its formula
     inputs: tuple[str, ...] | str = ()
-    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  #: kept as pairs, so that the config is hashable
+    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  #: the filter's settings, by name
 
     def __post_init__(self) -> None:
         settings = {name: _hashable(value) for name, value in dict(self.settings).items()}

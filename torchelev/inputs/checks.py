@@ -33,7 +33,7 @@ def readable(value: Tensor, always: bool = False) -> bool:
 
 def require_tensor(name: str, value: object) -> Tensor:
     """Return the value; TypeError unless it is a tensor."""
-    actual, hint = type(value).__name__, "make it one with torch.tensor"
+    actual, hint = type(value).__name__, "make it one with torch.as_tensor"
     require(isinstance(value, Tensor), name, "must be a torch.Tensor", actual, hint, TypeError)
     assert isinstance(value, Tensor)
     return value

@@ -33,8 +33,8 @@ class ExclusionConfig:
 class BodyConfig:
     """A box in the base frame that holds the robot; points inside are the robot's own."""
 
-    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  #: [m]
-    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  #: [m]
+    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  #: [m] x, y, z of the rear, right, lower corner
+    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  #: [m] x, y, z of the front, left, upper corner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +42,9 @@ class SensorConfig:
     """Noise model and gates of the points."""
 
     noise_factor: float = 1e-4  #: alpha_d: sigma_p^2 = alpha_d * d^2 + noise_floor; 1 % of the distance
-    noise_floor: float = 2.5e-5  #: [m^2] (5 mm)^2
-    min_distance: float = 0.1  #: [m]
-    max_distance: float = 50.0  #: [m]
+    noise_floor: float = 2.5e-5  #: [m^2] variance of a point beside the sensor: (5 mm)^2
+    min_distance: float = 0.1  #: [m] from the sensor; nearer points are ignored
+    max_distance: float = 50.0  #: [m] from the sensor; farther points are ignored
     #: ramp above which points are overhangs; None: every point counts
     exclusion: ExclusionConfig | None = ExclusionConfig()
     body: BodyConfig | None = None  #: box around the robot whose points are ignored; None: none are

@@ -31,8 +31,8 @@ class TraversabilityConfig:
     """Critical values of the analytic head: at each of them traversability is zero."""
 
     radius: float = 0.1  #: [m] of the window that a foot or wheel needs
-    critical_slope: float = 0.7  #: [rad]
-    critical_step: float = 0.2  #: [m]
+    critical_slope: float = 0.7  #: [rad] inclination of the window's plane
+    critical_step: float = 0.2  #: [m] height of a step within the window
     critical_roughness: float = 0.05  #: [m] standard deviation around the local plane
 
     # From which rating on cells measure the height drift; measured by `training.traversability.drift_gate`.
@@ -54,7 +54,7 @@ class LearnedTraversabilityConfig:
 
     #: size and abilities of the robot that the ground is rated for
     robot: RobotConfig = field(default_factory=RobotConfig)
-    weights: str | Path | None = None  #: of what `TraversabilityNet.save` wrote
+    weights: str | Path | None = None  #: file that `TraversabilityNet.save` wrote; None: the shipped weights
 
     drift_gate: ClassVar[float] = 0.2  # as of the analytic head
 

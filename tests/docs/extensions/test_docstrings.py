@@ -12,6 +12,7 @@ def test_code_equations_and_bars():
         "Args:\n    x: Long\n        line."
     )
     assert "\n".join(to_rst(text.split("\n"))) == (
-        "Take \\|x| of `|y|` and \\*a.\n\n::\n\n    h = |z|\n    k = 1\n\nThen:\n\n\n.. code-block:: python\n\n"
+        "Take \\|x| of `|y|` and \\*a.\n\n.. code-block:: text\n\n    h = |z|\n    k = 1\n\nThen:\n\n\n"
+        ".. code-block:: python\n\n"
         "   if a:\n       b\n\nEnd.\n\nArgs:\n    x: Long\n        line."
     )

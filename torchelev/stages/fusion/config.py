@@ -44,7 +44,7 @@ class FusionConfig:
     max_support: float = 60.0  #: points; how many must disagree until a settled cell is founded anew
     min_above: int = 5  #: points above a cell, `challenge.py`, that found it anew, however settled it is
     max_above_per_scan: int = 2  #: of those points, how many one scan adds: a single bad scan is no obstacle
-    max_variance: float = 1.0  #: [m^2]
+    max_variance: float = 1.0  #: [m^2] a cell's variance grows no larger
     edges: EdgeConfig | None = EdgeConfig()  #: walls and steps kept sharp; None: every cell averages its points
 
     def __post_init__(self) -> None:
