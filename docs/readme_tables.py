@@ -17,7 +17,8 @@ from typing import Any
 import benchmarks
 import training
 from benchmarks.quality.changes import report as changes
-from benchmarks.speed import growth, head, long_run, loop, postprocessing, sight, tables
+from benchmarks.speed import growth, head, long_run, loop, postprocessing, sight
+from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.nav import experiment
 from training.traversability import block, evaluate

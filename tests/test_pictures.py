@@ -11,7 +11,8 @@ import training
 from benchmarks.quality.accuracy import report
 from benchmarks.quality.features.comparison import FEATURES
 from benchmarks.quality.features.picture import ROWS
-from benchmarks.speed import growth, plots
+from benchmarks.speed import growth
+from benchmarks.speed.update import plots
 from docs.readme_tables import SPEED, load
 from torchelev.viz import style
 from training.nav import experiment

@@ -20,8 +20,9 @@ from typing import Any
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed import meter, plots, tables
-from benchmarks.speed.sections import SECTIONS
+from benchmarks.speed import meter
+from benchmarks.speed.update import plots, tables
+from benchmarks.speed.update.sections import SECTIONS
 from benchmarks.speed.workload import full_config
 from torchelev.app.results import commit, machine, slug, write_json
 

@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
-from benchmarks.speed import run, scaling
+from benchmarks.speed import run
 from benchmarks.speed.run import regressions
+from benchmarks.speed.update import scaling
 from docs.readme_tables import ROOT
 
 

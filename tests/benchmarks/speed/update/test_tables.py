@@ -1,7 +1,7 @@
 """Tables and figure of a speed result, and the verdicts on its targets."""
 
-from benchmarks.speed import plots, tables
 from benchmarks.speed.run import timings
+from benchmarks.speed.update import plots, tables
 from docs.readme_tables import SPEED, load
 
 

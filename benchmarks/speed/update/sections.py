@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks.speed.scaling import cells, points, rays, robots
-from benchmarks.speed.stages import parts, stages
-from benchmarks.speed.startup import start
+from benchmarks.speed.update.scaling import cells, points, rays, robots
+from benchmarks.speed.update.stages import parts, stages
+from benchmarks.speed.update.startup import start
 
 SECTIONS: dict[str, Callable[[float], dict[str, Any]]] = {
     "points": points,

@@ -2,9 +2,9 @@
 
 import pytest
 
-from benchmarks.speed import scaling
 from benchmarks.speed.run import timings
-from benchmarks.speed.sections import SECTIONS
+from benchmarks.speed.update import scaling
+from benchmarks.speed.update.sections import SECTIONS
 
 
 @pytest.mark.slow(6)
