@@ -18,6 +18,7 @@ from torchelev.sim import DepthCamera, Scene, noisy, turn_on_the_spot
 from torchelev.sim.exact.scenes import block, mixed, rough, steps
 from torchelev.viz.picture import save_image
 from torchelev.viz.plot import Panel, save_layers
+from torchelev.viz.style import ERRORS
 
 PICTURES = Path(__file__).parent / "pictures"
 LENGTH = 4.0  # [m] of the layers' window
@@ -36,7 +37,7 @@ class Shown(NamedTuple):
 
 def signed(limit: float) -> dict[str, Any]:
     """Return the colours of values around zero."""
-    return dict(cmap="RdBu", vmin=-limit, vmax=limit)
+    return dict(cmap=ERRORS, vmin=-limit, vmax=limit)
 
 
 def positive(limit: float) -> dict[str, Any]:

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from docs.mistakes.cases import Case
 from torchelev import ElevationMap
-
-UNKNOWN = "#d9d9d9"
+from torchelev.viz.style import HEIGHTS, draw_cells, make_figure
 
 
 def draw(case: Case, right: ElevationMap, wrong: ElevationMap) -> Figure:
     """Draw the elevation of two maps side by side, with the colours of the right one."""
-    figure = Figure(figsize=(6.6, 2.9), layout="compressed")
-    FigureCanvasAgg(figure)
+    figure = make_figure(6.6, 2.9)
     axes = figure.subplots(1, 2)
     heights, others = (emap.layer("elevation")[0].numpy() for emap in (right, wrong))
     low, high = np.nanpercentile(heights, [1, 99])
@@ -38,9 +33,7 @@ def _draw_map(ax: Axes, emap: ElevationMap, heights: NDArray, limits: tuple[floa
     """Draw heights (H, W) where the map lies, x to the right and y up; unknown cells are grey."""
     grid, (x, y, _) = emap.cfg.grid, emap.center[0].tolist()
     half_x, half_y = grid.length_x / 2, grid.length_y / 2
-    ax.set_facecolor(UNKNOWN)
     ax.title.set_fontsize(10)
     ax.set_xlabel("x [m]")
-    colors: dict[str, Any] = dict(cmap="cividis", vmin=limits[0], vmax=limits[1], interpolation="nearest")
     extent = (x - half_x, x + half_x, y - half_y, y + half_y)
-    return ax.imshow(np.ma.masked_invalid(heights.T), origin="lower", extent=extent, **colors)
+    return draw_cells(ax, heights, extent, HEIGHTS, vmin=limits[0], vmax=limits[1])

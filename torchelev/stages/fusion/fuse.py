@@ -48,7 +48,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
         unchanged = prior.challenger.clone(), prior.challenger_support.clone()
         challenge = Challenge(*unchanged, torch.zeros_like(prior.known))
     measured, ignored = measure_cells(scan, prior, consensus, cfg)
-    decision = decide(prior, measured, challenge, cfg, cfg.relief * grid.resolution)
+    decision = decide_by_vote(prior, measured, challenge, cfg, cfg.relief * grid.resolution)
     points_used = (measured.kept * decision.takes).sum(1).to(torch.int64)
     return tally(
         update_cells(state, prior, measured, challenge, decision, cfg),
@@ -119,7 +119,9 @@ class Decision(NamedTuple):
     support: Float[Tensor, "B C"]  #: points for the elevation less those against it, before a cell is founded
 
 
-def decide(prior: Prior, measured: CellMeasurement, challenge: Challenge, cfg: FusionConfig, relief: float) -> Decision:
+def decide_by_vote(
+    prior: Prior, measured: CellMeasurement, challenge: Challenge, cfg: FusionConfig, relief: float
+) -> Decision:
     """Decide by the gate and the majority vote whether a cell takes the scan's height; `relief` is in [m]."""
     agrees = gate_cells(prior, measured, cfg, relief)
     votes = torch.where(agrees, measured.votes - measured.dissent, measured.agreeing - measured.votes)

@@ -112,7 +112,7 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     is_steep = ray.incidence > cfg.min_incidence
     is_old = state.time > cfg.min_time
     gone = ray.found & passes_below & is_old & (is_steep | passes_far_below(state, h - p_z, grid, cfg))
-    return bound(refute_challengers(state._replace(validity=state.validity & ~gone), ray), ray)
+    return lower_upper_bound(refute_challengers(state._replace(validity=state.validity & ~gone), ray), ray)
 
 
 def refute_challengers(state: MapState, ray: RayOverCell) -> MapState:
@@ -125,7 +125,7 @@ def refute_challengers(state: MapState, ray: RayOverCell) -> MapState:
     return state._replace(challenger_support=torch.where(passes_below | ~state.validity, 0, state.challenger_support))
 
 
-def bound(state: MapState, ray: RayOverCell) -> MapState:
+def lower_upper_bound(state: MapState, ray: RayOverCell) -> MapState:
     """Lower the upper bound of unknown cells to the ray's height (paper, Sec. II-H)."""
     bounds = ray.found & ~state.validity
     lower = torch.where(state.bounded, torch.minimum(state.upper_bound, ray.height), ray.height)
