@@ -13,7 +13,7 @@ import queue
 import threading
 import time
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: its threads wait without keeping cores busy
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch; leave it out if the map has cores of its own
 
 import numpy as np
 
