@@ -29,7 +29,7 @@ def test_one_section_into_a_new_folder(tmp_path, monkeypatch, capsys, eager):
     monkeypatch.setattr(sys, "argv", ["run", "rays", "--out", str(tmp_path), "--seconds", "0.001"])
     assert run.main() == 0
     assert "growth with ray length" in capsys.readouterr().out
-    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png"}
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png", ".svg"}
 
 
 def run_compare(new, old):
