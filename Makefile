@@ -33,6 +33,9 @@ setup: $(BIN)/.ready  ## make the environment .venv
 demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
+# Workers and the programs that they start share the cores: threads that wait busily would hold them up.
+test test-fast test-library: export OMP_WAIT_POLICY = PASSIVE
+
 test: setup  ## run all tests, on all cores
 	$(BIN)/python $(PYTEST)
 
