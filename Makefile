@@ -17,7 +17,7 @@ help:  ## list the targets
 
 # The demo needs the core and the command line only; `setup` adds the rest.
 $(BIN)/.demo-ready: pyproject.toml constraints.txt
-	@echo "Installing PyTorch and the packages of the command line into $(VENV), nowhere else: 1.2 GB and about five"
+	@echo "Installing PyTorch and the packages of the command line into $(VENV), nowhere else: 1.3 GB and one to five"
 	@echo "minutes with a CPU build of PyTorch; a CUDA build is several times as large."
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt --editable '.[io]'
