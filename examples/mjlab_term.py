@@ -41,8 +41,8 @@ class MapScan(ManagerTermBase):
         robot, rays = env.scene[entity].data, env.scene[sensor].data
         T_map_base = transform(robot.root_link_pos_w, robot.root_link_quat_w)  # mjlab's quaternions are w x y z
         T_map_sensor = transform(rays.pos_w, rays.quat_w)
-        # Hits are given in the world: the map wants them in the sensor's frame, to know where rays came from. A miss is
-        # a distance of -1; NaN points are ignored.
+        # mjlab gives hits in the world frame, the map expects the sensor frame. A miss has distance -1 and becomes NaN,
+        # which the map ignores.
         points = (rays.hit_pos_w - rays.pos_w[:, None]) @ T_map_sensor[:, :3, :3]
         points = points.where((rays.distances >= 0)[..., None], torch.nan)
         if self.updated != env.common_step_counter:  # another observation group may ask again within the step

@@ -16,20 +16,16 @@ from typing import NamedTuple
 import click
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.image import AxesImage
-from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
 from envs.terrain_nav import TerrainNav
-from envs.terrain_nav.render import Snapshot, snapshot
+from envs.terrain_nav.render import Snapshot, draw_column, snapshot, window_around
 from envs.terrain_nav.task import ENDINGS
-from torchelev.viz.style import GOAL_COLOR, HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, save, styled
+from torchelev.viz.style import ROBOT_COLOR, make_figure, save, styled
 from training.nav.evaluate import Policy
 from training.nav.train import task_config
 
 PICTURES = Path(__file__).parents[1] / "pictures"
-_CONTRAST = 0.6  # [m]
 _NAMES = ("trained on the true ground", "trained with the map")
 _SAYS = {"success": "arrives", "fallen": "falls", "stuck": "is stuck", "truncated": "runs out of time"}
 
@@ -81,12 +77,16 @@ def draw(results: tuple[Outcomes, Outcomes], env: int, out: Path) -> None:
     """Draw an episode of both policies: the ground with the paths above, the maps at the end below."""
     figure = make_figure(8, 7.4)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
-    window = _window(results, env)
+    places = [*(_trail(result, env) for result in results), results[0].shots[env].goal]
+    window = window_around(np.vstack(places), margin=1.0)
     for column, name, result in zip(axes.T, _NAMES, results, strict=True):
-        image = _draw_column(column, result, env)
+        trail = _trail(result, env)
+        image = draw_column(column, result.shots[env], trail, window)
+        for ax in column:
+            ax.plot(*trail[0], "o", color=ROBOT_COLOR, markeredgecolor="white")
         column[0].set_title(f"{name}: {_SAYS[result.ending[env]]}\nafter {result.seconds[env]:.1f} s")
         column[1].set_xlabel("x [m]")
-    axes[0, 0].set(xlim=window[:2], ylim=window[2:], ylabel="ground\ny [m]")
+    axes[0, 0].set_ylabel("ground\ny [m]")
     axes[1, 0].set_ylabel("the robot's map at the end\ny [m]")
     figure.colorbar(image, ax=axes, pad=0.01, extend="both").set_label("height above the level ground [m]")
     save(figure, out)
@@ -95,31 +95,6 @@ def draw(results: tuple[Outcomes, Outcomes], env: int, out: Path) -> None:
 def _trail(result: Outcomes, env: int) -> NDArray:
     """Return the positions (T, 2) [m] of an episode."""
     return result.trails[: round(result.seconds[env] / task_config().dt) + 1, env]
-
-
-def _window(results: tuple[Outcomes, Outcomes], env: int, margin: float = 1.0) -> tuple[float, ...]:
-    """Return the square (x_min, x_max, y_min, y_max) [m] around both paths and the goal."""
-    places = np.vstack([*(_trail(result, env) for result in results), results[0].shots[env].goal])
-    middle, half = (places.max(0) + places.min(0)) / 2, np.ptp(places, axis=0).max() / 2 + margin
-    return middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half
-
-
-def _draw_column(axes: NDArray, result: Outcomes, env: int) -> AxesImage:
-    shot, trail = result.shots[env], _trail(result, env)
-    assert shot.seen is not None
-    level, limits = float(np.median(shot.truth)), {"vmin": -_CONTRAST, "vmax": _CONTRAST}
-    image = draw_cells(axes[0], shot.truth - level, shot.truth_extent, HEIGHTS, **limits)
-    draw_cells(axes[1], shot.seen - level, shot.seen_extent, HEIGHTS, **limits)
-    for ax in axes:
-        _draw_robot(ax, shot, trail)
-    return image
-
-
-def _draw_robot(ax: Axes, shot: Snapshot, trail: NDArray) -> None:
-    ax.plot(*trail.T, color=ROBOT_COLOR)
-    ax.plot(*trail[0], "o", color=ROBOT_COLOR, markeredgecolor="white")
-    ax.add_patch(Polygon(shot.footprint, facecolor="none", edgecolor=ROBOT_COLOR, linewidth=2))
-    ax.plot(*shot.goal, marker="*", color=GOAL_COLOR, markeredgecolor="black", markersize=15)
 
 
 @click.command(help=__doc__)

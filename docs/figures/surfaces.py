@@ -19,10 +19,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
+from docs.moving_picture.stage import add_lights
 from docs.moving_picture.surface import surface
 from docs.moving_picture.walk import GRID, make_ground, walk
 from docs.moving_picture.walk import Path as RobotPath
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.io.poses import read_poses
 from torchelev.viz.style import DEVIATIONS, HEIGHTS, draw_cells, make_figure, save, styled
 
 PICTURES = Path(__file__).parents[1] / "pictures"
@@ -36,10 +38,8 @@ def render(mesh: pv.PolyData, cmap: str, limits: tuple[float, float], camera: Ca
     """Return a picture (h, w, 3) of a surface, lit from the left, on white."""
     plotter = pv.Plotter(off_screen=True, window_size=[2 * length for length in _SIZE], lighting="none")
     plotter.set_background("white")
-    for position, intensity in (((-4, -6, 9), 0.75), ((6, 2, 5), 0.25), ((0, -8, 3), 0.2)):
-        plotter.add_light(pv.Light(position=position, focal_point=(0, 0, 0), intensity=intensity))
+    add_lights(plotter)
     plotter.add_mesh(mesh, scalars="values", cmap=cmap, clim=limits, show_scalar_bar=False, ambient=0.35)
-    plotter.enable_ssao(radius=0.35, bias=0.01, kernel_size=64, blur=True)
     plotter.camera_position = [*camera, (0, 0, 1)]
     plotter.camera.view_angle = 34
     picture = np.asarray(plotter.screenshot(return_img=True))[..., :3].astype(float)
@@ -112,12 +112,6 @@ def map_scan(scan: Path, pose: NDArray) -> ElevationMap:
     return emap
 
 
-def read_poses(path: Path) -> NDArray:
-    """Read KITTI poses (T, 4, 4)."""
-    rows = np.loadtxt(path, ndmin=2).reshape(-1, 3, 4)
-    return np.concatenate([rows, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 4))], 1)
-
-
 @click.group(help=__doc__)
 def main() -> None:
     """Draw a surface."""
@@ -137,8 +131,8 @@ def uncertainty(out: Path) -> None:
 @click.option("--out", type=click.Path(path_type=Path), default=PICTURES / "real_scan.png")
 def real_scan(scans: Path, poses: Path, driven: Path | None, out: Path) -> None:
     """Draw the map of the first scan of a recording."""
-    path = None if driven is None else read_poses(driven)[:, :3, 3]
-    draw_real_scan(min(scans.glob("*.bin")), read_poses(poses)[0], path, out)
+    path = None if driven is None else read_poses(driven).T_map_sensor[:, :3, 3]
+    draw_real_scan(min(scans.glob("*.bin")), read_poses(poses).T_map_sensor[0], path, out)
 
 
 if __name__ == "__main__":

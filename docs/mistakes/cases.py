@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from docs.mistakes.walk import Scan, map_of, scans_of
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, OverlapConfig, SensorConfig
-from torchelev.frames import transform
+from torchelev.frames import change_axes, transform
 from torchelev.sim import mount
 
-OPTICAL = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).double()  # T_sensor_optical
-OPENGL = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()  # optical axes from those of OpenGL, and back
 GRID = GridConfig(resolution=0.05, length_x=7.0, length_y=7.0)
 CFG = ElevationMapConfig(grid=GRID)
 
@@ -64,11 +63,9 @@ def rotated(pose: Tensor, rotation: Tensor) -> Tensor:
 
 
 def quaternion(pose: Tensor) -> Tensor:
-    """Return the quaternion (w, x, y, z) of a pose, for rotations of less than half a turn."""
-    R = pose[..., :3, :3]
-    w = (1 + R.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt() / 2
-    x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    return torch.stack([w, *(part / (4 * w) for part in (x, y, z))], -1)
+    """Return the quaternion (w, x, y, z) of a pose."""
+    xyzw = Rotation.from_matrix(pose[..., :3, :3].numpy()).as_quat(canonical=True)
+    return torch.from_numpy(xyzw).roll(1, -1)
 
 
 def misread(pose: Tensor) -> Tensor:
@@ -111,9 +108,10 @@ def shifted(pose: Tensor | None, x: float = 0.0, z: float = 0.0) -> Tensor:
     return pose + change
 
 
-def pitched(degrees: float) -> Tensor:
-    """Return a turn (4, 4) of the sensor downwards."""
-    return mount(degrees, z=0.0)
+def in_optical_axes(scan: Scan) -> Tensor:
+    """Return the points in the axes of a camera's optical frame."""
+    T_sensor_optical = change_axes(torch.eye(4, dtype=torch.float64), "forward", "optical")
+    return move(torch.linalg.inv(T_sensor_optical), scan.points)
 
 
 SMALL = ElevationMapConfig(grid=GridConfig(resolution=0.05, length_x=4.0, length_y=4.0))
@@ -124,14 +122,14 @@ FAR = each(T_map_sensor=lambda s: shifted(s.T_map_sensor, 3.0), T_map_base=lambd
 CASES = {
     "millimetres": Case(each(points=lambda s: 1000 * s.points)),
     "map-frame": Case(each(points=lambda s: move(s.T_map_sensor, s.points))),
-    "optical": Case(each(points=lambda s: move(torch.linalg.inv(OPTICAL), s.points))),
+    "optical": Case(each(points=in_optical_axes)),
     "opengl": Case(each(
-        points=lambda s: move(torch.linalg.inv(OPTICAL), s.points),
-        T_map_sensor=lambda s: s.T_map_sensor @ OPTICAL @ OPENGL,
+        points=in_optical_axes,
+        T_map_sensor=lambda s: change_axes(s.T_map_sensor, "forward", "opengl"),
     )),
     "quaternion": Case(each(T_map_sensor=lambda s: misread(s.T_map_sensor))),
     "inverted": Case(each(T_map_sensor=lambda s: torch.linalg.inv(s.T_map_sensor))),
-    "pitch": Case(each(T_map_sensor=lambda s: s.T_map_sensor @ pitched(4.0)), scene="boxes"),
+    "pitch": Case(each(T_map_sensor=lambda s: s.T_map_sensor @ mount(4.0, z=0.0)), scene="boxes"),
     "no-base": Case(each(T_map_base=lambda s: None), given=FAR, right=SMALL, wrong=SMALL),
     "low-base": Case(each(T_map_base=lambda s: shifted(s.T_map_base, z=-3.0))),
     "late": Case(late),

@@ -15,13 +15,21 @@ from PIL import Image
 from docs.moving_picture.legs import leg_joints
 from docs.moving_picture.surface import surface
 from docs.moving_picture.walk import CAMERA, GRID, Moment, Path
+from torchelev.viz.style import HEIGHTS
 
-CMAP, LIMITS = "viridis", (-0.5, 0.8)  # [m]
+CMAP, LIMITS = HEIGHTS, (-0.5, 0.8)  # [m]
 BACKGROUND = "#ffffff"
 _SUPERSAMPLING = 2
 _CAMERA = (5.1, -7.0, 6.6), (1.0, 0.0, -0.2)  # [m] position and focus
 _MATT = {"ambient": 0.35, "diffuse": 0.85, "specular": 0.05}
 _BODY, _DARK, _VIEW = "#f4f4f2", "#2b2f36", "#ff7a1a"
+
+
+def add_lights(plotter: pv.Plotter) -> None:
+    """Light a scene from the left, with soft shadows in its corners."""
+    for position, intensity in (((-4, -6, 9), 0.75), ((6, 2, 5), 0.25), ((0, -8, 3), 0.2)):
+        plotter.add_light(pv.Light(position=position, focal_point=(0, 0, 0), intensity=intensity))
+    plotter.enable_ssao(radius=0.35, bias=0.01, kernel_size=64, blur=True)
 
 
 class Stage:
@@ -39,12 +47,7 @@ class Stage:
         self.plotter.set_background(BACKGROUND)
         self.plotter.camera_position = [*_CAMERA, (0, 0, 1)]
         self.plotter.camera.view_angle = 36
-        self._light()
-
-    def _light(self) -> None:
-        for position, intensity in (((-4, -6, 9), 0.75), ((6, 2, 5), 0.25), ((0, -8, 3), 0.2)):
-            self.plotter.add_light(pv.Light(position=position, focal_point=(0, 0, 0), intensity=intensity))
-        self.plotter.enable_ssao(radius=0.35, bias=0.01, kernel_size=64, blur=True)
+        add_lights(self.plotter)
 
     def render(self, moment: Moment) -> Image.Image:
         """Return a frame. The camera stands still, so that a film repeats what does not change."""

@@ -60,7 +60,7 @@ def draw(task: TerrainNav, env: int = 0) -> np.ndarray:
     figure = Figure(figsize=(8, 4), layout="constrained", dpi=80)
     canvas = FigureCanvasAgg(figure)
     shot = snapshot(task, env)
-    _draw_column(figure.subplots(1, 2), shot, [shot.xy], shot.seen_extent)
+    draw_column(figure.subplots(1, 2), shot, [shot.xy], shot.seen_extent)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
@@ -77,10 +77,10 @@ def save_strip(shots: Sequence[Snapshot], path: Path, *, trail: Sequence[np.ndar
     """
     figure = make_figure(2.2 * len(shots), 4.4)
     axes = figure.subplots(2, len(shots), sharex=True, sharey=True)
-    extent = _window(np.array(trail), shots[0].goal)
+    extent = window_around(np.vstack([np.array(trail), shots[0].goal]))
     for column, shot in zip(axes.T, shots, strict=True):
         walked = trail[: round(shot.seconds / cfg.dt) + 1]
-        image = _draw_column(column, shot, walked, extent)
+        image = draw_column(column, shot, walked, extent)
     for ax in axes[1]:
         ax.set_xlabel("x [m]")
     for ax, name in zip(axes[:, 0], ("ground", "the robot's map"), strict=True):
@@ -89,15 +89,17 @@ def save_strip(shots: Sequence[Snapshot], path: Path, *, trail: Sequence[np.ndar
     save(figure, path)
 
 
-def _window(trail: np.ndarray, goal: np.ndarray, margin: float = 1.2) -> tuple[float, float, float, float]:
-    """Return the square (x_min, x_max, y_min, y_max) [m] around the path and the goal."""
-    places = np.vstack([trail, goal])
+def window_around(places: np.ndarray, margin: float = 1.2) -> tuple[float, float, float, float]:
+    """Return the square (x_min, x_max, y_min, y_max) [m] around places (T, 2) [m], such as a path and its goal."""
     middle, half = (places.max(0) + places.min(0)) / 2, np.ptp(places, axis=0).max() / 2 + margin
     return middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half
 
 
-def _draw_column(
-    axes: Sequence[Axes], shot: Snapshot, walked: Sequence[np.ndarray], extent: tuple[float, float, float, float]
+def draw_column(
+    axes: Sequence[Axes],
+    shot: Snapshot,
+    walked: Sequence[np.ndarray] | np.ndarray,
+    extent: tuple[float, float, float, float],
 ) -> AxesImage:
     """Draw the ground and the map of one moment, both within `extent` [m], and return the image of the ground."""
     level = float(np.median(shot.truth))

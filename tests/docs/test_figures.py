@@ -5,6 +5,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
+from torchelev.io.poses import read_poses
 from torchelev.sim import Lidar
 from torchelev.sim.exact.scenes import boxes
 
@@ -21,7 +22,7 @@ def test_a_scan_in_kitti_layout_is_mapped_and_drawn(tmp_path):
     points = Lidar(rings=16, azimuths=256).cast(boxes(), torch.from_numpy(pose)).numpy()
     np.column_stack([points, points[:, :1]]).astype(np.float32).tofile(tmp_path / "000000.bin")
     np.savetxt(tmp_path / "poses.txt", pose[:3].reshape(1, 12))
-    poses = surfaces.read_poses(tmp_path / "poses.txt")
+    poses = read_poses(tmp_path / "poses.txt").T_map_sensor
     np.testing.assert_allclose(poses[0], pose)
     elevation = surfaces.map_scan(tmp_path / "000000.bin", poses[0]).layer("elevation")[0]
     assert elevation.isfinite().sum() > 500 and abs(float(elevation.nanmedian())) < 0.02

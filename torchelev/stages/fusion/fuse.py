@@ -37,8 +37,8 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
 
     Each cell counts the points that agree with it, less those that do not (majority vote of Boyer and Moore), so that
     the height on which most points agree wins, even if an outlier came first. A scan that disagrees raises the
-    variance, as in the paper. It replaces the cell's estimate once the votes are used up, or once enough points above
-    the cell agree with each other (`challenge`): a new obstacle appears soon, even on ground that was seen for long.
+    variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
+    above the cell agree with each other (`challenge`): a new obstacle appears soon, even on ground seen for long.
     """
     scan, prior = gather_points(m, cells_of(state, m, grid), grid, cfg), gather_prior(state)
     consensus = estimate_consensus(scan, prior, grid, cfg)
