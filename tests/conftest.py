@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
 
+import envs.offscreen  # noqa: F401  (before any test imports MuJoCo)
 from torchelev.compiled_update import graphs_of
 from torchelev.ops import compiler
 

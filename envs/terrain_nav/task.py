@@ -64,6 +64,8 @@ class TerrainNav(nn.Module):
         ValueError: `perception` is none of the three.
     """
 
+    num_actions = NUM_ACTIONS
+    max_action = 1.0
     xy: Tensor
     yaw: Tensor
     velocity: Tensor
@@ -113,6 +115,21 @@ class TerrainNav(nn.Module):
     def T_map_base(self) -> Tensor:
         """Poses of the robots (B, 4, 4) in the frame of their tile."""
         return base_pose(self.xy, self.yaw, self.tile_ids, self.course.field, self.cfg.robot)
+
+    @property
+    def max_episode_length(self) -> int:
+        """Number of steps after which an episode is truncated."""
+        return self.cfg.max_episode_length
+
+    def info(self, outcome: Outcome | None) -> dict[str, Tensor]:
+        """Return the distance to the goal [m], and after a step how the episode ended, each (B,)."""
+        endings = {} if outcome is None else {name: getattr(outcome, name) for name in ENDINGS[:3]}
+        return {"distance": self.distance, **endings}
+
+    @property
+    def log(self) -> dict[str, Tensor]:
+        """Figures that a training shows: the fraction of the last finished episodes by ending."""
+        return self.ending_fractions
 
     @property
     def ending_fractions(self) -> dict[str, Tensor]:

@@ -1,0 +1,76 @@
+"""What the quadruped knows of itself: the observation "policy", and "privileged" for the critic."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from envs.quadruped.gait import constants
+
+NUM_POLICY = 50
+
+
+def observe_body(
+    velocity: Tensor,
+    angular_velocity: Tensor,
+    gravity: Tensor,
+    command: Tensor,
+    joints: Tensor,
+    joint_velocities: Tensor,
+    last_action: Tensor,
+    phase: Tensor,
+) -> Tensor:
+    """Return the observation "policy" (B, 50).
+
+    Its entries are, in this order: estimated velocity of the base (3) [m/s], angular velocity (3) [rad/s] and direction
+    of gravity (3), all in the base frame; command (3); joint angles less those of the standing robot (12) [rad]; joint
+    velocities (12) [10 rad/s]; last action (12); sine and cosine of the gait's phase (2).
+    """
+    angle = 2 * math.pi * phase
+    clock = torch.stack([angle.sin(), angle.cos()], -1)
+    parts = [velocity, angular_velocity, gravity, command, joints, 0.1 * joint_velocities, last_action, clock]
+    return torch.cat(parts, -1)
+
+
+def observe_privileged(velocity: Tensor, stands: Tensor, foot_velocities: Tensor, latency: Tensor) -> Tensor:
+    """Return the observation "privileged" (B, 20) of the critic.
+
+    Its entries are: true velocity of the base (3) [m/s], whether each foot stands (4), velocities of the feet (12)
+    [m/s], latency (1) [physics steps].
+    """
+    parts = [velocity, stands.to(velocity.dtype), foot_velocities.flatten(1), latency[:, None].to(velocity.dtype)]
+    return torch.cat(parts, -1)
+
+
+def rotation_matrix(quat_wxyz: Tensor) -> Tensor:
+    """Return rotations (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = quat_wxyz.unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def poses(position: Tensor, quat_wxyz: Tensor) -> Tensor:
+    """Return transforms (..., 4, 4) of positions (..., 3) [m] and unit quaternions (..., 4)."""
+    T = torch.zeros(*position.shape[:-1], 4, 4, dtype=position.dtype, device=position.device)
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation_matrix(quat_wxyz), position, 1.0
+    return T
+
+
+def invert(T: Tensor) -> Tensor:
+    """Return the inverses (..., 4, 4) of rigid transforms."""
+    inverse = T.clone()
+    inverse[..., :3, :3] = T[..., :3, :3].mT
+    inverse[..., :3, 3] = -(T[..., :3, :3].mT @ T[..., :3, 3:])[..., 0]
+    return inverse
+
+
+def feet_in_base(feet_from_hips: Tensor) -> Tensor:
+    """Return feet (B, 4, 3) [m] in the base frame, given each from its abduction axis."""
+    hips = constants(feet_from_hips.device)[0]
+    return feet_from_hips + torch.nn.functional.pad(hips, (0, 1))

@@ -1,0 +1,176 @@
+"""What the quadruped sees of the ground: its map, the true heights with noise, or nothing.
+
+Each sight returns the same two observations: "height_scan" (B, 187), the base above the ground around it, and "feet"
+(B, 4 * P), each foot above the rings of ground around it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from envs.quadruped.config import QuadrupedConfig
+from envs.quadruped.height_noise import HeightNoise
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan
+from torchelev.observations.patterns import compute_heading
+from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, SensorErrors, mount, preset
+
+NUM_FEET = 4
+
+
+def make_scans(cfg: QuadrupedConfig) -> tuple[HeightScan, HeightScan]:
+    """Return the scan around the base, and that around the feet."""
+    height = cfg.gait.body_height
+    base = HeightScan.isaac_lab(nominal_height=height, clip=1.0, fill=cfg.sight.fill)
+    return base, HeightScan.feet(rings=cfg.sight.rings, reach=0.5, clip=1.0, fill=cfg.sight.fill)
+
+
+class View:
+    """The poses from which robots see, for B robots in the frame of their tile.
+
+    Args:
+        T_map_base: True poses (B, 4, 4).
+        T_estimated: Poses that the robots believe in (B, 4, 4).
+        feet: Feet in the base frame (B, 4, 3) [m], from the joint encoders.
+        T_base_links: Poses of the links in the base frame (B, K, 4, 4).
+        tile_ids: (B,).
+    """
+
+    def __init__(
+        self, T_map_base: Tensor, T_estimated: Tensor, feet: Tensor, T_base_links: Tensor, tile_ids: Tensor
+    ) -> None:
+        self.T_map_base, self.T_estimated, self.tile_ids = T_map_base, T_estimated, tile_ids
+        self.feet, self.T_base_links = feet, T_base_links
+
+    def feet_in(self, T_map_base: Tensor) -> Tensor:
+        """Return the feet (B, 4, 3) [m] in the frame of a pose."""
+        return self.feet @ T_map_base[:, :3, :3].mT + T_map_base[:, None, :3, 3]
+
+
+class BlindSight(nn.Module):
+    """No sight: all values are 0. The other sights derive from it."""
+
+    def __init__(self, cfg: QuadrupedConfig, field: HeightField, num_envs: int, compiled: bool = False) -> None:
+        super().__init__()
+        self.cfg, self.field, self.num_envs = cfg, field, num_envs
+        self.scan, self.foot_scan = make_scans(cfg)
+
+    def reset(self, mask: Tensor) -> None:
+        """Begin new episodes in the environments of `mask` (B,) bool."""
+
+    def sense(self, view: View, dt: Tensor) -> None:
+        """Take a measurement; `dt` (B,) [s] is the time since the last one, 0 in new episodes."""
+
+    def read(self, view: View) -> dict[str, Tensor]:
+        """Return the observations "height_scan" (B, 187) and "feet" (B, 4 * P)."""
+        sizes = {"height_scan": self.scan.num_points, "feet": self.foot_scan.num_points}
+        return {name: torch.zeros(self.num_envs, n, device=self.field.device) for name, n in sizes.items()}
+
+
+class TruthSight(BlindSight):
+    """The true heights, with or without noise."""
+
+    def __init__(
+        self,
+        cfg: QuadrupedConfig,
+        field: HeightField,
+        num_envs: int,
+        compiled: bool = False,
+        noisy: bool | None = None,
+    ) -> None:
+        super().__init__(cfg, field, num_envs)
+        noisy = cfg.sight.truth_noise if noisy is None else noisy
+        self.noise = HeightNoise(num_envs, 1 + NUM_FEET, field.device) if noisy else None
+
+    def reset(self, mask: Tensor) -> None:
+        """Draw new offsets."""
+        if self.noise is not None:
+            self.noise.reset(mask)
+
+    def read(self, view: View) -> dict[str, Tensor]:
+        """Return the true heights at the points of the scans."""
+        T, feet = view.T_map_base, view.feet_in(view.T_map_base)
+        scan = self._heights(self.scan, T, T[:, None, :3, 3], view.tile_ids, 0)
+        rings = self._heights(self.foot_scan, T, feet, view.tile_ids, 1)
+        return {"height_scan": scan, "feet": rings}
+
+    def _heights(self, scan: HeightScan, T: Tensor, origins: Tensor, tile_ids: Tensor, first: int) -> Tensor:
+        """Return z - h - nominal_height, clipped, at the pattern around each of K origins (B, K, 3) [m]."""
+        forward = compute_heading(T)
+        left = torch.stack([-forward[:, 1], forward[:, 0]], -1)
+        points = scan.placement.on(T.device, T.dtype)
+        offset = points[:, :1] * forward[:, None] + points[:, 1:] * left[:, None]
+        values = []
+        for k, origin in enumerate(origins.unbind(1)):
+            xy = origin[:, None, :2] + offset
+            xy = xy if self.noise is None else self.noise.shift(xy, first + k)
+            height = self.field.height(tile_ids, xy)
+            height = height if self.noise is None else self.noise.disturb(height, first + k)
+            values.append(origin[:, 2:] - height - scan.nominal_height)
+        return torch.cat(values, -1).clamp(-1.0, 1.0)
+
+
+class MapSight(BlindSight):
+    """An elevation map built from simulated sensors, at estimated poses that drift."""
+
+    def __init__(self, cfg: QuadrupedConfig, field: HeightField, num_envs: int, compiled: bool = False) -> None:
+        super().__init__(cfg, field, num_envs)
+        sight, device = cfg.sight, field.device
+        grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
+        self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs, device)
+        if compiled:
+            self.emap.compile()
+        self.sensors = make_sensors(cfg)
+        errors = preset(sight.sensor_errors).sensor
+        self.sensor_errors = nn.ModuleList(SensorErrors(errors, num_envs, device) for _ in self.sensors)
+
+    def reset(self, mask: Tensor) -> None:
+        """Clear the maps and draw new errors."""
+        self.emap.reset(mask=mask)
+        for errors in self.sensor_errors:
+            assert isinstance(errors, SensorErrors)
+            errors.reset(mask=mask)
+
+    def sense(self, view: View, dt: Tensor) -> None:
+        """Cast rays from the true poses, and map the points at the estimated ones."""
+        points, T_map_sensor = self.look(view)
+        self.emap.update(points, T_map_sensor, view.T_estimated, dt)
+
+    def look(self, view: View) -> tuple[Tensor, Tensor]:
+        """Return the points of the S sensors (B, S, N, 3), sensor frame, and their estimated poses (B, S, 4, 4)."""
+        clouds: list[Tensor] = []
+        poses: list[Tensor] = []
+        for sensor, errors in zip(self.sensors, self.sensor_errors, strict=True):
+            assert isinstance(errors, SensorErrors)
+            mounting = sensor.T_base_sensor.to(self.field.device) @ errors.mounting().to(sensor.T_base_sensor.dtype)
+            points = sensor(self.field, view.tile_ids, view.T_map_base, T_base_sensor=mounting)
+            cloud = errors(points, sensor.T_map_sensor(view.T_estimated), image_shape=self._image_shape())
+            clouds.append(cloud.points)
+            poses.append(cloud.T_map_sensor)
+        return torch.stack(clouds, 1), torch.stack(poses, 1)
+
+    def _image_shape(self) -> tuple[int, int] | None:
+        width, height = self.cfg.sight.camera_pixels
+        return (height, width) if self.cfg.sight.sensors == "depth_cameras" else None
+
+    def read(self, view: View) -> dict[str, Tensor]:
+        """Return the heights of the map."""
+        T = view.T_estimated
+        scan, _ = self.scan(self.emap, T)
+        feet, _ = self.foot_scan(self.emap, T, view.feet_in(T))
+        return {"height_scan": scan, "feet": feet}
+
+
+def make_sensors(cfg: QuadrupedConfig) -> list[MountedSensor]:
+    """Return the depth cameras at both ends of the base, or the lidar on its back."""
+    sight = cfg.sight
+    if sight.sensors == "lidar":
+        lidar = Lidar(rings=16, azimuths=60, max_range=sight.max_range)
+        return [MountedSensor(lidar, mount(0.0, z=0.12).float(), min_range=0.1)]
+    camera = DepthCamera(*sight.camera_pixels, *sight.camera_fov_deg, max_range=sight.max_range)
+    places = ((0.2, 0.0), (-0.2, 180.0))
+    mountings = [mount(sight.camera_pitch_deg, x, 0.04, yaw_deg=yaw_deg).float() for x, yaw_deg in places]
+    return [MountedSensor(camera, T, min_range=0.05) for T in mountings]
+
+
+SIGHTS: dict[str, type[BlindSight]] = {"map": MapSight, "truth": TruthSight, "blind": BlindSight}

@@ -1,0 +1,448 @@
+"""The quadruped task: follow velocity commands over rough ground that the robot sees only through its map.
+
+The task offers its parts as separate calls: `advance`, `reset`, `sense`, `observe`. `envs.vector_env` and rsl-rl's
+environment call them in the order of their interfaces. Physics runs on the CPU; all else is tensors on one device.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from envs.quadruped.config import PERCEPTION, QuadrupedConfig
+from envs.quadruped.gait import feet_from_joints, foot_positions, joint_angles
+from envs.quadruped.odometry import LegOdometry
+from envs.quadruped.physics import Physics, Sensed
+from envs.quadruped.proprioception import (
+    feet_in_base,
+    invert,
+    observe_body,
+    observe_privileged,
+    poses,
+    rotation_matrix,
+)
+from envs.quadruped.rewards import Motion, reward
+from envs.quadruped.sight import SIGHTS, TruthSight, View
+from torchelev.errors import require
+from torchelev.sim import terrain_grid
+
+NUM_ACTIONS = 12
+ENDINGS = ("crossed", "fallen", "timed_out")  # how an episode can end
+_CONTACT = 1.0  # [N] of a foot that stands
+
+
+class Outcome(NamedTuple):
+    """Result of a step for B robots."""
+
+    reward: Tensor  #: (B,)
+    crossed: Tensor  #: (B,) bool, whether the robot has reached the rim of its tile
+    fallen: Tensor  #: (B,) bool, whether the robot has fallen
+    timed_out: Tensor  #: (B,) bool, whether time has run out
+
+    @property
+    def terminated(self) -> Tensor:
+        """Whether the episode has ended by a fall (B,)."""
+        return self.fallen
+
+    @property
+    def truncated(self) -> Tensor:
+        """Whether the episode was cut, as the tile is crossed or time has run out (B,)."""
+        return self.crossed | self.timed_out
+
+    @property
+    def done(self) -> Tensor:
+        """Whether the episode has ended, in any way (B,)."""
+        return self.terminated | self.truncated
+
+
+class Quadruped(nn.Module):
+    """B quadrupeds that walk across their tiles.
+
+    The action (B, 12) moves the feet of a trot, leg by leg along x, y and z of the base; `gait.py` turns feet into
+    joint angles, which PD controllers hold. `rewards.py` gives the reward.
+
+    An episode terminates when the robot falls: its base touches the ground or tilts by more than `max_tilt`. It is
+    truncated when the robot has crossed its tile, or after `episode_length`.
+
+    Args:
+        cfg: The settings; None for the defaults.
+        num_envs: B.
+        device: Where everything but the physics is computed.
+        perception: What "height_scan" and "feet" of `observe()` contain: "map", the elevation map built from simulated
+            sensors; "truth", the true ground with the noise of Miki et al. 2022; "blind", zeros.
+        seed: Seed of bodies, starts, commands and all noise. The terrain has its own, `cfg.terrain.seed`.
+        compiled: Run the map's update compiled.
+
+    Raises:
+        ValueError: `perception` is none of the three.
+    """
+
+    num_actions = NUM_ACTIONS
+    level: Tensor
+    kind: Tensor
+    phase: Tensor
+    command: Tensor
+    heading: Tensor
+    latency: Tensor
+    action: Tensor
+    joint_velocities: Tensor
+    episode_length: Tensor
+    since_sight: Tensor
+    commanded: Tensor
+    endings: Tensor
+    steps: Tensor
+    noise: Tensor
+
+    def __init__(
+        self,
+        cfg: QuadrupedConfig | None = None,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        perception: str = "map",
+        seed: int = 0,
+        compiled: bool = False,
+    ) -> None:
+        super().__init__()
+        names = ", ".join(PERCEPTION)
+        require(perception in PERCEPTION, "perception", f"must be one of {names}", repr(perception), "use 'map'")
+        self.cfg, self.num_envs, self.perception = cfg or QuadrupedConfig(), num_envs, perception
+        self.max_action = self.cfg.gait.max_action
+        terrain = self.cfg.terrain
+        self.terrain = terrain_grid(
+            terrain.kinds, terrain.num_levels, length=terrain.length, resolution=terrain.resolution,
+            seed=terrain.seed, device=device,
+        )  # fmt: skip
+        self.physics = Physics(self.terrain, num_envs, self.cfg.random, seed)
+        self.generator = torch.Generator(device)
+        self.odometry = LegOdometry(self.cfg.odometry, num_envs, device)
+        self.sight = SIGHTS[perception](self.cfg, self.terrain.field, num_envs, compiled)
+        self.truth = TruthSight(self.cfg, self.terrain.field, num_envs, noisy=False)
+        self.origins = self.physics.tile_origins.to(device, torch.float32)
+        shapes = {
+            "phase": (), "command": (3,), "heading": (), "action": (12,), "joint_velocities": (12,),
+            "since_sight": (), "commanded": (), "noise": (30,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            self.register_buffer(name, torch.zeros(num_envs, *shape, device=device))
+        for name in ("level", "latency", "episode_length"):
+            self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64, device=device))
+        self.register_buffer("kind", torch.arange(num_envs, device=device) % len(terrain.kinds))
+        self.register_buffer("endings", torch.zeros(len(ENDINGS), num_envs, device=device))
+        self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
+        self.reward_terms: dict[str, Tensor] = {}
+        self._is_fresh = True
+        self.seed(seed)
+        self.reset()
+        self.sense()
+
+    # State --------------------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> torch.device:
+        """Where all tensors but the physics are stored."""
+        return self.phase.device
+
+    @property
+    def tile_ids(self) -> Tensor:
+        """The tile of each robot (B,)."""
+        return self.level * len(self.terrain.kinds) + self.kind
+
+    @property
+    def T_map_base(self) -> Tensor:
+        """True poses of the robots (B, 4, 4) in the frame of their tile."""
+        return self._to_tile(poses(self._qpos[:, :3], self._qpos[:, 3:7]))
+
+    @property
+    def max_episode_length(self) -> int:
+        """Number of steps after which an episode is truncated."""
+        return self.cfg.max_episode_length
+
+    def info(self, outcome: Outcome | None) -> dict[str, Tensor]:
+        """Return the level of the terrain, and after a step how the episode ended, each (B,)."""
+        endings = {} if outcome is None else {name: getattr(outcome, name) for name in ENDINGS}
+        return {"level": self.level.clone(), **endings}
+
+    @property
+    def log(self) -> dict[str, Tensor]:
+        """Figures that a training shows: endings, the mean level, and each term of the reward per second."""
+        terms = {f"reward/{name}": value.mean() / self.cfg.dt for name, value in self.reward_terms.items()}
+        return {**self.ending_fractions, "level": self.level.float().mean(), **terms}
+
+    @property
+    def ending_fractions(self) -> dict[str, Tensor]:
+        """Fraction of the last finished episodes that ended in each way; zeros before the first one has finished."""
+        finished = self.endings.sum().clamp(min=1.0)
+        return {name: ended.sum() / finished for name, ended in zip(ENDINGS, self.endings, strict=True)}
+
+    @property
+    def _qpos(self) -> Tensor:
+        return self._floats(self.physics.qpos)
+
+    def _floats(self, values: Tensor) -> Tensor:
+        """Return values of the physics as float32 on the device."""
+        return values.to(self.device, torch.float32)
+
+    def _to_tile(self, T: Tensor) -> Tensor:
+        """Move poses (B, ..., 4, 4) from the world's frame to that of the robots' tiles."""
+        T = T.clone()
+        T[..., :2, 3] -= self.origins[self.tile_ids].view(-1, *[1] * (T.ndim - 3), 2)
+        return T
+
+    # Steps --------------------------------------------------------------------------------------------------------
+
+    def reset(self, mask: Tensor | None = None) -> None:
+        """Begin new episodes in the environments of `mask` (B,) bool, or in all; the curriculum gives the levels."""
+        every = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if mask is None:
+            self.steps.zero_()
+        self._choose_levels(every if mask is None else mask)
+        self._begin(every if mask is None else mask)
+
+    def _begin(self, mask: Tensor) -> None:
+        """Begin new episodes on the tiles of the current levels."""
+        self._place(mask)
+        for name in ("action", "joint_velocities", "episode_length", "since_sight", "commanded"):
+            getattr(self, name).masked_fill_(mask.view(-1, *[1] * (getattr(self, name).ndim - 1)), 0)
+        self._store("latency", (self._uniform() * (self.cfg.random.max_latency + 1)).long(), mask)
+        self._draw_commands(mask)
+        self.odometry.reset(mask)
+        self.sight.reset(mask)
+        self._draw_noise()
+
+    def place_at(self, levels: Tensor) -> None:
+        """Begin new episodes in all environments, each at a given level (B,) of its kind of terrain."""
+        self.level.copy_(levels)
+        self.steps.zero_()
+        self._begin(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        self.sense()
+
+    @property
+    def forward_speed(self) -> Tensor:
+        """Speed of the robots ahead (B,) [m/s]."""
+        return _to_yaw_frame(self._floats(self.physics.qvel[:, :3]), rotation_matrix(self._qpos[:, 3:7]))[:, 0]
+
+    def _choose_levels(self, mask: Tensor) -> None:
+        """Move robots up that have crossed their tile, and down that have not come half as far as commanded.
+
+        After seeding, levels are drawn from the first `start_level`; without a curriculum always, and from all.
+        """
+        terrain = self.cfg.terrain
+        if self._is_fresh or not terrain.curriculum:
+            top = min(terrain.start_level, terrain.num_levels) if terrain.curriculum else terrain.num_levels
+            self._store("level", (self._uniform() * top).long().clamp(max=top - 1), mask)
+            self._is_fresh = False
+        else:
+            distance = torch.linalg.vector_norm(self.T_map_base[:, :2, 3], dim=-1)
+            crossed = self._has_crossed()
+            failed = distance < 0.5 * self.commanded
+            self._store("level", self.terrain.promote(self.level, crossed, failed, self.generator), mask)
+
+    def _place(self, mask: Tensor) -> None:
+        """Put robots at the middle of their tile, standing, at any heading."""
+        env_ids = mask.cpu().nonzero()[:, 0].tolist()
+        if not env_ids:
+            return
+        n, cfg = len(env_ids), self.cfg
+        u = self._uniform(6, self.num_envs)[:, env_ids].cpu()
+        phase = torch.where(u[0] < 0.5, 0.0, 0.5)
+        self.phase[env_ids] = phase.to(self.device)
+        yaw, offset = (2 * u[1] - 1) * math.pi, 0.6 * (u[2:4] - 0.5)
+        qpos = torch.zeros(n, 19, dtype=torch.float64)
+        qpos[:, :2] = self.physics.tile_origins[self.tile_ids[env_ids].cpu()] + offset.t()
+        qpos[:, 2] = cfg.gait.body_height + 0.02
+        qpos[:, 3], qpos[:, 6] = torch.cos(yaw / 2), torch.sin(yaw / 2)
+        still = torch.zeros(n, 3)
+        qpos[:, 7:] = joint_angles(foot_positions(phase, still, cfg.gait))
+        bodies = (u[4] * cfg.random.num_bodies).long().clamp(max=cfg.random.num_bodies - 1)
+        self.physics.place(env_ids, qpos, torch.zeros(n, 18, dtype=torch.float64), bodies)
+        self.heading[env_ids] = yaw.to(self.device)
+
+    def advance(self, action: Tensor) -> Outcome:
+        """Move the robots by one step of `cfg.dt`.
+
+        Args:
+            action: Displacements of the feet (B, 12) in units of `gait.action_scale`; NaN counts as 0.
+
+        Raises:
+            ValueError: The action has another shape.
+        """
+        expected = (self.num_envs, NUM_ACTIONS)
+        actual, hint = tuple(action.shape), "give one per robot"
+        require(actual == expected, "action", f"expected {expected}", actual, hint)
+        cfg, limit = self.cfg, self.cfg.gait.max_action
+        action = action.to(self.device, torch.float32).nan_to_num(0.0).clamp(-limit, limit)
+        self._steer()
+        self._store("phase", (self.phase + cfg.gait.frequency * cfg.dt).remainder(1.0))
+        scale = torch.tensor(cfg.gait.action_scale, device=self.device)
+        feet = foot_positions(self.phase, self.command, cfg.gait) + action.unflatten(-1, (4, 3)) * scale
+        self.physics.step(joint_angles(feet).cpu().double(), self.latency.cpu(), cfg.substeps)
+        sensed = Sensed(*(self._floats(value) for value in self.physics.sensed()))
+        self._store("episode_length", self.episode_length + 1)
+        self._store("commanded", self.commanded + torch.linalg.vector_norm(self.command[:, :2], dim=-1) * cfg.dt)
+        self._store("since_sight", self.since_sight + cfg.dt)
+        velocity = self._floats(self.physics.qvel[:, :3])
+        self.odometry.step(velocity, sensed.sole_velocities, sensed.foot_forces, cfg.dt)
+        outcome = self._evaluate(action, sensed)
+        self._store("joint_velocities", self._floats(self.physics.qvel[:, 6:]))
+        self._store("action", action)
+        endings = torch.stack([getattr(outcome, name) for name in ENDINGS])
+        self._store("endings", torch.where(outcome.done, endings.to(self.endings.dtype), self.endings))
+        self._push()
+        self._draw_commands(self._happens(cfg.command.interval))
+        self._draw_noise()
+        return outcome
+
+    def _evaluate(self, action: Tensor, sensed: Sensed) -> Outcome:
+        """Return reward and endings of a step."""
+        cfg, rotation = self.cfg, rotation_matrix(self._qpos[:, 3:7])
+        qvel = self._floats(self.physics.qvel)
+        upright = rotation[:, 2, 2]
+        fallen = (sensed.touches[:, 0] > 0) | (upright < math.cos(cfg.max_tilt)) | ~torch.isfinite(qvel).all(-1)
+        motion = Motion(
+            velocity=_to_yaw_frame(qvel[:, :3], rotation),
+            angular_velocity=qvel[:, 3:6],
+            gravity=-rotation[:, 2],
+            command=self.command,
+            torques=sensed.torques,
+            joint_acceleration=(qvel[:, 6:] - self.joint_velocities) / cfg.dt,
+            action=action,
+            last_action=self.action,
+            touches=(sensed.touches > 0).float(),
+            foot_speed=torch.linalg.vector_norm(sensed.sole_velocities[..., :2], dim=-1),
+            stands=sensed.foot_forces > _CONTACT,
+            fallen=fallen,
+        )
+        value, self.reward_terms = reward(motion, cfg.reward, cfg.dt)
+        crossed = self._has_crossed() & ~fallen
+        timed_out = (self.episode_length >= cfg.max_episode_length) & ~fallen & ~crossed
+        return Outcome(value.nan_to_num(0.0).clamp(-10.0, 10.0), crossed, fallen, timed_out)
+
+    def _has_crossed(self) -> Tensor:
+        """Tell which robots are at the rim of their tile (B,)."""
+        terrain = self.cfg.terrain
+        return self.T_map_base[:, :2, 3].abs().amax(-1) > terrain.length / 2 - terrain.rim
+
+    def _steer(self) -> None:
+        """Set the commanded yaw rate from the error of the heading (legged_gym)."""
+        cfg, forward = self.cfg.command, rotation_matrix(self._qpos[:, 3:7])[:, :2, 0]
+        error = self.heading - torch.atan2(forward[:, 1], forward[:, 0])
+        error = torch.remainder(error + math.pi, 2 * math.pi) - math.pi
+        rate = (cfg.heading_gain * error).clamp(-cfg.max_yaw_rate, cfg.max_yaw_rate)
+        stands = (self.command[:, :2].abs().amax(-1) == 0).float()
+        self.command[:, 2] = rate * (1 - stands)
+
+    def _draw_commands(self, mask: Tensor) -> None:
+        """Draw new commands in the environments of `mask` (B,) bool."""
+        cfg, u = self.cfg.command, self._uniform(4, self.num_envs)
+        moves = (u[3] >= cfg.standing).float()
+        ahead, left = (low + (high - low) * x for (low, high), x in ((cfg.forward, u[0]), (cfg.left, u[1])))
+        command = torch.stack([ahead * moves, left * moves, torch.zeros_like(ahead)], -1)
+        self._store("command", command, mask)
+        self._store("heading", self.heading + cfg.heading * (2 * u[2] - 1), mask)
+
+    def _push(self) -> None:
+        """Change the velocity of some robots at random."""
+        cfg = self.cfg.random
+        change = cfg.push * (2 * self._uniform(2, self.num_envs) - 1) * self._happens(cfg.push_interval)
+        self.physics.qvel[:, :2] += change.t().cpu()
+
+    def _happens(self, interval: float) -> Tensor:
+        """Tell for which robots an event happens that has this mean time [s] between two (B,) bool."""
+        return self._uniform() < self.cfg.dt / interval
+
+    # Observations -------------------------------------------------------------------------------------------------
+
+    def sense(self, mask: Tensor | None = None) -> None:
+        """Update the maps of all robots, at every `map_every`-th call; `mask` is accepted for the common interface."""
+        if int(self.steps) % self.cfg.sight.map_every == 0:
+            self.sight.sense(self.view(), self.since_sight)
+            self._store("since_sight", torch.zeros_like(self.since_sight))
+        self.steps.add_(1)
+
+    def view(self) -> View:
+        """Return the poses from which the robots see now."""
+        sensed = Sensed(*(self._floats(value) for value in self.physics.sensed()))
+        T_map_links = self._to_tile(poses(sensed.link_positions, sensed.link_quaternions))
+        T_map_base = T_map_links[:, 0]
+        T_base_links = invert(T_map_base)[:, None] @ T_map_links
+        feet = feet_in_base(feet_from_joints(self._joints()))
+        return View(T_map_base, self.odometry.estimate(T_map_base), feet, T_base_links, self.tile_ids)
+
+    def _joints(self) -> Tensor:
+        """Return what the joint encoders read (B, 12) [rad]."""
+        return self._qpos[:, 7:] + self.cfg.random.joint_noise * self.noise[:, 18:]
+
+    def observe(self, critic: bool = True) -> dict[str, Tensor]:
+        """Return new tensors with the current observations.
+
+        Args:
+            critic: Whether to include what only a critic may see.
+
+        Returns:
+            "policy" (B, 50), see `observe_body`. "height_scan" (B, 187) and "feet" (B, 56) as `perception` says. For
+            the critic "privileged" (B, 20), "true_height_scan" and "true_feet", the scans of the true ground.
+        """
+        cfg, rotation = self.cfg, rotation_matrix(self._qpos[:, 3:7])
+        random, noise, view = cfg.random, self.noise, self.view()
+        standing = joint_angles(foot_positions(torch.zeros_like(self.phase), torch.zeros_like(self.command), cfg.gait))
+        qvel = self._floats(self.physics.qvel)
+        policy = observe_body(
+            (rotation.mT @ self.odometry.velocity[..., None])[..., 0],
+            qvel[:, 3:6] + random.gyro_noise * noise[:, :3],
+            -rotation[:, 2] + random.gravity_noise * noise[:, 3:6],
+            self.command,
+            self._joints() - standing,
+            qvel[:, 6:] + random.joint_velocity_noise * noise[:, 6:18],
+            self.action,
+            self.phase,
+        )
+        seen = {"policy": policy, **self.sight.read(view)}
+        if critic:
+            sensed = Sensed(*(self._floats(value) for value in self.physics.sensed()))
+            velocity = (rotation.mT @ qvel[:, :3, None])[..., 0]
+            stands = sensed.foot_forces > _CONTACT
+            seen["privileged"] = observe_privileged(velocity, stands, sensed.foot_velocities, self.latency)
+            seen |= {f"true_{name}": value for name, value in self.truth.read(view).items()}
+        return seen
+
+    def _draw_noise(self) -> None:
+        self.noise.copy_(2 * self._uniform(*self.noise.shape) - 1)
+
+    # Storage ------------------------------------------------------------------------------------------------------
+
+    def _uniform(self, *shape: int) -> Tensor:
+        """Draw numbers from 0 to 1, by default one for each robot."""
+        return torch.rand(shape or (self.num_envs,), generator=self.generator, device=self.device)
+
+    def _store(self, name: str, value: Tensor, mask: Tensor | None = None) -> None:
+        """Write into a buffer in place, as CONTRIBUTING.md explains under inference mode."""
+        buffer = getattr(self, name)
+        if mask is not None:
+            value = torch.where(mask.view(-1, *[1] * (buffer.ndim - 1)), value, buffer)
+        buffer.copy_(value)
+
+    def seed(self, seed: int) -> None:
+        """Seed all random number generators, so that the next `reset` begins the same episodes."""
+        generators = (getattr(module, "generator", None) for module in self.modules())
+        for index, generator in enumerate(g for g in generators if isinstance(g, torch.Generator)):
+            generator.manual_seed(1000 * seed + index)  # all different, also from those of the next seeds
+        self._is_fresh = True
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the states of the random number generators, so that a resumed training continues exactly."""
+        return {"generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Set the states of the random number generators."""
+        self.generator.set_state(state["generator"].cpu())
+
+
+def _to_yaw_frame(vector: Tensor, rotation: Tensor) -> Tensor:
+    """Return vectors (B, 3) of the map frame in the yaw frame of the base."""
+    forward = torch.nn.functional.normalize(rotation[:, :2, 0], dim=-1)
+    ahead = (vector[:, :2] * forward).sum(-1)
+    left = vector[:, 1] * forward[:, 0] - vector[:, 0] * forward[:, 1]
+    return torch.stack([ahead, left, vector[:, 2]], -1)

@@ -1,0 +1,1 @@
+"""Training, evaluation and export of walking policies for the quadruped."""

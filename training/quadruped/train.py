@@ -1,0 +1,141 @@
+"""Train a quadruped to walk over rough ground with rsl-rl's PPO, evaluate and export the policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+
+from envs.quadruped import Quadruped, QuadrupedConfig
+from envs.quadruped.config import PERCEPTION
+from envs.quadruped.rsl_rl import RslRlQuadruped
+from training.nav.runner import ResumableRunner
+from training.quadruped.evaluate import evaluate, table
+from training.resume import checkpoint_path, write_result
+
+_POSITIVE = click.IntRange(min=1)
+_HELD_OUT_SEED = 1001  # of the terrain
+ACTOR = ("policy", "height_scan", "feet")
+CRITIC = ("policy", "privileged", "true_height_scan", "true_feet")
+
+
+def ppo_config(save_interval: int = 25) -> dict[str, Any]:
+    """Return rsl-rl's configuration: PPO with an actor that sees its map and a critic that sees the truth."""
+    model = {"class_name": "MLPModel", "hidden_dims": [256, 128, 64], "activation": "elu", "obs_normalization": True}
+    gaussian = {"class_name": "GaussianDistribution", "init_std": 0.35}
+    return {
+        "num_steps_per_env": 24,
+        "save_interval": save_interval,
+        "obs_groups": {"actor": list(ACTOR), "critic": list(CRITIC)},
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": 4,
+            "num_mini_batches": 4,
+            "learning_rate": 1e-3,
+            "schedule": "adaptive",
+            "desired_kl": 0.01,
+            "gamma": 0.99,
+            "lam": 0.95,
+            "entropy_coef": 0.002,
+        },
+        "actor": model | {"distribution_cfg": gaussian},
+        "critic": dict(model),
+    }
+
+
+def task_config(held_out: bool = False) -> QuadrupedConfig:
+    """Return the task on the training ground, with a curriculum, or on held-out ground at levels drawn evenly."""
+    cfg = QuadrupedConfig()
+    if not held_out:
+        return cfg
+    terrain = dataclasses.replace(cfg.terrain, seed=_HELD_OUT_SEED, curriculum=False)
+    command = dataclasses.replace(cfg.command, forward=(0.5, 0.5), left=(0.0, 0.0), standing=0.0)
+    return dataclasses.replace(cfg, terrain=terrain, command=command)
+
+
+def make_runner(
+    num_envs: int, perception: str, seed: int, device: str, log_dir: Path | None, compiled: bool = True
+) -> ResumableRunner:
+    """Return a runner with its environments, all seeded."""
+    rank = int(os.environ.get("RANK", "0"))
+    torch.manual_seed(seed + 1000 * rank)
+    task = Quadruped(task_config(), num_envs, device, perception, seed + 1000 * rank, compiled)
+    return ResumableRunner(RslRlQuadruped(task), ppo_config(), str(log_dir) if log_dir else None, device)
+
+
+@click.command()
+@click.option("--num-envs", type=_POSITIVE, default=256, show_default=True, help="Number of parallel robots.")
+@click.option(
+    "--iterations",
+    type=_POSITIVE,
+    default=1000,
+    show_default=True,
+    help="Iterations in total, including those before --resume.",
+)
+@click.option(
+    "--perception",
+    type=click.Choice(PERCEPTION),
+    default="map",
+    show_default=True,
+    help="What the policy sees: the map, the true ground with noise, or nothing.",
+)
+@click.option("--seed", default=0, show_default=True, help="Seed of weights, starts, commands and noise.")
+@click.option("--device", default=None, help="Of policy and map. Default: a GPU if there is one, else the CPU.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("runs/quadruped"), show_default=True, help="Output folder."
+)
+@click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
+@click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Compile the map's update.")
+@click.option("--episodes", type=_POSITIVE, default=280, show_default=True, help="Episodes of the evaluation.")
+def main(
+    num_envs: int,
+    iterations: int,
+    perception: str,
+    seed: int,
+    device: str | None,
+    out: Path,
+    resume: bool,
+    compiled: bool,
+    episodes: int,
+) -> None:
+    """Train a quadruped to walk over rough ground with rsl-rl's PPO.
+
+    Then evaluate it on held-out ground with the map in the loop and odometry that drifts, and export the policy.
+
+    Writes TensorBoard logs, checkpoints and result.json to OUT.
+    """
+    device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
+    checkpoint = checkpoint_path(out, resume)
+    runner = make_runner(num_envs, perception, seed, device, out, compiled)
+    if resume:
+        try:
+            runner.resume(checkpoint)
+        except ValueError as error:
+            raise click.UsageError(str(error)) from None
+    remaining = iterations - runner.current_learning_iteration
+    if remaining <= 0:
+        click.echo(f"{checkpoint} has {runner.current_learning_iteration} iterations already: only evaluating it.")
+    else:
+        try:
+            runner.learn(remaining, init_at_random_ep_len=not resume)
+        except KeyboardInterrupt:
+            raise click.ClickException(f"stopped; {checkpoint} is saved, continue with --resume") from None
+    runner.close()
+    if int(os.environ.get("RANK", "0")) == 0:
+        _finish(runner, out, episodes, compiled)
+
+
+def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> None:
+    """Evaluate with the map in the loop and write the result."""
+    policy = runner.get_inference_policy(device=runner.device)
+    result = evaluate(policy, task_config(held_out=True), "map", episodes, runner.device, compiled)
+    click.echo(table(result))
+    training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
+    write_result(out / "result.json", {"training": training, "evaluation": result})
+    click.echo(f"Wrote result.json to {out}.")
