@@ -15,6 +15,8 @@ from envs.quadruped.config import PERCEPTION
 from envs.quadruped.rsl_rl import RslRlQuadruped
 from training.nav.runner import ResumableRunner
 from training.quadruped.evaluate import evaluate, table
+from training.quadruped.play import play
+from training.quadruped.policy import export, load_policy
 from training.resume import checkpoint_path, write_result
 
 _POSITIVE = click.IntRange(min=1)
@@ -91,6 +93,14 @@ def make_runner(
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
 @click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Compile the map's update.")
 @click.option("--episodes", type=_POSITIVE, default=280, show_default=True, help="Episodes of the evaluation.")
+@click.option(
+    "--play",
+    "played",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Do not train: walk with this policy.pt and write OUT/walk.webp.",
+)
+@click.option("--kind", default="stairs_up", show_default=True, help="Kind of terrain for --play.")
+@click.option("--level", default=3, show_default=True, help="Difficulty for --play, from 0 to 7.")
 def main(
     num_envs: int,
     iterations: int,
@@ -101,13 +111,19 @@ def main(
     resume: bool,
     compiled: bool,
     episodes: int,
+    played: Path | None,
+    kind: str,
+    level: int,
 ) -> None:
     """Train a quadruped to walk over rough ground with rsl-rl's PPO.
 
     Then evaluate it on held-out ground with the map in the loop and odometry that drifts, and export the policy.
 
-    Writes TensorBoard logs, checkpoints and result.json to OUT.
+    Writes TensorBoard logs, checkpoints, result.json, policy.pt and policy.onnx to OUT. Both policies hold the layout
+    of the scans that they read, and loading policy.pt with another one is refused.
     """
+    if played is not None:
+        return _play(played, out, kind, level, seed)
     device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
@@ -131,11 +147,23 @@ def main(
         _finish(runner, out, episodes, compiled)
 
 
+def _play(policy: Path, out: Path, kind: str, level: int, seed: int) -> None:
+    """Walk with an exported policy and write a moving picture."""
+    out.mkdir(parents=True, exist_ok=True)
+    cfg = task_config(held_out=True)
+    try:
+        play(load_policy(policy, cfg), cfg, out / "walk.webp", kind, level, seed=seed)
+    except (ValueError, RuntimeError) as error:
+        raise click.ClickException(str(error)) from None
+    click.echo(f"Wrote {out / 'walk.webp'}.")
+
+
 def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> None:
-    """Evaluate with the map in the loop and write the result."""
+    """Evaluate with the map in the loop, write the result and export the policy."""
     policy = runner.get_inference_policy(device=runner.device)
     result = evaluate(policy, task_config(held_out=True), "map", episodes, runner.device, compiled)
     click.echo(table(result))
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
     write_result(out / "result.json", {"training": training, "evaluation": result})
-    click.echo(f"Wrote result.json to {out}.")
+    export(runner, task_config(), out)
+    click.echo(f"Wrote result.json, policy.pt and policy.onnx to {out}.")

@@ -1,0 +1,90 @@
+"""Two iterations of training, export, evaluation, and what is refused."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+from envs.quadruped import Quadruped
+from tests.envs.quadruped.cases import CFG
+from training.quadruped import evaluate, policy, train
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Train for two iterations on small terrains."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(train, "task_config", lambda held_out=False: dataclasses.replace(CFG, episode_length=0.5))
+    out = tmp_path_factory.mktemp("quadruped")
+    command = ["--num-envs", "4", "--iterations", "2", "--episodes", "4", "--no-compile", "--perception", "truth"]
+    result = CliRunner().invoke(train.main, [*command, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    yield out, result.output
+    patch.undo()
+
+
+@pytest.mark.slow(12)
+def test_two_iterations_leave_result_policies_and_logs(small):
+    out, printed = small
+    result = json.loads((out / "result.json").read_text())
+    assert result["training"]["steps"] == 2 * 24 * 4 and result["evaluation"]["episodes"] == 4
+    assert set(result["evaluation"]["by_kind"]) == {"flat", "stairs_up"}
+    assert {"policy.pt", "policy.onnx", "checkpoint.pt"} <= {path.name for path in out.iterdir()}
+    assert list(out.glob("events.*")) and "speed by command" in printed
+
+
+def test_a_policy_is_loaded_onto_the_scans_that_it_was_trained_with(small):
+    out, _ = small
+    loaded = policy.load_policy(out / "policy.pt", CFG)
+    actions = loaded(Quadruped(CFG, 2, perception="map").observe())
+    assert actions.shape == (2, 12) and actions.isfinite().all()
+
+
+def test_a_policy_on_other_scans_is_refused_by_name(small):
+    out, _ = small
+    rings = dataclasses.replace(CFG, sight=dataclasses.replace(CFG.sight, rings=((0.1, 4),)))
+    with pytest.raises(ValueError, match="feet.pattern: must have the points"):
+        policy.load_policy(out / "policy.pt", rings)
+    lower = dataclasses.replace(CFG, gait=dataclasses.replace(CFG.gait, body_height=0.25))
+    with pytest.raises(ValueError, match="height_scan.nominal_height: must be 0.3"):
+        policy.load_policy(out / "policy.pt", lower)
+
+
+def test_the_onnx_file_holds_the_layout_too(small):
+    onnx = pytest.importorskip("onnx")
+    out, _ = small
+    metadata = {prop.key: prop.value for prop in onnx.load(str(out / "policy.onnx")).metadata_props}
+    assert json.loads(metadata[policy.LAYOUT])["groups"] == list(policy.GROUPS)
+
+
+def test_a_checkpoint_of_another_perception_is_refused(small):
+    out, _ = small
+    command = ["--num-envs", "4", "--iterations", "3", "--no-compile", "--perception", "blind", "--resume"]
+    result = CliRunner().invoke(train.main, [*command, "--out", str(out)])
+    assert result.exit_code != 0 and "perception" in result.output
+
+
+def test_training_resumes(small):
+    out, _ = small
+    command = ["--num-envs", "4", "--iterations", "3", "--episodes", "4", "--no-compile", "--perception", "truth"]
+    result = CliRunner().invoke(train.main, [*command, "--out", str(out), "--resume"])
+    assert result.exit_code == 0, result.output
+    assert json.loads((out / "result.json").read_text())["training"]["steps"] == 3 * 24 * 4
+
+
+def test_an_evaluation_counts_every_episode_once():
+    cfg = dataclasses.replace(CFG, episode_length=0.2)
+    result = evaluate.evaluate(evaluate.stand_in_trot, cfg, "blind", episodes=6)
+    assert result["all"]["episodes"] == 6 and result["all"]["timed_out"] == 1.0
+    assert sum(row["episodes"] for row in result["by_kind"].values()) == 6
+    levels = [row["episodes"] for rows in result["by_level"].values() for row in rows.values()]
+    assert sum(levels) == 6 and "| all |" in evaluate.table(result)
+
+
+def test_a_file_without_a_layout_is_refused(tmp_path):
+    path = tmp_path / "other.pt"
+    torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), str(path))
+    with pytest.raises(ValueError, match="must hold the layout of its scans"):
+        policy.load_policy(path, CFG)

@@ -1,0 +1,72 @@
+"""What a policy must know about the height scan that it was trained with, as plain data to store beside its weights."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from torchelev.errors import require
+from torchelev.observations.scan_settings import ScanSettings
+
+# Noise belongs to training, reach to the map's window; the placement follows from the pattern.
+_LEFT_OUT = ("noise", "noise_after_clip", "reach", "placement")
+_DIGITS = 6  # of a pattern's coordinates [m]
+
+
+def scan_layout(scan: ScanSettings) -> dict[str, Any]:
+    """Describe a scan by its points in their order, offset, clip, scale and fill, as values that JSON can hold.
+
+    Store it with a policy, and check it with `require_layout` where the policy is deployed.
+    """
+    names = [field.name for field in dataclasses.fields(scan) if field.name not in _LEFT_OUT]
+    layout = {name: _to_json(getattr(scan, name)) for name in names}
+    layout["pattern"] = [[round(x, _DIGITS), round(y, _DIGITS)] for x, y in scan.pattern]
+    return layout
+
+
+def _to_json(value: Any) -> Any:
+    """Return infinities, which JSON cannot hold, as strings."""
+    return str(value) if isinstance(value, float) and math.isinf(value) else value
+
+
+def require_layout(scan: ScanSettings, layout: Mapping[str, Any], name: str = "height_scan") -> None:
+    """Refuse a scan that a policy of another layout would misread.
+
+    Args:
+        scan: The scan that the policy is to read.
+        layout: What `scan_layout` returned for the scan that it was trained with.
+        name: What errors call the scan.
+
+    Raises:
+        ValueError: The two differ; the error names the first setting that does, both values, and the fix.
+    """
+    actual = scan_layout(scan)
+    for key in sorted(actual.keys() | layout.keys(), key=lambda key: (key != "pattern", key)):
+        found, wanted = actual.get(key), layout.get(key)
+        if key == "pattern":
+            _require_pattern(found, wanted, name)
+        hint = f"build the scan with {key}={wanted!r}, or train with {found!r}"
+        require(found == wanted, f"{name}.{key}", f"must be {wanted!r}, with which the policy was trained", found, hint)
+
+
+def _require_pattern(found: Any, wanted: Any, name: str) -> None:
+    """Refuse other points, or the same in another order."""
+    if found == wanted:
+        return
+    is_reordered = isinstance(wanted, list) and sorted(found) == sorted(wanted)
+    rule = "must have the points with which the policy was trained"
+    hint = "use the same preset: isaac_lab and mjlab have x fastest, legged_gym and grid y fastest"
+    if is_reordered:
+        require(False, f"{name}.pattern", f"{rule}, in their order", "the same points in another order", hint)
+    actual = f"{_summarize(found)} instead of {_summarize(wanted)}"
+    require(False, f"{name}.pattern", rule, actual, "use the lengths and the resolution of the training")
+
+
+def _summarize(points: Any) -> str:
+    """Name the number of points and their extent."""
+    if not isinstance(points, list) or not points:
+        return "none"
+    (x0, y0), (x1, y1) = ([f(axis) for axis in zip(*points, strict=True)] for f in (min, max))
+    return f"{len(points)} points over x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"

@@ -1,0 +1,59 @@
+"""Watch a policy: walk over one kind of terrain and write a video or a strip of pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from tqdm import tqdm
+
+from envs.quadruped import Quadruped, QuadrupedConfig
+from envs.quadruped.render import draw, save_strip, save_video
+from torchelev.errors import require
+from training.quadruped.policy import Policy
+
+_EVERY = 2  # steps between two pictures: 25 a second
+
+
+@torch.inference_mode()
+def play(
+    policy: Policy,
+    cfg: QuadrupedConfig,
+    path: Path,
+    kind: str = "stairs_up",
+    level: int = 3,
+    seconds: float = 8.0,
+    seed: int = 0,
+) -> None:
+    """Walk with the map in the loop and draw it.
+
+    Args:
+        policy: Maps an observation to actions.
+        cfg: The task.
+        path: Where to write: .webp is a moving picture, .png a strip of five.
+        kind: Kind of terrain.
+        level: Difficulty, from 0.
+        seconds: Duration.
+        seed: Of start, body and noise.
+
+    Raises:
+        ValueError: There is no such kind or level.
+        RuntimeError: MuJoCo finds no OpenGL.
+    """
+    kinds = cfg.terrain.kinds
+    require(kind in kinds, "kind", f"must be one of {', '.join(kinds)}", kind, "choose one of them")
+    fits = 0 <= level < cfg.terrain.num_levels
+    require(fits, "level", f"must be from 0 to {cfg.terrain.num_levels - 1}", level, "choose one of them")
+    task = Quadruped(cfg, 1, perception="map", seed=seed)
+    task.kind.fill_(kinds.index(kind))
+    task.place_at(torch.full((1,), level))
+    pictures = [draw(task)]
+    for step in tqdm(range(round(seconds / cfg.dt)), unit="step"):
+        outcome = task.advance(policy(TensorDict(task.observe(), batch_size=[1])))
+        if step % _EVERY == 0:
+            pictures.append(draw(task))
+        if bool(outcome.done):
+            break
+        task.sense()
+    (save_video if path.suffix == ".webp" else save_strip)(pictures, path)

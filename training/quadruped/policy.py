@@ -1,0 +1,110 @@
+"""Policies as files: TorchScript and ONNX with the layout of the scans that they read, and loading them again."""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from envs.quadruped import QuadrupedConfig
+from envs.quadruped.sight import make_scans
+from torchelev.errors import require
+from torchelev.observations.scan_layout import require_layout, scan_layout
+from training.nav.runner import ResumableRunner
+
+LAYOUT = "torchelev.json"  # name of the layout in a TorchScript file, and of its metadata in an ONNX file
+GROUPS = ("policy", "height_scan", "feet")  # in the order in which the network takes them, side by side
+_TOLERANCE = 1e-5  # largest difference of an action
+
+Policy = Callable[[Any], Tensor]
+
+
+def layout_of(cfg: QuadrupedConfig) -> dict[str, Any]:
+    """Describe what a policy of this task reads: its groups in order, and the layout of each scan."""
+    scan, feet = make_scans(cfg)
+    return {"groups": list(GROUPS), "height_scan": scan_layout(scan), "feet": scan_layout(feet)}
+
+
+def join(observation: Any) -> Tensor:
+    """Return the observation groups side by side (B, 293), as exported policies take them."""
+    return torch.cat([observation[name] for name in GROUPS], -1)
+
+
+def export(runner: ResumableRunner, cfg: QuadrupedConfig, folder: Path) -> None:
+    """Write policy.pt (TorchScript) and policy.onnx to a folder, each with its layout.
+
+    Both take the groups side by side, "policy" (50), "height_scan" (187), "feet" (56), and return actions.
+
+    Raises:
+        ValueError: An exported policy returns other actions than the trained one.
+    """
+    layout = json.dumps(layout_of(cfg))
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns about packages that are not installed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporters warn about their own deprecations
+        runner.export_policy_to_jit(str(folder), "policy.pt")
+        runner.export_policy_to_onnx(str(folder), "policy.onnx")
+        scripted = torch.jit.load(str(folder / "policy.pt"), map_location="cpu")
+        torch.jit.save(scripted, str(folder / "policy.pt"), _extra_files={LAYOUT: layout})
+    _add_metadata(folder / "policy.onnx", layout)
+    observation = runner.env.get_observations().to("cpu")
+    actor = runner.get_inference_policy(device="cpu")
+    with torch.inference_mode():
+        expected = actor(observation).numpy()
+        found = {"policy.pt": load_policy(folder / "policy.pt", cfg)(observation).numpy()}
+    found["policy.onnx"] = run_onnx(folder / "policy.onnx", observation)
+    for name, actual in found.items():
+        error = float(np.abs(actual - expected[: len(actual)]).max())
+        require(error < _TOLERANCE, name, "must act as the policy does", f"an error of {error:.2g}", "report it")
+    actor.to(runner.device)
+
+
+def _add_metadata(path: Path, layout: str) -> None:
+    import onnx
+
+    model = onnx.load(str(path))
+    onnx.helper.set_model_props(model, {LAYOUT: layout})
+    onnx.save(model, str(path))
+    path.with_name(f"{path.name}.data").unlink(missing_ok=True)  # the weights are in the file itself now
+
+
+def load_policy(path: Path, cfg: QuadrupedConfig) -> Policy:
+    """Return an exported TorchScript policy, which takes observations of this task.
+
+    Raises:
+        ValueError: The file has no layout, or the task's scans are laid out otherwise than those of the training.
+    """
+    files = {LAYOUT: ""}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scripted = torch.jit.load(str(path), map_location="cpu", _extra_files=files)
+    require(
+        bool(files[LAYOUT]), str(path), "must hold the layout of its scans", "none", "export it with training.quadruped"
+    )
+    layout = json.loads(files[LAYOUT])
+    groups = tuple(layout["groups"])
+    require(groups == GROUPS, "groups", f"must be {GROUPS}", groups, "use the version that exported the policy")
+    for name, scan in zip(("height_scan", "feet"), make_scans(cfg), strict=True):
+        require_layout(scan, layout[name], name)
+    return lambda observation: scripted(join(observation))
+
+
+def run_onnx(path: Path, observation: Any, count: int = 4) -> np.ndarray:
+    """Return the actions (count, 12) of an ONNX policy for the first observations."""
+    from onnx.reference import ReferenceEvaluator
+
+    session = ReferenceEvaluator(str(path))
+    rows = join(observation)[:count].numpy()
+    actions = []
+    for row in rows:
+        outputs = session.run(None, {session.input_names[0]: row[None]})
+        assert isinstance(outputs, list)
+        actions.append(outputs[0])
+    return np.concatenate(actions)
