@@ -23,6 +23,7 @@ from training import RESULTS
 from training.jobs import Job, train_all
 from training.nav.evaluate import Policy, evaluate, straight_line
 from training.nav.train import ppo_config, task_config
+from training.options import jobs_option, runs_option
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
@@ -126,14 +127,8 @@ def plot(result: dict[str, Any], path: Path) -> None:
 
 
 @click.command(help=__doc__)
-@click.option(
-    "--runs",
-    type=click.Path(path_type=Path),
-    default=Path("runs/nav_experiment"),
-    show_default=True,
-    help="Folder of the trainings.",
-)
-@click.option("--jobs", default=2, show_default=True, help="Number of parallel trainings, each on one core.")
+@runs_option("runs/nav_experiment")
+@jobs_option
 def main(runs: Path, jobs: int) -> None:
     """Train, deploy, write JSON and figure and print the table."""
     train_all(_jobs(runs), jobs)

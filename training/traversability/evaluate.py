@@ -20,6 +20,7 @@ from tqdm import tqdm
 from torchelev.app.results import markdown_table, write_json
 from torchelev.robot import RobotConfig
 from torchelev.traversability.net import TraversabilityNet
+from training.options import paper_weights_option
 from training.traversability.heads import Score, baselines, family
 from training.traversability.maps.data import MappedTerrain, data_set
 from training.traversability.maps.mapping import DataConfig
@@ -180,9 +181,7 @@ def _cell(values: list[float | None]) -> str:
 @click.option(
     "--robot", type=RobotType(), default=None, help="length=0.7,width=0.4,... or a YAML file. Default: any robot."
 )
-@click.option(
-    "--paper-weights", type=click.Path(path_type=Path, exists=True), default=None, help="The paper's filter (npz)."
-)
+@paper_weights_option
 @click.option(
     "--out",
     type=click.Path(path_type=Path),

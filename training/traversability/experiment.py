@@ -18,6 +18,7 @@ from torchelev.robot import RobotConfig
 from torchelev.traversability.net import TraversabilityNet
 from training import RESULTS
 from training.jobs import Job, train_all
+from training.options import jobs_option, paper_weights_option, runs_option
 from training.traversability.evaluate import SPLITS, evaluate, table
 from training.traversability.maps.mapping import DataConfig
 from training.traversability.robot import RobotType
@@ -45,21 +46,10 @@ def _folder(runs: Path, seed: int) -> Path:
 
 
 @click.command(help=__doc__)
-@click.option(
-    "--runs",
-    type=click.Path(path_type=Path),
-    default=Path("runs/traversability_experiment"),
-    show_default=True,
-    help="Folder of the trainings.",
-)
-@click.option("--jobs", default=2, show_default=True, help="Number of parallel trainings, each on one core.")
+@runs_option("runs/traversability_experiment")
+@jobs_option
 @click.option("--robot", default=None, help="length=0.7,width=0.4,... or a YAML file. Default: any robot.")
-@click.option(
-    "--paper-weights",
-    type=click.Path(path_type=Path, exists=True),
-    default=None,
-    help="The paper's filter (npz) to compare with.",
-)
+@paper_weights_option
 def main(runs: Path, jobs: int, robot: str | None, paper_weights: Path | None) -> None:
     """Train, evaluate, write JSON and figure and print the tables."""
     cfg = DataConfig(robot=_robot(robot))

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchelev.traversability.net import TraversabilityNet
 from torchelev.viz.style import HEIGHTS, RATINGS, draw_cells, make_figure, save, styled
 from training import RESULTS
+from training.options import paper_weights_option
 from training.traversability.heads import Score, baselines
 from training.traversability.maps.data import MappedTerrain, data_set
 from training.traversability.maps.mapping import DataConfig
@@ -93,9 +94,7 @@ def _draw_panel(ax: Axes, values: Tensor, mask: Tensor, name: str) -> Any:
     help="Folder of the maps; missing ones are made.",
 )  # fmt: skip
 @click.option("--weights", type=click.Path(path_type=Path, exists=True), help="Default: the shipped ones.")
-@click.option(
-    "--paper-weights", type=click.Path(path_type=Path, exists=True), default=None, help="The paper's filter (npz)."
-)
+@paper_weights_option
 @click.option("--batches", default=20, show_default=True, help="Held-out batches to choose the first maps from.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "traversability.png", help="File to write.")
 def main(data: Path, weights: Path | None, paper_weights: Path | None, batches: int, out: Path) -> None:

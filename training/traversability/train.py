@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from torchelev.robot import RobotConfig
+from training.options import paper_weights_option
 from training.resume import checkpoint_path, write_result
 from training.traversability.evaluate import evaluate, table
 from training.traversability.heads import baselines
@@ -37,12 +38,7 @@ _POSITIVE = click.IntRange(1)
 @click.option(
     "--evaluation-batches", type=_POSITIVE, default=20, show_default=True, help="Evaluation batches per resolution."
 )
-@click.option(
-    "--paper-weights",
-    type=click.Path(path_type=Path, exists=True),
-    default=None,
-    help="The paper's filter (npz) to compare with.",
-)
+@paper_weights_option
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
