@@ -5,7 +5,8 @@ import torch
 
 from tests.helpers import pose
 from tests.observations.maps import BASE, at, ground_map, near
-from torchelev.observations.height_scan import PRESETS, HeightScan
+from torchelev.observations.height_scan import HeightScan
+from torchelev.observations.presets import PRESETS
 
 
 @pytest.mark.parametrize("scan", [*(HeightScan.preset(name) for name in PRESETS), HeightScan.grid()])

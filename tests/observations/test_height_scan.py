@@ -17,9 +17,10 @@ from tests.observations.maps import BASE, SEEDS, at, flat, ground_map, near, pla
 from torchelev import ElevationMap
 from torchelev.inputs import checks
 from torchelev.observations.fill import FILLS, MODES
-from torchelev.observations.height_scan import PRESETS, HeightScan
+from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import CHANNELS, MapImage
 from torchelev.observations.patterns import ALIGNMENTS
+from torchelev.observations.presets import PRESETS
 
 # The presets, worked out by hand: the base at (0.3, -0.2, 0.7) looks along +y, so that the pattern's point (x, y) lies
 # at (0.3 - y, -0.2 + x). Ground 0.1 x + 0.2 y:

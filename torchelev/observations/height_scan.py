@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,15 +10,14 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive, whole_cells
-from torchelev.observations import patterns
+from torchelev.observations import patterns, presets
+from torchelev.observations.presets import PRESETS
 from torchelev.observations.scan_reading import read_scan
 from torchelev.observations.scan_settings import ScanSettings
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-PRESETS = ("isaac_lab", "mjlab", "legged_gym")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +59,8 @@ class HeightScan(ScanSettings):
             **settings: fields of `ScanSettings` that replace those of the preset.
         """
         require_positive(length_x=length_x, length_y=length_y, resolution=resolution)
-        x, y = (patterns.space_by_arange(length, resolution, 1e-9) for length in (length_x, length_y))
-        preset: dict[str, Any] = dict(nominal_height=0.5, clip=1.0, noise=0.1, original=-math.inf)
-        return cls(pattern=patterns.order_x_fastest(x, y), **(preset | settings))
+        points = presets.isaac_lab_points(length_x, length_y, resolution)
+        return cls(pattern=points, **(presets.ISAAC_LAB | settings))
 
     @classmethod
     def mjlab(
@@ -88,13 +85,12 @@ class HeightScan(ScanSettings):
             **settings: fields of `ScanSettings` that replace those of the preset.
         """
         require_positive(length_x=length_x, length_y=length_y, resolution=resolution)
-        x, y = (patterns.space_by_arange(length, resolution, resolution * 0.5) for length in (length_x, length_y))
-        preset: dict[str, Any] = dict(scale=1 / 5, noise=0.1, original=5.0, standing_height=0.5)
-        return cls(pattern=patterns.order_x_fastest(x, y), **(preset | settings))
+        points = presets.mjlab_points(length_x, length_y, resolution)
+        return cls(pattern=points, **(presets.MJLAB | settings))
 
     @classmethod
     def legged_gym(
-        cls, *, x: Sequence[float] = patterns.LEGGED_GYM_X, y: Sequence[float] = patterns.LEGGED_GYM_Y, **settings: Any
+        cls, *, x: Sequence[float] = presets.LEGGED_GYM_X, y: Sequence[float] = presets.LEGGED_GYM_Y, **settings: Any
     ) -> HeightScan:
         """Build legged_gym's height measurements: 5 clip(z - 0.5 - elevation, -1, 1), by default 187 values.
 
@@ -114,8 +110,7 @@ class HeightScan(ScanSettings):
             y: `measured_points_y` [m].
             **settings: fields of `ScanSettings` that replace those of the preset.
         """
-        preset: dict[str, Any] = dict(mode="minimum", nominal_height=0.5, clip=1.0, scale=5.0, noise=0.1)
-        return cls(pattern=patterns.order_y_fastest(x, y), **(preset | dict(noise_after_clip=True) | settings))
+        return cls(pattern=patterns.order_y_fastest(x, y), **(presets.LEGGED_GYM | settings))
 
     @classmethod
     def grid(
@@ -162,7 +157,7 @@ class HeightScan(ScanSettings):
         cls,
         *,
         num_feet: int = 4,
-        rings: Iterable[tuple[float, int]] = patterns.RINGS,
+        rings: Iterable[tuple[float, int]] = presets.RINGS,
         reach: float = 0.6,
         **settings: Any,
     ) -> HeightScan:

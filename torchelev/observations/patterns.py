@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 Points = tuple[tuple[float, float], ...]  # x, y [m]
 
 ALIGNMENTS = ("yaw", "base", "world")
-LEGGED_GYM_X = tuple(k / 10 for k in range(-8, 9))  # [m]
-LEGGED_GYM_Y = tuple(k / 10 for k in range(-5, 6))  # [m]
-RINGS = ((0.08, 6), (0.16, 8), (0.26, 10), (0.36, 12), (0.48, 16))  # radius [m] and points of Miki et al. 2022
 _MIN_HORIZONTAL = 0.1  # horizontal length of the base's x axis below which it does not define the heading
 
 
