@@ -3,20 +3,16 @@
 import copy
 import os
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from tests.diagnosis.walks import CFG, DT, SENSORS, map_of, on_reordered_base, reordered, sound_scene
 from tests.helpers import nans, small_map
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.diagnosis.pose_hypotheses import to_quaternion, to_rotation
-from torchelev.sim import DepthCamera, Lidar, mount, range_noise, walk
+from torchelev import ElevationMap, ElevationMapConfig
+from torchelev.sim import mount, range_noise, walk
 from torchelev.sim.exact import scenes as library
 
-DT = 0.2  # [s]
-CFG = ElevationMapConfig(grid=GridConfig(resolution=0.08, length_x=8.0, length_y=8.0))
-SENSORS = {"camera": (DepthCamera(width=80, height=60, max_range=6.0), 35.0), "lidar": (Lidar(azimuths=256), 0.0)}
 OPTICAL = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).double()
 FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
 
@@ -36,13 +32,6 @@ def walked(request):
             for k in steps]  # fmt: skip
 
 
-def map_of(scans, mistake=lambda *scan: scan, dt=DT, cfg=CFG):
-    emap = ElevationMap(cfg)
-    for scan in scans:
-        emap.update(*mistake(*scan), dt=dt)
-    return emap
-
-
 def shift(axis, length):
     """What to add to poses to move them along an axis of the map [m]."""
     change = torch.zeros(4, 4)
@@ -53,13 +42,6 @@ def shift(axis, length):
 def transposed(T):
     T = T.clone()
     T[..., :3, :3] = T[..., :3, :3].mT.clone()
-    return T
-
-
-def reordered(T, shift):
-    """The pose that results if the order of the quaternion's entries is mistaken."""
-    T = T.clone()
-    T[0, :3, :3] = torch.from_numpy(to_rotation(np.roll(to_quaternion(T[0, :3, :3].numpy()), shift)))
     return T
 
 
@@ -79,6 +61,8 @@ MISTAKES = {
     "rotation in T_map_sensor is transposed": lambda p, T, base: (p, transposed(T), base),
     "order w x y z was read as x y z w": lambda p, T, base: (p, reordered(T, 1), base),
     "order x y z w was read as w x y z": lambda p, T, base: (p, reordered(T, -1), base),
+    "the base's quaternion, in the order w x y z, was read as x y z w": on_reordered_base(1),
+    "the base's quaternion, in the order x y z w, was read as w x y z": on_reordered_base(-1),
     "upside down": lambda p, T, base: (move(FLIP, p), T, base),
     "own legs": with_legs,
     "give T_map_base, which the window follows": lambda p, T, base: (p, T + shift(0, 50.0), None),
@@ -211,28 +195,6 @@ def test_inputs_are_copied_and_maps_too(walked):
     twin = ElevationMap(CFG)
     twin.update(p.clone().requires_grad_(), T, base, dt=DT)
     copy.deepcopy(twin)
-
-
-def sound_scene(seed):
-    """A random terrain, sensor, mount, speed and window -> scene, sensor, path, config, whether the base is known."""
-    rng = np.random.default_rng(seed)
-    kinds = [lambda: library.slope(rng.uniform(0, 30)), lambda: library.rough(seed), library.stairs,
-             lambda: library.boxes(seed), lambda: library.mixed(seed), library.wall, library.overhang,
-             lambda: library.person(2.0), library.flat]  # fmt: skip
-    scene = kinds[rng.integers(len(kinds))]()
-    if rng.random() < 0.6:
-        sensor, pitch = DepthCamera(width=64, height=48, max_range=rng.uniform(4, 10)), rng.uniform(10, 50)
-    else:
-        rings, top = int(rng.choice([8, 16, 32])), rng.choice([15, 45])
-        sensor = Lidar(rings, 256, fov_high_deg=float(top), max_range=rng.uniform(8, 40))
-        pitch = rng.uniform(-5, 20)
-    start, end = rng.uniform(-2, 2, (2, 2))
-    T_base_sensor = mount(pitch, z=float(rng.choice([0.1, 0.25, 0.5, 1.5])))
-    path = walk(scene, [tuple(start), tuple(end)], speed=rng.uniform(0.2, 1.5), dt=DT, T_base_sensor=T_base_sensor)
-    size, resolution = float(rng.choice([4, 8, 16])), float(rng.choice([0.04, 0.1, 0.2]))
-    grid = GridConfig(resolution=resolution, length_x=size, length_y=size)
-    knows_base = size == 4 or rng.random() < 0.8  # a window of 4 m that does not follow the robot is a mistake
-    return scene, sensor, path, ElevationMapConfig(grid=grid), knows_base
 
 
 @pytest.mark.slow(9)

@@ -45,10 +45,11 @@ def _find_wrong_poses(seen: Evidence) -> str | None:
     fit, mistakes = seen.explained
     if not mistakes:
         return None
-    angle = np.degrees(np.arccos(np.clip(fit.level, -1, 1)))
+    angle, largest = np.degrees(np.arccos(np.clip([fit.level, fit.lowest], -1, 1)))
     tilt = "" if not fit.level < 0.8 else f"the ground that the sensor sees is tilted by {angle:.0f} deg"
     apart = "" if not fit.agreement < 0.75 else f"scans agree in {100 * fit.agreement:.0f} % of the cells they share"
     numbers = " and ".join(text for text in (tilt, apart) if text)
+    numbers = numbers or f"the ground that the sensor sees is tilted by up to {largest:.0f} deg"
     return f"poses: {'; or '.join(mistakes)} (as given, {numbers}; without the mistake, ground and scans fit)"
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.history import PastUpdate
-from torchelev.diagnosis.pose_hypotheses import Fit, Scan, explain
+from torchelev.diagnosis.pose_hypotheses import explain
+from torchelev.diagnosis.scan_fit import Fit, Scan
 from torchelev.grid import cell_centers
 from torchelev.stages.measure import measure
 from torchelev.state import MapState, Measurement
@@ -46,11 +47,11 @@ class Evidence:
 
     @cached_property
     def scans(self) -> list[Scan]:
-        """Each sensor's finite points, with its pose."""
-        updates = enumerate(zip(self.points, self.poses, strict=True))
-        pairs = [(k, cloud, T) for k, update in updates for cloud, T in zip(*update, strict=True)]
-        finite = [(k, cloud[np.isfinite(cloud).all(1)], T) for k, cloud, T in pairs if np.isfinite(T).all()]
-        return [Scan(cloud, T, k) for k, cloud, T in finite if len(cloud)]
+        """Each sensor's finite points, with its pose and that of the base."""
+        updates = zip(self.points, self.poses, self.bases, strict=True)
+        given = [(cloud, T, base) for clouds, Ts, base in updates for cloud, T in zip(clouds, Ts, strict=True)]
+        finite = [(cloud[np.isfinite(cloud).all(1)], T, base) for cloud, T, base in given if np.isfinite(T).all()]
+        return [Scan(*scan) for scan in finite if len(scan[0])]
 
     @cached_property
     def distances(self) -> NDArray:
@@ -68,7 +69,7 @@ class Evidence:
     def explained(self) -> tuple[Fit, list[str]]:
         """How well poses and points fit, and the mistakes that would explain why they do not."""
         is_comparable = self.scans and not self.is_in_millimetres
-        return explain(self.scans) if is_comparable else (Fit(np.nan, np.nan, np.nan), [])
+        return explain(self.scans) if is_comparable else (Fit(np.nan, np.nan, np.nan, np.nan), [])
 
     @cached_property
     def positions(self) -> NDArray:
