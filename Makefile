@@ -9,8 +9,9 @@ MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
 	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
 EXTRAS := io,rl,dev,docs
+MJLAB := .venv-mjlab
 
-.PHONY: help demo test test-fast test-library matrix lint types setup bench quality docs clean
+.PHONY: help demo test test-fast test-library test-mjlab matrix lint types setup bench quality docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -34,13 +35,24 @@ demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
 # Workers and the programs that they start share the cores: threads that wait busily would hold them up.
-test test-fast test-library: export OMP_WAIT_POLICY = PASSIVE
+test test-fast test-library test-mjlab: export OMP_WAIT_POLICY = PASSIVE
 
 test: setup  ## run all tests, on all cores
 	$(BIN)/python $(PYTEST)
 
 test-fast: setup  ## run the quick tests, every stage against the reference: under 90 seconds
 	$(BIN)/python $(PYTEST) -m "not slow"
+
+# mjlab pins its own mujoco and rsl-rl-lib.
+$(MJLAB)/.ready: pyproject.toml constraints-mjlab.txt
+	@echo "Installing mjlab and PyTorch into $(MJLAB), nowhere else: SIZE GB."
+	$(PYTHON) -m venv $(MJLAB)
+	$(MJLAB)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints-mjlab.txt \
+		--editable . mjlab pytest hypothesis
+	@touch $@
+
+test-mjlab: $(MJLAB)/.ready  ## run the observation term in mjlab, in the environment .venv-mjlab
+	$(MJLAB)/bin/python -m pytest tests/integrations/test_mjlab_simulator.py
 
 matrix: $(MATRIX:%=on-%)  ## run the library's quick tests on Python 3.10, 3.12 and 3.13, where they are installed
 
@@ -77,4 +89,4 @@ docs: setup  ## build the documentation in docs/_build/html, warnings as errors;
 	@echo "Open docs/_build/html/index.html"
 
 clean:  ## remove what the targets made
-	rm -rf $(VENV) $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks
+	rm -rf $(VENV) $(MJLAB) $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks

@@ -14,22 +14,25 @@ from torchelev.frames import change_axes
 from torchelev.sim import DepthCamera, MountedSensor, make_terrain, mount
 from torchelev.sim.poses import pose
 
-SceneEntityCfg = namedtuple("SceneEntityCfg", "name")
+
 ObservationTermCfg = namedtuple("ObservationTermCfg", "func params")
+SceneEntityCfg = namedtuple("SceneEntityCfg", "name")
 
 
-class ManagerTermBase:  # of Isaac Lab
-    def __init__(self, cfg, env):
-        self.cfg, self._env = cfg, env
+class Scene(dict):
+    """The robot and the sensors by name."""
+
+    entities = property(lambda self: {"robot": self["robot"]})
+    sensors = property(lambda self: {name: part for name, part in self.items() if name != "robot"})
 
 
-class MjlabTermBase:
-    def __init__(self, env):
-        self._env = env
+class PinholeCameraPattern:
+    def generate_rays(self, mj_model, device):
+        return torch.zeros(80 * 60, 3), None  # all start at the sensor; their directions are not needed
 
 
 class Environment:
-    """Stand-in of both `ManagerBasedEnv` (Isaac Lab) and `ManagerBasedRlEnv` (mjlab)."""
+    """Stand-in of both `ManagerBasedRLEnv` (Isaac Lab) and `ManagerBasedRlEnv` (mjlab)."""
 
     def __init__(self, num_envs=8, step_dt=0.1):
         self.num_envs, self.device, self.step_dt = num_envs, "cpu", step_dt
@@ -37,7 +40,7 @@ class Environment:
         self.tile_ids = torch.arange(num_envs)
         self.origins = self.tile_ids[:, None] * torch.tensor([10.0, -10.0, 0.0], dtype=torch.float64)
         self.camera = MountedSensor(DepthCamera(width=80, height=60, max_range=5.0), mount(pitch_deg=35, x=0.3, z=0.2))
-        self.walked, self.common_step_counter = 0.0, 0
+        self.sim, self.walked, self.common_step_counter = SimpleNamespace(mj_model=None), 0.0, -1
         self.step()
 
     def step(self, distance=0.05):
@@ -49,27 +52,27 @@ class Environment:
         T_base = pose(torch.cat([xy, z], -1), yaw)
         points = self.camera(self.terrain.field, self.tile_ids, T_base)
         T_base[:, :3, 3] += self.origins
-        T_camera = self.camera.T_map_sensor(T_base)
-        entities = {"robot": robot(T_base), "rays": self.rays(T_camera, points)}
-        entities["camera"] = self.depth_camera(T_camera, points)
-        self.scene = {name: SimpleNamespace(data=SimpleNamespace(**data)) for name, data in entities.items()}
+        T = self.camera.T_map_sensor(T_base)
+        robot = SimpleNamespace(root_link_pos_w=T_base[:, :3, 3].float(), root_link_quat_w=quat_wxyz(T_base))
+        self.scene = Scene(robot=SimpleNamespace(data=robot), camera=self.depth_camera(T, points), rays=rays(T, points))
 
     def depth_camera(self, T, points):
+        """Isaac Lab's `RayCasterCamera`: pixels are counted from the image's corner, so centres are at 0.5, 1.5, ..."""
         depth = {"distance_to_image_plane": self.camera.depth(points).nan_to_num(torch.inf)[..., None]}
-        K = self.camera.pattern.intrinsics.float().expand(self.num_envs, 3, 3)
+        K = self.camera.pattern.intrinsics.float().expand(self.num_envs, 3, 3).clone()
+        K[:, :2, 2] += 0.5
         quat = quat_wxyz(change_axes(T, "forward", "optical"))
-        return {"pos_w": T[:, :3, 3].float(), "quat_w_ros": quat, "output": depth, "intrinsic_matrices": K}
-
-    def rays(self, T, points):
-        hits = (points.double() @ T[:, :3, :3].mT + T[:, None, :3, 3]).float().nan_to_num(0.0)
-        distances = torch.linalg.vector_norm(points, dim=-1).nan_to_num(-1.0)  # -1: nothing was hit
-        return {"pos_w": T[:, :3, 3].float(), "quat_w": quat_wxyz(T), "hit_pos_w": hits, "distances": distances}
+        data = SimpleNamespace(pos_w=T[:, :3, 3].float(), quat_w_ros=quat, output=depth, intrinsic_matrices=K)
+        return SimpleNamespace(cfg=SimpleNamespace(data_types=list(depth), update_period=0.0), data=data)
 
 
-def robot(T):
-    position, quat = T[:, :3, 3].float(), quat_wxyz(T)
-    names = ("root_pos_w", "root_quat_w"), ("root_link_pos_w", "root_link_quat_w")  # Isaac Lab's, mjlab's
-    return {name: value for pair in names for name, value in zip(pair, (position, quat), strict=True)}
+def rays(T, points):
+    """Return mjlab's `RayCastSensor`: hits in the world frame; -1 says that nothing was hit."""
+    hits = (points.double() @ T[:, :3, :3].mT + T[:, None, :3, 3]).float().nan_to_num(0.0)
+    distances = torch.linalg.vector_norm(points, dim=-1).nan_to_num(-1.0)
+    data = SimpleNamespace(frame_pos_w=T[:, None, :3, 3].float(), hit_pos_w=hits, distances=distances)
+    cfg = SimpleNamespace(pattern=PinholeCameraPattern())
+    return SimpleNamespace(cfg=cfg, data=data, num_frames=1, num_rays_per_frame=hits.shape[1])
 
 
 def quat_wxyz(T):
