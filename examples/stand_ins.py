@@ -14,7 +14,6 @@ from torchelev.frames import change_axes
 from torchelev.sim import DepthCamera, MountedSensor, make_terrain, mount
 from torchelev.sim.poses import pose
 
-
 ObservationTermCfg = namedtuple("ObservationTermCfg", "func params")
 SceneEntityCfg = namedtuple("SceneEntityCfg", "name")
 

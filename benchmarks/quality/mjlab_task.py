@@ -3,16 +3,14 @@
     .venv-mjlab/bin/python -m benchmarks.quality.mjlab_task
 
 16 robots take 50 steps of small random actions; where the map is valid, its height scan is compared with mjlab's own,
-which sees through everything. Then PPO learns for one iteration. Writes benchmarks/results/mjlab.json. `make test-mjlab`
-makes the environment, and runs the same as a test.
+which sees through everything. Then PPO learns for one iteration. Writes benchmarks/results/mjlab.json.
+`make test-mjlab` makes the environment, and runs the same as a test.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
-import json
-import platform
 import time
 from pathlib import Path
 from typing import Any
@@ -22,9 +20,10 @@ from torch import Tensor
 
 from benchmarks import RESULTS
 from torchelev import HeightScan
+from torchelev.app.results import write_json
 from torchelev.integrations.mjlab import MapObservation
 
-PACKAGES = ("mjlab", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib", "torch")
+PACKAGES = ("mjlab", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib")
 STANDING_HEIGHT = 0.3  # [m] of the Go1's trunk
 LEVEL = 0.02  # [m] that the ideal scan may differ between neighbours where the ground counts as level
 
@@ -143,7 +142,6 @@ def main(path: Path = RESULTS / "mjlab.json", num_envs: int = 16, steps: int = 5
     walked = walk(env, steps)
     seconds = time.perf_counter() - start
     results = {
-        "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
         "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
         "task": "Mjlab-Velocity-Rough-Unitree-Go1",
         "num_envs": num_envs,
@@ -152,8 +150,8 @@ def main(path: Path = RESULTS / "mjlab.json", num_envs: int = 16, steps: int = 5
         "error": compare(walked),
         "losses": train_once(env),
     }
-    path.write_text(json.dumps(results, indent=1) + "\n")
-    print(json.dumps(results, indent=1))
+    write_json(path, results)
+    print(path.read_text())
 
 
 if __name__ == "__main__":

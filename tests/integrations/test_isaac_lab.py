@@ -1,6 +1,5 @@
 """The term for Isaac Lab against stand-ins of its sensors, in the conventions of 2.x and of 3.0."""
 
-import textwrap
 from types import SimpleNamespace
 
 import numpy as np

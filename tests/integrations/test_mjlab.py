@@ -128,7 +128,7 @@ def test_two_sensors_are_one_measurement():
     env.scene["rays"] = mjlab_rays(base()[:, None], ground_hits(base(), ground(), half=0.3)[:, None])
     term, _ = begin(env, sensor_name=["camera", "rays"])
     alone, _ = begin(depth_camera(), sensor_name="camera")
-    assert (term.emap.layer("validity").sum((1, 2)) > alone.emap.layer("validity").sum((1, 2)) + 50).all()
+    assert (term.emap.layer("validity").sum((1, 2)) > alone.emap.layer("validity").sum((1, 2))).all()
 
 
 def test_terms_of_two_groups_share_their_maps():

@@ -47,8 +47,8 @@ class MapObservation(MapTerm, ManagerTermBase):
     - update_every: control steps from one update to the next, for instance the sensor's `update_period` / `step_dt`.
     - standing_height: height of the base over flat ground [m], which an empty map reads.
 
-    Further settings are class attributes: `quaternions` here, and `read`, `map_cfg` and `with_validity` of `MapTerm`. By
-    default it reads `HeightScan.isaac_lab()`, which includes the offset of 0.5 m and the clip of +-1 m.
+    Further settings are class attributes: `quaternions` here, and `read`, `map_cfg` and `with_validity` of `MapTerm`.
+    By default it reads `HeightScan.isaac_lab()`, which includes the offset of 0.5 m and the clip of +-1 m.
 
     Raises:
         ValueError, TypeError: for a sensor or asset that is missing or does not fit, and for settings out of range.
