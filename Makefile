@@ -45,7 +45,7 @@ test-fast: setup  ## run the quick tests, every stage against the reference: und
 
 # mjlab pins its own mujoco and rsl-rl-lib.
 $(MJLAB)/.ready: pyproject.toml constraints-mjlab.txt
-	@echo "Installing mjlab and PyTorch into $(MJLAB), nowhere else: SIZE GB."
+	@echo "Installing mjlab and PyTorch into $(MJLAB), nowhere else: 2.3 GB."
 	$(PYTHON) -m venv $(MJLAB)
 	$(MJLAB)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints-mjlab.txt \
 		--editable . mjlab pytest hypothesis

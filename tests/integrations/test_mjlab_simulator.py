@@ -1,6 +1,7 @@
 """The term in mjlab itself, on a CPU: `make test-mjlab` runs this in an environment of its own."""
 
 import dataclasses
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -31,19 +32,16 @@ def test_the_policy_reads_the_scan(walked):
 
 
 def test_the_scan_is_mjlab_s_own_on_level_visible_ground(walked):
+    """The rays are exact: what is left are the 2 cm that level ground may differ from one point to the next."""
     found = mjlab_task.compare(walked)
-    assert found["valid"] > 0.2 and found["level"]["points"] > 10_000
-    assert found["level"]["p50"] < 0.005 and found["level"]["p90"] < mjlab_task.LEVEL
+    assert found["valid"] > 0.1 and found["level"]["points"] > 10_000
+    assert found["level"]["p50"] < 0.001 and found["level"]["p99"] < mjlab_task.LEVEL
 
 
 def test_an_order_or_sign_that_differs_would_be_seen(walked):
-    error = mjlab_task.compare(walked)["all"]["p50"]
-    for wrong in (
-        walked["ours"].flip(-1),
-        walked["ours"].unflatten(-1, (11, 17)).flip(-2).flatten(-2),
-        -walked["ours"],
-    ):
-        assert mjlab_task.compare({**walked, "ours": wrong})["all"]["p50"] > 2 * error
+    error, grid = mjlab_task.compare(walked)["all"]["p90"], walked["ours"].unflatten(-1, (11, 17))
+    for wrong in (grid.flip(-1), grid.flip(-2), -grid, grid.flatten(-2).unflatten(-1, (17, 11)).mT):
+        assert mjlab_task.compare({**walked, "ours": wrong.flatten(-2)})["all"]["p90"] > 5 * error
 
 
 def test_a_step_later_the_observation_is_as_it_was(env):
@@ -105,7 +103,10 @@ def test_the_config_of_the_page_is_this_one():
     cfg, ours = names["cfg"], mjlab_task.make_config(num_envs=1)
     assert cfg.scene.sensors[-1] == ours.scene.sensors[-1]
     assert cfg.observations["actor"].terms["height_scan"] == ours.observations["actor"].terms["height_scan"]
-    assert names["add_camera"].__code__.co_consts[1:] == mjlab_task.add_camera.__code__.co_consts[1:]
+    given, own = Mock(), Mock()
+    names["add_camera"](given)
+    mjlab_task.add_camera(own)
+    assert given.mock_calls == own.mock_calls
 
 
 def test_mjlab_s_training_script_takes_the_config(tmp_path):
