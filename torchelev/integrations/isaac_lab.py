@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 if importlib.util.find_spec("isaaclab") is None:
     ManagerTermBase: Any = object
 else:  # the manager refuses classes that are not derived from it
-    from isaaclab.managers import ManagerTermBase
+    from isaaclab.managers import ManagerTermBase  # type: ignore[no-redef]
 
 #: images of distances, and along what they are measured, as `depth_to_points` calls it
 DEPTHS = {"distance_to_image_plane": "z", "depth": "z", "distance_to_camera": "ray"}
@@ -150,15 +150,15 @@ def _is_camera(sensor: Any) -> bool:
     return hasattr(sensor.cfg, "data_types")
 
 
-def _find_depth(sensor: Any) -> str | None:
-    """Return the name of the first depth image that a camera provides."""
-    return next((name for name in DEPTHS if name in sensor.cfg.data_types), None)
+def _find_depth(sensor: Any) -> str:
+    """Return the name of the first depth image that a camera provides, "" if there is none."""
+    return next((name for name in DEPTHS if name in sensor.cfg.data_types), "")
 
 
 def _check_camera(name: str, sensor: Any) -> None:
     cfg = sensor.cfg
     rule, hint = f"{name!r} must have one of {', '.join(DEPTHS)}", 'set data_types=["distance_to_image_plane"]'
-    require(_find_depth(sensor) is not None, "sensor_cfg", rule, repr(cfg.data_types), hint)
+    require(_find_depth(sensor) != "", "sensor_cfg", rule, repr(cfg.data_types), hint)
     clipping = getattr(cfg, "depth_clipping_behavior", "none")
     rule, hint = f"{name!r} must not report misses as its maximum distance", 'set depth_clipping_behavior="none"'
     require(clipping != "max", "sensor_cfg", rule, f"depth_clipping_behavior={clipping!r}", hint)

@@ -13,7 +13,7 @@ from torchelev.errors import require
 def to_names(parameter: str, value: Any) -> tuple[str, ...]:
     """Return one name, or a list of names, as a tuple; a `SceneEntityCfg` counts by its `name`."""
     given = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
-    names = tuple(getattr(item, "name", item) for item in given)
+    names: tuple[Any, ...] = tuple(getattr(item, "name", item) for item in given)
     are_names = len(names) > 0 and all(isinstance(name, str) for name in names)
     hint = f"set params={{{parameter!r}: ...}} of the term"
     require(are_names, parameter, "must name a part of the scene, or several in a list", repr(value), hint, TypeError)
