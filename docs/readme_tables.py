@@ -16,6 +16,7 @@ from typing import Any
 
 import benchmarks
 import training
+from benchmarks.quality import mjlab_task
 from benchmarks.quality.changes import report as changes
 from benchmarks.speed import growth, head, long_run, loop, postprocessing, sight
 from benchmarks.speed.update import tables
@@ -96,6 +97,11 @@ def _sight() -> str:
     return sight.table(load("sight")["rows"])
 
 
+def _mjlab() -> str:
+    """Tabulate how the scan of a map differs from mjlab's own."""
+    return mjlab_task.table(load("mjlab"))
+
+
 def _head() -> str:
     """Tabulate what the traversability heads cost."""
     return head.table(load("head")["rows"])
@@ -138,6 +144,7 @@ TABLES = {
     "long_run": _long_run,
     "nav": _nav,
     "sight": _sight,
+    "mjlab": _mjlab,
     "postprocessing": _postprocessing,
     "occlusion": _occlusion,
     "traversability": _traversability,
@@ -169,7 +176,13 @@ def _insert(table: str, match: re.Match[str]) -> str:
     return f"{match[1]}{table}\n{match[2]}"
 
 
-PAGES = {ROOT / "README.md": "", ROOT / "docs/benchmarks.md": "../", ROOT / "docs/howto/on_a_robot.md": "../../"}
+HOWTO = ROOT / "docs/howto"
+PAGES = {
+    ROOT / "README.md": "",
+    ROOT / "docs/benchmarks.md": "../",
+    HOWTO / "on_a_robot.md": "../../",
+    HOWTO / "mjlab.md": "../../",
+}
 
 if __name__ == "__main__":
     for page, to_root in PAGES.items():

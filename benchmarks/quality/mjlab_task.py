@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchmarks import RESULTS
 from torchelev import HeightScan
-from torchelev.app.results import write_json
+from torchelev.app.results import markdown_table, write_json
 from torchelev.integrations.mjlab import MapObservation
 
 PACKAGES = ("mjlab", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib")
@@ -156,6 +156,21 @@ def time_steps(envs: dict[str, Any], steps: int = 10, rounds: int = 5) -> dict[s
     return {name: statistics.median(values) for name, values in times.items()}
 
 
+def table(results: dict[str, Any]) -> str:
+    """Tabulate the differences [mm] and the times of a step [ms], with the versions."""
+    rows = []
+    for name, where in (("all", "where the map is valid"), ("level", "of these, on level ground")):
+        error = results["error"][name]
+        rows.append([where, *(f"{1e3 * error[q]:.2f}" for q in ("p50", "p90", "p99")), f"{error['points']:,}"])
+    head = ["difference from mjlab's scan", "median mm", "p90 mm", "p99 mm", "points"]
+    times, versions = results["milliseconds_per_step"], results["versions"]
+    valid = f"The map is valid at {results['error']['valid']:.0%} of the points"
+    steps = f"a control step of {results['num_envs']} robots takes {times['map']:.0f} ms with the map"
+    with_ideal = f"{times['ideal scan']:.0f} ms with the ideal scan alone"
+    run_with = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return f"{markdown_table(head, rows)}\n\n{valid}; {steps} and {with_ideal}. {run_with}."
+
+
 def main(path: Path = RESULTS / "mjlab.json", num_envs: int = 16, steps: int = 50) -> None:
     """Run, print and write the results."""
     plain, env = make_env(make_plain_config(num_envs)), make_env(make_config(num_envs))
@@ -169,7 +184,7 @@ def main(path: Path = RESULTS / "mjlab.json", num_envs: int = 16, steps: int = 5
         "losses": train_once(env),
     }
     write_json(path, results)
-    print(path.read_text())
+    print(table(results))
 
 
 if __name__ == "__main__":
