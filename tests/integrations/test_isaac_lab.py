@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.integrations.simulators import Env, build, ground_hits, look_down, pinhole, quat_wxyz
 from tests.processes import run_python
+from torchelev import HeightScan
 from torchelev.integrations import isaac_lab
 
 B = 3
@@ -154,6 +156,32 @@ def test_a_slow_sensor_is_read_as_often_as_it_measures(version):
     with pytest.raises(ValueError, match="'sensor' must measure at least every 0.02 s"):
         begin(version, camera)
     begin(version, camera, update_every=5)
+
+
+@pytest.mark.slow(2)
+def test_a_step_does_not_wait_for_the_device(monkeypatch):
+    """Fake tensors hold no data: reading a value raises. Only building the term may, to check the rays' origins."""
+
+    class Term(isaac_lab.MapObservation):
+        read = HeightScan.isaac_lab()  # it keeps its points as a fake tensor
+
+    monkeypatch.setattr(isaac_lab, "require_one_origin", lambda *args: None)
+    with FakeTensorMode():
+        place, quat = Array(torch.zeros(B, 3)), Array(torch.zeros(B, 4))
+        robot = SimpleNamespace(data=SimpleNamespace(root_link_pos_w=place, root_link_quat_w=quat))
+        image = {"depth": Array(torch.zeros(B, 6, 8, 1))}
+        data = SimpleNamespace(pos_w=place, quat_w_ros=quat, output=image, intrinsic_matrices=torch.zeros(B, 3, 3))
+        camera = SimpleNamespace(cfg=SimpleNamespace(data_types=["depth"], update_period=0.0), data=data)
+        hits = Array(torch.zeros(B, 50, 3))
+        cfg = SimpleNamespace(update_period=0.0, ray_alignment="yaw")
+        caster = SimpleNamespace(cfg=cfg, data=SimpleNamespace(pos_w=place, quat_w=quat, ray_hits_w=hits))
+        caster.ray_starts = hits
+        env = Env(robot=robot, camera=camera, caster=caster)
+        term, observe, _ = build(Term, env, sensor_cfg=["camera", "caster"])
+        for ids in (torch.zeros(2, dtype=torch.int64), None):
+            term.reset(ids)
+            env.common_step_counter += 1
+            assert observe().shape == (B, 187)
 
 
 @pytest.mark.parametrize(

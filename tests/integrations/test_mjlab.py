@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.integrations.simulators import (
     Env,
@@ -16,6 +17,7 @@ from tests.integrations.simulators import (
     mjlab_robot,
     pinhole,
 )
+from torchelev import HeightScan
 from torchelev.integrations import mjlab
 
 B = 3
@@ -136,6 +138,30 @@ def test_terms_of_two_groups_share_their_maps():
     terms = [build(mjlab.MapObservation, env, sensor_name="rays")[0] for _ in range(2)]
     assert terms[0].emap is terms[1].emap
     assert build(mjlab.MapObservation, env, sensor_name="rays", update_every=2)[0].emap is not terms[0].emap
+
+
+@pytest.mark.slow(2)
+def test_a_step_does_not_wait_for_the_device(monkeypatch):
+    """Fake tensors hold no data: reading a value raises. Only building the term may, to check the rays' origins."""
+
+    class Term(mjlab.MapObservation):
+        read = HeightScan.mjlab()  # it keeps its points as a fake tensor
+
+    monkeypatch.setattr(mjlab, "require_one_origin", lambda *args: None)
+    with FakeTensorMode():
+        pose = SimpleNamespace(root_link_pos_w=torch.zeros(B, 3), root_link_quat_w=torch.zeros(B, 4))
+        rays = mjlab_rays(torch.zeros(B, 2, 3), torch.zeros(B, 2, 50, 3))
+        image = SimpleNamespace(cfg=SimpleNamespace(data_types=("depth",), orthographic=False), camera_idx=0)
+        image.data = SimpleNamespace(depth=torch.zeros(B, 6, 8, 1))
+        env = Env(robot=SimpleNamespace(data=pose), rays=rays, camera=image)
+        data = SimpleNamespace(cam_xpos=torch.zeros(B, 1, 3), cam_xmat=torch.zeros(B, 1, 3, 3))
+        model = SimpleNamespace(cam_fovy=torch.zeros(B, 1))
+        env.sim = SimpleNamespace(data=data, model=model, mj_model=SimpleNamespace(cam_sensorsize=np.zeros((1, 2))))
+        term, observe, _ = build(Term, env, sensor_name=["rays", "camera"])
+        for ids in (torch.zeros(2, dtype=torch.int64), slice(None), None):
+            term.reset(ids)
+            env.common_step_counter += 1
+            assert observe().shape == (B, 187)
 
 
 @pytest.mark.parametrize(
