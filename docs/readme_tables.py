@@ -18,10 +18,10 @@ import benchmarks
 import training
 from benchmarks.quality import mjlab_task
 from benchmarks.quality.changes import report as changes
-from benchmarks.speed import growth, head, long_run, loop, postprocessing, sight
+from benchmarks.speed import encoders, growth, head, long_run, loop, postprocessing, sight
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
-from training.nav import experiment
+from training.nav import encoder_experiment, experiment
 from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
@@ -118,6 +118,16 @@ def _nav() -> str:
     return experiment.table(load("nav", training.RESULTS))
 
 
+def _encoders() -> str:
+    """Tabulate the success of policies by the encoder of their map."""
+    return encoder_experiment.table(load("encoders", training.RESULTS))
+
+
+def _encoder_cost() -> str:
+    """Tabulate what encoders of the map cost."""
+    return encoders.table(load("encoders")["rows"])
+
+
 def _traversability() -> str:
     """Tabulate the quality of the traversability heads on each split."""
     result = load("traversability", training.RESULTS)
@@ -143,6 +153,8 @@ TABLES = {
     "loop": _loop,
     "long_run": _long_run,
     "nav": _nav,
+    "encoders": _encoders,
+    "encoder_cost": _encoder_cost,
     "sight": _sight,
     "mjlab": _mjlab,
     "postprocessing": _postprocessing,
@@ -182,6 +194,7 @@ PAGES = {
     ROOT / "docs/benchmarks.md": "../",
     HOWTO / "on_a_robot.md": "../../",
     HOWTO / "mjlab.md": "../../",
+    HOWTO / "encoders.md": "../../",
 }
 
 if __name__ == "__main__":

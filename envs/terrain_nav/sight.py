@@ -15,7 +15,7 @@ from envs.terrain_nav.course import RatedCourse
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, MapImage
 from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, mount_on_rim, preset
 
-_LAYERS = ("elevation", "upper_bound", "validity", "traversability")
+LAYERS = ("elevation", "upper_bound", "validity", "traversability")
 
 
 def _make_crop(cfg: TerrainNavConfig) -> MapImage:
@@ -26,7 +26,7 @@ def _make_crop(cfg: TerrainNavConfig) -> MapImage:
         length_y=sight.crop_length,
         resolution=sight.crop_resolution,
         offset=(sight.crop_ahead, 0.0),
-        layers=_LAYERS,
+        layers=LAYERS,
         nominal_height=cfg.robot.body_height,
     )
 

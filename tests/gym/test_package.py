@@ -21,7 +21,9 @@ def without(*names):
 
 
 @pytest.mark.slow(1)
-@pytest.mark.parametrize("module", ["torchelev", "torchelev.sim", "torchelev.planes", "torchelev.filters"])
+@pytest.mark.parametrize(
+    "module", ["torchelev", "torchelev.sim", "torchelev.planes", "torchelev.filters", "torchelev.encoders"]
+)
 def test_the_package_imports_no_reinforcement_learning(module):
     done = run(f"import {module}\nprint([name for name in {LIBRARIES} if name in sys.modules])")
     assert done.stdout.strip() == "[]", done.stderr
@@ -43,6 +45,8 @@ def test_torchelev_gym_imports_no_rsl_rl():
         ("torchelev.gym.rsl_rl", "gymnasium", "gym"),
         ("torchelev.gym.rsl_rl", "rsl_rl", "rl"),
         ("torchelev.gym.rsl_rl", "tensordict", "rl"),
+        ("torchelev.encoders.rsl_rl", "rsl_rl", "rl"),
+        ("torchelev.encoders.rsl_rl", "tensordict", "rl"),
     ],
 )
 def test_an_import_without_its_library_names_the_extra(module, missing, extra):

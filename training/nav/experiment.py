@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import torch
 from tqdm import tqdm
 
 from envs.terrain_nav.config import PERCEPTION
@@ -21,8 +20,9 @@ from torchelev.app.results import markdown_table, write_json
 from torchelev.viz.style import make_figure, save, styled
 from training import RESULTS
 from training.jobs import Job, train_all
-from training.nav.evaluate import Policy, evaluate, straight_line
-from training.nav.train import ppo_config, task_config
+from training.nav.evaluate import evaluate, straight_line
+from training.nav.runs import load_policy, mean, read_curve, spread
+from training.nav.train import task_config
 from training.options import jobs_option, runs_option
 
 # Fixed before the first run.
@@ -30,24 +30,6 @@ SEEDS = (0, 1, 2)
 ITERATIONS, NUM_ENVS, EPISODES = 140, 256, 512
 CASES = [(perception, seed) for perception in PERCEPTION for seed in SEEDS]
 NAMES = {"map": "map in the loop", "truth": "truth with white noise", "blind": "blind"}
-
-
-def _load_policy(folder: Path) -> Policy:
-    scripted = torch.jit.load(str(folder / "policy.pt"))
-    return lambda observation: scripted(observation["policy"], [observation["map"]])
-
-
-def _curve(folder: Path) -> dict[str, list[float]]:
-    """Read the success during training over environment steps from the TensorBoard log."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    log = EventAccumulator(str(folder))
-    log.Reload()
-    values = {
-        point.step: round(point.value, 4) for point in log.Scalars("/success")
-    }  # a resumed training repeats steps
-    steps = ppo_config()["num_steps_per_env"] * NUM_ENVS
-    return {"steps": [(step + 1) * steps for step in sorted(values)], "success": [values[k] for k in sorted(values)]}
 
 
 def _jobs(runs: Path) -> list[Job]:
@@ -69,11 +51,11 @@ def _deploy_all(runs: Path) -> dict[str, Any]:
     for perception, seed in tqdm(CASES, unit="policy"):
         folder = _folder(runs, perception, seed)
         trained = json.loads((folder / "result.json").read_text())["training"]
-        policy = _load_policy(folder)
+        policy = load_policy(folder)
         deployed = evaluate(policy, cfg, "map", EPISODES, compiled=True)
         own = evaluate(policy, cfg, perception, EPISODES, compiled=True)["success"]
         row = {"perception": perception, "seed": seed, "training": trained, "deployed": deployed, "own": own}
-        rows.append(row | {"curve": _curve(folder)})
+        rows.append(row | {"curve": read_curve(folder, NUM_ENVS)})
     fixed = {"seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES}
     line = evaluate(straight_line, cfg, "map", EPISODES, compiled=True)
     return {"config": fixed, "straight_line": line, "rows": rows}
@@ -87,22 +69,14 @@ def table(result: dict[str, Any]) -> str:
     for perception in PERCEPTION:
         rows = [row for row in result["rows"] if row["perception"] == perception]
         ends = {name: [row["deployed"][name] for row in rows] for name in ("success", "fallen", "stuck", "truncated")}
-        cells = [_spread(ends["success"]), *(f"{100 * _mean(ends[name]):.0f} %" for name in list(ends)[1:])]
-        rate = _mean([row["training"]["steps"] / row["training"]["seconds"] for row in rows])
-        minutes = _mean([row["training"]["seconds"] / 60 for row in rows])
-        own = _spread([row["own"] for row in rows])
+        cells = [spread(ends["success"]), *(f"{100 * mean(ends[name]):.0f} %" for name in list(ends)[1:])]
+        rate = mean([row["training"]["steps"] / row["training"]["seconds"] for row in rows])
+        minutes = mean([row["training"]["seconds"] / 60 for row in rows])
+        own = spread([row["own"] for row in rows])
         lines.append([NAMES[perception], *cells, own, f"{rate:,.0f}", f"{minutes:.1f}"])
     line = result["straight_line"]
     percentages = [f"{100 * line[name]:.0f} %" for name in ("success", "fallen", "stuck", "truncated")]
     return markdown_table(head, [*lines, ["(a straight line)", *percentages, "", "", ""]])
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
-
-
-def _spread(values: list[float]) -> str:
-    return f"{100 * _mean(values):.1f} % ({100 * min(values):.1f} to {100 * max(values):.1f})"
 
 
 @styled()

@@ -17,6 +17,7 @@ from torchelev.errors import require
 from torchelev.output_files import atomic_file
 from training.resume import CHECKPOINT, deferred_interrupt
 
+_ENCODER = "cnn"  # of configurations and checkpoints that name none
 _LOGGER_STATE = ("tot_timesteps", "tot_time", "rewbuffer", "lenbuffer", "cur_reward_sum", "cur_episode_length")
 
 
@@ -99,7 +100,7 @@ class ResumableRunner(OnPolicyRunner):
         shapes = {name: tuple(value.shape[1:]) for name, value in sorted(self.env.get_observations().items())}
         task = self.env.task
         settings = {"perception": task.perception, "num_envs": task.num_envs, "processes": self.gpu_world_size}
-        return {"observations": shapes, **settings}
+        return {"observations": shapes, **settings, "encoder": self.cfg.get("encoder", _ENCODER)}
 
     def _snapshot(self) -> dict[str, Any]:
         cuda = str(self.device).startswith("cuda")
@@ -115,14 +116,14 @@ class ResumableRunner(OnPolicyRunner):
         """Continue from a `checkpoint.pt`.
 
         Raises:
-            ValueError: the checkpoint has other observations, another perception, or another number of environments or
-                processes; nothing has changed then.
+            ValueError: the checkpoint has other observations, another perception or encoder, or another number of
+                environments or processes; nothing has changed then.
         """
         path = self._own(Path(path))
         found = torch.load(path, weights_only=False, map_location=self.device)["infos"]
         require(found is not None, "checkpoint", "must hold the environments", str(path), f"give a {CHECKPOINT}")
         for name, expected in self._kind().items():
-            actual, hint = found["kind"][name], "use the settings that it was trained with"
+            actual, hint = ({"encoder": _ENCODER} | found["kind"])[name], "use the settings that it was trained with"
             require(actual == expected, "checkpoint", f"must be of {name} {expected}", actual, hint)
         self.load(str(path), map_location=self.device)
         self.env.task.load_state_dict(found["task"])

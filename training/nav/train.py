@@ -12,6 +12,7 @@ import torch
 from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.config import PERCEPTION
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
+from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export
 from training.nav.runner import ResumableRunner
@@ -21,14 +22,14 @@ _POSITIVE = click.IntRange(1)
 _TRAIN_SEED, _HELD_OUT_SEED = 1, 1001  # of the courses
 
 
-def ppo_config(num_steps: int = 24, save_interval: int = 10) -> dict[str, Any]:
-    """Return rsl-rl's configuration: PPO, with a small convolutional network for the actor and one for the critic."""
-    cnn = {"output_channels": [8, 16], "kernel_size": 3, "stride": 2, "padding": "zeros", "activation": "elu"}
-    model = {"class_name": "CNNModel", "hidden_dims": [128, 64], "activation": "elu", "obs_normalization": True}
+def ppo_config(num_steps: int = 24, save_interval: int = 10, encoder: str = "cnn") -> dict[str, Any]:
+    """Return rsl-rl's configuration: PPO, with a small network for the actor and one for the critic."""
+    model = {"hidden_dims": [128, 64], "activation": "elu", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.7}
     return {
         "num_steps_per_env": num_steps,
         "save_interval": save_interval,
+        "encoder": encoder,
         "obs_groups": {"actor": ["policy", "map"], "critic": ["policy", "truth"]},
         "algorithm": {
             "class_name": "PPO",
@@ -42,8 +43,8 @@ def ppo_config(num_steps: int = 24, save_interval: int = 10) -> dict[str, Any]:
             "entropy_coef": 0.003,
             "symmetry_cfg": {"data_augmentation_func": mirror, "use_data_augmentation": True},
         },
-        "actor": model | {"cnn_cfg": dict(cnn), "distribution_cfg": gaussian},
-        "critic": model | {"cnn_cfg": dict(cnn)},
+        "actor": model | encoder_config(encoder, "map") | {"distribution_cfg": gaussian},
+        "critic": model | encoder_config(encoder, "truth"),
     }
 
 
@@ -53,13 +54,20 @@ def task_config(held_out: bool = False) -> TerrainNavConfig:
 
 
 def make_runner(
-    num_envs: int, perception: str, seed: int, device: str, log_dir: Path | None, compiled: bool = True
+    num_envs: int,
+    perception: str,
+    seed: int,
+    device: str,
+    log_dir: Path | None,
+    compiled: bool = True,
+    encoder: str = "cnn",
 ) -> ResumableRunner:
     """Return a runner with its environments, all seeded."""
     rank = int(os.environ.get("RANK", "0"))
     torch.manual_seed(seed + 1000 * rank)
     task = TerrainNav(task_config(), num_envs, device, perception, seed + 1000 * rank, compiled)
-    return ResumableRunner(RslRlTerrainNav(task), ppo_config(), str(log_dir) if log_dir else None, device)
+    settings = ppo_config(encoder=encoder)
+    return ResumableRunner(RslRlTerrainNav(task), settings, str(log_dir) if log_dir else None, device)
 
 
 @click.command()
@@ -78,6 +86,13 @@ def make_runner(
     show_default=True,
     help="What the policy sees: the map, the true ground with white noise, or nothing.",
 )
+@click.option(
+    "--encoder",
+    type=click.Choice(ENCODERS),
+    default="cnn",
+    show_default=True,
+    help="How the policy reads the map's image.",
+)
 @click.option("--seed", default=0, show_default=True, help="Seed of weights, starts, goals and noise.")
 @click.option("--device", default=None, help="Default: a GPU if there is one, else the CPU.")
 @click.option(
@@ -90,6 +105,7 @@ def main(
     num_envs: int,
     iterations: int,
     perception: str,
+    encoder: str,
     seed: int,
     device: str | None,
     out: Path,
@@ -109,7 +125,7 @@ def main(
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
     checkpoint = checkpoint_path(out, resume)
-    runner = make_runner(num_envs, perception, seed, device, out, compiled)
+    runner = make_runner(num_envs, perception, seed, device, out, compiled, encoder)
     if resume:
         try:
             runner.resume(checkpoint)

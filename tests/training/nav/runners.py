@@ -10,10 +10,10 @@ from training.nav.runner import ResumableRunner
 CFG = TerrainNavConfig(course=CourseConfig(num_tiles=2, num_routes=8), episode_length=2.0)
 
 
-def make_runner(folder, perception="map", cfg=CFG, num_envs=4, seed=0):
+def make_runner(folder, perception="map", cfg=CFG, num_envs=4, seed=0, encoder="cnn"):
     torch.manual_seed(seed)
     task = TerrainNav(cfg, num_envs, perception=perception, seed=seed)
-    settings = nav.ppo_config(num_steps=6, save_interval=100)
+    settings = nav.ppo_config(num_steps=6, save_interval=100, encoder=encoder)
     return ResumableRunner(RslRlTerrainNav(task), settings, str(folder) if folder else None)
 
 

@@ -1,0 +1,112 @@
+"""Compare encoders of the map at equal steps: a perceptron, a convolutional network and attention.
+
+    python -m training.nav.encoder_experiment
+
+Trains two seeds with each encoder, all with the map in the loop, and deploys every policy on held-out ground. Finished
+trainings are kept in RUNS: after Ctrl-C, run the command again. Writes training/results/encoders.json and encoders.png.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from torchelev.app.results import markdown_table, write_json
+from torchelev.viz.style import make_figure, save, styled
+from training import RESULTS
+from training.jobs import Job, train_all
+from training.nav.encoders import ENCODERS
+from training.nav.evaluate import evaluate
+from training.nav.runs import load_policy, mean, read_curve, spread
+from training.nav.train import task_config
+
+# Fixed before the first run, as are the encoders' sizes in training/nav/encoders.py.
+SEEDS = (0, 1)
+ITERATIONS, NUM_ENVS, EPISODES = 60, 256, 512
+CASES = [(encoder, seed) for seed in SEEDS for encoder in ENCODERS]
+NAMES = {"mlp": "MLP", "cnn": "CNN", "attention": "attention"}
+
+
+def _folder(runs: Path, encoder: str, seed: int) -> Path:
+    return runs / f"{encoder}-{seed}"
+
+
+def _jobs(runs: Path) -> list[Job]:
+    """Return a training for each encoder and seed."""
+    fixed = {"--iterations": ITERATIONS, "--num-envs": NUM_ENVS, "--perception": "map"}
+    return [
+        Job("training.nav", {"--encoder": encoder, "--seed": seed, **fixed}, _folder(runs, encoder, seed))
+        for encoder, seed in CASES
+    ]
+
+
+def deploy_all(runs: Path) -> dict[str, Any]:
+    """Deploy every policy on held-out ground with the map in the loop."""
+    rows = []
+    for encoder, seed in tqdm(CASES, unit="policy"):
+        folder = _folder(runs, encoder, seed)
+        trained = json.loads((folder / "result.json").read_text())["training"]
+        deployed = evaluate(load_policy(folder), task_config(held_out=True), "map", EPISODES, compiled=True)
+        row = {"encoder": encoder, "seed": seed, "training": trained, "deployed": deployed}
+        rows.append(row | {"curve": read_curve(folder, NUM_ENVS)})
+    fixed = {"seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES}
+    return {"config": fixed, "rows": rows}
+
+
+def table(result: dict[str, Any]) -> str:
+    """Tabulate success and time by encoder: the mean over the seeds, and the lowest and highest success."""
+    head = ["encoder", "success on held-out ground", "fallen", "stuck", "out of time", "steps / s", "minutes"]
+    lines = []
+    for encoder in ENCODERS:
+        rows = [row for row in result["rows"] if row["encoder"] == encoder]
+        endings = [mean([row["deployed"][name] for row in rows]) for name in ("fallen", "stuck", "truncated")]
+        rate = mean([row["training"]["steps"] / row["training"]["seconds"] for row in rows])
+        minutes = mean([row["training"]["seconds"] / 60 for row in rows])
+        success = spread([row["deployed"]["success"] for row in rows])
+        percentages = [f"{100 * fraction:.0f} %" for fraction in endings]
+        lines.append([NAMES[encoder], success, *percentages, f"{rate:,.0f}", f"{minutes:.1f}"])
+    return markdown_table(head, lines)
+
+
+@styled()
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Draw the success during training and when deployed."""
+    figure = make_figure(8, 4.2)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1))
+    for row in result["rows"]:
+        place = ENCODERS.index(row["encoder"])
+        label = NAMES[row["encoder"]] if row["seed"] == result["config"]["seeds"][0] else None
+        left.plot(*row["curve"].values(), color=f"C{place}", linewidth=1.2, label=label)
+        right.plot(place, row["deployed"]["success"], "o", color=f"C{place}")
+    left.set(xlabel="environment steps", ylabel="success", title="while training", ylim=(0, 1))
+    left.legend(loc="lower right")
+    left.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1e3:,.0f}k")
+    right.set(title="on held-out ground", ylim=(0, 1), xlim=(-0.4, len(ENCODERS) - 0.6), xlabel="encoder")
+    right.set_xticks(range(len(ENCODERS)), [NAMES[encoder] for encoder in ENCODERS])
+    save(figure, path)
+
+
+@click.command(help=__doc__)
+@click.option(
+    "--runs",
+    type=click.Path(path_type=Path),
+    default=Path("runs/encoder_experiment"),
+    show_default=True,
+    help="Folder of the trainings.",
+)
+@click.option("--jobs", default=1, show_default=True, help="Number of parallel trainings, each on one core.")
+def main(runs: Path, jobs: int) -> None:
+    """Train, deploy, write JSON and figure and print the table."""
+    train_all(_jobs(runs), jobs)
+    result = deploy_all(runs)
+    write_json(RESULTS / "encoders.json", result)
+    plot(result, RESULTS / "encoders.png")
+    click.echo(table(result))
+
+
+if __name__ == "__main__":
+    main()
