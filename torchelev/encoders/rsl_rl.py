@@ -108,7 +108,7 @@ class AttentionModel(MLPModel):
         looks. Computed anew by each call, and by no other.
         """
         state = super().get_latent(obs)
-        encoders = self.encoders.items()
+        encoders: Any = self.encoders.items()
         return {name: encoder.attention(state, self._read_map(obs, name)) for name, encoder in encoders}
 
     def as_jit(self) -> nn.Module:
