@@ -23,6 +23,7 @@ from training.nav.encoders import ENCODERS
 from training.nav.evaluate import evaluate
 from training.nav.runs import load_policy, mean, read_curve, spread
 from training.nav.train import task_config
+from training.options import jobs_option, runs_option
 
 # Fixed before the first run, as are the encoders' sizes in training/nav/encoders.py.
 SEEDS = (0, 1)
@@ -91,14 +92,8 @@ def plot(result: dict[str, Any], path: Path) -> None:
 
 
 @click.command(help=__doc__)
-@click.option(
-    "--runs",
-    type=click.Path(path_type=Path),
-    default=Path("runs/encoder_experiment"),
-    show_default=True,
-    help="Folder of the trainings.",
-)
-@click.option("--jobs", default=1, show_default=True, help="Number of parallel trainings, each on one core.")
+@runs_option("runs/encoder_experiment")
+@jobs_option
 def main(runs: Path, jobs: int) -> None:
     """Train, deploy, write JSON and figure and print the table."""
     train_all(_jobs(runs), jobs)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchelev.errors import require
-from training.nav.runner import ResumableRunner
+from training.runner import ResumableRunner
 
 _TOLERANCE = 1e-4  # largest difference of an action
 

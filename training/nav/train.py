@@ -15,8 +15,8 @@ from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export
-from training.nav.runner import ResumableRunner
 from training.resume import checkpoint_path, write_result
+from training.runner import ResumableRunner
 
 _POSITIVE = click.IntRange(1)
 _TRAIN_SEED, _HELD_OUT_SEED = 1, 1001  # of the courses

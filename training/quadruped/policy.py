@@ -17,7 +17,7 @@ from envs.quadruped import QuadrupedConfig
 from envs.quadruped.sight import make_scans
 from torchelev.errors import require
 from torchelev.observations.scan_layout import require_layout, scan_layout
-from training.nav.runner import ResumableRunner
+from training.runner import ResumableRunner
 
 LAYOUT = "torchelev.json"  # name of the layout in a TorchScript file, and of its metadata in an ONNX file
 GROUPS = ("policy", "height_scan", "feet")  # in the order in which the network takes them, side by side

@@ -13,11 +13,11 @@ import torch
 from envs.quadruped import Quadruped, QuadrupedConfig
 from envs.quadruped.config import PERCEPTION
 from envs.quadruped.rsl_rl import RslRlQuadruped
-from training.nav.runner import ResumableRunner
 from training.quadruped.evaluate import evaluate, table
 from training.quadruped.play import play
 from training.quadruped.policy import export, load_policy
 from training.resume import checkpoint_path, write_result
+from training.runner import ResumableRunner
 
 _POSITIVE = click.IntRange(min=1)
 _HELD_OUT_SEED = 1001  # of the terrain

@@ -5,7 +5,7 @@ import torch
 import training.nav.train as nav
 from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav
-from training.nav.runner import ResumableRunner
+from training.runner import ResumableRunner
 
 CFG = TerrainNavConfig(course=CourseConfig(num_tiles=2, num_routes=8), episode_length=2.0)
 
