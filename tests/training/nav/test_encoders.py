@@ -5,7 +5,7 @@ import torch
 
 import training.nav.train as nav
 from envs.terrain_nav.sight import LAYERS
-from tests.training.runners import CFG, make_runner, weights
+from tests.training.nav.runners import CFG, make_runner, weights
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.export import export
 from training.resume import CHECKPOINT

@@ -3,7 +3,7 @@
 import pytest
 
 import training.nav.export as nav_export
-from tests.training.runners import make_runner
+from tests.training.nav.runners import make_runner
 
 
 @pytest.mark.slow(1)

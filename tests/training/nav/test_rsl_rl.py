@@ -6,7 +6,7 @@ import torch
 
 from envs.terrain_nav import TerrainNav
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav
-from tests.training.runners import CFG
+from tests.training.nav.runners import CFG
 
 
 def test_a_vec_env_of_rsl_rl():

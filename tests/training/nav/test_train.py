@@ -7,7 +7,7 @@ import torch
 from click.testing import CliRunner
 
 import training.nav.train as nav
-from tests.training.runners import CFG
+from tests.training.nav.runners import CFG
 
 
 def invoke(*arguments):

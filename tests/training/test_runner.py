@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from envs.terrain_nav import SightConfig
-from tests.training.runners import CFG, make_runner, weights
+from tests.training.nav.runners import CFG, make_runner, weights
 from training.resume import CHECKPOINT
 
 ROOT = Path(__file__).parents[3]
@@ -82,7 +82,7 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path):
 def test_two_processes_train_one_policy(tmp_path):
     script = tmp_path / "two.py"
     script.write_text(
-        "import os, torch, tests.training.runners as t\n"
+        "import os, torch, tests.training.nav.runners as t\n"
         "torch.set_num_threads(1)\n"
         f"folder = r'{tmp_path}/run'\n"
         "runner = t.make_runner(folder, 'blind', seed=int(os.environ['RANK']))\n"
