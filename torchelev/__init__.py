@@ -8,10 +8,12 @@ from torchelev.inputs.clouds import depth_to_points, voxel_filter
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
 from torchelev.robot import RobotConfig
+from torchelev.robot_body.shapes import Box, Capsule, RobotBody
 from torchelev.stages.age import AgingConfig
+from torchelev.stages.body import BodyConfig
 from torchelev.stages.compensate import DriftConfig
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
-from torchelev.stages.measure import BodyConfig, ExclusionConfig, SensorConfig
+from torchelev.stages.measure import ExclusionConfig, SensorConfig
 from torchelev.stages.overlap import OverlapConfig
 from torchelev.stages.surface import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig
@@ -23,6 +25,8 @@ __version__ = "0.1.0"
 __all__ = [
     "AgingConfig",
     "BodyConfig",
+    "Box",
+    "Capsule",
     "DriftConfig",
     "EdgeConfig",
     "ElevationMap",
@@ -38,6 +42,7 @@ __all__ = [
     "Measurement",
     "OverlapConfig",
     "RaycastConfig",
+    "RobotBody",
     "RobotConfig",
     "SensorConfig",
     "Statistics",

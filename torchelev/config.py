@@ -33,7 +33,7 @@ class ElevationMapConfig:
     """
 
     grid: GridConfig = field(default_factory=GridConfig)  #: size of the window and its cells
-    sensor: SensorConfig = field(default_factory=SensorConfig)  #: noise model, range, exclusion area and body box
+    sensor: SensorConfig = field(default_factory=SensorConfig)  #: noise, range, exclusion area and the robot's body
     aging: AgingConfig = field(default_factory=AgingConfig)  #: process noise of cells that are not measured
     #: drift compensation; None if the poses do not drift in height
     drift: DriftConfig | None = field(default_factory=DriftConfig)
@@ -121,7 +121,10 @@ def _convert(hint: Any, value: object, where: str) -> Any:
             kinds, key=lambda k: len(names & set(_setting_types(k)))
         )  # of several types, the one with these settings
         return _build(typing.cast(type, kind), value, where)
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
+        element = typing.get_args(kind)[0] if typing.get_args(kind) else None
+        if dataclasses.is_dataclass(element):
+            return tuple(_build(typing.cast(type, element), v, f"{where}[{k}]") for k, v in enumerate(value))
         return tuple(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)
     require(number or kind is not float, where, "must be a number", repr(value), "give a number without quotes")

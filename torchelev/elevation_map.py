@@ -70,6 +70,7 @@ class ElevationMap(ReadableMap):
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
         self.pace = Pace()
+        self._links = cfg.sensor.links
         self._update_cfg = dataclasses.replace(cfg, filters=())  # compiled graphs are shared by maps of equal ones
         self._compiled = False
         self._history = InputHistory()
@@ -86,6 +87,7 @@ class ElevationMap(ReadableMap):
         dt: float | Float[Tensor, "B"] | None = None,
         *,
         variance: Float[Tensor, "B *S N"] | None = None,
+        T_base_links: Float[Tensor, "B K 4 4"] | None = None,
     ) -> None:
         """Fuse one cloud per environment into its map.
 
@@ -94,17 +96,20 @@ class ElevationMap(ReadableMap):
                 or inf are ignored: pad ragged clouds with NaN.
             T_map_sensor: sensor frame to map frame, (B, 4, 4) or (B, S, 4, 4); give float64 far from the origin.
             T_map_base: pose of the robot, (B, 4, 4). The window follows it, and overlap clearance and the body box need
-                it. None: the window stays, and both are skipped.
+                it. None: the window stays, and both are skipped. Required if `cfg.sensor.body` is a `RobotBody`.
             dt: time since that environment's last update [s], a number or (B,); 0.0 for a further sensor of the same
                 instant. Required: ageing and visibility clean-up depend on it.
             variance: variance of each point's height [m^2], (B, N) or (B, S, N), in place of the noise model. Points
                 whose variance is not positive and finite are ignored.
+            T_base_links: poses of the links in the base frame, (B, K, 4, 4), as joint encoders tell them at the time of
+                the points, in the order of `cfg.sensor.body.links`. Required if the body is a `RobotBody`, and only
+                then.
 
         Raises:
             TypeError: if `dt` is missing, or an argument has the wrong type or dtype. Nothing has changed then.
             ValueError: if a shape, device or value is wrong. Nothing has changed then.
         """
-        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
+        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links)
         self._history.add(inputs)
         self._filtered.clear()
         if self.device.type == "cpu":
@@ -125,9 +130,10 @@ class ElevationMap(ReadableMap):
         dt: float | Float[Tensor, "B"] | None = None,
         *,
         variance: Float[Tensor, "B *S N"] | None = None,
+        T_base_links: Float[Tensor, "B K 4 4"] | None = None,
     ) -> Measurement:
         """Return the measurement of a cloud, for `forward`. Arguments and errors are those of `update`."""
-        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance)
+        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links)
         return measure(*inputs, self.cfg.grid, self.cfg.sensor, self.elevation.dtype)
 
     def forward(self, state: MapState, measurement: Measurement) -> MapState:
@@ -151,10 +157,10 @@ class ElevationMap(ReadableMap):
         new = pipeline.forward(state, measurement, self.cfg, self._weights)
         return without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))
 
-    def _check_inputs(self, points: Any, T_map_sensor: Any, T_map_base: Any, dt: Any, variance: Any) -> Inputs:
+    def _check_inputs(self, *inputs: Any) -> Inputs:
         elevation = self.elevation
-        of_map = (self.num_envs, elevation.device, elevation.dtype)
-        return check_inputs(points, T_map_sensor, T_map_base, dt, variance, *of_map, self.check_values)
+        of_map = (self.num_envs, elevation.device, elevation.dtype, self._links)
+        return check_inputs(*inputs, *of_map, self.check_values)
 
     @property
     def chunks(self) -> list[slice]:
@@ -202,7 +208,7 @@ class ElevationMap(ReadableMap):
             base: whether updates come with `T_map_base`.
             variance: whether updates come with `variance`.
             dtype: dtype of the points and of their variance.
-            pose_dtype: dtype of the poses.
+            pose_dtype: dtype of the poses, those of the links included.
 
         Raises:
             TypeError: if no update takes these dtypes.
@@ -210,7 +216,7 @@ class ElevationMap(ReadableMap):
         """
         N = require_count("num_points", num_points, "give the number of points of each sensor")
         S = require_count("num_sensors", num_sensors, "give the number of sensors")
-        kinds: dict[str, Any] = dict(device=self.device, dtype=dtype, pose_dtype=pose_dtype)
+        kinds: dict[str, Any] = dict(device=self.device, num_links=len(self._links), dtype=dtype, pose_dtype=pose_dtype)
         with torch.inference_mode(False), torch.no_grad():
             inputs = placeholder_inputs(self.num_envs, S, N, with_base=base, with_variance=variance, **kinds)
             inputs = self._check_inputs(*inputs)

@@ -67,12 +67,14 @@ def update_in_place(
     T_map_base: Tensor | None,
     dt: Tensor,
     variance: Tensor | None,
+    T_base_links: Tensor | None,
     *,
     cfg: ElevationMapConfig,
     weights: Weights | None = None,
 ) -> None:
     """Measure, fuse, and write the new values into the stored state's own tensors; points come as (B, S, N, 3)."""
-    m = measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, stored.elevation.dtype)
+    inputs = points, T_map_sensor, T_map_base, dt, variance, T_base_links
+    m = measure(*inputs, cfg.grid, cfg.sensor, stored.elevation.dtype)
     write(stored, forward(stored, m, cfg, weights))
 
 

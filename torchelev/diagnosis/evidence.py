@@ -113,9 +113,7 @@ def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[
 def _measure_again(cfg: ElevationMapConfig, update: PastUpdate, env: int) -> Measurement:
     """Return one environment's measurement of an update's thinned points."""
     inputs = [None if value is None else value[env, None] for value in update.inputs]
-    points, T_map_sensor, T_map_base, dt, variance = inputs
-    assert points is not None and T_map_sensor is not None and dt is not None
-    return measure(points, T_map_sensor, T_map_base, dt, variance, cfg.grid, cfg.sensor, torch.float32)
+    return measure(*inputs, cfg.grid, cfg.sensor, torch.float32)  # type: ignore[arg-type]
 
 
 def _count_near(cfg: ElevationMapConfig, state: MapState, update: PastUpdate, env: int) -> int:

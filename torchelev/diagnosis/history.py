@@ -77,4 +77,5 @@ def _thin(inputs: Inputs) -> Inputs:
             T_map_base=None if inputs.T_map_base is None else copy(inputs.T_map_base),
             dt=copy(inputs.dt),
             variance=None if inputs.variance is None else copy(inputs.variance[:, :, ::step]),
+            T_base_links=None if inputs.T_base_links is None else copy(inputs.T_base_links),
         )

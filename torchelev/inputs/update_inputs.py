@@ -30,6 +30,7 @@ class Inputs(NamedTuple):
     T_map_base: Float[Tensor, "B 4 4"] | None  #: pose of the robot; None: unknown, the window stays
     dt: Float[Tensor, "B"]  #: [s] since the environment's last update
     variance: Float[Tensor, "B S N"] | None  #: [m^2] of each point's height; None: the noise model's
+    T_base_links: Float[Tensor, "B K 4 4"] | None  #: poses of the links of `sensor.body`; None: it has none
 
 
 class TakesInputs(Protocol[_ResultOut]):
@@ -47,10 +48,17 @@ class TakesInputs(Protocol[_ResultOut]):
         dt: float | Tensor,
         *,
         variance: Tensor | None = None,
+        T_base_links: Tensor | None = None,
     ) -> _ResultOut: ...
     @overload
     def __call__(
-        self, points: Tensor, T_map_sensor: Tensor, *, dt: float | Tensor, variance: Tensor | None = None
+        self,
+        points: Tensor,
+        T_map_sensor: Tensor,
+        *,
+        dt: float | Tensor,
+        variance: Tensor | None = None,
+        T_base_links: Tensor | None = None,
     ) -> _ResultOut: ...
 
 
@@ -65,18 +73,20 @@ def check_inputs(
     T_map_base: Any,
     dt: Any,
     variance: Any,
+    T_base_links: Any,
     num_envs: int,
     device: torch.device,
     dtype: torch.dtype,
+    links: tuple[str, ...],
     check_values: bool,
 ) -> Inputs:
     """Check the arguments of `update` and `measure`, and return them in the shapes that the stages take.
 
-    `device` and `dtype` are the map's. `check_values` also reads poses and a tensor `dt` that lie on another device
-    than the CPU.
+    `device` and `dtype` are the map's, `links` those of its `sensor.body`. `check_values` also reads poses and a tensor
+    `dt` that lie on another device than the CPU.
     """
     require_full_precision(dtype)
-    require_reverse_mode((points, T_map_sensor, T_map_base, dt, variance))
+    require_reverse_mode((points, T_map_sensor, T_map_base, dt, variance, T_base_links))
     cloud = _check_points(points, num_envs, device)
     B, S = num_envs, cloud.shape[1]  # not the cloud's B, which the compiler may take for variable
     shape = (B, S, 4, 4) if points.ndim == 4 else (B, 4, 4)
@@ -89,7 +99,24 @@ def check_inputs(
         fits = variance.shape == points.shape[:-1]
         require(fits, "variance", f"expected {tuple(points.shape[:-1])}", tuple(variance.shape), "give one per point")
         variance = variance.view(cloud.shape[:-1])
-    return Inputs(cloud, T_map_sensor, T_map_base, dt, variance)
+    T_base_links = _check_links(T_base_links, links, T_map_base is not None, B, device, check_values)
+    return Inputs(cloud, T_map_sensor, T_map_base, dt, variance, T_base_links)
+
+
+def _check_links(
+    T_base_links: Any, links: tuple[str, ...], has_base: bool, num_envs: int, device: torch.device, check_values: bool
+) -> Float[Tensor, "B K 4 4"] | None:
+    """Return the poses of the links; they are required if the body has links, together with the base, and only then."""
+    given = T_base_links is not None
+    if not links:
+        hint = "give sensor.body=RobotBody(...), or leave it out"
+        require(not given, "T_base_links", "must be left out, as sensor.body has no links", "poses", hint)
+        return None
+    names = f"expected ({num_envs}, {len(links)}, 4, 4), the poses in the base frame of {', '.join(links)}"
+    require(given, "T_base_links", names, "None", "compute them from the joint angles")
+    hint = "give it, or sensor.body=None"
+    require(has_base, "T_map_base", "is required to pose the links of sensor.body", "None", hint)
+    return checks.check_pose("T_base_links", T_base_links, (num_envs, len(links), 4, 4), device, check_values)
 
 
 def require_full_precision(dtype: torch.dtype) -> None:
@@ -149,6 +176,7 @@ def placeholder_inputs(
     device: torch.device,
     with_base: bool,
     with_variance: bool,
+    num_links: int,
     dtype: torch.dtype,
     pose_dtype: torch.dtype,
 ) -> Inputs:
@@ -157,4 +185,5 @@ def placeholder_inputs(
     points = torch.full((1, 1, 1, 1), torch.nan, dtype=dtype, device=device).expand(B, S, N, 3)
     T = torch.eye(4, dtype=pose_dtype, device=device).expand(B, S, 4, 4)
     variance = torch.ones((1, 1, 1), dtype=dtype, device=device).expand(B, S, N) if with_variance else None
-    return Inputs(points, T, T[:, 0] if with_base else None, torch.zeros(B, device=device), variance)
+    links = T[:, :1].expand(B, num_links, 4, 4) if num_links else None
+    return Inputs(points, T, T[:, 0] if with_base else None, torch.zeros(B, device=device), variance, links)

@@ -13,6 +13,8 @@ from torchelev.grid import GridConfig
 from torchelev.inputs.checks import FARTHEST
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
+from torchelev.robot_body.shapes import RobotBody
+from torchelev.stages.body import BodyConfig, inside_body, on_robot, rotate
 from torchelev.state import Measurement
 
 if TYPE_CHECKING:
@@ -30,14 +32,6 @@ class ExclusionConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BodyConfig:
-    """A box in the base frame that holds the robot; points inside are the robot's own."""
-
-    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  #: [m] x, y, z of the rear, right, lower corner
-    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  #: [m] x, y, z of the front, left, upper corner
-
-
-@dataclass(frozen=True, kw_only=True)
 class SensorConfig:
     """Noise model and gates of the points."""
 
@@ -47,7 +41,8 @@ class SensorConfig:
     max_distance: float = 50.0  #: [m] from the sensor; farther points are ignored
     #: ramp above which points are overhangs; None: every point counts
     exclusion: ExclusionConfig | None = ExclusionConfig()
-    body: BodyConfig | None = None  #: box around the robot whose points are ignored; None: none are
+    #: the robot itself, whose points are ignored: a box in the base frame, or the shapes of its links; None: none are
+    body: BodyConfig | RobotBody | None = None
 
     def __post_init__(self) -> None:
         require(self.noise_factor >= 0, "sensor.noise_factor", "must not be negative", self.noise_factor, "give 1e-4")
@@ -55,6 +50,14 @@ class SensorConfig:
         ordered, actual = 0 <= self.min_distance < self.max_distance, (self.min_distance, self.max_distance)
         hint = "give 0 <= min < max in metres"
         require(ordered, "sensor.min_distance, max_distance", "must be ordered", actual, hint)
+        is_body = self.body is None or isinstance(self.body, BodyConfig | RobotBody)
+        hint = "give a box in the base frame, or the shapes of the links"
+        require(is_body, "sensor.body", "must be a BodyConfig, a RobotBody or None", repr(self.body), hint, TypeError)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the K links whose poses an update takes as `T_base_links`; none unless the body is a RobotBody."""
+        return self.body.links if isinstance(self.body, RobotBody) else ()
 
 
 def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[Tensor, "B M"]:
@@ -66,16 +69,6 @@ def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[
     r = (relative[..., 0].square() + relative[..., 1].square()).clamp(min=1e-12).sqrt()
     limit = ((r - ramp.distance).clamp(min=0) * ramp.slope + ramp.offset).clamp(max=ramp.height)
     return relative[..., 2] > limit
-
-
-def inside_body(points: Float[Tensor, "B M 3"], T_map_base: Tensor, base: Tensor, body: BodyConfig) -> Tensor:
-    """Tell which points lie in the robot's body box, which turns with the base."""
-    to_base = T_map_base[:, :3, :3].to(points.dtype).transpose(1, 2)
-    in_base = rotate(to_base, *(points - base[:, None]).unbind(-1))
-    inside = torch.ones_like(in_base[0], dtype=torch.bool)
-    for axis, coordinate in enumerate(in_base):
-        inside = inside & (coordinate >= body.lower[axis]) & (coordinate <= body.upper[axis])
-    return inside
 
 
 @stored
@@ -91,23 +84,23 @@ def relative_to(position: Float[Tensor, "B ... 3"], anchor: Tensor, resolution: 
     return (position.double() - corner.view(-1, *[1] * (position.ndim - 2), 3)).to(dtype)
 
 
-def rotate(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
-    """Return the rows of R p. Written out: a matrix product may round otherwise for another batch size."""
-    entries = rotation.flatten(-2).unsqueeze(-2).unbind(-1)
-    return [a * x + b * y + c * z for a, b, c in (entries[:3], entries[3:6], entries[6:])]
-
-
 @stored
-def sound_poses(T_map_sensor: Tensor, T_map_base: Tensor | None) -> tuple[Bool[Tensor, "B"], Tensor, Tensor | None]:
+def sound_poses(
+    T_map_sensor: Tensor, T_map_base: Tensor | None, T_base_links: Tensor | None
+) -> tuple[Bool[Tensor, "B"], Tensor, Tensor | None, Tensor | None]:
     """Tell which environments' poses are finite and within FARTHEST; return all, with zeros in place of unsound ones.
 
     Where the host may not read poses, it cannot refuse them: a robot's NaN would become an index out of range.
     """
-    sound = is_near(T_map_sensor) if T_map_base is None else is_near(T_map_sensor) & is_near(T_map_base)
+    sound = is_near(T_map_sensor)
+    for pose in (T_map_base, T_base_links):
+        sound = sound if pose is None else sound & is_near(pose)
     T_map_sensor = torch.where(sound[:, None, None, None], T_map_sensor, 0.0)
     if T_map_base is not None:
         T_map_base = torch.where(sound[:, None, None], T_map_base, 0.0)
-    return sound, T_map_sensor, T_map_base
+    if T_base_links is not None:
+        T_base_links = torch.where(sound[:, None, None, None], T_base_links, 0.0)
+    return sound, T_map_sensor, T_map_base, T_base_links
 
 
 def is_near(pose: Float[Tensor, "B ... 4 4"]) -> Bool[Tensor, "B"]:
@@ -178,6 +171,7 @@ def gate_points(
     variance: Tensor | None,
     T_map_base: Tensor | None,
     base: Tensor | None,
+    own: Bool[Tensor, "B S N"] | None,
     cfg: SensorConfig,
 ) -> Gates:
     """Leave out points on the robot's body and above the ramp; set sigma_p^2 = alpha_d d^2 + noise_floor."""
@@ -187,7 +181,9 @@ def gate_points(
     else:
         variance = torch.where(sensed.finite, variance, 1.0).flatten(1)
     body = overhang = torch.zeros_like(mapped.in_range)
-    if cfg.body is not None and base is not None and T_map_base is not None:
+    if own is not None:
+        body = mapped.in_range & own.flatten(1)
+    elif isinstance(cfg.body, BodyConfig) and base is not None and T_map_base is not None:
         body = mapped.in_range & inside_body(position, T_map_base, base, cfg.body)
     if cfg.exclusion is not None:
         overhang = mapped.in_range & ~body & above_ramp(relative, cfg.exclusion)
@@ -212,6 +208,7 @@ def measure(
     T_map_base: Float[Tensor, "B 4 4"] | None,
     dt: Float[Tensor, "B"],
     variance: Float[Tensor, "B S N"] | None,
+    T_base_links: Float[Tensor, "B K 4 4"] | None,
     grid: GridConfig,
     cfg: SensorConfig,
     dtype: torch.dtype,
@@ -219,10 +216,10 @@ def measure(
     """Turn sensor-frame points into a measurement (paper, Sec. II-A "transform" and II-C).
 
     Noise: sigma_p^2 = alpha_d * d^2 + noise_floor with d the distance from the sensor, or the caller's variances.
-    Gates: not finite, distance, body box, exclusion ramp. Rejected points have used = False. A point counts as not
-    finite if its variance has no finite inverse, or if a pose of its environment is not finite or beyond FARTHEST.
+    Gates: not finite, distance, the robot's body, exclusion ramp. Rejected points have used = False. A point counts as
+    not finite if its variance has no finite inverse, or if a pose of its environment is not finite or beyond FARTHEST.
     """
-    sound, T_map_sensor, T_map_base = sound_poses(T_map_sensor, T_map_base)
+    sound, T_map_sensor, T_map_base, T_base_links = sound_poses(T_map_sensor, T_map_base, T_base_links)
     position = T_map_sensor[..., :3, 3]
     anchor = anchor_of(position[:, 0] if T_map_base is None else T_map_base[:, :3, 3], grid.resolution)
     origin = relative_to(position, anchor, grid.resolution, dtype)
@@ -230,7 +227,11 @@ def measure(
     variance = None if variance is None else variance.to(dtype)
     sensed = gate_range(points.to(dtype), variance, sound, cfg)
     mapped = transform(sensed, T_map_sensor[..., :3, :3].to(dtype), origin)
-    gates = gate_points(sensed, mapped, variance, T_map_base, base, cfg)
+    own = None
+    if isinstance(cfg.body, RobotBody) and T_map_base is not None and T_base_links is not None:
+        coordinates = sensed.x, sensed.y, sensed.z, sensed.distance2
+        own = on_robot(*coordinates, T_map_sensor, T_map_base, T_base_links, cfg.body)
+    gates = gate_points(sensed, mapped, variance, T_map_base, base, own, cfg)
     finite, in_range, casts, used = (count(mask) for mask in (sensed.finite, mapped.in_range, gates.casts, gates.used))
     return Measurement(
         anchor=anchor,

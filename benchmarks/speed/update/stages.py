@@ -41,7 +41,7 @@ def stages(seconds: float) -> dict[str, Any]:
     assert cfg.drift and cfg.raycast and cfg.overlap and cfg.traversability
 
     def transform() -> Measurement:
-        return measure.measure(cloud[:, None], T[:, None], T, drive.dt, None, grid, cfg.sensor, torch.float32)
+        return measure.measure(cloud[:, None], T[:, None], T, drive.dt, None, None, grid, cfg.sensor, torch.float32)
 
     all_stages: dict[str, _Stage] = {
         "point transform, gates, noise": lambda state, m: transform(),

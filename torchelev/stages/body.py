@@ -1,0 +1,73 @@
+"""Which points lie on the robot itself: in one box that turns with the base, or on the shapes of its links."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.ops.storage import stored
+from torchelev.robot_body.own_points import find_own_points
+from torchelev.robot_body.posing import pose_body
+from torchelev.robot_body.shapes import RobotBody
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyConfig:
+    """A box in the base frame that holds the robot; points inside are the robot's own."""
+
+    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  #: [m] x, y, z of the rear, right, lower corner
+    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  #: [m] x, y, z of the front, left, upper corner
+
+
+def rotate(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    """Return the rows of R p. Written out: a matrix product may round otherwise for another batch size."""
+    entries = rotation.flatten(-2).unsqueeze(-2).unbind(-1)
+    return [a * x + b * y + c * z for a, b, c in (entries[:3], entries[3:6], entries[6:])]
+
+
+def inside_body(points: Float[Tensor, "B M 3"], T_map_base: Tensor, base: Tensor, body: BodyConfig) -> Tensor:
+    """Tell which points lie in the robot's body box, which turns with the base."""
+    to_base = T_map_base[:, :3, :3].to(points.dtype).transpose(1, 2)
+    in_base = rotate(to_base, *(points - base[:, None]).unbind(-1))
+    inside = torch.ones_like(in_base[0], dtype=torch.bool)
+    for axis, coordinate in enumerate(in_base):
+        inside = inside & (coordinate >= body.lower[axis]) & (coordinate <= body.upper[axis])
+    return inside
+
+
+@stored
+def relative_pose(
+    T_map_sensor: Float[Tensor, "B S 4 4"], T_map_base: Float[Tensor, "B 4 4"], dtype: torch.dtype
+) -> Float[Tensor, "B S 4 4"]:
+    """Return T_sensor_base; differenced in float64, as both may lie 100 km from the origin."""
+    sensor, base = T_map_sensor.double(), T_map_base[:, None].double()
+    to_sensor = sensor[..., :3, :3].transpose(-2, -1)
+    columns = [rotate(to_sensor, *base[..., :3, k, None].unbind(-2)) for k in range(3)]
+    offset = rotate(to_sensor, *(base[..., :3, 3] - sensor[..., :3, 3])[..., None].unbind(-2))
+    rows = [torch.cat([*(column[row] for column in columns), offset[row]], -1) for row in range(3)]
+    return torch.stack([*rows, torch.zeros_like(rows[0])], -2).to(dtype)
+
+
+def on_robot(
+    x: Float[Tensor, "B S N"],
+    y: Tensor,
+    z: Tensor,
+    distance2: Float[Tensor, "B S N"],
+    T_map_sensor: Float[Tensor, "B S 4 4"],
+    T_map_base: Float[Tensor, "B 4 4"],
+    T_base_links: Float[Tensor, "B K 4 4"],
+    body: RobotBody,
+) -> Bool[Tensor, "B S N"]:
+    """Tell which points of the sensors' frames lie on the robot's links, see `RobotBody`.
+
+    The links are posed in the base frame, so that an error of the base's pose, which the sensors share, cancels.
+    """
+    T_sensor_base = relative_pose(T_map_sensor, T_map_base, x.dtype)
+    posed = pose_body(body, T_sensor_base, T_base_links.to(x.dtype))
+    return find_own_points(x, y, z, distance2, posed, body)
