@@ -57,6 +57,20 @@ def rotation_rows(quat_wxyz: tuple[float, float, float, float]) -> list[float]:
 
 
 @stored
+def relative_pose(
+    T_a_sensor: Float[Tensor, "B S 4 4"], T_a_base: Float[Tensor, "B 4 4"], dtype: torch.dtype
+) -> Float[Tensor, "B S 4 4"]:
+    """Return T_sensor_base from both poses in a frame a; differenced in float64, as a's origin may be 100 km away."""
+    R_sensor, t_sensor = _coordinates_first(T_a_sensor.double())
+    R_base, t_base = _coordinates_first(T_a_base[:, None].double())
+    to_sensor = R_sensor.transpose(0, 1)
+    columns = [torch.stack(_turn(to_sensor, vector)) for vector in (*R_base.unbind(1), t_base - t_sensor)]
+    rows = torch.stack(columns, 1)
+    last = torch.zeros_like(rows[:1])
+    return torch.cat([rows, last]).movedim((0, 1), (-2, -1)).to(dtype)
+
+
+@stored
 def pose_body(
     body: RobotBody, T_sensor_base: Float[Tensor, "B S 4 4"], T_base_links: Float[Tensor, "B K 4 4"]
 ) -> PosedBody:

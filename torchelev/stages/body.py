@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.robot_body.own_points import find_own_points
-from torchelev.robot_body.posing import pose_body
+from torchelev.robot_body.posing import pose_body, relative_pose
 from torchelev.robot_body.shapes import RobotBody
 
 if TYPE_CHECKING:
@@ -39,19 +38,6 @@ def inside_body(points: Float[Tensor, "B M 3"], T_map_base: Tensor, base: Tensor
     for axis, coordinate in enumerate(in_base):
         inside = inside & (coordinate >= body.lower[axis]) & (coordinate <= body.upper[axis])
     return inside
-
-
-@stored
-def relative_pose(
-    T_map_sensor: Float[Tensor, "B S 4 4"], T_map_base: Float[Tensor, "B 4 4"], dtype: torch.dtype
-) -> Float[Tensor, "B S 4 4"]:
-    """Return T_sensor_base; differenced in float64, as both may lie 100 km from the origin."""
-    sensor, base = T_map_sensor.double(), T_map_base[:, None].double()
-    to_sensor = sensor[..., :3, :3].transpose(-2, -1)
-    columns = [rotate(to_sensor, *base[..., :3, k, None].unbind(-2)) for k in range(3)]
-    offset = rotate(to_sensor, *(base[..., :3, 3] - sensor[..., :3, 3])[..., None].unbind(-2))
-    rows = [torch.cat([*(column[row] for column in columns), offset[row]], -1) for row in range(3)]
-    return torch.stack([*rows, torch.zeros_like(rows[0])], -2).to(dtype)
 
 
 def on_robot(

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.inputs.checks import check_pose
+from torchelev.robot_body.shapes import RobotBody
+from torchelev.sim.sensors.body_casting import cast_at_body
 from torchelev.sim.sensors.casting import Boxes, cast
 from torchelev.sim.terrains.heightfield import HeightField
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 
 class Pattern(Protocol):
@@ -28,6 +30,13 @@ class Pattern(Protocol):
     @property
     def directions(self) -> Tensor | Callable[[Tensor], Tensor]:
         """Unit vectors (M, 3) in the sensor frame, or a function that returns those of a step."""
+
+
+class View(NamedTuple):
+    """What a sensor sees."""
+
+    points: Float[Tensor, "B M 3"]  #: [m] sensor frame, float32; NaN where nothing is hit, or nearer than `min_range`
+    on_body: Bool[Tensor, "B M"]  #: the robot's own `body` was hit; also where that was nearer than `min_range`
 
 
 class MountedSensor:
@@ -92,8 +101,39 @@ class MountedSensor:
         legs: Boxes | None = None,
         step: int | Int[Tensor, "B"] = 0,
         T_base_sensor: Float[Tensor, "B 4 4"] | None = None,
+        body: RobotBody | None = None,
+        T_base_links: Float[Tensor, "B K 4 4"] | None = None,
     ) -> Float[Tensor, "B M 3"]:
         """Return the points seen [m], sensor frame, float32; NaN where nothing is hit, or nearer than `min_range`.
+
+        Arguments and errors are those of `view`, which also tells the points on the robot's own body.
+        """
+        return self.view(
+            field,
+            tile_ids,
+            T_map_base,
+            boxes,
+            legs=legs,
+            step=step,
+            T_base_sensor=T_base_sensor,
+            body=body,
+            T_base_links=T_base_links,
+        ).points
+
+    def view(
+        self,
+        field: HeightField,
+        tile_ids: Int[Tensor, "B"],
+        T_map_base: Float[Tensor, "B 4 4"],
+        boxes: Boxes | None = None,
+        *,
+        legs: Boxes | None = None,
+        step: int | Int[Tensor, "B"] = 0,
+        T_base_sensor: Float[Tensor, "B 4 4"] | None = None,
+        body: RobotBody | None = None,
+        T_base_links: Float[Tensor, "B K 4 4"] | None = None,
+    ) -> View:
+        """Return the points seen, and which of them lie on the robot's own body.
 
         Args:
             field: Terrain tiles.
@@ -103,6 +143,9 @@ class MountedSensor:
             legs: Boxes of the robot itself, in the base frame: here `T_map_box` holds T_base_box.
             step: Step of a pattern that changes, one for all or one for each environment.
             T_base_sensor: True mountings, where they differ from the nominal one.
+            body: Shapes of the robot itself, which hide what is behind them. They are not padded, and a shape that
+                holds the sensor hides nothing from it, as cameras are built into housings.
+            T_base_links: Poses of the body's links in the base frame, in the order of `body.links`.
 
         Raises:
             TypeError: An argument has the wrong dtype.
@@ -117,8 +160,24 @@ class MountedSensor:
         if legs is not None:
             boxes = legs.moved(T_map_base) if boxes is None else boxes.joined(legs.moved(T_map_base))
         distance = cast(field, tile_ids, T[:, :3, 3], rays @ T[:, :3, :3].mT, self.max_range, boxes)
+        on_body = torch.zeros_like(distance, dtype=torch.bool)
+        if body is not None:
+            to_body = self._distance_to(body, T_base_links, rays, T_base_sensor)
+            on_body = (to_body < distance) & (to_body <= self.max_range)
+            distance = torch.where(on_body, to_body, distance)
         is_returned = (distance >= self.min_range) & (distance < math.inf)
-        return rays * distance.masked_fill(~is_returned, math.nan)[..., None]
+        return View(rays * distance.masked_fill(~is_returned, math.nan)[..., None], on_body)
+
+    def _distance_to(
+        self, body: RobotBody, T_base_links: Tensor | None, rays: Tensor, T_base_sensor: Tensor | None
+    ) -> Float[Tensor, "B M"]:
+        """Return the distance [m] to the robot's body; inf where a ray does not hit it."""
+        B, K, device = len(rays), len(body.links), rays.device
+        rule = f"expected ({B}, {K}, 4, 4), the poses in the base frame of {', '.join(body.links)}"
+        require(T_base_links is not None, "T_base_links", rule, "None", "compute them from the joint angles")
+        T_base_links = check_pose("T_base_links", T_base_links, (B, K, 4, 4), device, False)
+        T = self._on(device)[0].expand(B, 4, 4) if T_base_sensor is None else T_base_sensor
+        return cast_at_body(body, T, T_base_links, rays)
 
     def depth(self, points: Float[Tensor, "B M 3"]) -> Float[Tensor, "B h w"]:
         """Return the points of a camera as depth images, along its viewing direction [m], NaN where there is no return.
