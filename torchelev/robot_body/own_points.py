@@ -32,10 +32,10 @@ def find_own_points(
 
     The least excess decides, which is at most 0 where a shape is met: compiled code is slow at joining masks.
     """
-    x, y, z, distance = x.detach(), y.detach(), z.detach(), squared.detach().clamp(min=_TINY).sqrt()
-    inverse, tolerance = 1 / distance, body.depth_tolerance
-    direction = [x * inverse, y * inverse, z * inverse]
-    pieces = _Pieces(direction, (distance - tolerance).clamp(min=0), distance + tolerance)
+    distance = squared.detach().clamp(min=_TINY).sqrt()
+    inverse = 1 / distance
+    direction = [c.detach() * inverse for c in (x, y, z)]
+    pieces = _Pieces(direction, distance, distance + body.depth_tolerance)
     least = torch.full_like(distance, torch.inf)
     for k in range(len(body.capsules)):
         least = torch.minimum(least, _excess_of_capsule(pieces, posed, body, k))

@@ -67,9 +67,9 @@ class Box:
 class RobotBody:
     """The robot's links as capsules and boxes: points on them are the robot's own and neither measure nor cast rays.
 
-    A point lies on the robot if a piece of its ray, from `depth_tolerance` before it to `depth_tolerance` behind it,
-    meets a shape that is `padding` larger on all sides. Depth noise moves points along their rays, so that it takes no
-    point of a leg out of reach, while the ground beside a foot stays in the map.
+    A point lies on the robot if it, or a place up to `depth_tolerance` behind it on its ray, is in a shape that is
+    `padding` larger on all sides. Depth noise moves points along their rays: what is measured too near has the shape
+    behind it, and what is measured too far is still within the shape. The ground beside a foot stays in the map.
 
     Raises:
         TypeError: if the shapes are not capsules and boxes.
@@ -78,11 +78,12 @@ class RobotBody:
 
     capsules: tuple[Capsule, ...] = ()  #: such as legs, and feet as spheres
     boxes: tuple[Box, ...] = ()  #: such as the trunk
-    #: [m] by which shapes are larger on all sides: errors of mounting, joint encoders and shapes. Larger removes points
-    #: at a leg's rim more surely, and more of the ground around the feet
+    #: [m] by which shapes are larger on all sides: errors of mounting, joint encoders and shapes. Larger removes more
+    #: points at a leg's rim if these errors are larger, and more of the ground around the feet
     padding: float = 0.005
-    #: [m] by which depth noise may move a point along its ray: three standard deviations at the legs' distance
-    depth_tolerance: float = 0.02
+    #: [m] by which a point may be measured too near: three standard deviations of the depth at the legs' distance, of
+    #: the default noise at 0.8 m. Larger removes more of what is between the sensor and a leg, and no ground
+    depth_tolerance: float = 0.03
 
     def __post_init__(self) -> None:
         for name, kind in (("capsules", Capsule), ("boxes", Box)):

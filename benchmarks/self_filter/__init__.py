@@ -1,0 +1,1 @@
+"""The self-filter on a robot that trots: what it costs, and which points it takes from the legs and the ground."""

@@ -1,0 +1,54 @@
+"""Measure the self-filter on a quadruped that trots, with two depth cameras of 300 points.
+
+    python -m benchmarks.self_filter
+
+Speed: updates of 256 maps of 64 x 64 cells without a body, with one box, and with the 17 shapes of 13 links, in turn.
+
+Writes benchmarks/results/self_filter.json section by section; sections that are not measured keep their results.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from benchmarks import RESULTS
+from benchmarks.self_filter import speed
+from torchelev.app.results import commit, markdown_table, write_json
+
+SECTIONS: dict[str, Callable[[float], dict[str, Any]]] = {"speed": speed.measure}
+
+
+def tables(result: dict[str, Any]) -> str:
+    """Tabulate the sections that were measured."""
+    parts = []
+    if "speed" in result:
+        rows = [
+            [name, f"{row['median']:.1f}", f"{row['min']:.1f}", f"{row['extra']:+.1%}"]
+            for name, row in result["speed"]["rows"].items()
+        ]
+        parts.append(markdown_table([f"{result['speed']['robots']} robots", "median ms", "min ms", "extra"], rows))
+    return "\n\n".join(parts)
+
+
+@click.command(help=__doc__)
+@click.option("--seconds", default=10.0, show_default=True, help="Time per row of the speed [s].")
+@click.option("--only", type=click.Choice(list(SECTIONS)), help="Measure only this section.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
+def main(seconds: float, only: str | None, out: Path) -> None:
+    """Measure, write JSON and print the tables."""
+    path = out / "self_filter.json"
+    result = json.loads(path.read_text()) if path.exists() else {}
+    for name, measure in SECTIONS.items():
+        if only in (None, name):
+            result[name] = measure(seconds) | {"commit": commit()}
+            write_json(path, result)
+    click.echo(tables(result))
+
+
+if __name__ == "__main__":
+    main()
