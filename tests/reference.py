@@ -55,6 +55,50 @@ def inside_box(point, T_map_base, lower, upper):
     return all(lower[k] <= in_base[k] <= upper[k] for k in range(3))
 
 
+def rotation_of(quat_wxyz):
+    """The matrix that turns v to v + 2 w (q x v) + 2 q x (q x v), column by column."""
+    w, q = quat_wxyz[0], np.array(quat_wxyz[1:])
+    return np.column_stack([v + 2 * w * np.cross(q, v) + 2 * np.cross(q, np.cross(q, v)) for v in np.eye(3)])
+
+
+def outside_capsule(p, start, end, radius):
+    """How far outside a capsule a point lies, both in the link's frame; negative inside."""
+    start, axis = np.array(start), np.array(end) - np.array(start)
+    v = min(max(np.dot(p - start, axis) / np.dot(axis, axis), 0.0), 1.0) if axis.any() else 0.0
+    return np.linalg.norm(p - start - v * axis) - radius
+
+
+def outside_box(p, center, half_lengths, rotation):
+    """How far a point lies outside the faces of a box, both in the link's frame; negative inside."""
+    in_box = (p - np.array(center)) @ rotation
+    return max(abs(in_box[k]) - half_lengths[k] for k in range(3))
+
+
+def least(f, low, high):
+    """The least value of a convex function between two numbers, by thirds."""
+    for _ in range(40):
+        a, b = low + (high - low) / 3, high - (high - low) / 3
+        low, high = (low, b) if f(a) <= f(b) else (a, high)
+    return f((low + high) / 2)
+
+
+def outside_robot(p, origin, robot, T_map_links):
+    """How far a point and what is up to `depth_tolerance` behind it lie outside the padded robot; on it if <= 0.
+
+    `robot` holds lists of dicts, `T_map_links` the poses by the link's name; `origin` is the sensor's.
+    """
+    distances = []
+    for kind, outside in (("capsules", outside_capsule), ("boxes", outside_box)):
+        for shape in robot[kind]:
+            to_link = np.linalg.inv(T_map_links[shape["link"]])
+            point, ray = (to_link @ np.append(p, 1.0))[:3], to_link[:3, :3] @ (p - origin) / np.linalg.norm(p - origin)
+            sizes = {key: value for key, value in shape.items() if key not in ("link", "quat_wxyz")}
+            if kind == "boxes":
+                sizes["rotation"] = rotation_of(shape["quat_wxyz"])
+            distances.append(least(lambda t: outside(point + t * ray, **sizes), 0.0, robot["depth_tolerance"]))  # noqa: B023
+    return min(distances) - robot["padding"]
+
+
 def measure(points, T_map_sensor, T_map_base, *, noise, limits, exclusion=None, body=None):
     """Transform and gate the points (S, N, 3) of sensors with poses (S, 4, 4): a list of dicts, sensor after sensor.
 

@@ -121,10 +121,11 @@ def _convert(hint: Any, value: object, where: str) -> Any:
             kinds, key=lambda k: len(names & set(_setting_types(k)))
         )  # of several types, the one with these settings
         return _build(typing.cast(type, kind), value, where)
-    if isinstance(value, list | tuple):
-        element = typing.get_args(kind)[0] if typing.get_args(kind) else None
-        if dataclasses.is_dataclass(element):
-            return tuple(_build(typing.cast(type, element), v, f"{where}[{k}]") for k, v in enumerate(value))
+    element = next(iter(typing.get_args(kind)), None)
+    if dataclasses.is_dataclass(element):
+        require(isinstance(value, list | tuple), where, "must be a list", type(value).__name__, "begin lines with -")
+        return tuple(_build(typing.cast(type, element), v, f"{where}[{k}]") for k, v in enumerate(value))  # type: ignore[arg-type]
+    if isinstance(value, list):
         return tuple(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)
     require(number or kind is not float, where, "must be a number", repr(value), "give a number without quotes")
