@@ -82,21 +82,47 @@ def least(f, low, high):
     return f((low + high) / 2)
 
 
-def outside_robot(p, origin, robot, T_map_links):
-    """How far a point and what is up to `depth_tolerance` behind it lie outside the padded robot; on it if <= 0.
+def shapes_of(robot, T_map_links):
+    """A function of a map-frame point for each shape: how far it lies outside, negative inside.
 
-    `robot` holds lists of dicts, `T_map_links` the poses by the link's name; `origin` is the sensor's.
+    `robot` holds lists of dicts, `T_map_links` the poses by the link's name.
     """
-    distances = []
+    shapes = []
     for kind, outside in (("capsules", outside_capsule), ("boxes", outside_box)):
         for shape in robot[kind]:
             to_link = np.linalg.inv(T_map_links[shape["link"]])
-            point, ray = (to_link @ np.append(p, 1.0))[:3], to_link[:3, :3] @ (p - origin) / np.linalg.norm(p - origin)
             sizes = {key: value for key, value in shape.items() if key not in ("link", "quat_wxyz")}
             if kind == "boxes":
                 sizes["rotation"] = rotation_of(shape["quat_wxyz"])
-            distances.append(least(lambda t: outside(point + t * ray, **sizes), 0.0, robot["depth_tolerance"]))  # noqa: B023
-    return min(distances) - robot["padding"]
+            shapes.append(lambda p, f=outside, T=to_link, s=sizes: f(T[:3, :3] @ p + T[:3, 3], **s))
+    return shapes
+
+
+def outside_robot(p, origin, robot, T_map_links):
+    """How far a point and what is up to `depth_tolerance` behind it lie outside the padded robot; on it if <= 0."""
+    ray = (p - origin) / np.linalg.norm(p - origin)
+    nearest = [
+        least(lambda t, f=outside: f(p + t * ray), 0.0, robot["depth_tolerance"])
+        for outside in shapes_of(robot, T_map_links)
+    ]
+    return min(nearest) - robot["padding"]
+
+
+def first_hit(origin, ray, robot, T_map_links, reach):
+    """The distance at which a ray enters its first shape from outside, inf for none.
+
+    No shape is nearer than it is far outside, so that steps of that length enter none.
+    """
+    hits = [math.inf]
+    for outside in shapes_of(robot, T_map_links):
+        t, inside = 0.0, outside(origin) <= 0
+        while not inside and t < reach:
+            step = outside(origin + t * ray)
+            if step < 1e-6:
+                hits.append(t)
+                break
+            t += step
+    return min(hits)
 
 
 def measure(points, T_map_sensor, T_map_base, *, noise, limits, exclusion=None, body=None):

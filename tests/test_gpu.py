@@ -7,6 +7,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from tests.helpers import pose, random_poses, small_config
+from tests.robot_body.bodies import random_body
 from torchelev import BodyConfig, ElevationMap, SensorConfig
 from torchelev.ops import operators
 
@@ -52,6 +53,16 @@ def test_host_reads_nothing_back(monkeypatch):
         emap.reset(mask=torch.empty(5, device="meta", dtype=torch.bool))
         emap.reset(torch.empty(3, device="meta", dtype=torch.int64))
         emap.reset()
+
+
+def test_links_are_not_read_back(monkeypatch):
+    forbid_reading(monkeypatch)
+    body = random_body(np.random.default_rng(0))
+    emap = ElevationMap(small_config(sensor=SensorConfig(body=body)), 5, "meta")
+    cloud, T = torch.empty(5, 2, 100, 3, device="meta"), torch.empty(5, 2, 4, 4, device="meta")
+    links = torch.empty(5, len(body.links), 4, 4, device="meta")
+    with OneDevice():
+        emap.update(cloud, T, T[:, 0], 0.1, T_base_links=links)
 
 
 def drive(emap, updates=4, seed=0):

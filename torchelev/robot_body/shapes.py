@@ -78,9 +78,9 @@ class RobotBody:
 
     capsules: tuple[Capsule, ...] = ()  #: such as legs, and feet as spheres
     boxes: tuple[Box, ...] = ()  #: such as the trunk
-    #: [m] by which shapes are larger on all sides: errors of mounting, joint encoders and shapes. Larger removes more
-    #: points at a leg's rim if these errors are larger, and more of the ground around the feet
-    padding: float = 0.005
+    #: [m] by which shapes are larger on all sides: errors of mounting, joint encoders and shapes. Of a robot whose
+    #: errors are larger, more removes points at the legs' rims; it also removes more of the ground at the feet
+    padding: float = 0.003
     #: [m] by which a point may be measured too near: three standard deviations of the depth at the legs' distance, of
     #: the default noise at 0.8 m. Larger removes more of what is between the sensor and a leg, and no ground
     depth_tolerance: float = 0.03
@@ -98,7 +98,7 @@ class RobotBody:
         for name in ("padding", "depth_tolerance"):
             value = getattr(self, name)
             fits = isinstance(value, Real) and not isinstance(value, bool) and 0 <= value < math.inf
-            require(fits, f"body.{name}", "must be finite and not negative", repr(value), "give metres, such as 0.005")
+            require(fits, f"body.{name}", "must be finite and not negative", repr(value), "give metres, such as 0.003")
 
     @property
     def links(self) -> tuple[str, ...]:

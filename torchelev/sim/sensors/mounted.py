@@ -151,6 +151,10 @@ class MountedSensor:
             TypeError: An argument has the wrong dtype.
             ValueError: A shape does not fit, or, on a CPU, a pose is not rigid.
         """
+        hint = "give both, or neither"
+        require(
+            body is not None or T_base_links is None, "T_base_links", "must be left out without body", "poses", hint
+        )
         shape = (len(tile_ids), 4, 4)
         check_pose("T_map_base", T_map_base, shape, field.device, False)
         if T_base_sensor is not None:
