@@ -1,7 +1,9 @@
-"""Recordings in (scans with poses), maps out (export, map_file, grid_map, publish). Plots are in `torchelev.viz`.
+"""Recordings in (scans with poses), robot models in (MJCF, URDF), maps out (export, map_file, grid_map, publish).
+
+Plots are in `torchelev.viz`.
 
 `.bin`, `.npy` and `.npz` files need NumPy only. `.ply`, `.pcd`, depth images and YAML need the packages of
-``torchelev[io]``, which are imported on first use.
+``torchelev[io]``, and robot models need MuJoCo; these are imported on first use.
 """
 
 from torchelev.io.clouds import read_cloud
@@ -11,6 +13,7 @@ from torchelev.io.layout import FileLayout
 from torchelev.io.mapping import MappingRun, base_poses
 from torchelev.io.poses import Poses, read_poses, read_transform
 from torchelev.io.recording import Frame, Recording, open_recording
+from torchelev.io.robot_model import link_poses, read_body
 
 __all__ = [
     "FileLayout",
@@ -21,7 +24,9 @@ __all__ = [
     "Recording",
     "RecordingError",
     "base_poses",
+    "link_poses",
     "open_recording",
+    "read_body",
     "read_cloud",
     "read_depth",
     "read_intrinsics",
