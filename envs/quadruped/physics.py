@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 import envs.offscreen  # noqa: F401  (before MuJoCo)
 from envs.quadruped.config import RandomConfig
+from envs.quadruped.kinematics import FOOT_RADIUS, JOINTS
 from torchelev.errors import require
 from torchelev.sim import TerrainGrid
 
@@ -22,18 +23,12 @@ except ImportError as error:
     raise ImportError("envs.quadruped: needs MuJoCo; install it with pip install 'torchelev[rl]'") from error
 
 ROBOT = Path(__file__).with_name("robot.xml")
-LEGS = ("FL", "FR", "RL", "RR")
-LINKS = ("base", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf")))
-JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("abduction", "thigh", "knee"))
 _DEPTH = 1.0  # [m] of solid ground below the lowest point
 
 
 class Sensed(NamedTuple):
-    """What MuJoCo's sensors measured, all in one instant, in the world's frame."""
+    """What MuJoCo's sensors measured, in the world's frame."""
 
-    link_positions: Tensor  #: (B, 13, 3) [m]
-    link_quaternions: Tensor  #: (B, 13, 4) w x y z
-    feet: Tensor  #: (B, 4, 3) [m] centres of the feet
     foot_velocities: Tensor  #: (B, 4, 3) [m/s] of their centres
     foot_turns: Tensor  #: (B, 4, 3) [rad/s] angular velocities
     foot_forces: Tensor  #: (B, 4) [N]
@@ -48,8 +43,7 @@ class Sensed(NamedTuple):
         return self.foot_velocities + FOOT_RADIUS * torch.stack([-y, x, zero], -1)
 
 
-_SHAPES = ((13, 3), (13, 4), (4, 3), (4, 3), (4, 3), (4,), (12,), (13,))
-FOOT_RADIUS = 0.022  # [m]
+_SHAPES = ((4, 3), (4, 3), (4,), (12,), (13,))
 
 
 class Physics(nn.Module):

@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from envs.quadruped.gait import constants
-
 NUM_POLICY = 50
 
 
@@ -55,22 +53,8 @@ def rotation_matrix(quat_wxyz: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def poses(position: Tensor, quat_wxyz: Tensor) -> Tensor:
-    """Return transforms (..., 4, 4) of positions (..., 3) [m] and unit quaternions (..., 4)."""
-    T = torch.zeros(*position.shape[:-1], 4, 4, dtype=position.dtype, device=position.device)
-    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation_matrix(quat_wxyz), position, 1.0
+def base_poses(position: Tensor, quat_wxyz: Tensor) -> Tensor:
+    """Return transforms (B, 4, 4) of positions (B, 3) [m] and unit quaternions (B, 4)."""
+    T = torch.zeros(len(position), 4, 4, dtype=position.dtype, device=position.device)
+    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = rotation_matrix(quat_wxyz), position, 1.0
     return T
-
-
-def invert(T: Tensor) -> Tensor:
-    """Return the inverses (..., 4, 4) of rigid transforms."""
-    inverse = T.clone()
-    inverse[..., :3, :3] = T[..., :3, :3].mT
-    inverse[..., :3, 3] = -(T[..., :3, :3].mT @ T[..., :3, 3:])[..., 0]
-    return inverse
-
-
-def feet_in_base(feet_from_hips: Tensor) -> Tensor:
-    """Return feet (B, 4, 3) [m] in the base frame, given each from its abduction axis."""
-    hips = constants(feet_from_hips.device)[0]
-    return feet_from_hips + torch.nn.functional.pad(hips, (0, 1))

@@ -6,14 +6,20 @@ Each sight returns the same two observations: "height_scan" (B, 187), the base a
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any, NamedTuple
+
 import torch
 from torch import Tensor, nn
 
 from envs.quadruped.config import QuadrupedConfig
 from envs.quadruped.height_noise import HeightNoise
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan
+from envs.quadruped.kinematics import LINKS
+from envs.quadruped.physics import ROBOT
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, SensorConfig
+from torchelev.io.robot_model import read_body
 from torchelev.observations.patterns import compute_heading
-from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, SensorErrors, mount, preset
+from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, SensorErrorConfig, SensorErrors, mount, preset
 
 NUM_FEET = 4
 
@@ -25,26 +31,27 @@ def make_scans(cfg: QuadrupedConfig) -> tuple[HeightScan, HeightScan]:
     return base, HeightScan.feet(rings=cfg.sight.rings, reach=0.5, clip=1.0, fill=cfg.sight.fill)
 
 
-class View:
-    """The poses from which robots see, for B robots in the frame of their tile.
+class View(NamedTuple):
+    """The poses from which B robots see, in the frame of their tile."""
 
-    Args:
-        T_map_base: True poses (B, 4, 4).
-        T_estimated: Poses that the robots believe in (B, 4, 4).
-        feet: Feet in the base frame (B, 4, 3) [m], from the joint encoders.
-        T_base_links: Poses of the links in the base frame (B, K, 4, 4).
-        tile_ids: (B,).
-    """
-
-    def __init__(
-        self, T_map_base: Tensor, T_estimated: Tensor, feet: Tensor, T_base_links: Tensor, tile_ids: Tensor
-    ) -> None:
-        self.T_map_base, self.T_estimated, self.tile_ids = T_map_base, T_estimated, tile_ids
-        self.feet, self.T_base_links = feet, T_base_links
+    T_map_base: Tensor  #: (B, 4, 4) true poses
+    T_estimated: Tensor  #: (B, 4, 4) poses that the robots believe in
+    T_base_links: Tensor  #: (B, 13, 4, 4) true poses of the links
+    T_base_links_measured: Tensor  #: (B, 13, 4, 4) the same from the joint encoders
+    feet: Tensor  #: (B, 4, 3) [m] base frame, from the joint encoders
+    tile_ids: Tensor  #: (B,)
 
     def feet_in(self, T_map_base: Tensor) -> Tensor:
         """Return the feet (B, 4, 3) [m] in the frame of a pose."""
         return self.feet @ T_map_base[:, :3, :3].mT + T_map_base[:, None, :3, 3]
+
+
+class Seen(NamedTuple):
+    """What S sensors of N rays see."""
+
+    points: Tensor  #: (B, S, N, 3) [m] sensor frame
+    on_body: Tensor  #: (B, S, N) bool, whether a ray hit the robot itself
+    T_map_sensor: Tensor  #: (B, S, 4, 4) estimated poses
 
 
 class BlindSight(nn.Module):
@@ -117,11 +124,17 @@ class MapSight(BlindSight):
         super().__init__(cfg, field, num_envs)
         sight, device = cfg.sight, field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
-        self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs, device)
+        self.body = read_body(ROBOT)
+        self._link_ids = [LINKS.index(link) for link in self.body.links]
+        config = ElevationMapConfig(grid=grid, sensor=SensorConfig(body=self.body))
+        self.emap = ElevationMap(config, num_envs, device)
         if compiled:
             self.emap.compile()
         self.sensors = make_sensors(cfg)
         errors = preset(sight.sensor_errors).sensor
+        assert isinstance(errors, SensorErrorConfig)
+        # A robot looks up joint angles by a scan's stamp: a late scan comes with the links' poses of its own moment.
+        errors = dataclasses.replace(errors, latency=0)
         self.sensor_errors = nn.ModuleList(SensorErrors(errors, num_envs, device) for _ in self.sensors)
 
     def reset(self, mask: Tensor) -> None:
@@ -133,21 +146,26 @@ class MapSight(BlindSight):
 
     def sense(self, view: View, dt: Tensor) -> None:
         """Cast rays from the true poses, and map the points at the estimated ones."""
-        points, T_map_sensor = self.look(view)
-        self.emap.update(points, T_map_sensor, view.T_estimated, dt)
+        seen = self.look(view)
+        links = view.T_base_links_measured[:, self._link_ids]
+        self.emap.update(seen.points, seen.T_map_sensor, view.T_estimated, dt, T_base_links=links)
 
-    def look(self, view: View) -> tuple[Tensor, Tensor]:
-        """Return the points of the S sensors (B, S, N, 3), sensor frame, and their estimated poses (B, S, 4, 4)."""
+    def look(self, view: View) -> Seen:
+        """Return what the S sensors see, with their errors."""
         clouds: list[Tensor] = []
+        masks: list[Tensor] = []
         poses: list[Tensor] = []
+        links = view.T_base_links[:, self._link_ids]
         for sensor, errors in zip(self.sensors, self.sensor_errors, strict=True):
             assert isinstance(errors, SensorErrors)
             mounting = sensor.T_base_sensor.to(self.field.device) @ errors.mounting().to(sensor.T_base_sensor.dtype)
-            points = sensor(self.field, view.tile_ids, view.T_map_base, T_base_sensor=mounting)
-            cloud = errors(points, sensor.T_map_sensor(view.T_estimated), image_shape=self._image_shape())
+            at: dict[str, Any] = {"T_base_sensor": mounting, "body": self.body, "T_base_links": links}
+            ideal = sensor.view(self.field, view.tile_ids, view.T_map_base, **at)
+            cloud = errors(ideal.points, sensor.T_map_sensor(view.T_estimated), image_shape=self._image_shape())
             clouds.append(cloud.points)
+            masks.append(ideal.on_body)
             poses.append(cloud.T_map_sensor)
-        return torch.stack(clouds, 1), torch.stack(poses, 1)
+        return Seen(torch.stack(clouds, 1), torch.stack(masks, 1), torch.stack(poses, 1))
 
     def _image_shape(self) -> tuple[int, int] | None:
         width, height = self.cfg.sight.camera_pixels

@@ -13,17 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from envs.quadruped.config import PERCEPTION, QuadrupedConfig
-from envs.quadruped.gait import feet_from_joints, foot_positions, joint_angles
+from envs.quadruped.gait import foot_positions
+from envs.quadruped.kinematics import feet_in_base, joint_angles, link_poses
 from envs.quadruped.odometry import LegOdometry
 from envs.quadruped.physics import Physics, Sensed
-from envs.quadruped.proprioception import (
-    feet_in_base,
-    invert,
-    observe_body,
-    observe_privileged,
-    poses,
-    rotation_matrix,
-)
+from envs.quadruped.proprioception import base_poses, observe_body, observe_privileged, rotation_matrix
 from envs.quadruped.rewards import Motion, reward
 from envs.quadruped.sight import SIGHTS, TruthSight, View
 from torchelev.errors import require
@@ -153,7 +147,8 @@ class Quadruped(nn.Module):
     @property
     def T_map_base(self) -> Tensor:
         """True poses of the robots (B, 4, 4) in the frame of their tile."""
-        return self._to_tile(poses(self._qpos[:, :3], self._qpos[:, 3:7]))
+        position = self._qpos[:, :3] - torch.nn.functional.pad(self.origins[self.tile_ids], (0, 1))
+        return base_poses(position, self._qpos[:, 3:7])
 
     @property
     def max_episode_length(self) -> int:
@@ -184,12 +179,6 @@ class Quadruped(nn.Module):
     def _floats(self, values: Tensor) -> Tensor:
         """Return values of the physics as float32 on the device."""
         return values.to(self.device, torch.float32)
-
-    def _to_tile(self, T: Tensor) -> Tensor:
-        """Move poses (B, ..., 4, 4) from the world's frame to that of the robots' tiles."""
-        T = T.clone()
-        T[..., :2, 3] -= self.origins[self.tile_ids].view(-1, *[1] * (T.ndim - 3), 2)
-        return T
 
     # Steps --------------------------------------------------------------------------------------------------------
 
@@ -364,12 +353,15 @@ class Quadruped(nn.Module):
 
     def view(self) -> View:
         """Return the poses from which the robots see now."""
-        sensed = Sensed(*(self._floats(value) for value in self.physics.sensed()))
-        T_map_links = self._to_tile(poses(sensed.link_positions, sensed.link_quaternions))
-        T_map_base = T_map_links[:, 0]
-        T_base_links = invert(T_map_base)[:, None] @ T_map_links
-        feet = feet_in_base(feet_from_joints(self._joints()))
-        return View(T_map_base, self.odometry.estimate(T_map_base), feet, T_base_links, self.tile_ids)
+        T_map_base, joints = self.T_map_base, self._joints()
+        return View(
+            T_map_base=T_map_base,
+            T_estimated=self.odometry.estimate(T_map_base),
+            T_base_links=link_poses(self._qpos[:, 7:]),
+            T_base_links_measured=link_poses(joints),
+            feet=feet_in_base(joints),
+            tile_ids=self.tile_ids,
+        )
 
     def _joints(self) -> Tensor:
         """Return what the joint encoders read (B, 12) [rad]."""

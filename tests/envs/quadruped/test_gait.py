@@ -1,45 +1,11 @@
-"""The trot and its inverse kinematics."""
+"""The trot."""
 
-import mujoco
-import numpy as np
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from envs.quadruped.config import GaitConfig
-from envs.quadruped.gait import feet_from_joints, foot_positions, joint_angles
-from envs.quadruped.physics import ROBOT
-from envs.quadruped.proprioception import feet_in_base
+from envs.quadruped.gait import foot_positions
 
 GAIT = GaitConfig()
-
-
-def angles(seed, count=16):
-    """Draw joint angles with feet well below the hips."""
-    u = torch.rand(count, 4, 3, generator=torch.Generator().manual_seed(seed))
-    low, high = torch.tensor([-0.5, -0.1, -1.9]), torch.tensor([0.5, 1.2, -0.8])
-    return (low + (high - low) * u).flatten(1)
-
-
-@given(st.integers(0, 1000))
-def test_the_inverse_kinematics_inverts_the_forward_one(seed):
-    q = angles(seed)
-    torch.testing.assert_close(joint_angles(feet_from_joints(q)), q, atol=1e-4, rtol=0)
-
-
-def test_the_forward_kinematics_is_that_of_the_model():
-    model = mujoco.MjModel.from_xml_path(str(ROBOT))
-    data = mujoco.MjData(model)
-    q = angles(0, 1)
-    data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q[0].tolist()]
-    mujoco.mj_forward(model, data)
-    feet = np.stack([data.site(f"{leg}_foot").xpos for leg in ("FL", "FR", "RL", "RR")])
-    np.testing.assert_allclose(feet_in_base(feet_from_joints(q))[0].numpy(), feet, atol=1e-5)
-
-
-def test_a_foot_out_of_reach_gives_finite_angles():
-    feet = torch.tensor([[0.0, 0.08, -2.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.08, 0.5]])[None]
-    assert joint_angles(feet).isfinite().all()
 
 
 def test_standing_feet_move_backwards_at_the_commanded_speed():

@@ -90,7 +90,7 @@ def test_the_map_is_updated_at_every_fourth_step():
     task = Quadruped(CFG, 1, perception="map")
     counts = []
     update = task.sight.emap.update
-    task.sight.emap.update = lambda *args: (counts.append(float(args[3])), update(*args))
+    task.sight.emap.update = lambda *args, **links: (counts.append(float(args[3])), update(*args, **links))
     run(task, 9)
     assert len(counts) == 2 and counts == pytest.approx([0.08, 0.08]), "the first one came with the reset"
 

@@ -1,0 +1,54 @@
+"""Forward and inverse kinematics of the legs, against MuJoCo's."""
+
+import mujoco
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envs.quadruped.kinematics import LEGS, LINKS, feet_from_joints, feet_in_base, joint_angles, link_poses
+from envs.quadruped.physics import ROBOT
+
+
+def posed(q):
+    """Return MuJoCo's data of the robot at the origin with joint angles (12,)."""
+    model = mujoco.MjModel.from_xml_path(str(ROBOT))
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q.tolist()]
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def angles(seed, count=16):
+    """Draw joint angles with feet well below the hips."""
+    u = torch.rand(count, 4, 3, generator=torch.Generator().manual_seed(seed))
+    low, high = torch.tensor([-0.5, -0.1, -1.9]), torch.tensor([0.5, 1.2, -0.8])
+    return (low + (high - low) * u).flatten(1)
+
+
+@given(st.integers(0, 1000))
+def test_the_inverse_kinematics_inverts_the_forward_one(seed):
+    q = angles(seed)
+    torch.testing.assert_close(joint_angles(feet_from_joints(q)), q, atol=1e-4, rtol=0)
+
+
+def test_the_forward_kinematics_is_that_of_the_model():
+    q = angles(0, 1)
+    data = posed(q[0])
+    feet = np.stack([data.site(f"{leg}_foot").xpos for leg in LEGS])
+    np.testing.assert_allclose(feet_in_base(q)[0].numpy(), feet, atol=1e-5)
+
+
+def test_link_poses_are_those_of_the_model():
+    q = angles(1, 2)
+    found = link_poses(q)
+    for k in range(2):
+        data = posed(q[k])
+        for link, T in zip(LINKS, found[k].numpy(), strict=True):
+            np.testing.assert_allclose(T[:3, 3], data.body(link).xpos, atol=1e-5, err_msg=link)
+            np.testing.assert_allclose(T[:3, :3].ravel(), data.body(link).xmat, atol=1e-5, err_msg=link)
+
+
+def test_a_foot_out_of_reach_gives_finite_angles():
+    feet = torch.tensor([[0.0, 0.08, -2.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.08, 0.5]])[None]
+    assert joint_angles(feet).isfinite().all()
