@@ -2,7 +2,9 @@
 
     python -m benchmarks.self_filter
 
-Speed: updates of 256 maps of 64 x 64 cells without a body, with one box, and with the 17 shapes of 13 links, in turn.
+Walking: the quadruped of envs/ trots over rough ground; how many of the points on it are removed, and how many ground
+points near its feet are lost. Speed: updates of 256 maps of 64 x 64 cells without a body, with one box, and with the 17
+shapes of 13 links, in turn.
 
 Writes benchmarks/results/self_filter.json section by section; sections that are not measured keep their results.
 """
@@ -17,10 +19,10 @@ from typing import Any
 import click
 
 from benchmarks import RESULTS
-from benchmarks.self_filter import speed
+from benchmarks.self_filter import speed, walking
 from torchelev.app.results import commit, markdown_table, write_json
 
-SECTIONS: dict[str, Callable[[float], dict[str, Any]]] = {"speed": speed.measure}
+SECTIONS: dict[str, Callable[[float], dict[str, Any]]] = {"speed": speed.measure, "walking": walking.measure}
 
 
 def tables(result: dict[str, Any]) -> str:
@@ -32,11 +34,13 @@ def tables(result: dict[str, Any]) -> str:
             for name, row in result["speed"]["rows"].items()
         ]
         parts.append(markdown_table([f"{result['speed']['robots']} robots", "median ms", "min ms", "extra"], rows))
+    if "walking" in result:
+        parts.append(walking.table(result["walking"]))
     return "\n\n".join(parts)
 
 
 @click.command(help=__doc__)
-@click.option("--seconds", default=10.0, show_default=True, help="Time per row of the speed [s].")
+@click.option("--seconds", default=10.0, show_default=True, help="Time per row [s].")
 @click.option("--only", type=click.Choice(list(SECTIONS)), help="Measure only this section.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
 def main(seconds: float, only: str | None, out: Path) -> None:

@@ -114,6 +114,8 @@ class SightConfig:
     camera_pitch_deg: float = 45.0  #: [deg] by which the cameras look down
     max_range: float = 3.0  #: [m]
     sensor_errors: str = "depth_camera"  #: preset of torchelev.sim
+    #: [m], [deg] standard deviations of the cameras' place on the robot, as a calibration against the legs leaves them
+    mounting_error: tuple[float, float] = (0.001, 0.1)
     resolution: float = 0.05  #: [m] of the map
     window: float = 2.8  #: [m] side of the map
     map_every: int = 4  #: policy steps between two updates of the map: 12.5 Hz

@@ -22,6 +22,7 @@ from torchelev.observations.patterns import compute_heading
 from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, SensorErrorConfig, SensorErrors, mount, preset
 
 NUM_FEET = 4
+_CAMERA_WIDTH = 848  # pixels of the camera that the preset "depth_camera" imitates
 
 
 def make_scans(cfg: QuadrupedConfig) -> tuple[HeightScan, HeightScan]:
@@ -50,6 +51,7 @@ class Seen(NamedTuple):
     """What S sensors of N rays see."""
 
     points: Tensor  #: (B, S, N, 3) [m] sensor frame
+    ideal: Tensor  #: (B, S, N, 3) [m] the same without errors
     on_body: Tensor  #: (B, S, N) bool, whether a ray hit the robot itself
     T_map_sensor: Tensor  #: (B, S, 4, 4) estimated poses
 
@@ -125,16 +127,13 @@ class MapSight(BlindSight):
         sight, device = cfg.sight, field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
         self.body = read_body(ROBOT)
-        self._link_ids = [LINKS.index(link) for link in self.body.links]
+        self.link_ids = [LINKS.index(link) for link in self.body.links]
         config = ElevationMapConfig(grid=grid, sensor=SensorConfig(body=self.body))
         self.emap = ElevationMap(config, num_envs, device)
         if compiled:
             self.emap.compile()
         self.sensors = make_sensors(cfg)
-        errors = preset(sight.sensor_errors).sensor
-        assert isinstance(errors, SensorErrorConfig)
-        # A robot looks up joint angles by a scan's stamp: a late scan comes with the links' poses of its own moment.
-        errors = dataclasses.replace(errors, latency=0)
+        errors = sensor_errors(cfg)
         self.sensor_errors = nn.ModuleList(SensorErrors(errors, num_envs, device) for _ in self.sensors)
 
     def reset(self, mask: Tensor) -> None:
@@ -147,25 +146,21 @@ class MapSight(BlindSight):
     def sense(self, view: View, dt: Tensor) -> None:
         """Cast rays from the true poses, and map the points at the estimated ones."""
         seen = self.look(view)
-        links = view.T_base_links_measured[:, self._link_ids]
+        links = view.T_base_links_measured[:, self.link_ids]
         self.emap.update(seen.points, seen.T_map_sensor, view.T_estimated, dt, T_base_links=links)
 
     def look(self, view: View) -> Seen:
         """Return what the S sensors see, with their errors."""
-        clouds: list[Tensor] = []
-        masks: list[Tensor] = []
-        poses: list[Tensor] = []
-        links = view.T_base_links[:, self._link_ids]
+        parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        links = view.T_base_links[:, self.link_ids]
         for sensor, errors in zip(self.sensors, self.sensor_errors, strict=True):
             assert isinstance(errors, SensorErrors)
             mounting = sensor.T_base_sensor.to(self.field.device) @ errors.mounting().to(sensor.T_base_sensor.dtype)
             at: dict[str, Any] = {"T_base_sensor": mounting, "body": self.body, "T_base_links": links}
             ideal = sensor.view(self.field, view.tile_ids, view.T_map_base, **at)
             cloud = errors(ideal.points, sensor.T_map_sensor(view.T_estimated), image_shape=self._image_shape())
-            clouds.append(cloud.points)
-            masks.append(ideal.on_body)
-            poses.append(cloud.T_map_sensor)
-        return Seen(torch.stack(clouds, 1), torch.stack(masks, 1), torch.stack(poses, 1))
+            parts.append((cloud.points, ideal.points, ideal.on_body, cloud.T_map_sensor))
+        return Seen(*(torch.stack(part, 1) for part in zip(*parts, strict=True)))
 
     def _image_shape(self) -> tuple[int, int] | None:
         width, height = self.cfg.sight.camera_pixels
@@ -189,6 +184,27 @@ def make_sensors(cfg: QuadrupedConfig) -> list[MountedSensor]:
     places = ((0.2, 0.0), (-0.2, 180.0))
     mountings = [mount(sight.camera_pitch_deg, x, 0.04, yaw_deg=yaw_deg).float() for x, yaw_deg in places]
     return [MountedSensor(camera, T, min_range=0.05) for T in mountings]
+
+
+def sensor_errors(cfg: QuadrupedConfig) -> SensorErrorConfig:
+    """Return the preset's errors for images of few pixels, picked from those of a whole camera.
+
+    A pixel that straddles an edge measures a depth between its two sides. Of picked pixels, few do: as many fewer as
+    there are fewer pixels. Latency is left out: a robot looks up its joint angles by the stamp of a scan, so that a
+    late scan comes with the poses of its own moment.
+    """
+    errors = preset(cfg.sight.sensor_errors).sensor
+    assert isinstance(errors, SensorErrorConfig)
+    flying = errors.flying if isinstance(errors.flying, tuple) else (errors.flying, errors.flying)
+    picked = cfg.sight.camera_pixels[0] / _CAMERA_WIDTH
+    position, rotation_deg = cfg.sight.mounting_error
+    return dataclasses.replace(
+        errors,
+        latency=0,
+        flying=(flying[0] * picked, flying[1] * picked),
+        mounting_position=position,
+        mounting_rotation_deg=rotation_deg,
+    )
 
 
 SIGHTS: dict[str, type[BlindSight]] = {"map": MapSight, "truth": TruthSight, "blind": BlindSight}
