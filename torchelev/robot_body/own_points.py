@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.ops.storage import stored
 from torchelev.robot_body.posing import PosedBody, dot
 from torchelev.robot_body.shapes import RobotBody
 
@@ -32,16 +33,21 @@ def find_own_points(
 
     The least excess decides, which is at most 0 where a shape is met: compiled code is slow at joining masks.
     """
-    distance = squared.detach().clamp(min=_TINY).sqrt()
-    inverse = 1 / distance
-    direction = [c.detach() * inverse for c in (x, y, z)]
-    pieces = _Pieces(direction, distance, distance + body.depth_tolerance)
-    least = torch.full_like(distance, torch.inf)
+    pieces = _pieces_behind(x.detach(), y.detach(), z.detach(), squared.detach(), body.depth_tolerance)
+    least = torch.full_like(pieces.near, torch.inf)
     for k in range(len(body.capsules)):
         least = torch.minimum(least, _excess_of_capsule(pieces, posed, body, k))
     for k in range(len(body.boxes)):
         least = torch.minimum(least, _excess_of_box(pieces, posed, body, k))
     return least <= 0
+
+
+@stored
+def _pieces_behind(x: Tensor, y: Tensor, z: Tensor, squared: Tensor, length: float) -> _Pieces:
+    """Return the pieces of these points' rays that begin at the points, which lie at these squared distances."""
+    distance = squared.clamp(min=_TINY).sqrt()
+    inverse = 1 / distance
+    return _Pieces([x * inverse, y * inverse, z * inverse], distance, distance + length)
 
 
 def _excess_of_capsule(pieces: _Pieces, posed: PosedBody, body: RobotBody, k: int) -> Float[Tensor, "B S N"]:
@@ -53,13 +59,16 @@ def _excess_of_capsule(pieces: _Pieces, posed: PosedBody, body: RobotBody, k: in
     capsule = body.capsules[k]
     start, axis = (value[..., k, None] for value in (posed.start, posed.axis))
     start_start, start_axis = posed.start_start[..., k, None], posed.start_axis[..., k, None]
-    squared, radius = capsule.length**2, capsule.radius + body.padding
+    squared, limit = capsule.length**2, (capsule.radius + body.padding) ** 2
     on_start, on_axis = dot(pieces.direction, start), dot(pieces.direction, axis)
+    if not capsule.length:
+        t = torch.minimum(torch.maximum(on_start, pieces.near), pieces.far)
+        return t * (t - 2 * on_start) + start_start - limit
     v = ((on_start * on_axis - start_axis) / (squared - on_axis * on_axis).clamp(min=_TINY)).clamp(0, 1)
     t = torch.minimum(torch.maximum(on_start + v * on_axis, pieces.near), pieces.far)
-    v = ((t * on_axis - start_axis) * (1 / max(squared, _TINY))).clamp(0, 1)
+    v = ((t * on_axis - start_axis) / squared).clamp(0, 1)
     distance2 = t * (t - 2 * (on_start + v * on_axis)) + start_start + v * (2 * start_axis + v * squared)
-    return distance2 - radius**2
+    return distance2 - limit
 
 
 def _excess_of_box(pieces: _Pieces, posed: PosedBody, body: RobotBody, k: int) -> Float[Tensor, "B S N"]:
