@@ -18,6 +18,7 @@ import benchmarks
 import training
 from benchmarks.quality import mjlab_task
 from benchmarks.quality.changes import report as changes
+from benchmarks.self_filter import walking
 from benchmarks.speed import encoders, growth, head, long_run, loop, postprocessing, sight
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
@@ -102,6 +103,11 @@ def _mjlab() -> str:
     return mjlab_task.table(load("mjlab"))
 
 
+def _self_filter_walking() -> str:
+    """Tabulate what the self-filter removes while a quadruped walks."""
+    return walking.table(load("self_filter")["walking"])
+
+
 def _head() -> str:
     """Tabulate what the traversability heads cost."""
     return head.table(load("head")["rows"])
@@ -157,6 +163,7 @@ TABLES = {
     "encoder_cost": _encoder_cost,
     "sight": _sight,
     "mjlab": _mjlab,
+    "self_filter_walking": _self_filter_walking,
     "postprocessing": _postprocessing,
     "occlusion": _occlusion,
     "traversability": _traversability,
@@ -194,6 +201,7 @@ PAGES = {
     ROOT / "docs/benchmarks.md": "../",
     HOWTO / "on_a_robot.md": "../../",
     HOWTO / "mjlab.md": "../../",
+    HOWTO / "legs.md": "../../",
     HOWTO / "encoders.md": "../../",
 }
 
