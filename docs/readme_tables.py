@@ -22,7 +22,7 @@ from benchmarks.self_filter import walking
 from benchmarks.speed import encoders, growth, head, long_run, loop, postprocessing, sight
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
-from training.nav import encoder_experiment, experiment
+from training.nav import experiment
 from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
@@ -124,11 +124,6 @@ def _nav() -> str:
     return experiment.table(load("nav", training.RESULTS))
 
 
-def _encoders() -> str:
-    """Tabulate the success of policies by the encoder of their map."""
-    return encoder_experiment.table(load("encoders", training.RESULTS))
-
-
 def _encoder_cost() -> str:
     """Tabulate what encoders of the map cost."""
     return encoders.table(load("encoders")["rows"])
@@ -159,7 +154,6 @@ TABLES = {
     "loop": _loop,
     "long_run": _long_run,
     "nav": _nav,
-    "encoders": _encoders,
     "encoder_cost": _encoder_cost,
     "sight": _sight,
     "mjlab": _mjlab,

@@ -1,16 +1,8 @@
 """Give rsl-rl's policies an attention encoder of the map, by the `class_name` of a model's configuration.
 
-For a height scan of 187 points::
-
-    "obs_groups": {"actor": ["policy", "height_scan"], "critic": ["policy", "height_scan"]},
-    "actor": {
-        "class_name": "torchelev.encoders.rsl_rl:AttentionModel",
-        "hidden_dims": [128, 64],
-        "activation": "elu",
-        "obs_normalization": True,
-        "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0},
-        "attention_cfg": {"height_scan": {"points": "isaac_lab", "grid": [11, 17], "kernel_size": 5}},
-    },
+In rsl-rl's configuration of an actor or critic, set `class_name` to "torchelev.encoders.rsl_rl:AttentionModel" and say
+in `attention_cfg` how each observation of the map is laid out, such as `{"height_scan": {"points": "isaac_lab"}}`. The
+page "MLP, CNN, attention" of the documentation has the whole configuration.
 """
 
 from __future__ import annotations

@@ -59,17 +59,14 @@ def deploy_all(runs: Path) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Tabulate success and time by encoder: the mean over the seeds, and the lowest and highest success."""
-    head = ["encoder", "success on held-out ground", "fallen", "stuck", "out of time", "steps / s", "minutes"]
+    """Tabulate the endings by encoder: the mean over the seeds, and the lowest and highest success."""
+    head = ["encoder", "success on held-out ground", "fallen", "stuck", "out of time"]
     lines = []
     for encoder in ENCODERS:
         rows = [row for row in result["rows"] if row["encoder"] == encoder]
         endings = [mean([row["deployed"][name] for row in rows]) for name in ("fallen", "stuck", "truncated")]
-        rate = mean([row["training"]["steps"] / row["training"]["seconds"] for row in rows])
-        minutes = mean([row["training"]["seconds"] / 60 for row in rows])
         success = spread([row["deployed"]["success"] for row in rows])
-        percentages = [f"{100 * fraction:.0f} %" for fraction in endings]
-        lines.append([NAMES[encoder], success, *percentages, f"{rate:,.0f}", f"{minutes:.1f}"])
+        lines.append([NAMES[encoder], success, *(f"{100 * fraction:.0f} %" for fraction in endings)])
     return markdown_table(head, lines)
 
 
