@@ -32,9 +32,8 @@ def compiled_update(
         update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
     inputs = [None if value is None else packed(value) for value in (points, *others)]
-    points, _, _, _, variance, _ = inputs
-    assert points is not None
-    mark_dynamic(2, points, variance)
+    _, _, _, _, variance, _ = inputs
+    mark_dynamic(2, inputs[0], variance)
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     with announced_compilation():
         graphs = graphs_of(cfg, kinds, points.shape[1])
@@ -102,7 +101,7 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
     """Return what compiles and keeps the updates of one kind of inputs, for any number of environments."""
 
     def first(stored: MapState, points: Tensor, *others: Any) -> Measurement:
-        m = measure(points, *others, cfg.grid, cfg.sensor, stored.elevation.dtype)
+        m = measure(points, *others, cfg.grid, cfg.sensor, stored.elevation.dtype)  # type: ignore[call-arg]
         state = with_masks(stored, as_mask)
         write_changes(stored, state, move_window(state, m, cfg))
         return with_masks(m, as_bytes)

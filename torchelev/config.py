@@ -124,7 +124,8 @@ def _convert(hint: Any, value: object, where: str) -> Any:
     element = next(iter(typing.get_args(kind)), None)
     if dataclasses.is_dataclass(element):
         require(isinstance(value, list | tuple), where, "must be a list", type(value).__name__, "begin lines with -")
-        return tuple(_build(typing.cast(type, element), v, f"{where}[{k}]") for k, v in enumerate(value))  # type: ignore[arg-type]
+        items = enumerate(typing.cast(list, value))
+        return tuple(_build(typing.cast(type, element), item, f"{where}[{k}]") for k, item in items)
     if isinstance(value, list):
         return tuple(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)

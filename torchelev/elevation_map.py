@@ -159,8 +159,8 @@ class ElevationMap(ReadableMap):
 
     def _check_inputs(self, *inputs: Any) -> Inputs:
         elevation = self.elevation
-        of_map = (self.num_envs, elevation.device, elevation.dtype, self._links)
-        return check_inputs(*inputs, *of_map, self.check_values)
+        of_map = (self.num_envs, elevation.device, elevation.dtype, self._links, self.check_values)
+        return check_inputs(*inputs, *of_map)  # type: ignore[call-arg]
 
     @property
     def chunks(self) -> list[slice]:

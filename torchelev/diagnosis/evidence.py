@@ -113,7 +113,10 @@ def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[
 def _measure_again(cfg: ElevationMapConfig, update: PastUpdate, env: int) -> Measurement:
     """Return one environment's measurement of an update's thinned points."""
     inputs = [None if value is None else value[env, None] for value in update.inputs]
-    return measure(*inputs, cfg.grid, cfg.sensor, torch.float32)  # type: ignore[arg-type]
+    points, T_map_sensor, T_map_base, dt, variance, T_base_links = inputs
+    assert points is not None and T_map_sensor is not None and dt is not None
+    poses = (T_map_sensor, T_map_base, dt, variance, T_base_links)
+    return measure(points, *poses, cfg.grid, cfg.sensor, torch.float32)
 
 
 def _count_near(cfg: ElevationMapConfig, state: MapState, update: PastUpdate, env: int) -> int:

@@ -45,7 +45,9 @@ def read_body(source: Any, links: Iterable[str] | None = None, **options: float)
     model = _load(source)
     names = [model.body(k).name for k in range(model.nbody)]
     wanted = None if links is None else _check_links(links, names)
-    capsules, boxes, found = [], [], set()
+    capsules: list[Capsule] = []
+    boxes: list[Box] = []
+    found: set[str] = set()
     for geom in _collision_geoms(model):
         body, link = int(model.geom_bodyid[geom]), _link_of(model, int(model.geom_bodyid[geom]))
         if wanted is not None and not wanted & {names[body], names[link]}:
@@ -54,7 +56,10 @@ def read_body(source: Any, links: Iterable[str] | None = None, **options: float)
         hint = "give its body a name in the model"
         require(names[link] != "", "source", "must name the bodies of its shapes", f"body {link} without a name", hint)
         shape = _shape(model, geom, names[link], _pose_in_link(model, geom, link))
-        (capsules if isinstance(shape, Capsule) else boxes).append(shape)
+        if isinstance(shape, Capsule):
+            capsules.append(shape)
+        else:
+            boxes.append(shape)
     without = sorted((wanted or set()) - found)
     hint = "leave them out: they take no room that the model knows of"
     require(not without, "links", "must have collision shapes", f"none of {', '.join(without)}", hint)
@@ -182,6 +187,7 @@ def _box(link: str, T_link_geom: NDArray[np.float64], center: NDArray, half_leng
 
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, T_link_geom[:3, :3].ravel())
+    w, x, y, z = quat.tolist()
     position = tuple((T_link_geom @ [*center, 1.0])[:3])
     half_lengths = np.maximum(half_lengths, 1e-4)  # of a flat mesh, one is zero
-    return Box(link=link, center=position, half_lengths=tuple(half_lengths), quat_wxyz=tuple(quat))
+    return Box(link=link, center=position, half_lengths=tuple(half_lengths), quat_wxyz=(w, x, y, z))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -79,9 +79,7 @@ def _excess_of_box(pieces: _Pieces, posed: PosedBody, body: RobotBody, k: int) -
     return torch.maximum(enter, pieces.near) - torch.minimum(leave, pieces.far)
 
 
-def cross_slabs(
-    direction: Sequence[Tensor], origin: Sequence[Tensor], half: Sequence[float] | Sequence[Tensor]
-) -> tuple[Tensor, Tensor]:
+def cross_slabs(direction: Sequence[Tensor], origin: Sequence[Tensor], half: Sequence[Any]) -> tuple[Tensor, Tensor]:
     """Return where rays enter and leave a box [m], in its axes; rays that miss it leave before they enter.
 
     Along an axis, with the origin x, the direction d and the half length h, the ray is between the two faces from

@@ -97,7 +97,7 @@ class RobotBody:
         require(has_shapes, "body", "must have a capsule or a box", "none", "give shapes, or body=None for no body")
         for name in ("padding", "depth_tolerance"):
             value = getattr(self, name)
-            fits = isinstance(value, Real) and not isinstance(value, bool) and 0 <= value < math.inf
+            fits = isinstance(value, Real) and not isinstance(value, bool) and 0 <= float(value) < math.inf
             require(fits, f"body.{name}", "must be finite and not negative", repr(value), "give metres, such as 0.003")
 
     @property
@@ -106,4 +106,5 @@ class RobotBody:
 
         Capsules come before boxes.
         """
-        return tuple(dict.fromkeys(shape.link for shape in (*self.capsules, *self.boxes)))
+        shapes: tuple[Capsule | Box, ...] = (*self.capsules, *self.boxes)
+        return tuple(dict.fromkeys(shape.link for shape in shapes))
