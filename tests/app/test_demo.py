@@ -1,5 +1,6 @@
 """The demo runs, writes its picture and says how good the map is."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -7,7 +8,8 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("tqdm")
 
 from torchelev.app import demo
-from torchelev.app.demo_course import make_course
+from torchelev.app.demo_course import LANDMARKS, ROUTE, make_course
+from torchelev.viz import style
 
 
 @pytest.fixture(autouse=True)
@@ -31,6 +33,31 @@ def test_result_is_that_of_a_map_of_the_course(tmp_path):
     assert result.updates == round(2 / demo.DT)
     # Few pixels, one in a hundred wrong, a person in view: the map can only be roughly right so early.
     assert result.p95 < 0.15 and result.coverage > 0.95
+
+
+@pytest.mark.slow(2)
+def test_labels_touch_neither_the_path_nor_each_other(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(style, "write", lambda figure, path: figures.append(figure))
+    demo.run_demo(tmp_path / "a.png", seconds=0.4, progress=False)
+    ax = figures[0].axes[0]
+    figures[0].canvas.draw()
+    boxes = [text.get_bbox_patch().get_window_extent() for text in ax.texts]
+    assert len(boxes) == len(LANDMARKS)
+    assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+    corners = np.array(ROUTE)
+    fraction = np.linspace(0, 1, 200)[:, None]
+    path = np.concatenate([a + fraction * (b - a) for a, b in zip(corners[:-1], corners[1:], strict=True)])
+    pixels, line = ax.transData.transform(path), 2.4 / 72 * figures[0].dpi
+    assert not any(box.padded(line / 2).contains(x, y) for box in boxes for x, y in pixels)
+
+
+@pytest.mark.slow(2)
+def test_an_svg_is_small_and_always_the_same(tmp_path):
+    for name in ("a.svg", "b.svg"):
+        demo.run_demo(tmp_path / name, seconds=1, progress=False)
+    first, second = ((tmp_path / name).read_bytes() for name in ("a.svg", "b.svg"))
+    assert first == second and first.count(b"<svg") == 1 and len(first) < style.MAX_BYTES
 
 
 def test_finds_the_cells_at_steps():

@@ -1,6 +1,8 @@
 """The style: files come out in both formats, colours stay apart, the caller's settings stay."""
 
+import base64
 import io
+import re
 
 import matplotlib
 import numpy as np
@@ -10,6 +12,7 @@ from PIL import Image
 
 from torchelev.viz import style
 
+IMAGE = re.compile(rb'base64,([^"]+)"')
 RED, GREEN, BLUE = 0.2126, 0.7152, 0.0722  # of the luminance
 
 
@@ -29,6 +32,25 @@ def test_a_figure_is_saved_as_png_and_svg_and_always_the_same(tmp_path):
     assert (tmp_path / "a.svg").read_text().count("<svg") == 1
     for suffix in (".png", ".svg"):
         assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+
+
+def test_a_noisy_svg_stays_small_and_keeps_its_colours(tmp_path):
+    figure = style.make_figure(4, 3)
+    noise = np.random.default_rng(0).uniform(0, 1, (300, 240))
+    noise[:30] = np.nan
+    style.draw_cells(figure.subplots(), noise, (0, 2, 0, 1), style.HEIGHTS)
+    style.write(figure, tmp_path / "noise.svg")
+    text, raw = (tmp_path / "noise.svg").read_bytes(), io.BytesIO()
+    figure.savefig(raw, format="svg", dpi=100, bbox_inches="tight", pad_inches=0.1)
+    small, large = (Image.open(io.BytesIO(base64.b64decode(IMAGE.search(svg)[1]))) for svg in (text, raw.getvalue()))
+    assert small.mode == "P" and len(text) < 0.6 * len(raw.getvalue())
+    assert (np.asarray(small.convert("RGBA")) == np.asarray(large)).all()
+
+
+def test_other_endings_choose_their_format(tmp_path):
+    for name, start in (("a", b"\x89PNG"), ("a.jpg", b"\xff\xd8"), ("a.pdf", b"%PDF")):
+        style.write(draw(np.ones((2, 1))), tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(start)
 
 
 def test_settings_hold_within_the_context_alone():

@@ -18,10 +18,12 @@ from torchelev.app.demo_course import LANDMARKS, ROUTE, make_course
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.grid import GridConfig
-from torchelev.output_files import atomic_file, require_writable
+from torchelev.output_files import require_writable
 from torchelev.sim import DepthCamera, Scene, Trajectory, mount, outliers, range_noise, walk
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from torchelev.viz.plot import Panel
 
 SPEED, DT = 0.8, 0.2  # [m/s], [s]
@@ -159,22 +161,21 @@ def find_steps(scene: Scene, xy: Tensor, t: float) -> Tensor:
 def _draw(out: str | Path, emap: ElevationMap, scene: Scene, path_xy: Tensor, t: float, result: DemoResult) -> None:
     """Write the picture: ground truth, elevation, error, deviation, traversability and upper bound."""
     from torchelev.viz.plot import draw_layers
-    from torchelev.viz.style import small_png
+    from torchelev.viz.style import write
 
     xy = emap.cell_centers()[0]
     low, high = xy[0, 0] - GRID.resolution / 2, xy[-1, -1] + GRID.resolution / 2
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     title = f"A simulated walk: {result.updates} scans in one map\n{result.accuracy}"
     figure = draw_layers(_make_panels(emap, scene.truth(xy, t)), extent=extent, path_xy=path_xy.numpy(), title=title)
+    _label_landmarks(figure.axes[0])
+    write(figure, out)
+
+
+def _label_landmarks(ax: Axes) -> None:
     box = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
     for name, x, y in LANDMARKS:
-        figure.axes[0].text(x, y, name, color="white", fontsize=8, ha="center", va="center", bbox=box)
-    suffix = Path(out).suffix.removeprefix(".") or "png"
-    with atomic_file(out) as file:
-        if suffix == "png":
-            file.write(small_png(figure))
-        else:
-            figure.savefig(file, format=suffix, bbox_inches="tight", pad_inches=0.1)
+        ax.text(x, y, name, color="white", fontsize=8, ha="center", va="center", bbox=box)
 
 
 def _make_panels(emap: ElevationMap, truth: Tensor) -> list[Panel]:

@@ -15,7 +15,7 @@ ROUTE = ((-3.4, -1.6), (2.9, -1.6), (2.9, 1.5), (-2.6, 1.5), (-2.6, -0.2), (0.2,
 PERSON_LEAVES = 6.0  # [s]
 LANDMARKS = (
     ("stairs", -2.8, -2.3), ("platform", -1.6, -3.0), ("ramp", 1.0, -4.2), ("wall", 0.0, 1.0), ("box", 1.9, 0.0),
-    ("wall", 2.2, 2.9), ("bar overhead", 0.6, 2.0), ("rough ground", -3.2, 2.4), ("person, leaves", 4.4, 0.85),
+    ("wall", 2.2, 2.9), ("bar overhead", 0.6, 2.0), ("rough ground", -3.2, 2.4), ("person,\nleaves", 4.4, 0.85),
 )  # fmt: skip
 
 

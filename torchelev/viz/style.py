@@ -5,7 +5,9 @@ Needs matplotlib (``pip install 'torchelev[io]'``).
 
 from __future__ import annotations
 
+import base64
 import io
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 import matplotlib
+import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -31,7 +34,7 @@ RATINGS = "cividis"  #: colour map of traversability, from 0 (dark, impassable) 
 ROBOT_COLOR = "#d55e00"  #: robots, paths and cameras
 GOAL_COLOR = "#e69f00"  #: goals
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  #: of lines (Okabe and Ito)
-MAX_BYTES = 300_000  #: of a PNG
+MAX_BYTES = 300_000  #: of a picture
 
 SETTINGS: Mapping[str, Any] = MappingProxyType(
     {
@@ -53,6 +56,8 @@ SETTINGS: Mapping[str, Any] = MappingProxyType(
         "svg.hashsalt": MARK,  # the same figure gives the same file
     }
 )
+
+_CROPPED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.1}
 
 
 @contextmanager
@@ -101,12 +106,18 @@ def save(figure: Figure, path: str | Path) -> None:
         figure: from `make_figure`, drawn within `styled`.
         path: of the PNG.
     """
-    path = Path(path)
-    with styled():
-        with atomic_file(path) as file:
-            file.write(small_png(figure))
-        with atomic_file(path.with_suffix(".svg")) as file:
-            figure.savefig(file, format="svg", metadata={"Date": None, "Creator": MARK})
+    for suffix in (".png", ".svg"):
+        write(figure, Path(path).with_suffix(suffix))
+
+
+def write(figure: Figure, path: str | Path) -> None:
+    """Write a figure in the format that the ending of `path` names, by default as a small PNG."""
+    ending = Path(path).suffix.lower().removeprefix(".") or "png"
+    with styled(), atomic_file(path) as file:
+        if ending in ("png", "svg"):
+            file.write(small_png(figure) if ending == "png" else _small_svg(figure))
+        else:
+            figure.savefig(file, format=ending, **_CROPPED)
 
 
 def png_info() -> PngInfo:
@@ -120,10 +131,33 @@ def small_png(figure: Figure) -> bytes:
     """Return a PNG below `MAX_BYTES`: in full colour if that fits, else with a palette, then at lower resolutions."""
     for dpi, colors in ((110, None), (90, None), (100, 256), (75, 256), (55, 256)):
         raw, small = io.BytesIO(), io.BytesIO()
-        figure.savefig(raw, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.1)
+        figure.savefig(raw, format="png", dpi=dpi, **_CROPPED)
         picture = Image.open(raw).convert("RGB")
         picture = picture.quantize(colors, dither=Image.Dither.NONE) if colors else picture
         picture.save(small, format="png", optimize=True, pnginfo=png_info())
         if small.tell() < MAX_BYTES:
             break
     return small.getvalue()
+
+
+def _small_svg(figure: Figure) -> bytes:
+    """Return an SVG whose images have palettes, at resolutions that keep it below `MAX_BYTES` where they can."""
+    for dpi in (100, 90, 80, 70, 55):
+        raw = io.BytesIO()
+        figure.savefig(raw, format="svg", dpi=dpi, metadata={"Date": None, "Creator": MARK}, **_CROPPED)
+        small = re.sub(rb"(?<=data:image/png;base64,)[^\"]+", _shrink_image, raw.getvalue())
+        if len(small) < MAX_BYTES:
+            break
+    return small
+
+
+def _shrink_image(image: re.Match[bytes]) -> bytes:
+    """Return a PNG in base64 with a palette if it has at most 256 colours, as an image of one colour map has."""
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(image[0]))).convert("RGBA"))
+    colors, index = np.unique(pixels.reshape(-1, 4), axis=0, return_inverse=True)
+    if len(colors) > 256:
+        return image[0]
+    picture, small = Image.fromarray(index.reshape(pixels.shape[:2]).astype(np.uint8), "P"), io.BytesIO()
+    picture.putpalette(colors[:, :3].tobytes())
+    picture.save(small, format="png", optimize=True, transparency=colors[:, 3].tobytes())
+    return base64.b64encode(small.getvalue())
