@@ -74,6 +74,12 @@ def misread(pose: Tensor) -> Tensor:
     return rotated(pose, wrong[..., :3, :3])
 
 
+def on_misread_base(scan: Scan) -> Tensor:
+    """Return the pose of the sensor, mounted as it should be on a base whose quaternion is misread."""
+    assert scan.T_map_base is not None
+    return misread(scan.T_map_base) @ torch.linalg.inv(scan.T_map_base) @ scan.T_map_sensor
+
+
 def with_legs(scan: Scan) -> Tensor:
     """Return the points, and 240 on four legs that move with the base."""
     assert scan.T_map_base is not None
@@ -128,6 +134,7 @@ CASES = {
         T_map_sensor=lambda s: change_axes(s.T_map_sensor, "forward", "opengl"),
     )),
     "quaternion": Case(each(T_map_sensor=lambda s: misread(s.T_map_sensor))),
+    "base-quaternion": Case(each(T_map_sensor=on_misread_base, T_map_base=lambda s: misread(s.T_map_base))),
     "inverted": Case(each(T_map_sensor=lambda s: torch.linalg.inv(s.T_map_sensor))),
     "pitch": Case(each(T_map_sensor=lambda s: s.T_map_sensor @ mount(4.0, z=0.0)), scene="boxes"),
     "no-base": Case(each(T_map_base=lambda s: None), given=FAR, right=SMALL, wrong=SMALL),

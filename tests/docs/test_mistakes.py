@@ -20,6 +20,7 @@ QUOTED = {
     "no-base": "give T_map_base, which the window follows",
     "opengl": "the sensor is mounted upside down",
     "quaternion": "a quaternion in the order x y z w was read as w x y z",
+    "base-quaternion": "the base's quaternion, in the order x y z w, was read as w x y z",
     "inverted": "T_map_sensor is inverted",
     "map-frame": "the pose is applied twice",
     "legs": "stay within 0.4 m of the robot while it moves",
