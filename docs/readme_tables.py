@@ -18,6 +18,7 @@ import benchmarks
 import training
 from benchmarks.quality import mjlab_task
 from benchmarks.quality.changes import report as changes
+from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
 from benchmarks.speed import encoders, growth, head, long_run, loop, postprocessing, sight
 from benchmarks.speed.update import tables
@@ -119,6 +120,11 @@ def _postprocessing() -> str:
     return f"{postprocessing.table(result['rows'])}\n\n{postprocessing.planes_table(result['planes'])}"
 
 
+def _self_filter() -> str:
+    """Tabulate what the self-filter takes, leaves and costs."""
+    return self_filter.tables({name: value for name, value in load("self_filter").items() if name != "walking"})
+
+
 def _nav() -> str:
     """Tabulate the success of policies by what they were trained with."""
     return experiment.table(load("nav", training.RESULTS))
@@ -163,6 +169,7 @@ TABLES = {
     "traversability": _traversability,
     "head": _head,
     "block": _block,
+    "self_filter": _self_filter,
 }
 
 

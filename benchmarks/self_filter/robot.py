@@ -22,11 +22,12 @@ FOOT_RADIUS = 0.022  # [m]
 HEIGHT = 0.3  # [m] of the hips over the middles of standing feet
 STRIDE, LIFT = 0.16, 0.08  # [m]
 PERIOD = 0.5  # [s] of a step of both diagonals
-CAMERA = DepthCamera(width=20, height=15, max_range=4.0)  # 300 points
-CAMERAS = [
-    MountedSensor(CAMERA, mount(75.0, 0.28, 0.06)),
-    MountedSensor(CAMERA, mount(75.0, -0.28, 0.06, yaw_deg=180.0)),
-]
+MOUNTS = [mount(75.0, 0.28, 0.06), mount(75.0, -0.28, 0.06, yaw_deg=180.0)]
+
+
+def make_cameras(width: int = 20, height: int = 15) -> list[MountedSensor]:
+    """Return depth cameras at both ends of the trunk that look down at the feet."""
+    return [MountedSensor(DepthCamera(width=width, height=height, max_range=4.0), T) for T in MOUNTS]
 
 
 def make_body(**options: float) -> RobotBody:
@@ -72,14 +73,14 @@ def link_poses(phase: Tensor, links: tuple[str, ...]) -> Tensor:
 class Scan(NamedTuple):
     """What the cameras of B robots see at one instant, and the poses."""
 
-    points: Tensor  #: (B, 2, 300, 3) [m] sensor frames, exact
-    on_body: Tensor  #: (B, 2, 300) bool, the points on the robot itself
+    points: Tensor  #: (B, 2, N, 3) [m] sensor frames, exact
+    on_body: Tensor  #: (B, 2, N) bool, the points on the robot itself
     T_map_sensor: Tensor  #: (B, 2, 4, 4)
     T_map_base: Tensor  #: (B, 4, 4)
     T_base_links: Tensor  #: (B, 13, 4, 4)
 
 
-def walk(robots: int, scans: int, seed: int = 0) -> list[Scan]:
+def walk(robots: int, scans: int, cameras: list[MountedSensor], seed: int = 0) -> list[Scan]:
     """Return scans of robots that trot ahead over flat ground, a tenth of a second apart, each with its own phase."""
     generator = torch.Generator().manual_seed(seed)
     field, tiles = HeightField(torch.zeros(1, 100, 100), 0.1), torch.zeros(robots, dtype=torch.int64)
@@ -90,8 +91,8 @@ def walk(robots: int, scans: int, seed: int = 0) -> list[Scan]:
         position[:, 0] = 0.1 * k * 2 * STRIDE / PERIOD
         T_map_base = pose(position, torch.zeros(robots))
         T_base_links = link_poses((start + 0.1 * k / PERIOD) % 1, body.links)
-        views = [c.view(field, tiles, T_map_base, body=body, T_base_links=T_base_links) for c in CAMERAS]
-        T_map_sensor = torch.stack([camera.T_map_sensor(T_map_base) for camera in CAMERAS], 1)
+        views = [c.view(field, tiles, T_map_base, body=body, T_base_links=T_base_links) for c in cameras]
+        T_map_sensor = torch.stack([camera.T_map_sensor(T_map_base) for camera in cameras], 1)
         points, on_body = torch.stack([v.points for v in views], 1), torch.stack([v.on_body for v in views], 1)
         seen.append(Scan(points, on_body, T_map_sensor, T_map_base, T_base_links))
     return seen

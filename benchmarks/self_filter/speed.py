@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks.self_filter.robot import Scan, make_body, walk
+from benchmarks.self_filter.robot import Scan, make_body, make_cameras, walk
 from benchmarks.speed.meter import interleaved
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, GridConfig, RobotBody, SensorConfig
 
@@ -38,7 +38,7 @@ def _updates(body: BodyConfig | RobotBody | None, scans: list[Scan], compiled: b
 
 def measure(seconds: float, robots: int = ROBOTS, compiled: bool = True) -> dict[str, Any]:
     """Time the updates of maps of 64 x 64 cells in turn, and what each takes beyond the one without a body."""
-    scans = walk(robots, SCANS)
+    scans = walk(robots, SCANS, make_cameras())
     runs = {name: _updates(body, scans, compiled) for name, body in BODIES.items()}
     for run in runs.values():
         for _ in range(SCANS):

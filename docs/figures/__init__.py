@@ -1,1 +1,1 @@
-"""Figures of the documentation that no benchmark or training draws: surfaces, a real scan, a pair of episodes."""
+"""Figures of the documentation that no benchmark or training draws: surfaces, a real scan, a pair of episodes, legs."""

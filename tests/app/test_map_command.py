@@ -151,6 +151,7 @@ def test_poses_that_contradict_each_other_are_warned_of(run, recording):
         (["--config", "gone.yaml"], "gone.yaml: cannot be read"),
         (["--config", "unknown.yaml"], "unknown.yaml: config.sensor.rang"),
         (["--config", "body.yaml", "--sensor-height", "1"], "config.sensor.body: the body box turns"),
+        (["--config", "links.yaml"], "config.sensor.body: recordings hold no poses of links; give one box"),
         (["--config", "list.yaml"], "list.yaml: expected settings grouped by stage"),
         (["--config", "broken.yaml"], "broken.yaml: cannot be read as YAML"),
         (["--resolution", "-1"], "resolution and size must be positive"),
@@ -169,6 +170,8 @@ def test_poses_that_contradict_each_other_are_warned_of(run, recording):
 def test_bad_options_are_one_line(run, recording, tmp_path, options, problem):
     (tmp_path / "unknown.yaml").write_text("sensor: {rang: 3}")
     (tmp_path / "body.yaml").write_text("sensor: {body: {}}")
+    shape = "{link: base, center: [0, 0, 0], half_lengths: [1, 1, 1]}"
+    (tmp_path / "links.yaml").write_text(f"sensor: {{body: {{boxes: [{shape}]}}}}")
     (tmp_path / "list.yaml").write_text("[1, 2]")
     (tmp_path / "broken.yaml").write_text("{grid: [")
     code, out, err = run("map", recording, *options)

@@ -1,6 +1,7 @@
 """`diagnose` names each usual mistake on simulated scans that provoke it, and is silent on sound ones."""
 
 import copy
+import dataclasses
 import os
 
 import pytest
@@ -8,8 +9,8 @@ import torch
 from torch import Tensor
 
 from tests.diagnosis.walks import CFG, DT, SENSORS, map_of, on_reordered_base, reordered, sound_scene
-from tests.helpers import nans, small_map
-from torchelev import ElevationMap, ElevationMapConfig
+from tests.helpers import nans, pose, small_map
+from torchelev import Capsule, ElevationMap, ElevationMapConfig, RobotBody, SensorConfig
 from torchelev.sim import mount, range_noise, walk
 from torchelev.sim.exact import scenes as library
 
@@ -90,6 +91,16 @@ def test_dt_in_milliseconds(walked):
         (sentence,) = map_of(walked, dt=dt).diagnose()
         assert sentence.startswith(f"dt: {dt:g} s") and "not ms" in sentence
     assert "dt" in map_of(walked[:1] * 3, dt=100.0).diagnose()[0], "who stands still"
+
+
+@pytest.mark.slow(1)
+def test_legs_that_are_left_by_a_filter_are_blamed_on_its_poses(walked):
+    leg = Capsule(link="leg", start=(0, 0, 0), end=(0, 0, 0.3), radius=0.06)
+    emap = ElevationMap(dataclasses.replace(CFG, sensor=SensorConfig(body=RobotBody(capsules=(leg,)))))
+    for scan in walked:
+        emap.update(*with_legs(*scan), dt=DT, T_base_links=pose((0.9, 0.0, 0.0))[:, None])
+    (sentence,) = emap.diagnose()
+    assert "own legs" in sentence and "check T_base_links" in sentence
 
 
 SILENT_GATES = {

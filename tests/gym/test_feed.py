@@ -1,11 +1,13 @@
 """The feed by itself: what a simulator's own loop gets from its maps, without a wrapper."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from tests.gym.test_wrappers import CONFIG, DT, LAYERS, cloud_of, pose_of
-from torchelev import ElevationMap, HeightScan
+from torchelev import Capsule, ElevationMap, HeightScan, RobotBody, SensorConfig
 from torchelev.gym import MapFeed
 
 
@@ -57,6 +59,18 @@ def test_a_reset_of_some_fuses_their_clouds_alone():
     moved.update(torch.full((1, 1, 3), torch.nan), T[1], T[1], dt=0.0)
     for name in before:
         torch.testing.assert_close(feed.emap.layer(name)[0], moved.layer(name)[0], rtol=0, atol=1e-6, equal_nan=True)
+
+
+def test_links_are_posed_by_their_function():
+    """All points lie on a ball of 9 m around the base."""
+    ball = Capsule(link="a", start=(0, 0, 0), end=(0, 0, 0), radius=9.0)
+    cfg = dataclasses.replace(CONFIG, sensor=SensorConfig(body=RobotBody(capsules=(ball,))))
+    feed = MapFeed(2, **SOURCES | dict(cfg=cfg), T_base_links=lambda sim: np.eye(4)[None].repeat(2, 0)[:, None])
+    feed.observe(Simulator(), torch.ones(2, dtype=torch.bool), stepped=False)
+    assert (feed.emap.statistics.rejected_body > 0).all() and not feed.emap.validity.any()
+    for options in (dict(cfg=cfg), dict(T_base_links=pose)):
+        with pytest.raises(ValueError, match="T_base_links: must be a function if cfg.sensor.body has links"):
+            MapFeed(2, **SOURCES | options)
 
 
 def test_it_needs_a_time_and_poses():

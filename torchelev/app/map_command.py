@@ -121,6 +121,8 @@ def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> Ele
 
     from torchelev.elevation_map import ElevationMap
 
+    if config.sensor.links:
+        raise ValueError("config.sensor.body: recordings hold no poses of links; give one box, lower and upper")
     if config.sensor.body is not None and options.T_base_sensor is None:
         raise ValueError("config.sensor.body: the body box turns with the robot's base; give --extrinsics")
     if not options.knows_base:

@@ -17,7 +17,7 @@ from torchelev.state import MapState
 _REASONS = {
     "invalid": "are NaN or infinite, or their pose or variance is: check what makes them",
     "range": "are too near or too far: check their unit, and sensor.min_distance and sensor.max_distance",
-    "body": "lie in the robot's body box: check sensor.body and T_map_base",
+    "body": "lie on the robot's own body: check sensor.body, T_map_base and T_base_links",
     "overhang": "lie above the exclusion ramp: check that the pose's z axis points up, that points with optical axes "
     "have a pose with such axes, and sensor.exclusion",
 }
@@ -147,9 +147,12 @@ def _find_own_legs(seen: Evidence) -> str | None:
     if np.mean(np.array(counts) >= 5) < 0.75:
         return None
     number = int(np.median(counts))
+    cure = "give sensor.body=RobotBody(...) with T_base_links, or one box, BodyConfig(...), with T_map_base"
+    if seen.cfg.sensor.links:
+        cure = "check T_base_links: in the order of sensor.body.links, at the time of the points; or raise its padding"
     return (
         f"points: about {number} in each scan stay within 0.4 m of the robot while it moves, as of its own legs or "
-        "body; give sensor.body=BodyConfig(...) and T_map_base, or a larger sensor.min_distance"
+        f"body; {cure}"
     )
 
 

@@ -16,7 +16,10 @@ from torchelev.errors import require
 
 Source = Callable[[Any], Any]
 DEFAULT_READ = MapImage(length_x=1.6, length_y=1.0, resolution=0.1, layers=("elevation", "validity"))
-_SHAPES = {"points": "N, 3", "depth": "h, w", "T_map_sensor": "4, 4", "T_map_base": "4, 4"}  # of one environment
+_SHAPES = {  # of one environment
+    **{"points": "N, 3", "depth": "h, w"},
+    **{"T_map_sensor": "4, 4", "T_map_base": "4, 4", "T_base_links": "K, 4, 4"},
+}
 
 
 class MapFeed:
@@ -32,6 +35,7 @@ class MapFeed:
         intrinsics: (3, 3) [pixels], required with `depth`. The sensor frame is then x right, y down, z forward.
         T_map_sensor: env -> (B, 4, 4) or (B, S, 4, 4), sensor frame to map frame.
         T_map_base: env -> (B, 4, 4), base frame to map frame; the map's window follows the base.
+        T_base_links: env -> (B, K, 4, 4), poses of the links; required if `cfg.sensor.body` is a RobotBody.
         dt: duration of one step [s].
         read: (emap, T_map_base) -> observation (B, ...), or values and validity, which are stacked to (B, 2, ...).
             None: `DEFAULT_READ`, the elevation relative to the base and its validity every 0.1 m of 1.6 x 1.0 m.
@@ -48,6 +52,7 @@ class MapFeed:
         *,
         T_map_sensor: Source | None,
         T_map_base: Source | None,
+        T_base_links: Source | None = None,
         dt: float | None,
         points: Source | None = None,
         depth: Source | None = None,
@@ -58,7 +63,12 @@ class MapFeed:
     ) -> None:
         sources = {"points": points, "depth": depth, "T_map_sensor": T_map_sensor, "T_map_base": T_map_base}
         _check_arguments(sources, intrinsics, dt)
-        self.sources: dict[str, Any] = sources
+        links = cfg.sensor.links if isinstance(cfg, ElevationMapConfig) else ()
+        rule, actual = "must be a function if cfg.sensor.body has links, and only then", type(T_base_links).__name__
+        require(
+            callable(T_base_links) == bool(links), "T_base_links", rule, actual, "give env -> (K, 4, 4), or neither"
+        )
+        self.sources: dict[str, Any] = sources | {"T_base_links": T_base_links}
         self.batch = () if num_envs is None else (num_envs,)
         self.dt = float(dt)  # type: ignore[arg-type]
         self.reader = DEFAULT_READ if read is None else read
@@ -84,7 +94,8 @@ class MapFeed:
             points = torch.where(began.view(-1, *[1] * (points.ndim - 1)), points, torch.nan)
         dt = torch.where(began, 0.0, self.dt if stepped else 0.0)
         self.emap.reset(mask=began)
-        self.emap.update(points, T_map_sensor, T_map_base, dt=dt)
+        links = None if self.sources["T_base_links"] is None else self._call("T_base_links", env)
+        self.emap.update(points, T_map_sensor, T_map_base, dt=dt, T_base_links=links)
         return self.read(T_map_base)
 
     @torch.no_grad()

@@ -70,6 +70,7 @@ class _MapObservation(RecordConstructorArgs):
         intrinsics: Any = None,
         T_map_sensor: Source | None = None,
         T_map_base: Source | None = None,
+        T_base_links: Source | None = None,
         dt: float | None = None,
         read: Callable[[ElevationMap, Tensor], Any] | None = None,
         cfg: ElevationMapConfig | None = None,
@@ -79,7 +80,7 @@ class _MapObservation(RecordConstructorArgs):
         rule = f"must be a {self._env_type.__name__}"
         require(isinstance(env, self._env_type), "env", rule, type(env).__name__, self._hint, TypeError)
         sources = {"points": points, "depth": depth, "intrinsics": intrinsics}
-        poses = {"T_map_sensor": T_map_sensor, "T_map_base": T_map_base, "dt": dt}
+        poses = {"T_map_sensor": T_map_sensor, "T_map_base": T_map_base, "T_base_links": T_base_links, "dt": dt}
         maps = {"read": read, "cfg": cfg, "device": device}
         # Not copied: a function may be a method of a large object, such as the simulation.
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **sources, **poses, **maps, key=key)
@@ -126,6 +127,7 @@ class ElevationMapObservation(_MapObservation, gymnasium.Wrapper):
         intrinsics: (3, 3) [pixels], required with `depth`. The sensor frame is then x right, y down, z forward.
         T_map_sensor: env -> (4, 4) or (S, 4, 4), sensor frame to map frame.
         T_map_base: env -> (4, 4), base frame to map frame; the map's window follows the base.
+        T_base_links: env -> (K, 4, 4), poses of the links; required if `cfg.sensor.body` is a RobotBody.
         dt: duration of one step [s].
         read: (emap, T_map_base) -> (B, ...), such as a `torchelev.MapImage`; or values and validity, such as a
             `HeightScan`, which are stacked to (B, 2, ...). Here B = 1. Values that are not finite become 0. None: the
