@@ -68,8 +68,9 @@ def quaternion(pose: Tensor) -> Tensor:
     return torch.from_numpy(xyzw).roll(1, -1)
 
 
-def misread(pose: Tensor) -> Tensor:
+def misread(pose: Tensor | None) -> Tensor:
     """Return the pose whose quaternion (x, y, z, w) was read as (w, x, y, z)."""
+    assert pose is not None
     wrong = transform(torch.zeros(1, 3).double(), quaternion(pose).roll(-1, -1))
     return rotated(pose, wrong[..., :3, :3])
 
