@@ -180,6 +180,15 @@ def test_far_from_the_origin():
     assert torch.equal(own_points(body, *case, dtype=torch.float32), own)
 
 
+def test_a_ray_in_the_plane_of_a_face_spoils_no_other_shape():
+    """Where the ray lies in the face and is parallel to it, the place at which it crosses is 0 / 0."""
+    block = Box(link="leg", center=(0.0, 0.25, 0.0), half_lengths=(0.25, 0.25, 0.25))
+    body = RobotBody(capsules=(LEG,), boxes=(block,), padding=0.0, depth_tolerance=0.0)
+    sensor, rest = pose((-1.0, 0.0, 0.0)), pose((0.0, 0.0, 0.0))
+    cloud = torch.tensor([[[[1.0, 0.0, 0.0], [1.2, 0.0, 0.0], [2.0, 0.0, 0.0]]]], dtype=torch.float64)
+    assert own_points(body, cloud, sensor[:, None], rest, rest[:, None]).tolist() == [[True, True, False]]
+
+
 def test_only_what_is_in_range_is_on_the_body():
     """A point without a return or out of range counts there, though zeros stand for it at a sensor within a shape."""
     body = RobotBody(capsules=(LEG,))

@@ -182,7 +182,7 @@ def gate_points(
         variance = torch.where(sensed.finite, variance, 1.0).flatten(1)
     body = overhang = torch.zeros_like(mapped.in_range)
     if own is not None:
-        body = mapped.in_range & own.flatten(1)
+        body = own.flatten(1)
     elif isinstance(cfg.body, BodyConfig) and base is not None and T_map_base is not None:
         body = mapped.in_range & inside_body(position, T_map_base, base, cfg.body)
     if cfg.exclusion is not None:

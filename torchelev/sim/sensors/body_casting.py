@@ -63,7 +63,7 @@ def _cast_part(body: RobotBody, posed: PosedBody, directions: Float[Tensor, "B M
 def _hit_capsules(rays: list[Tensor], posed: PosedBody, capsules: tuple[Capsule, ...]) -> Float[Tensor, "B P M"]:
     """Return where rays enter capsules of axes from a to a + e and radius r [m], inf where they do not.
 
-    t d lies on the cylinder where |t d - a - v e| = r with v the place along the axis: a quadratic equation in t. Where
+    A sensor inside is past the entry, whose t is negative. t d lies on the cylinder where |t d - a - v e| = r with v the place along the axis: a quadratic equation in t. Where
     v is not in 0 to 1, the ray meets the end's sphere first, |t d - c| = r, if it meets the capsule at all.
     """
     start, axis = (value.squeeze(-2)[..., None] for value in (posed.start, posed.axis))
@@ -87,14 +87,7 @@ def _hit_capsules(rays: list[Tensor], posed: PosedBody, capsules: tuple[Capsule,
     on_side = (v > 0) & (v < length2)
     t = torch.where(on_side, t, on_cap)
     is_met = torch.where(on_side, b * b >= a * c, rest >= 0) & (t > 0)
-    is_outside = _squared_distance(start_start, start_axis, length2) > radius2
-    return t.masked_fill(~(is_met & is_outside), math.inf)
-
-
-def _squared_distance(start_start: Tensor, start_axis: Tensor, length2: Tensor) -> Tensor:
-    """Return the squared distance of the sensor, the origin, from axes from a to a + e."""
-    v = (-start_axis / length2.clamp(min=_TINY)).clamp(0, 1)
-    return start_start + v * (2 * start_axis + v * length2)
+    return t.masked_fill(~is_met, math.inf)
 
 
 def _hit_boxes(rays: list[Tensor], posed: PosedBody, body: RobotBody) -> Float[Tensor, "B Q M"]:
