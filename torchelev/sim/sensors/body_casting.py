@@ -63,15 +63,14 @@ def _cast_part(body: RobotBody, posed: PosedBody, directions: Float[Tensor, "B M
 def _hit_capsules(rays: list[Tensor], posed: PosedBody, capsules: tuple[Capsule, ...]) -> Float[Tensor, "B P M"]:
     """Return where rays enter capsules of axes from a to a + e and radius r [m], inf where they do not.
 
-    A sensor inside is past the entry, whose t is negative. t d lies on the cylinder where |t d - a - v e| = r with v the place along the axis: a quadratic equation in t. Where
-    v is not in 0 to 1, the ray meets the end's sphere first, |t d - c| = r, if it meets the capsule at all.
+    t d lies on the cylinder where |t d - a - v e| = r with v the place along the axis: a quadratic equation in t. Where
+    v is not in 0 to 1, the ray meets the end's sphere first, |t d - c| = r, if it meets the capsule at all. A sensor
+    inside is past the entry: t is negative.
     """
     start, axis = (value.squeeze(-2)[..., None] for value in (posed.start, posed.axis))
     start_start, start_axis = (value.squeeze(-2)[..., None] for value in (posed.start_start, posed.start_axis))
-    length2, radius2 = (
-        _per_shape([value(capsule) for capsule in capsules], start_start)
-        for value in (lambda capsule: capsule.length**2, lambda capsule: capsule.radius**2)
-    )
+    length2 = _per_shape([capsule.length**2 for capsule in capsules], start_start)
+    radius2 = _per_shape([capsule.radius**2 for capsule in capsules], start_start)
     on_start, on_axis = dot(rays, start), dot(rays, axis)
     # Of a ray along the axis, a is a rounding error: kept above it, the ray meets the cylinder far before its ends.
     a = torch.maximum(length2 - on_axis * on_axis, _ROUNDING * length2 + _TINY)
