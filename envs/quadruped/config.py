@@ -24,6 +24,7 @@ class TerrainConfig:
         "gaps",
     )  #: of torchelev.sim
     num_levels: int = 8  #: difficulties from the easiest to the hardest
+    difficulty: tuple[float, float] = (0.0, 0.5)  #: of the first and last level: stairs of 5 to 14 cm
     length: float = 8.0  #: [m] side of a tile; a robot that leaves its tile has crossed it
     resolution: float = 0.05  #: [m] between the samples of the height field
     rim: float = 0.4  #: [m] the tile counts as crossed this far before its rim

@@ -106,8 +106,8 @@ class Quadruped(nn.Module):
         self.max_action = self.cfg.gait.max_action
         terrain = self.cfg.terrain
         self.terrain = terrain_grid(
-            terrain.kinds, terrain.num_levels, length=terrain.length, resolution=terrain.resolution,
-            seed=terrain.seed, device=device,
+            terrain.kinds, terrain.num_levels, difficulty=terrain.difficulty, length=terrain.length,
+            resolution=terrain.resolution, seed=terrain.seed, device=device,
         )  # fmt: skip
         self.physics = Physics(self.terrain, num_envs, self.cfg.random, seed)
         self.generator = torch.Generator(device)

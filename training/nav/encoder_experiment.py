@@ -21,9 +21,10 @@ from training import RESULTS
 from training.jobs import Job, train_all
 from training.nav.encoders import ENCODERS
 from training.nav.evaluate import evaluate
-from training.nav.runs import load_policy, mean, read_curve, spread
+from training.nav.runs import load_policy, read_curve
 from training.nav.train import task_config
 from training.options import jobs_option, runs_option
+from training.runs import mean, spread
 
 # Fixed before the first run, as are the encoders' sizes in training/nav/encoders.py.
 SEEDS = (0, 1)

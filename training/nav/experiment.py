@@ -21,9 +21,10 @@ from torchelev.viz.style import make_figure, save, styled
 from training import RESULTS
 from training.jobs import Job, train_all
 from training.nav.evaluate import evaluate, straight_line
-from training.nav.runs import load_policy, mean, read_curve, spread
+from training.nav.runs import load_policy, read_curve
 from training.nav.train import task_config
 from training.options import jobs_option, runs_option
+from training.runs import mean, spread
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)

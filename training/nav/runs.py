@@ -1,4 +1,4 @@
-"""What experiments read from the folders of finished trainings, and how they write figures of several seeds."""
+"""What experiments read from the folders of finished trainings."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 
 from training.nav.evaluate import Policy
 from training.nav.train import ppo_config
+from training.runs import read_scalars
 
 
 def load_policy(folder: Path) -> Policy:
@@ -17,23 +18,7 @@ def load_policy(folder: Path) -> Policy:
 
 
 def read_curve(folder: Path, num_envs: int) -> dict[str, list[float]]:
-    """Read the success during training over environment steps from the TensorBoard log."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    log = EventAccumulator(str(folder))
-    log.Reload()
-    values = {
-        point.step: round(point.value, 4) for point in log.Scalars("/success")
-    }  # a resumed training repeats steps
+    """Return the success during training over environment steps."""
+    values = read_scalars(folder, "/success")
     steps = ppo_config()["num_steps_per_env"] * num_envs
-    return {"steps": [(step + 1) * steps for step in sorted(values)], "success": [values[k] for k in sorted(values)]}
-
-
-def mean(values: list[float]) -> float:
-    """Return the mean."""
-    return sum(values) / len(values)
-
-
-def spread(values: list[float]) -> str:
-    """Return fractions as percentages: the mean, and the lowest and highest."""
-    return f"{100 * mean(values):.1f} % ({100 * min(values):.1f} to {100 * max(values):.1f})"
+    return {"steps": [(step + 1) * steps for step in values], "success": [round(v, 4) for v in values.values()]}

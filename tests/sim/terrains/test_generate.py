@@ -198,6 +198,14 @@ def test_a_grid_has_each_kind_at_each_level():
             torch.testing.assert_close(grid.truth(torch.tensor([tile]), xy)[0], grid.field.heights[tile].flatten())
 
 
+def test_the_levels_of_a_grid_span_the_difficulties_asked_for():
+    grid = terrain_grid(["stairs_up"], 3, difficulty=(0.25, 0.75), resolution=0.5)
+    assert grid.difficulty.tolist() == [0.25, 0.5, 0.75]
+    assert terrain_grid(["stairs_up"], 1, difficulty=(0.25, 0.75), resolution=0.5).difficulty.tolist() == [0.75]
+    with pytest.raises(ValueError, match="difficulty: must be"):
+        terrain_grid(["stairs_up"], 2, difficulty=(0.0, 1.5))
+
+
 def test_levels_go_up_on_success_and_down_on_failure():
     grid = terrain_grid(["flat"], 4, resolution=0.5)
     level = torch.tensor([0, 1, 2, 0, 1, 1])

@@ -122,6 +122,7 @@ def terrain_grid(
     kinds: Sequence[str],
     num_levels: int,
     *,
+    difficulty: tuple[float, float] = (0.0, 1.0),
     length: float = 8.0,
     resolution: float = 0.04,
     seed: int = 0,
@@ -131,7 +132,8 @@ def terrain_grid(
 
     Args:
         kinds: Names of the kinds, as in `make_terrain`. A repeated kind gives further random tiles of that kind.
-        num_levels: Number of difficulties, from 0 to 1 in equal steps; a single level has difficulty 1.
+        num_levels: Number of difficulties.
+        difficulty: Those of the first and the last level, with equal steps between; a single level has the last one.
         length: Side of a tile [m].
         resolution: Distance between the samples of the height field [m].
         seed: Seed of the random shapes; the same seed gives the same tiles on every device.
@@ -142,7 +144,7 @@ def terrain_grid(
     """
     require(len(kinds) > 0, "kinds", "must not be empty", list(kinds), "name some terrains")
     num_levels = require_count("num_levels", num_levels, "give the number of difficulties")
-    levels = torch.linspace(0, 1, num_levels) if num_levels > 1 else torch.ones(1)
+    levels = torch.linspace(*difficulty, num_levels) if num_levels > 1 else torch.tensor([difficulty[1]])
     kind_ids = torch.arange(len(kinds)).repeat(num_levels)
     tiles = _tiles(tuple(kinds), kind_ids, levels.repeat_interleave(len(kinds)), length, resolution, seed, device)
     return TerrainGrid(num_levels=num_levels, **tiles)

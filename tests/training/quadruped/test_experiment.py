@@ -1,0 +1,94 @@
+"""The comparison of perceptions: its trainings, its tables and its figure."""
+
+import json
+
+import pytest
+
+from envs.quadruped.config import PERCEPTION
+from training.quadruped import experiment
+
+LEVELS = 2
+
+
+def summary(crossed, speed=1.0):
+    return {"crossed": crossed, "fallen": 1 - crossed, "timed out": 0.0, "speed": speed, "episodes": 8}
+
+
+def evaluation(crossed):
+    by_level = {kind: {str(level): summary(crossed / (1 + level)) for level in range(LEVELS)} for kind in experiment.KINDS}
+    return {"all": summary(crossed), "by_kind": dict.fromkeys(experiment.KINDS, summary(crossed)), "by_level": by_level}
+
+
+def deployment(crossed, walking=1.0):
+    return {
+        "deployed": evaluation(crossed),
+        "walk": {"flat": summary(walking, 0.9), "rough": summary(walking - 0.25, 0.8)},
+    }
+
+
+def result():
+    """Crossed 0.5 and 0.7 with the map, 0.4 and 0.6 with the truth, 0.3 and 0.5 blind."""
+    rows = []
+    for perception, seed in experiment.CASES:
+        crossed = 0.5 - 0.1 * PERCEPTION.index(perception) + 0.2 * seed
+        curve = {"steps": [100, 200], "level": [0.0, 5 * crossed], "crossed": [0.0, crossed]}
+        row = {"perception": perception, "seed": seed, "training": {"steps": 6000, "seconds": 120.0}, "curve": curve}
+        rows.append(row | deployment(crossed) | {"own": summary(crossed)})
+    return {"config": {"seeds": [0, 1], "levels": LEVELS}, "rows": rows, "trot": deployment(0.25)}
+
+
+def test_every_perception_gets_the_same_training(tmp_path):
+    jobs = experiment._jobs(tmp_path)
+    assert len({job.folder for job in jobs}) == len(jobs) == len(PERCEPTION) * len(experiment.SEEDS)
+    others = [{name: value for name, value in job.arguments.items() if name != "--perception"} for job in jobs]
+    assert all(others.count(other) == len(PERCEPTION) for other in others)
+
+
+def test_nobody_crosses_a_tile_of_the_long_walk():
+    cfg = experiment.walk_config()
+    fastest = cfg.command.forward[1] * cfg.episode_length
+    assert cfg.command.forward == (0.5, 0.5) and cfg.terrain.length / 2 - cfg.terrain.rim - 0.3 > fastest
+
+
+def test_the_tables_have_the_mean_and_the_extremes():
+    lines = experiment.table(result()).split("\n")
+    assert lines[2].startswith("| map in the loop | 60.0 % (50.0 to 70.0) | 60 % | 60 % |")
+    assert lines[5].startswith("| (the trot alone) | 25 % | 25 % |") and lines[5].endswith("| 75 % |  |")
+    walked = experiment.walk_table(result()).split("\n")
+    assert walked[4] == "| blind | 0.90 | 0.0 % | 0.80 | 25.0 % | 2 |" and len(walked) == 5
+
+
+@pytest.mark.slow(2)
+def test_the_figure_is_drawn(tmp_path):
+    experiment.plot(result(), tmp_path / "quadruped.png")
+    assert (tmp_path / "quadruped.png").stat().st_size > 5000 and (tmp_path / "quadruped.svg").exists()
+
+
+def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
+    deployed = []
+    for perception, seed in experiment.CASES:
+        folder = experiment._folder(tmp_path, perception, seed)
+        folder.mkdir()
+        (folder / "result.json").write_text(json.dumps({"training": {"steps": 1, "seconds": seed}}))
+
+    def fake(policy, cfg, perception, *rest, **options):
+        deployed.append((policy, perception))
+        return {"all": policy, "by_kind": policy}
+
+    monkeypatch.setattr(experiment, "load_policy", lambda path, cfg: path.parent.name)
+    monkeypatch.setattr(experiment, "read_curve", lambda folder: {"steps": []})
+    monkeypatch.setattr(experiment, "evaluate", fake)
+    rows = experiment._deploy_all(tmp_path)["rows"]
+    expected = [f"{perception}-{seed}" for perception, seed in experiment.CASES]
+    assert [row["deployed"]["all"] for row in rows] == [row["own"] for row in rows] == expected
+    own = [(f"{perception}-{seed}", perception) for perception, seed in experiment.CASES]
+    assert deployed[: 3 * len(own) : 3] == own
+    assert all(perception == "map" for name, perception in deployed[1::3] + deployed[2::3])
+
+
+def test_a_curve_averages_blocks_of_iterations(tmp_path, monkeypatch):
+    values = {k: float(k) for k in range(25)}
+    monkeypatch.setattr(experiment, "read_scalars", lambda folder, tag: values)
+    curve = experiment.read_curve(tmp_path)
+    assert curve["level"] == [4.5, 14.5, 22.0]
+    assert curve["steps"] == [n * 24 * experiment.NUM_ENVS for n in (10, 20, 25)]

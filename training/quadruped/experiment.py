@@ -1,0 +1,183 @@
+"""Compare walking policies that were trained with the map in the loop, with the true ground and blind.
+
+    python -m training.quadruped.experiment
+
+Trains every seed with each perception and deploys every policy on held-out ground, with the map in the loop and
+odometry that drifts. Finished trainings are kept in RUNS: after Ctrl-C, run the command again. Writes
+training/results/quadruped.json and quadruped.png.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from envs.quadruped import QuadrupedConfig
+from envs.quadruped.config import PERCEPTION
+from torchelev.app.results import markdown_table, write_json
+from torchelev.viz.style import make_figure, save, styled
+from training import RESULTS
+from training.jobs import Job, train_all
+from training.options import jobs_option, runs_option
+from training.quadruped.evaluate import evaluate, stand_in_trot
+from training.quadruped.policy import load_policy
+from training.quadruped.train import ppo_config, task_config
+from training.runs import mean, read_scalars, spread
+
+# Fixed before the first run.
+SEEDS = (0, 1)
+ITERATIONS, NUM_ENVS, EPISODES, WALKS = 800, 256, 1120, 128
+CASES = [(perception, seed) for seed in SEEDS for perception in PERCEPTION]
+NAMES = {"map": "map in the loop", "truth": "truth with noise", "blind": "blind"}
+KINDS = {
+    "flat": "flat",
+    "rough": "rough",
+    "slope": "slopes",
+    "stairs_up": "stairs, up",
+    "stairs_down": "stairs, down",
+    "boxes": "boxes",
+    "gaps": "gaps",
+}
+_BLOCK = 10  # iterations that a point of a learning curve averages
+
+
+def _folder(runs: Path, perception: str, seed: int) -> Path:
+    return runs / f"{perception}-{seed}"
+
+
+def _jobs(runs: Path) -> list[Job]:
+    """Return a training for each perception and seed."""
+    fixed = {"--iterations": ITERATIONS, "--num-envs": NUM_ENVS}
+    return [
+        Job("training.quadruped", {"--perception": perception, "--seed": seed, **fixed}, _folder(runs, perception, seed))
+        for perception, seed in CASES
+    ]
+
+
+def walk_config() -> QuadrupedConfig:
+    """Return flat and rough tiles so wide that nobody crosses them within 20 s at the commanded 0.5 m/s."""
+    cfg = task_config(held_out=True)
+    terrain = dataclasses.replace(cfg.terrain, kinds=("flat", "rough"), num_levels=4, length=24.0)
+    return dataclasses.replace(cfg, terrain=terrain)
+
+
+def _deploy(policy: Any) -> dict[str, Any]:
+    """Deploy a policy with the map in the loop, over all kinds of terrain and for 20 s on flat and rough ground."""
+    crossing = evaluate(policy, task_config(held_out=True), "map", EPISODES, compiled=True)
+    return {"deployed": crossing, "walk": evaluate(policy, walk_config(), "map", WALKS, compiled=True)["by_kind"]}
+
+
+def _deploy_all(runs: Path) -> dict[str, Any]:
+    """Deploy every policy on held-out ground, and the trot that none of them has modified."""
+    cfg, rows = task_config(held_out=True), []
+    for perception, seed in tqdm(CASES, unit="policy"):
+        folder = _folder(runs, perception, seed)
+        trained = json.loads((folder / "result.json").read_text())["training"]
+        policy = load_policy(folder / "policy.pt", cfg)
+        own = evaluate(policy, cfg, perception, EPISODES, compiled=True)["all"]
+        row = {"perception": perception, "seed": seed, "training": trained, "own": own}
+        rows.append(row | _deploy(policy) | {"curve": read_curve(folder)})
+    fixed = {
+        "seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS,
+        "levels": cfg.terrain.num_levels, "difficulty": cfg.terrain.difficulty,
+    }  # fmt: skip
+    return {"config": fixed, "trot": _deploy(stand_in_trot), "rows": rows}
+
+
+def read_curve(folder: Path) -> dict[str, list[float]]:
+    """Return the mean level and the share of crossed tiles over environment steps, each averaged over iterations."""
+    per_iteration = ppo_config()["num_steps_per_env"] * NUM_ENVS
+    level, crossed = (list(read_scalars(folder, f"/{name}").values()) for name in ("level", "crossed"))
+    starts = range(0, len(level), _BLOCK)
+    return {
+        "steps": [(start + len(level[start : start + _BLOCK])) * per_iteration for start in starts],
+        "level": [round(mean(level[start : start + _BLOCK]), 3) for start in starts],
+        "crossed": [round(mean(crossed[start : start + _BLOCK]), 4) for start in starts],
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """Tabulate the crossed tiles by kind of terrain: the mean over the seeds, and the lowest and highest of all."""
+    head = ["trained with", "crossed", *(KINDS[kind].replace(",", "") for kind in KINDS), "fallen", "as trained"]
+    lines = []
+    for perception in PERCEPTION:
+        rows = _rows(result, perception)
+        kinds = [mean([row["deployed"]["by_kind"][kind]["crossed"] for row in rows]) for kind in KINDS]
+        crossed, own = (spread([row[name]["crossed"] for row in rows]) for name in ("all", "own"))
+        fallen = mean([row["all"]["fallen"] for row in rows])
+        lines.append([NAMES[perception], crossed, *map(_percent, kinds), _percent(fallen), own])
+    trot = result["trot"]["deployed"]
+    kinds = [_percent(trot["by_kind"][kind]["crossed"]) for kind in KINDS]
+    ends = [_percent(trot["all"][name]) for name in ("crossed", "fallen")]
+    return markdown_table(head, [*lines, ["(the trot alone)", ends[0], *kinds, ends[1], ""]])
+
+
+def walk_table(result: dict[str, Any]) -> str:
+    """Tabulate the speed by the commanded 0.5 m/s, and the falls, in 20 s on flat and rough ground."""
+    head = ["trained with", "flat: speed by command", "fallen", "rough: speed by command", "fallen", "minutes"]
+    lines = []
+    for perception in PERCEPTION:
+        rows, cells = _rows(result, perception), []
+        for kind in ("flat", "rough"):
+            speed, fallen = (mean([row["walk"][kind][name] for row in rows]) for name in ("speed", "fallen"))
+            cells += [f"{speed:.2f}", f"{100 * fallen:.1f} %"]
+        minutes = mean([row["training"]["seconds"] / 60 for row in rows])
+        lines.append([NAMES[perception], *cells, f"{minutes:.0f}"])
+    return markdown_table(head, lines)
+
+
+def _rows(result: dict[str, Any], perception: str) -> list[dict[str, Any]]:
+    """Return the results of a perception, one for each seed."""
+    return [row | {"all": row["deployed"]["all"]} for row in result["rows"] if row["perception"] == perception]
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.0f} %"
+
+
+@styled()
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Draw the level during training, and the crossed tiles by kind and level when deployed."""
+    figure = make_figure(11, 5.2)
+    grid = figure.add_gridspec(2, 5)
+    curves = figure.add_subplot(grid[:, :2])
+    colors = dict(zip(PERCEPTION, ("C0", "C1", "0.5"), strict=True))
+    for row in result["rows"]:
+        label = NAMES[row["perception"]] if row["seed"] == result["config"]["seeds"][0] else None
+        curve = row["curve"]
+        curves.plot(curve["steps"], curve["level"], color=colors[row["perception"]], linewidth=1.2, label=label)
+    curves.set(xlabel="environment steps", ylabel="mean level", title="while training, as trained")
+    curves.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1e6:.0f}M")
+    curves.legend(loc="lower right")
+    levels = range(result["config"]["levels"])
+    shown = [kind for kind in KINDS if kind != "flat"]
+    for place, kind in enumerate(shown):
+        axes = figure.add_subplot(grid[place // 3, 2 + place % 3])
+        for perception in PERCEPTION:
+            rows = [row["deployed"]["by_level"][kind] for row in _rows(result, perception)]
+            crossed = [mean([row[str(level)]["crossed"] for row in rows]) for level in levels]
+            axes.plot(levels, crossed, "o-", color=colors[perception], linewidth=1.2, markersize=3)
+        axes.set(title=KINDS[kind], ylim=(-0.04, 1.04), xticks=levels)
+        axes.set(xlabel="level" if place >= 3 else None, ylabel="crossed" if place % 3 == 0 else None)
+    save(figure, path)
+
+
+@click.command(help=__doc__)
+@runs_option("runs/quadruped_experiment")
+@jobs_option
+def main(runs: Path, jobs: int) -> None:
+    """Train, deploy, write JSON and figure and print the tables."""
+    train_all(_jobs(runs), jobs)
+    result = _deploy_all(runs)
+    write_json(RESULTS / "quadruped.json", result)
+    plot(result, RESULTS / "quadruped.png")
+    click.echo(f"{table(result)}\n\n{walk_table(result)}")
+
+
+if __name__ == "__main__":
+    main()
