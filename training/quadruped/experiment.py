@@ -54,8 +54,8 @@ def _jobs(runs: Path) -> list[Job]:
     """Return a training for each perception and seed."""
     fixed = {"--iterations": ITERATIONS, "--num-envs": NUM_ENVS}
     return [
-        Job("training.quadruped", {"--perception": perception, "--seed": seed, **fixed}, _folder(runs, perception, seed))
-        for perception, seed in CASES
+        Job("training.quadruped", {"--perception": name, "--seed": seed, **fixed}, _folder(runs, name, seed))
+        for name, seed in CASES
     ]
 
 
@@ -112,9 +112,9 @@ def table(result: dict[str, Any]) -> str:
         fallen = mean([row["all"]["fallen"] for row in rows])
         lines.append([NAMES[perception], crossed, *map(_percent, kinds), _percent(fallen), own])
     trot = result["trot"]["deployed"]
-    kinds = [_percent(trot["by_kind"][kind]["crossed"]) for kind in KINDS]
+    alone = [_percent(trot["by_kind"][kind]["crossed"]) for kind in KINDS]
     ends = [_percent(trot["all"][name]) for name in ("crossed", "fallen")]
-    return markdown_table(head, [*lines, ["(the trot alone)", ends[0], *kinds, ends[1], ""]])
+    return markdown_table(head, [*lines, ["(the trot alone)", ends[0], *alone, ends[1], ""]])
 
 
 def walk_table(result: dict[str, Any]) -> str:

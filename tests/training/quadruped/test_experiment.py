@@ -15,7 +15,9 @@ def summary(crossed, speed=1.0):
 
 
 def evaluation(crossed):
-    by_level = {kind: {str(level): summary(crossed / (1 + level)) for level in range(LEVELS)} for kind in experiment.KINDS}
+    by_level = {
+        kind: {str(level): summary(crossed / (1 + level)) for level in range(LEVELS)} for kind in experiment.KINDS
+    }
     return {"all": summary(crossed), "by_kind": dict.fromkeys(experiment.KINDS, summary(crossed)), "by_level": by_level}
 
 
