@@ -118,7 +118,7 @@ class SightConfig:
     #: [m], [deg] standard deviations of the cameras' place on the robot, as a calibration against the legs leaves them
     mounting_error: tuple[float, float] = (0.001, 0.1)
     resolution: float = 0.05  #: [m] of the map
-    window: float = 2.8  #: [m] side of the map
+    window: float = 2.2  #: [m] side of the map, which holds the scan at any heading
     map_every: int = 4  #: policy steps between two updates of the map: 12.5 Hz
     rings: tuple[tuple[float, int], ...] = ((0.06, 6), (0.12, 8))  #: radius [m] and points of the rings around a foot
     fill: str = (

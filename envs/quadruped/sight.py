@@ -138,7 +138,7 @@ class MapSight(BlindSight):
 
     def reset(self, mask: Tensor) -> None:
         """Clear the maps and draw new errors."""
-        self.emap.reset(mask=mask)
+        self.emap.reset(mask.nonzero()[:, 0])
         for errors in self.sensor_errors:
             assert isinstance(errors, SensorErrors)
             errors.reset(mask=mask)

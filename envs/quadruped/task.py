@@ -184,11 +184,12 @@ class Quadruped(nn.Module):
 
     def reset(self, mask: Tensor | None = None) -> None:
         """Begin new episodes in the environments of `mask` (B,) bool, or in all; the curriculum gives the levels."""
-        every = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if mask is None:
+            mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
             self.steps.zero_()
-        self._choose_levels(every if mask is None else mask)
-        self._begin(every if mask is None else mask)
+        if bool(mask.any()):
+            self._choose_levels(mask)
+            self._begin(mask)
 
     def _begin(self, mask: Tensor) -> None:
         """Begin new episodes on the tiles of the current levels."""

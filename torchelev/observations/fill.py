@@ -34,7 +34,6 @@ class Query(NamedTuple):
     base_z: Float[Tensor, "B 1"]  #: [m] height of the base, map frame
     half_extent: tuple[int, int]  #: [cells] largest distance of points from the window's centre along x and y
     grid: GridConfig  #: the maps' grid
-    mode: str  #: one of MODES
 
 
 def require_mode(mode: object) -> None:
@@ -77,7 +76,21 @@ def read_points(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridC
     return [_find_lowest(values.unflatten(1, (3, -1)), known.unflatten(1, (3, -1)), dim=1) for values, known in read]
 
 
-def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, rings: int) -> Layer:
+def filled_layers(fill: str | float, state: MapState, half_extent: tuple[int, int], rings: int) -> list[Layer]:
+    """Return the layer that fills unknown heights, to be read at the same points; none for the other rules.
+
+    Args:
+        fill: one of FILLS, or a number.
+        state: the state of the maps.
+        half_extent: as in `Query`.
+        rings: how far "inpaint" reaches [cells].
+    """
+    if fill == "upper_bound":
+        return [LAYERS["upper_bound"](state)]
+    return [inpaint((state.elevation, state.validity), half_extent, rings)] if fill == "inpaint" else []
+
+
+def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, filled: Sequence[Layer]) -> Layer:
     """Fill the unknown ones of the heights read at points by a rule.
 
     Args:
@@ -85,21 +98,19 @@ def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, 
         state: the state of the maps.
         query: the points.
         read: the elevation (B, M) at the points, and where it is known.
-        rings: how far "inpaint" reaches [cells].
+        filled: what was read there of `filled_layers`.
 
     Returns:
         Heights (B, M), and where the map or the rule provides one.
     """
     elevation, known = read
-    layer = (state.elevation, state.validity)
     if fill == "ground":
+        layer = (state.elevation, state.validity)
         ground, found = continue_ground(layer, query.uv, query.base_uv, query.base_z, query.grid, query.half_extent)
     elif fill == "lowest":
         ground, found = (part[:, None] for part in _find_lowest(elevation, known, dim=1))
-    elif fill == "upper_bound":
-        ((ground, found),) = read_points([LAYERS["upper_bound"](state)], query.uv, query.grid, query.mode)
-    elif fill == "inpaint":
-        ((ground, found),) = read_points([inpaint(layer, query.half_extent, rings)], query.uv, query.grid, query.mode)
+    elif filled:
+        ((ground, found),) = filled
     else:
         return elevation, known
     return torch.where(known, elevation, ground), known | found

@@ -53,24 +53,25 @@ def continue_ground(
     relative = torch.where(known, values - z[..., None], 0.0)
     points = torch.cat([uv, base_uv], 1)
     points = torch.stack([points[..., 0] - top, points[..., 1] - left], -1)
-    levels = _read_levels((relative, known), points)
     num_near = 1 + max(0, math.floor(math.log2(_MAX_BLOCK / grid.resolution)))
+    levels = _read_levels((relative, known), points, num_near)
     below = [(mean[:, -1:], found[:, -1:] & (mean[:, -1:] < 0)) for mean, found in levels]
     base_ground, base_found = _take_first_known(below)
     ground, found = _take_first_known([(mean[:, :-1], found[:, :-1]) for mean, found in levels[:num_near]])
     return torch.where(found, ground, base_ground) + z, found | base_found
 
 
-def _read_levels(layer: Layer, points: Float[Tensor, "B M 2"]) -> list[Layer]:
+def _read_levels(layer: Layer, points: Float[Tensor, "B M 2"], num_near: int) -> list[Layer]:
     """Read a layer at points [cells], averaged over blocks of 1, 2, 4, ... cells a side, up to one block.
 
-    The mean of a block is that of its known quarters.
+    The mean of a block is that of its known quarters. Levels after the first `num_near` are read at the last point.
     """
     values, known = layer
     levels = []
     while True:
         H, W = values.shape[1:]
         blocks = GridConfig(resolution=1.0, length_x=H, length_y=W)
+        points = points if len(levels) < num_near else points[:, -1:]
         levels.append(sample_layer((values, known), points, blocks, "bilinear"))
         if max(H, W) == 1:
             return levels

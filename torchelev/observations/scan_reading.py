@@ -8,7 +8,7 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.layers import Layer
-from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, read_points
+from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, filled_layers, read_points
 from torchelev.observations.inputs import check_base, check_feet, draw_noise
 from torchelev.observations.patterns import to_cells
 from torchelev.observations.scan_settings import ScanSettings
@@ -36,14 +36,15 @@ def read_scan(
     dtype = state.elevation.dtype
     uv = scan.placement.place(T_map_base, origin, state.corner, grid.resolution, dtype)
     base_uv, base_z = to_cells(base, state.corner, grid.resolution, dtype), base[..., 2].to(dtype)
-    query = Query(uv, base_uv, base_z, scan.placement.half_extent(grid), grid, scan.mode)
+    query = Query(uv, base_uv, base_z, scan.placement.half_extent(grid), grid)
     z = origin[..., 2:].to(dtype)
     # On a GPU the poses are not checked: they may not be finite.
     z, is_finite = (v.expand(-1, -1, len(scan.pattern)).flatten(1) for v in (z, torch.isfinite(z)))
-    ((elevation, known),) = read_points([(state.elevation, state.validity)], uv, grid, scan.mode)
-    valid = known & is_finite
     fill = scan.original if scan.fill == ORIGINAL else scan.fill
-    ground, has_ground = fill_unknown(fill, state, query, (elevation, valid), scan.inpaint_rings)
+    layers = filled_layers(fill, state, query.half_extent, scan.inpaint_rings)
+    (elevation, known), *filled = read_points([(state.elevation, state.validity), *layers], uv, grid, scan.mode)
+    valid = known & is_finite
+    ground, has_ground = fill_unknown(fill, state, query, (elevation, valid), filled)
     standing_height = scan.nominal_height if scan.standing_height is None else scan.standing_height
     missing = standing_height - scan.nominal_height if isinstance(fill, str) else fill
     value = torch.where(has_ground & is_finite, z - ground - scan.nominal_height, missing)
