@@ -67,7 +67,7 @@ def _read_levels(layer: Layer, points: Float[Tensor, "B M 2"], num_near: int) ->
     The mean of a block is that of its known quarters. Levels after the first `num_near` are read at the last point.
     """
     values, known = layer
-    levels = []
+    levels: list[Layer] = []
     while True:
         H, W = values.shape[1:]
         blocks = GridConfig(resolution=1.0, length_x=H, length_y=W)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from torchelev.sim.sensors import tracing
+from torchelev.sim.sensors import body_casting, tracing
 
 PATHS = ["selects rays", "keeps all rays"]  # what a CPU does, and what a GPU does
 
@@ -10,5 +10,6 @@ PATHS = ["selects rays", "keeps all rays"]  # what a CPU does, and what a GPU do
 @pytest.fixture(params=PATHS)
 def path(request, monkeypatch):
     if request.param == PATHS[1]:
-        monkeypatch.setattr(tracing, "can_select_rays", lambda device: False)
+        for module in (body_casting, tracing):
+            monkeypatch.setattr(module, "can_select_rays", lambda device: False)
     return request.param

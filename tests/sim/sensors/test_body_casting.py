@@ -74,7 +74,7 @@ BLOCK = Box(link="a", center=(0.0, 0.0, 0.0), half_lengths=(0.1, 0.2, 0.3))
         (BLOCK, [1.0, 0.11, 0], math.inf),
     ],
 )
-def test_by_hand(shape, ray, expected):
+def test_by_hand(shape, ray, expected, path):
     """A shape 2 m ahead."""
     body = RobotBody(**{"boxes" if shape is BLOCK else "capsules": (shape,)}, padding=0.5)
     rays = torch.nn.functional.normalize(torch.tensor([[ray]], dtype=torch.float64), dim=-1)
@@ -83,7 +83,7 @@ def test_by_hand(shape, ray, expected):
 
 
 @pytest.mark.parametrize("down, expected", [(1.0, math.inf), (-1.0, 1.9)])
-def test_rays_along_the_axis_of_a_capsule(down, expected):
+def test_rays_along_the_axis_of_a_capsule(down, expected, path):
     """The end's sphere, 3 m less 1 m and 0.1 m, whether or not rounding makes the ray parallel."""
     body = RobotBody(capsules=(LEG,))
     for tilt in (0.0, 1e-8, 1e-5, 1e-4):
@@ -95,13 +95,25 @@ def test_rays_along_the_axis_of_a_capsule(down, expected):
 
 
 @pytest.mark.parametrize("shape", [LEG, BALL, BLOCK])
-def test_a_shape_that_holds_the_sensor_hides_nothing(shape):
+def test_a_shape_that_holds_the_sensor_hides_nothing(shape, path):
     wall = Box(link="b", center=(0.0, 0.0, 0.0), half_lengths=(0.1, 5.0, 5.0))
     around = {"boxes": (wall, shape)} if shape is BLOCK else {"boxes": (wall,), "capsules": (shape,)}
     body = RobotBody(**around)
     links = torch.stack([pose((0.05, 0.0, 0.0))[0] if link == "a" else pose((1.0, 0, 0))[0] for link in body.links])
     got = cast_at_body(body, REST, links[None], torch.tensor([[[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]]))
     assert got[0].tolist() == [pytest.approx(0.9), math.inf]
+
+
+@given(SEEDS)
+def test_only_capsules_far_from_a_ray_are_left_out(seed):
+    rng = np.random.default_rng(seed)
+    body = random_body(rng, capsules=3, boxes=0)
+    inputs = body, any_poses(rng, 4, reach=0.5), any_poses(rng, 4, len(body.links), reach=0.3), unit(rng, 4, 200)
+    near = cast_at_body(*inputs)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(body_casting, "can_select_rays", lambda device: False)
+        every = cast_at_body(*inputs)
+    torch.testing.assert_close(near, every, rtol=0, atol=1e-6)
 
 
 def test_parts_make_the_whole(monkeypatch):
