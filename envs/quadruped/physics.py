@@ -24,6 +24,7 @@ except ImportError as error:
 
 ROBOT = Path(__file__).with_name("robot.xml")
 _DEPTH = 1.0  # [m] of solid ground below the lowest point
+_MAX_SAMPLES = 2**24  # of the height field: MuJoCo's models hold one copy for each body
 
 
 class Sensed(NamedTuple):
@@ -58,7 +59,7 @@ class Physics(nn.Module):
         robot: A model with the joints and sensors of `robot.xml`.
 
     Raises:
-        ValueError: The model lacks a joint or a sensor.
+        ValueError: The model lacks a joint or a sensor, or the tiles are too many for one height field.
     """
 
     state: Tensor
@@ -137,9 +138,15 @@ def lay_out(terrain: TerrainGrid) -> tuple[np.ndarray, Tensor]:
     Returns:
         The heights (rows along x, columns along y) [m], and the tiles' origins (K, 2) [m] in the world's frame, whose
         origin is the centre of all.
+
+    Raises:
+        ValueError: The tiles have more samples than the height field may have.
     """
-    tiles, kinds = terrain.field.heights.cpu(), len(terrain.kinds)
+    tiles, kinds = terrain.field.heights, len(terrain.kinds)
     n = tiles.shape[1] - 1  # neighbours share their rim
+    actual, hint = len(tiles) * n * n, "take fewer kinds or levels, shorter tiles or a coarser resolution"
+    require(actual <= _MAX_SAMPLES, "terrain", f"must fit a height field of {_MAX_SAMPLES} samples", actual, hint)
+    tiles = tiles.cpu()
     grid = tiles[:, :n, :n].unflatten(0, (-1, kinds)).permute(0, 2, 1, 3).flatten(2).flatten(0, 1)
     index = torch.arange(len(tiles))
     middle = torch.stack([index // kinds, index % kinds], -1) * n + n / 2

@@ -87,6 +87,12 @@ def test_bodies_differ_and_the_seed_repeats_them():
     assert masses[0] == masses[1] != masses[2] and len(set(masses[0])) == RandomConfig().num_bodies
 
 
+def test_a_terrain_larger_than_the_height_field_is_refused(monkeypatch):
+    monkeypatch.setattr("envs.quadruped.physics._MAX_SAMPLES", 4 * 120 * 120 - 1)
+    with pytest.raises(ValueError, match=r"terrain: must fit a height field of 57599 samples, got 57600; take fewer"):
+        Physics(TERRAIN, 1, RandomConfig())
+
+
 def test_a_model_without_the_joints_is_refused(tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(ROBOT.read_text().replace("FL_knee", "FL_ankle"))
