@@ -26,7 +26,7 @@ def tiny(monkeypatch):
 @pytest.mark.slow(6)
 def test_the_commands_train_evaluate_draw_and_resume(tmp_path, tiny):
     out = tmp_path / "run"
-    common = ("--out", out, "--batches", 1, "--evaluation-batches", 1, "--steps", 2)
+    common = ("--out", out, "--batches", 1, "--exact-batches", 1, "--evaluation-batches", 1, "--steps", 2)
     done = invoke(training.main, *common)
     assert done.exit_code == 0 and "| 8 cm | learned |" in done.output
     result = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
@@ -48,9 +48,9 @@ def test_the_commands_train_evaluate_draw_and_resume(tmp_path, tiny):
 @pytest.mark.slow(2)
 def test_the_command_trains_for_one_robot(tmp_path, tiny, monkeypatch):
     monkeypatch.setattr(training, "_finish", lambda *_: None)
-    sizes = ("--robot", "length=0.5,width=0.45,foot_radius=0.1")
-    assert invoke(training.main, "--out", tmp_path, "--batches", 1, "--steps", 1, *sizes).exit_code == 0
-    assert invoke(training.main, "--out", tmp_path, "--batches", 1, "--steps", 1, "--resume").exit_code == 2
+    common = ("--out", tmp_path, "--batches", 1, "--exact-batches", 1, "--steps", 1)
+    assert invoke(training.main, *common, "--robot", "length=0.5,width=0.45,foot_radius=0.1").exit_code == 0
+    assert invoke(training.main, *common, "--resume").exit_code == 2
     found = torch.load(tmp_path / CHECKPOINT, weights_only=True)["settings"]["robot"]
     assert (found["length"], found["width"], found["foot_radius"]) == (0.5, 0.45, 0.1)
 
