@@ -117,7 +117,8 @@ def main(
 ) -> None:
     """Train a quadruped to walk over rough ground with rsl-rl's PPO.
 
-    Then evaluate it on held-out ground with the map in the loop and odometry that drifts, and export the policy.
+    Then evaluate it on held-out ground, with odometry that drifts and the map in the loop (a blind policy: blind), and
+    export the policy.
 
     Writes TensorBoard logs, checkpoints, result.json, policy.pt and policy.onnx to OUT. Both policies hold the layout
     of the scans that they read, and loading policy.pt with another one is refused.
@@ -159,9 +160,10 @@ def _play(policy: Path, out: Path, kind: str, level: int, seed: int) -> None:
 
 
 def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> None:
-    """Evaluate with the map in the loop, write the result and export the policy."""
+    """Evaluate with the map in the loop, or blind, write the result and export the policy."""
     policy = runner.get_inference_policy(device=runner.device)
-    result = evaluate(policy, task_config(held_out=True), "map", episodes, runner.device, compiled)
+    perception = "blind" if runner.env.task.perception == "blind" else "map"
+    result = evaluate(policy, task_config(held_out=True), perception, episodes, runner.device, compiled)
     click.echo(table(result))
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
     write_result(out / "result.json", {"training": training, "evaluation": result})

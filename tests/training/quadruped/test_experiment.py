@@ -75,17 +75,17 @@ def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
 
     def fake(policy, cfg, perception, *rest, **options):
         deployed.append((policy, perception))
-        return {"all": policy, "by_kind": policy}
+        return {"all": (policy, perception), "by_kind": {}}
 
     monkeypatch.setattr(experiment, "load_policy", lambda path, cfg: path.parent.name)
     monkeypatch.setattr(experiment, "read_curve", lambda folder: {"steps": []})
     monkeypatch.setattr(experiment, "evaluate", fake)
     rows = experiment._deploy_all(tmp_path)["rows"]
-    expected = [f"{perception}-{seed}" for perception, seed in experiment.CASES]
-    assert [row["deployed"]["all"] for row in rows] == [row["own"] for row in rows] == expected
-    own = [(f"{perception}-{seed}", perception) for perception, seed in experiment.CASES]
-    assert deployed[: 3 * len(own) : 3] == own
-    assert all(perception == "map" for name, perception in deployed[1::3] + deployed[2::3])
+    sights = {"map": "map", "truth": "map", "blind": "blind"}
+    for (perception, seed), row in zip(experiment.CASES, rows, strict=True):
+        name = f"{perception}-{seed}"
+        assert row["deployed"]["all"] == (name, sights[perception]) and row["own"] == (name, perception)
+    assert len(deployed) == 2 * len(rows) + 2 + len(experiment.SEEDS), "twice each; those with the truth also with it"
 
 
 def test_a_curve_averages_blocks_of_iterations(tmp_path, monkeypatch):
