@@ -10,7 +10,9 @@ again. Writes training/results/quadruped.json and quadruped.png.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -75,20 +77,33 @@ def _deploy(policy: Any, sees: bool) -> dict[str, Any]:
 
 def _deploy_all(runs: Path) -> dict[str, Any]:
     """Deploy every policy on held-out ground, and the trot that none of them has modified."""
-    cfg, rows = task_config(held_out=True), []
-    for perception, seed in tqdm(CASES, unit="policy"):
-        folder = _folder(runs, perception, seed)
-        trained = json.loads((folder / "result.json").read_text())["training"]
-        policy = load_policy(folder / "policy.pt", cfg)
-        row = {"perception": perception, "seed": seed, "training": trained} | _deploy(policy, perception != "blind")
-        is_own = perception != "truth"  # it was deployed with what it was trained with
-        own = row["deployed"]["all"] if is_own else evaluate(policy, cfg, perception, EPISODES)["all"]
-        rows.append(row | {"own": own, "curve": read_curve(folder)})
+    cfg = task_config(held_out=True)
+    rows = [_kept(_folder(runs, *case) / "deployed.json", functools.partial(_row, runs, *case)) for case in tqdm(CASES)]
     fixed = {
         "seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS,
         "levels": cfg.terrain.num_levels, "difficulty": cfg.terrain.difficulty,
     }  # fmt: skip
-    return {"config": fixed, "trot": _deploy(stand_in_trot, sees=False), "rows": rows}
+    trot = _kept(runs / "trot.json", lambda: _deploy(stand_in_trot, sees=False))
+    return {"config": fixed, "trot": trot, "rows": rows}
+
+
+def _kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what the file holds; made and written there the first time."""
+    if not path.exists():
+        text = json.dumps(make())
+        path.write_text(text)
+    return json.loads(path.read_text())
+
+
+def _row(runs: Path, perception: str, seed: int) -> dict[str, Any]:
+    """Deploy one policy; also as it was trained, if that is something else."""
+    cfg, folder = task_config(held_out=True), _folder(runs, perception, seed)
+    policy = load_policy(folder / "policy.pt", cfg)
+    training = json.loads((folder / "result.json").read_text())["training"]
+    row = {"perception": perception, "seed": seed, "training": training} | _deploy(policy, perception != "blind")
+    is_own = perception != "truth"
+    own = row["deployed"]["all"] if is_own else evaluate(policy, cfg, perception, EPISODES)["all"]
+    return row | {"own": own, "curve": read_curve(folder)}
 
 
 def read_curve(folder: Path) -> dict[str, list[float]]:

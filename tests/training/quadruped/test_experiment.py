@@ -75,7 +75,7 @@ def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
 
     def fake(policy, cfg, perception, *rest, **options):
         deployed.append((policy, perception))
-        return {"all": (policy, perception), "by_kind": {}}
+        return {"all": [str(policy), perception], "by_kind": {}}
 
     monkeypatch.setattr(experiment, "load_policy", lambda path, cfg: path.parent.name)
     monkeypatch.setattr(experiment, "read_curve", lambda folder: {"steps": []})
@@ -84,8 +84,10 @@ def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
     sights = {"map": "map", "truth": "map", "blind": "blind"}
     for (perception, seed), row in zip(experiment.CASES, rows, strict=True):
         name = f"{perception}-{seed}"
-        assert row["deployed"]["all"] == (name, sights[perception]) and row["own"] == (name, perception)
+        assert row["deployed"]["all"] == [name, sights[perception]] and row["own"] == [name, perception]
     assert len(deployed) == 2 * len(rows) + 2 + len(experiment.SEEDS), "twice each; those with the truth also with it"
+    again = len(deployed)
+    assert experiment._deploy_all(tmp_path)["rows"] == rows and len(deployed) == again, "what is finished is kept"
 
 
 def test_a_curve_averages_blocks_of_iterations(tmp_path, monkeypatch):
