@@ -153,6 +153,18 @@ def measure(points, T_map_sensor, T_map_base, *, noise, limits, exclusion=None, 
     return measured
 
 
+def pose_variance(relative, covariance):
+    """J Sigma J^T of a point's height, J = (0, 0, 1, r_y, -r_x, 0); `relative` is the point less the sensor."""
+    J = [0.0, 0.0, 1.0, relative[1], -relative[0], 0.0]
+    return sum(J[i] * covariance[i][j] * J[j] for i in range(6) for j in range(6))
+
+
+def absolute_variance(variance, gradient, covariance):
+    """The elevation's own variance and n^T Sigma n of the position that it counts from, n = (-g_x, -g_y, 1)."""
+    n = [-gradient[0], -gradient[1], 1.0]
+    return variance + sum(n[i] * covariance[i][j] * n[j] for i in range(3) for j in range(3))
+
+
 def depth_to_points(depth, fx, fy, cx, cy, along):
     """The points of a depth image (h, w), optical frame, row after row; NaN where there is no depth."""
     points = []

@@ -32,14 +32,13 @@ def compiled_update(
         update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
     inputs = [None if value is None else packed(value) for value in (points, *others)]
-    _, _, _, _, variance, _ = inputs
-    mark_dynamic(2, inputs[0], variance)
+    mark_dynamic(2, inputs[0], inputs[4])  # points, and their variance
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     with announced_compilation():
         graphs = graphs_of(cfg, kinds, points.shape[1])
         stored = with_masks(stored, as_bytes)
         m = graphs.move_window(stored, *inputs)
-        mark_dynamic(1, m.points, m.variance, m.used, m.casts)
+        mark_dynamic(1, m.points, m.variance, m.used, m.casts, m.noise)
         graphs.fuse_heights(stored, m)
         graphs.apply_rays(stored, m, weights)
 

@@ -88,6 +88,7 @@ class ElevationMap(ReadableMap):
         *,
         variance: Float[Tensor, "B *S N"] | None = None,
         T_base_links: Float[Tensor, "B K 4 4"] | None = None,
+        pose_covariance: Float[Tensor, "B *S 6 6"] | None = None,
     ) -> None:
         """Fuse one cloud per environment into its map.
 
@@ -104,12 +105,16 @@ class ElevationMap(ReadableMap):
             T_base_links: poses of the links in the base frame, (B, K, 4, 4), as joint encoders tell them at the time of
                 the points, in the order of `cfg.sensor.body.links`. Required if the body is a `RobotBody`, and only
                 then.
+            pose_covariance: covariance of each sensor's pose, (B, 6, 6) or (B, S, 6, 6): x, y, z [m], then the
+                rotations about the map's axes [rad], as in a ROS Odometry message. It adds J Sigma J^T to the variance
+                of each point's height, J = (0, 0, 1, r_y, -r_x, 0) with r from the sensor to the point; the layer
+                `variance` then holds what the pose's errors add. None: poses are exact.
 
         Raises:
             TypeError: if `dt` is missing, or an argument has the wrong type or dtype. Nothing has changed then.
             ValueError: if a shape, device or value is wrong. Nothing has changed then.
         """
-        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links)
+        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
         self._history.add(inputs)
         self._filtered.clear()
         if self.device.type == "cpu":
@@ -131,9 +136,10 @@ class ElevationMap(ReadableMap):
         *,
         variance: Float[Tensor, "B *S N"] | None = None,
         T_base_links: Float[Tensor, "B K 4 4"] | None = None,
+        pose_covariance: Float[Tensor, "B *S 6 6"] | None = None,
     ) -> Measurement:
         """Return the measurement of a cloud, for `forward`. Arguments and errors are those of `update`."""
-        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links)
+        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
         return measure(*inputs, self.cfg.grid, self.cfg.sensor, self.elevation.dtype)
 
     def forward(self, state: MapState, measurement: Measurement) -> MapState:

@@ -36,9 +36,21 @@ def _validity(state: MapState) -> Layer:
     return state.validity.to(state.elevation.dtype), torch.ones_like(state.validity)
 
 
+def absolute_variance(state: MapState) -> Float[Tensor, "B H W"]:
+    """Return the variance [m^2] of each elevation in the map frame: its own, and n^T Sigma n of the pose's position.
+
+    With n = (-dz/dx, -dz/dy, 1): on a slope, a map that is off sideways is off in height.
+    """
+    C = state.pose_covariance[..., None, None]
+    gx, gy = state.gradient_x, state.gradient_y
+    level = C[:, 0, 0] * gx.square() + 2 * C[:, 0, 1] * gx * gy + C[:, 1, 1] * gy.square()
+    shared = level + C[:, 2, 2] - 2 * (C[:, 0, 2] * gx + C[:, 1, 2] * gy)
+    return state.variance + shared.clamp(min=0)
+
+
 LAYERS: dict[str, Callable[[MapState], Layer]] = {
     "elevation": lambda state: (state.elevation, state.validity),
-    "variance": lambda state: (state.variance, state.validity),
+    "variance": lambda state: (absolute_variance(state), state.validity),
     "validity": _validity,
     "time": lambda state: (state.time, state.validity),
     "upper_bound": _upper_bound,

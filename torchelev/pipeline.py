@@ -68,12 +68,13 @@ def update_in_place(
     dt: Tensor,
     variance: Tensor | None,
     T_base_links: Tensor | None,
+    pose_covariance: Tensor | None = None,
     *,
     cfg: ElevationMapConfig,
     weights: Weights | None = None,
 ) -> None:
     """Measure, fuse, and write the new values into the stored state's own tensors; points come as (B, S, N, 3)."""
-    inputs = points, T_map_sensor, T_map_base, dt, variance, T_base_links
+    inputs = points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance
     m = measure(*inputs, cfg.grid, cfg.sensor, stored.elevation.dtype)
     write(stored, forward(stored, m, cfg, weights))
 

@@ -38,6 +38,7 @@ class MapState(NamedTuple):
 
     corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the map frame's lattice
     base_height: Float[Tensor, "B"]  #: [m] z of the last T_map_base
+    pose_covariance: Float[Tensor, "B 3 3"]  #: [m^2] of the position that all elevations count from; see `pose_error`
     elevation: Float[Tensor, "B H W"]  #: [m] map frame
     variance: Float[Tensor, "B H W"]  #: [m^2]
     validity: Bool[Tensor, "B H W"]  #: elevation is known
@@ -73,9 +74,11 @@ class Measurement(NamedTuple):
     rejected_range: Int[Tensor, "B"]  #: see `Statistics`
     rejected_body: Int[Tensor, "B"]  #: see `Statistics`
     rejected_overhang: Int[Tensor, "B"]  #: see `Statistics`
+    noise: Float[Tensor, "B M"] | None = None  #: [m^2] of the variance, what the pose does not add; None: all of it
+    pose_covariance: Float[Tensor, "B 3 3"] | None = None  #: [m^2] of the first sensor's position
 
 
-LAYERS = MapState._fields[2:-1]  # (B, H, W)
+LAYERS = MapState._fields[3:-1]  # (B, H, W)
 MASKS = ("validity", "bounded", "has_normal", "rated")  # layers that are true or false
 # What an unknown cell holds, by layer; everything else is zero.
 BLANK = {"variance": 1.0}
@@ -96,7 +99,9 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
     kinds = dict.fromkeys(MASKS, torch.bool) | {"challenger_support": torch.uint8}
     values = {name: (layer + BLANK.get(name, 0.0)).to(kinds.get(name, dtype)) for name in LAYERS}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))
-    return MapState(corner=corner, base_height=number, statistics=statistics, **values)
+    covariance = number.new_zeros(num_envs, 3, 3)
+    own = dict(corner=corner, base_height=number, pose_covariance=covariance)
+    return MapState(**own, statistics=statistics, **values)
 
 
 def forget(state: MapState, grid: GridConfig, env_ids: Tensor | None, mask: Tensor | None) -> None:

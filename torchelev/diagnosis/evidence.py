@@ -113,9 +113,9 @@ def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[
 def _measure_again(cfg: ElevationMapConfig, update: PastUpdate, env: int) -> Measurement:
     """Return one environment's measurement of an update's thinned points."""
     inputs = [None if value is None else value[env, None] for value in update.inputs]
-    points, T_map_sensor, T_map_base, dt, variance, T_base_links = inputs
+    points, T_map_sensor, T_map_base, dt, variance, T_base_links, covariance = inputs
     assert points is not None and T_map_sensor is not None and dt is not None
-    poses = (T_map_sensor, T_map_base, dt, variance, T_base_links)
+    poses = (T_map_sensor, T_map_base, dt, variance, T_base_links, covariance)
     return measure(points, *poses, cfg.grid, cfg.sensor, torch.float32)
 
 

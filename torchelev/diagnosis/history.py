@@ -78,4 +78,5 @@ def _thin(inputs: Inputs) -> Inputs:
             dt=copy(inputs.dt),
             variance=None if inputs.variance is None else copy(inputs.variance[:, :, ::step]),
             T_base_links=None if inputs.T_base_links is None else copy(inputs.T_base_links),
+            pose_covariance=None if inputs.pose_covariance is None else copy(inputs.pose_covariance),
         )

@@ -109,6 +109,20 @@ def _require_rigid(name: str, pose: Tensor) -> None:
     refuse(distance > FARTHEST, f"must lie within {FARTHEST:g} m", lambda: f"{distance.max():.3g} m", hint)
 
 
+def require_covariance(name: str, value: Tensor) -> None:
+    """Refuse matrices (B, ..., 6, 6) that are not finite, symmetric and positive semidefinite."""
+    matrix = value.detach().cpu().double().numpy()
+    scale = np.abs(matrix).max(initial=0.0)
+    bad = ~np.isfinite(matrix)
+    hint = "where the pose's uncertainty is unknown, leave it out"
+    require(not bad.any(), name, "must be finite", "NaN or inf" + name_environments(bad), hint)
+    bad = np.abs(matrix - matrix.swapaxes(-1, -2)) > 1e-4 * scale
+    hint = "give the covariance of x, y, z and the rotations about the map's axes"
+    require(not bad.any(), name, "must be symmetric", "another" + name_environments(bad), hint)
+    bad = np.linalg.eigvalsh(matrix) < -1e-4 * scale
+    require(not bad.any(), name, "must have no negative eigenvalue", "one" + name_environments(bad), hint)
+
+
 def name_environments(bad: np.ndarray) -> str:
     """Return " in environment 0, 2" for the rows (B, ...) that hold a bad value, and "" if there is one row only."""
     which = np.flatnonzero(bad.reshape(len(bad), -1).any(1))

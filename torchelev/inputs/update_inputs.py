@@ -31,6 +31,7 @@ class Inputs(NamedTuple):
     dt: Float[Tensor, "B"]  #: [s] since the environment's last update
     variance: Float[Tensor, "B S N"] | None  #: [m^2] of each point's height; None: the noise model's
     T_base_links: Float[Tensor, "B K 4 4"] | None  #: poses of the links of `sensor.body`; None: it has none
+    pose_covariance: Float[Tensor, "B S 6 6"] | None = None  #: of each sensor's pose; None: poses are exact
 
 
 class TakesInputs(Protocol[_ResultOut]):
@@ -49,6 +50,7 @@ class TakesInputs(Protocol[_ResultOut]):
         *,
         variance: Tensor | None = None,
         T_base_links: Tensor | None = None,
+        pose_covariance: Tensor | None = None,
     ) -> _ResultOut: ...
     @overload
     def __call__(
@@ -59,6 +61,7 @@ class TakesInputs(Protocol[_ResultOut]):
         dt: float | Tensor,
         variance: Tensor | None = None,
         T_base_links: Tensor | None = None,
+        pose_covariance: Tensor | None = None,
     ) -> _ResultOut: ...
 
 
@@ -74,6 +77,7 @@ def check_inputs(
     dt: Any,
     variance: Any,
     T_base_links: Any,
+    pose_covariance: Any,
     num_envs: int,
     device: torch.device,
     dtype: torch.dtype,
@@ -86,7 +90,7 @@ def check_inputs(
     `dt` that lie on another device than the CPU.
     """
     require_full_precision(dtype)
-    require_reverse_mode((points, T_map_sensor, T_map_base, dt, variance, T_base_links))
+    require_reverse_mode((points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance))
     cloud = _check_points(points, num_envs, device)
     B, S = num_envs, cloud.shape[1]  # not the cloud's B, which the compiler may take for variable
     shape = (B, S, 4, 4) if points.ndim == 4 else (B, 4, 4)
@@ -100,7 +104,23 @@ def check_inputs(
         require(fits, "variance", f"expected {tuple(points.shape[:-1])}", tuple(variance.shape), "give one per point")
         variance = variance.view(cloud.shape[:-1])
     T_base_links = _check_links(T_base_links, links, T_map_base is not None, B, device, check_values)
-    return Inputs(cloud, T_map_sensor, T_map_base, dt, variance, T_base_links)
+    if pose_covariance is not None:
+        pose_covariance = _check_covariance(pose_covariance, B, S, device, check_values)
+    return Inputs(cloud, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
+
+
+def _check_covariance(
+    covariance: Any, num_envs: int, num_sensors: int, device: torch.device, check_values: bool
+) -> Float[Tensor, "B S 6 6"]:
+    """Return the covariance of each sensor's pose; one that was given for all sensors is repeated."""
+    value = checks.check_tensor("pose_covariance", covariance, device, checks.FLOATS)
+    one, each = (num_envs, 6, 6), (num_envs, num_sensors, 6, 6)
+    rule, hint = f"expected {one} or {each}", "give one 6 x 6 matrix for each: x, y, z and rotations about them"
+    require(tuple(value.shape) in (one, each), "pose_covariance", rule, tuple(value.shape), hint)
+    value = value if value.ndim == 4 else value[:, None].expand(each)
+    if checks.readable(value, check_values):
+        checks.require_covariance("pose_covariance", value)
+    return value
 
 
 def _check_links(

@@ -11,6 +11,7 @@ from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE, count
 from torchelev.stages.cells import cells_of, center_offsets
+from torchelev.stages.pose_error import share_pose_error
 from torchelev.state import MapState, Measurement, tally
 
 
@@ -55,7 +56,7 @@ def compensate(
     of their mean. No correction if n < min_points or |e| > max_drift, or without `cfg`.
     """
     if cfg is None:
-        return state
+        return share_pose_error(state, m, torch.zeros_like(m.dt, dtype=torch.bool))
     cells = cells_of(state, m, grid)
     px, py, pz = m.points.unbind(-1)
     suits = state.validity & (state.traversability >= min_traversability) & (state.variance <= cfg.max_variance)
@@ -68,8 +69,9 @@ def compensate(
     error = pz - (ground + gx * px + gy * py)
     counts = cells.inside & (error.abs() <= cfg.max_error)
     mean = masked_mean(error, counts)
+    noise = m.variance if m.noise is None else m.noise
     # Again around the mean: the foot of a wall that was not seen before stands on ground that looks flat.
-    counts = counts & ((error - mean[:, None]).square() <= cfg.gate**2 * (m.variance + cfg.relief**2))
+    counts = counts & ((error - mean[:, None]).square() <= cfg.gate**2 * (noise + cfg.relief**2))
     number, mean = count(counts), masked_mean(error, counts)
     applies = (number >= cfg.min_points) & (mean.abs() <= cfg.max_drift)
     correction = torch.where(applies, cfg.gain * mean, 0.0)
@@ -79,4 +81,5 @@ def compensate(
         challenger=state.challenger + shift.detach() * (state.challenger_support > 0),
         upper_bound=state.upper_bound + shift * state.bounded,
     )
+    state = share_pose_error(state, m, applies)
     return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

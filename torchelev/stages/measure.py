@@ -15,6 +15,7 @@ from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
 from torchelev.robot_body.shapes import RobotBody
 from torchelev.stages.body import BodyConfig, inside_body, on_robot, rotate
+from torchelev.stages.pose_error import project_covariance
 from torchelev.state import Measurement
 
 if TYPE_CHECKING:
@@ -209,6 +210,7 @@ def measure(
     dt: Float[Tensor, "B"],
     variance: Float[Tensor, "B S N"] | None,
     T_base_links: Float[Tensor, "B K 4 4"] | None,
+    pose_covariance: Float[Tensor, "B S 6 6"] | None,
     grid: GridConfig,
     cfg: SensorConfig,
     dtype: torch.dtype,
@@ -232,11 +234,15 @@ def measure(
         coordinates = sensed.x, sensed.y, sensed.z, sensed.distance2
         own = on_robot(*coordinates, T_map_sensor, T_map_base, T_base_links, cfg.body)
     gates = gate_points(sensed, mapped, variance, T_map_base, base, own, cfg)
+    total, noise, of_position = gates.variance, None, None
+    if pose_covariance is not None:
+        total, noise = gates.variance + project_covariance(mapped.relative, pose_covariance, dtype), gates.variance
+        of_position = pose_covariance[:, 0, :3, :3].to(dtype)
     finite, in_range, casts, used = (count(mask) for mask in (sensed.finite, mapped.in_range, gates.casts, gates.used))
     return Measurement(
         anchor=anchor,
         points=mapped.position.transpose(1, 2),
-        variance=gates.variance,
+        variance=total,
         used=gates.used,
         casts=gates.casts,
         origin=origin,
@@ -246,4 +252,6 @@ def measure(
         rejected_range=finite - in_range,
         rejected_body=in_range - casts,
         rejected_overhang=casts - used,
+        noise=noise,
+        pose_covariance=of_position,
     )

@@ -46,10 +46,11 @@ def measure_cells(
     is_settled = prior.support >= (cfg.edges.min_settled if cfg.edges is not None else 0.0)
     is_lower_part = (consensus.side > 0) & (height < prior.elevation) & is_settled
     votes = kept_number + edge  # points on the face of a wall support its top
+    # Cells without points need a finite one.
+    variance = (1.0 / information.clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor)
     cells = CellMeasurement(
         height=height,
-        # Cells without points need a finite one.
-        variance=(1.0 / information.clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor),
+        variance=scan.add_shared(variance, weight, information),
         kept=kept_number,
         votes=votes,
         dissent=consensus.number - votes,

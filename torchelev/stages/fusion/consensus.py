@@ -93,6 +93,7 @@ def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: Fu
     height, relief = torch.where(trusted, elevation, mean), cfg.relief * grid.resolution
     height, side = resolve_contested(points, height, shown, grid.width, cfg.gate, relief, cfg.edges)
     variance = (1.0 / weight.detach().clamp(min=1e-12)).clamp(min=cfg.scan_variance_floor)
+    variance = scan.add_shared(variance, scan.weight, weight).detach()
     is_challenged = (number > 0) & ((prior.known & ~trusted) | (prior.challenger_support > 0))
     return Consensus(height, side, trusted, number, variance, near, gate_at, SelectedCells(is_challenged))
 

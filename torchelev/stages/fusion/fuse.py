@@ -18,6 +18,7 @@ from torchelev.stages.fusion.consensus import estimate_consensus
 from torchelev.stages.fusion.contested import ratio
 from torchelev.stages.fusion.points import Prior, gather_points, gather_prior
 from torchelev.stages.fusion.vote import Decision, decide_by_vote
+from torchelev.stages.pose_error import relative_variance
 from torchelev.state import BLANK, MapState, Measurement, tally
 
 
@@ -39,7 +40,8 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
     above the cell agree with each other (`challenge`): a new obstacle appears soon, even on ground seen for long.
     """
-    scan, prior = gather_points(m, cells_of(state, m, grid), grid, cfg), gather_prior(state)
+    scan = gather_points(m, cells_of(state, m, grid), relative_variance(state, m), grid, cfg)
+    prior = gather_prior(state)
     consensus = estimate_consensus(scan, prior, grid, cfg)
     if has_rays:  # nothing else tells outliers in a blind spot from an obstacle
         challenge = challenge_from_above(prior, consensus, grid.width, cfg.relief * grid.resolution, cfg)

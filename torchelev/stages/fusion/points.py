@@ -10,6 +10,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.stages.cells import PointCells
 from torchelev.stages.fusion.config import FusionConfig
+from torchelev.stages.fusion.contested import ratio
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
@@ -26,10 +27,18 @@ class ScanPoints(NamedTuple):
     ray: list[Float[Tensor, "B M"]]  #: [m] x and y from the sensor to the point
     passed: Bool[Tensor, "B M"]  #: the ray passed over the cell's centre before it hit
     cells: PointCells  #: the cell of each point
+    shared: Float[Tensor, "B M"] | None  #: [m^2] variance that the pose adds, the same error for points of a cell
 
     def sums(self, *columns: Tensor) -> tuple[Tensor, ...]:
         """Sum numbers, or count what is true, over the points of each cell."""
         return self.cells.sums(*(column.to(self.z.dtype) for column in columns))
+
+    def add_shared(self, variance: Tensor, weight: Tensor, information: Tensor) -> Tensor:
+        """Return the variance (B, C) of a mean of points: what its points do not share, and what they do."""
+        if self.shared is None:
+            return variance
+        (moment,) = self.sums(weight * self.shared)
+        return variance + ratio(moment, information)
 
     def columns(self) -> list[Tensor]:
         """Return what `ContestedCells` needs of every point, without a gradient."""
@@ -47,20 +56,25 @@ class Prior(NamedTuple):
     challenger_support: UInt8[Tensor, "B C"]  #: points that do so, less points that do not
 
 
-def gather_points(m: Measurement, cells: PointCells, grid: GridConfig, cfg: FusionConfig) -> ScanPoints:
+def gather_points(
+    m: Measurement, cells: PointCells, shared: Tensor | None, grid: GridConfig, cfg: FusionConfig
+) -> ScanPoints:
     """Find what the update needs of each point, and whether its ray passed over the cell's centre."""
     xy, z, used = m.points[..., :2], m.points[..., 2], cells.inside
     from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
     sensors = m.origin.shape[1]
     ray = (xy.unflatten(1, (sensors, -1)) - m.origin[:, :, None, :2]).flatten(1, 2)
+    noise = m.variance if m.noise is None else m.noise
+    spread = noise + (cfg.relief * grid.resolution) ** 2
     return ScanPoints(
         z=z,
-        spread=m.variance + (cfg.relief * grid.resolution) ** 2,
-        weight=torch.where(used, 1.0 / m.variance, 0.0),
+        spread=spread if shared is None else spread + shared,
+        weight=torch.where(used, 1.0 / noise, 0.0),
         used=used,
         ray=list(ray.unbind(-1)),
         passed=passed_center(from_center, ray),
         cells=cells,
+        shared=shared,
     )
 
 
