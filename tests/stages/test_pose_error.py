@@ -50,15 +50,17 @@ def test_points_agree_with_the_reference(seed, num_envs, sensors, each):
     T = torch.stack([random_poses(rng, sensors, 1.0) for _ in range(num_envs)])
     covariance = covariances(rng, num_envs, sensors) if each else covariances(rng, num_envs)
     cloud = torch.from_numpy(rng.uniform(-2, 2, (num_envs, sensors, 20, 3)))
-    told = emap.measure(cloud, T, None, 0.1, pose_covariance=covariance)
+    m = emap.measure(cloud, T, None, 0.1, pose_covariance=covariance)
     exact = emap.measure(cloud, T, None, 0.1)
-    assert torch.equal(told.noise, exact.variance) and torch.equal(told.used, exact.used)
-    added = (told.variance - told.noise).view(num_envs, sensors, -1)
+    assert torch.equal(m.noise, exact.variance) and torch.equal(m.used, exact.used)
+    added = (m.variance - m.noise).view(num_envs, sensors, -1)
     for b in range(num_envs):
         for s in range(sensors):
             for k in range(20):
                 turned = T[b, s, :3, :3] @ cloud[b, s, k]
-                expected = reference.pose_variance(turned.tolist(), (covariance[b, s] if each else covariance[b]).tolist())
+                expected = reference.pose_variance(
+                    turned.tolist(), (covariance[b, s] if each else covariance[b]).tolist()
+                )
                 assert float(added[b, s, k]) == pytest.approx(expected, abs=1e-12)
 
 

@@ -263,3 +263,20 @@ def test_host_reads_nothing_back(monkeypatch):
     errors(T, 0.1)
     errors(T, torch.empty(2, device="meta"), torch.empty(2, device="meta"))
     errors.reset(mask=torch.empty(2, dtype=torch.bool, device="meta"))
+
+
+def test_the_covariance_is_that_of_the_errors():
+    """Of robots that all walk the same bent way, with drift and noise; the bias is a known offset here."""
+    errors = make(noise_xy=0.01, noise_z=0.02, noise_yaw_deg=0.5, bias_z=0.3, **DRIFT)
+    for x, y in ((0.0, 0.0), (0.5, 0.0), (1.0, 0.5), (1.0, 1.0), (0.5, 1.5)):
+        estimated = errors(at(x, y), dt=0.2)
+    sample = torch.cat([estimated[:, :3, 3] - at(x, y)[:, :3, 3], yaw_of(estimated)[:, None]], -1)
+    told = errors.covariance[:, [0, 1, 2, 5]][:, :, [0, 1, 2, 5]]
+    assert torch.equal(told, told[:1].expand_as(told)) and not errors.covariance[:, 3:5].any()
+    actual, expected = torch.cov(sample.T), told[0]
+    std = expected.diagonal().sqrt()
+    assert ((actual - expected).abs() <= 5 * (2 / B) ** 0.5 * std[:, None] * std).all()
+    assert abs(expected[0, 3] / (std[0] * std[3])) > 0.2  # a yaw error moves the robot sideways
+    errors.reset()
+    errors(at(), dt=0.2)
+    assert float(errors.covariance[0, 2, 2]) == pytest.approx(0.02**2)

@@ -82,6 +82,7 @@ class PoseErrors(DomainRandomization):
     error: Tensor
     yaw: Tensor
     is_first: Tensor
+    drift_covariance: Tensor
 
     def __init__(
         self,
@@ -94,14 +95,29 @@ class PoseErrors(DomainRandomization):
         self.register_buffer("position", torch.zeros(num_envs, 3, dtype=torch.float64, device=device))
         self.register_buffer("error", torch.zeros(num_envs, 3, device=device))
         self.register_buffer("yaw", torch.zeros(num_envs, device=device))
+        self.register_buffer("drift_covariance", torch.zeros(num_envs, 4, 4, dtype=torch.float64, device=device))
         self.register_buffer("is_first", torch.ones(num_envs, dtype=torch.bool, device=device))
         self.reset()
 
     def _restart(self, mask: Bool[Tensor, "B"]) -> None:
         super()._restart(mask)
         self.error.masked_fill_(mask[:, None], 0.0)
+        self.drift_covariance.masked_fill_(mask[:, None, None], 0.0)
         self.yaw.copy_(torch.where(mask, torch.deg2rad(self.value("bias_yaw_deg")), self.yaw))
         self.is_first.copy_(self.is_first | mask)
+
+    @property
+    def covariance(self) -> Float[Tensor, "B 6 6"]:
+        """Covariance of the last estimate: x, y, z [m^2], then the rotations about the map's x, y and z [rad^2].
+
+        That of the drift so far, to first order in the yaw, and of the noise; a bias is not in it. Float64.
+        """
+        noise = self.columns("noise_xy", "noise_xy", "noise_z", "noise_yaw_deg").double()
+        noise[:, 3].deg2rad_()
+        total = torch.zeros(self.num_envs, 6, 6, dtype=torch.float64, device=self.error.device)
+        place = torch.tensor([0, 1, 2, 5], device=total.device)  # roll and pitch have no error
+        total[:, place[:, None], place] = self.drift_covariance + torch.diag_embed(noise.square())
+        return total
 
     def forward(
         self,
@@ -144,8 +160,17 @@ class PoseErrors(DomainRandomization):
         walk = variance.sqrt() * self.normal(self.num_envs, 4)
         self.yaw.add_(torch.deg2rad(walk[:, 3]))
         self.error.add_(walk[:, :3] + (_rotate_about_z(self.yaw) @ step[:, :, None])[:, :, 0] - step)
+        self._propagate(step, variance)
         self.position.copy_(position)
         self.is_first.fill_(False)
+
+    def _propagate(self, step: Tensor, variance: Tensor) -> None:
+        """Advance the covariance of x, y, z and yaw: F (P + Q) F^T, where F turns an error of yaw into one of dp."""
+        F = torch.eye(4, dtype=torch.float64, device=step.device).repeat(self.num_envs, 1, 1)
+        F[:, 0, 3], F[:, 1, 3] = -step[:, 1], step[:, 0]
+        Q = variance.double()
+        Q[:, 3] *= math.radians(1) ** 2
+        self.drift_covariance.copy_(F @ (self.drift_covariance + torch.diag_embed(Q)) @ F.mT)
 
     def _check(self, T_map_base: Tensor, dt: float | Tensor, moved: Tensor | None) -> None:
         B, actual = self.num_envs, tuple(T_map_base.shape)
