@@ -199,3 +199,4 @@ def test_the_gate_widens_with_the_pose():
         update(emap, flat(0.2, 9), of_height(variance), dt=0.0)
         outliers = int(emap.statistics.rejected_outlier)
         assert outliers == (9 if variance == 0.0 else 0)
+        assert float(emap.state.support.max()) == (0.0 if variance == 0.0 else 18.0)
