@@ -13,6 +13,9 @@ from tests.helpers import assert_close, differences, pose, random_poses, small_m
 from tests.test_properties import LIVELY, recording
 from torchelev import DriftConfig, FusionConfig, SensorConfig
 from torchelev.layers import LAYERS
+from torchelev.stages.cells import cells_of
+from torchelev.stages.fusion.points import gather_points
+from torchelev.stages.pose_error import relative_variance
 
 SEEDS = st.integers(0, 10_000)
 NOISE = 1e-4  # [m^2]
@@ -199,4 +202,13 @@ def test_the_gate_widens_with_the_pose():
         update(emap, flat(0.2, 9), of_height(variance), dt=0.0)
         outliers = int(emap.statistics.rejected_outlier)
         assert outliers == (9 if variance == 0.0 else 0)
-        assert float(emap.state.support.max()) == (0.0 if variance == 0.0 else 18.0)
+
+
+def test_the_gate_of_points_is_that_of_their_whole_variance():
+    emap = small_map(**EXACT, dtype=torch.float64)
+    covariance = covariances(np.random.default_rng(0), 1)
+    m = emap.measure(flat(0.0, 4, side=0.1), pose((0, 0, 1)), None, 0.1, pose_covariance=covariance)
+    cfg, grid, state = FusionConfig(), emap.cfg.grid, emap.state
+    scan = gather_points(m, cells_of(state, m, grid), relative_variance(state, m), grid, cfg)
+    torch.testing.assert_close(scan.spread, m.variance + (cfg.relief * grid.resolution) ** 2)
+    torch.testing.assert_close(scan.weight, 1 / m.noise)
