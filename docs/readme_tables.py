@@ -16,7 +16,7 @@ from typing import Any
 
 import benchmarks
 import training
-from benchmarks.quality import mjlab_task
+from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
@@ -130,6 +130,11 @@ def _nav() -> str:
     return experiment.table(load("nav", training.RESULTS))
 
 
+def _pose_covariance() -> str:
+    """Tabulate how often the truth lies within two standard deviations of the map."""
+    return pose_covariance.table(load("pose_covariance"))
+
+
 def _encoder_cost() -> str:
     """Tabulate what encoders of the map cost."""
     return encoders.table(load("encoders")["rows"])
@@ -160,6 +165,7 @@ TABLES = {
     "loop": _loop,
     "long_run": _long_run,
     "nav": _nav,
+    "pose_covariance": _pose_covariance,
     "encoder_cost": _encoder_cost,
     "sight": _sight,
     "mjlab": _mjlab,
