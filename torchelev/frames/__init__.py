@@ -15,5 +15,6 @@ Isaac Gym (legged_gym), ROS, SciPy     x, y, z, w    ROS: "optical" (`*_optical_
 
 from torchelev.frames.camera_axes import change_axes
 from torchelev.frames.constructors import transform, transform_matrix, transform_xyzw
+from torchelev.frames.motion import deskew, interpolate_poses
 
-__all__ = ["change_axes", "transform", "transform_matrix", "transform_xyzw"]
+__all__ = ["change_axes", "deskew", "interpolate_poses", "transform", "transform_matrix", "transform_xyzw"]
