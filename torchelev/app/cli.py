@@ -9,11 +9,20 @@ from typing import Any
 import click
 
 from torchelev import __version__
-from torchelev.app.map_command import MapRequest, run_map
+from torchelev.app.map_command import MapRequest, UserError, run_map
+from torchelev.io.errors import RecordingError
 
-_MAP_HELP = """Build an elevation map from RECORDING, a folder of scans with poses.
+_MAP_HELP = """Build an elevation map from RECORDING, a folder of scans with poses, or a bag.
 
-RECORDING, or its subfolder scans/, holds one file per scan. File names set the
+A bag is a file .bag (ROS 1), .mcap or .db3 (ROS 2), or a ROS 2 folder. Its
+topics and frames are found where there is no doubt; `torchelev bag` lists them.
+
+\b
+  torchelev map drive.mcap
+  torchelev map drive.mcap --points /lidar/points \\
+      --map-frame odom --base-frame base_link
+
+A folder, or its subfolder scans/, holds one file per scan. File names set the
 order; numbers in them count by value, so 2 comes before 10. Maps written there
 earlier are ignored.
 
@@ -62,12 +71,13 @@ def main() -> None:
     """Build elevation maps from point clouds and depth images."""
 
 
-@main.command("map", help=_MAP_HELP, short_help="Build an elevation map from a folder of scans with poses.")
+@main.command("map", help=_MAP_HELP, short_help="Build an elevation map from scans with poses, or a bag.")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option(
     "--poses",
     type=click.Path(path_type=Path),
-    help="Pose file.  [default: poses.txt or groundtruth.txt in or beside RECORDING]",
+    help="Pose file.  [default: poses.txt or groundtruth.txt in or beside RECORDING] Of a bag: a topic of Odometry or "
+    "PoseStamped in place of its transforms.",
 )
 @click.option(
     "--intrinsics",
@@ -134,9 +144,27 @@ def main() -> None:
     type=click.Choice(["sensor", "viewpoint"]),
     help="Frame of the points in .pcd files: the sensor frame, or the frame in which VIEWPOINT is given.",
 )
+@click.option("--points", multiple=True, metavar="TOPIC", help="Bag: clouds or laser scans; may be repeated.")
+@click.option("--depth", multiple=True, metavar="TOPIC", help="Bag: depth images with a CameraInfo; may be repeated.")
+@click.option("--map-frame", metavar="FRAME", help="Bag: frame in which the map is built, such as odom.")
+@click.option("--base-frame", metavar="FRAME", help="Bag: frame that the map follows, such as base_link.")
 def map_command(**options: Any) -> None:
     """Run `torchelev map`; its help text is `_MAP_HELP`."""
     sys.exit(run_map(MapRequest(**options)))
+
+
+@main.command("bag", short_help="List what a bag holds, and how to map it.")
+@click.argument("bag", type=click.Path(path_type=Path))
+def bag_command(bag: Path) -> None:
+    """List topics, types, counts, rates and frames of BAG and its tree of transforms; propose the command to map it."""
+    from torchelev.app.bag_command import describe_bag
+
+    try:
+        click.echo(describe_bag(bag))
+    except ModuleNotFoundError as error:
+        raise UserError(f"{error}; install it with pip install 'torchelev[bags]'") from error
+    except (RecordingError, OSError) as error:
+        raise UserError(error) from error
 
 
 @main.command("demo", short_help="Map a simulated walk and compare it with ground truth.")

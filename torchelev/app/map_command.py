@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import click
-import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.app.config_file import load_config
+from torchelev.app.fuse_scans import MapOptions, Scans, fuse_all, new_map, show_progress
 from torchelev.app.interrupts import defer_interrupts
 from torchelev.app.map_files import prepare_outputs, write_outputs
 from torchelev.app.report import suggest_options, summarize
-from torchelev.io import FileLayout, MappingRun, Recording, RecordingError, base_poses, open_recording, read_transform
-
-if TYPE_CHECKING:
-    from torchelev.config import ElevationMapConfig
-    from torchelev.elevation_map import ElevationMap
+from torchelev.io import (
+    FileLayout,
+    MappingRun,
+    RecordingError,
+    base_poses,
+    is_bag,
+    open_recording,
+    read_transform,
+)
 
 _BAD_INPUT, _INTERRUPTED = 2, 130  # exit codes
 
@@ -29,8 +32,8 @@ _BAD_INPUT, _INTERRUPTED = 2, 130  # exit codes
 class MapRequest:
     """Arguments of `torchelev map` as the user gave them; see its help."""
 
-    recording: Path  #: folder of scans
-    poses: Path | None  #: pose file; None: found in or beside the recording
+    recording: Path  #: folder of scans, or a bag
+    poses: Path | None  #: pose file, of a bag a topic; None: found in or beside the recording
     intrinsics: Path | None  #: camera file of depth images; None: the scans are point clouds
     out: str  #: prefix of the output files, or a folder
     resolution: float | None  #: [m] cell size; None: the config's
@@ -46,23 +49,13 @@ class MapRequest:
     quaternions: Literal["xyzw", "wxyz"] | None  #: see FileLayout.quaternions
     time_unit: Literal["s", "ms", "us", "ns"] | None  #: see FileLayout.time_unit
     pcd_frame: Literal["sensor", "viewpoint"] | None  #: see FileLayout.pcd_frame
+    points: tuple[str, ...] = ()  #: topics of a bag's clouds
+    depth: tuple[str, ...] = ()  #: topics of a bag's depth images
+    map_frame: str | None = None  #: frame of a bag in which the map is built
+    base_frame: str | None = None  #: frame of a bag that the window follows
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapOptions:
-    """Where the robot's base is, and whether the window follows it."""
-
-    T_base_sensor: NDArray[np.float64] | None  #: takes sensor-frame points into the base frame; None: unknown
-    sensor_height: float | None  #: [m] above the base, an alternative to T_base_sensor; None: unknown
-    fixed: bool  #: keep the window in place
-
-    @property
-    def knows_base(self) -> bool:
-        """Whether the height of the base is known, not only the sensor's."""
-        return self.T_base_sensor is not None or self.sensor_height is not None
-
-
-class _UserError(click.ClickException):
+class UserError(click.ClickException):
     """Bad input: print one line to stderr and exit with code 2."""
 
     exit_code = _BAD_INPUT
@@ -76,12 +69,15 @@ def run_map(request: MapRequest) -> int:
     try:
         return _run(request)
     except ModuleNotFoundError as error:
-        raise _UserError(f"{error}; install it with pip install 'torchelev[io]'") from error
+        extra = "bags" if str(error.name).startswith("rosbags") else "io"
+        raise UserError(f"{error}; install it with pip install 'torchelev[{extra}]'") from error
     except (RecordingError, ValueError, OSError) as error:
-        raise _UserError(error) from error
+        raise UserError(error) from error
 
 
 def _run(request: MapRequest) -> int:
+    if is_bag(request.recording):
+        return run_bag(request)
     mount = None if request.extrinsics is None else read_transform(request.extrinsics)
     _check(request, mount)
     options = MapOptions(T_base_sensor=mount, sensor_height=request.sensor_height, fixed=request.fixed)
@@ -94,10 +90,16 @@ def _run(request: MapRequest) -> int:
     scans = open_recording(request.recording, request.poses, request.intrinsics, request.dt, layout)
     if request.poses_of == "base" and mount is not None:
         scans = scans.apply_mount(mount)
-    emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
-    prefix, run = prepare_outputs(request.out, emap), MappingRun(emap)
+    scans = scans.with_bases(base_poses(scans.T_map_sensor, mount, request.sensor_height))
     if scans.note:
         click.echo(f"warning: {scans.note}", err=True)
+    return map_scans(request, scans, options)
+
+
+def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
+    """Fuse all scans of a recording, write the map, report it and return the exit code."""
+    emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
+    prefix, run = prepare_outputs(request.out, emap), MappingRun(emap)
     stopped = fuse_all(run, scans, options)
     return _finish(run, len(scans), prefix, stopped, options)
 
@@ -105,6 +107,10 @@ def _run(request: MapRequest) -> int:
 def _check(request: MapRequest, mount: NDArray | None) -> None:
     """Reject options that contradict each other or are out of range."""
     height, dt = request.sensor_height, request.dt
+    names = ("points", "depth", "map_frame", "base_frame")
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name)]
+    if given:
+        raise ValueError(f"{', '.join(given)}: only bags have topics and frames, and {request.recording} is none")
     if request.poses_of == "base" and mount is None:
         raise ValueError("--poses-of base: the sensor's pose on the robot is unknown; give --extrinsics")
     if mount is not None and height is not None:
@@ -115,56 +121,33 @@ def _check(request: MapRequest, mount: NDArray | None) -> None:
         raise ValueError(f"--dt: must be finite and not negative, got {dt}; give seconds")
 
 
-def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> ElevationMap:
-    """Create an empty map; without the base's height, overlap clearance is turned off because it depends on it."""
-    import torch
+def run_bag(request: MapRequest) -> int:
+    """Map the scans of a bag, and say what was left out."""
+    from torchelev.io.bags import Bag, BagRequest, open_bag
 
-    from torchelev.elevation_map import ElevationMap
-
-    if config.sensor.links:
-        raise ValueError("config.sensor.body: recordings hold no poses of links; give one box, lower and upper")
-    if config.sensor.body is not None and options.T_base_sensor is None:
-        raise ValueError("config.sensor.body: the body box turns with the robot's base; give --extrinsics")
-    if not options.knows_base:
-        config = replace(config, overlap=None)
-    try:
-        torch.empty(1, device=device)
-        return ElevationMap(config, num_envs=1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"--device {device}: {reason}; use cpu, or install a torch built for that device") from error
+    _refuse_file_options(request)
+    poses = None if request.poses is None else str(request.poses)
+    wanted = BagRequest(request.points, request.depth, request.map_frame, request.base_frame, poses)
+    with Bag(request.recording) as bag:
+        scans = open_bag(bag, wanted, lambda m: show_progress(m, "reading poses", "message"))
+        click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}")
+        options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=True)
+        try:
+            return map_scans(request, scans, options)
+        finally:
+            for note in scans.warnings:
+                click.echo(f"warning: {note}", err=True)
 
 
-def fuse_all(run: MappingRun, scans: Recording, options: MapOptions) -> BaseException | None:
-    """Fuse all scans in order.
-
-    Args:
-        run: the map and its counts.
-        scans: the recording.
-        options: where the base is, and whether the window follows it.
-
-    Returns:
-        The exception that stopped the mapping early, so that the caller can save the map before raising it; else None.
-    """
-    bases = base_poses(scans.T_map_sensor, options.T_base_sensor, options.sensor_height)
-    sensors = scans.T_map_sensor[:, :3, 3]
-    middle = (sensors.min(axis=0) + sensors.max(axis=0)) / 2
-    try:
-        # This update without points also covers torch's set-up on first use, which would distort the first scan's time.
-        run.center_on(middle if options.fixed else bases[0, :3, 3])
-        for k, frame in enumerate(_show_progress(scans)):
-            with defer_interrupts():
-                run.add(frame, None if options.fixed else bases[k])
-    except (KeyboardInterrupt, Exception) as reason:
-        return reason
-    return None
-
-
-def _show_progress(scans: Recording) -> Iterator:
-    """Iterate with a progress bar on a terminal; print nothing where stderr is redirected."""
-    from tqdm import tqdm
-
-    yield from tqdm(scans, desc="mapping", unit="scan", disable=None, leave=False)
+def _refuse_file_options(request: MapRequest) -> None:
+    """Reject options for what a bag itself says."""
+    names = ("intrinsics", "dt", "sensor_height", "extrinsics", "bin_layout", "quaternions", "time_unit", "pcd_frame")
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) is not None]
+    if given or request.poses_of == "base":
+        given = given or ["--poses-of"]
+        raise ValueError(
+            f"{', '.join(given)}: only for folders of files; {request.recording} is a bag, which says it itself"
+        )
 
 
 def _finish(run: MappingRun, num_scans: int, prefix: Path, stopped: BaseException | None, options: MapOptions) -> int:
@@ -178,10 +161,12 @@ def _finish(run: MappingRun, num_scans: int, prefix: Path, stopped: BaseExceptio
         click.echo(f"interrupted: {kept}", err=True)
         return _INTERRUPTED
     if isinstance(stopped, RecordingError | OSError):
-        raise _UserError(f"{stopped}; {kept}")
+        raise UserError(f"{stopped}; {kept}")
     if stopped is not None:
         click.echo(f"stopped by an error: {kept}", err=True)
         raise stopped
+    if not run.num_scans:
+        raise UserError(f"none of the {num_scans} scans could be used")
     if failures:
         return _BAD_INPUT
     for line in run.emap.diagnose():

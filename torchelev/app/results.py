@@ -6,6 +6,7 @@ import json
 import platform
 import re
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,12 @@ def write_json(path: str | Path, values: dict[str, Any]) -> None:
 def slug(name: str) -> str:
     """Return a name in lower case for use in file names: letters and digits, joined by hyphens."""
     return "-".join(re.findall(r"[a-z0-9]+", name.lower()))
+
+
+def align(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows of text as lines whose columns are aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def markdown_table(head: list[str], rows: list[list[str]]) -> str:

@@ -6,6 +6,7 @@ Plots are in `torchelev.viz`.
 ``torchelev[io]``, and robot models need MuJoCo; these are imported on first use.
 """
 
+from torchelev.io.bags.bag import is_bag
 from torchelev.io.clouds import read_cloud
 from torchelev.io.depth import Intrinsics, read_depth, read_intrinsics
 from torchelev.io.errors import RecordingError
@@ -24,6 +25,7 @@ __all__ = [
     "Recording",
     "RecordingError",
     "base_poses",
+    "is_bag",
     "link_poses",
     "open_recording",
     "read_body",

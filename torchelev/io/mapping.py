@@ -61,7 +61,8 @@ class MappingRun:
         points = torch.from_numpy(frame.points)[None].to(self.emap.device)
         base = None if T_map_base is None else self._to_tensor(T_map_base)
         start = time.perf_counter()
-        self.emap.update(points, self._to_tensor(frame.T_map_sensor), base, dt=frame.dt)
+        covariance = None if frame.pose_covariance is None else self._to_tensor(frame.pose_covariance)
+        self.emap.update(points, self._to_tensor(frame.T_map_sensor), base, dt=frame.dt, pose_covariance=covariance)
         self._count(len(frame.points))  # reading the statistics waits for a GPU to finish
         self.update_ms.append(1e3 * (time.perf_counter() - start))
         self.sensor_xy.append(frame.T_map_sensor[:2, 3])

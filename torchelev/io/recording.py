@@ -28,7 +28,10 @@ class Frame(NamedTuple):
     points: NDArray[np.float32]  #: (N, 3) [m], sensor frame; NaN where there was no return
     T_map_sensor: NDArray[np.float64]  #: (4, 4)
     dt: float  #: [s] since the previous scan, 0 for the first
-    name: str  #: file name, for messages
+    name: str  #: file name or topic, for messages
+    T_map_base: NDArray[np.float64] | None = None  #: (4, 4); None: unknown
+    pose_covariance: NDArray[np.float64] | None = None  #: (6, 6) of the sensor's pose, see `ElevationMap.update`
+    stamp: float = 0.0  #: [s] of a bag's scan; 0 of a file
 
 
 class Recording(Sequence[Frame]):
@@ -40,12 +43,20 @@ class Recording(Sequence[Frame]):
         dt: (T,) [s] since the previous scan.
         read: reads the points (N, 3) [m] of a file.
         note: a warning on how scans were matched with poses, or "".
+        T_map_base: (T, 4, 4) poses of the base; None: unknown.
     """
 
     def __init__(
-        self, files: list[Path], T_map_sensor: NDArray, dt: NDArray, read: Callable[[Path], NDArray], note: str = ""
+        self,
+        files: list[Path],
+        T_map_sensor: NDArray,
+        dt: NDArray,
+        read: Callable[[Path], NDArray],
+        note: str = "",
+        T_map_base: NDArray | None = None,
     ) -> None:
         self.files, self.T_map_sensor, self.dt, self._read, self.note = files, T_map_sensor, dt, read, note
+        self.T_map_base = T_map_base
 
     def __len__(self) -> int:
         return len(self.files)
@@ -56,9 +67,16 @@ class Recording(Sequence[Frame]):
     def __getitem__(self, index: slice) -> Recording: ...
     def __getitem__(self, index: int | slice) -> Frame | Recording:
         if isinstance(index, slice):
-            return Recording(self.files[index], self.T_map_sensor[index], self.dt[index], self._read, self.note)
-        path = self.files[index]
-        return Frame(self._read(path), self.T_map_sensor[index], float(self.dt[index]), path.name)
+            bases = None if self.T_map_base is None else self.T_map_base[index]
+            return Recording(self.files[index], self.T_map_sensor[index], self.dt[index], self._read, self.note, bases)
+        path, base = self.files[index], None if self.T_map_base is None else self.T_map_base[index]
+        return Frame(self._read(path), self.T_map_sensor[index], float(self.dt[index]), path.name, base)
+
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """The middle (3,) [m] of the sensor's path, map frame."""
+        places = self.T_map_sensor[:, :3, 3]
+        return (places.min(axis=0) + places.max(axis=0)) / 2
 
     def apply_mount(self, T_base_sensor: NDArray[np.float64]) -> Recording:
         """Return the recording with poses of the base turned into poses of the sensor: T_map_base T_base_sensor.
@@ -70,6 +88,10 @@ class Recording(Sequence[Frame]):
             The same scans with the sensor's poses.
         """
         return Recording(self.files, self.T_map_sensor @ T_base_sensor, self.dt, self._read, self.note)
+
+    def with_bases(self, T_map_base: NDArray[np.float64]) -> Recording:
+        """Return the recording with poses (T, 4, 4) of the robot's base."""
+        return Recording(self.files, self.T_map_sensor, self.dt, self._read, self.note, T_map_base)
 
 
 def open_recording(

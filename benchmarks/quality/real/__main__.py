@@ -47,9 +47,9 @@ from benchmarks.quality.real.metrics import (
 )
 from torchelev import LearnedTraversabilityConfig as Head
 from torchelev.app.config_file import load_config
-from torchelev.app.map_command import MapOptions, fuse_all, new_map
+from torchelev.app.fuse_scans import MapOptions, fuse_all, new_map
 from torchelev.app.results import markdown_table, write_json
-from torchelev.io import MappingRun
+from torchelev.io import MappingRun, base_poses
 from torchelev.io.export import SavedMap, take
 
 SIZE = 20.0  # [m] side of the maps
@@ -61,10 +61,11 @@ def _map(case: Case, head: Head | None = None, repeats: int = _REPEATS) -> tuple
     options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=False)
     cfg = load_config(None, case.resolution, SIZE)
     cfg = cfg if head is None else replace(cfg, traversability=head)
+    recording = case.recording.with_bases(base_poses(case.recording.T_map_sensor, None, None))
     times = []
     for _ in range(repeats):
         run = MappingRun(new_map(cfg, "cpu", options))
-        stopped = fuse_all(run, case.recording, options)
+        stopped = fuse_all(run, recording, options)
         if stopped is not None:
             raise stopped
         times += run.update_ms
