@@ -131,7 +131,7 @@ def run_bag(request: MapRequest) -> int:
     with Bag(request.recording) as bag:
         scans = open_bag(bag, wanted, lambda m: show_progress(m, "reading poses", "message"))
         click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}")
-        options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=True)
+        options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base)
         try:
             return map_scans(request, scans, options)
         finally:

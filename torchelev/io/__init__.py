@@ -6,7 +6,7 @@ Plots are in `torchelev.viz`.
 ``torchelev[io]``, and robot models need MuJoCo; these are imported on first use.
 """
 
-from torchelev.io.bags.bag import is_bag
+from torchelev.io.bags import GridMapWriter, is_bag, read_grid_map, read_grid_maps, write_grid_map
 from torchelev.io.clouds import read_cloud
 from torchelev.io.depth import Intrinsics, read_depth, read_intrinsics
 from torchelev.io.errors import RecordingError
@@ -19,6 +19,7 @@ from torchelev.io.robot_model import link_poses, read_body
 __all__ = [
     "FileLayout",
     "Frame",
+    "GridMapWriter",
     "Intrinsics",
     "MappingRun",
     "Poses",
@@ -31,7 +32,10 @@ __all__ = [
     "read_body",
     "read_cloud",
     "read_depth",
+    "read_grid_map",
+    "read_grid_maps",
     "read_intrinsics",
     "read_poses",
     "read_transform",
+    "write_grid_map",
 ]

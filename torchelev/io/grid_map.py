@@ -12,6 +12,7 @@ GridMapMsgHelpers):
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -141,7 +142,7 @@ def to_grid_map(
 def from_grid_map(grid_map: GridMap) -> MapLayers:
     """Read a GridMap or a received message grid_map_msgs/GridMap, with any start of its circular buffer.
 
-    The orientation is ignored: a GridMap is aligned with its frame.
+    The orientation is ignored, as grid_map_ros does: a GridMap is aligned with its frame. A warning says so.
 
     Args:
         grid_map: the GridMap or message.
@@ -156,6 +157,9 @@ def from_grid_map(grid_map: GridMap) -> MapLayers:
     is_complete = len(grid_map.layers) == len(grid_map.data)
     actual = f"{len(grid_map.layers)} layers and {len(grid_map.data)} data"
     require(is_complete, "grid_map", "must have data for each layer", actual, "check its publisher")
+    turn = info.pose.orientation
+    if abs(turn.x) + abs(turn.y) + abs(turn.z) > 1e-6:
+        warnings.warn("grid_map: its orientation is ignored, as a GridMap is aligned with its frame", stacklevel=2)
     start = int(grid_map.outer_start_index), int(grid_map.inner_start_index)
     layers = {}
     for name, array in zip(grid_map.layers, grid_map.data, strict=True):

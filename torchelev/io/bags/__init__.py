@@ -1,11 +1,33 @@
 """Bags, the recordings of ROS 1 and ROS 2: scans and poses out of them, as a recording that `torchelev map` fuses.
 
 Needs ``torchelev[bags]``; no ROS. `bag` reads messages, `point_cloud` and `scans` turn them into points, `transforms`
-finds poses, `recording` puts them together. Writing maps is done elsewhere.
+finds poses, `recording` puts them together. `grid_maps` writes maps to bags and reads them.
 """
 
 from torchelev.io.bags.bag import Bag, Topic, is_bag
+from torchelev.io.bags.grid_maps import (
+    GridMapWriter,
+    from_bytes,
+    read_grid_map,
+    read_grid_maps,
+    to_bytes,
+    write_grid_map,
+)
 from torchelev.io.bags.recording import BagRecording, BagRequest, open_bag
 from torchelev.io.bags.transforms import TransformTree
 
-__all__ = ["Bag", "BagRecording", "BagRequest", "Topic", "TransformTree", "is_bag", "open_bag"]
+__all__ = [
+    "Bag",
+    "BagRecording",
+    "BagRequest",
+    "GridMapWriter",
+    "Topic",
+    "TransformTree",
+    "from_bytes",
+    "is_bag",
+    "open_bag",
+    "read_grid_map",
+    "read_grid_maps",
+    "to_bytes",
+    "write_grid_map",
+]

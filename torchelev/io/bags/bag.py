@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchelev.io.bags.definitions import make_typestore
 from torchelev.io.bags.unfinished import UnfinishedBag
 from torchelev.io.errors import RecordingError
 
@@ -146,10 +147,9 @@ def _storage_file(path: Path) -> Path | None:
 
 def _make_reader(path: Path) -> Any:
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
 
     # Bags of ROS 2 before Iron hold no definitions of their messages.
-    return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    return AnyReader([path], default_typestore=make_typestore(2))
 
 
 def _describe(error: Exception) -> str:

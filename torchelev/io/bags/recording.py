@@ -42,6 +42,7 @@ class BagRecording:
     Attributes:
         map_frame: in which the poses are.
         base_frame: whose pose a frame's `T_map_base` is.
+        has_base: whether that is another frame than the sensor's, so that the sensor's place on the robot is known.
         topics: of the scans.
         skipped: number of scans that were left out when it was last read, by reason.
         notes: what is not used of the scans' messages.
@@ -58,6 +59,7 @@ class BagRecording:
         self._read_poses(request, types, show)
         sensor = self._first_frame()
         self.map_frame, self.base_frame = _choose_frames(bag, self.tree, sensor, request)
+        self.has_base = self.base_frame != sensor
         self.skipped: Counter[str] = Counter()
         self.notes: dict[str, None] = {}
 

@@ -1,0 +1,60 @@
+"""Traversability as a nav_msgs/OccupancyGrid for Nav2, without importing ROS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchelev.errors import require
+from torchelev.io.export import take
+from torchelev.io.grid_map import Point, Pose
+
+if TYPE_CHECKING:
+    from torchelev.elevation_map import ElevationMap
+
+UNKNOWN, LETHAL = -1, 100
+_HIGHEST = 98  # 99 stands for Nav2's inscribed obstacle, which a costmap computes itself
+
+
+class MapMetaData(NamedTuple):
+    """Same fields as nav_msgs/MapMetaData, except for the time."""
+
+    resolution: float  #: [m]
+    width: int  #: number of cells along x
+    height: int  #: number of cells along y
+    origin: Pose  #: of the corner of the cell with the smallest x and y
+
+
+class OccupancyGrid(NamedTuple):
+    """Same fields as nav_msgs/OccupancyGrid, except for the header."""
+
+    info: MapMetaData  #: resolution, size and place
+    data: NDArray[np.int8]  #: (W * H,), x fastest: -1 unknown, 0 free to 100 lethal
+
+
+def to_occupancy_grid(emap: ElevationMap, env: int = 0, min_traversability: float = 0.5) -> OccupancyGrid:
+    """Turn the traversability t of one environment into the costs of Nav2's costmaps.
+
+    Below `min_traversability` a cell is lethal, 100. Above, its cost falls from 98 to 0, 98 (1 - t) / (1 - min). 99,
+    Nav2's inscribed obstacle, is left to its inflation layer. Cells that are not rated are unknown, -1.
+
+    Args:
+        emap: the map.
+        env: the environment.
+        min_traversability: t below which the robot must not stand, from 0 to less than 1.
+
+    Raises:
+        ValueError: the environment does not exist, or `min_traversability` is out of range.
+    """
+    in_range, hint = 0 <= min_traversability < 1, "the default is 0.5"
+    require(in_range, "min_traversability", "must be at least 0 and less than 1", min_traversability, hint)
+    taken = take(emap, env, ("traversability",))
+    t = taken.layers["traversability"]
+    cost = np.round(_HIGHEST * (1 - t) / (1 - min_traversability))
+    cost = np.where(t < min_traversability, LETHAL, cost)
+    data = np.where(np.isnan(t), UNKNOWN, cost).astype(np.int8)
+    x_min, _, y_min, _ = taken.extent
+    info = MapMetaData(taken.resolution, t.shape[0], t.shape[1], Pose(Point(x_min, y_min)))
+    return OccupancyGrid(info, np.ascontiguousarray(data.T).ravel())
