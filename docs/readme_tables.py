@@ -24,6 +24,8 @@ from benchmarks.speed import encoders, growth, head, long_run, loop, postprocess
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.nav import experiment
+from training.quadruped import experiment as legs
+from training.quadruped import step_time
 from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
@@ -135,6 +137,21 @@ def _pose_covariance() -> str:
     return pose_covariance.table(load("pose_covariance"))
 
 
+def _legs() -> str:
+    """Tabulate the tiles that walking policies crossed, by what they were trained with."""
+    return legs.table(load("quadruped", training.RESULTS))
+
+
+def _legs_walk() -> str:
+    """Tabulate how policies keep to the commanded speed on flat and rough ground."""
+    return legs.walk_table(load("quadruped", training.RESULTS))
+
+
+def _legs_step_time() -> str:
+    """Tabulate where the time of a training step of the quadruped goes."""
+    return step_time.table(load("quadruped-step-time", training.RESULTS))
+
+
 def _encoder_cost() -> str:
     """Tabulate what encoders of the map cost."""
     return encoders.table(load("encoders")["rows"])
@@ -166,6 +183,9 @@ TABLES = {
     "long_run": _long_run,
     "nav": _nav,
     "pose_covariance": _pose_covariance,
+    "legs": _legs,
+    "legs_walk": _legs_walk,
+    "legs_step_time": _legs_step_time,
     "encoder_cost": _encoder_cost,
     "sight": _sight,
     "mjlab": _mjlab,
