@@ -123,3 +123,32 @@ def test_ctrl_c_keeps_the_map(run, bag, tmp_path, monkeypatch):
     monkeypatch.setattr(MappingRun, "add", interrupted)
     code, _, err = run("map", bag, "--size", 4)
     assert code == 130 and f"kept the map of 3 of {SCANS} scans" in err and (tmp_path / "map.npz").exists()
+
+
+@pytest.mark.slow(1)
+def test_the_growing_map_is_recorded(run, bag, tmp_path):
+    from torchelev.io import read_grid_maps
+
+    code, out, err = run("map", bag, "--size", 4, "--grid-map", "grown.mcap", "--every", 0.2)
+    assert (code, err) == (0, "") and "recorded  3 maps in grown.mcap" in out
+    maps = list(read_grid_maps(tmp_path / "grown.mcap"))
+    known = [int(np.isfinite(one.layers["elevation"]).sum()) for one in maps]
+    assert len(maps) == 3 and known[0] < known[2] and maps[0].frame == "odom"
+    assert [one.stamp - maps[0].stamp for one in maps] == pytest.approx([0.0, 0.2, 0.4], abs=1e-6)
+    last = load_npz(tmp_path / "map.npz")
+    assert last.layers["elevation"].shape == maps[-1].layers["elevation"].shape
+
+
+@pytest.mark.slow(1)
+def test_the_growing_map_of_a_folder_is_recorded(run, recording, tmp_path):
+    code, out, _ = run("map", recording, "--size", 4, "--grid-map", "grown.bag", "--every", 0)
+    assert code == 0 and "recorded  4 maps in grown.bag" in out
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    (("--every", -1), "--every: must not be negative"),
+    (("--grid-map", "x.png"), "path: must be a bag's, got x.png"),
+])  # fmt: skip
+def test_a_wrong_bag_for_maps_is_refused(run, bag, tmp_path, options, words):
+    code, _, err = run("map", bag, *options)
+    assert code == 2 and words in err and not (tmp_path / "map.npz").exists()

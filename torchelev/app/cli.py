@@ -148,6 +148,15 @@ def main() -> None:
 @click.option("--depth", multiple=True, metavar="TOPIC", help="Bag: depth images with a CameraInfo; may be repeated.")
 @click.option("--map-frame", metavar="FRAME", help="Bag: frame in which the map is built, such as odom.")
 @click.option("--base-frame", metavar="FRAME", help="Bag: frame that the map follows, such as base_link.")
+@click.option(
+    "--grid-map",
+    type=click.Path(path_type=Path),
+    metavar="BAG",
+    help="Also write the growing map to this bag as GridMap, for RViz or Foxglove: .mcap, .db3 or .bag.",
+)
+@click.option(
+    "--every", type=float, default=1.0, show_default=True, metavar="S", help="Time between two maps in it [s]."
+)
 def map_command(**options: Any) -> None:
     """Run `torchelev map`; its help text is `_MAP_HELP`."""
     sys.exit(run_map(MapRequest(**options)))

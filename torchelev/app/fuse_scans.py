@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -63,13 +63,19 @@ class Scans(Protocol):
     def __iter__(self) -> Iterator[Frame | None]: ...
 
 
-def fuse_all(run: MappingRun, scans: Scans, options: MapOptions) -> BaseException | None:
+def fuse_all(
+    run: MappingRun,
+    scans: Scans,
+    options: MapOptions,
+    after: Callable[[MappingRun, Frame], None] = lambda run, frame: None,
+) -> BaseException | None:
     """Fuse all scans in order.
 
     Args:
         run: the map and its counts.
         scans: the recording.
         options: where the base is, and whether the window follows it.
+        after: called after each scan.
 
     Returns:
         The exception that stopped the mapping early, so that the caller can save the map before raising it; else None.
@@ -84,6 +90,7 @@ def fuse_all(run: MappingRun, scans: Scans, options: MapOptions) -> BaseExceptio
                 run.center_on(frame.T_map_base[:3, 3] if middle is None else middle)
             with defer_interrupts():
                 run.add(frame, None if options.fixed else frame.T_map_base)
+                after(run, frame)
     except (KeyboardInterrupt, Exception) as reason:
         return reason
     return None

@@ -14,6 +14,7 @@ from torchelev.app.config_file import load_config
 from torchelev.app.fuse_scans import MapOptions, Scans, fuse_all, new_map, show_progress
 from torchelev.app.interrupts import defer_interrupts
 from torchelev.app.map_files import prepare_outputs, write_outputs
+from torchelev.app.map_recorder import MapRecorder
 from torchelev.app.report import suggest_options, summarize
 from torchelev.io import (
     FileLayout,
@@ -53,6 +54,8 @@ class MapRequest:
     depth: tuple[str, ...] = ()  #: topics of a bag's depth images
     map_frame: str | None = None  #: frame of a bag in which the map is built
     base_frame: str | None = None  #: frame of a bag that the window follows
+    grid_map: Path | None = None  #: bag to write the growing map to
+    every: float = 1.0  #: [s] between two maps in it
 
 
 class UserError(click.ClickException):
@@ -69,7 +72,7 @@ def run_map(request: MapRequest) -> int:
     try:
         return _run(request)
     except ModuleNotFoundError as error:
-        extra = "bags" if str(error.name).startswith("rosbags") else "io"
+        extra = "bags" if str(error.name).startswith(("rosbags", "mcap")) else "io"
         raise UserError(f"{error}; install it with pip install 'torchelev[{extra}]'") from error
     except (RecordingError, ValueError, OSError) as error:
         raise UserError(error) from error
@@ -100,7 +103,12 @@ def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
     """Fuse all scans of a recording, write the map, report it and return the exit code."""
     emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
     prefix, run = prepare_outputs(request.out, emap), MappingRun(emap)
-    stopped = fuse_all(run, scans, options)
+    if not request.every >= 0:
+        raise ValueError(f"--every: must not be negative, got {request.every}; give seconds, or 0 for each scan")
+    with MapRecorder(request.grid_map, request.every, getattr(scans, "map_frame", "map")) as recorder:
+        stopped = fuse_all(run, scans, options, recorder.after)
+    if recorder.num:
+        click.echo(f"recorded  {recorder.num} maps in {recorder.path}")
     return _finish(run, len(scans), prefix, stopped, options)
 
 

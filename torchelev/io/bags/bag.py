@@ -78,7 +78,7 @@ class Bag:
             raise
         except Exception:
             files = [file or self.path] if not self.path.is_dir() or file else _storage_files(self.path)
-            if len(files) != 1 or files[0].suffix not in (".bag", ".mcap"):
+            if len(files) != 1 or files[0].suffix not in SUFFIXES:
                 raise
             try:
                 unfinished = UnfinishedBag(files[0])
@@ -118,19 +118,26 @@ class Bag:
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         if not connections:
             return
-        messages, last = self._reader.messages(connections), None
+        messages, last, num = self._reader.messages(connections), None, 0
         while True:
             try:
                 connection, time, raw = next(messages)
                 data = self._reader.deserialize(raw, connection.msgtype)
             except StopIteration:
+                self._require_all(topics, num)
                 return
             except Exception as error:  # rosbags lets through what its file formats raise
                 read = "not read" if last is None else f"read up to {last - self._start:.1f} s after its start"
                 self.ended_early = f"the bag is damaged, and was {read}: {_describe(error)}"
                 return
-            last = time / 1e9
+            last, num = time / 1e9, num + 1
             yield Message(connection.topic, last, data)
+
+    def _require_all(self, topics: Sequence[str], num: int) -> None:
+        """Say so if the bag counts more messages than could be read: its index is damaged."""
+        expected = sum(topic.num for topic in self.topics if topic.name in topics)
+        if num < expected and not self.ended_early:
+            self.ended_early = f"the bag is damaged: {expected - num} of {expected} messages are missing"
 
     @property
     def _start(self) -> float:

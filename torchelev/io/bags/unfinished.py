@@ -1,15 +1,19 @@
 """Bags that were not closed, as after a crash or a full disk: without an index, read from the start to the last record.
 
-Records are read by rosbags (ROS 1) and mcap. `UnfinishedBag` has the members of rosbags' AnyReader that `Bag` uses.
+Records are read by rosbags (ROS 1), mcap and sqlite3. `UnfinishedBag` has what `Bag` uses of rosbags' AnyReader.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
+import sqlite3
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from torchelev.io.bags.definitions import make_typestore
 
 
 class _Connection(NamedTuple):
@@ -34,7 +38,7 @@ class UnfinishedBag:
     """A bag without an index. Its messages come in the order in which they were written.
 
     Args:
-        path: a `.bag` or `.mcap` file.
+        path: a `.bag`, `.mcap` or `.db3` file.
 
     Attributes:
         ending: says how far the bag could be read.
@@ -44,7 +48,7 @@ class UnfinishedBag:
     """
 
     def __init__(self, path: Path) -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from rosbags.typesys import get_types_from_msg
 
         self._path, self._is1, self._records = path, path.suffix == ".bag", _RECORDS[path.suffix]
         self._counts: Counter[_Connection] = Counter()
@@ -56,9 +60,10 @@ class UnfinishedBag:
             raise ValueError("no message can be read")
         self.start_time, self.duration = times[0], times[1] - times[0]
         self.ending = f"the bag was not closed: read up to {self.duration / 1e9:.1f} s after its start"
-        self.typestore = get_typestore(Stores.EMPTY)
+        self.typestore = make_typestore(1 if self._is1 else 2)
         for connection in self._counts:
-            self.typestore.register(get_types_from_msg(connection.definition, connection.msgtype))
+            if connection.definition:
+                self.typestore.register(get_types_from_msg(connection.definition, connection.msgtype))
 
     @property
     def connections(self) -> list[_Connection]:
@@ -86,14 +91,28 @@ class UnfinishedBag:
 
     def _read(self) -> _Records:
         """Yield the records up to the first that cannot be read."""
-        with self._path.open("rb") as file:
-            try:
-                yield from self._records(file)
-            except Exception:  # whatever the file formats raise where a file is cut
-                return
+        try:
+            yield from self._records(self._path)
+        except Exception:  # whatever the file formats raise where a file is cut
+            return
 
 
-def _read_mcap(file: io.BufferedIOBase) -> _Records:
+def _read_database(path: Path) -> _Records:
+    """Yield the rows of a database; types that ROS 2 does not have are unknown."""
+    with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+        database.execute("PRAGMA writable_schema=ON")  # or sqlite refuses a file shorter than its header says
+        topics = database.execute("SELECT id, name, type FROM topics").fetchall()
+        connections = {number: _Connection(name, kind, "") for number, name, kind in topics}
+        for number, time, data in database.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED"):
+            yield connections[number], time, data
+
+
+def _read_mcap(path: Path) -> _Records:
+    with path.open("rb") as file:
+        yield from _read_mcap_records(file)
+
+
+def _read_mcap_records(file: io.BufferedIOBase) -> _Records:
     from mcap.records import Channel, Message, Schema
     from mcap.stream_reader import StreamReader
 
@@ -109,7 +128,12 @@ def _read_mcap(file: io.BufferedIOBase) -> _Records:
             yield connections[record.channel_id], record.log_time, record.data
 
 
-def _read_ros1(file: io.BufferedIOBase) -> _Records:
+def _read_ros1(path: Path) -> _Records:
+    with path.open("rb") as file:
+        yield from _read_ros1_records(file)
+
+
+def _read_ros1_records(file: io.BufferedIOBase) -> _Records:
     from rosbags.rosbag1.reader import Header, RecordType, decompressors
 
     if file.readline() != b"#ROSBAG V2.0\n":
@@ -149,4 +173,4 @@ def _read_exactly(file: io.BufferedIOBase, size: int) -> bytes:
     return data
 
 
-_RECORDS: dict[str, Callable[[io.BufferedIOBase], _Records]] = {".bag": _read_ros1, ".mcap": _read_mcap}
+_RECORDS: dict[str, Callable[[Path], _Records]] = {".bag": _read_ros1, ".mcap": _read_mcap, ".db3": _read_database}

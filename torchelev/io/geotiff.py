@@ -1,0 +1,92 @@
+"""Maps as GeoTIFF, for geographic information systems such as QGIS. Needs ``torchelev[geo]``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from torchelev.errors import require
+from torchelev.io.export import take
+from torchelev.output_files import atomic_file
+
+if TYPE_CHECKING:
+    from torchelev.elevation_map import ElevationMap
+
+# Tags of GeoTIFF 1.1 (OGC 19-008r4), and two of GDAL's.
+_PIXEL_SCALE, _TIE_POINT, _GEO_KEYS, _GDAL_METADATA, _GDAL_NODATA = 33550, 33922, 34735, 42112, 42113
+_MODEL_TYPE, _RASTER_TYPE, _PROJECTED_CRS = 1024, 1025, 3072
+_PROJECTED, _PIXEL_IS_AREA = 1, 1
+_SHORT, _DOUBLE, _ASCII = 3, 12, 2
+
+
+def save_geotiff(
+    path: str | Path,
+    emap: ElevationMap,
+    env: int = 0,
+    layers: Sequence[str] | None = None,
+    *,
+    epsg: int | None = None,
+    origin: tuple[float, float] = (0.0, 0.0),
+) -> None:
+    """Write layers of one environment as bands of a GeoTIFF, float32, NaN where unknown.
+
+    The map frame's x must point east and its y north, as in ROS (REP 103). Rows run from north to south.
+
+    Args:
+        path: of the file.
+        emap: the map.
+        env: the environment.
+        layers: names as in `ElevationMap.layer`, in the order of the bands; None: all of them.
+        epsg: code of the projected coordinate system, such as 32632 for UTM zone 32N; None: none is written.
+        origin: easting and northing [m] of the map frame's origin in it.
+
+    Raises:
+        KeyError: a layer does not exist. Nothing is written then.
+        ValueError: the environment does not exist, or `epsg` is no code.
+        ModuleNotFoundError: tifffile is missing.
+    """
+    import tifffile
+
+    is_code = epsg is None or (isinstance(epsg, int) and 1024 <= epsg <= 32767)
+    require(is_code, "epsg", "must be the code of a projected system, 1024 to 32767", repr(epsg), "give 32632, say")
+    names = list(emap.layers if layers is None else layers)
+    taken = take(emap, env, names)
+    bands = np.stack([np.flipud(taken.layers[name].T) for name in names]).astype(np.float32)
+    x_min, _, _, y_max = taken.extent
+    keys = {_RASTER_TYPE: _PIXEL_IS_AREA}
+    if epsg is not None:
+        keys = {_MODEL_TYPE: _PROJECTED, **keys, _PROJECTED_CRS: epsg}
+    resolution = taken.resolution
+    tags = [
+        (_PIXEL_SCALE, _DOUBLE, 3, (resolution, resolution, 0.0), True),
+        (_TIE_POINT, _DOUBLE, 6, (0.0, 0.0, 0.0, x_min + origin[0], y_max + origin[1], 0.0), True),
+        _geo_keys(keys),
+        (_GDAL_METADATA, _ASCII, 0, _describe(names), True),
+        (_GDAL_NODATA, _ASCII, 0, "nan", True),
+    ]
+    options: dict[str, Any] = dict(photometric="minisblack", metadata=None)
+    if len(bands) > 1:
+        options["planarconfig"] = "separate"
+    with atomic_file(path) as file:
+        tifffile.imwrite(file, bands, compression="zlib", extratags=tags, **options)
+
+
+def _geo_keys(keys: dict[int, int]) -> tuple:
+    """Return the tag of short keys: version 1.1.0, the number of keys, and four numbers for each."""
+    numbers = [1, 1, 0, len(keys)]
+    for key, value in keys.items():
+        numbers += [key, 0, 1, value]
+    return _GEO_KEYS, _SHORT, len(numbers), tuple(numbers), True
+
+
+def _describe(names: Sequence[str]) -> str:
+    """Return the names of the bands as GDAL writes them."""
+    items = [
+        f'<Item name="DESCRIPTION" sample="{k}" role="description">{escape(name)}</Item>'
+        for k, name in enumerate(names)
+    ]
+    return f"<GDALMetadata>{''.join(items)}</GDALMetadata>"
