@@ -144,12 +144,12 @@ def scan(seed, num_envs=2, num_points=300, dtype=torch.float32):
     return random_clouds(rng, T, num_points, dtype), T
 
 
-def mapped(num_envs=2, scans=2, **stages):
+def mapped(num_envs=2, scans=2, pose_covariance=None, **stages):
     """A map after a few scans."""
     emap = small_map(num_envs, **stages)
     for k in range(scans):
         cloud, T = scan(k, num_envs)
-        emap.update(cloud, T, T, 0.3)
+        emap.update(cloud, T, T, 0.3, pose_covariance=pose_covariance)
     return emap
 
 

@@ -32,6 +32,7 @@ LIVELY = dict(
     overlap=OverlapConfig(radius=0.5, height=1.2),
 )
 NEWER = VERSION + 1
+UNCERTAIN = 1e-6 * torch.eye(6, dtype=torch.float64).repeat(2, 1, 1)
 
 
 @register
@@ -59,7 +60,7 @@ def rewrite_header(path, **changes):
 
 @pytest.fixture
 def path(tmp_path):
-    save_map(tmp_path / "map.npz", mapped())
+    save_map(tmp_path / "map.npz", mapped(pose_covariance=UNCERTAIN))
     return tmp_path / "map.npz"
 
 

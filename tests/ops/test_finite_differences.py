@@ -44,6 +44,7 @@ def hollow_scene(head, sensors, base=True):
         gradient_x=draw(-0.02, 0.02) * known,
         gradient_y=draw(-0.02, 0.02) * known,
         traversability=draw(0.8, 0.9) * known,
+        pose_covariance=1e-5 * torch.eye(3, dtype=torch.float64)[None],
     )
     prior = {f"prior {name}": getattr(state, name).clone() for name in LAYERS}
     inputs = prior | dict(
@@ -52,13 +53,15 @@ def hollow_scene(head, sensors, base=True):
         T_map_base=pose((0.01, 0.02, 0.6))[:, :3],
         dt=torch.tensor([0.1], dtype=torch.float64),
         variance=torch.from_numpy(rng.uniform(1e-4, 4e-4, cloud.shape[:-1])),
+        pose_covariance=(1e-5 * torch.eye(6, dtype=torch.float64) + 1e-6).repeat(1, sensors, 1, 1),
     )
 
     def run(values):
         before = state._replace(**{name: values[f"prior {name}"] for name in LAYERS})
         T_sensor, T_base = (rigid(values[name]) for name in ("T_map_sensor", "T_map_base"))
-        points, dt, variance = (values[name] for name in ("points", "dt", "variance"))
-        m = emap.measure(points, T_sensor, T_base if base else None, dt=dt, variance=variance)
+        points = values["points"]
+        own = {name: values[name] for name in ("dt", "variance", "pose_covariance")}
+        m = emap.measure(points, T_sensor, T_base if base else None, **own)
         after = emap(before, m)
         return after, {n: getattr(after if n in LAYERS else after.statistics, n) for n in LAYERS + NUMBERS}
 
@@ -85,7 +88,7 @@ def test_finite_differences_of_every_layer_by_every_input(head, sensors, base):
     after, outputs = run(given)
     assert (after.bounded & ~after.validity).sum() >= 6 and after.statistics.drift_correction != 0
     generator, moved = torch.Generator().manual_seed(0), set()
-    weights = {n: torch.randn(v.shape, dtype=torch.float64, generator=generator) for n, v in outputs.items()}
+    weights = {n: 0.5 + torch.rand(v.shape, dtype=torch.float64, generator=generator) for n, v in outputs.items()}
     slopes = {name: slopes_of((output * weights[name]).sum(), given) for name, output in outputs.items()}
     for source, value in inputs.items():
         direction = torch.randn(value.shape, dtype=torch.float64, generator=generator) * value.abs()
@@ -99,7 +102,7 @@ def test_finite_differences_of_every_layer_by_every_input(head, sensors, base):
         assert ("upper_bound", source) in moved
     for name in ("elevation", "gradient_x", "gradient_y"):
         assert {(name, source) for source in ("points", "variance", "T_map_sensor", "prior elevation")} <= moved
-    assert ("drift_error", "prior gradient_y") in moved and ("time", "dt") in moved
+    assert {("drift_error", "prior gradient_y"), ("time", "dt"), ("variance", "pose_covariance")} <= moved
 
 
 def test_the_upper_bound_follows_the_ray_that_bounds():

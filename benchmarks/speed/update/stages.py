@@ -41,7 +41,8 @@ def stages(seconds: float) -> dict[str, Any]:
     assert cfg.drift and cfg.raycast and cfg.overlap and cfg.traversability
 
     def transform() -> Measurement:
-        return measure.measure(cloud[:, None], T[:, None], T, drive.dt, None, None, grid, cfg.sensor, torch.float32)
+        inputs = cloud[:, None], T[:, None], T, drive.dt, None, None, None
+        return measure.measure(*inputs, grid, cfg.sensor, torch.float32)
 
     all_stages: dict[str, _Stage] = {
         "point transform, gates, noise": lambda state, m: transform(),
