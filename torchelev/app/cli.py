@@ -155,7 +155,17 @@ def main() -> None:
     help="Also write the growing map to this bag as GridMap, for RViz or Foxglove: .mcap, .db3 or .bag.",
 )
 @click.option(
-    "--every", type=float, default=1.0, show_default=True, metavar="S", help="Time between two maps in it [s]."
+    "--video",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Also film the growing map: .mp4 or .gif, ten frames a second.",
+)
+@click.option(
+    "--every",
+    type=float,
+    metavar="S",
+    help="Time of the recording between two maps or frames [s]; 0: each scan.  [default: 1 for --grid-map; for --video "
+    "so many scans that it lasts a minute at most]",
 )
 def map_command(**options: Any) -> None:
     """Run `torchelev map`; its help text is `_MAP_HELP`."""

@@ -15,9 +15,11 @@ from torchelev.app.fuse_scans import MapOptions, Scans, fuse_all, new_map, show_
 from torchelev.app.interrupts import defer_interrupts
 from torchelev.app.map_files import prepare_outputs, write_outputs
 from torchelev.app.map_recorder import MapRecorder
+from torchelev.app.map_video import MapVideo
 from torchelev.app.report import suggest_options, summarize
 from torchelev.io import (
     FileLayout,
+    Frame,
     MappingRun,
     RecordingError,
     base_poses,
@@ -27,6 +29,7 @@ from torchelev.io import (
 )
 
 _BAD_INPUT, _INTERRUPTED = 2, 130  # exit codes
+_DEFAULT_EVERY = 1.0  # [s] between two maps of --grid-map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +58,8 @@ class MapRequest:
     map_frame: str | None = None  #: frame of a bag in which the map is built
     base_frame: str | None = None  #: frame of a bag that the window follows
     grid_map: Path | None = None  #: bag to write the growing map to
-    every: float = 1.0  #: [s] between two maps in it
+    video: Path | None = None  #: of the growing map
+    every: float | None = None  #: [s] between two maps or frames in them; None: see MapVideo, and 1 s of maps
 
 
 class UserError(click.ClickException):
@@ -72,7 +76,7 @@ def run_map(request: MapRequest) -> int:
     try:
         return _run(request)
     except ModuleNotFoundError as error:
-        extra = "bags" if str(error.name).startswith(("rosbags", "mcap")) else "io"
+        extra = {"rosbags": "bags", "mcap": "bags", "av": "video"}.get(str(error.name).split(".")[0], "io")
         raise UserError(f"{error}; install it with pip install 'torchelev[{extra}]'") from error
     except (RecordingError, ValueError, OSError) as error:
         raise UserError(error) from error
@@ -103,13 +107,34 @@ def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
     """Fuse all scans of a recording, write the map, report it and return the exit code."""
     emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
     prefix, run = prepare_outputs(request.out, emap), MappingRun(emap)
-    if not request.every >= 0:
-        raise ValueError(f"--every: must not be negative, got {request.every}; give seconds, or 0 for each scan")
-    with MapRecorder(request.grid_map, request.every, getattr(scans, "map_frame", "map")) as recorder:
-        stopped = fuse_all(run, scans, options, recorder.after)
+    every = request.every
+    if every is not None and not every >= 0:
+        raise ValueError(f"--every: must not be negative, got {every}; give seconds, or 0 for each scan")
+    video = MapVideo(request.video, every, len(scans), request.recording.resolve().name)
+    frame = getattr(scans, "map_frame", "map")
+    recorder = MapRecorder(request.grid_map, _DEFAULT_EVERY if every is None else every, frame)
+    stopped = _fuse_and_record(run, scans, options, recorder, video)
     if recorder.num:
         click.echo(f"recorded  {recorder.num} maps in {recorder.path}")
+    if video.num:
+        click.echo(f"filmed    {video.num} frames in {video.path}")
     return _finish(run, len(scans), prefix, stopped, options)
+
+
+def _fuse_and_record(
+    run: MappingRun, scans: Scans, options: MapOptions, recorder: MapRecorder, video: MapVideo
+) -> BaseException | None:
+    """Fuse all scans and record the growing map; return what stopped that, if anything did."""
+
+    def after(run: MappingRun, frame: Frame) -> None:
+        recorder.after(run, frame)
+        video.after(run, frame)
+
+    try:
+        with recorder, video:
+            return fuse_all(run, scans, options, after)
+    except (KeyboardInterrupt, OSError) as reason:  # raised when a recording is finished: the map is still written
+        return reason
 
 
 def _check(request: MapRequest, mount: NDArray | None) -> None:

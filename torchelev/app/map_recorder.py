@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torchelev.app.due_scans import DueScans
+from torchelev.app.interrupts import defer_interrupts
 from torchelev.io import Frame, MappingRun
 
 if TYPE_CHECKING:
     from torchelev.io import GridMapWriter
-
-_ROUNDING = 1e-6  # [s]
 
 
 class MapRecorder:
@@ -29,9 +29,8 @@ class MapRecorder:
 
     def __init__(self, path: Path | None, every: float, frame: str) -> None:
         self._writer: GridMapWriter | None = None
-        self.path, self.every, self.num = path, every, 0
-        self._time = 0.0  # [s] since the first scan
-        self._due = 0.0
+        self.path, self.num = path, 0
+        self._due = DueScans(every)
         if path is not None:
             from torchelev.io.bags import GridMapWriter
 
@@ -42,13 +41,11 @@ class MapRecorder:
 
     def __exit__(self, *exception: object) -> None:
         if self._writer is not None:
-            self._writer.close()
+            with defer_interrupts():
+                self._writer.close()
 
     def after(self, run: MappingRun, frame: Frame) -> None:
         """Write the map if it is due; called after each scan."""
-        if self._writer is None:
-            return
-        self._time += frame.dt
-        if self._time >= self._due - _ROUNDING:
-            self._writer.write(run.emap, frame.stamp or self._time)
-            self._due, self.num = self._time + self.every, self.num + 1
+        if self._due.is_due(frame) and self._writer is not None:
+            self._writer.write(run.emap, frame.stamp or self._due.time)
+            self.num += 1

@@ -11,7 +11,7 @@ from torchelev.io.errors import RecordingError
 from torchelev.output_files import is_own_output
 
 # Files of these types may lie beside point clouds; any other file there is an error, not silently skipped.
-_IGNORED_SUFFIXES = {"", ".txt", ".csv", ".json", ".yaml", ".yml", ".md", ".log", ".png", ".jpg", ".jpeg"}
+_IGNORED_SUFFIXES = {"", *".txt .csv .json .yaml .yml .md .log .png .jpg .jpeg .mp4 .gif".split()}
 _SCANS_FOLDER = "scans"  # takes precedence over scans beside it
 
 
