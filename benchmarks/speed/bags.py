@@ -1,0 +1,131 @@
+"""Time reading, deskewing and mapping of bags, and check that memory does not grow with their length.
+
+    python -m benchmarks.speed.bags     # benchmarks/results/bags.json, five minutes and 0.6 GB of disk
+
+A robot drives in circles with a lidar of 32 rings. Bags are mapped as `torchelev map` does by default: cells of 10 cm,
+20 x 20 m, not compiled. For each scan, reading it, reading and deskewing it, and fusing it are timed in turn.
+
+Memory is that of a new process for each bag: what it holds when the map is empty, and its peak over the bag. Both are
+of the process alone (VmHWM), without the file cache.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+
+from benchmarks import RESULTS
+from benchmarks.speed.bag_drive import CLOUDS, MAP_FRAME, POSES, SENSOR_FRAME, write_bag
+from benchmarks.speed.meter import progress
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.app.results import markdown_table, write_json
+from torchelev.io import MappingRun
+from torchelev.io.bags import Bag, BagRecording, BagRequest, open_bag
+from torchelev.io.bags.scans import read_scan
+from torchelev.sim import Lidar
+
+FORMATS = (".bag", ".mcap", ".db3")
+LIDAR, TIMED_SCANS = Lidar(rings=32, azimuths=1024), 200
+SMALL_LIDAR, LENGTHS = Lidar(rings=16, azimuths=512), (200, 2000)  # of the bags whose memory is measured
+GRID = GridConfig(resolution=0.1, length_x=20.0, length_y=20.0)
+_REQUEST = BagRequest(clouds=(CLOUDS,), map_frame=MAP_FRAME, base_frame=SENSOR_FRAME, poses=POSES)
+_STEPS = ("read", "deskew", "map")
+
+
+def measure_times(path: Path) -> dict[str, float]:
+    """Return the median time of each step [ms per scan]; deskewing includes the poses."""
+    times: dict[str, list[float]] = {step: [] for step in _STEPS}
+    run = MappingRun(ElevationMap(ElevationMapConfig(grid=GRID)))
+    with Bag(path) as bag, Bag(path) as same:
+        messages, frames = bag.read([CLOUDS]), iter(open_bag(same, _REQUEST))
+        while True:
+            start = time.perf_counter()
+            message = next(messages, None)
+            if message is None:
+                return {step: 1e3 * statistics.median(values) for step, values in times.items()}
+            read_scan(message.data)
+            read = time.perf_counter()
+            frame = next(frames)
+            whole = time.perf_counter()
+            if frame is None:
+                raise ValueError(f"{path}: a scan was left out")
+            run.add(frame, frame.T_map_base)
+            done = time.perf_counter()
+            for step, value in zip(_STEPS, (read - start, whole - read - (read - start), done - whole), strict=True):
+                times[step].append(value)
+
+
+def measure_memory(path: Path) -> dict[str, float]:
+    """Map a bag; return the memory of this process before the first scan and its peak [MB]."""
+    torch.set_num_threads(1)
+    run = MappingRun(ElevationMap(ElevationMapConfig(grid=GRID)))
+    with Bag(path) as bag:
+        recording: BagRecording = open_bag(bag, _REQUEST)
+        start = peak_megabytes()
+        for frame in recording:
+            if frame is not None:
+                run.add(frame, frame.T_map_base)
+    return {"scans": run.num_scans, "start": start, "peak": peak_megabytes()}
+
+
+def peak_megabytes() -> float:
+    """Return the largest memory that this process had in its life [MB]."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024 / 1e6
+
+
+def measure(folder: Path) -> list[dict[str, Any]]:
+    """Return the figures of each format; bags are written to a folder, one at a time."""
+    rows = []
+    for suffix in progress(FORMATS, "formats"):
+        path = folder / f"drive{suffix}"
+        write_bag(path, TIMED_SCANS, LIDAR)
+        row = {"format": suffix, "points": len(LIDAR.directions), "scans": TIMED_SCANS, "ms": measure_times(path)}
+        row["memory_mb"] = [_measure_apart(path, length) for length in LENGTHS]
+        path.unlink()
+        rows.append(row)
+    return rows
+
+
+def _measure_apart(path: Path, num_scans: int) -> dict[str, float]:
+    """Write a bag and measure the memory of mapping it in a new process."""
+    write_bag(path, num_scans, SMALL_LIDAR)
+    with ProcessPoolExecutor(1, get_context("spawn")) as new:  # a fork would inherit this process's memory
+        return new.submit(measure_memory, path).result()
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Tabulate scans per second of each step and of all, and the memory over the lengths."""
+    lengths = [int(memory["scans"]) for memory in rows[0]["memory_mb"]]
+    head = ["format", "reading [1/s]", "deskewing [1/s]", "mapping [1/s]", "all [scans/s]"]
+    head += [f"peak memory, {length:,} scans [MB]" for length in lengths]
+    lines = [
+        [row["format"], *(f"{1e3 / row['ms'][step]:.0f}" for step in _STEPS), f"{1e3 / sum(row['ms'].values()):.0f}"]
+        + [f"{memory['peak']:.0f}" for memory in row["memory_mb"]]
+        for row in rows
+    ]
+    return markdown_table(head, lines)
+
+
+@click.command(help=__doc__)
+@click.option("--threads", default=1, show_default=True, help="CPU threads.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
+def main(threads: int, out: Path) -> None:
+    """Measure, write JSON and print the table."""
+    torch.set_num_threads(threads)
+    with tempfile.TemporaryDirectory() as folder:
+        rows = measure(Path(folder))
+    write_json(out / "bags.json", {"rows": rows})
+    click.echo(table(rows))
+
+
+if __name__ == "__main__":
+    main()
