@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torchelev.frames import deskew
 from torchelev.io.bags.bag import Bag, Message, Topic
 from torchelev.io.bags.covariance import PoseCovariances
+from torchelev.io.bags.order import order_by_stamp
 from torchelev.io.bags.point_cloud import CloudError
 from torchelev.io.bags.scans import CLOUDS, IMAGES, Scan, read_scan
 from torchelev.io.bags.transforms import FrameError, TransformTree
@@ -23,6 +24,7 @@ ODOMETRY, POSE, CAMERA = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped
 TRANSFORMS = {"/tf": False, "/tf_static": True}  # topic -> whether its transforms are static
 _PERIODS = 0.02, 1.0  # [s] shortest and longest period of scans that is believed
 _POSE_STEP, _MAX_POSES = 0.01, 64  # [s] between the poses of a scan, and how many there are at most
+_LATE = "some scans are older than those before them, and are fused with dt = 0"
 _BASES = ("base_link", "base_footprint", "base", "trunk", "body")
 
 
@@ -37,7 +39,7 @@ class BagRequest(NamedTuple):
 
 
 class BagRecording:
-    """The scans of a bag. Iterating reads it once more from the start, one message at a time.
+    """The scans of a bag in the order of their stamps. Iterating reads it once more from the start.
 
     Attributes:
         map_frame: in which the poses are.
@@ -89,7 +91,7 @@ class BagRecording:
         self.skipped.clear()
         self.notes.clear()
         last: float | None = None
-        for message in self._bag.read(self.topics):
+        for message in order_by_stamp(self._bag.read(self.topics), self.topics):
             try:
                 frame = self._to_frame(message, last)
             except CloudError as error:
@@ -113,8 +115,11 @@ class BagRecording:
             self.skipped[f"no pose of {scan.frame} in {self.map_frame} at that time"] += 1
             return None
         covariance = self._covariances.of_sensor(scan.stamp, T_map_sensor[:3, 3] - T_map_base[:3, 3])
-        dt = 0.0 if last is None else max(0.0, scan.stamp - last)
-        return Frame(self._still(scan), T_map_sensor, dt, message.topic, T_map_base, covariance, scan.stamp)
+        dt = 0.0 if last is None else scan.stamp - last
+        if dt < 0:
+            self.notes[f"{message.topic}: {_LATE}"] = None
+        points = self._still(scan)
+        return Frame(points, T_map_sensor, max(0.0, dt), message.topic, T_map_base, covariance, scan.stamp)
 
     def _still(self, scan: Scan) -> NDArray[np.float32]:
         """Return the points as seen from the sensor's place at the stamp."""
