@@ -52,7 +52,9 @@ def _propose(bag: Bag) -> list[str]:
     depths = [topic.name for topic in bag.topics if topic.type in IMAGES and "depth" in topic.name]
     request = BagRequest(clouds=clouds[:1], depths=[] if clouds else depths[:1])
     try:
-        return ["to map it", f"  {_command(bag, open_bag(bag, request), request)}"]
+        recording = open_bag(bag, request)
+        warnings = [f"warning: {note}" for note in recording.pose_notes]
+        return ["to map it", f"  {_command(bag, recording, request)}", *warnings]
     except RecordingError as error:
         return ["it cannot be mapped without more options:", f"  {error}"]
 

@@ -23,6 +23,7 @@ from torchelev.io.recording import Frame
 ODOMETRY, POSE, CAMERA = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = {"/tf": False, "/tf_static": True}  # topic -> whether its transforms are static
 _PERIODS = 0.02, 1.0  # [s] shortest and longest period of scans that is believed
+_MAX_GAP = 1.0  # [s] between two poses without a warning
 _POSE_STEP, _MAX_POSES = 0.01, 64  # [s] between the poses of a scan, and how many there are at most
 _LATE = "some scans are older than those before them, and are fused with dt = 0"
 _BASES = ("base_link", "base_footprint", "base", "trunk", "body")
@@ -46,6 +47,7 @@ class BagRecording:
         base_frame: whose pose a frame's `T_map_base` is.
         has_base: whether that is another frame than the sensor's, so that the sensor's place on the robot is known.
         topics: of the scans.
+        pose_notes: frames with several parents, and gaps in the poses.
         skipped: number of scans that were left out when it was last read, by reason.
         notes: what is not used of the scans' messages.
     """
@@ -62,6 +64,8 @@ class BagRecording:
         sensor = self._first_frame()
         self.map_frame, self.base_frame = _choose_frames(bag, self.tree, sensor, request)
         self.has_base = self.base_frame != sensor
+        gaps = [self.tree.describe_gaps(self.map_frame, frame, _MAX_GAP) for frame in (self.base_frame, sensor)]
+        self.pose_notes = [*self.tree.describe_conflicts(), *dict.fromkeys(line for lines in gaps for line in lines)]
         self.skipped: Counter[str] = Counter()
         self.notes: dict[str, None] = {}
 
@@ -75,9 +79,9 @@ class BagRecording:
 
     @property
     def warnings(self) -> list[str]:
-        """What was left out when the scans were last read, and where the bag ended too early."""
+        """What was left out when the scans were last read, what is wrong with the poses, and where the bag ended."""
         skipped = [f"{number} of {self._num} scans were left out: {reason}" for reason, number in self.skipped.items()]
-        return [*skipped, *self.notes, *([self.ended_early] if self.ended_early else [])]
+        return [*skipped, *self.pose_notes, *self.notes, *([self.ended_early] if self.ended_early else [])]
 
     @property
     def middle(self) -> NDArray[np.float64]:

@@ -36,6 +36,8 @@ class TransformTree:
         self.max_extrapolation = max_extrapolation
         self._edges: dict[str, _Edge] = {}
         self._sorted: dict[str, NDArray] = {}
+        self._parents: dict[str, list[str]] = {}  # of each frame, in the order in which they came
+        self._requested: set[str] = set()  # frames whose transforms are replaced by a topic of poses
 
     @property
     def frames(self) -> list[str]:
@@ -50,6 +52,9 @@ class TransformTree:
         parent, child, row = clean(parent), clean(child), (stamp, *pose)
         if not (np.isfinite(row).all() and sum(q * q for q in row[4:]) > 0.5):
             return
+        parents = self._parents.setdefault(child, [])
+        if parent not in parents:
+            parents.append(parent)
         edge = self._edges.get(child)
         if edge is None or edge.parent != parent or edge.is_static != is_static or is_static:
             edge = self._edges[child] = _Edge(parent, is_static, array("d"))
@@ -59,18 +64,56 @@ class TransformTree:
     def add_message(self, message: Any, is_static: bool) -> None:
         """Add the transforms of a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
+            if clean(stamped.child_frame_id) in self._requested:
+                continue
             pose = _numbers(stamped.transform.translation, stamped.transform.rotation)
             self.add(stamped.header.frame_id, stamped.child_frame_id, stamp_of(stamped.header), pose, is_static)
 
     def add_odometry(self, message: Any) -> None:
-        """Add the pose of a nav_msgs/Odometry."""
+        """Add the pose of a nav_msgs/Odometry, in place of that frame's transforms."""
+        self._replace(message.child_frame_id)
         pose = _numbers(message.pose.pose.position, message.pose.pose.orientation)
         self.add(message.header.frame_id, message.child_frame_id, stamp_of(message.header), pose)
 
     def add_pose(self, message: Any, child: str) -> None:
-        """Add a geometry_msgs/PoseStamped, the pose of a frame that the message does not name."""
+        """Add a geometry_msgs/PoseStamped, the pose of a frame that the message does not name, as Odometry."""
+        self._replace(child)
         pose = _numbers(message.pose.position, message.pose.orientation)
         self.add(message.header.frame_id, child, stamp_of(message.header), pose)
+
+    def _replace(self, frame: str) -> None:
+        """Drop the transforms of a frame, also those to come."""
+        frame = clean(frame)
+        if frame not in self._requested:
+            self._requested.add(frame)
+            for kept in (self._edges, self._parents, self._sorted):
+                kept.pop(frame, None)
+
+    def describe_conflicts(self) -> list[str]:
+        """Return a sentence for each frame that has several parents."""
+        return [
+            f"{frame} has several parents in the transforms, {' and '.join(parents)}: only its last poses in "
+            f"{self._edges[frame].parent} are used; give --poses, or record one parent"
+            for frame, parents in sorted(self._parents.items())
+            if len(parents) > 1
+        ]
+
+    def describe_gaps(self, target: str, source: str, max_gap: float) -> list[str]:
+        """Return a sentence for each transform between two frames that pauses for longer than a time [s]."""
+        lines = []
+        for frame in self._moving_between(target, source):
+            stamps = self._rows(frame)[:, 0]
+            gaps = np.diff(stamps)
+            if not (gaps > max_gap).any():
+                continue
+            longest, more = int(gaps.argmax()), int((gaps > max_gap).sum()) - 1
+            lines.append(
+                f"{frame} has no pose in {self._edges[frame].parent} for {gaps[longest]:.1f} s, from "
+                f"{stamps[longest] - stamps[0]:.1f} s after its first (stamp {stamps[longest]:.3f})"
+                + (f", and {more} more" if more else "")
+                + ": scans there have interpolated poses"
+            )
+        return lines
 
     def ancestors(self, frame: str) -> list[str]:
         """Return a frame, its parent, its parent's parent, ... up to the root."""
@@ -98,9 +141,14 @@ class TransformTree:
 
     def stamps(self, target: str, source: str) -> NDArray[np.float64]:
         """Return the times [s] of all poses that move between two frames; of none, that there is no motion: [0]."""
-        frames = [frame for frame in self.ancestors(source) if frame in self._edges and not self.is_static(frame)]
-        frames = [frame for frame in frames if frame not in self.ancestors(target)]
+        frames = self._moving_between(target, source)
         return np.concatenate([self._rows(frame)[:, 0] for frame in frames]) if frames else np.zeros(1)
+
+    def _moving_between(self, target: str, source: str) -> list[str]:
+        """Return the frames that move in their parent, on the way between two frames."""
+        up, down = self.ancestors(source), self.ancestors(target)
+        way = [frame for frame in up if frame not in down] + [frame for frame in down if frame not in up]
+        return [frame for frame in way if frame in self._edges and not self.is_static(frame)]
 
     def _chain(self, frames: list[str], times: NDArray) -> NDArray:
         """Return the pose of the first frame in the parent of the last one."""
