@@ -9,8 +9,9 @@ from typing import Any
 import click
 
 from torchelev import __version__
-from torchelev.app.map_command import MapRequest, UserError, run_map
-from torchelev.io.errors import RecordingError
+from torchelev.app.map_command import run_map
+from torchelev.app.map_request import MapRequest
+from torchelev.app.user_error import user_errors
 
 _MAP_HELP = """Build an elevation map from RECORDING, a folder of scans with poses, or a bag.
 
@@ -178,12 +179,8 @@ def bag_command(bag: Path) -> None:
     """List topics, types, counts, rates and frames of BAG and its tree of transforms; propose the command to map it."""
     from torchelev.app.bag_command import describe_bag
 
-    try:
+    with user_errors():
         click.echo(describe_bag(bag))
-    except ModuleNotFoundError as error:
-        raise UserError(f"{error}; install it with pip install 'torchelev[bags]'") from error
-    except (RecordingError, OSError) as error:
-        raise UserError(error) from error
 
 
 @main.command("demo", short_help="Map a simulated walk and compare it with ground truth.")
@@ -198,6 +195,46 @@ def demo_command(out: Path, seconds: float | None, quiet: bool) -> None:
 
     click.echo(run_demo(out=out, seconds=seconds, progress=not quiet))
     click.echo(f"wrote {out}")
+
+
+_VIEW_HELP = """Show a map in the browser while it grows.
+
+RECORDING is a folder of scans or a bag, as of `torchelev map`, with the same
+options; or a map that was saved, .npz. Without it, a simulated walk is shown.
+
+\b
+  torchelev view                   the demo's walk
+  torchelev view drive.mcap        a bag
+  torchelev view drive/            a folder of scans with poses
+  torchelev view map.npz           a saved map
+
+The page plays the recording, pauses, steps and goes back. It colours the
+surface by any layer, shows cloud, frames, path and planes, and says the values
+of the cell that is clicked. Ctrl-C closes it.
+"""
+
+
+def _view_command(recording: Path | None, host: str, port: int, paused: bool, **options: Any) -> None:
+    """Run `torchelev view`; its help text is `_VIEW_HELP`."""
+    from torchelev.app.view_command import run_view
+
+    request = None if recording is None else MapRequest(recording=recording, **options)
+    run_view(request, host, port, paused)
+
+
+_OUTPUTS = ("recording", "out", "grid_map", "video", "every")  # parameters of `map` that `view` lacks
+_VIEW_OPTIONS: list[click.Parameter] = [
+    click.Argument(["recording"], type=click.Path(path_type=Path), required=False),
+    click.Option(["--host"], default="127.0.0.1", show_default=True, help="0.0.0.0: let other machines connect."),
+    click.Option(["--port"], type=click.IntRange(1, 65535), default=8080, show_default=True, help="Of the page."),
+    click.Option(["--paused"], is_flag=True, help="Wait at the first scan."),
+    *(parameter for parameter in map_command.params if parameter.name not in _OUTPUTS),
+]
+main.add_command(
+    click.Command(
+        "view", params=_VIEW_OPTIONS, callback=_view_command, help=_VIEW_HELP, short_help="Show a map in the browser."
+    )
+)
 
 
 @main.command("filters", short_help="List the filters that a config can use.")

@@ -6,6 +6,7 @@ Run ``make demo`` or ``torchelev demo``. Needs ``torchelev[io]``.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -56,12 +57,13 @@ class DemoResult:
         return f"{self.accuracy}, {self.ms_per_update:.1f} ms per update"
 
 
-class _DemoScan(NamedTuple):
+class DemoScan(NamedTuple):
     """One depth image with its poses."""
 
     points: Tensor  #: (N, 3) [m] sensor frame
     T_map_sensor: Tensor  #: (4, 4)
     T_map_base: Tensor  #: (4, 4)
+    time: float  #: [s] since the start
 
 
 class _HitCells:
@@ -72,7 +74,7 @@ class _HitCells:
         self.half = round(reach / resolution)
         self.cells = torch.zeros(2 * self.half, 2 * self.half, dtype=torch.bool)
 
-    def add(self, scan: _DemoScan, window: Tensor) -> None:
+    def add(self, scan: DemoScan, window: Tensor) -> None:
         """Add the cells that a scan hit; drop those outside the window, given by its cell centres (H, W, 2) [m]."""
         T = scan.T_map_sensor
         points = scan.points[scan.points.isfinite().all(-1)].double()
@@ -90,6 +92,32 @@ class _HitCells:
         return cell[..., 0], cell[..., 1]
 
 
+class DemoWalk:
+    """The simulated walk. Iterating observes one scan after the other and fuses it into the map.
+
+    Args:
+        seconds: simulated time [s] to walk; None: the whole course, about 30 s.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        torch.manual_seed(0)
+        self.scene = make_course()
+        self.path = walk(self.scene, ROUTE, speed=SPEED, dt=DT, T_base_sensor=T_BASE_CAMERA)
+        self._num_scans = len(self.path.times) if seconds is None else max(1, round(seconds / DT))
+        self.emap = ElevationMap(ElevationMapConfig(grid=GRID), num_envs=1)
+        self.update_ms: list[float] = []
+
+    def __len__(self) -> int:
+        return min(len(self.path.times), self._num_scans)
+
+    def __iter__(self) -> Iterator[DemoScan]:
+        generator = torch.Generator().manual_seed(0)
+        for k in range(len(self)):
+            scan = _observe(self.scene, self.path, k, generator)
+            self.update_ms.append(_fuse(self.emap, scan))
+            yield scan
+
+
 def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progress: bool = True) -> DemoResult:
     """Walk the course, map it and draw the result.
 
@@ -105,30 +133,23 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
         WriteError: the picture cannot be written; raised before the walk.
     """
     require_writable(out)
-    torch.manual_seed(0)
-    scene, generator = make_course(), torch.Generator().manual_seed(0)
-    path = walk(scene, ROUTE, speed=SPEED, dt=DT, T_base_sensor=T_BASE_CAMERA)
-    num_scans = len(path.times) if seconds is None else min(len(path.times), max(1, round(seconds / DT)))
-    emap = ElevationMap(ElevationMapConfig(grid=GRID), num_envs=1)
-    hit, update_ms = _HitCells(GRID.resolution), []
-    for k in tqdm(range(num_scans), desc="walking and mapping", unit="scan", disable=not progress):
-        scan = _observe(scene, path, k, generator)
-        update_ms.append(_fuse(emap, scan))
-        hit.add(scan, emap.cell_centers()[0])
-    end = float(path.times[num_scans - 1])
-    result = _assess(emap, scene, hit, update_ms, end)
-    _draw(out, emap, scene, path.T_map_base[:num_scans, :2, 3], end, result)
+    demo, hit = DemoWalk(seconds), _HitCells(GRID.resolution)
+    for scan in tqdm(demo, desc="walking and mapping", unit="scan", disable=not progress):
+        hit.add(scan, demo.emap.cell_centers()[0])
+    end = float(demo.path.times[len(demo) - 1])
+    result = _assess(demo.emap, demo.scene, hit, demo.update_ms, end)
+    _draw(out, demo.emap, demo.scene, demo.path.T_map_base[: len(demo), :2, 3], end, result)
     return result
 
 
-def _observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator) -> _DemoScan:
+def _observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator) -> DemoScan:
     """Simulate the depth image of step k: range noise, and 1 % of the pixels at wrong depths."""
     points = CAMERA.cast(scene, path.T_map_sensor[k], float(path.times[k]))
     points = outliers(range_noise(points, generator), generator, dust=0.005, flying=0.005)
-    return _DemoScan(points, path.T_map_sensor[k], path.T_map_base[k])
+    return DemoScan(points, path.T_map_sensor[k], path.T_map_base[k], float(path.times[k]))
 
 
-def _fuse(emap: ElevationMap, scan: _DemoScan) -> float:
+def _fuse(emap: ElevationMap, scan: DemoScan) -> float:
     """Fuse one scan and return the time it took [ms]."""
     start = time.perf_counter()
     emap.update(scan.points[None], scan.T_map_sensor[None], scan.T_map_base[None], DT)

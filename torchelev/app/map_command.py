@@ -2,105 +2,30 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import click
-from numpy.typing import NDArray
 
 from torchelev.app.config_file import load_config
-from torchelev.app.fuse_scans import MapOptions, Scans, fuse_all, new_map, show_progress
+from torchelev.app.fuse_scans import MapOptions, Scans, fuse_all, new_map
 from torchelev.app.interrupts import defer_interrupts
 from torchelev.app.map_files import prepare_outputs, write_outputs
 from torchelev.app.map_recorder import MapRecorder
+from torchelev.app.map_request import MapRequest
 from torchelev.app.map_video import MapVideo
+from torchelev.app.open_scans import open_scans
 from torchelev.app.report import suggest_options, summarize
-from torchelev.io import (
-    FileLayout,
-    Frame,
-    MappingRun,
-    RecordingError,
-    base_poses,
-    is_bag,
-    open_recording,
-    read_transform,
-)
+from torchelev.app.user_error import BAD_INPUT, UserError, user_errors
+from torchelev.io import Frame, MappingRun, RecordingError
 
-_BAD_INPUT, _INTERRUPTED = 2, 130  # exit codes
+_INTERRUPTED = 130  # exit code
 _DEFAULT_EVERY = 1.0  # [s] between two maps of --grid-map
-
-
-@dataclass(frozen=True, kw_only=True)
-class MapRequest:
-    """Arguments of `torchelev map` as the user gave them; see its help."""
-
-    recording: Path  #: folder of scans, or a bag
-    poses: Path | None  #: pose file, of a bag a topic; None: found in or beside the recording
-    intrinsics: Path | None  #: camera file of depth images; None: the scans are point clouds
-    out: str  #: prefix of the output files, or a folder
-    resolution: float | None  #: [m] cell size; None: the config's
-    size: float | None  #: [m] side length of the map; None: the config's
-    fixed: bool  #: keep the window in place
-    device: str  #: torch device
-    config: Path | None  #: YAML settings
-    dt: float | None  #: [s] between scans; None: from the pose file
-    sensor_height: float | None  #: [m] above the base
-    extrinsics: str | None  #: T_base_sensor, a file or numbers
-    poses_of: Literal["sensor", "base"]  #: frame whose poses the pose file holds
-    bin_layout: str | None  #: see FileLayout.bin
-    quaternions: Literal["xyzw", "wxyz"] | None  #: see FileLayout.quaternions
-    time_unit: Literal["s", "ms", "us", "ns"] | None  #: see FileLayout.time_unit
-    pcd_frame: Literal["sensor", "viewpoint"] | None  #: see FileLayout.pcd_frame
-    points: tuple[str, ...] = ()  #: topics of a bag's clouds
-    depth: tuple[str, ...] = ()  #: topics of a bag's depth images
-    map_frame: str | None = None  #: frame of a bag in which the map is built
-    base_frame: str | None = None  #: frame of a bag that the window follows
-    grid_map: Path | None = None  #: bag to write the growing map to
-    video: Path | None = None  #: of the growing map
-    every: float | None = None  #: [s] between two maps or frames in them; None: see MapVideo, and 1 s of maps
-
-
-class UserError(click.ClickException):
-    """Bad input: print one line to stderr and exit with code 2."""
-
-    exit_code = _BAD_INPUT
-
-    def __init__(self, error: object) -> None:
-        super().__init__(" ".join(str(error).split()))
 
 
 def run_map(request: MapRequest) -> int:
     """Run `torchelev map` and return its exit code; bad input becomes a one-line click error."""
-    try:
-        return _run(request)
-    except ModuleNotFoundError as error:
-        extra = {"rosbags": "bags", "mcap": "bags", "av": "video"}.get(str(error.name).split(".")[0], "io")
-        raise UserError(f"{error}; install it with pip install 'torchelev[{extra}]'") from error
-    except (RecordingError, ValueError, OSError) as error:
-        raise UserError(error) from error
-
-
-def _run(request: MapRequest) -> int:
-    if is_bag(request.recording):
-        return run_bag(request)
-    mount = None if request.extrinsics is None else read_transform(request.extrinsics)
-    _check(request, mount)
-    options = MapOptions(T_base_sensor=mount, sensor_height=request.sensor_height, fixed=request.fixed)
-    layout = FileLayout(
-        bin=request.bin_layout,
-        quaternions=request.quaternions,
-        time_unit=request.time_unit,
-        pcd_frame=request.pcd_frame,
-    )
-    scans = open_recording(request.recording, request.poses, request.intrinsics, request.dt, layout)
-    if request.poses_of == "base" and mount is not None:
-        scans = scans.apply_mount(mount)
-    scans = scans.with_bases(base_poses(scans.T_map_sensor, mount, request.sensor_height))
-    if scans.note:
-        click.echo(f"warning: {scans.note}", err=True)
-    return map_scans(request, scans, options)
+    with user_errors(), open_scans(request) as (scans, options):
+        return map_scans(request, scans, options)
 
 
 def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
@@ -137,52 +62,6 @@ def _fuse_and_record(
         return reason
 
 
-def _check(request: MapRequest, mount: NDArray | None) -> None:
-    """Reject options that contradict each other or are out of range."""
-    height, dt = request.sensor_height, request.dt
-    names = ("points", "depth", "map_frame", "base_frame")
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name)]
-    if given:
-        raise ValueError(f"{', '.join(given)}: only bags have topics and frames, and {request.recording} is none")
-    if request.poses_of == "base" and mount is None:
-        raise ValueError("--poses-of base: the sensor's pose on the robot is unknown; give --extrinsics")
-    if mount is not None and height is not None:
-        raise ValueError("--sensor-height: --extrinsics already gives the height; drop one of the two")
-    if height is not None and not math.isfinite(height):
-        raise ValueError(f"--sensor-height: must be a finite number, got {height}; give metres")
-    if dt is not None and not (math.isfinite(dt) and dt >= 0):
-        raise ValueError(f"--dt: must be finite and not negative, got {dt}; give seconds")
-
-
-def run_bag(request: MapRequest) -> int:
-    """Map the scans of a bag, and say what was left out."""
-    from torchelev.io.bags import Bag, BagRequest, open_bag
-
-    _refuse_file_options(request)
-    poses = None if request.poses is None else str(request.poses)
-    wanted = BagRequest(request.points, request.depth, request.map_frame, request.base_frame, poses)
-    with Bag(request.recording) as bag:
-        scans = open_bag(bag, wanted, lambda m: show_progress(m, "reading poses", "message"))
-        click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}")
-        options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base)
-        try:
-            return map_scans(request, scans, options)
-        finally:
-            for note in scans.warnings:
-                click.echo(f"warning: {note}", err=True)
-
-
-def _refuse_file_options(request: MapRequest) -> None:
-    """Reject options for what a bag itself says."""
-    names = ("intrinsics", "dt", "sensor_height", "extrinsics", "bin_layout", "quaternions", "time_unit", "pcd_frame")
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) is not None]
-    if given or request.poses_of == "base":
-        given = given or ["--poses-of"]
-        raise ValueError(
-            f"{', '.join(given)}: only for folders of files; {request.recording} is a bag, which says it itself"
-        )
-
-
 def _finish(run: MappingRun, num_scans: int, prefix: Path, stopped: BaseException | None, options: MapOptions) -> int:
     """Write and report the map; return the exit code, or raise what stopped the mapping."""
     kept = f"kept the map of {run.num_scans} of {num_scans} scans" if run.num_scans else "nothing was mapped yet"
@@ -201,7 +80,7 @@ def _finish(run: MappingRun, num_scans: int, prefix: Path, stopped: BaseExceptio
     if not run.num_scans:
         raise UserError(f"none of the {num_scans} scans could be used")
     if failures:
-        return _BAD_INPUT
+        return BAD_INPUT
     for line in run.emap.diagnose():
         click.echo(f"warning: {line}", err=True)
     return 0

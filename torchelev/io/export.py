@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torchelev.errors import require
 from torchelev.io.map_file import as_array, load_map, read_npz, save_map
 from torchelev.output_files import MARK, atomic_file
+from torchelev.state import map_layers
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
@@ -70,7 +71,9 @@ def take(emap: ElevationMap, env: int = 0, layers: Sequence[str] | None = None) 
         ValueError: the environment does not exist.
     """
     require(0 <= env < emap.num_envs, "env", f"must lie in [0, {emap.num_envs})", env, "environments count from 0")
-    arrays = {name: as_array(emap.layer(name)[env].clone()) for name in (emap.layers if layers is None else layers)}
+    state = map_layers(lambda value: value[env : env + 1], emap.state)  # or filters would run for all environments
+    names = emap.layers if layers is None else layers
+    arrays = {name: as_array(emap.layer(name, state=state)[0]) for name in names}
     center = as_array(emap.center[env])
     return SavedMap(arrays, emap.cfg.grid.resolution, center, emap.cfg.to_dict())
 

@@ -1,0 +1,67 @@
+"""The page in a real browser: it opens, draws the surface, switches the layer, and says what a cell holds."""
+
+import io
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from docs.browser import Browser, find_browser
+from tests.helpers import pose
+from tests.viz.live.test_page import mapped_step
+from torchelev.viz.live import LiveView
+
+pytestmark = [
+    pytest.mark.slow(15),
+    pytest.mark.skipif(find_browser() is None, reason="no chromium or chrome on the PATH"),
+]
+SIZE = (900, 600)
+_CENTER_OF = """(() => {
+    const found = [...document.querySelectorAll(%r)].filter(e => (e.value ?? e.textContent) === %r);
+    if (!found.length) return null;
+    const box = found[0].getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+})()"""
+
+
+def pixels(browser):
+    """The scene (H, W, 3), without the panel at its right."""
+    picture = np.asarray(Image.open(io.BytesIO(browser.picture())).convert("RGB")).astype(int)
+    return picture[:, : SIZE[0] // 2]
+
+
+def num_colored(picture):
+    return int((picture.max(-1) - picture.min(-1) > 40).sum())
+
+
+def wait_until(claim, seconds=120.0):
+    end = time.monotonic() + seconds
+    while not claim():
+        assert time.monotonic() < end
+        time.sleep(0.2)
+
+
+def test_the_page_in_a_browser(port):
+    emap, T, _ = mapped_step()
+    with LiveView(emap, port=port) as view:
+        assert view.show(pose((0, 0, 0.5)), T)
+        with Browser(view.page.url, SIZE) as browser:
+            browser.wait_for("document.querySelector('canvas') !== null")
+            wait_until(lambda: num_colored(pixels(browser)) > 1000)
+            browser.wait_for("document.body.innerText.includes('elevation [m]')")
+
+            browser.click(*browser.wait_for(_CENTER_OF % ("input", "elevation")))
+            browser.click(*browser.wait_for(_CENTER_OF % ("[role=option]", "traversability")))
+            browser.wait_for("!document.body.innerText.includes('elevation [m]')")
+            assert view.page.layer == "traversability"
+
+            colored = pixels(browser).max(-1) - pixels(browser).min(-1) > 40
+            row, column = (int(np.median(index)) for index in np.nonzero(colored))
+            browser.click(column, row)
+            browser.wait_for("document.body.innerText.includes('Cell at (')")
+
+            first = pixels(browser)
+            emap.reset()
+            wait_until(lambda: view.show(pose((0, 0, 0.5)), T))
+            wait_until(lambda: num_colored(pixels(browser)) < num_colored(first) / 3)  # the map is gone from the page

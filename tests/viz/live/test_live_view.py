@@ -1,0 +1,66 @@
+"""The live view of a loop: it shows the map, and never holds the loop up."""
+
+import time
+
+import pytest
+
+from tests.helpers import mapped, pose
+from torchelev.viz.live import LiveView
+
+
+@pytest.fixture
+def emap():
+    return mapped(num_envs=3)
+
+
+def wait_for(claim, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not claim():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_it_shows_the_robot_that_was_chosen(emap, port, capsys):
+    with LiveView(emap, port=port, max_share=1.0) as view:
+        assert view.show(pose(num_envs=3))
+        wait_for(lambda: view.num_drawn == 1)
+        shown = view.page._last.map.layers["elevation"]
+        view.page._env.value = 2
+        wait_for(lambda: view.show(pose(num_envs=3)))
+        wait_for(lambda: view.num_drawn == 2)
+        other = view.page._last.map.layers["elevation"]
+    assert f"http://localhost:{port}" in capsys.readouterr().out
+    assert (shown == emap.layer("elevation")[0].numpy())[shown == shown].all()
+    assert (other == emap.layer("elevation")[2].numpy())[other == other].all()
+
+
+def test_pictures_beyond_the_share_are_dropped(emap, port, monkeypatch):
+    with LiveView(emap, port=port, max_share=0.05, max_rate=1e6) as view:
+        spent = []
+
+        def draw(*args):
+            start = time.thread_time()
+            while time.thread_time() - start < 0.01:
+                pass
+            spent.append(time.thread_time() - start)
+
+        monkeypatch.setattr(view.page, "draw", draw)
+        start = time.perf_counter()
+        while time.perf_counter() - start < 2.0:
+            view.show(pose(num_envs=3))
+            time.sleep(0.001)
+        assert 2 <= len(spent) and sum(spent[:-1]) < 0.05 * 2.0
+
+
+def test_a_slow_page_never_holds_the_loop_up(emap, port, monkeypatch):
+    with LiveView(emap, port=port, max_share=1.0, max_rate=1e6) as view:
+        monkeypatch.setattr(view.page, "draw", lambda *args: time.sleep(1.0))
+        start = time.perf_counter()
+        shown = [view.show(pose(num_envs=3)) for _ in range(50)]
+        assert time.perf_counter() - start < 0.9 and sum(shown) <= 2
+
+
+@pytest.mark.parametrize("wrong", [{"max_share": 0.0}, {"max_share": 1.5}, {"max_rate": 0.0}])
+def test_wrong_settings_are_named(emap, port, wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: must"):
+        LiveView(emap, port=port, **wrong)

@@ -1,0 +1,37 @@
+"""What `torchelev map` and `torchelev view` were asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapRequest:
+    """Arguments of `torchelev map` as the user gave them; see its help."""
+
+    recording: Path  #: folder of scans, or a bag
+    poses: Path | None  #: pose file, of a bag a topic; None: found in or beside the recording
+    intrinsics: Path | None  #: camera file of depth images; None: the scans are point clouds
+    out: str = "map"  #: prefix of the output files, or a folder
+    resolution: float | None  #: [m] cell size; None: the config's
+    size: float | None  #: [m] side length of the map; None: the config's
+    fixed: bool  #: keep the window in place
+    device: str  #: torch device
+    config: Path | None  #: YAML settings
+    dt: float | None  #: [s] between scans; None: from the pose file
+    sensor_height: float | None  #: [m] above the base
+    extrinsics: str | None  #: T_base_sensor, a file or numbers
+    poses_of: Literal["sensor", "base"]  #: frame whose poses the pose file holds
+    bin_layout: str | None  #: see FileLayout.bin
+    quaternions: Literal["xyzw", "wxyz"] | None  #: see FileLayout.quaternions
+    time_unit: Literal["s", "ms", "us", "ns"] | None  #: see FileLayout.time_unit
+    pcd_frame: Literal["sensor", "viewpoint"] | None  #: see FileLayout.pcd_frame
+    points: tuple[str, ...] = ()  #: topics of a bag's clouds
+    depth: tuple[str, ...] = ()  #: topics of a bag's depth images
+    map_frame: str | None = None  #: frame of a bag in which the map is built
+    base_frame: str | None = None  #: frame of a bag that the window follows
+    grid_map: Path | None = None  #: bag to write the growing map to
+    video: Path | None = None  #: of the growing map
+    every: float | None = None  #: [s] between two maps or frames in them; None: see MapVideo, and 1 s of maps

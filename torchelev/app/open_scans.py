@@ -1,0 +1,96 @@
+"""Open the scans that a request names: a folder of files, or a bag."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import click
+from numpy.typing import NDArray
+
+from torchelev.app.fuse_scans import MapOptions, Scans, show_progress
+from torchelev.app.map_request import MapRequest
+from torchelev.io import FileLayout, base_poses, is_bag, open_recording, read_transform
+
+
+@contextmanager
+def open_scans(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
+    """Open the scans of a request, and print warnings: of a folder before they are read, of a bag afterwards.
+
+    Raises:
+        RecordingError: the recording cannot be read.
+        ValueError: options contradict each other, or are out of range.
+    """
+    if is_bag(request.recording):
+        with _open_bag(request) as opened:
+            yield opened
+    else:
+        yield _open_folder(request)
+
+
+def _open_folder(request: MapRequest) -> tuple[Scans, MapOptions]:
+    mount = None if request.extrinsics is None else read_transform(request.extrinsics)
+    _check(request, mount)
+    options = MapOptions(T_base_sensor=mount, sensor_height=request.sensor_height, fixed=request.fixed)
+    layout = FileLayout(
+        bin=request.bin_layout,
+        quaternions=request.quaternions,
+        time_unit=request.time_unit,
+        pcd_frame=request.pcd_frame,
+    )
+    scans = open_recording(request.recording, request.poses, request.intrinsics, request.dt, layout)
+    if request.poses_of == "base" and mount is not None:
+        scans = scans.apply_mount(mount)
+    scans = scans.with_bases(base_poses(scans.T_map_sensor, mount, request.sensor_height))
+    if scans.note:
+        click.echo(f"warning: {scans.note}", err=True)
+    return scans, options
+
+
+def _check(request: MapRequest, mount: NDArray | None) -> None:
+    """Reject options that contradict each other or are out of range."""
+    height, dt = request.sensor_height, request.dt
+    names = ("points", "depth", "map_frame", "base_frame")
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name)]
+    if given:
+        raise ValueError(f"{', '.join(given)}: only bags have topics and frames, and {request.recording} is none")
+    if request.poses_of == "base" and mount is None:
+        raise ValueError("--poses-of base: the sensor's pose on the robot is unknown; give --extrinsics")
+    if mount is not None and height is not None:
+        raise ValueError("--sensor-height: --extrinsics already gives the height; drop one of the two")
+    if height is not None and not math.isfinite(height):
+        raise ValueError(f"--sensor-height: must be a finite number, got {height}; give metres")
+    if dt is not None and not (math.isfinite(dt) and dt >= 0):
+        raise ValueError(f"--dt: must be finite and not negative, got {dt}; give seconds")
+
+
+@contextmanager
+def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
+    from torchelev.io.bags import Bag, BagRequest, open_bag
+
+    _refuse_file_options(request)
+    poses = None if request.poses is None else str(request.poses)
+    wanted = BagRequest(request.points, request.depth, request.map_frame, request.base_frame, poses)
+    with Bag(request.recording) as bag:
+        scans = open_bag(bag, wanted, lambda m: show_progress(m, "reading poses", "message"))
+        click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}")
+        try:
+            yield (
+                scans,
+                MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base),
+            )
+        finally:
+            for note in scans.warnings:
+                click.echo(f"warning: {note}", err=True)
+
+
+def _refuse_file_options(request: MapRequest) -> None:
+    """Reject options for what a bag itself says."""
+    names = ("intrinsics", "dt", "sensor_height", "extrinsics", "bin_layout", "quaternions", "time_unit", "pcd_frame")
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) is not None]
+    if given or request.poses_of == "base":
+        given = given or ["--poses-of"]
+        raise ValueError(
+            f"{', '.join(given)}: only for folders of files; {request.recording} is a bag, which says it itself"
+        )

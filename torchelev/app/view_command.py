@@ -1,0 +1,120 @@
+"""`torchelev view`: show a recording, a simulated walk or a saved map in the browser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from torchelev.app.config_file import load_config
+from torchelev.app.fuse_scans import fuse_all, new_map
+from torchelev.app.map_request import MapRequest
+from torchelev.app.open_scans import open_scans
+from torchelev.app.user_error import user_errors
+from torchelev.io import Frame, MappingRun
+
+if TYPE_CHECKING:
+    from torchelev.io.export import SavedMap
+    from torchelev.viz.live import Page, Player
+
+_MakePage = Callable[[str, tuple[str, ...]], "Page"]
+
+
+def run_view(request: MapRequest | None, host: str, port: int, is_paused: bool) -> None:
+    """Show what was asked for until Ctrl-C; bad input becomes a one-line click error.
+
+    Args:
+        request: a recording, or a saved map; None: the demo's walk.
+        host: address that the page listens on.
+        port: of the page.
+        is_paused: wait at the first scan.
+    """
+
+    def make_page(title: str, layers: tuple[str, ...]) -> Page:
+        from torchelev.viz.live import Page
+
+        page = Page(title, layers, host=host, port=port)
+        click.echo(f"open      {page.url}   (Ctrl-C ends)")
+        return page
+
+    with user_errors():
+        try:
+            if request is None:
+                _view_demo(make_page, is_paused)
+            elif request.recording.suffix == ".npz" and request.recording.is_file():
+                _view_map(make_page, request.recording)
+            else:
+                _view_recording(make_page, request, is_paused)
+        except KeyboardInterrupt:
+            click.echo("closed")
+
+
+def _view_recording(make_page: _MakePage, request: MapRequest, is_paused: bool) -> None:
+    from torchelev.viz.live import Player
+
+    with open_scans(request) as (scans, options):
+        emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
+        page = make_page(request.recording.resolve().name, emap.layers)
+        player, show = Player(page, len(scans), not is_paused), ShowScans()
+        stopped = fuse_all(MappingRun(emap), scans, options, lambda run, frame: show(player, run, frame))
+        if stopped is not None and not isinstance(stopped, KeyboardInterrupt) and player.num_shown:
+            click.echo(f"stopped after {player.num_shown} of {len(scans)} scans: {stopped}", err=True)
+        elif stopped is not None:
+            raise stopped
+        if not player.num_shown:
+            raise ValueError(f"{request.recording}: none of the {len(scans)} scans could be used")
+    player.hold()
+
+
+class ShowScans:
+    """Shows each scan of a recording on a player's page, at its time."""
+
+    def __init__(self) -> None:
+        self._time = 0.0  # [s] since the first scan
+
+    def __call__(self, player: Player, run: MappingRun, frame: Frame) -> None:
+        """Show the map after a scan."""
+        from torchelev.viz.live import take_snapshot
+
+        self._time += frame.dt if run.num_scans > 1 else 0.0
+        base = frame.T_map_sensor if frame.T_map_base is None else frame.T_map_base
+        layers, pose = run.emap.layers, frame.T_map_sensor
+        player.show(take_snapshot(run.emap, base, pose, frame.points, layers=layers, time=self._time))
+
+
+def _view_demo(make_page: _MakePage, is_paused: bool) -> None:
+    from torchelev.app.demo import DemoWalk
+    from torchelev.viz.live import Player, take_snapshot
+
+    demo = DemoWalk()
+    emap = demo.emap
+    player = Player(make_page("demo", emap.layers), len(demo), not is_paused)
+    for scan in demo:
+        scene = scan.T_map_base, scan.T_map_sensor, scan.points
+        player.show(take_snapshot(emap, *scene, layers=emap.layers, time=scan.time))
+    player.hold()
+
+
+def _view_map(make_page: _MakePage, path: Path) -> None:
+    from torchelev.viz.live import Snapshot
+
+    saved = _read_map(path)
+    page = make_page(path.name, tuple(saved.layers))
+    page.draw(Snapshot(saved), f"{saved.resolution:g} m cells, {' x '.join(map(str, _shape(saved)))}")
+    page.wait()
+
+
+def _shape(saved: SavedMap) -> tuple[int, ...]:
+    return next(iter(saved.layers.values())).shape
+
+
+def _read_map(path: Path) -> SavedMap:
+    """Read a file of `save_map`, of which the first environment counts, or of `save_npz`."""
+    from torchelev.io.export import load_map, load_npz, take
+
+    with np.load(path) as arrays:
+        has_state = "header" in arrays.files
+    return take(load_map(path)) if has_state else load_npz(path)

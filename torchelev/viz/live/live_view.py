@@ -1,0 +1,137 @@
+"""The live view of a map in a loop of your own, which it does not hold up."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from torchelev.errors import require
+from torchelev.viz.live.page import Page
+from torchelev.viz.live.snapshot import Snapshot, take_snapshot
+
+if TYPE_CHECKING:
+    from torchelev.elevation_map import ElevationMap
+
+_SERVER = 2.0  # what the server's own threads take in all, by the time that drawing takes: packing, sending
+
+
+class LiveView:
+    """A page that shows a map while it is used; also a context, which closes the page.
+
+    ```python
+    view = LiveView(emap)                                  # prints the page's address
+    while True:
+        emap.update(points, T_map_sensor, T_map_base, dt)
+        view.show(T_map_base, T_map_sensor, points)        # returns at once
+    ```
+
+    Args:
+        emap: the map.
+        host: "127.0.0.1" lets only this machine connect, "0.0.0.0" every machine that reaches it.
+        port: of the page. If it is taken, the next free one is used.
+        max_share: share of the time that the view may take; pictures beyond it are dropped.
+        max_rate: [Hz] of pictures at most.
+
+    Raises:
+        ModuleNotFoundError: viser is missing.
+        ValueError: a number is out of range.
+    """
+
+    def __init__(
+        self,
+        emap: ElevationMap,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        max_share: float = 0.05,
+        max_rate: float = 15.0,
+    ) -> None:
+        require(0 < max_share <= 1, "max_share", "must lie in (0, 1]", max_share, "use 0.05")
+        require(max_rate > 0, "max_rate", "must be positive", max_rate, "use 15")
+        self._emap, self._max_share, self._max_rate = emap, max_share, max_rate
+        self.page = Page("torchelev", emap.layers, emap.num_envs, host, port)
+        self._start = self._due = time.perf_counter()
+        self._drawing = 0.0  # [s] of the CPU for the last picture
+        self._next: Snapshot | None = None
+        self._wake, self._stopped = threading.Condition(), False
+        self.num_drawn = 0
+        self._thread = threading.Thread(target=self._draw, name="live view", daemon=True)
+        self._thread.start()
+        print(f"torchelev: the live view is at {self.page.url}", flush=True)
+
+    def show(
+        self,
+        T_map_base: Any = None,
+        T_map_sensor: Any = None,
+        points: Any = None,
+        *,
+        scan: Any = None,
+        plan: Any = None,
+    ) -> bool:
+        """Show the map as it is now, unless pictures have had their share of the time.
+
+        Args:
+            T_map_base: as for `take_snapshot`, like all others.
+            T_map_sensor: poses of the sensors.
+            points: the last cloud, sensor frame.
+            scan: points that a policy reads, map frame.
+            plan: planned path, map frame.
+
+        Returns:
+            Whether it will be shown.
+        """
+        start = time.perf_counter()
+        if start < self._due or self._next is not None:
+            return False
+        snapshot = take_snapshot(
+            self._emap, T_map_base, T_map_sensor, points,
+            env=self.page.env, scan=scan, plan=plan, layers=self._own_layers(), time=start - self._start,
+        )  # fmt: skip
+        with self._wake:
+            self._next = snapshot
+            self._wake.notify()
+        taken = time.perf_counter() - start
+        self._due = start + max(1 / self._max_rate, (taken + _SERVER * self._drawing) / self._max_share)
+        return True
+
+    def _own_layers(self) -> tuple[str, ...]:
+        """The filter's layer that colours the map, if one does; others are not computed."""
+        return (self.page.layer,) if self.page.layer in self._emap.layers else ()
+
+    def _draw(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._next is not None or self._stopped)
+                snapshot = self._next
+            if self._stopped or snapshot is None:
+                return
+            start = time.thread_time()
+            self.page.draw(snapshot, f"{snapshot.time:.1f} s")
+            self._drawing = time.thread_time() - start
+            self.num_drawn += 1
+            self._next = None
+
+    def wait(self) -> None:
+        """Keep the page open after the loop, until Ctrl-C."""
+        try:
+            self.page.wait()
+        except KeyboardInterrupt:
+            self.close()
+
+    def close(self) -> None:
+        """Close the page."""
+        with self._wake:
+            self._stopped = True
+            self._wake.notify()
+        self._thread.join()
+        self.page.stop()
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,170 @@
+"""The page: a scene beside a panel with the layer, the legend, what is shown, and the values of a cell."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchelev.errors import require
+from torchelev.viz.live.camera import Camera
+from torchelev.viz.live.colors import Limits, choose_limits, colorize, describe, legend, shown_layers
+from torchelev.viz.live.scene import PARTS, Scene
+from torchelev.viz.live.snapshot import Snapshot
+from torchelev.viz.live.surface import find_cell
+
+_MAX_PORT = 65535
+_CLICK_HINT = "Click a cell to read its values."
+
+
+class Page:
+    """Serves one page to any number of browsers.
+
+    Args:
+        title: of the page.
+        layers: names of the layers to colour by; the first one is shown first.
+        num_envs: number of environments to choose from.
+        host: "127.0.0.1" lets only this machine connect, "0.0.0.0" every machine that reaches it.
+        port: of the page. If it is taken, the next free one is used.
+
+    Attributes:
+        on_change: called, in a thread of the server, when the picture has to be drawn again.
+
+    Raises:
+        ModuleNotFoundError: viser is missing.
+        ValueError: the port is none.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        layers: tuple[str, ...],
+        num_envs: int = 1,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
+        import viser
+
+        require(0 < port <= _MAX_PORT, "port", f"must lie in [1, {_MAX_PORT}]", port, "use 8080")
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner
+            self.server: Any = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self.on_change: Callable[[], None] = lambda: None
+        self._scene, self._camera = Scene(self.server), Camera(self.server)
+        self._lock = threading.Lock()
+        self._path: list[NDArray] = []
+        self._last: Snapshot | None = None
+        self._limits: dict[str, Limits] = {}
+        self._ray: tuple[NDArray, NDArray] | None = None
+        self._add_controls(layers, num_envs)
+        self.server.scene.on_click()(self._point_at)
+
+    @property
+    def url(self) -> str:
+        """The page's address."""
+        host = self.server.get_host()
+        return f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
+
+    @property
+    def layer(self) -> str:
+        """The layer that colours the surface."""
+        return self._layer.value
+
+    @property
+    def env(self) -> int:
+        """The environment to show."""
+        return 0 if self._env is None else int(self._env.value)
+
+    def _add_controls(self, layers: tuple[str, ...], num_envs: int) -> None:
+        gui = self.server.gui
+        self._status = gui.add_markdown("Waiting for a map.")
+        self._env = None
+        if num_envs > 1:
+            self._env = gui.add_slider("robot", 0, num_envs - 1, 1, 0)
+            self._env.on_update(lambda _: self._forget_robot())
+        names = tuple(shown_layers(dict.fromkeys(layers, np.zeros(0))))
+        self._layer = gui.add_dropdown("colour", names, initial_value=names[0])
+        self._layer.on_update(lambda _: self.redraw())
+        self._legend = gui.add_html("")
+        with gui.add_folder("show"):
+            self._parts = {name: gui.add_checkbox(name, shown) for name, shown in PARTS.items()}
+            self._follow = gui.add_checkbox("follow the robot", False)
+        for box in self._parts.values():
+            box.on_update(lambda _: self.redraw())
+        self._cell = gui.add_markdown(_CLICK_HINT)
+
+    def _forget_robot(self) -> None:
+        self._path.clear()
+        self.on_change()
+
+    def draw(self, snapshot: Snapshot, status: str = "", path: list[NDArray] | None = None) -> None:
+        """Draw a snapshot in all browsers.
+
+        Args:
+            snapshot: what to draw.
+            status: a line above the controls.
+            path: (3,) [m] positions of the base so far; None: those of the snapshots drawn.
+        """
+        with self._lock:
+            if path is not None:
+                self._path = list(path)
+            elif snapshot.T_map_base is not None:
+                self._path.append(snapshot.T_map_base[:3, 3])
+            if self._last is None:
+                self._scene.origin = np.append(np.round(snapshot.map.center[:2]), 0.0)
+                self._camera.look_at_map(snapshot.map, self._scene.origin)
+            self._last = snapshot
+            if status:
+                self._status.content = status
+            self._draw(snapshot)
+            base = snapshot.T_map_base if self._follow.value else None
+            self._camera.follow(None if base is None else base[:3, 3])
+
+    def redraw(self) -> None:
+        """Draw the last snapshot again, as the controls now say."""
+        with self._lock:
+            if self._last is not None:
+                self._draw(self._last)
+
+    def _draw(self, snapshot: Snapshot) -> None:
+        layers = shown_layers(snapshot.map.layers)
+        layer = self.layer if self.layer in layers else "elevation"  # a filter chosen after the snapshot was taken
+        values = layers[layer]
+        self._limits[layer] = limits = choose_limits(layer, values, self._limits.get(layer))
+        parts = {name for name, box in self._parts.items() if box.value}
+        with self.server.atomic():
+            self._legend.content = legend(layer, limits)
+            self._scene.draw(snapshot, colorize(layer, values, limits), np.array(self._path), parts)
+            self._cell.content = self._describe_cell(snapshot, layers)
+
+    def _point_at(self, event: Any) -> None:
+        self._ray = np.array(event.ray_origin) + self._scene.origin, np.array(event.ray_direction)
+        self.redraw()
+
+    def _describe_cell(self, snapshot: Snapshot, layers: dict[str, NDArray]) -> str:
+        """Return the values of the cell that was clicked, a line each."""
+        if self._ray is None:
+            return _CLICK_HINT
+        cell = find_cell(snapshot.map, *self._ray)
+        if cell is None:
+            return f"No known cell there. {_CLICK_HINT}"
+        half = np.array(layers["elevation"].shape) / 2
+        x, y = snapshot.map.center[:2] + (np.array(cell) + 0.5 - half) * snapshot.map.resolution
+        rows = [f"| {name} | {describe(name, float(values[cell]))} |" for name, values in layers.items()]
+        head = [f"**Cell at ({x:.2f} m, {y:.2f} m)**", "", "| layer | value |", "| --- | --- |"]
+        return "\n".join(head + rows)
+
+    def wait(self) -> None:
+        """Keep the page open; returns only by Ctrl-C, which raises KeyboardInterrupt."""
+        while True:
+            time.sleep(0.5)
+
+    def stop(self) -> None:
+        """Close the page."""
+        self.server.stop()

@@ -1,0 +1,109 @@
+"""What one picture of the live view shows, copied from the map and its robot."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchelev.errors import require
+from torchelev.io.export import SavedMap, take
+from torchelev.layers import LAYERS
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from torchelev.elevation_map import ElevationMap
+
+_MAX_POINTS = 20_000  # of a cloud, so that a page stays fluid
+_NO_POINTS = np.zeros((0, 3))
+
+
+class Snapshot(NamedTuple):
+    """One map with its robot at one time. Points are in the map frame."""
+
+    map: SavedMap  #: layers of one environment
+    T_map_base: NDArray[np.float64] | None = None  #: (4, 4); None: unknown
+    T_map_sensor: NDArray[np.float64] | None = None  #: (S, 4, 4); None: unknown
+    cloud: NDArray[np.float64] = _NO_POINTS  #: (N, 3) [m] the last cloud
+    scan: NDArray[np.float64] = _NO_POINTS  #: (M, 3) [m] points that a policy reads
+    plan: NDArray[np.float64] = _NO_POINTS  #: (P, 3) [m] planned path
+    time: float = 0.0  #: [s] since the start
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes] of the arrays."""
+        return sum(values.nbytes for values in self.map.layers.values()) + self.cloud.nbytes
+
+
+def take_snapshot(
+    emap: ElevationMap,
+    T_map_base: Float[Any, "*B 4 4"] | None = None,
+    T_map_sensor: Float[Any, "*B 4 4"] | None = None,
+    points: Float[Any, "*B N 3"] | None = None,
+    *,
+    env: int = 0,
+    scan: Float[Any, "*B M 3"] | None = None,
+    plan: Float[Any, "P 3"] | None = None,
+    layers: tuple[str, ...] = (),
+    time: float = 0.0,
+) -> Snapshot:
+    """Copy one environment and what surrounds it.
+
+    Args:
+        emap: the map.
+        T_map_base: (B, 4, 4) or (4, 4) pose of the base; tensors or arrays, as are all others.
+        T_map_sensor: (B, 4, 4), (B, S, 4, 4) or (4, 4) poses of the sensors.
+        points: (B, N, 3), (B, S, N, 3) or (N, 3) [m] the last cloud, sensor frame.
+        env: the environment.
+        scan: (B, M, 3) or (M, 3) [m] points that a policy reads, map frame.
+        plan: (P, 3) [m] planned path of this environment, map frame.
+        layers: names of filters' layers to show beside the map's own.
+        time: [s] since the start.
+
+    Raises:
+        ValueError: the environment does not exist, or a shape differs.
+    """
+    saved = take(emap, env, (*LAYERS, *(name for name in layers if name not in LAYERS)))
+    base, sensor = _pick("T_map_base", T_map_base, env, (4, 4)), _pick("T_map_sensor", T_map_sensor, env, (4, 4))
+    sensor = None if sensor is None else sensor.reshape(-1, 4, 4)
+    cloud = _pick("points", points, env, (3,))
+    require(cloud is None or sensor is not None, "T_map_sensor", "expected the poses of `points`", None, "give both")
+    return Snapshot(
+        saved,
+        None if base is None else base.reshape(4, 4),
+        sensor,
+        _NO_POINTS if cloud is None or sensor is None else _to_map_frame(cloud, sensor),
+        _points_or_none(_pick("scan", scan, env, (3,))),
+        _points_or_none(None if plan is None else _to_numpy(plan)),
+        time,
+    )
+
+
+def _pick(name: str, values: Any, env: int, ending: tuple[int, ...]) -> NDArray[np.float64] | None:
+    """Return one environment's values (..., *ending), or the values as they are if they have no batch dimension."""
+    if values is None:
+        return None
+    shape = tuple(values.shape)
+    num_own = len(ending) + (ending == (3,))  # points have their number before the coordinates
+    fits = len(shape) >= num_own and shape[-len(ending) :] == ending
+    require(fits, name, f"expected (B, ..., {', '.join(map(str, ending))})", shape, "see take_snapshot")
+    return _to_numpy(values[env] if len(shape) > num_own else values)
+
+
+def _to_numpy(values: Any) -> NDArray[np.float64]:
+    return values.detach().double().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values, float)
+
+
+def _points_or_none(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    points = _NO_POINTS if points is None else points.reshape(-1, 3)
+    return points[np.isfinite(points).all(1)]
+
+
+def _to_map_frame(points: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return at most `_MAX_POINTS` of the points of all sensors, map frame."""
+    points = points.reshape(len(T), -1, 3)
+    points = points[:, :: max(1, -(-points.shape[0] * points.shape[1] // _MAX_POINTS))]
+    return _points_or_none(points @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3])
