@@ -20,7 +20,7 @@ from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
-from benchmarks.speed import encoders, growth, head, long_run, loop, postprocessing, sight
+from benchmarks.speed import bags, encoders, growth, head, long_run, loop, postprocessing, sight
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.nav import experiment
@@ -94,6 +94,11 @@ def _loop() -> str:
 def _long_run() -> str:
     """Tabulate growth over long runs."""
     return growth.table({name: values for name, values in load("long_run").items() if name in long_run.CASES})
+
+
+def _bags() -> str:
+    """Tabulate how fast bags are mapped, and the memory over their length."""
+    return bags.table(load("bags")["rows"])
 
 
 def _sight() -> str:
@@ -181,6 +186,7 @@ TABLES = {
     "speed": _speed,
     "loop": _loop,
     "long_run": _long_run,
+    "bags": _bags,
     "nav": _nav,
     "pose_covariance": _pose_covariance,
     "legs": _legs,

@@ -1,6 +1,6 @@
 """Time reading, deskewing and mapping of bags, and check that memory does not grow with their length.
 
-    python -m benchmarks.speed.bags     # benchmarks/results/bags.json, five minutes and 0.6 GB of disk
+    python -m benchmarks.speed.bags     # benchmarks/results/bags.json, five minutes and 0.5 GB of disk
 
 A robot drives in circles with a lidar of 32 rings. Bags are mapped as `torchelev map` does by default: cells of 10 cm,
 20 x 20 m, not compiled. For each scan, reading it, reading and deskewing it, and fusing it are timed in turn.
@@ -11,15 +11,16 @@ of the process alone (VmHWM), without the file cache.
 
 from __future__ import annotations
 
-import statistics
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 import torch
 
 from benchmarks import RESULTS
@@ -40,27 +41,30 @@ _REQUEST = BagRequest(clouds=(CLOUDS,), map_frame=MAP_FRAME, base_frame=SENSOR_F
 _STEPS = ("read", "deskew", "map")
 
 
-def measure_times(path: Path) -> dict[str, float]:
-    """Return the median time of each step [ms per scan]; deskewing includes the poses."""
-    times: dict[str, list[float]] = {step: [] for step in _STEPS}
+def measure_times(paths: Sequence[Path]) -> list[dict[str, float]]:
+    """Return the median time of each step [ms per scan] of each bag; deskewing includes the poses.
+
+    The bags are mapped scan by scan in turn, so that the load of a shared machine affects all alike.
+    """
+    times = np.array(list(zip(*map(_time_scans, paths), strict=True)))  # (scans, bags, steps) [s]
+    return [dict(zip(_STEPS, row, strict=True)) for row in (1e3 * np.median(times, 0)).tolist()]
+
+
+def _time_scans(path: Path) -> Iterator[tuple[float, float, float]]:
+    """Map a bag; yield the time of each step of each scan [s]."""
     run = MappingRun(ElevationMap(ElevationMapConfig(grid=GRID)))
     with Bag(path) as bag, Bag(path) as same:
         messages, frames = bag.read([CLOUDS]), iter(open_bag(same, _REQUEST))
-        while True:
+        for _ in range(TIMED_SCANS):
             start = time.perf_counter()
-            message = next(messages, None)
-            if message is None:
-                return {step: 1e3 * statistics.median(values) for step, values in times.items()}
-            read_scan(message.data)
+            read_scan(next(messages).data)
             read = time.perf_counter()
             frame = next(frames)
             whole = time.perf_counter()
             if frame is None:
                 raise ValueError(f"{path}: a scan was left out")
             run.add(frame, frame.T_map_base)
-            done = time.perf_counter()
-            for step, value in zip(_STEPS, (read - start, whole - read - (read - start), done - whole), strict=True):
-                times[step].append(value)
+            yield read - start, whole - read - (read - start), time.perf_counter() - whole
 
 
 def measure_memory(path: Path) -> dict[str, float]:
@@ -83,23 +87,25 @@ def peak_megabytes() -> float:
 
 
 def measure(folder: Path) -> list[dict[str, Any]]:
-    """Return the figures of each format; bags are written to a folder, one at a time."""
-    rows = []
-    for suffix in progress(FORMATS, "formats"):
-        path = folder / f"drive{suffix}"
+    """Return the figures of each format; bags are written to a folder."""
+    paths = [folder / f"drive{suffix}" for suffix in FORMATS]
+    for path in paths:
         write_bag(path, TIMED_SCANS, LIDAR)
-        row = {"format": suffix, "points": len(LIDAR.directions), "scans": TIMED_SCANS, "ms": measure_times(path)}
-        row["memory_mb"] = [_measure_apart(path, length) for length in LENGTHS]
-        path.unlink()
-        rows.append(row)
-    return rows
+    times = measure_times(paths)
+    return [
+        {"format": path.suffix, "points": len(LIDAR.directions), "scans": TIMED_SCANS, "ms": ms}
+        | {"memory_mb": [_measure_apart(path, length) for length in LENGTHS]}
+        for path, ms in progress(zip(paths, times, strict=True), "memory")
+    ]
 
 
 def _measure_apart(path: Path, num_scans: int) -> dict[str, float]:
     """Write a bag and measure the memory of mapping it in a new process."""
     write_bag(path, num_scans, SMALL_LIDAR)
     with ProcessPoolExecutor(1, get_context("spawn")) as new:  # a fork would inherit this process's memory
-        return new.submit(measure_memory, path).result()
+        memory = new.submit(measure_memory, path).result()
+    path.unlink()
+    return memory
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -40,6 +40,7 @@ def test_a_run_counts_points_and_follows_the_base():
     run.add(Frame(points, pose, 0.0, "0.npy"), pose)
     assert (run.num_scans, run.num_points, run.counts["points_used"]) == (1, 3, 2)
     assert run.sensor_xy[0].tolist() == [2.0, 1.0] and len(run.update_ms) == 1
+    assert run.sensor_xy[0].base is None, "nothing else of a scan stays in memory"
     pose = pose.copy()
     pose[0, 3] += 1.0
     run.add(Frame(points, pose, 0.1, "1.npy"), None)

@@ -65,7 +65,7 @@ class MappingRun:
         self.emap.update(points, self._to_tensor(frame.T_map_sensor), base, dt=frame.dt, pose_covariance=covariance)
         self._count(len(frame.points))  # reading the statistics waits for a GPU to finish
         self.update_ms.append(1e3 * (time.perf_counter() - start))
-        self.sensor_xy.append(frame.T_map_sensor[:2, 3])
+        self.sensor_xy.append(frame.T_map_sensor[:2, 3].copy())  # a view would keep what the pose was computed from
 
     def _to_tensor(self, pose: NDArray[np.float64]) -> torch.Tensor:
         return torch.from_numpy(pose)[None].to(self.emap.device)

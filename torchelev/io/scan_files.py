@@ -11,7 +11,7 @@ from torchelev.io.errors import RecordingError
 from torchelev.output_files import is_own_output
 
 # Files of these types may lie beside point clouds; any other file there is an error, not silently skipped.
-_IGNORED_SUFFIXES = {"", *".txt .csv .json .yaml .yml .md .log .png .jpg .jpeg .mp4 .gif".split()}
+_IGNORED_SUFFIXES = {"", *".txt .csv .json .yaml .yml .md .log .png .jpg .jpeg .mp4 .gif .bag .mcap .db3".split()}
 _SCANS_FOLDER = "scans"  # takes precedence over scans beside it
 
 
@@ -45,6 +45,11 @@ def find_scans(folder: Path, depth: bool = False) -> list[Path]:
     found = sorted({path.suffix or path.name for path in folder.rglob("*") if path.is_file()})
     problem = f"holds no scan, only {' '.join(found[:8])}" if found else "holds no scan"
     raise RecordingError(folder, problem, f"expected files of one format among {wanted}")
+
+
+def has_clouds(folder: Path) -> bool:
+    """Tell whether a folder or its subfolder `scans` holds point clouds."""
+    return any(_has_scan(place, depth=False) for place in (folder, folder / _SCANS_FOLDER))
 
 
 def _list_places(folder: Path, depth: bool) -> Iterator[Path]:

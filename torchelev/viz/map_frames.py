@@ -106,7 +106,9 @@ class MapFrames:
         draw = ImageDraw.Draw(picture)
         self._write(draw, (place.left, place.top - em // 2), title, "ld")
         self._write(draw, (place.left + place.width // 2, place.top + place.height + 2 * em), "x [m]", "ma")
-        self._write(draw, (em, place.top + place.height // 2), "y [m]", "lm")
+        upright = Image.new("RGB", (3 * em, em + em // 2), "white")
+        self._write(ImageDraw.Draw(upright), (upright.width // 2, upright.height // 2), "y [m]", "mm")
+        picture.paste(upright.rotate(90, expand=True), (0, place.top + (place.height - upright.width) // 2))
         self._write(draw, (place.bar, place.top), "elevation [m]", "la")
         box = place.bar, self._bar_bottom + em, place.bar + em, self._bar_bottom + 2 * em
         draw.rectangle(box, fill=UNKNOWN_COLOR, outline=_GREY)

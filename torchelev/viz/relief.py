@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchelev.viz.style import HEIGHTS, UNKNOWN_COLOR
 
-_AMBIENT = 0.35  # brightness where no light falls; flat ground has 1
+_AMBIENT = 0.5  # brightness where no light falls; flat ground has 1
 _BRIGHTEST = 1.25
 _CONTRAST = 60  # by which light and shadow differ on black: heights of dark colours have relief, too
 

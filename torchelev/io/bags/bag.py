@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 from torchelev.io.bags.definitions import make_typestore
 from torchelev.io.bags.unfinished import UnfinishedBag
 from torchelev.io.errors import RecordingError
+from torchelev.io.scan_files import has_clouds
 
 SUFFIXES = (".bag", ".mcap", ".db3")
+_HEAD_BYTES = 4096  # of a metadata.yaml, which begin with its key
 
 
 class Topic(NamedTuple):
@@ -31,10 +33,23 @@ class Message(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a path is a bag: a file of a known suffix, or a ROS 2 folder with metadata.yaml or such files."""
+    """Tell whether a path is a bag: a file of a known suffix, or a folder of ROS 2.
+
+    Such a folder has the metadata.yaml of rosbag2, or files of messages and no scans beside them: the maps of
+    `torchelev map --grid-map` may lie in a folder of scans.
+    """
     if path.is_dir():
-        return (path / "metadata.yaml").is_file() or bool(_storage_files(path))
+        return _has_metadata(path) or (bool(_storage_files(path)) and not has_clouds(path))
     return path.suffix in SUFFIXES
+
+
+def _has_metadata(folder: Path) -> bool:
+    """Tell whether a folder has the metadata.yaml of rosbag2; data sets have files of this name, too."""
+    file = folder / "metadata.yaml"
+    if not file.is_file():
+        return False
+    with file.open("rb") as opened:
+        return b"rosbag2_bagfile_information" in opened.read(_HEAD_BYTES)
 
 
 def _storage_files(folder: Path) -> list[Path]:
@@ -146,7 +161,7 @@ class Bag:
 
 def _storage_file(path: Path) -> Path | None:
     """Return the only file of messages in a folder without metadata.yaml, as a crash leaves one; else None."""
-    if not path.is_dir() or (path / "metadata.yaml").is_file():
+    if not path.is_dir() or _has_metadata(path):
         return None
     files = _storage_files(path)
     return files[0] if len(files) == 1 else None

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.io.bags.depth_png import decode_depth
 from torchelev.io.bags.point_cloud import CloudError, read_points
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserScan")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _UNITS = {"16UC1": 1e-3, "mono16": 1e-3, "32FC1": 1.0}  # [m] of depth, by encoding
-_PNG = b"\x89PNG"
 
 
 class Scan(NamedTuple):
@@ -30,7 +30,7 @@ def read_scan(message: Any, camera: Any = None) -> Scan:
 
     Args:
         message: a PointCloud2, a LaserScan, or with `camera` an Image or CompressedImage of depth: 16UC1 [mm], 32FC1
-            [m], or a PNG of 16 bits [mm].
+            [m], or a PNG of 16 bits: [mm], or 32FC1 quantised by compressedDepth.
         camera: the CameraInfo of a depth image.
 
     Raises:
@@ -72,7 +72,7 @@ def _read_image(message: Any, camera: Any) -> NDArray[np.float32]:
 
     from torchelev.inputs.clouds import depth_to_points
 
-    depth = _decode_png(message) if hasattr(message, "format") else _decode_raw(message)
+    depth = _decode_compressed(message) if hasattr(message, "format") else _decode_raw(message)
     matrix = np.asarray(getattr(camera, "K", None) if hasattr(camera, "K") else camera.k, dtype=np.float64)
     if (depth.shape[1], depth.shape[0]) != (camera.width, camera.height):
         actual, told = f"{depth.shape[1]} x {depth.shape[0]}", f"{camera.width} x {camera.height}"
@@ -96,15 +96,6 @@ def _decode_raw(message: Any) -> NDArray[np.float32]:
     return image.astype(np.float32) * np.float32(_UNITS[message.encoding])
 
 
-def _decode_png(message: Any) -> NDArray[np.float32]:
-    """Return a CompressedImage's depth (h, w) [m]: a PNG, perhaps behind the header of compressedDepth."""
-    import cv2
-
-    data = bytes(np.asarray(message.data, dtype=np.uint8))
-    start = data.find(_PNG, 0, 64)
-    image = None if start < 0 else cv2.imdecode(np.frombuffer(data[start:], np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.dtype != np.uint16 or image.ndim != 2:
-        raise CloudError(f"compressed images of {message.format!r} hold no depth; a PNG of 16 bits does")
-    if "32FC1" in message.format:
-        raise CloudError("compressed depth of 32FC1 is quantised; record 16UC1, or the raw image")
-    return image.astype(np.float32) * np.float32(1e-3)
+def _decode_compressed(message: Any) -> NDArray[np.float32]:
+    """Return a CompressedImage's depth (h, w) [m]."""
+    return decode_depth(bytes(np.asarray(message.data, dtype=np.uint8)), message.format)
