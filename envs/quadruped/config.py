@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from torchelev.errors import require
 
 PERCEPTION = ("map", "truth", "blind")
-SENSORS = ("depth_cameras", "lidar")
+SENSORS = {"depth_cameras": "depth_camera", "lidar": "spinning_lidar"}  # and the presets of their errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +114,8 @@ class SightConfig:
     camera_fov_deg: tuple[float, float] = (87.0, 58.0)  #: [deg] horizontal and vertical
     camera_pitch_deg: float = 45.0  #: [deg] by which the cameras look down
     max_range: float = 3.0  #: [m]
-    sensor_errors: str = "depth_camera"  #: preset of torchelev.sim
+    #: preset of torchelev.sim; None: "depth_camera" for cameras, "spinning_lidar" for the lidar
+    sensor_errors: str | None = None
     #: [m], [deg] standard deviations of the cameras' place on the robot, as a calibration against the legs leaves them
     mounting_error: tuple[float, float] = (0.001, 0.1)
     resolution: float = 0.05  #: [m] of the map
@@ -125,6 +126,13 @@ class SightConfig:
         "upper_bound"  #: what scans read over unknown cells, see `ScanSettings`; "ground" takes ten times as long
     )
     truth_noise: bool = True  #: perception "truth" reads heights with the noise of Miki et al. 2022
+
+    def __post_init__(self) -> None:
+        rule = f"must be one of {', '.join(SENSORS)}"
+        require(self.sensors in SENSORS, "sight.sensors", rule, self.sensors, "choose one")
+        fits = (self.sensors, self.sensor_errors) != ("lidar", "depth_camera")
+        rule = "must not be those of a camera if sensors='lidar'"
+        require(fits, "sight.sensor_errors", rule, repr(self.sensor_errors), "leave it out, or use 'spinning_lidar'")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +154,6 @@ class QuadrupedConfig:
         for name in ("substeps", "episode_length", "max_tilt"):
             value = getattr(self, name)
             require(value > 0, name, "must be positive", value, "raise it")
-        sensors = self.sight.sensors
-        require(sensors in SENSORS, "sight.sensors", f"must be one of {', '.join(SENSORS)}", sensors, "choose one")
 
     @property
     def dt(self) -> float:
