@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -46,7 +47,7 @@ def evaluate(
 
     Returns:
         "all", "by_kind" and "by_level": the fraction of episodes by ending, and the mean forward speed by the one that
-        was commanded; and `episodes`.
+        was commanded, NaN where none was; and `episodes`.
     """
     task = Quadruped(cfg, episodes, device, perception, seed, compiled)
     levels = (torch.arange(episodes, device=task.device) // len(cfg.terrain.kinds)) % cfg.terrain.num_levels
@@ -56,7 +57,7 @@ def evaluate(
     walked, asked = torch.zeros(2, episodes, device=task.device)
     for _ in range(cfg.max_episode_length):
         command = task.command[:, 0].clone()
-        outcome = task.advance(policy(TensorDict(task.observe(), batch_size=[episodes])))
+        outcome = task.advance(policy(TensorDict(task.observe(critic=False), batch_size=[episodes])))
         going = ~endings.any(0)
         walked += task.forward_speed * going
         asked += command * going
@@ -65,25 +66,25 @@ def evaluate(
             break
         task.reset(outcome.done)
         task.sense()
-    tracking = walked / asked.clamp(min=1e-6)
     kinds = {name: kind == k for k, name in enumerate(cfg.terrain.kinds)}
     by_level = {
-        name: {str(k): _summarize(endings, tracking, chosen & (level == k)) for k in range(cfg.terrain.num_levels)}
+        name: {str(k): _summarize(endings, walked, asked, chosen & (level == k)) for k in range(cfg.terrain.num_levels)}
         for name, chosen in kinds.items()
     }
-    by_kind = {name: _summarize(endings, tracking, chosen) for name, chosen in kinds.items()}
-    everything = _summarize(endings, tracking, torch.ones_like(kind, dtype=torch.bool))
+    by_kind = {name: _summarize(endings, walked, asked, chosen) for name, chosen in kinds.items()}
+    everything = _summarize(endings, walked, asked, torch.ones_like(kind, dtype=torch.bool))
     return {"all": everything, "by_kind": by_kind, "by_level": by_level, "episodes": episodes}
 
 
-def _summarize(endings: Tensor, tracking: Tensor, chosen: Tensor) -> dict[str, float | int]:
-    """Return the fractions of the chosen episodes by ending, and their mean speed by the commanded one."""
+def _summarize(endings: Tensor, walked: Tensor, asked: Tensor, chosen: Tensor) -> dict[str, float | int]:
+    """Return the fractions of the chosen episodes by ending, and what they walked by what was asked."""
     count = int(chosen.sum())
     shares = {
         name: round(float((ended & chosen).sum()) / max(1, count), 4)
         for name, ended in zip(ENDINGS, endings, strict=True)
     }
-    speed = round(float((tracking * chosen).sum()) / max(1, count), 4)
+    total_walked, total_asked = (float((value * chosen).sum()) for value in (walked, asked))
+    speed = round(total_walked / total_asked, 4) if total_asked else math.nan
     return {**shares, "speed": speed, "episodes": count}
 
 

@@ -50,7 +50,7 @@ def play(
     task.place_at(torch.full((1,), level))
     pictures = [draw(task)]
     for step in tqdm(range(round(seconds / cfg.dt)), unit="step"):
-        outcome = task.advance(policy(TensorDict(task.observe(), batch_size=[1])))
+        outcome = task.advance(policy(TensorDict(task.observe(critic=False), batch_size=[1])))
         if step % _EVERY == 0:
             pictures.append(draw(task))
         if bool(outcome.done):

@@ -15,13 +15,12 @@ from envs.quadruped.config import PERCEPTION
 from envs.quadruped.rsl_rl import RslRlQuadruped
 from training.quadruped.evaluate import evaluate, table
 from training.quadruped.play import play
-from training.quadruped.policy import export, load_policy
+from training.quadruped.policy import GROUPS, export, load_policy
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
 
 _POSITIVE = click.IntRange(min=1)
 _HELD_OUT_SEED = 1001  # of the terrain
-ACTOR = ("policy", "height_scan", "feet")
 CRITIC = ("policy", "privileged", "true_height_scan", "true_feet")
 
 
@@ -32,7 +31,7 @@ def ppo_config(save_interval: int = 25) -> dict[str, Any]:
     return {
         "num_steps_per_env": 24,
         "save_interval": save_interval,
-        "obs_groups": {"actor": list(ACTOR), "critic": list(CRITIC)},
+        "obs_groups": {"actor": list(GROUPS), "critic": list(CRITIC)},
         "algorithm": {
             "class_name": "PPO",
             "num_learning_epochs": 4,

@@ -1,5 +1,6 @@
 """The comparison of perceptions: its trainings, its tables and its figure."""
 
+import dataclasses
 import json
 
 import pytest
@@ -46,10 +47,47 @@ def test_every_perception_gets_the_same_training(tmp_path):
     assert all(others.count(other) == len(PERCEPTION) for other in others)
 
 
-def test_nobody_crosses_a_tile_of_the_long_walk():
+def test_the_long_walk_has_room_for_robots_faster_than_commanded():
     cfg = experiment.walk_config()
-    fastest = cfg.command.forward[1] * cfg.episode_length
-    assert cfg.command.forward == (0.5, 0.5) and cfg.terrain.length / 2 - cfg.terrain.rim - 0.3 > fastest
+    commanded = cfg.command.forward[1] * cfg.episode_length
+    assert cfg.command.forward == (0.5, 0.5) and cfg.terrain.length / 2 - cfg.terrain.rim - 0.3 > 1.5 * commanded
+
+
+def test_a_walk_that_ends_at_the_rim_is_refused(monkeypatch):
+    def fake(policy, cfg, *rest, **options):
+        return {"all": summary(1.0), "by_kind": {"flat": summary(0.0), "rough": summary(0.05 if rim else 0.0)}}
+
+    monkeypatch.setattr(experiment, "evaluate", fake)
+    rim = False
+    assert set(experiment._deploy(None, sees=False)["walk"]) == {"flat", "rough"}
+    rim = True
+    with pytest.raises(ValueError, match=r"walk, rough: must end before the rim .* got 5 % crossed; .*walk_config"):
+        experiment._deploy(None, sees=False)
+
+
+def test_a_kept_result_is_made_anew_when_its_constants_or_its_policy_change(tmp_path, monkeypatch):
+    folder, made = tmp_path / "map-0", []
+    folder.mkdir()
+    weights = folder / "policy.pt"
+    weights.write_bytes(b"one")
+
+    def make():
+        made.append(len(made))
+        return {"number": made[-1]}
+
+    def kept():
+        return experiment._kept(folder / "deployed.json", make, weights)["number"]
+
+    assert [kept(), kept()] == [0, 0]
+    weights.write_bytes(b"two")
+    assert [kept(), kept()] == [1, 1]
+    monkeypatch.setattr(experiment, "WALKS", 3)
+    assert [kept(), kept()] == [2, 2]
+    cfg = experiment.task_config(held_out=True)
+    monkeypatch.setattr(experiment, "task_config", lambda held_out: dataclasses.replace(cfg, max_tilt=0.9))
+    assert [kept(), kept()] == [3, 3]
+    (folder / "deployed.json").write_text('{"number": 9}')  # of a version that kept no more
+    assert kept() == 4
 
 
 def test_the_tables_have_the_mean_and_the_extremes():
@@ -71,6 +109,7 @@ def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
     for perception, seed in experiment.CASES:
         folder = experiment._folder(tmp_path, perception, seed)
         folder.mkdir()
+        (folder / "policy.pt").write_bytes(b"weights")
         (folder / "result.json").write_text(json.dumps({"training": {"steps": 1, "seconds": seed}}))
 
     def fake(policy, cfg, perception, *rest, **options):

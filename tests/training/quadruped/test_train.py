@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 import torch
@@ -81,6 +82,33 @@ def test_an_evaluation_counts_every_episode_once():
     assert sum(row["episodes"] for row in result["by_kind"].values()) == 6
     levels = [row["episodes"] for rows in result["by_level"].values() for row in rows.values()]
     assert sum(levels) == 6 and "| all |" in evaluate.table(result)
+
+
+def test_the_speed_is_the_way_walked_by_the_way_asked():
+    chosen = torch.tensor([True, True, True, False])
+    walked, asked = torch.tensor([3.0, 1.0, -0.3, 7.0]), torch.tensor([4.0, 1.0, 0.0, 1.0])
+    endings = torch.zeros(3, 4, dtype=torch.bool)
+    assert evaluate._summarize(endings, walked, asked, chosen)["speed"] == pytest.approx(3.7 / 5)
+    still = evaluate._summarize(endings, walked, asked, torch.tensor([False, False, True, False]))
+    assert math.isnan(still["speed"])
+
+
+def test_robots_that_are_asked_to_stand_have_no_speed():
+    command = dataclasses.replace(CFG.command, standing=1.0)
+    cfg = dataclasses.replace(CFG, episode_length=0.2, command=command)
+    result = evaluate.evaluate(evaluate.stand_in_trot, cfg, "blind", episodes=2)
+    assert math.isnan(result["all"]["speed"]) and "| nan |" in evaluate.table(result)
+
+
+def test_an_evaluation_reads_no_more_than_the_policy_does():
+    seen = set()
+
+    def spy(observation):
+        seen.update(observation.keys())
+        return evaluate.stand_in_trot(observation)
+
+    evaluate.evaluate(spy, dataclasses.replace(CFG, episode_length=0.04), "blind", episodes=2)
+    assert seen == set(policy.GROUPS)
 
 
 def test_a_file_without_a_layout_is_refused(tmp_path):
