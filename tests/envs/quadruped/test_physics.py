@@ -99,17 +99,17 @@ def test_the_sensors_belong_to_the_sensed_state(num_steps):
     assert (velocities[1] - velocities[0]).abs().max() > 1e-4, "the last state is another one"
 
 
-@pytest.mark.parametrize("steps", [0, 2])
-def test_a_state_that_mujoco_resets_has_diverged(steps, tmp_path, monkeypatch):
+@pytest.mark.parametrize("steps, num_steps", [(0, 1), (0, 4), (2, 4)])
+def test_a_state_that_mujoco_resets_has_diverged(steps, num_steps, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
     physics = Physics(TERRAIN, 3, SAME, num_threads=1)
     qpos, late = standing(physics, [0, 1, 2]), torch.zeros(3, dtype=torch.int64)
     physics.place([0, 1, 2], qpos, torch.zeros(3, 18), torch.zeros(3, dtype=torch.int64))
     for _ in range(steps):
-        physics.step(qpos[:, 7:], late, 4)
+        physics.step(qpos[:, 7:], late, num_steps)
         assert not physics.diverged.any()
     physics.qvel[0, 3], physics.qvel[2, 12] = torch.nan, 1e9
-    physics.step(qpos[:, 7:], late, 4)
+    physics.step(qpos[:, 7:], late, num_steps)
     assert physics.diverged.tolist() == [True, False, True] and physics.state.isfinite().all()
     physics.place([0, 2], qpos[[0, 2]], torch.zeros(2, 18), torch.zeros(2, dtype=torch.int64))
     assert not physics.diverged.any()
