@@ -10,6 +10,11 @@ PERCEPTION = ("map", "truth", "blind")
 SENSORS = {"depth_cameras": "depth_camera", "lidar": "spinning_lidar"}  # and the presets of their errors
 
 
+# What a robot meets that walks from the middle of a tile to its rim. The kinds of torchelev.sim are called by how the
+# ground climbs towards the middle.
+_LABELS = {"slope": "slopes", "stairs_up": "stairs down", "stairs_down": "stairs up"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class TerrainConfig:
     """Tiles of each kind at each difficulty, side by side in one height field."""
@@ -22,7 +27,7 @@ class TerrainConfig:
         "stairs_down",
         "boxes",
         "gaps",
-    )  #: of torchelev.sim
+    )  #: of torchelev.sim; `labels` says what a robot meets there
     num_levels: int = 8  #: difficulties from the easiest to the hardest
     difficulty: tuple[float, float] = (0.0, 0.5)  #: of the first and last level: stairs of 5 to 14 cm
     length: float = 8.0  #: [m] side of a tile; a robot that leaves its tile has crossed it
@@ -31,6 +36,11 @@ class TerrainConfig:
     start_level: int = 2  #: new robots begin at levels below this
     curriculum: bool = True  #: robots that cross their tile go on to the next level; False: levels are drawn evenly
     seed: int = 0  #: the same seed makes the same tiles
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What a robot meets on each kind, as it starts in the middle of a tile: it climbs "stairs up"."""
+        return tuple(_LABELS.get(kind, kind) for kind in self.kinds)
 
 
 @dataclass(frozen=True, kw_only=True)

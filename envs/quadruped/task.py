@@ -13,14 +13,14 @@ import torch
 from torch import Tensor, nn
 
 from envs.quadruped.config import PERCEPTION, QuadrupedConfig
-from envs.quadruped.gait import foot_positions
+from envs.quadruped.gait import foot_positions, joint_targets
 from envs.quadruped.kinematics import feet_in_base, joint_angles, link_poses
 from envs.quadruped.odometry import LegOdometry
 from envs.quadruped.physics import Physics, Sensed
 from envs.quadruped.proprioception import observe_body, observe_privileged, rotation_matrix
 from envs.quadruped.rewards import Motion, reward
 from envs.quadruped.sight import SIGHTS, TruthSight, View
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 from torchelev.frames.arrays import assemble
 from torchelev.observations.patterns import compute_heading
 from torchelev.sim import terrain_grid
@@ -73,7 +73,7 @@ class Quadruped(nn.Module):
         compiled: Run the map's update compiled.
 
     Raises:
-        ValueError: `perception` is none of the three.
+        ValueError: `perception` is none of the three, or `num_envs` is not positive.
     """
 
     num_actions = NUM_ACTIONS
@@ -104,6 +104,7 @@ class Quadruped(nn.Module):
         super().__init__()
         names = ", ".join(PERCEPTION)
         require(perception in PERCEPTION, "perception", f"must be one of {names}", repr(perception), "use 'map'")
+        num_envs = require_count("num_envs", num_envs, "give the number of robots")
         self.cfg, self.num_envs, self.perception = cfg or QuadrupedConfig(), num_envs, perception
         self.max_action = self.cfg.gait.max_action
         terrain = self.cfg.terrain
@@ -269,9 +270,8 @@ class Quadruped(nn.Module):
         action = action.to(self.device, torch.float32).nan_to_num(0.0).clamp(-limit, limit)
         self._steer()
         self._store("phase", (self.phase + cfg.gait.frequency * cfg.dt).remainder(1.0))
-        scale = torch.tensor(cfg.gait.action_scale, device=self.device)
-        feet = foot_positions(self.phase, self.command, cfg.gait) + action.unflatten(-1, (4, 3)) * scale
-        self.physics.step(joint_angles(feet).cpu().double(), self.latency.cpu(), cfg.substeps)
+        targets = joint_targets(action, self.phase, self.command, cfg.gait)
+        self.physics.step(targets.cpu().double(), self.latency.cpu(), cfg.substeps)
         sensed = self._sensed()
         self._store("episode_length", self.episode_length + 1)
         self._store("commanded", self.commanded + torch.linalg.vector_norm(self.command[:, :2], dim=-1) * cfg.dt)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -47,7 +46,7 @@ def evaluate(
 
     Returns:
         "all", "by_kind" and "by_level": the fraction of episodes by ending, and the mean forward speed by the one that
-        was commanded, NaN where none was; and `episodes`.
+        was commanded, None where none was; and `episodes`. Kinds are called by what the robot meets.
     """
     task = Quadruped(cfg, episodes, device, perception, seed, compiled)
     levels = (torch.arange(episodes, device=task.device) // len(cfg.terrain.kinds)) % cfg.terrain.num_levels
@@ -66,7 +65,7 @@ def evaluate(
             break
         task.reset(outcome.done)
         task.sense()
-    kinds = {name: kind == k for k, name in enumerate(cfg.terrain.kinds)}
+    kinds = {name: kind == k for k, name in enumerate(cfg.terrain.labels)}
     by_level = {
         name: {str(k): _summarize(endings, walked, asked, chosen & (level == k)) for k in range(cfg.terrain.num_levels)}
         for name, chosen in kinds.items()
@@ -76,7 +75,7 @@ def evaluate(
     return {"all": everything, "by_kind": by_kind, "by_level": by_level, "episodes": episodes}
 
 
-def _summarize(endings: Tensor, walked: Tensor, asked: Tensor, chosen: Tensor) -> dict[str, float | int]:
+def _summarize(endings: Tensor, walked: Tensor, asked: Tensor, chosen: Tensor) -> dict[str, float | None]:
     """Return the fractions of the chosen episodes by ending, and what they walked by what was asked."""
     count = int(chosen.sum())
     shares = {
@@ -84,7 +83,7 @@ def _summarize(endings: Tensor, walked: Tensor, asked: Tensor, chosen: Tensor) -
         for name, ended in zip(ENDINGS, endings, strict=True)
     }
     total_walked, total_asked = (float((value * chosen).sum()) for value in (walked, asked))
-    speed = round(total_walked / total_asked, 4) if total_asked else math.nan
+    speed = round(total_walked / total_asked, 4) if total_asked else None
     return {**shares, "speed": speed, "episodes": count}
 
 
@@ -92,7 +91,12 @@ def table(result: dict[str, Any]) -> str:
     """Tabulate an evaluation by kind of terrain."""
     head = ["terrain", "crossed", "fallen", "timed out", "speed by command"]
     rows = [
-        [name, *(f"{100 * row[key]:.0f} %" for key in ENDINGS), f"{row['speed']:.2f}"]
+        [name, *(f"{100 * row[key]:.0f} %" for key in ENDINGS), _speed(row["speed"])]
         for name, row in (result["by_kind"] | {"all": result["all"]}).items()
     ]
     return markdown_table(head, rows)
+
+
+def _speed(speed: float | None) -> str:
+    """Return the speed by the commanded one, or a dash where none was commanded."""
+    return "–" if speed is None else f"{speed:.2f}"

@@ -18,18 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import click
+import torch
 from tqdm import tqdm
 
 from envs.quadruped import QuadrupedConfig
 from envs.quadruped.config import PERCEPTION
 from torchelev.app.results import markdown_table, write_json
 from torchelev.errors import require
+from torchelev.sim import make_terrain
 from torchelev.viz.style import make_figure, save, styled
 from training import RESULTS
 from training.jobs import Job, train_all
 from training.options import jobs_option, runs_option
 from training.quadruped.evaluate import evaluate, stand_in_trot
-from training.quadruped.policy import load_policy
+from training.quadruped.policy import load_policy, sight_of
 from training.quadruped.train import ppo_config, task_config
 from training.runs import mean, read_scalars, spread
 
@@ -38,15 +40,7 @@ SEEDS = (0, 1)
 ITERATIONS, NUM_ENVS, EPISODES, WALKS = 500, 256, 560, 128
 CASES = [(perception, seed) for seed in SEEDS for perception in PERCEPTION]
 NAMES = {"map": "map in the loop", "truth": "truth with noise", "blind": "blind"}
-KINDS = {
-    "flat": "flat",
-    "rough": "rough",
-    "slope": "slopes",
-    "stairs_up": "stairs, down",  # the tile climbs towards its middle, where robots start
-    "stairs_down": "stairs, up",
-    "boxes": "boxes",
-    "gaps": "gaps",
-}
+KINDS = QuadrupedConfig().terrain.labels
 _BLOCK = 10  # iterations that a point of a learning curve averages
 
 
@@ -70,13 +64,12 @@ def walk_config() -> QuadrupedConfig:
     return dataclasses.replace(cfg, terrain=terrain)
 
 
-def _deploy(policy: Any, sees: bool) -> dict[str, Any]:
-    """Deploy a policy over all kinds of terrain, and for 20 s on flat and rough ground; one that sees, by its map.
+def _deploy(policy: Any, perception: str) -> dict[str, Any]:
+    """Deploy a policy over all kinds of terrain, and for 20 s on flat and rough ground, with what it sees.
 
     Raises:
         ValueError: A robot has crossed its tile on flat or rough ground: its speed there would be of a shorter walk.
     """
-    perception = "map" if sees else "blind"
     crossing = evaluate(policy, task_config(held_out=True), perception, EPISODES, compiled=True)
     walk = evaluate(policy, walk_config(), perception, WALKS, compiled=True)["by_kind"]
     for kind, row in walk.items():
@@ -96,7 +89,7 @@ def _deploy_all(runs: Path) -> dict[str, Any]:
         "seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS,
         "levels": cfg.terrain.num_levels, "difficulty": cfg.terrain.difficulty,
     }  # fmt: skip
-    trot = _kept(runs / "trot.json", lambda: _deploy(stand_in_trot, sees=False))
+    trot = _kept(runs / "trot.json", lambda: _deploy(stand_in_trot, "blind"))
     return {"config": fixed, "trot": trot, "rows": rows}
 
 
@@ -122,7 +115,7 @@ def _row(runs: Path, perception: str, seed: int) -> dict[str, Any]:
     cfg, folder = task_config(held_out=True), _folder(runs, perception, seed)
     policy = load_policy(folder / "policy.pt", cfg)
     training = json.loads((folder / "result.json").read_text())["training"]
-    row = {"perception": perception, "seed": seed, "training": training} | _deploy(policy, perception != "blind")
+    row = {"perception": perception, "seed": seed, "training": training} | _deploy(policy, sight_of(perception))
     is_own = perception != "truth"
     own = row["deployed"]["all"] if is_own else evaluate(policy, cfg, perception, EPISODES)["all"]
     return row | {"own": own, "curve": read_curve(folder)}
@@ -142,7 +135,7 @@ def read_curve(folder: Path) -> dict[str, list[float]]:
 
 def table(result: dict[str, Any]) -> str:
     """Tabulate the crossed tiles by kind of terrain: the mean over the seeds, and the lowest and highest of all."""
-    head = ["trained with", "crossed", *(KINDS[kind].replace(",", "") for kind in KINDS), "fallen", "as trained"]
+    head = ["trained with", "crossed", *KINDS, "fallen", "as trained"]
     lines = []
     for perception in PERCEPTION:
         rows = _rows(result, perception)
@@ -200,9 +193,26 @@ def plot(result: dict[str, Any], path: Path) -> None:
             rows = [row["deployed"]["by_level"][kind] for row in _rows(result, perception)]
             crossed = [mean([row[str(level)]["crossed"] for row in rows]) for level in levels]
             axes.plot(levels, crossed, "o-", color=colors[perception], linewidth=1.2, markersize=3)
-        axes.set(title=KINDS[kind], ylim=(-0.04, 1.04), xticks=levels)
-        axes.set(xlabel="level" if place >= 3 else None, ylabel="crossed" if place % 3 == 0 else None)
+        axes.set(title=kind, ylim=(-0.04, 1.04), xticks=levels, xlabel="level")
+        if kind.startswith("stairs"):
+            axes.set_xticks(levels, [f"{height:.0f}" for height in stair_heights(result["config"])])
+            axes.set_xlabel("height of a stair [cm]")
+        axes.set_ylabel(f"crossed, of {_per_point(result)}" if place % 3 == 0 else "")
     save(figure, path)
+
+
+def stair_heights(config: dict[str, Any]) -> list[float]:
+    """Return the height of a stair [cm] at each level."""
+    first, last = config["difficulty"]
+    difficulty = torch.linspace(first, last, config["levels"])
+    tiles = make_terrain("stairs_down", difficulty, resolution=0.1).field.heights  # 0 in the middle
+    return [100 * float(heights[heights > 0].min()) for heights in tiles]
+
+
+def _per_point(result: dict[str, Any]) -> int:
+    """Return the number of episodes, over the seeds, of a kind and level."""
+    rows = _rows(result, PERCEPTION[0])
+    return sum(row["deployed"]["by_level"][KINDS[0]]["0"]["episodes"] for row in rows)
 
 
 @click.command(help=__doc__)

@@ -6,6 +6,7 @@ import json
 import pytest
 
 from envs.quadruped.config import PERCEPTION
+from torchelev.viz.style import save
 from training.quadruped import experiment
 
 LEVELS = 2
@@ -37,7 +38,8 @@ def result():
         curve = {"steps": [100, 200], "level": [0.0, 5 * crossed], "crossed": [0.0, crossed]}
         row = {"perception": perception, "seed": seed, "training": {"steps": 6000, "seconds": 120.0}, "curve": curve}
         rows.append(row | deployment(crossed) | {"own": summary(crossed)})
-    return {"config": {"seeds": [0, 1], "levels": LEVELS}, "rows": rows, "trot": deployment(0.25)}
+    config = {"seeds": [0, 1], "levels": LEVELS, "difficulty": [0.0, 0.5]}
+    return {"config": config, "rows": rows, "trot": deployment(0.25)}
 
 
 def test_every_perception_gets_the_same_training(tmp_path):
@@ -59,10 +61,10 @@ def test_a_walk_that_ends_at_the_rim_is_refused(monkeypatch):
 
     monkeypatch.setattr(experiment, "evaluate", fake)
     rim = False
-    assert set(experiment._deploy(None, sees=False)["walk"]) == {"flat", "rough"}
+    assert set(experiment._deploy(None, "blind")["walk"]) == {"flat", "rough"}
     rim = True
     with pytest.raises(ValueError, match=r"walk, rough: must end before the rim .* got 5 % crossed; .*walk_config"):
-        experiment._deploy(None, sees=False)
+        experiment._deploy(None, "blind")
 
 
 def test_a_kept_result_is_made_anew_when_its_constants_or_its_policy_change(tmp_path, monkeypatch):
@@ -99,9 +101,16 @@ def test_the_tables_have_the_mean_and_the_extremes():
 
 
 @pytest.mark.slow(2)
-def test_the_figure_is_drawn(tmp_path):
+def test_the_figure_is_drawn_over_the_heights_of_stairs(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(experiment, "save", lambda figure, path: figures.append(figure) or save(figure, path))
     experiment.plot(result(), tmp_path / "quadruped.png")
     assert (tmp_path / "quadruped.png").stat().st_size > 5000 and (tmp_path / "quadruped.svg").exists()
+    panels = {axes.get_title(): axes for axes in figures[0].axes}
+    for kind in ("stairs up", "stairs down"):
+        assert panels[kind].get_xlabel() == "height of a stair [cm]"
+        assert [label.get_text() for label in panels[kind].get_xticklabels()] == ["5", "14"]
+    assert panels["boxes"].get_xlabel() == "level" and panels["rough"].get_ylabel() == "crossed, of 16"
 
 
 def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
