@@ -149,6 +149,18 @@ def table(result: dict[str, Any]) -> str:
     return markdown_table(head, [*lines, ["(the trot alone)", ends[0], *alone, ends[1], ""]])
 
 
+def stairs_table(result: dict[str, Any]) -> str:
+    """Tabulate the stairs that each policy crossed, by their height: a percentage for each seed."""
+    head = ["crossed [%], by seed", *(f"{height:.1f} cm" for height in stair_heights(result["config"]))]
+    lines = []
+    for kind in ("stairs up", "stairs down"):
+        for perception in PERCEPTION:
+            by_level = [row["deployed"]["by_level"][kind].values() for row in _rows(result, perception)]
+            cells = [", ".join(f"{100 * of['crossed']:.0f}" for of in level) for level in zip(*by_level, strict=True)]
+            lines.append([f"{kind}: {NAMES[perception]}", *cells])
+    return markdown_table(head, lines)
+
+
 def walk_table(result: dict[str, Any]) -> str:
     """Tabulate the speed by the commanded 0.5 m/s, and the falls, in 20 s on flat and rough ground."""
     head = ["trained with", "flat: speed by command", "fallen", "rough: speed by command", "fallen"]
@@ -224,7 +236,7 @@ def main(runs: Path, jobs: int) -> None:
     result = _deploy_all(runs)
     write_json(RESULTS / "quadruped.json", result)
     plot(result, RESULTS / "quadruped.png")
-    click.echo(f"{table(result)}\n\n{walk_table(result)}")
+    click.echo("\n\n".join(make(result) for make in (table, stairs_table, walk_table)))
 
 
 if __name__ == "__main__":

@@ -96,6 +96,10 @@ def test_the_tables_have_the_mean_and_the_extremes():
     lines = experiment.table(result()).split("\n")
     assert lines[2].startswith("| map in the loop | 60.0 % (50.0 to 70.0) | 60 % | 60 % |")
     assert lines[5].startswith("| (the trot alone) | 25 % | 25 % |") and lines[5].endswith("| 75 % |  |")
+    stairs = experiment.stairs_table(result()).split("\n")
+    assert stairs[0] == "| crossed [%], by seed | 5.0 cm | 14.0 cm |" and len(stairs) == 2 + 2 * len(PERCEPTION)
+    assert stairs[2] == "| stairs up: map in the loop | 50, 70 | 25, 35 |"
+    assert stairs[-1] == "| stairs down: blind | 30, 50 | 15, 25 |"
     walked = experiment.walk_table(result()).split("\n")
     assert walked[4] == "| blind | 0.90 | 0.0 % | 0.80 | 25.0 % |" and len(walked) == 5
 
