@@ -3,7 +3,7 @@
     python -m docs.readme_tables
 
 Each table is between <!-- name --> and <!-- end -->. docs/benchmarks.md holds every table, the other
-pages a selection.
+pages a selection. A table whose result does not exist yet stays empty, and its name is printed.
 """
 
 from __future__ import annotations
@@ -147,6 +147,11 @@ def _legs() -> str:
     return legs.table(load("quadruped", training.RESULTS))
 
 
+def _legs_stairs() -> str:
+    """Tabulate the stairs that walking policies crossed, by their height."""
+    return legs.stairs_table(load("quadruped", training.RESULTS))
+
+
 def _legs_walk() -> str:
     """Tabulate how policies keep to the commanded speed on flat and rough ground."""
     return legs.walk_table(load("quadruped", training.RESULTS))
@@ -190,6 +195,7 @@ TABLES = {
     "nav": _nav,
     "pose_covariance": _pose_covariance,
     "legs": _legs,
+    "legs_stairs": _legs_stairs,
     "legs_walk": _legs_walk,
     "legs_step_time": _legs_step_time,
     "encoder_cost": _encoder_cost,
@@ -213,6 +219,8 @@ def with_tables(text: str, to_root: str = "") -> str:
         to_root: path from the page to the root, from which the pictures in the tables count.
     """
     for name in names_of_tables(text):
+        if name in empty_tables(text) and not has_result(name):
+            continue
         table = TABLES[name]().replace("](", f"]({to_root}")
         pattern = rf"(<!-- {name} -->\n).*?(<!-- end -->)"
         text = re.sub(pattern, functools.partial(_insert, table), text, flags=re.DOTALL)
@@ -222,6 +230,20 @@ def with_tables(text: str, to_root: str = "") -> str:
 def names_of_tables(text: str) -> list[str]:
     """Return the names of the tables that a page holds, in its order."""
     return [name for name in re.findall(r"<!-- (\w+) -->\n", text) if name in TABLES]
+
+
+def empty_tables(text: str) -> list[str]:
+    """Return the names of the tables of a page that have no content."""
+    return [name for name in names_of_tables(text) if re.search(rf"<!-- {name} -->\n\s*<!-- end -->", text)]
+
+
+def has_result(name: str) -> bool:
+    """Tell whether the results that a table needs exist."""
+    try:
+        TABLES[name]()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _insert(table: str, match: re.Match[str]) -> str:
@@ -241,3 +263,5 @@ PAGES = {
 if __name__ == "__main__":
     for page, to_root in PAGES.items():
         page.write_text(with_tables(page.read_text(), to_root))
+        for name in empty_tables(page.read_text()):
+            print(f"{page.relative_to(ROOT)}: {name} stays empty, as its result does not exist yet")

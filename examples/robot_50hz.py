@@ -38,7 +38,7 @@ scans = itertools.cycle([(camera.cast(scene, T)[None], T[None], T_base[None]) fo
 emap = ElevationMap(ElevationMapConfig(grid=GridConfig(resolution=0.04, length_x=8.0, length_y=8.0)))
 if not args.eager:
     emap.compile()
-    emap.warm_up(num_points=camera.width * camera.height)  # takes up to a minute now, instead of at the first scan
+    emap.warm_up(num_points=camera.width * camera.height)  # takes minutes now, instead of at the first scan
 height_scan, publisher = HeightScan.isaac_lab(), Publisher(emap, ("elevation",), rate=5.0)
 slot, views, stop = queue.Queue(maxsize=1), queue.Queue(maxsize=1), threading.Event()
 

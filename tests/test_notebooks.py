@@ -13,7 +13,7 @@ SHORTER = {
     "=128": "=8",
     "BATCHES, STEPS = 24, 600": "BATCHES, STEPS = 1, 3",
     "range(4)]": "range(1)]",
-    "STEPS = 300": "STEPS = 3",
+    "STEPS = 1000": "STEPS = 3",
 }
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 

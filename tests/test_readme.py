@@ -2,7 +2,7 @@
 
 import pytest
 
-from docs.readme_tables import PAGES, ROOT, TABLES, names_of_tables, with_tables
+from docs.readme_tables import PAGES, ROOT, TABLES, empty_tables, has_result, names_of_tables, with_tables
 from tests.docs.markdown import code_blocks, run_blocks
 
 README = ROOT / "README.md"
@@ -16,6 +16,22 @@ def test_tables_are_those_of_the_results(page):
 
 def test_the_benchmarks_page_has_every_table_once():
     assert sorted(names_of_tables((ROOT / "docs/benchmarks.md").read_text())) == sorted(TABLES)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_table_is_empty_although_its_result_exists(page):
+    left = [name for name in empty_tables(page.read_text()) if has_result(name)]
+    assert not left, "run python -m docs.readme_tables"
+
+
+def test_a_table_stays_empty_until_its_result_exists(tmp_path, monkeypatch):
+    monkeypatch.setitem(TABLES, "loop", lambda: (tmp_path / "loop.json").read_text())
+    empty = "<!-- loop -->\n<!-- end -->\n"
+    assert empty_tables(empty) == ["loop"] and not has_result("loop") and with_tables(empty) == empty
+    with pytest.raises(FileNotFoundError):
+        with_tables("<!-- loop -->\nof a result that was removed\n<!-- end -->\n")
+    (tmp_path / "loop.json").write_text("numbers")
+    assert has_result("loop") and empty_tables(with_tables(empty)) == []
 
 
 def test_writes_a_table_in_place_of_an_old_one():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import click
 from tqdm import tqdm
 
+from torchelev.app.results import to_json
 from torchelev.output_files import atomic_file
 
 CHECKPOINT = "checkpoint.pt"
@@ -49,6 +49,6 @@ def deferred_interrupt(unit: str) -> Iterator[Callable[[], bool]]:
 
 
 def write_result(path: Path, values: dict[str, Any]) -> None:
-    """Write a result as JSON; an interruption leaves an older file intact."""
+    """Write a result as strict JSON; an interruption leaves an older file intact."""
     with atomic_file(path) as file:
-        file.write((json.dumps(values, indent=1) + "\n").encode())
+        file.write(to_json(values).encode())

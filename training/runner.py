@@ -13,11 +13,12 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from tqdm import tqdm
 
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.output_files import atomic_file
 from training.resume import CHECKPOINT, deferred_interrupt
 
 _ENCODER = "cnn"  # of configurations and checkpoints that name none
+_HINT = "use the settings that it was trained with"
 _LOGGER_STATE = ("tot_timesteps", "tot_time", "rewbuffer", "lenbuffer", "cur_reward_sum", "cur_episode_length")
 
 
@@ -116,15 +117,17 @@ class ResumableRunner(OnPolicyRunner):
         """Continue from a `checkpoint.pt`.
 
         Raises:
-            ValueError: the checkpoint has other observations, another perception or encoder, or another number of
-                environments or processes; nothing has changed then.
+            ValueError: the checkpoint is damaged, has other observations, weights of other sizes, another perception or
+                encoder, or another number of environments or processes; nothing has changed then.
         """
         path = self._own(Path(path))
-        found = torch.load(path, weights_only=False, map_location=self.device)["infos"]
+        saved = _read(path, self.device)
+        found: Any = saved.get("infos")
         require(found is not None, "checkpoint", "must hold the environments", str(path), f"give a {CHECKPOINT}")
         for name, expected in self._kind().items():
-            actual, hint = ({"encoder": _ENCODER} | found["kind"])[name], "use the settings that it was trained with"
-            require(actual == expected, "checkpoint", f"must be of {name} {expected}", actual, hint)
+            actual = ({"encoder": _ENCODER} | found["kind"])[name]
+            require(actual == expected, "checkpoint", f"must be of {name} {expected}", actual, _HINT)
+        _require_sizes(saved, self.alg.save())
         self.load(str(path), map_location=self.device)
         self.env.task.load_state_dict(found["task"])
         torch.set_rng_state(found["random"].cpu())
@@ -143,3 +146,33 @@ class ResumableRunner(OnPolicyRunner):
         self.is_distributed, self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = True, world, rank, local
         self.cfg["multi_gpu"] = {"global_rank": rank, "local_rank": local, "world_size": world}
         torch.distributed.init_process_group("gloo", rank=rank, world_size=world)
+
+
+def _read(path: Path, device: torch.device | str) -> dict[str, Any]:
+    """Return what a checkpoint holds.
+
+    Raises:
+        ValueError: the file is damaged, or is no checkpoint.
+    """
+    rule, hint = "must be a file that a training saved", "restore a copy of it, or begin again in another folder"
+    try:
+        saved = torch.load(path, weights_only=False, map_location=device)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # whatever the zip file and its pickles raise
+        actual = f"{path}, which cannot be read ({type(error).__name__})"
+        raise ValueError(message("checkpoint", rule, actual, hint)) from None
+    require(isinstance(saved, dict), "checkpoint", rule, f"{path}, which holds a {type(saved).__name__}", hint)
+    return dict(saved)
+
+
+def _require_sizes(saved: dict[str, Any], own: dict[str, Any]) -> None:
+    """Raise ValueError unless the actor's and the critic's saved weights have the sizes of this training's."""
+    for model in ("actor", "critic"):
+        expected, actual = (
+            {name: tuple(value.shape) for name, value in state.get(f"{model}_state_dict", {}).items()}
+            for state in (own, saved)
+        )
+        for name in expected | actual:
+            size, found = expected.get(name, "none"), actual.get(name, "none")
+            require(size == found, "checkpoint", f"the {model}'s {name} must be of size {size}", found, _HINT)

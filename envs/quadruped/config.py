@@ -7,7 +7,12 @@ from dataclasses import dataclass, field
 from torchelev.errors import require
 
 PERCEPTION = ("map", "truth", "blind")
-SENSORS = ("depth_cameras", "lidar")
+SENSORS = {"depth_cameras": "depth_camera", "lidar": "spinning_lidar"}  # and the presets of their errors
+
+
+# What a robot meets that walks from the middle of a tile to its rim. The kinds of torchelev.sim are called by how the
+# ground climbs towards the middle.
+_LABELS = {"slope": "slopes", "stairs_up": "stairs down", "stairs_down": "stairs up"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +27,7 @@ class TerrainConfig:
         "stairs_down",
         "boxes",
         "gaps",
-    )  #: of torchelev.sim
+    )  #: of torchelev.sim; `labels` says what a robot meets there
     num_levels: int = 8  #: difficulties from the easiest to the hardest
     difficulty: tuple[float, float] = (0.0, 0.5)  #: of the first and last level: stairs of 5 to 14 cm
     length: float = 8.0  #: [m] side of a tile; a robot that leaves its tile has crossed it
@@ -31,6 +36,11 @@ class TerrainConfig:
     start_level: int = 2  #: new robots begin at levels below this
     curriculum: bool = True  #: robots that cross their tile go on to the next level; False: levels are drawn evenly
     seed: int = 0  #: the same seed makes the same tiles
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What a robot meets on each kind, as it starts in the middle of a tile: it climbs "stairs up"."""
+        return tuple(_LABELS.get(kind, kind) for kind in self.kinds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +124,8 @@ class SightConfig:
     camera_fov_deg: tuple[float, float] = (87.0, 58.0)  #: [deg] horizontal and vertical
     camera_pitch_deg: float = 45.0  #: [deg] by which the cameras look down
     max_range: float = 3.0  #: [m]
-    sensor_errors: str = "depth_camera"  #: preset of torchelev.sim
+    #: preset of torchelev.sim; None: "depth_camera" for cameras, "spinning_lidar" for the lidar
+    sensor_errors: str | None = None
     #: [m], [deg] standard deviations of the cameras' place on the robot, as a calibration against the legs leaves them
     mounting_error: tuple[float, float] = (0.001, 0.1)
     resolution: float = 0.05  #: [m] of the map
@@ -125,6 +136,13 @@ class SightConfig:
         "upper_bound"  #: what scans read over unknown cells, see `ScanSettings`; "ground" takes ten times as long
     )
     truth_noise: bool = True  #: perception "truth" reads heights with the noise of Miki et al. 2022
+
+    def __post_init__(self) -> None:
+        rule = f"must be one of {', '.join(SENSORS)}"
+        require(self.sensors in SENSORS, "sight.sensors", rule, self.sensors, "choose one")
+        fits = (self.sensors, self.sensor_errors) != ("lidar", "depth_camera")
+        rule = "must not be those of a camera if sensors='lidar'"
+        require(fits, "sight.sensor_errors", rule, repr(self.sensor_errors), "leave it out, or use 'spinning_lidar'")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +164,6 @@ class QuadrupedConfig:
         for name in ("substeps", "episode_length", "max_tilt"):
             value = getattr(self, name)
             require(value > 0, name, "must be positive", value, "raise it")
-        sensors = self.sight.sensors
-        require(sensors in SENSORS, "sight.sensors", f"must be one of {', '.join(SENSORS)}", sensors, "choose one")
 
     @property
     def dt(self) -> float:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.quadruped.config import GaitConfig
-from envs.quadruped.kinematics import ABDUCTION, FOOT_RADIUS, leg_constants
+from envs.quadruped.kinematics import ABDUCTION, FOOT_RADIUS, joint_angles, leg_constants
 
 PHASES = (0.0, 0.5, 0.5, 0.0)  # of the legs in a cycle: diagonal pairs
 
@@ -46,3 +46,17 @@ def foot_positions(phase: Tensor, command: Tensor, cfg: GaitConfig) -> Tensor:
     stride = velocity * (cfg.duty / cfg.frequency * along * moves)[..., None]
     nominal = (sides * ABDUCTION).expand_as(lift)
     return torch.stack([stride[..., 0], nominal + stride[..., 1], lift - cfg.body_height + FOOT_RADIUS], -1)
+
+
+def joint_targets(action: Tensor, phase: Tensor, command: Tensor, cfg: GaitConfig) -> Tensor:
+    """Return the joint angles (B, 12) [rad] that an action asks for, in the order of `kinematics.JOINTS`.
+
+    Args:
+        action: Displacements of the feet (B, 12), leg by leg along x, y and z, in units of `action_scale`.
+        phase: Clock of each robot (B,), already at the end of the step.
+        command: Velocity ahead and to the left [m/s] and yaw rate [rad/s] (B, 3).
+        cfg: The trot.
+    """
+    limited = action.clamp(-cfg.max_action, cfg.max_action).unflatten(-1, (4, 3))
+    scale = torch.tensor(cfg.action_scale, device=action.device)
+    return joint_angles(foot_positions(phase, command, cfg) + limited * scale)

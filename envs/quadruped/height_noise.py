@@ -59,5 +59,13 @@ class HeightNoise(nn.Module):
         noise = torch.hypot(sigma[:, 1:2], far) * self._normal(*heights.shape)
         return heights + self.offset[:, scan, 2:] + noise
 
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return the state of the random number generator."""
+        return {"generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Set the state of the random number generator."""
+        self.generator.set_state(state["generator"].cpu())
+
     def _normal(self, *shape: int) -> Tensor:
         return torch.randn(shape, generator=self.generator, device=self.offset.device)

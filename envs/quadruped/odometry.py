@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from envs.quadruped.config import OdometryConfig
 
-_LEAST_FORCE = 5.0  # [N] of a foot on the ground
+_MIN_FORCE = 5.0  # [N] of a foot on the ground
 
 
 class LegOdometry(nn.Module):
@@ -44,7 +44,7 @@ class LegOdometry(nn.Module):
             buffer.masked_fill_(mask.view(-1, *[1] * (buffer.ndim - 1)), 0.0)
 
     def step(self, velocity: Tensor, foot_velocities: Tensor, foot_forces: Tensor, dt: float) -> None:
-        """Integrate one step.
+        """Integrate one step; velocities and forces are of one instant.
 
         Args:
             velocity: True velocity of the base (B, 3) [m/s], map frame.
@@ -53,9 +53,9 @@ class LegOdometry(nn.Module):
             dt: Duration of the step [s].
         """
         cfg = self.cfg
-        weight = torch.where(foot_forces > _LEAST_FORCE, foot_forces, 0.0)
+        weight = torch.where(foot_forces > _MIN_FORCE, foot_forces, 0.0)
         total = weight.sum(-1, keepdim=True)
-        slip = (weight[..., None] * foot_velocities).sum(1) / total.clamp(min=_LEAST_FORCE)
+        slip = (weight[..., None] * foot_velocities).sum(1) / total.clamp(min=_MIN_FORCE)
         noise = cfg.velocity_noise * self._draw(torch.randn, *velocity.shape)
         seen = (velocity - slip) * self.scale[:, None] + noise
         seen[:, 2] = velocity[:, 2]  # heights drift by themselves, see below
@@ -72,6 +72,14 @@ class LegOdometry(nn.Module):
         T[:, :3, :3] = torch.stack([_turn(column, self.yaw_error) for column in T_map_base[:, :3, :3].unbind(-1)], -1)
         T[:, :3, 3] += self.error
         return T
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return the state of the random number generator."""
+        return {"generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Set the state of the random number generator."""
+        self.generator.set_state(state["generator"].cpu())
 
     def _draw(self, source: object, *shape: int) -> Tensor:
         return source(*shape, generator=self.generator, device=self.velocity.device)  # type: ignore[operator]

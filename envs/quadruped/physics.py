@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 import envs.offscreen  # noqa: F401  (before MuJoCo)
 from envs.quadruped.config import RandomConfig
-from envs.quadruped.kinematics import FOOT_RADIUS, JOINTS
+from envs.quadruped.kinematics import FOOT_RADIUS, JOINTS, ROBOT
 from torchelev.errors import require
 from torchelev.sim import TerrainGrid
 
@@ -22,13 +22,13 @@ try:
 except ImportError as error:
     raise ImportError("envs.quadruped: needs MuJoCo; install it with pip install 'torchelev[rl]'") from error
 
-ROBOT = Path(__file__).with_name("robot.xml")
 _DEPTH = 1.0  # [m] of solid ground below the lowest point
+_START = 1.0  # [s] time of a placed robot: after a reset by MuJoCo, whose time begins at 0, it is never reached
 _MAX_SAMPLES = 2**24  # of the height field: MuJoCo's models hold one copy for each body
 
 
 class Sensed(NamedTuple):
-    """What MuJoCo's sensors measured, in the world's frame."""
+    """What MuJoCo's sensors measured, in the world's frame, at the instant of `Physics.sensed_state`."""
 
     foot_velocities: Tensor  #: (B, 4, 3) [m/s] of their centres
     foot_turns: Tensor  #: (B, 4, 3) [rad/s] angular velocities
@@ -50,6 +50,9 @@ _SHAPES = ((4, 3), (4, 3), (4,), (12,), (13,))
 class Physics(nn.Module):
     """B robots in MuJoCo, in float64 on the CPU.
 
+    MuJoCo evaluates its sensors before it integrates: after a step, they belong to the state one physics step (5 ms)
+    before the last. `sensed_state` is that state, for what is combined with sensors. After `place`, both are the same.
+
     Args:
         terrain: The tiles.
         num_envs: B.
@@ -63,6 +66,8 @@ class Physics(nn.Module):
     """
 
     state: Tensor
+    sensed_state: Tensor
+    diverged: Tensor
     sensors: Tensor
     targets: Tensor
     body_ids: Tensor
@@ -84,8 +89,10 @@ class Physics(nn.Module):
         self._rollout = rollout.Rollout(nthread=threads)
         self._data = [mujoco.MjData(model) for _ in range(threads)]
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        for name, width in (("state", size), ("sensors", model.nsensordata), ("targets", model.nu)):
+        widths = {"state": size, "sensed_state": size, "sensors": model.nsensordata, "targets": model.nu}
+        for name, width in widths.items():
             self.register_buffer(name, torch.zeros(num_envs, width, dtype=torch.float64))
+        self.register_buffer("diverged", torch.zeros(num_envs, dtype=torch.bool))
         self.register_buffer("body_ids", torch.zeros(num_envs, dtype=torch.int64))
 
     @property
@@ -98,13 +105,25 @@ class Physics(nn.Module):
         """Linear velocity in the world's frame, angular velocity in the base's, joint velocities (B, 18): a view."""
         return self.state[:, 20:38]
 
+    @property
+    def sensed_qpos(self) -> Tensor:
+        """The same as `qpos`, at the instant of the sensors."""
+        return self.sensed_state[:, 1:20]
+
+    @property
+    def sensed_qvel(self) -> Tensor:
+        """The same as `qvel`, at the instant of the sensors."""
+        return self.sensed_state[:, 20:38]
+
     def sensed(self) -> Sensed:
         """Return the sensors' values."""
         parts = self.sensors.split([int(np.prod(shape)) for shape in _SHAPES], -1)
         return Sensed(*(part.unflatten(-1, shape) for part, shape in zip(parts, _SHAPES, strict=True)))
 
     def step(self, targets: Tensor, latency: Tensor, num_steps: int) -> None:
-        """Step all robots.
+        """Step all robots, and tell in `diverged` (B,) whose simulation has failed.
+
+        Where a state is NaN, infinite or huge, MuJoCo resets the robot to the model's first pose and its time to 0.
 
         Args:
             targets: Joint angles (B, 12) [rad] to hold.
@@ -115,7 +134,10 @@ class Physics(nn.Module):
         control = torch.where(late, self.targets[:, None], targets[:, None])
         models = [self.models[k] for k in self.body_ids.tolist()]
         state, sensors = self._rollout.rollout(models, self._data, self.state.numpy(), control.numpy())
-        self.state.copy_(torch.from_numpy(state[:, -1]))
+        last, timestep = torch.from_numpy(state[:, -1]), self.models[0].opt.timestep
+        self.diverged.copy_((last[:, 0] - self.state[:, 0] - num_steps * timestep).abs() > 0.5 * timestep)
+        self.sensed_state.copy_(torch.from_numpy(state[:, -2]) if num_steps > 1 else self.state)
+        self.state.copy_(last)
         self.sensors.copy_(torch.from_numpy(sensors[:, -1]))
         self.sensors[:, -13:] = torch.from_numpy(sensors[:, :, -13:].max(1))  # any touch within the step
         self.targets.copy_(targets)
@@ -123,7 +145,10 @@ class Physics(nn.Module):
     def place(self, env_ids: list[int], qpos: Tensor, qvel: Tensor, body_ids: Tensor) -> None:
         """Put robots at a state: qpos (n, 19), qvel (n, 18), and one of the bodies (n,) for each."""
         self.body_ids[env_ids] = body_ids
-        self.state[env_ids] = torch.cat([torch.zeros(len(env_ids), 1), qpos, qvel], -1).to(torch.float64)
+        start = torch.full((len(env_ids), 1), _START)
+        self.state[env_ids] = torch.cat([start, qpos, qvel], -1).to(torch.float64)
+        self.sensed_state[env_ids] = self.state[env_ids]
+        self.diverged[env_ids] = False
         self.targets[env_ids] = qpos[:, 7:].to(torch.float64)
         data = self._data[0]
         for index, body in zip(env_ids, body_ids.tolist(), strict=True):

@@ -35,8 +35,9 @@ def observe_body(
 def observe_privileged(velocity: Tensor, stands: Tensor, foot_velocities: Tensor, latency: Tensor) -> Tensor:
     """Return the observation "privileged" (B, 20) of the critic.
 
-    Its entries are: true velocity of the base (3) [m/s], whether each foot stands (4), velocities of the feet (12)
-    [m/s], latency (1) [physics steps].
+    Its entries are: true velocity of the base (3) [m/s], base frame; whether each foot stands (4); velocities of the
+    feet (12) [m/s], relative to the ground and in axes of the base too; latency (1) [physics steps]. The feet's are
+    those of the sensors' instant, 5 ms earlier, as that is what sensors can tell.
     """
     parts = [velocity, stands.to(velocity.dtype), foot_velocities.flatten(1), latency[:, None].to(velocity.dtype)]
     return torch.cat(parts, -1)
@@ -51,10 +52,3 @@ def rotation_matrix(quat_wxyz: Tensor) -> Tensor:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
-
-
-def base_poses(position: Tensor, quat_wxyz: Tensor) -> Tensor:
-    """Return transforms (B, 4, 4) of positions (B, 3) [m] and unit quaternions (B, 4)."""
-    T = torch.zeros(len(position), 4, 4, dtype=position.dtype, device=position.device)
-    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = rotation_matrix(quat_wxyz), position, 1.0
-    return T

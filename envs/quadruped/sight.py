@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from envs.quadruped.config import QuadrupedConfig
+from envs.quadruped.config import SENSORS, QuadrupedConfig
 from envs.quadruped.height_noise import HeightNoise
 from envs.quadruped.kinematics import LINKS
 from envs.quadruped.physics import ROBOT
@@ -116,7 +116,8 @@ class TruthSight(BlindSight):
             height = self.field.height(tile_ids, xy)
             height = height if self.noise is None else self.noise.disturb(height, first + k)
             values.append(origin[:, 2:] - height - scan.nominal_height)
-        return torch.cat(values, -1).clamp(-1.0, 1.0)
+        clip = torch.inf if scan.clip is None else scan.clip
+        return torch.cat(values, -1).clamp(-clip, clip)
 
 
 class MapSight(BlindSight):
@@ -138,7 +139,7 @@ class MapSight(BlindSight):
 
     def reset(self, mask: Tensor) -> None:
         """Clear the maps and draw new errors."""
-        self.emap.reset(mask.nonzero()[:, 0])
+        self.emap.reset(mask=mask)
         for errors in self.sensor_errors:
             assert isinstance(errors, SensorErrors)
             errors.reset(mask=mask)
@@ -187,17 +188,18 @@ def make_sensors(cfg: QuadrupedConfig) -> list[MountedSensor]:
 
 
 def sensor_errors(cfg: QuadrupedConfig) -> SensorErrorConfig:
-    """Return the preset's errors for images of few pixels, picked from those of a whole camera.
+    """Return the errors of the sensors' preset; of cameras, for images of few pixels, picked from those of a whole one.
 
     A pixel that straddles an edge measures a depth between its two sides. Of picked pixels, few do: as many fewer as
-    there are fewer pixels. Latency is left out: a robot looks up its joint angles by the stamp of a scan, so that a
-    late scan comes with the poses of its own moment.
+    there are fewer pixels. A lidar is simulated with all its points. Latency is left out: a robot looks up its joint
+    angles by the stamp of a scan, so that a late scan comes with the poses of its own moment.
     """
-    errors = preset(cfg.sight.sensor_errors).sensor
+    sight = cfg.sight
+    errors = preset(sight.sensor_errors or SENSORS[sight.sensors]).sensor
     assert isinstance(errors, SensorErrorConfig)
     flying = errors.flying if isinstance(errors.flying, tuple) else (errors.flying, errors.flying)
-    picked = cfg.sight.camera_pixels[0] / _CAMERA_WIDTH
-    position, rotation_deg = cfg.sight.mounting_error
+    picked = sight.camera_pixels[0] / _CAMERA_WIDTH if sight.sensors == "depth_cameras" else 1.0
+    position, rotation_deg = sight.mounting_error
     return dataclasses.replace(
         errors,
         latency=0,

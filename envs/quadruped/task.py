@@ -13,14 +13,16 @@ import torch
 from torch import Tensor, nn
 
 from envs.quadruped.config import PERCEPTION, QuadrupedConfig
-from envs.quadruped.gait import foot_positions
+from envs.quadruped.gait import foot_positions, joint_targets
 from envs.quadruped.kinematics import feet_in_base, joint_angles, link_poses
 from envs.quadruped.odometry import LegOdometry
 from envs.quadruped.physics import Physics, Sensed
-from envs.quadruped.proprioception import base_poses, observe_body, observe_privileged, rotation_matrix
+from envs.quadruped.proprioception import observe_body, observe_privileged, rotation_matrix
 from envs.quadruped.rewards import Motion, reward
 from envs.quadruped.sight import SIGHTS, TruthSight, View
-from torchelev.errors import require
+from torchelev.errors import require, require_count
+from torchelev.frames.arrays import assemble
+from torchelev.observations.patterns import compute_heading
 from torchelev.sim import terrain_grid
 
 NUM_ACTIONS = 12
@@ -58,8 +60,8 @@ class Quadruped(nn.Module):
     The action (B, 12) moves the feet of a trot, leg by leg along x, y and z of the base; `gait.py` turns feet into
     joint angles, which PD controllers hold. `rewards.py` gives the reward.
 
-    An episode terminates when the robot falls: its base touches the ground or tilts by more than `max_tilt`. It is
-    truncated when the robot has crossed its tile, or after `episode_length`.
+    An episode terminates when the robot falls: its base touches the ground or tilts by more than `max_tilt`, or its
+    simulation diverges. It is truncated when the robot has crossed its tile, or after `episode_length`.
 
     Args:
         cfg: The settings; None for the defaults.
@@ -71,7 +73,7 @@ class Quadruped(nn.Module):
         compiled: Run the map's update compiled.
 
     Raises:
-        ValueError: `perception` is none of the three.
+        ValueError: `perception` is none of the three, or `num_envs` is not positive.
     """
 
     num_actions = NUM_ACTIONS
@@ -102,6 +104,7 @@ class Quadruped(nn.Module):
         super().__init__()
         names = ", ".join(PERCEPTION)
         require(perception in PERCEPTION, "perception", f"must be one of {names}", repr(perception), "use 'map'")
+        num_envs = require_count("num_envs", num_envs, "give the number of robots")
         self.cfg, self.num_envs, self.perception = cfg or QuadrupedConfig(), num_envs, perception
         self.max_action = self.cfg.gait.max_action
         terrain = self.cfg.terrain
@@ -148,7 +151,7 @@ class Quadruped(nn.Module):
     def T_map_base(self) -> Tensor:
         """True poses of the robots (B, 4, 4) in the frame of their tile."""
         position = self._qpos[:, :3] - torch.nn.functional.pad(self.origins[self.tile_ids], (0, 1))
-        return base_poses(position, self._qpos[:, 3:7])
+        return assemble(position, rotation_matrix(self._qpos[:, 3:7]))
 
     @property
     def max_episode_length(self) -> int:
@@ -212,11 +215,12 @@ class Quadruped(nn.Module):
     @property
     def forward_speed(self) -> Tensor:
         """Speed of the robots ahead (B,) [m/s]."""
-        return _to_yaw_frame(self._floats(self.physics.qvel[:, :3]), rotation_matrix(self._qpos[:, 3:7]))[:, 0]
+        return _to_yaw_frame(self._floats(self.physics.qvel[:, :3]), self.T_map_base)[:, 0]
 
     def _choose_levels(self, mask: Tensor) -> None:
         """Move robots up that have crossed their tile, and down that have not come half as far as commanded.
 
+        Fallen robots never move up: one that has diverged is anywhere.
         After seeding, levels are drawn from the first `start_level`; without a curriculum always, and from all.
         """
         terrain = self.cfg.terrain
@@ -226,7 +230,7 @@ class Quadruped(nn.Module):
             self._is_fresh = False
         else:
             distance = torch.linalg.vector_norm(self.T_map_base[:, :2, 3], dim=-1)
-            crossed = self._has_crossed()
+            crossed = self._has_crossed() & ~self._has_fallen(self._sensed())
             failed = distance < 0.5 * self.commanded
             self._store("level", self.terrain.promote(self.level, crossed, failed, self.generator), mask)
 
@@ -236,7 +240,7 @@ class Quadruped(nn.Module):
         if not env_ids:
             return
         n, cfg = len(env_ids), self.cfg
-        u = self._uniform(6, self.num_envs)[:, env_ids].cpu()
+        u = self._uniform(5, self.num_envs)[:, env_ids].cpu()
         phase = torch.where(u[0] < 0.5, 0.0, 0.5)
         self.phase[env_ids] = phase.to(self.device)
         yaw, offset = (2 * u[1] - 1) * math.pi, 0.6 * (u[2:4] - 0.5)
@@ -266,14 +270,13 @@ class Quadruped(nn.Module):
         action = action.to(self.device, torch.float32).nan_to_num(0.0).clamp(-limit, limit)
         self._steer()
         self._store("phase", (self.phase + cfg.gait.frequency * cfg.dt).remainder(1.0))
-        scale = torch.tensor(cfg.gait.action_scale, device=self.device)
-        feet = foot_positions(self.phase, self.command, cfg.gait) + action.unflatten(-1, (4, 3)) * scale
-        self.physics.step(joint_angles(feet).cpu().double(), self.latency.cpu(), cfg.substeps)
-        sensed = Sensed(*(self._floats(value) for value in self.physics.sensed()))
+        targets = joint_targets(action, self.phase, self.command, cfg.gait)
+        self.physics.step(targets.cpu().double(), self.latency.cpu(), cfg.substeps)
+        sensed = self._sensed()
         self._store("episode_length", self.episode_length + 1)
         self._store("commanded", self.commanded + torch.linalg.vector_norm(self.command[:, :2], dim=-1) * cfg.dt)
         self._store("since_sight", self.since_sight + cfg.dt)
-        velocity = self._floats(self.physics.qvel[:, :3])
+        velocity = self._floats(self.physics.sensed_qvel[:, :3])  # of the sensors' instant
         self.odometry.step(velocity, sensed.sole_velocities, sensed.foot_forces, cfg.dt)
         outcome = self._evaluate(action, sensed)
         self._store("joint_velocities", self._floats(self.physics.qvel[:, 6:]))
@@ -285,16 +288,19 @@ class Quadruped(nn.Module):
         self._draw_noise()
         return outcome
 
+    def _sensed(self) -> Sensed:
+        """Return what the sensors measured, as float32 on the device."""
+        return Sensed(*(self._floats(value) for value in self.physics.sensed()))
+
     def _evaluate(self, action: Tensor, sensed: Sensed) -> Outcome:
-        """Return reward and endings of a step."""
-        cfg, rotation = self.cfg, rotation_matrix(self._qpos[:, 3:7])
+        """Return reward and endings of a step. No term combines sensors with the state, which is 5 ms later."""
+        cfg, T_map_base = self.cfg, self.T_map_base
         qvel = self._floats(self.physics.qvel)
-        upright = rotation[:, 2, 2]
-        fallen = (sensed.touches[:, 0] > 0) | (upright < math.cos(cfg.max_tilt)) | ~torch.isfinite(qvel).all(-1)
+        fallen = self._has_fallen(sensed)
         motion = Motion(
-            velocity=_to_yaw_frame(qvel[:, :3], rotation),
+            velocity=_to_yaw_frame(qvel[:, :3], T_map_base),
             angular_velocity=qvel[:, 3:6],
-            gravity=-rotation[:, 2],
+            gravity=-T_map_base[:, 2, :3],
             command=self.command,
             torques=sensed.torques,
             joint_acceleration=(qvel[:, 6:] - self.joint_velocities) / cfg.dt,
@@ -310,6 +316,12 @@ class Quadruped(nn.Module):
         timed_out = (self.episode_length >= cfg.max_episode_length) & ~fallen & ~crossed
         return Outcome(value.nan_to_num(0.0).clamp(-10.0, 10.0), crossed, fallen, timed_out)
 
+    def _has_fallen(self, sensed: Sensed) -> Tensor:
+        """Tell which robots lie on their base, tilt too far or have diverged (B,)."""
+        upright = rotation_matrix(self._qpos[:, 3:7])[:, 2, 2]
+        tilts = upright < math.cos(self.cfg.max_tilt)
+        return (sensed.touches[:, 0] > 0) | tilts | self.physics.diverged.to(self.device)
+
     def _has_crossed(self) -> Tensor:
         """Tell which robots are at the rim of their tile (B,)."""
         terrain = self.cfg.terrain
@@ -317,7 +329,7 @@ class Quadruped(nn.Module):
 
     def _steer(self) -> None:
         """Set the commanded yaw rate from the error of the heading (legged_gym)."""
-        cfg, forward = self.cfg.command, rotation_matrix(self._qpos[:, 3:7])[:, :2, 0]
+        cfg, forward = self.cfg.command, compute_heading(self.T_map_base)
         error = self.heading - torch.atan2(forward[:, 1], forward[:, 0])
         error = torch.remainder(error + math.pi, 2 * math.pi) - math.pi
         rate = (cfg.heading_gain * error).clamp(-cfg.max_yaw_rate, cfg.max_yaw_rate)
@@ -394,10 +406,12 @@ class Quadruped(nn.Module):
         )
         seen = {"policy": policy, **self.sight.read(view)}
         if critic:
-            sensed = Sensed(*(self._floats(value) for value in self.physics.sensed()))
+            sensed = self._sensed()
             velocity = (rotation.mT @ qvel[:, :3, None])[..., 0]
             stands = sensed.foot_forces > _CONTACT
-            seen["privileged"] = observe_privileged(velocity, stands, sensed.foot_velocities, self.latency)
+            sensed_rotation = rotation_matrix(self._floats(self.physics.sensed_qpos[:, 3:7]))
+            feet = sensed.foot_velocities @ sensed_rotation  # rows: v^T R = (R^T v)^T
+            seen["privileged"] = observe_privileged(velocity, stands, feet, self.latency)
             seen |= {f"true_{name}": value for name, value in self.truth.read(view).items()}
         return seen
 
@@ -433,9 +447,9 @@ class Quadruped(nn.Module):
         self.generator.set_state(state["generator"].cpu())
 
 
-def _to_yaw_frame(vector: Tensor, rotation: Tensor) -> Tensor:
+def _to_yaw_frame(vector: Tensor, T_map_base: Tensor) -> Tensor:
     """Return vectors (B, 3) of the map frame in the yaw frame of the base."""
-    forward = torch.nn.functional.normalize(rotation[:, :2, 0], dim=-1)
+    forward = compute_heading(T_map_base)
     ahead = (vector[:, :2] * forward).sum(-1)
     left = vector[:, 1] * forward[:, 0] - vector[:, 0] * forward[:, 1]
     return torch.stack([ahead, left, vector[:, 2]], -1)

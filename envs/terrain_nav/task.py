@@ -16,7 +16,7 @@ from envs.terrain_nav.course import make_rated_course
 from envs.terrain_nav.proprioception import observe_body
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
 from envs.terrain_nav.sight import SIGHTS, TruthSight
-from torchelev.errors import require
+from torchelev.errors import require, require_count
 
 NUM_ACTIONS = 2  # forward speed and yaw rate
 ENDINGS = ("success", "fallen", "stuck", "truncated")  # how an episode can end
@@ -61,7 +61,7 @@ class TerrainNav(nn.Module):
         compiled: Run the map's update compiled.
 
     Raises:
-        ValueError: `perception` is none of the three.
+        ValueError: `perception` is none of the three, or `num_envs` is not positive.
     """
 
     num_actions = NUM_ACTIONS
@@ -90,6 +90,7 @@ class TerrainNav(nn.Module):
         super().__init__()
         names = ", ".join(PERCEPTION)
         require(perception in PERCEPTION, "perception", f"must be one of {names}", repr(perception), "use 'map'")
+        num_envs = require_count("num_envs", num_envs, "give the number of robots")
         self.cfg, self.num_envs, self.perception = cfg or TerrainNavConfig(), num_envs, perception
         self.course = make_rated_course(self.cfg.course, device)
         self.ground = Ground(self.course.field, self.cfg.robot.reach)

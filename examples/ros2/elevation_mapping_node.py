@@ -51,7 +51,7 @@ class ElevationMapping(Node):
         )
         self.emap, self.stamp = ElevationMap(ElevationMapConfig(grid=grid)), None
         if self.settings["compile"]:
-            self.get_logger().info("compiling for up to a minute")
+            self.get_logger().info("compiling for one to three minutes")
             self.emap.compile()
             self.emap.warm_up(num_points=20_000)
         self.buffer = Buffer()

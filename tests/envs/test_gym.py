@@ -161,3 +161,11 @@ def test_a_strip_shows_ground_and_map_in_one_extent(tmp_path, monkeypatch):
     places = np.array([*(shot.xy for shot in shots), shots[0].goal])
     margins = np.concatenate([places.min(0) - [x_min, y_min], [x_max, y_max] - places.max(0)])
     assert margins.min() == pytest.approx(1.2), "as close as the path and the goal allow"
+
+
+@pytest.mark.parametrize("num_envs", [-3, 0])
+def test_a_number_of_robots_that_is_not_positive_is_refused(num_envs):
+    with pytest.raises(
+        ValueError, match=f"num_envs: must be a positive int, got {num_envs}; give the number of robots"
+    ):
+        gymnasium.make_vec(ID, num_envs=num_envs, cfg=CFG)

@@ -3,6 +3,7 @@
 import gc
 import weakref
 
+import numpy as np
 import pytest
 import torch
 
@@ -130,13 +131,21 @@ def test_goes_on_when_a_resumed_training_sets_the_counter(walking, resumed):
 
 @pytest.mark.parametrize(
     "ids, forgotten",
-    [(None, [0, 1, 2]), (slice(None), [0, 1, 2]), (slice(1, 3), [1, 2]), ([0, 2], [0, 2]), (torch.tensor([1]), [1])],
-)
+    [(None, [0, 1, 2]), (slice(None), [0, 1, 2]), (slice(1, 3), [1, 2]), ([0, 2], [0, 2]), (torch.tensor([1]), [1]),
+     ([], []), (torch.tensor([True, False, True]), [0, 2]), ([False, True, False], [1]),
+     (np.array([False, False, True]), [2])],
+)  # fmt: skip
 def test_takes_what_managers_pass_to_reset(walking, ids, forgotten):
     env, _, maps = walking
     start(env, maps)
     maps.reset(ids)
     assert [k for k in range(3) if known(maps)[k] == 0] == forgotten
+
+
+def test_refuses_a_mask_of_another_size(walking):
+    _, _, maps = walking
+    with pytest.raises(ValueError, match=r"mask: expected \(3,\).*got \(2,\)"):
+        maps.reset([True, False])
 
 
 def test_works_in_inference_mode_and_outside_of_it(walking):

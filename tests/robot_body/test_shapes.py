@@ -41,6 +41,8 @@ def test_lists_and_arrays_become_tuples_of_floats():
         (lambda: Box(**TRUNK | dict(half_lengths=(0.1, 0.0, 0.1))), ValueError, r"box\.half_lengths: must be positive"),
         (lambda: Box(**TRUNK | dict(center="abc")), ValueError, r"box\.center: must be 3 finite numbers, got 'abc'"),
         (lambda: Box(**TRUNK, quat_wxyz=(2.0, 0, 0, 0)), ValueError, r"box\.quat_wxyz: must have norm 1, got 2"),
+        (lambda: Box(**TRUNK, quat_wxyz=(1.0, 0)), ValueError, r"box\.quat_wxyz: must be 4 .*; give w, x, y, z$"),
+        (lambda: Box(**TRUNK | dict(center=(1.0,))), ValueError, r"box\.center: must be 3 finite .*; give metres$"),
         (lambda: RobotBody(), ValueError, "body: must have a capsule or a box"),
         (lambda: RobotBody(capsules=(Box(**TRUNK),)), TypeError, r"body\.capsules: must be a tuple .*Capsule"),
         (lambda: RobotBody(capsules=Capsule(**LEG)), TypeError, r"body\.capsules"),

@@ -61,6 +61,31 @@ def test_a_checkpoint_of_another_kind_is_refused_before_anything_changed(tmp_pat
     assert all(torch.equal(value, before[name]) for name, value in weights(other).items())
 
 
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", None])
+def test_a_damaged_checkpoint_is_refused(tmp_path, content):
+    make_runner(tmp_path, "blind").learn(1)
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:2000] if content is None else content)
+    with pytest.raises(
+        ValueError, match=r"checkpoint: must be a file that a training saved, got .*checkpoint.pt, which"
+    ):
+        make_runner(None, "blind").resume(path)
+
+
+def test_a_checkpoint_of_other_sizes_is_refused_before_anything_changed(tmp_path):
+    make_runner(tmp_path, "blind").learn(1)
+    path, other = tmp_path / CHECKPOINT, make_runner(None, "blind")
+    saved, before = torch.load(path, weights_only=False), weights(other)
+    name = next(name for name, value in saved["actor_state_dict"].items() if value.ndim == 2 and len(value) > 2)
+    saved["actor_state_dict"][name] = saved["actor_state_dict"][name][:-1]
+    torch.save(saved, path)
+    with pytest.raises(
+        ValueError, match=rf"checkpoint: the actor's {name} must be of size .*, got .*; use the settings"
+    ):
+        other.resume(path)
+    assert all(torch.equal(value, before[key]) for key, value in weights(other).items())
+
+
 def test_ctrl_c_leaves_a_checkpoint(tmp_path):
     runner = make_runner(tmp_path, "blind")
     log = runner.logger.log

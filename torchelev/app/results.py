@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import re
 import subprocess
@@ -48,7 +49,21 @@ def write_json(path: str | Path, values: dict[str, Any]) -> None:
     """Write a result as JSON, with the machine it was measured on; create the folder if needed."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     described = {"machine": None} | values | {"machine": machine()}  # not the machine of an older file
-    Path(path).write_text(json.dumps(described, indent=1) + "\n")
+    Path(path).write_text(to_json(described))
+
+
+def to_json(values: Any) -> str:
+    """Return values as strict JSON, which has no NaN and no infinity: null takes their place."""
+    return json.dumps(_finite(values), indent=1, allow_nan=False) + "\n"
+
+
+def _finite(values: Any) -> Any:
+    """Replace all floats within dicts, lists and tuples that are not finite by None."""
+    if isinstance(values, dict):
+        return {name: _finite(value) for name, value in values.items()}
+    if isinstance(values, (list, tuple)):
+        return [_finite(value) for value in values]
+    return None if isinstance(values, float) and not math.isfinite(values) else values
 
 
 def slug(name: str) -> str:

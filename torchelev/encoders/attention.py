@@ -48,7 +48,7 @@ class MapAttention(nn.Module):
         super().__init__()
         self.embed_dim, self.num_heads, self.patch = cfg.embed_dim, cfg.num_heads, cfg.patch
         self.rows, self.columns = layout.coordinates.shape[1:]
-        self.num_inputs, self.validity = len(layout.groups), -1 if layout.validity is None else layout.validity
+        self.validity = -1 if layout.validity is None else layout.validity
         self.mask_unknown = cfg.mask_unknown
         plain = len(layout.coordinates) + layout.channels
         rule = f"must exceed the {plain} coordinates and values of a point"

@@ -63,17 +63,21 @@ class StepMap:
 
     @torch.no_grad()
     def reset(self, env_ids: Any = None) -> None:
-        """Forget the maps of environments that begin anew: ids, a slice, or None for all."""
+        """Forget the maps of environments that begin anew: ids, a mask (B,) bool, a slice, or None for all."""
         self._has_begun = True
         if env_ids is None or isinstance(env_ids, slice):
             mask = torch.zeros_like(self._began)
             mask[slice(None) if env_ids is None else env_ids] = True
-            self.emap.reset(mask=mask)
-            self._began |= mask
-            return
-        ids = torch.as_tensor(env_ids, dtype=torch.int64, device=self.emap.device)
-        self.emap.reset(ids)
-        self._began.index_fill_(0, ids, True)
+        else:
+            chosen = torch.as_tensor(env_ids, device=self.emap.device)
+            if chosen.dtype != torch.bool:
+                ids = chosen.to(torch.int64)  # an empty list has floats
+                self.emap.reset(ids)
+                self._began.index_fill_(0, ids, True)
+                return
+            mask = chosen
+        self.emap.reset(mask=mask)
+        self._began |= mask
 
     @torch.no_grad()
     def advance(self, env: Any) -> None:
@@ -131,9 +135,9 @@ def to_cloud(hits: Float[Tensor, "B S N 3"], origin: Float[Tensor, "B S 3"], mis
 
 def join(clouds: list[Cloud]) -> Cloud:
     """Return the clouds of several sensors as one, the smaller ones padded with NaN points."""
-    most = max(cloud.points.shape[2] for cloud in clouds)
+    max_points = max(cloud.points.shape[2] for cloud in clouds)
     padded = [
-        torch.nn.functional.pad(cloud.points, (0, 0, 0, most - cloud.points.shape[2]), value=torch.nan)
+        torch.nn.functional.pad(cloud.points, (0, 0, 0, max_points - cloud.points.shape[2]), value=torch.nan)
         for cloud in clouds
     ]
     return Cloud(torch.cat(padded, 1), torch.cat([cloud.T_map_sensor for cloud in clouds], 1))

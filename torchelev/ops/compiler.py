@@ -142,14 +142,14 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
 
 @contextlib.contextmanager
 def announced_compilation() -> Iterator[None]:
-    """Say on stderr what is going on for a minute, and what it cost, if anything is compiled."""
+    """Say on stderr what is going on for minutes, and what it cost, if anything is compiled."""
     from torch._dynamo.callback import callback_handler
 
     starts: list[float] = []
 
     def announce(*_: Any) -> None:
         if not starts:
-            print("torchelev: compiling the update, for up to a minute ...", end=" ", file=sys.stderr, flush=True)
+            print("torchelev: compiling the update, for one to three minutes ...", end=" ", file=sys.stderr, flush=True)
         starts.append(time.perf_counter())
 
     callback_handler.register_start_callback(announce)

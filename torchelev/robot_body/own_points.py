@@ -31,15 +31,15 @@ def find_own_points(
 ) -> Bool[Tensor, "B S N"]:
     """Tell which points of the sensor frame lie on the robot, see `RobotBody`; `squared` is their squared distance.
 
-    The least excess decides, which is at most 0 where a shape is met: compiled code is slow at joining masks.
+    The smallest excess decides, which is at most 0 where a shape is met: compiled code is slow at joining masks.
     """
     pieces = _pieces_behind(x.detach(), y.detach(), z.detach(), squared.detach(), body.depth_tolerance)
-    least = torch.full_like(pieces.near, torch.inf)
+    min_excess = torch.full_like(pieces.near, torch.inf)
     for k in range(len(body.capsules)):
-        least = torch.minimum(least, _excess_of_capsule(pieces, posed, body, k))
+        min_excess = torch.minimum(min_excess, _excess_of_capsule(pieces, posed, body, k))
     for k in range(len(body.boxes)):
-        least = torch.minimum(least, _excess_of_box(pieces, posed, body, k))
-    return least <= 0
+        min_excess = torch.minimum(min_excess, _excess_of_box(pieces, posed, body, k))
+    return min_excess <= 0
 
 
 @stored

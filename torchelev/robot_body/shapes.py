@@ -10,11 +10,11 @@ from typing import Any
 from torchelev.errors import require, require_positive
 
 
-def _floats(name: str, value: Any, size: int) -> tuple[float, ...]:
+def _floats(name: str, value: Any, size: int, hint: str = "give metres") -> tuple[float, ...]:
     """Return finite numbers as a tuple of floats; ValueError for anything else."""
     values = tuple(value) if hasattr(value, "__iter__") and not isinstance(value, str) else (value,)
     numbers = all(isinstance(v, Real) and not isinstance(v, bool) and math.isfinite(v) for v in values)
-    require(numbers and len(values) == size, name, f"must be {size} finite numbers", repr(value), "give metres")
+    require(numbers and len(values) == size, name, f"must be {size} finite numbers", repr(value), hint)
     return tuple(float(v) for v in values)
 
 
@@ -55,8 +55,10 @@ class Box:
 
     def __post_init__(self) -> None:
         _require_link("box.link", self.link)
-        for name, size in (("center", 3), ("half_lengths", 3), ("quat_wxyz", 4)):
-            object.__setattr__(self, name, _floats(f"box.{name}", getattr(self, name), size))
+        for name in ("center", "half_lengths"):
+            object.__setattr__(self, name, _floats(f"box.{name}", getattr(self, name), 3))
+        quat_wxyz = _floats("box.quat_wxyz", self.quat_wxyz, 4, "give w, x, y, z")
+        object.__setattr__(self, "quat_wxyz", quat_wxyz)
         hint = "give half the side lengths in metres"
         require(min(self.half_lengths) > 0, "box.half_lengths", "must be positive", self.half_lengths, hint)
         norm = math.hypot(*self.quat_wxyz)

@@ -46,7 +46,7 @@ def evaluate(
 
     Returns:
         "all", "by_kind" and "by_level": the fraction of episodes by ending, and the mean forward speed by the one that
-        was commanded; and `episodes`.
+        was commanded, None where none was; and `episodes`. Kinds are called by what the robot meets.
     """
     task = Quadruped(cfg, episodes, device, perception, seed, compiled)
     levels = (torch.arange(episodes, device=task.device) // len(cfg.terrain.kinds)) % cfg.terrain.num_levels
@@ -56,7 +56,7 @@ def evaluate(
     walked, asked = torch.zeros(2, episodes, device=task.device)
     for _ in range(cfg.max_episode_length):
         command = task.command[:, 0].clone()
-        outcome = task.advance(policy(TensorDict(task.observe(), batch_size=[episodes])))
+        outcome = task.advance(policy(TensorDict(task.observe(critic=False), batch_size=[episodes])))
         going = ~endings.any(0)
         walked += task.forward_speed * going
         asked += command * going
@@ -65,25 +65,25 @@ def evaluate(
             break
         task.reset(outcome.done)
         task.sense()
-    tracking = walked / asked.clamp(min=1e-6)
-    kinds = {name: kind == k for k, name in enumerate(cfg.terrain.kinds)}
+    kinds = {name: kind == k for k, name in enumerate(cfg.terrain.labels)}
     by_level = {
-        name: {str(k): _summarize(endings, tracking, chosen & (level == k)) for k in range(cfg.terrain.num_levels)}
+        name: {str(k): _summarize(endings, walked, asked, chosen & (level == k)) for k in range(cfg.terrain.num_levels)}
         for name, chosen in kinds.items()
     }
-    by_kind = {name: _summarize(endings, tracking, chosen) for name, chosen in kinds.items()}
-    everything = _summarize(endings, tracking, torch.ones_like(kind, dtype=torch.bool))
+    by_kind = {name: _summarize(endings, walked, asked, chosen) for name, chosen in kinds.items()}
+    everything = _summarize(endings, walked, asked, torch.ones_like(kind, dtype=torch.bool))
     return {"all": everything, "by_kind": by_kind, "by_level": by_level, "episodes": episodes}
 
 
-def _summarize(endings: Tensor, tracking: Tensor, chosen: Tensor) -> dict[str, float | int]:
-    """Return the fractions of the chosen episodes by ending, and their mean speed by the commanded one."""
+def _summarize(endings: Tensor, walked: Tensor, asked: Tensor, chosen: Tensor) -> dict[str, float | None]:
+    """Return the fractions of the chosen episodes by ending, and what they walked by what was asked."""
     count = int(chosen.sum())
     shares = {
         name: round(float((ended & chosen).sum()) / max(1, count), 4)
         for name, ended in zip(ENDINGS, endings, strict=True)
     }
-    speed = round(float((tracking * chosen).sum()) / max(1, count), 4)
+    total_walked, total_asked = (float((value * chosen).sum()) for value in (walked, asked))
+    speed = round(total_walked / total_asked, 4) if total_asked else None
     return {**shares, "speed": speed, "episodes": count}
 
 
@@ -91,7 +91,12 @@ def table(result: dict[str, Any]) -> str:
     """Tabulate an evaluation by kind of terrain."""
     head = ["terrain", "crossed", "fallen", "timed out", "speed by command"]
     rows = [
-        [name, *(f"{100 * row[key]:.0f} %" for key in ENDINGS), f"{row['speed']:.2f}"]
+        [name, *(f"{100 * row[key]:.0f} %" for key in ENDINGS), _speed(row["speed"])]
         for name, row in (result["by_kind"] | {"all": result["all"]}).items()
     ]
     return markdown_table(head, rows)
+
+
+def _speed(speed: float | None) -> str:
+    """Return the speed by the commanded one, or a dash where none was commanded."""
+    return "–" if speed is None else f"{speed:.2f}"

@@ -13,21 +13,25 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import click
+import torch
 from tqdm import tqdm
 
 from envs.quadruped import QuadrupedConfig
 from envs.quadruped.config import PERCEPTION
 from torchelev.app.results import markdown_table, write_json
+from torchelev.errors import require
+from torchelev.sim import make_terrain
 from torchelev.viz.style import make_figure, save, styled
 from training import RESULTS
 from training.jobs import Job, train_all
 from training.options import jobs_option, runs_option
 from training.quadruped.evaluate import evaluate, stand_in_trot
-from training.quadruped.policy import load_policy
+from training.quadruped.policy import load_policy, sight_of
 from training.quadruped.train import ppo_config, task_config
 from training.runs import mean, read_scalars, spread
 
@@ -36,15 +40,7 @@ SEEDS = (0, 1)
 ITERATIONS, NUM_ENVS, EPISODES, WALKS = 500, 256, 560, 128
 CASES = [(perception, seed) for seed in SEEDS for perception in PERCEPTION]
 NAMES = {"map": "map in the loop", "truth": "truth with noise", "blind": "blind"}
-KINDS = {
-    "flat": "flat",
-    "rough": "rough",
-    "slope": "slopes",
-    "stairs_up": "stairs, down",  # the tile climbs towards its middle, where robots start
-    "stairs_down": "stairs, up",
-    "boxes": "boxes",
-    "gaps": "gaps",
-}
+KINDS = QuadrupedConfig().terrain.labels
 _BLOCK = 10  # iterations that a point of a learning curve averages
 
 
@@ -62,37 +58,56 @@ def _jobs(runs: Path) -> list[Job]:
 
 
 def walk_config() -> QuadrupedConfig:
-    """Return flat and rough tiles so wide that nobody crosses them within 20 s at the commanded 0.5 m/s."""
+    """Return flat and rough tiles with room for 20 s at 1.5 times the commanded 0.5 m/s."""
     cfg = task_config(held_out=True)
-    terrain = dataclasses.replace(cfg.terrain, kinds=("flat", "rough"), num_levels=4, length=24.0)
+    terrain = dataclasses.replace(cfg.terrain, kinds=("flat", "rough"), num_levels=4, length=32.0)
     return dataclasses.replace(cfg, terrain=terrain)
 
 
-def _deploy(policy: Any, sees: bool) -> dict[str, Any]:
-    """Deploy a policy over all kinds of terrain, and for 20 s on flat and rough ground; one that sees, by its map."""
-    perception = "map" if sees else "blind"
+def _deploy(policy: Any, perception: str) -> dict[str, Any]:
+    """Deploy a policy over all kinds of terrain, and for 20 s on flat and rough ground, with what it sees.
+
+    Raises:
+        ValueError: A robot has crossed its tile on flat or rough ground: its speed there would be of a shorter walk.
+    """
     crossing = evaluate(policy, task_config(held_out=True), perception, EPISODES, compiled=True)
-    return {"deployed": crossing, "walk": evaluate(policy, walk_config(), perception, WALKS, compiled=True)["by_kind"]}
+    walk = evaluate(policy, walk_config(), perception, WALKS, compiled=True)["by_kind"]
+    for kind, row in walk.items():
+        actual, hint = f"{100 * row['crossed']:.3g} % crossed", "lengthen the tiles of walk_config"
+        require(row["crossed"] == 0, f"walk, {kind}", "must end before the rim of the tile", actual, hint)
+    return {"deployed": crossing, "walk": walk}
 
 
 def _deploy_all(runs: Path) -> dict[str, Any]:
     """Deploy every policy on held-out ground, and the trot that none of them has modified."""
     cfg = task_config(held_out=True)
-    rows = [_kept(_folder(runs, *case) / "deployed.json", functools.partial(_row, runs, *case)) for case in tqdm(CASES)]
+    rows = []
+    for case in tqdm(CASES):
+        folder = _folder(runs, *case)
+        rows.append(_kept(folder / "deployed.json", functools.partial(_row, runs, *case), folder / "policy.pt"))
     fixed = {
         "seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS,
         "levels": cfg.terrain.num_levels, "difficulty": cfg.terrain.difficulty,
     }  # fmt: skip
-    trot = _kept(runs / "trot.json", lambda: _deploy(stand_in_trot, sees=False))
+    trot = _kept(runs / "trot.json", lambda: _deploy(stand_in_trot, "blind"))
     return {"config": fixed, "trot": trot, "rows": rows}
 
 
-def _kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return what the file holds; made and written there the first time."""
-    if not path.exists():
-        text = json.dumps(make())
-        path.write_text(text)
-    return json.loads(path.read_text())
+def _kept(path: Path, make: Callable[[], dict[str, Any]], policy: Path | None = None) -> dict[str, Any]:
+    """Return the result that the file holds, made anew and written there if it came from other settings or weights."""
+    source = json.loads(json.dumps(_settings() | {"policy": policy and sha256(policy.read_bytes()).hexdigest()}))
+    kept = json.loads(path.read_text()) if path.exists() else {}
+    if kept.get("source") != source:
+        kept = {"source": source, "result": make()}
+        path.write_text(json.dumps(kept))
+    return json.loads(json.dumps(kept["result"]))
+
+
+def _settings() -> dict[str, Any]:
+    """Return what the result of a deployment depends on, besides the policy."""
+    tasks = {"crossing": task_config(held_out=True), "walk": walk_config()}
+    constants = {"iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS}
+    return constants | {name: dataclasses.asdict(cfg) for name, cfg in tasks.items()}
 
 
 def _row(runs: Path, perception: str, seed: int) -> dict[str, Any]:
@@ -100,7 +115,7 @@ def _row(runs: Path, perception: str, seed: int) -> dict[str, Any]:
     cfg, folder = task_config(held_out=True), _folder(runs, perception, seed)
     policy = load_policy(folder / "policy.pt", cfg)
     training = json.loads((folder / "result.json").read_text())["training"]
-    row = {"perception": perception, "seed": seed, "training": training} | _deploy(policy, perception != "blind")
+    row = {"perception": perception, "seed": seed, "training": training} | _deploy(policy, sight_of(perception))
     is_own = perception != "truth"
     own = row["deployed"]["all"] if is_own else evaluate(policy, cfg, perception, EPISODES)["all"]
     return row | {"own": own, "curve": read_curve(folder)}
@@ -120,7 +135,7 @@ def read_curve(folder: Path) -> dict[str, list[float]]:
 
 def table(result: dict[str, Any]) -> str:
     """Tabulate the crossed tiles by kind of terrain: the mean over the seeds, and the lowest and highest of all."""
-    head = ["trained with", "crossed", *(KINDS[kind].replace(",", "") for kind in KINDS), "fallen", "as trained"]
+    head = ["trained with", "crossed", *KINDS, "fallen", "as trained"]
     lines = []
     for perception in PERCEPTION:
         rows = _rows(result, perception)
@@ -132,6 +147,18 @@ def table(result: dict[str, Any]) -> str:
     alone = [_percent(trot["by_kind"][kind]["crossed"]) for kind in KINDS]
     ends = [_percent(trot["all"][name]) for name in ("crossed", "fallen")]
     return markdown_table(head, [*lines, ["(the trot alone)", ends[0], *alone, ends[1], ""]])
+
+
+def stairs_table(result: dict[str, Any]) -> str:
+    """Tabulate the stairs that each policy crossed, by their height: a percentage for each seed."""
+    head = ["crossed [%], by seed", *(f"{height:.1f} cm" for height in stair_heights(result["config"]))]
+    lines = []
+    for kind in ("stairs up", "stairs down"):
+        for perception in PERCEPTION:
+            by_level = [row["deployed"]["by_level"][kind].values() for row in _rows(result, perception)]
+            cells = [", ".join(f"{100 * of['crossed']:.0f}" for of in level) for level in zip(*by_level, strict=True)]
+            lines.append([f"{kind}: {NAMES[perception]}", *cells])
+    return markdown_table(head, lines)
 
 
 def walk_table(result: dict[str, Any]) -> str:
@@ -178,9 +205,26 @@ def plot(result: dict[str, Any], path: Path) -> None:
             rows = [row["deployed"]["by_level"][kind] for row in _rows(result, perception)]
             crossed = [mean([row[str(level)]["crossed"] for row in rows]) for level in levels]
             axes.plot(levels, crossed, "o-", color=colors[perception], linewidth=1.2, markersize=3)
-        axes.set(title=KINDS[kind], ylim=(-0.04, 1.04), xticks=levels)
-        axes.set(xlabel="level" if place >= 3 else None, ylabel="crossed" if place % 3 == 0 else None)
+        axes.set(title=kind, ylim=(-0.04, 1.04), xticks=levels, xlabel="level")
+        if kind.startswith("stairs"):
+            axes.set_xticks(levels, [f"{height:.0f}" for height in stair_heights(result["config"])])
+            axes.set_xlabel("height of a stair [cm]")
+        axes.set_ylabel(f"crossed, of {_per_point(result)}" if place % 3 == 0 else "")
     save(figure, path)
+
+
+def stair_heights(config: dict[str, Any]) -> list[float]:
+    """Return the height of a stair [cm] at each level."""
+    first, last = config["difficulty"]
+    difficulty = torch.linspace(first, last, config["levels"])
+    tiles = make_terrain("stairs_down", difficulty, resolution=0.1).field.heights  # 0 in the middle
+    return [100 * float(heights[heights > 0].min()) for heights in tiles]
+
+
+def _per_point(result: dict[str, Any]) -> int:
+    """Return the number of episodes, over the seeds, of a kind and level."""
+    rows = _rows(result, PERCEPTION[0])
+    return sum(row["deployed"]["by_level"][KINDS[0]]["0"]["episodes"] for row in rows)
 
 
 @click.command(help=__doc__)
@@ -192,7 +236,7 @@ def main(runs: Path, jobs: int) -> None:
     result = _deploy_all(runs)
     write_json(RESULTS / "quadruped.json", result)
     plot(result, RESULTS / "quadruped.png")
-    click.echo(f"{table(result)}\n\n{walk_table(result)}")
+    click.echo("\n\n".join(make(result) for make in (table, stairs_table, walk_table)))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from envs.quadruped import Quadruped, QuadrupedConfig
 from envs.quadruped.render import draw, save_strip, save_video
 from torchelev.errors import require
-from training.quadruped.policy import Policy
+from training.quadruped.policy import Policy, sight_of
 
 _EVERY = 2  # steps between two pictures: 25 a second
 
@@ -21,36 +21,38 @@ def play(
     policy: Policy,
     cfg: QuadrupedConfig,
     path: Path,
-    kind: str = "stairs_up",
+    kind: str = "stairs up",
     level: int = 3,
     seconds: float = 8.0,
     seed: int = 0,
+    perception: str = "map",
 ) -> None:
-    """Walk with the map in the loop and draw it.
+    """Walk and draw it, with the map over the ground if the policy sees it.
 
     Args:
         policy: Maps an observation to actions.
         cfg: The task.
         path: Where to write: .webp is a moving picture, .png a strip of five.
-        kind: Kind of terrain.
+        kind: Kind of terrain by what the robot meets, one of `cfg.terrain.labels`.
         level: Difficulty, from 0.
         seconds: Duration.
         seed: Of start, body and noise.
+        perception: With which the policy was trained. A blind one walks blind, others with the map.
 
     Raises:
         ValueError: There is no such kind or level.
         RuntimeError: MuJoCo finds no OpenGL.
     """
-    kinds = cfg.terrain.kinds
+    kinds = cfg.terrain.labels
     require(kind in kinds, "kind", f"must be one of {', '.join(kinds)}", kind, "choose one of them")
     fits = 0 <= level < cfg.terrain.num_levels
     require(fits, "level", f"must be from 0 to {cfg.terrain.num_levels - 1}", level, "choose one of them")
-    task = Quadruped(cfg, 1, perception="map", seed=seed)
+    task = Quadruped(cfg, 1, perception=sight_of(perception), seed=seed)
     task.kind.fill_(kinds.index(kind))
     task.place_at(torch.full((1,), level))
     pictures = [draw(task)]
     for step in tqdm(range(round(seconds / cfg.dt)), unit="step"):
-        outcome = task.advance(policy(TensorDict(task.observe(), batch_size=[1])))
+        outcome = task.advance(policy(TensorDict(task.observe(critic=False), batch_size=[1])))
         if step % _EVERY == 0:
             pictures.append(draw(task))
         if bool(outcome.done):

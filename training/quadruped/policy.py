@@ -6,6 +6,7 @@ import json
 import logging
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from envs.quadruped import QuadrupedConfig
 from envs.quadruped.sight import make_scans
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.observations.scan_layout import require_layout, scan_layout
 from training.runner import ResumableRunner
 
@@ -26,10 +27,28 @@ _TOLERANCE = 1e-5  # largest difference of an action
 Policy = Callable[[Any], Tensor]
 
 
-def layout_of(cfg: QuadrupedConfig) -> dict[str, Any]:
-    """Describe what a policy of this task reads: its groups in order, and the layout of each scan."""
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """An exported policy, which returns the actions (B, 12) for an observation."""
+
+    network: Policy  #: takes the groups side by side (B, 293)
+    perception: str | None  #: with which it was trained: "map", "truth" or "blind"; None where the file does not say
+
+    def __call__(self, observation: Any) -> Tensor:
+        """Return the actions for an observation of the task."""
+        return self.network(join(observation))
+
+
+def sight_of(perception: str) -> str:
+    """Return the perception with which a policy is deployed: a blind one stays blind, the others see the map."""
+    return "blind" if perception == "blind" else "map"
+
+
+def layout_of(cfg: QuadrupedConfig, perception: str) -> dict[str, Any]:
+    """Describe what a policy of this task reads: its perception, its groups in order, and the layout of each scan."""
     scan, feet = make_scans(cfg)
-    return {"groups": list(GROUPS), "height_scan": scan_layout(scan), "feet": scan_layout(feet)}
+    scans = {"height_scan": scan_layout(scan), "feet": scan_layout(feet)}
+    return {"perception": perception, "groups": list(GROUPS), **scans}
 
 
 def join(observation: Any) -> Tensor:
@@ -38,14 +57,14 @@ def join(observation: Any) -> Tensor:
 
 
 def export(runner: ResumableRunner, cfg: QuadrupedConfig, folder: Path) -> None:
-    """Write policy.pt (TorchScript) and policy.onnx to a folder, each with its layout.
+    """Write policy.pt (TorchScript) and policy.onnx to a folder, each with its layout and perception.
 
     Both take the groups side by side, "policy" (50), "height_scan" (187), "feet" (56), and return actions.
 
     Raises:
         ValueError: An exported policy returns other actions than the trained one.
     """
-    layout = json.dumps(layout_of(cfg))
+    layout = json.dumps(layout_of(cfg, runner.env.task.perception))
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns about packages that are not installed
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporters warn about their own deprecations
@@ -75,25 +94,28 @@ def _add_metadata(path: Path, layout: str) -> None:
     path.with_name(f"{path.name}.data").unlink(missing_ok=True)  # the weights are in the file itself now
 
 
-def load_policy(path: Path, cfg: QuadrupedConfig) -> Policy:
+def load_policy(path: Path, cfg: QuadrupedConfig) -> LoadedPolicy:
     """Return an exported TorchScript policy, which takes observations of this task.
 
     Raises:
-        ValueError: The file has no layout, or the task's scans are laid out otherwise than those of the training.
+        ValueError: The file is no TorchScript or has no layout, or the task's scans are laid out otherwise than those
+            of the training.
     """
-    files = {LAYOUT: ""}
+    files, hint = {LAYOUT: ""}, "give a policy.pt that python -m training.quadruped wrote"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scripted = torch.jit.load(str(path), map_location="cpu", _extra_files=files)
-    require(
-        bool(files[LAYOUT]), str(path), "must hold the layout of its scans", "none", "export it with training.quadruped"
-    )
+        try:
+            scripted = torch.jit.load(str(path), map_location="cpu", _extra_files=files)
+        except RuntimeError:
+            rule = "must be a policy in TorchScript"
+            raise ValueError(message(str(path), rule, "another or a damaged file", hint)) from None
+    require(bool(files[LAYOUT]), str(path), "must hold the layout of its scans", "none", hint)
     layout = json.loads(files[LAYOUT])
     groups = tuple(layout["groups"])
     require(groups == GROUPS, "groups", f"must be {GROUPS}", groups, "use the version that exported the policy")
     for name, scan in zip(("height_scan", "feet"), make_scans(cfg), strict=True):
         require_layout(scan, layout[name], name)
-    return lambda observation: scripted(join(observation))
+    return LoadedPolicy(scripted, layout.get("perception"))
 
 
 def run_onnx(path: Path, observation: Any, count: int = 4) -> np.ndarray:

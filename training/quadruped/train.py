@@ -13,15 +13,15 @@ import torch
 from envs.quadruped import Quadruped, QuadrupedConfig
 from envs.quadruped.config import PERCEPTION
 from envs.quadruped.rsl_rl import RslRlQuadruped
+from torchelev.errors import require
 from training.quadruped.evaluate import evaluate, table
 from training.quadruped.play import play
-from training.quadruped.policy import export, load_policy
+from training.quadruped.policy import GROUPS, LoadedPolicy, export, load_policy, sight_of
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
 
 _POSITIVE = click.IntRange(min=1)
 _HELD_OUT_SEED = 1001  # of the terrain
-ACTOR = ("policy", "height_scan", "feet")
 CRITIC = ("policy", "privileged", "true_height_scan", "true_feet")
 
 
@@ -32,7 +32,7 @@ def ppo_config(save_interval: int = 25) -> dict[str, Any]:
     return {
         "num_steps_per_env": 24,
         "save_interval": save_interval,
-        "obs_groups": {"actor": list(ACTOR), "critic": list(CRITIC)},
+        "obs_groups": {"actor": list(GROUPS), "critic": list(CRITIC)},
         "algorithm": {
             "class_name": "PPO",
             "num_learning_epochs": 4,
@@ -99,7 +99,9 @@ def make_runner(
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="Do not train: walk with this policy.pt and write OUT/walk.webp.",
 )
-@click.option("--kind", default="stairs_up", show_default=True, help="Kind of terrain for --play.")
+@click.option(
+    "--kind", default="stairs up", show_default=True, help="What the robot meets in --play, such as 'stairs down'."
+)
 @click.option("--level", default=3, show_default=True, help="Difficulty for --play, from 0 to 7.")
 def main(
     num_envs: int,
@@ -153,17 +155,30 @@ def _play(policy: Path, out: Path, kind: str, level: int, seed: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     cfg = task_config(held_out=True)
     try:
-        play(load_policy(policy, cfg), cfg, out / "walk.webp", kind, level, seed=seed)
+        loaded = load_policy(policy, cfg)
+        perception = _trained_with(loaded, policy)
+        play(loaded, cfg, out / "walk.webp", kind, level, seed=seed, perception=perception)
     except (ValueError, RuntimeError) as error:
         raise click.ClickException(str(error)) from None
-    click.echo(f"Wrote {out / 'walk.webp'}.")
+    click.echo(f"Wrote {out / 'walk.webp'}, {'blind' if perception == 'blind' else 'with the map in the loop'}.")
+
+
+def _trained_with(policy: LoadedPolicy, path: Path) -> str:
+    """Return the perception of a policy's training.
+
+    Raises:
+        ValueError: The file does not say.
+    """
+    hint = "export it again: python -m training.quadruped --resume --out with its folder"
+    require(policy.perception is not None, str(path), "must hold the perception of its training", "none", hint)
+    return str(policy.perception)
 
 
 def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> None:
     """Evaluate with the map in the loop, or blind, write the result and export the policy."""
     policy = runner.get_inference_policy(device=runner.device)
-    perception = "blind" if runner.env.task.perception == "blind" else "map"
-    result = evaluate(policy, task_config(held_out=True), perception, episodes, runner.device, compiled)
+    sight = sight_of(runner.env.task.perception)
+    result = evaluate(policy, task_config(held_out=True), sight, episodes, runner.device, compiled)
     click.echo(table(result))
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
     write_result(out / "result.json", {"training": training, "evaluation": result})

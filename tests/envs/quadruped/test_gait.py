@@ -3,7 +3,8 @@
 import torch
 
 from envs.quadruped.config import GaitConfig
-from envs.quadruped.gait import foot_positions
+from envs.quadruped.gait import foot_positions, joint_targets
+from envs.quadruped.kinematics import feet_from_joints
 
 GAIT = GaitConfig()
 
@@ -37,3 +38,13 @@ def test_mirrored_commands_give_mirrored_feet():
     left = foot_positions(torch.tensor([0.3]), torch.tensor([[0.4, 0.2, 0.5]]), GAIT)
     right = foot_positions(torch.tensor([0.8]), torch.tensor([[0.4, -0.2, -0.5]]), GAIT)
     torch.testing.assert_close(left, right[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1.0, 1.0]))
+
+
+def test_joint_targets_put_the_feet_where_the_action_asks():
+    phase, command = torch.tensor([0.2]), torch.tensor([[0.3, 0.0, 0.1]])
+    action = torch.tensor([[0.1, 0.2, 0.3] * 4])
+    feet = feet_from_joints(joint_targets(action, phase, command, GAIT))
+    expected = foot_positions(phase, command, GAIT) + 0.1 * torch.tensor([0.08, 0.1, 0.24])
+    torch.testing.assert_close(feet, expected, atol=1e-5, rtol=0)
+    largest, larger = (joint_targets(torch.full((1, 12), size), phase, command, GAIT) for size in (3.0, 9.0))
+    torch.testing.assert_close(larger, largest)

@@ -54,3 +54,11 @@ def test_rsl_rl_gets_the_groups_and_time_outs():
     env.episode_length_buf = torch.tensor([env.max_episode_length - 1, 0])
     _, _, dones, extras = env.step(torch.zeros(2, 12))
     assert dones.tolist() == [1, 0] and extras["time_outs"].tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("num_envs", [-3, 0])
+def test_a_number_of_robots_that_is_not_positive_is_refused(num_envs):
+    with pytest.raises(
+        ValueError, match=f"num_envs: must be a positive int, got {num_envs}; give the number of robots"
+    ):
+        gymnasium.make_vec(ID, num_envs=num_envs, cfg=CFG)

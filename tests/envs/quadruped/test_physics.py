@@ -81,6 +81,40 @@ def test_latency_delays_the_targets():
     assert moved[0] > moved[1] > moved[2]
 
 
+@pytest.mark.parametrize("num_steps", [1, 4])
+def test_the_sensors_belong_to_the_sensed_state(num_steps):
+    physics = Physics(TERRAIN, 1, SAME, num_threads=1)
+    qpos = standing(physics, [0])
+    physics.place([0], qpos, torch.zeros(1, 18), torch.zeros(1, dtype=torch.int64))
+    assert torch.equal(physics.sensed_state, physics.state)
+    for _ in range(8):
+        physics.step(qpos[:, 7:] + 0.2, torch.zeros(1, dtype=torch.int64), num_steps)
+    model, velocities = physics.models[0], []
+    data = mujoco.MjData(model)
+    for state in (physics.sensed_state, physics.state):
+        mujoco.mj_setState(model, data, state[0].numpy(), mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_forward(model, data)
+        velocities.append(torch.from_numpy(data.sensordata[:12].copy()).view(4, 3))
+    torch.testing.assert_close(physics.sensed().foot_velocities[0], velocities[0], rtol=0, atol=1e-9)
+    assert (velocities[1] - velocities[0]).abs().max() > 1e-4, "the last state is another one"
+
+
+@pytest.mark.parametrize("steps, num_steps", [(0, 1), (0, 4), (2, 4)])
+def test_a_state_that_mujoco_resets_has_diverged(steps, num_steps, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
+    physics = Physics(TERRAIN, 3, SAME, num_threads=1)
+    qpos, late = standing(physics, [0, 1, 2]), torch.zeros(3, dtype=torch.int64)
+    physics.place([0, 1, 2], qpos, torch.zeros(3, 18), torch.zeros(3, dtype=torch.int64))
+    for _ in range(steps):
+        physics.step(qpos[:, 7:], late, num_steps)
+        assert not physics.diverged.any()
+    physics.qvel[0, 3], physics.qvel[2, 12] = torch.nan, 1e9
+    physics.step(qpos[:, 7:], late, num_steps)
+    assert physics.diverged.tolist() == [True, False, True] and physics.state.isfinite().all()
+    physics.place([0, 2], qpos[[0, 2]], torch.zeros(2, 18), torch.zeros(2, dtype=torch.int64))
+    assert not physics.diverged.any()
+
+
 def test_bodies_differ_and_the_seed_repeats_them():
     a, b, c = (Physics(TERRAIN, 1, RandomConfig(), seed) for seed in (0, 0, 1))
     masses = [[model.body_mass.sum() for model in physics.models] for physics in (a, b, c)]

@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from envs.quadruped import Quadruped
+from envs.quadruped.config import SightConfig
 from envs.quadruped.height_noise import HeightNoise
-from envs.quadruped.sight import make_sensors
+from envs.quadruped.sight import make_sensors, sensor_errors
 from tests.envs.quadruped.cases import CFG, FLAT_CFG
+from torchelev.sim import preset
 
 
 def test_true_heights_are_those_below_the_pattern():
@@ -37,13 +39,21 @@ def test_foot_rings_on_flat_ground_read_the_height_of_each_foot():
 
 
 def test_the_map_reads_the_ground_that_it_has_seen():
-    task = Quadruped(FLAT_CFG, 2, perception="map", seed=1)
+    task = Quadruped(CFG, 4, perception="map", seed=1)
+    task.place_at(torch.ones(4, dtype=torch.int64))
+    task.physics.state[:, 1] += 1.2  # [m] from the middle to the stairs
+    ground = task.terrain.field.height(task.tile_ids, task.T_map_base[:, None, :2, 3])
+    task.physics.state[:, 3] = ground[:, 0].double() + 0.34
     for _ in range(40):
-        task.advance(torch.zeros(2, 12))
+        task.advance(torch.zeros(4, 12))
         task.sense()
+    _, valid = task.sight.scan(task.sight.emap, task.view().T_estimated)
     seen = task.observe()
     error = (seen["height_scan"] - seen["true_height_scan"]).abs()
-    assert error.median() < 0.02
+    for k, kind in enumerate(CFG.terrain.kinds):
+        known = valid & (task.kind == k)[:, None]
+        assert known.sum() > 0.4 * 2 * 187 and error[known].median() < 0.02, kind
+    assert (seen["true_height_scan"][task.kind == 1].std(-1) > 0.05).all(), "no plane that a guess could meet"
 
 
 def test_blind_robots_read_zeros_in_the_same_shapes():
@@ -88,15 +98,54 @@ def test_height_offsets_hold_through_an_episode():
     assert torch.equal(noise.offset[1:], before[1:]) and not torch.equal(noise.offset[:1], before[:1])
 
 
-def test_a_lidar_is_a_preset():
-    cfg = dataclasses.replace(
-        CFG, sight=dataclasses.replace(CFG.sight, sensors="lidar", sensor_errors="spinning_lidar")
-    )
+def test_true_heights_keep_the_clip_of_the_scan():
+    task = Quadruped(CFG, 1, perception="blind")
+    view = task.view()
+    task.truth.scan = dataclasses.replace(task.truth.scan, clip=0.01, nominal_height=0.0)
+    read = task.truth.read(view)
+    torch.testing.assert_close(read["height_scan"], torch.full((1, 187), 0.01))
+    task.truth.foot_scan = dataclasses.replace(task.truth.foot_scan, clip=None)
+    assert torch.equal(task.truth.read(view)["feet"], read["feet"])
+
+
+def test_resets_need_no_synchronisation():
+    sight = Quadruped(CFG, 2, perception="map").sight
+    given = []
+    sight.emap.reset = lambda *args, **kwargs: given.append((args, kwargs))
+    mask = torch.tensor([True, False])
+    sight.reset(mask)
+    assert given == [((), {"mask": mask})]
+
+
+def with_sight(**changes):
+    return dataclasses.replace(CFG, sight=dataclasses.replace(CFG.sight, **changes))
+
+
+def test_a_lidar_is_a_preset_with_errors_of_its_own():
+    cfg = with_sight(sensors="lidar")
     assert len(make_sensors(cfg)) == 1 and len(make_sensors(CFG)) == 2
     task = Quadruped(cfg, 1, perception="map")
     for _ in range(8):
         task.advance(torch.zeros(1, 12))
         task.sense()
     assert task.sight.emap.layer("validity").sum() > 100
+    seen = task.sight.look(task.view())
+    hit, kept = (points.isfinite().all(-1) for points in (seen.ideal, seen.points))
+    assert kept.sum() > 0.9 * hit.sum()
+    behind = hit & (seen.ideal[..., 0] < -0.3)
+    assert kept[behind].sum() > 0.9 * behind.sum() > 50
+
+
+def test_only_cameras_pick_pixels_that_straddle_edges():
+    lidar, camera = sensor_errors(with_sight(sensors="lidar")), sensor_errors(CFG)
+    assert lidar.flying == preset("spinning_lidar").sensor.flying
+    assert camera.flying[1] == pytest.approx(0.8 * CFG.sight.camera_pixels[0] / 848)
+    assert camera.disparity_step > 0 and lidar.disparity_step == 0
+
+
+def test_sensors_that_do_not_fit_are_refused():
+    words = r"sight.sensor_errors: must not be those of a camera if sensors='lidar', got 'depth_camera'; leave it out"
+    with pytest.raises(ValueError, match=words):
+        SightConfig(sensors="lidar", sensor_errors="depth_camera")
     with pytest.raises(ValueError, match="sight.sensors: must be one of depth_cameras, lidar"):
-        dataclasses.replace(CFG, sight=dataclasses.replace(CFG.sight, sensors="sonar"))
+        SightConfig(sensors="sonar")

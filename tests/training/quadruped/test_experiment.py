@@ -1,10 +1,12 @@
 """The comparison of perceptions: its trainings, its tables and its figure."""
 
+import dataclasses
 import json
 
 import pytest
 
 from envs.quadruped.config import PERCEPTION
+from torchelev.viz.style import save
 from training.quadruped import experiment
 
 LEVELS = 2
@@ -36,7 +38,8 @@ def result():
         curve = {"steps": [100, 200], "level": [0.0, 5 * crossed], "crossed": [0.0, crossed]}
         row = {"perception": perception, "seed": seed, "training": {"steps": 6000, "seconds": 120.0}, "curve": curve}
         rows.append(row | deployment(crossed) | {"own": summary(crossed)})
-    return {"config": {"seeds": [0, 1], "levels": LEVELS}, "rows": rows, "trot": deployment(0.25)}
+    config = {"seeds": [0, 1], "levels": LEVELS, "difficulty": [0.0, 0.5]}
+    return {"config": config, "rows": rows, "trot": deployment(0.25)}
 
 
 def test_every_perception_gets_the_same_training(tmp_path):
@@ -46,24 +49,72 @@ def test_every_perception_gets_the_same_training(tmp_path):
     assert all(others.count(other) == len(PERCEPTION) for other in others)
 
 
-def test_nobody_crosses_a_tile_of_the_long_walk():
+def test_the_long_walk_has_room_for_robots_faster_than_commanded():
     cfg = experiment.walk_config()
-    fastest = cfg.command.forward[1] * cfg.episode_length
-    assert cfg.command.forward == (0.5, 0.5) and cfg.terrain.length / 2 - cfg.terrain.rim - 0.3 > fastest
+    commanded = cfg.command.forward[1] * cfg.episode_length
+    assert cfg.command.forward == (0.5, 0.5) and cfg.terrain.length / 2 - cfg.terrain.rim - 0.3 > 1.5 * commanded
+
+
+def test_a_walk_that_ends_at_the_rim_is_refused(monkeypatch):
+    def fake(policy, cfg, *rest, **options):
+        return {"all": summary(1.0), "by_kind": {"flat": summary(0.0), "rough": summary(0.05 if rim else 0.0)}}
+
+    monkeypatch.setattr(experiment, "evaluate", fake)
+    rim = False
+    assert set(experiment._deploy(None, "blind")["walk"]) == {"flat", "rough"}
+    rim = True
+    with pytest.raises(ValueError, match=r"walk, rough: must end before the rim .* got 5 % crossed; .*walk_config"):
+        experiment._deploy(None, "blind")
+
+
+def test_a_kept_result_is_made_anew_when_its_constants_or_its_policy_change(tmp_path, monkeypatch):
+    folder, made = tmp_path / "map-0", []
+    folder.mkdir()
+    weights = folder / "policy.pt"
+    weights.write_bytes(b"one")
+
+    def make():
+        made.append(len(made))
+        return {"number": made[-1]}
+
+    def kept():
+        return experiment._kept(folder / "deployed.json", make, weights)["number"]
+
+    assert [kept(), kept()] == [0, 0]
+    weights.write_bytes(b"two")
+    assert [kept(), kept()] == [1, 1]
+    monkeypatch.setattr(experiment, "WALKS", 3)
+    assert [kept(), kept()] == [2, 2]
+    cfg = experiment.task_config(held_out=True)
+    monkeypatch.setattr(experiment, "task_config", lambda held_out: dataclasses.replace(cfg, max_tilt=0.9))
+    assert [kept(), kept()] == [3, 3]
+    (folder / "deployed.json").write_text('{"number": 9}')  # of a version that kept no more
+    assert kept() == 4
 
 
 def test_the_tables_have_the_mean_and_the_extremes():
     lines = experiment.table(result()).split("\n")
     assert lines[2].startswith("| map in the loop | 60.0 % (50.0 to 70.0) | 60 % | 60 % |")
     assert lines[5].startswith("| (the trot alone) | 25 % | 25 % |") and lines[5].endswith("| 75 % |  |")
+    stairs = experiment.stairs_table(result()).split("\n")
+    assert stairs[0] == "| crossed [%], by seed | 5.0 cm | 14.0 cm |" and len(stairs) == 2 + 2 * len(PERCEPTION)
+    assert stairs[2] == "| stairs up: map in the loop | 50, 70 | 25, 35 |"
+    assert stairs[-1] == "| stairs down: blind | 30, 50 | 15, 25 |"
     walked = experiment.walk_table(result()).split("\n")
     assert walked[4] == "| blind | 0.90 | 0.0 % | 0.80 | 25.0 % |" and len(walked) == 5
 
 
 @pytest.mark.slow(2)
-def test_the_figure_is_drawn(tmp_path):
+def test_the_figure_is_drawn_over_the_heights_of_stairs(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(experiment, "save", lambda figure, path: figures.append(figure) or save(figure, path))
     experiment.plot(result(), tmp_path / "quadruped.png")
     assert (tmp_path / "quadruped.png").stat().st_size > 5000 and (tmp_path / "quadruped.svg").exists()
+    panels = {axes.get_title(): axes for axes in figures[0].axes}
+    for kind in ("stairs up", "stairs down"):
+        assert panels[kind].get_xlabel() == "height of a stair [cm]"
+        assert [label.get_text() for label in panels[kind].get_xticklabels()] == ["5", "14"]
+    assert panels["boxes"].get_xlabel() == "level" and panels["rough"].get_ylabel() == "crossed, of 16"
 
 
 def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
@@ -71,6 +122,7 @@ def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
     for perception, seed in experiment.CASES:
         folder = experiment._folder(tmp_path, perception, seed)
         folder.mkdir()
+        (folder / "policy.pt").write_bytes(b"weights")
         (folder / "result.json").write_text(json.dumps({"training": {"steps": 1, "seconds": seed}}))
 
     def fake(policy, cfg, perception, *rest, **options):

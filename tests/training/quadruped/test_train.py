@@ -2,14 +2,19 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 import torch
 from click.testing import CliRunner
 
 from envs.quadruped import Quadruped
+from envs.quadruped.config import TerrainConfig
 from tests.envs.quadruped.cases import CFG
-from training.quadruped import evaluate, policy, train
+from torchelev.app.results import write_json
+from torchelev.sim import terrain_grid
+from training.quadruped import evaluate, play, policy, train
+from training.resume import write_result
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +35,7 @@ def test_two_iterations_leave_result_policies_and_logs(small):
     out, printed = small
     result = json.loads((out / "result.json").read_text())
     assert result["training"]["steps"] == 2 * 24 * 4 and result["evaluation"]["episodes"] == 4
-    assert set(result["evaluation"]["by_kind"]) == {"flat", "stairs_up"}
+    assert set(result["evaluation"]["by_kind"]) == {"flat", "stairs down"}, "what the robot meets"
     assert {"policy.pt", "policy.onnx", "checkpoint.pt"} <= {path.name for path in out.iterdir()}
     assert list(out.glob("events.*")) and "speed by command" in printed
 
@@ -59,6 +64,69 @@ def test_the_onnx_file_holds_the_layout_too(small):
     assert json.loads(metadata[policy.LAYOUT])["groups"] == list(policy.GROUPS)
 
 
+def test_a_policy_remembers_the_perception_of_its_training(small):
+    onnx = pytest.importorskip("onnx")
+    out, _ = small
+    metadata = {prop.key: prop.value for prop in onnx.load(str(out / "policy.onnx")).metadata_props}
+    stored = policy.load_policy(out / "policy.pt", CFG).perception
+    assert stored == json.loads(metadata[policy.LAYOUT])["perception"] == "truth"
+
+
+def _save(path, perception):
+    """Write a policy of zeros, with the layout of its scans and perhaps a perception."""
+    layout = policy.layout_of(CFG, perception)
+    files = {policy.LAYOUT: json.dumps({name: value for name, value in layout.items() if value is not None})}
+    network = torch.nn.Linear(293, 12)
+    torch.nn.init.zeros_(network.weight), torch.nn.init.zeros_(network.bias)
+    torch.jit.save(torch.jit.script(network), str(path), _extra_files=files)
+    return path
+
+
+def _play(path, *options):
+    return CliRunner().invoke(train.main, ["--play", str(path), "--out", str(path.parent), *options])
+
+
+@pytest.mark.parametrize("trained, walks", [("map", "map"), ("truth", "map"), ("blind", "blind")])
+def test_a_film_shows_a_policy_with_what_it_sees(trained, walks, tmp_path, monkeypatch):
+    tasks = []
+    monkeypatch.setattr(train, "task_config", lambda held_out=False: dataclasses.replace(CFG, episode_length=0.1))
+    monkeypatch.setattr(play, "draw", lambda task: tasks.append(task))
+    monkeypatch.setattr(play, "save_video", lambda pictures, path: None)
+    result = _play(_save(tmp_path / "policy.pt", trained), "--level", "1", "--kind", "stairs down")
+    assert result.exit_code == 0, result.output
+    assert tasks[0].perception == walks and ("blind" if walks == "blind" else "with the map") in result.output
+    assert tasks[0].cfg.terrain.kinds[int(tasks[0].kind)] == "stairs_up"
+
+
+def test_a_policy_of_unknown_perception_is_not_filmed(tmp_path):
+    result = _play(_save(tmp_path / "policy.pt", None))
+    assert result.exit_code == 1 and "policy.pt: must hold the perception of its training, got none" in result.output
+
+
+@pytest.mark.parametrize("kind", ["stairs_up", "up"])
+def test_a_film_takes_the_names_of_what_a_robot_meets(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "task_config", lambda held_out=False: CFG)
+    result = _play(_save(tmp_path / "policy.pt", "map"), "--kind", kind)
+    assert result.exit_code == 1 and f"kind: must be one of flat, stairs down, got {kind}" in result.output
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "checkpoint.pt", "cut.pt"])
+def test_other_files_are_no_policies(small, name):
+    out, _ = small
+    (out / "cut.pt").write_bytes((out / "policy.pt").read_bytes()[:1000])
+    result = _play(out / name)
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit), result.exception
+    assert f"{name}: must be a policy in TorchScript" in result.output and "give a policy.pt that" in result.output
+
+
+def test_a_robot_climbs_the_stairs_that_are_called_up():
+    terrain = TerrainConfig()
+    grid = terrain_grid(terrain.kinds, 1)
+    middle, rim = grid.field.heights[:, 100, 100], grid.field.heights[:, 100, 5]
+    climb = dict(zip(terrain.labels, (rim - middle).tolist(), strict=True))
+    assert climb["stairs up"] > 0.5 > -0.5 > climb["stairs down"] and climb["flat"] == 0
+
+
 def test_a_checkpoint_of_another_perception_is_refused(small):
     out, _ = small
     command = ["--num-envs", "4", "--iterations", "3", "--no-compile", "--perception", "blind", "--resume"]
@@ -81,6 +149,40 @@ def test_an_evaluation_counts_every_episode_once():
     assert sum(row["episodes"] for row in result["by_kind"].values()) == 6
     levels = [row["episodes"] for rows in result["by_level"].values() for row in rows.values()]
     assert sum(levels) == 6 and "| all |" in evaluate.table(result)
+
+
+def test_the_speed_is_the_way_walked_by_the_way_asked():
+    chosen = torch.tensor([True, True, True, False])
+    walked, asked = torch.tensor([3.0, 1.0, -0.3, 7.0]), torch.tensor([4.0, 1.0, 0.0, 1.0])
+    endings = torch.zeros(3, 4, dtype=torch.bool)
+    assert evaluate._summarize(endings, walked, asked, chosen)["speed"] == pytest.approx(3.7 / 5)
+    still = evaluate._summarize(endings, walked, asked, torch.tensor([False, False, True, False]))
+    assert still["speed"] is None
+
+
+def test_robots_that_are_asked_to_stand_have_no_speed(tmp_path):
+    command = dataclasses.replace(CFG.command, standing=1.0)
+    cfg = dataclasses.replace(CFG, episode_length=0.2, command=command)
+    result = evaluate.evaluate(evaluate.stand_in_trot, cfg, "blind", episodes=2)
+    assert result["all"]["speed"] is None and "| – |" in evaluate.table(result)
+
+
+@pytest.mark.parametrize("write", [write_result, write_json])
+def test_results_are_strict_json(tmp_path, write):
+    write(tmp_path / "result.json", {"speed": math.nan, "rows": [{"a": math.inf}, (1.0, -math.inf)]})
+    read = json.loads((tmp_path / "result.json").read_text(), parse_constant=pytest.fail)
+    assert read["speed"] is None and read["rows"] == [{"a": None}, [1.0, None]]
+
+
+def test_an_evaluation_reads_no_more_than_the_policy_does():
+    seen = set()
+
+    def spy(observation):
+        seen.update(observation.keys())
+        return evaluate.stand_in_trot(observation)
+
+    evaluate.evaluate(spy, dataclasses.replace(CFG, episode_length=0.04), "blind", episodes=2)
+    assert seen == set(policy.GROUPS)
 
 
 def test_a_file_without_a_layout_is_refused(tmp_path):

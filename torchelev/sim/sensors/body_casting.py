@@ -93,9 +93,11 @@ def _hit_near_capsules(directions: Float[Tensor, "B M 3"], capsules: _Capsules) 
     center = capsules.start + capsules.axis / 2
     reach = capsules.length2.sqrt() / 2 + capsules.radius2.sqrt()
     # A ray passes at |c|^2 - (c . d)^2 from the centre c; kept within 1 %, as float32 rounds.
-    least = dot(center, center) - (1.01 * reach).square()
+    min_square = dot(center, center) - (1.01 * reach).square()
     on_center = center.movedim(0, -1) @ directions.mT
-    env, shape, ray = ((on_center > -reach[..., None]) & (on_center.square() >= least[..., None])).nonzero().unbind(1)
+    env, shape, ray = (
+        ((on_center > -reach[..., None]) & (on_center.square() >= min_square[..., None])).nonzero().unbind(1)
+    )
     chosen = _Capsules(*(value.expand_as(center if value.ndim == 3 else reach)[..., env, shape] for value in capsules))
     distance = _hit_capsules(directions.movedim(-1, 0)[:, env, ray], chosen)
     nearest = torch.full_like(directions[..., 0], math.inf)
