@@ -1,5 +1,6 @@
 """Play, pause, step and scrub."""
 
+import functools
 import threading
 import time
 from types import SimpleNamespace
@@ -56,14 +57,16 @@ def scrub(player, number):
 
 def test_paused_it_waits_and_steps_one_by_one(player, snapshot):
     play(player, snapshot)
-    for expected in (1, 2, 3):
-        wait_for(lambda: player.made.num_shown == expected)
-        time.sleep(0.1)
-        assert player.made.num_shown == expected and player.page._status.content.startswith(
-            f"Scan {expected} of {SCANS}"
-        )
+    wait_for(lambda: player.made.num_shown == 1)
+    for expected in (2, 3, 4):
         player.made._press("step")
-    wait_for(lambda: player.made.num_shown == 4)
+        wait_for(functools.partial(has_status, player, f"Scan {expected} of {SCANS}"))
+        time.sleep(0.1)
+        assert player.made.num_shown == expected
+
+
+def has_status(player, start):
+    return player.page._status.content.startswith(start)
 
 
 def test_it_plays_in_the_recordings_time(player, snapshot):
