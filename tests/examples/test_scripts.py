@@ -14,6 +14,7 @@ SCRIPTS = sorted(path.stem for path in (ROOT / "examples").glob("*.py") if path.
 QUICK = {
     "gymnasium_observation": "--steps 5",
     "isaac_lab_term": "--steps 5",
+    "live_view": "--num-envs 4 --steps 5",
     "many_robots": "--num-envs 8 --steps 3",
     "mjlab_term": "--steps 5",
     "mujoco_depth_camera": "--steps 30",
@@ -59,6 +60,7 @@ def check_own_head(out):
 CHECKS = {
     "gymnasium_observation": lambda out: "'map': (2, 16, 10)" in out,
     "isaac_lab_term": lambda out: "observation (8, 187)" in out,
+    "live_view": lambda out: "the live view is at http://localhost" in out and " pictures in 5 steps" in out,
     "many_robots": lambda out: bool(re.search(r"8 robots, 768 points each(.|\n)* robots per second", out)),
     "mjlab_term": lambda out: "observation (8, 187)" in out,
     "mujoco_depth_camera": check_mujoco,

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
 from torchelev.app.config_file import load_config
 from torchelev.app.fuse_scans import fuse_all, new_map
@@ -114,7 +113,7 @@ def _shape(saved: SavedMap) -> tuple[int, ...]:
 def _read_map(path: Path) -> SavedMap:
     """Read a file of `save_map`, of which the first environment counts, or of `save_npz`."""
     from torchelev.io.export import load_map, load_npz, take
+    from torchelev.io.map_file import read_npz
 
-    with np.load(path) as arrays:
-        has_state = "header" in arrays.files
+    has_state = "header" in read_npz(path, "give a file of save_map or save_npz")
     return take(load_map(path)) if has_state else load_npz(path)

@@ -231,10 +231,11 @@ def triangulate(heights: NDArray, center: NDArray, resolution: float) -> tuple[N
         Vertices (V, 3) [m] at the known cells' centres, and triangles (F, 3), counter-clockwise seen from above.
     """
     is_known = np.isfinite(heights)
-    index = np.where(is_known, np.cumsum(is_known.ravel()).reshape(heights.shape) - 1, -1)
-    quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1).reshape(-1, 4)
-    quads = quads[(quads >= 0).all(axis=1)]
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    index = np.cumsum(is_known.ravel()).reshape(heights.shape) - 1
+    is_square = is_known[:-1, :-1] & is_known[1:, :-1] & is_known[1:, 1:] & is_known[:-1, 1:]
+    a, b = index[:-1, :-1][is_square], index[1:, :-1][is_square]
+    c, d = index[1:, 1:][is_square], index[:-1, 1:][is_square]
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     return _known_points(heights, center, resolution), triangles
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
@@ -209,3 +210,24 @@ class HeightScan(ScanSettings):
             ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the pattern.
         """
         return read_scan(self, emap, T_map_base, feet, noise, state)
+
+    def xy(
+        self, T_map_base: Float[Tensor, "B 4 4"], feet: Float[Tensor, "B K 3"] | None = None
+    ) -> Float[Tensor, "B P 2"]:
+        """Return the points of the scan [m], map frame, in its order, for instance to draw them.
+
+        Args:
+            T_map_base: base poses.
+            feet: positions of the feet [m], map frame, for a scan around feet.
+
+        Raises:
+            ValueError: feet are given for a scan around the base, or left out for one around feet.
+        """
+        actual = None if feet is None else tuple(feet.shape)
+        rule = f"expected (B, {self.num_feet}, 3)" if self.num_feet else "must be left out for a scan around the base"
+        require(
+            (feet is not None) == bool(self.num_feet), "feet", rule, actual, "give the feet of HeightScan.feet only"
+        )
+        corner = torch.zeros(len(T_map_base), 2, dtype=torch.int64, device=T_map_base.device)
+        origin = T_map_base[:, None, :3, 3] if feet is None else feet
+        return self.placement.place(T_map_base, origin, corner, 1.0, T_map_base.dtype)

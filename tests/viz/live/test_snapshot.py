@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tests.helpers import mapped, pose, small_map
+from torchelev import HeightScan
 from torchelev.viz.live import take_snapshot
 
 
@@ -42,11 +43,20 @@ def test_arrays_without_a_batch_dimension_do_too():
     assert np.array_equal(taken.scan, scan) and np.array_equal(taken.plan, scan) and len(taken.cloud) == 4
 
 
+def test_points_without_z_lie_on_the_map():
+    emap, scan = mapped(num_envs=2), HeightScan.grid(length_x=0.8, length_y=0.6, resolution=0.1)
+    T = pose(num_envs=2, yaw=0.3)
+    taken = take_snapshot(emap, T, scan=scan.xy(T), env=1)
+    z, known = emap.sample(scan.xy(T), mode="nearest")
+    assert 0 < len(taken.scan) == int(known[1].sum())
+    assert np.allclose(taken.scan[:, 2], z[1][known[1]].numpy())
+
+
 @pytest.mark.parametrize(
     "wrong, message",
     [
         ({"T_map_base": np.eye(3)}, r"T_map_base: expected \(B, ..., 4, 4\).*\(3, 3\)"),
-        ({"scan": np.zeros((2, 2))}, r"scan: expected"),
+        ({"scan": np.zeros((2, 4))}, r"scan: expected"),
         ({"points": np.zeros((2, 3))}, r"T_map_sensor: expected the poses"),
         ({"env": 1}, r"env: must lie in \[0, 1\)"),
     ],

@@ -4,11 +4,10 @@ import io
 
 import numpy as np
 import pytest
+import trimesh
 
 from torchelev.io.export import SavedMap
 from torchelev.viz.live.surface import bound_sheet, find_cell, surface
-
-trimesh = pytest.importorskip("trimesh", reason="needs torchelev[view]")
 
 
 def ramp(center=(0.0, 0.0, 0.0)):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchelev.io.export import SavedMap
 
-_DIRECTION = np.array([-0.55, -0.75, 0.75])  # from the map's centre to the camera, in lengths of the map
+_DIRECTION = np.array([-0.3, -0.45, 0.45])  # from the map's centre to the camera, in lengths of the map
 
 
 class Camera:

@@ -14,7 +14,7 @@ from torchelev.viz.live.snapshot import Snapshot, take_snapshot
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
-_SERVER = 2.0  # what the server's own threads take in all, by the time that drawing takes: packing, sending
+_WHOLE_COST = 2.0  # what a picture costs a loop on all cores, by the CPU time of drawing it: benchmarks.speed.live_view
 
 
 class LiveView:
@@ -93,7 +93,7 @@ class LiveView:
             self._next = snapshot
             self._wake.notify()
         taken = time.perf_counter() - start
-        self._due = start + max(1 / self._max_rate, (taken + _SERVER * self._drawing) / self._max_share)
+        self._due = start + max(1 / self._max_rate, (taken + _WHOLE_COST * self._drawing) / self._max_share)
         return True
 
     def _own_layers(self) -> tuple[str, ...]:
@@ -109,7 +109,8 @@ class LiveView:
                 return
             start = time.thread_time()
             self.page.draw(snapshot, f"{snapshot.time:.1f} s")
-            self._drawing = time.thread_time() - start
+            if self.num_drawn:  # the first picture also loads packages
+                self._drawing = time.thread_time() - start
             self.num_drawn += 1
             self._next = None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -52,6 +53,8 @@ class Page:
         import viser
 
         require(0 < port <= _MAX_PORT, "port", f"must lie in [1, {_MAX_PORT}]", port, "use 8080")
+        # A browser that connects in advance and then does not ask is no error worth a traceback.
+        logging.getLogger("websockets.server").addFilter(lambda record: "handshake failed" not in record.msg)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server: Any = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")

@@ -172,9 +172,13 @@ class Player:
     def _draw(self, number: int, snapshot: Snapshot) -> None:
         """Draw a snapshot; while playing at most `_MAX_RATE` of them."""
         self._shown = number
-        if self._is_playing and time.monotonic() - self._drawn_at < 1 / _MAX_RATE and number < self._num_scans - 1:
+        if self._is_playing and not self._is_due(number):
             return
         self._drawn_at = time.monotonic()
         self._slider.value = number + 1
         status = f"Scan {number + 1} of {self._num_scans}, {snapshot.time:.1f} s"
         self._page.draw(snapshot, status, self._path[: number + 1])
+
+    def _is_due(self, number: int) -> bool:
+        """Whether a picture may be drawn while playing: at most `_MAX_RATE`, and always the last one."""
+        return number == self._num_scans - 1 or time.monotonic() - self._drawn_at >= 1 / _MAX_RATE

@@ -58,7 +58,8 @@ def take_snapshot(
         T_map_sensor: (B, 4, 4), (B, S, 4, 4) or (4, 4) poses of the sensors.
         points: (B, N, 3), (B, S, N, 3) or (N, 3) [m] the last cloud, sensor frame.
         env: the environment.
-        scan: (B, M, 3) or (M, 3) [m] points that a policy reads, map frame.
+        scan: (B, M, 2), such as `HeightScan.xy`, or (B, M, 3) [m] points that a policy reads, map frame. Without z
+            they lie on the elevation, and are left out where that is unknown.
         plan: (P, 3) [m] planned path of this environment, map frame.
         layers: names of filters' layers to show beside the map's own.
         time: [s] since the start.
@@ -70,13 +71,16 @@ def take_snapshot(
     base, sensor = _pick("T_map_base", T_map_base, env, (4, 4)), _pick("T_map_sensor", T_map_sensor, env, (4, 4))
     sensor = None if sensor is None else sensor.reshape(-1, 4, 4)
     cloud = _pick("points", points, env, (3,))
+    flat = scan is not None and scan.shape[-1] == 2
+    policy = _pick("scan", scan, env, (2,) if flat else (3,))
+    policy = _onto(saved, policy.reshape(-1, 2)) if policy is not None and flat else policy
     require(cloud is None or sensor is not None, "T_map_sensor", "expected the poses of `points`", None, "give both")
     return Snapshot(
         saved,
         None if base is None else base.reshape(4, 4),
         sensor,
         _NO_POINTS if cloud is None or sensor is None else _to_map_frame(cloud, sensor),
-        _points_or_none(_pick("scan", scan, env, (3,))),
+        _points_or_none(policy),
         _points_or_none(None if plan is None else _to_numpy(plan)),
         time,
     )
@@ -87,7 +91,7 @@ def _pick(name: str, values: Any, env: int, ending: tuple[int, ...]) -> NDArray[
     if values is None:
         return None
     shape = tuple(values.shape)
-    num_own = len(ending) + (ending == (3,))  # points have their number before the coordinates
+    num_own = 2  # a matrix, or a number of points and their coordinates
     fits = len(shape) >= num_own and shape[-len(ending) :] == ending
     require(fits, name, f"expected (B, ..., {', '.join(map(str, ending))})", shape, "see take_snapshot")
     return _to_numpy(values[env] if len(shape) > num_own else values)
@@ -100,6 +104,15 @@ def _to_numpy(values: Any) -> NDArray[np.float64]:
 def _points_or_none(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
     points = _NO_POINTS if points is None else points.reshape(-1, 3)
     return points[np.isfinite(points).all(1)]
+
+
+def _onto(saved: SavedMap, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (M, 3) on the elevation of their cells, NaN where it is unknown."""
+    heights = saved.layers["elevation"]
+    cell = np.floor((xy - saved.center[:2]) / saved.resolution + np.array(heights.shape) / 2)
+    is_inside = np.all((cell >= 0) & (cell < heights.shape), axis=1)
+    i, j = np.where(is_inside[:, None], cell, 0).astype(int).T
+    return np.column_stack([xy, np.where(is_inside, heights[i, j], np.nan)])
 
 
 def _to_map_frame(points: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,154 @@
+"""How many pictures a second the live view makes, and how much it slows a loop down.
+
+    python -m benchmarks.speed.live_view
+
+Clients are processes of their own that receive what a browser would, and draw nothing. Writes
+benchmarks/results/live_view.json.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import click
+import torch
+
+from benchmarks import RESULTS
+from benchmarks.speed.meter import progress
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev.app.results import markdown_table, write_json
+from torchelev.sim.poses import pose
+from torchelev.viz.live import LiveView, Page, take_snapshot
+
+GRID = GridConfig(resolution=0.04, length_x=10.0, length_y=10.0)  # 250 x 250 cells
+CLIENTS, THREADS = (1, 3), (1, 2)
+NUM_POINTS, PAIRS, SECONDS, PICTURES = 20_000, 15, 3.0, 60
+_PICTURE_BYTES = 50_000  # of a message, at least
+
+
+class Workload:
+    """A map of waves whose sensor hangs 2 m above it."""
+
+    def __init__(self) -> None:
+        self.emap = ElevationMap(ElevationMapConfig(grid=GRID))
+        self.T = pose(torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64), torch.zeros(1))
+        self._generator = torch.Generator().manual_seed(0)
+        xy = self.emap.cell_centers()[0].flatten(0, 1).float()
+        self.fuse(xy)
+
+    def fuse(self, xy: torch.Tensor | None = None) -> None:
+        """Fuse a cloud of random points, or of the given ones (N, 2)."""
+        if xy is None:
+            xy = GRID.length_x * (torch.rand(NUM_POINTS, 2, generator=self._generator) - 0.5)
+        z = 0.3 * torch.sin(xy[:, :1]) - 2.0
+        self.emap.update(torch.cat([xy, z], -1)[None], self.T, self.T, dt=0.05)
+
+
+def receive(url: str, num_pictures: Any) -> None:
+    """Receive what a page sends, and count the pictures."""
+    import viser
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
+
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    with contextlib.suppress(ConnectionClosed):
+        with connect(url.replace("http", "ws"), max_size=None, subprotocols=[protocol]) as socket:
+            while True:
+                if len(socket.recv()) > _PICTURE_BYTES:
+                    num_pictures.value += 1
+
+
+@contextlib.contextmanager
+def connected(url: str, count: int) -> Iterator[list[Any]]:
+    """Connect clients to a page; yields their numbers of pictures."""
+    context = multiprocessing.get_context("spawn")  # a fork would inherit the server's threads
+    counts = [context.Value("q", 0) for _ in range(count)]
+    clients = [context.Process(target=receive, args=(url, value), daemon=True) for value in counts]
+    try:
+        for client in clients:
+            client.start()
+        yield counts
+    finally:
+        for client in clients:
+            client.kill()
+
+
+def measure_rate(clients: int) -> dict[str, Any]:
+    """Return pictures a second: as fast as they can be drawn, until every client has received them."""
+    work = Workload()
+    page = Page("benchmark", work.emap.layers)
+    page.draw(take_snapshot(work.emap, work.T, work.T))
+    with connected(page.url, clients) as counts:
+        while any(value.value < 1 for value in counts):  # the first picture is there when a client connects
+            time.sleep(0.05)
+        start = time.perf_counter()
+        for k in range(PICTURES):
+            page.draw(take_snapshot(work.emap, work.T, work.T))
+            while any(value.value < k for value in counts):  # at most one picture is under way
+                time.sleep(0.001)
+        seconds = time.perf_counter() - start
+    page.stop()
+    return {"clients": clients, "pictures_per_s": PICTURES / seconds}
+
+
+def measure_slowdown(threads: int) -> dict[str, Any]:
+    """Return the time of a loop with the live view by that without, the median over pairs of alternating order."""
+    torch.set_num_threads(threads)
+    work, ratios = Workload(), []
+    with LiveView(work.emap) as view, connected(view.page.url, 1):
+        _run(work, view)
+        num_before = view.num_drawn
+        for pair in progress(range(PAIRS), f"slowdown, {threads} threads"):
+            order = (True, False) if pair % 2 else (False, True)
+            ms = {shown: _run(work, view if shown else None) for shown in order}
+            ratios.append(ms[True] / ms[False])
+        rate = (view.num_drawn - num_before) / (PAIRS * SECONDS)
+    return {
+        "threads": threads,
+        "ratio": median(ratios),
+        "ratios": sorted(ratios),
+        "pictures_per_s": rate,
+        "ms": ms[False],
+    }
+
+
+def _run(work: Workload, view: LiveView | None) -> float:
+    """Return the milliseconds of an update in a loop of `SECONDS`."""
+    num_updates, start = 0, time.perf_counter()
+    while time.perf_counter() - start < SECONDS:
+        work.fuse()
+        if view is not None:
+            view.show(work.T, work.T)
+        num_updates += 1
+    return 1e3 * (time.perf_counter() - start) / num_updates
+
+
+def table(result: dict[str, Any]) -> str:
+    """Tabulate the rates by clients, and the slowdown by threads."""
+    rows = [[f"pictures a second, {row['clients']} clients", f"{row['pictures_per_s']:.0f}"] for row in result["rates"]]
+    for row in result["loops"]:
+        rows.append([f"a loop with the view by one without, {row['threads']} threads", f"{row['ratio']:.3f}"])
+        rows.append([f"pictures a second in it, {row['threads']} threads", f"{row['pictures_per_s']:.1f}"])
+    return markdown_table(["250 × 250 cells", ""], rows)
+
+
+@click.command(help=__doc__)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
+def main(out: Path) -> None:
+    """Measure, write JSON and print the table."""
+    torch.set_num_threads(1)
+    rates = [measure_rate(clients) for clients in progress(CLIENTS, "clients")]
+    result = {"rates": rates, "loops": [measure_slowdown(threads) for threads in THREADS]}
+    write_json(out / "live_view.json", result)
+    click.echo(table(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""`torchelev view`, from end to end."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+
+from tests.helpers import mapped
+from tests.io.bags.synthetic import write_drive
+from torchelev.io import export
+
+viser = pytest.importorskip("viser", reason="needs torchelev[view]")
+
+
+@pytest.fixture
+def port():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What pages drew. The player does not wait, and nothing stays open."""
+    from torchelev.viz.live import Page, Player
+
+    drawn = []
+    draw = Page.draw
+
+    def note(page, snapshot, *args):
+        drawn.append((snapshot, *args))
+        draw(page, snapshot, *args)
+
+    def leave(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Page, "draw", note)
+    monkeypatch.setattr(Player, "_wait_until_due", lambda self, time_now: None)
+    monkeypatch.setattr(Player, "_is_due", lambda self, number: True)
+    monkeypatch.setattr(Player, "hold", leave)
+    monkeypatch.setattr(Page, "wait", leave)
+    return drawn
+
+
+def test_a_folder_shows_the_map_that_map_writes(run, recording, port, shown, tmp_path):
+    options = ("--size", 6, "--resolution", 0.1, "--sensor-height", 1.0)
+    code, out, err = run("view", recording, "--port", port, *options)
+    assert (code, err) == (0, "") and f"open      http://localhost:{port}" in out and "closed" in out
+    assert [args[0] for _, *args in shown] == [
+        "Scan 1 of 4, 0.0 s",
+        "Scan 2 of 4, 0.1 s",
+        "Scan 3 of 4, 0.2 s",
+        "Scan 4 of 4, 0.3 s",
+    ]
+    assert run("map", recording, *options)[0] == 0
+    expected = export.load_npz(tmp_path / "map.npz").layers["elevation"]
+    assert np.array_equal(shown[-1][0].map.layers["elevation"], expected, equal_nan=True)
+    assert shown[-1][0].T_map_base[2, 3] == pytest.approx(0.2)  # the base, not the sensor
+
+
+@pytest.mark.slow(2)
+def test_a_bag(run, port, shown, tmp_path):
+    code, out, err = run("view", write_drive(tmp_path), "--port", port, "--size", 6)
+    assert (code, err) == (0, "") and len(shown) == 6 and len(shown[-1][0].cloud)
+
+
+@pytest.mark.parametrize("save", [export.save_npz, export.save_map])
+def test_a_saved_map(run, port, shown, tmp_path, save):
+    emap = mapped(num_envs=1)
+    save(tmp_path / "saved.npz", emap)
+    code, _, err = run("view", "saved.npz", "--port", port)
+    assert (code, err) == (0, "")
+    expected = emap.layer("elevation")[0].numpy()
+    assert np.array_equal(shown[0][0].map.layers["elevation"], expected, equal_nan=True)
+
+
+@pytest.mark.slow(3)
+def test_without_a_recording_the_demo_walks(run, port, shown, monkeypatch):
+    monkeypatch.setattr("torchelev.app.demo.DemoWalk.__len__", lambda walk: 3)
+    code, _, err = run("view", "--port", port)
+    assert (code, err) == (0, "") and len(shown) == 3 and shown[-1][0].time == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    "args, words",
+    [
+        (("nowhere",), "nowhere: no such folder"),
+        (("drive", "--extrinsics", "1 2"), "12 numbers"),
+        (("broken.npz",), "broken.npz"),
+        (("drive", "--port", "0"), "0 is not in the range"),
+        (("drive", "--points", "/cloud"), "only bags have topics"),
+    ],
+)
+def test_bad_input_is_one_line(run, recording, shown, tmp_path, args, words):
+    (tmp_path / "broken.npz").write_bytes(b"PK but no more")
+    code, _, err = run("view", *args)
+    assert code == 2 and words in err and "Traceback" not in err and not shown
+
+
+@pytest.mark.slow(8)
+def test_ctrl_c_closes_the_page(recording, port):
+    command = [
+        sys.executable,
+        "-m",
+        "torchelev",
+        "view",
+        str(recording),
+        "--port",
+        str(port),
+        "--paused",
+        "--size",
+        "6",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
+    try:
+        assert f"localhost:{port}" in process.stdout.readline()
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}") as page:
+            assert b"<html" in page.read().lower()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and "closed" in out and "Traceback" not in err
