@@ -20,10 +20,10 @@ from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
-from benchmarks.speed import bags, encoders, growth, head, long_run, loop, postprocessing, sight
+from benchmarks.speed import bags, encoders, growth, head, live_view, long_run, loop, postprocessing, sight
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
-from training.nav import experiment
+from training.nav import encoder_experiment, experiment
 from training.quadruped import experiment as legs
 from training.quadruped import step_time
 from training.traversability import block, evaluate
@@ -96,6 +96,11 @@ def _long_run() -> str:
     return growth.table({name: values for name, values in load("long_run").items() if name in long_run.CASES})
 
 
+def _live_view() -> str:
+    """Tabulate the rate of pictures, and how much the live view slows a loop down."""
+    return live_view.table(load("live_view"))
+
+
 def _bags() -> str:
     """Tabulate how fast bags are mapped, and the memory over their length."""
     return bags.table(load("bags")["rows"])
@@ -162,6 +167,11 @@ def _legs_step_time() -> str:
     return step_time.table(load("quadruped-step-time", training.RESULTS))
 
 
+def _encoder_success() -> str:
+    """Tabulate the success of navigation policies by their encoder."""
+    return encoder_experiment.table(load("encoders", training.RESULTS))
+
+
 def _encoder_cost() -> str:
     """Tabulate what encoders of the map cost."""
     return encoders.table(load("encoders")["rows"])
@@ -192,12 +202,14 @@ TABLES = {
     "loop": _loop,
     "long_run": _long_run,
     "bags": _bags,
+    "live_view": _live_view,
     "nav": _nav,
     "pose_covariance": _pose_covariance,
     "legs": _legs,
     "legs_stairs": _legs_stairs,
     "legs_walk": _legs_walk,
     "legs_step_time": _legs_step_time,
+    "encoder_success": _encoder_success,
     "encoder_cost": _encoder_cost,
     "sight": _sight,
     "mjlab": _mjlab,

@@ -20,7 +20,7 @@ from torchelev.output_files import atomic_file
 from torchelev.viz.live import Page, Player, take_snapshot
 
 PICTURE = Path(__file__).parents[1] / "pictures" / "live_view.png"
-_SIZE, _COLORS = (1200, 860), 256
+_SIZE, _SHOWN, _COLORS = (1200, 860), (1200, 700), 256
 # Says that there is no GPU, which a reader of the page need not know.
 _CLOSE_NOTES = "document.querySelectorAll('.mantine-Notification-root').forEach(note => note.remove())"
 
@@ -43,7 +43,9 @@ def main(scans: int) -> None:
         picture = Image.open(io.BytesIO(browser.picture())).convert("RGB")
     page.stop()
     with atomic_file(PICTURE) as file:
-        picture.crop((0, 0, _SIZE[0], 720)).quantize(_COLORS, dither=Image.Dither.NONE).save(file, format="png", optimize=True)
+        picture.crop((0, 0, _SIZE[0], 720)).quantize(_COLORS, dither=Image.Dither.NONE).save(
+            file, format="png", optimize=True
+        )
 
 
 if __name__ == "__main__":

@@ -54,6 +54,15 @@ def test_parts_can_be_hidden_and_shown(page):
     assert {"last cloud", "planes"} <= drawn(page) and "base" not in drawn(page)
 
 
+def test_boxes_appear_with_what_they_show(page):
+    emap, T, _ = mapped_step()
+    page.draw(take_snapshot(emap))
+    visible = {name for name, box in page._parts.items() if box.visible}
+    assert visible == {"upper bound", "planes"}
+    page.draw(take_snapshot(emap, T, T, scan=np.zeros((4, 3))))
+    assert {name for name, box in page._parts.items() if box.visible} == {*visible, "frames", "path", "policy's scan"}
+
+
 def test_the_legend_follows_the_layer(page):
     emap, T, _ = mapped_step()
     page.draw(take_snapshot(emap, T, T))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchelev.io.export import SavedMap
 
-_DIRECTION = np.array([-0.3, -0.45, 0.45])  # from the map's centre to the camera, in lengths of the map
+_DIRECTION = np.array([-0.35, -0.5, 0.5])  # from the map's centre to the camera, in lengths of the map
 
 
 class Camera:
@@ -22,9 +22,10 @@ class Camera:
     def __init__(self, server: Any) -> None:
         self._server = server
         self._followed: NDArray[np.float64] | None = None
+        self._has_looked = False
 
     def look_at_map(self, saved: SavedMap, origin: NDArray[np.float64]) -> None:
-        """Look at the whole map, also in browsers that open the page later.
+        """Look at the whole map: browsers that are there at the first call, and those that open the page later.
 
         Args:
             saved: the map.
@@ -34,8 +35,12 @@ class Camera:
         ground = float(np.nanmedian(heights)) if np.isfinite(heights).any() else float(saved.center[2])
         target = np.append(saved.center[:2], ground) - origin
         position = target + _DIRECTION * max(heights.shape) * saved.resolution
-        for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
+        cameras = [self._server.initial_camera]
+        if not self._has_looked:
+            cameras += [client.camera for client in self._server.get_clients().values()]
+        for camera in cameras:
             camera.position, camera.look_at = position, target
+        self._has_looked = True
 
     def follow(self, position: NDArray[np.float64] | None) -> None:
         """Move the cameras as the robot has moved since the call before.

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torchelev.errors import require
 from torchelev.viz.live.camera import Camera
 from torchelev.viz.live.colors import Limits, choose_limits, colorize, describe, legend, shown_layers
-from torchelev.viz.live.scene import PARTS, Scene
-from torchelev.viz.live.snapshot import Snapshot
+from torchelev.viz.live.scene import Scene
+from torchelev.viz.live.snapshot import PARTS, Snapshot
 from torchelev.viz.live.surface import find_cell
 
 _MAX_PORT = 65535
@@ -96,7 +96,7 @@ class Page:
         self._layer.on_update(lambda _: self.redraw())
         self._legend = gui.add_html("")
         with gui.add_folder("show"):
-            self._parts = {name: gui.add_checkbox(name, shown) for name, shown in PARTS.items()}
+            self._parts = {name: gui.add_checkbox(name, shown, visible=False) for name, shown in PARTS.items()}
             self._follow = gui.add_checkbox("follow the robot", False)
         for box in self._parts.values():
             box.on_update(lambda _: self.redraw())
@@ -121,11 +121,11 @@ class Page:
                 self._path.append(snapshot.T_map_base[:3, 3])
             if self._last is None:
                 self._scene.origin = np.append(np.round(snapshot.map.center[:2]), 0.0)
-                self._camera.look_at_map(snapshot.map, self._scene.origin)
             self._last = snapshot
             if status:
                 self._status.content = status
             self._draw(snapshot)
+            self._camera.look_at_map(snapshot.map, self._scene.origin)
             base = snapshot.T_map_base if self._follow.value else None
             self._camera.follow(None if base is None else base[:3, 3])
 
@@ -142,6 +142,8 @@ class Page:
         self._limits[layer] = limits = choose_limits(layer, values, self._limits.get(layer))
         parts = {name for name, box in self._parts.items() if box.value}
         with self.server.atomic():
+            for name in snapshot.parts:
+                self._parts[name].visible = True
             self._legend.content = legend(layer, limits)
             self._scene.draw(snapshot, colorize(layer, values, limits), np.array(self._path), parts)
             self._cell.content = self._describe_cell(snapshot, layers)

@@ -10,21 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.planes import segment
-from torchelev.viz.live.snapshot import Snapshot
+from torchelev.viz.live.snapshot import BOUND, CLOUD, FRAMES, PATH, PLAN, PLANES, SCAN, Snapshot
 from torchelev.viz.live.surface import bound_sheet, surface
 
-BOUND, CLOUD, SCAN, FRAMES, PATH, PLANES, PLAN = (
-    "upper bound", "last cloud", "policy's scan", "frames", "path", "planes", "planned path"
-)  # fmt: skip
-PARTS = {
-    BOUND: True,
-    CLOUD: False,
-    SCAN: True,
-    FRAMES: True,
-    PATH: True,
-    PLANES: False,
-    PLAN: True,
-}  #: shown at first
 _COLORS = {BOUND: (120, 150, 190), CLOUD: (230, 60, 60), SCAN: (240, 228, 66), PATH: (213, 94, 0), PLAN: (230, 159, 0)}
 _OUTLINE, _HOLE = (0, 114, 178), (204, 121, 167)
 _LIFT = 0.01  # [m] of lines above the surface, or they would hide in it

@@ -21,6 +21,13 @@ _MAX_POINTS = 20_000  # of a cloud, so that a page stays fluid
 _NO_POINTS = np.zeros((0, 3))
 
 
+BOUND, CLOUD, SCAN, FRAMES, PATH, PLANES, PLAN = (
+    "upper bound", "last cloud", "policy's scan", "frames", "path", "planes", "planned path"
+)  # fmt: skip
+#: What can be shown beside the surface, and whether it is at first.
+PARTS = {BOUND: True, CLOUD: False, SCAN: True, FRAMES: True, PATH: True, PLANES: False, PLAN: True}
+
+
 class Snapshot(NamedTuple):
     """One map with its robot at one time. Points are in the map frame."""
 
@@ -31,6 +38,13 @@ class Snapshot(NamedTuple):
     scan: NDArray[np.float64] = _NO_POINTS  #: (M, 3) [m] points that a policy reads
     plan: NDArray[np.float64] = _NO_POINTS  #: (P, 3) [m] planned path
     time: float = 0.0  #: [s] since the start
+
+    @property
+    def parts(self) -> set[str]:
+        """Names of `PARTS` that can be shown beside the surface."""
+        robot = {FRAMES, PATH} if self.T_map_base is not None else {FRAMES} if self.T_map_sensor is not None else set()
+        points = {CLOUD: self.cloud, SCAN: self.scan, PLAN: self.plan}
+        return {BOUND, PLANES} | robot | {name for name, values in points.items() if len(values)}
 
     @property
     def nbytes(self) -> int:
