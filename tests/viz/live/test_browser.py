@@ -42,6 +42,15 @@ def wait_until(claim, seconds=120.0):
         time.sleep(0.2)
 
 
+def click_on(browser, kind, text):
+    """Click on an element once it stands still."""
+    place, before = browser.wait_for(_CENTER_OF % (kind, text)), None
+    while place != before:
+        time.sleep(0.5)
+        place, before = browser.wait_for(_CENTER_OF % (kind, text)), place
+    browser.click(*place)
+
+
 def test_the_page_in_a_browser(port):
     emap, T, _ = mapped_step()
     with LiveView(emap, port=port) as view:
@@ -51,8 +60,8 @@ def test_the_page_in_a_browser(port):
             wait_until(lambda: num_colored(pixels(browser)) > 1000)
             browser.wait_for("document.body.innerText.includes('elevation [m]')")
 
-            browser.click(*browser.wait_for(_CENTER_OF % ("input", "elevation")))
-            browser.click(*browser.wait_for(_CENTER_OF % ("[role=option]", "traversability")))
+            click_on(browser, "input", "elevation")
+            click_on(browser, "[role=option]", "traversability")
             browser.wait_for("!document.body.innerText.includes('elevation [m]')")
             assert view.page.layer == "traversability"
 

@@ -14,7 +14,7 @@ from torchelev.viz.live.snapshot import Snapshot, take_snapshot
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
-_WHOLE_COST = 2.0  # what a picture costs a loop on all cores, by the CPU time of drawing it: benchmarks.speed.live_view
+_WHOLE_COST = 4.0  # what a picture costs a loop on all cores, by the CPU time of drawing it: benchmarks.speed.live_view
 
 
 class LiveView:
