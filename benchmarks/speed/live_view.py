@@ -29,6 +29,7 @@ from torchelev.viz.live import LiveView, Page, take_snapshot
 GRID = GridConfig(resolution=0.04, length_x=10.0, length_y=10.0)  # 250 x 250 cells
 CLIENTS, THREADS = (1, 3), (1, 2)
 NUM_POINTS, PAIRS, SECONDS, PICTURES = 20_000, 15, 3.0, 60
+PERIODS = (0.0, 0.1)  # [s] of the loop; 0: without a pause
 _PICTURE_BYTES = 50_000  # of a message, at least
 
 
@@ -98,20 +99,21 @@ def measure_rate(clients: int) -> dict[str, Any]:
     return {"clients": clients, "pictures_per_s": PICTURES / seconds}
 
 
-def measure_slowdown(threads: int) -> dict[str, Any]:
-    """Return the time of a loop with the live view by that without, the median over pairs of alternating order."""
+def measure_slowdown(threads: int, period: float) -> dict[str, Any]:
+    """Return the time of updates in a loop with the live view by that without, median over pairs in both orders."""
     torch.set_num_threads(threads)
     work, ratios = Workload(), []
     with LiveView(work.emap) as view, connected(view.page.url, 1):
-        _run(work, view)
+        _run(work, view, period)
         num_before = view.num_drawn
         for pair in progress(range(PAIRS), f"slowdown, {threads} threads"):
             order = (True, False) if pair % 2 else (False, True)
-            ms = {shown: _run(work, view if shown else None) for shown in order}
+            ms = {shown: _run(work, view if shown else None, period) for shown in order}
             ratios.append(ms[True] / ms[False])
         rate = (view.num_drawn - num_before) / (PAIRS * SECONDS)
     return {
         "threads": threads,
+        "period_s": period,
         "ratio": median(ratios),
         "ratios": sorted(ratios),
         "pictures_per_s": rate,
@@ -119,23 +121,27 @@ def measure_slowdown(threads: int) -> dict[str, Any]:
     }
 
 
-def _run(work: Workload, view: LiveView | None) -> float:
-    """Return the milliseconds of an update in a loop of `SECONDS`."""
-    num_updates, start = 0, time.perf_counter()
+def _run(work: Workload, view: LiveView | None, period: float) -> float:
+    """Return the milliseconds of an update with `show`, in a loop of `SECONDS`; the pause is left out."""
+    num_updates, busy, start = 0, 0.0, time.perf_counter()
     while time.perf_counter() - start < SECONDS:
+        begin = time.perf_counter()
         work.fuse()
         if view is not None:
             view.show(work.T, work.T)
-        num_updates += 1
-    return 1e3 * (time.perf_counter() - start) / num_updates
+        taken = time.perf_counter() - begin
+        busy, num_updates = busy + taken, num_updates + 1
+        time.sleep(max(0.0, period - taken))
+    return 1e3 * busy / num_updates
 
 
 def table(result: dict[str, Any]) -> str:
     """Tabulate the rates by clients, and the slowdown by threads."""
     rows = [[f"pictures a second, {row['clients']} clients", f"{row['pictures_per_s']:.0f}"] for row in result["rates"]]
     for row in result["loops"]:
-        rows.append([f"a loop with the view by one without, {row['threads']} threads", f"{row['ratio']:.3f}"])
-        rows.append([f"pictures a second in it, {row['threads']} threads", f"{row['pictures_per_s']:.1f}"])
+        loop = f"loop at {1 / row['period_s']:.0f} Hz" if row["period_s"] else "loop without a pause"
+        rows.append([f"{loop}, {row['threads']} threads: updates slower by", f"{100 * (row['ratio'] - 1):.1f} %"])
+        rows.append([f"{loop}, {row['threads']} threads: pictures a second", f"{row['pictures_per_s']:.1f}"])
     return markdown_table(["250 × 250 cells", ""], rows)
 
 
@@ -145,7 +151,7 @@ def main(out: Path) -> None:
     """Measure, write JSON and print the table."""
     torch.set_num_threads(1)
     rates = [measure_rate(clients) for clients in progress(CLIENTS, "clients")]
-    result = {"rates": rates, "loops": [measure_slowdown(threads) for threads in THREADS]}
+    result = {"rates": rates, "loops": [measure_slowdown(n, period) for period in PERIODS for n in THREADS]}
     write_json(out / "live_view.json", result)
     click.echo(table(result))
 

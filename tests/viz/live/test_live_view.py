@@ -34,22 +34,38 @@ def test_it_shows_the_robot_that_was_chosen(emap, port, capsys):
     assert (other == emap.layer("elevation")[2].numpy())[other == other].all()
 
 
+def work(seconds):
+    start = time.thread_time()
+    while time.thread_time() - start < seconds:
+        pass
+
+
 def test_pictures_beyond_the_share_are_dropped(emap, port, monkeypatch):
     with LiveView(emap, port=port, max_share=0.05, max_rate=1e6) as view:
         spent = []
 
         def draw(*args):
-            start = time.thread_time()
-            while time.thread_time() - start < 0.01:
-                pass
-            spent.append(time.thread_time() - start)
+            work(0.01)
+            spent.append(0.01)
 
         monkeypatch.setattr(view.page, "draw", draw)
         start = time.perf_counter()
         while time.perf_counter() - start < 2.0:
             view.show(pose(num_envs=3))
-            time.sleep(0.001)
+            work(0.001)
         assert 2 <= len(spent) and sum(spent[:-1]) < 0.05 * 2.0
+
+
+def test_a_loop_that_waits_is_shown_more_often(emap, port):
+    def count(wait):
+        with LiveView(emap, port=port, max_rate=50) as view:
+            start = time.perf_counter()
+            while time.perf_counter() - start < 3.0:
+                view.show(pose(num_envs=3))
+                wait(0.02)
+            return view.num_drawn
+
+    assert count(time.sleep) > 1.5 * count(work)
 
 
 def test_a_slow_page_never_holds_the_loop_up(emap, port, monkeypatch):

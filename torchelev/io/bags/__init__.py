@@ -4,9 +4,10 @@ Needs ``torchelev[bags]``; no ROS. `bag` reads messages, `point_cloud` and `scan
 finds poses, `recording` puts them together. `grid_maps` writes maps to bags and reads them.
 """
 
-from torchelev.io.bags.bag import Bag, Topic, is_bag
+from torchelev.io.bags.bag import Bag, Message, Topic, is_bag
 from torchelev.io.bags.grid_maps import (
     GridMapWriter,
+    RecordedMap,
     from_bytes,
     read_grid_map,
     read_grid_maps,
@@ -21,6 +22,8 @@ __all__ = [
     "BagRecording",
     "BagRequest",
     "GridMapWriter",
+    "Message",
+    "RecordedMap",
     "Topic",
     "TransformTree",
     "from_bytes",

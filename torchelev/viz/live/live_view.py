@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from types import TracebackType
@@ -15,6 +16,25 @@ if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
 _WHOLE_COST = 4.0  # what a picture costs a loop on all cores, by the CPU time of drawing it: benchmarks.speed.live_view
+_USED_IDLENESS = 0.5  # share of a loop's spare time that drawing may take
+
+
+class Load:
+    """How busy the calling thread and all cores are."""
+
+    def __init__(self) -> None:
+        self._num_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._before = self._now()
+
+    def _now(self) -> tuple[float, float, float]:
+        return time.perf_counter(), time.thread_time(), time.process_time()
+
+    def measure_idleness(self) -> float:
+        """Return the share of the time since the call before in which this thread, and the cores, had nothing to do."""
+        now = self._now()
+        wall, thread, process = (b - a for a, b in zip(self._before, now, strict=True))
+        self._before = now
+        return 1 - min(1.0, max(thread, process / self._num_cores) / max(wall, 1e-6))
 
 
 class LiveView:
@@ -31,7 +51,8 @@ class LiveView:
         emap: the map.
         host: "127.0.0.1" lets only this machine connect, "0.0.0.0" every machine that reaches it.
         port: of the page. If it is taken, the next free one is used.
-        max_share: share of the time that the view may take; pictures beyond it are dropped.
+        max_share: share of a busy loop's time that the view may take; pictures beyond it are dropped. A loop that
+            waits, such as one at 10 Hz, is shown more often, in the time that it does not need.
         max_rate: [Hz] of pictures at most.
 
     Raises:
@@ -53,6 +74,7 @@ class LiveView:
         self._emap, self._max_share, self._max_rate = emap, max_share, max_rate
         self.page = Page("torchelev", emap.layers, emap.num_envs, host, port)
         self._start = self._due = time.perf_counter()
+        self._load = Load()
         self._drawing = 0.0  # [s] of the CPU for the last picture
         self._next: Snapshot | None = None
         self._wake, self._stopped = threading.Condition(), False
@@ -93,7 +115,8 @@ class LiveView:
             self._next = snapshot
             self._wake.notify()
         taken = time.perf_counter() - start
-        self._due = start + max(1 / self._max_rate, (taken + _WHOLE_COST * self._drawing) / self._max_share)
+        share = self._max_share + (1 - self._max_share) * _USED_IDLENESS * self._load.measure_idleness()
+        self._due = start + max(1 / self._max_rate, (taken + _WHOLE_COST * self._drawing) / share)
         return True
 
     def _own_layers(self) -> tuple[str, ...]:
