@@ -24,7 +24,7 @@ class MapTerm:
     Simulators turn the parameters of a term into YAML and back, in which only plain values survive.
     """
 
-    #: (emap, T_map_base) -> (B, ...): a HeightScan, a MapImage, or a function of your own
+    #: a HeightScan, a MapImage, or a function of your own, (emap, T_map_base) -> (B, ...)
     read: ClassVar[Reader]
     map_cfg: ClassVar[ElevationMapConfig] = DEFAULT_CFG  #: config of the maps
     #: True appends the validity of a height scan, (B, P) becomes (B, 2 P)
