@@ -40,6 +40,22 @@ def test_topics_frames_and_poses_can_be_given(run, bag, tmp_path):
     assert np.nanmin(variance) > 0.9 * COVARIANCE[2, 2]
 
 
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_recording_is_not_written_over(run, tmp_path, kind):
+    bag = write_drive(tmp_path, kind)
+    files = sorted(bag.iterdir()) if bag.is_dir() else [bag]
+    before = [file.read_bytes() for file in files]
+    for name, ending in (("--grid-map", ".bag"), ("--video", ".gif")):
+        code, _, err = run("map", bag, name, bag / f"map{ending}" if bag.is_dir() else bag)
+        assert code == 2 and f"{name}: must not be written over the recording" in err
+    assert [file.read_bytes() for file in files] == before
+
+
+def test_a_time_between_maps_needs_a_recording_of_them(run, bag):
+    code, _, err = run("map", bag, "--every", 1)
+    assert code == 2 and "give --grid-map or --video" in err
+
+
 def test_the_listing_has_topics_frames_and_the_command(run, bag):
     code, out, err = run("bag", bag)
     assert (code, err) == (0, "")

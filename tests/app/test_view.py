@@ -89,15 +89,18 @@ def test_without_a_recording_the_demo_walks(run, port, shown, monkeypatch):
 @pytest.mark.parametrize(
     "args, words",
     [
-        (("nowhere",), "nowhere: no such folder"),
+        (("nowhere",), "nowhere: no such file or folder"),
         (("drive", "--extrinsics", "1 2"), "12 numbers"),
         (("broken.npz",), "broken.npz"),
         (("drive", "--port", "0"), "0 is not in the range"),
+        (("drive", "--host", "nonsense"), "host: must be an address of this machine, got 'nonsense'"),
+        (("whole.npz", "--size", "3"), "--size: only for recordings"),
         (("drive", "--points", "/cloud"), "only bags have topics"),
     ],
 )
 def test_bad_input_is_one_line(run, recording, shown, tmp_path, args, words):
     (tmp_path / "broken.npz").write_bytes(b"PK but no more")
+    export.save_npz(tmp_path / "whole.npz", mapped(num_envs=1))
     code, _, err = run("view", *args)
     assert code == 2 and words in err and "Traceback" not in err and not shown
 

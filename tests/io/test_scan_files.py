@@ -43,7 +43,7 @@ def test_ignores_hidden_files_notes_and_own_maps(tmp_path):
 
 
 def test_refuses_folders_without_scans(tmp_path):
-    with pytest.raises(RecordingError, match="no such folder"):
+    with pytest.raises(RecordingError, match="no such file or folder"):
         find_scans(tmp_path / "gone")
     with pytest.raises(RecordingError, match=r"holds no scan; expected .* among \.bin \.npy \.npz"):
         find_scans(tmp_path)

@@ -13,6 +13,7 @@ from torchelev.io.bags.recording import TRANSFORMS
 from torchelev.io.bags.scans import CLOUDS, IMAGES
 from torchelev.io.bags.transforms import TransformTree
 
+_TIMED = 20  # messages, of which the rate is told
 _HAVE_FRAMES = (*CLOUDS, *IMAGES, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 
 
@@ -32,10 +33,16 @@ def describe_bag(path: Path) -> str:
 
 
 def _row(bag: Bag, topic: Topic) -> tuple[str, str, str, str, str]:
-    rate = f"{(topic.num - 1) / bag.duration:.1f}" if topic.num > 1 and bag.duration > 0 else ""
+    rate = "" if TRANSFORMS.get(topic.name) else _rate(bag.read_times(topic.name, _TIMED))
     first = next(bag.read([topic.name]), None) if topic.type in _HAVE_FRAMES else None
     frame = "" if first is None else first.data.header.frame_id
     return topic.name, topic.type, f"{topic.num:,}", rate, frame
+
+
+def _rate(times: list[float]) -> str:
+    """Return the messages a second at these times [s], or "" where there are too few."""
+    spacing = (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
+    return f"{1 / spacing:.1f}" if spacing > 0 else ""
 
 
 def _read_tree(bag: Bag) -> TransformTree:

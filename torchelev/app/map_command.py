@@ -16,7 +16,7 @@ from torchelev.app.map_video import MapVideo
 from torchelev.app.open_scans import open_scans
 from torchelev.app.report import suggest_options, summarize
 from torchelev.app.user_error import BAD_INPUT, UserError, user_errors
-from torchelev.io import Frame, MappingRun, RecordingError
+from torchelev.io import Frame, MappingRun, RecordingError, is_bag
 
 _INTERRUPTED = 130  # exit code
 _DEFAULT_EVERY = 1.0  # [s] between two maps of --grid-map
@@ -33,8 +33,7 @@ def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
     emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
     prefix, run = prepare_outputs(request.out, emap), MappingRun(emap)
     every = request.every
-    if every is not None and not every >= 0:
-        raise ValueError(f"--every: must not be negative, got {every}; give seconds, or 0 for each scan")
+    _check_recordings(request)
     video = MapVideo(request.video, every, len(scans), request.recording.resolve().name)
     frame = getattr(scans, "map_frame", "map")
     recorder = MapRecorder(request.grid_map, _DEFAULT_EVERY if every is None else every, frame)
@@ -44,6 +43,18 @@ def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
     if video.num:
         click.echo(f"filmed    {video.num} frames in {video.path}")
     return _finish(run, len(scans), prefix, stopped, options)
+
+
+def _check_recordings(request: MapRequest) -> None:
+    """Refuse to record the map over the recording, and a time between maps that is none or unused."""
+    every, recording = request.every, request.recording.resolve()
+    for name, path in (("--grid-map", request.grid_map), ("--video", request.video)):
+        if path is not None and recording in (path.resolve(), *(path.resolve().parents if is_bag(recording) else ())):
+            raise ValueError(f"{name}: must not be written over the recording, got {path}; choose another path")
+    if every is not None and not every >= 0:
+        raise ValueError(f"--every: must not be negative, got {every}; give seconds, or 0 for each scan")
+    if every is not None and request.grid_map is None and request.video is None:
+        raise ValueError("--every: says how often the map is recorded; give --grid-map or --video, too")
 
 
 def _fuse_and_record(

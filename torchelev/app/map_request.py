@@ -12,22 +12,22 @@ class MapRequest:
     """Arguments of `torchelev map` as the user gave them; see its help."""
 
     recording: Path  #: folder of scans, or a bag
-    poses: Path | None  #: pose file, of a bag a topic; None: found in or beside the recording
-    intrinsics: Path | None  #: camera file of depth images; None: the scans are point clouds
+    poses: Path | None = None  #: pose file, of a bag a topic; None: found in or beside the recording
+    intrinsics: Path | None = None  #: camera file of depth images; None: the scans are point clouds
     out: str = "map"  #: prefix of the output files, or a folder
-    resolution: float | None  #: [m] cell size; None: the config's
-    size: float | None  #: [m] side length of the map; None: the config's
-    fixed: bool  #: keep the window in place
-    device: str  #: torch device
-    config: Path | None  #: YAML settings
-    dt: float | None  #: [s] between scans; None: from the pose file
-    sensor_height: float | None  #: [m] above the base
-    extrinsics: str | None  #: T_base_sensor, a file or numbers
-    poses_of: Literal["sensor", "base"]  #: frame whose poses the pose file holds
-    bin_layout: str | None  #: see FileLayout.bin
-    quaternions: Literal["xyzw", "wxyz"] | None  #: see FileLayout.quaternions
-    time_unit: Literal["s", "ms", "us", "ns"] | None  #: see FileLayout.time_unit
-    pcd_frame: Literal["sensor", "viewpoint"] | None  #: see FileLayout.pcd_frame
+    resolution: float | None = None  #: [m] cell size; None: the config's
+    size: float | None = None  #: [m] side length of the map; None: the config's
+    fixed: bool = False  #: keep the window in place
+    device: str = "cpu"  #: torch device
+    config: Path | None = None  #: YAML settings
+    dt: float | None = None  #: [s] between scans; None: from the pose file
+    sensor_height: float | None = None  #: [m] above the base
+    extrinsics: str | None = None  #: T_base_sensor, a file or numbers
+    poses_of: Literal["sensor", "base"] = "sensor"  #: frame whose poses the pose file holds
+    bin_layout: str | None = None  #: see FileLayout.bin
+    quaternions: Literal["xyzw", "wxyz"] | None = None  #: see FileLayout.quaternions
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None  #: see FileLayout.time_unit
+    pcd_frame: Literal["sensor", "viewpoint"] | None = None  #: see FileLayout.pcd_frame
     points: tuple[str, ...] = ()  #: topics of a bag's clouds
     depth: tuple[str, ...] = ()  #: topics of a bag's depth images
     map_frame: str | None = None  #: frame of a bag in which the map is built

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,14 +38,16 @@ def run_view(request: MapRequest | None, host: str, port: int, is_paused: bool) 
         from torchelev.viz.live import Page
 
         page = Page(title, layers, host=host, port=port)
+        closing.callback(page.stop)
         click.echo(f"open      {page.url}   (Ctrl-C ends)")
         return page
 
-    with user_errors():
+    with user_errors(), ExitStack() as closing:
         try:
             if request is None:
                 _view_demo(make_page, is_paused)
             elif request.recording.suffix == ".npz" and request.recording.is_file():
+                _refuse_options(request)
                 _view_map(make_page, request.recording)
             else:
                 _view_recording(make_page, request, is_paused)
@@ -95,6 +99,15 @@ def _view_demo(make_page: _MakePage, is_paused: bool) -> None:
         scene = scan.T_map_base, scan.T_map_sensor, scan.points
         player.show(take_snapshot(emap, *scene, layers=emap.layers, time=scan.time))
     player.hold()
+
+
+def _refuse_options(request: MapRequest) -> None:
+    """Refuse options that say how to read and map a recording, which a saved map is not."""
+    plain = MapRequest(recording=request.recording)
+    names = [field.name for field in fields(plain) if getattr(request, field.name) != getattr(plain, field.name)]
+    if names:
+        given = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+        raise ValueError(f"{given}: only for recordings; {request.recording} is a map, which is shown as it is")
 
 
 def _view_map(make_page: _MakePage, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 import pytest
 
 from tests.helpers import mapped, pose
@@ -32,6 +33,17 @@ def test_it_shows_the_robot_that_was_chosen(emap, port, capsys):
     assert f"http://localhost:{port}" in capsys.readouterr().out
     assert (shown == emap.layer("elevation")[0].numpy())[shown == shown].all()
     assert (other == emap.layer("elevation")[2].numpy())[other == other].all()
+
+
+def test_after_the_loop_another_robot_can_be_chosen(emap, port, monkeypatch):
+    with LiveView(emap, port=port, max_share=1.0) as view:
+        view.show(pose(num_envs=3))
+        wait_for(lambda: view.num_drawn == 1)
+        monkeypatch.setattr(view.page, "wait", lambda: None)
+        view.wait()
+        view.page._env.value = 2
+        shown = view.page._last.map.layers["elevation"]
+    assert np.array_equal(shown, emap.layer("elevation")[2].numpy(), equal_nan=True)
 
 
 def work(seconds):

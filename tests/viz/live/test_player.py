@@ -113,6 +113,21 @@ def test_play_from_an_earlier_scan_goes_on_at_the_last_one(player, snapshot):
     assert player.made.num_shown == SCANS
 
 
+def test_after_the_last_scan_play_shows_it_all_again(player, snapshot):
+    player.made._speed.value = "max"
+    thread = play(player, snapshot)
+    player.made._press("play")
+    thread.join(30)
+    threading.Thread(target=player.made.hold, daemon=True).start()
+    wait_for(lambda: player.made._is_over)
+    player.made._speed.value = "0.25x"
+    player.made._press("play")
+    wait_for(lambda: has_status(player, "Scan 2 "))
+    player.made._press("pause")
+    time.sleep(0.2)
+    assert player.made._shown < SCANS - 1 and player.made.num_shown == SCANS
+
+
 def test_the_history_has_bounded_memory(snapshot):
     history = History(max_bytes=10 * snapshot.nbytes)
     for k in range(100):

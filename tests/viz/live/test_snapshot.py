@@ -55,9 +55,13 @@ def test_points_without_z_lie_on_the_map():
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ({"T_map_base": np.eye(3)}, r"T_map_base: expected \(B, ..., 4, 4\).*\(3, 3\)"),
+        ({"T_map_base": np.eye(3)}, r"T_map_base: expected \(1, ..., 4, 4\).*\(3, 3\)"),
         ({"scan": np.zeros((2, 4))}, r"scan: expected"),
-        ({"points": np.zeros((2, 3))}, r"T_map_sensor: expected the poses"),
+        ({"points": np.zeros((2, 3))}, r"T_map_sensor: expected the poses of the 1 clouds"),
+        ({"points": np.zeros((2, 3)), "T_map_sensor": np.zeros((1, 2, 4, 4))}, r"T_map_sensor: expected the poses"),
+        ({"T_map_base": np.zeros((2, 4, 4))}, r"T_map_base: expected \(1, ..., 4, 4\).*\(2, 4, 4\)"),
+        ({"plan": np.zeros((4, 5, 3))}, r"plan: expected"),
+        ({"plan": [[0.0, 1.0]]}, r"plan: expected"),
         ({"env": 1}, r"env: must lie in \[0, 1\)"),
     ],
 )

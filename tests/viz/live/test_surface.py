@@ -49,6 +49,13 @@ def test_a_click_finds_the_first_cell_on_its_ray(cell):
         assert find_cell(saved, np.array(start), target - start) == cell
 
 
+def test_a_click_through_a_hole_finds_no_cell_under_the_surface():
+    saved = ramp()
+    hole = np.array([-0.05, -0.05, 0.2])
+    for start in ((-0.05, -0.05, 2.0), (-1.0, -0.05, 1.5), (-0.05, -1.0, 0.8)):
+        assert find_cell(saved, np.array(start), hole - start) is None
+
+
 def test_a_click_beside_the_map_or_on_the_hole_finds_none():
     saved, up = ramp(), np.array([0.0, 0.0, 2.0])
     assert find_cell(saved, up, np.array([1.0, 1.0, 0.1])) is None

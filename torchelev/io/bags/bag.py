@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -147,6 +149,15 @@ class Bag:
                 return
             last, num = time / 1e9, num + 1
             yield Message(connection.topic, last, data)
+
+    def read_times(self, topic: str, count: int) -> list[float]:
+        """Return when the first messages of a topic were recorded [s], at most `count`; a damaged bag gives fewer."""
+        connections = [connection for connection in self._reader.connections if connection.topic == topic]
+        times: list[float] = []
+        with contextlib.suppress(Exception):  # rosbags lets through what its file formats raise; `read` says what
+            for _, time, _ in itertools.islice(self._reader.messages(connections), count):
+                times.append(time / 1e9)
+        return times
 
     def _require_all(self, topics: Sequence[str], num: int) -> None:
         """Say so if the bag counts more messages than could be read: its index is damaged."""

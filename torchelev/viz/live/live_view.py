@@ -75,6 +75,7 @@ class LiveView:
         self.page = Page("torchelev", emap.layers, emap.num_envs, host, port)
         self._start = self._due = time.perf_counter()
         self._load = Load()
+        self._arguments: tuple[Any, ...] = (None,) * 5  # of the last `show`
         self._drawing = 0.0  # [s] of the CPU for the last picture
         self._next: Snapshot | None = None
         self._wake, self._stopped = threading.Condition(), False
@@ -105,12 +106,10 @@ class LiveView:
             Whether it will be shown.
         """
         start = time.perf_counter()
+        self._arguments = (T_map_base, T_map_sensor, points, scan, plan)
         if start < self._due or self._next is not None:
             return False
-        snapshot = take_snapshot(
-            self._emap, T_map_base, T_map_sensor, points,
-            env=self.page.env, scan=scan, plan=plan, layers=self._own_layers(), time=start - self._start,
-        )  # fmt: skip
+        snapshot = self._take(start - self._start)
         with self._wake:
             self._next = snapshot
             self._wake.notify()
@@ -118,6 +117,12 @@ class LiveView:
         share = self._max_share + (1 - self._max_share) * _USED_IDLENESS * self._load.measure_idleness()
         self._due = start + max(1 / self._max_rate, (taken + _WHOLE_COST * self._drawing) / share)
         return True
+
+    def _take(self, seconds: float) -> Snapshot:
+        """Copy the environment that the page asks for, with the arguments of the last `show`."""
+        T_map_base, T_map_sensor, points, scan, plan = self._arguments
+        own: dict[str, Any] = {"env": self.page.env, "layers": self._own_layers(), "time": seconds}
+        return take_snapshot(self._emap, T_map_base, T_map_sensor, points, scan=scan, plan=plan, **own)
 
     def _own_layers(self) -> tuple[str, ...]:
         """The filter's layer that colours the map, if one does; others are not computed."""
@@ -138,7 +143,9 @@ class LiveView:
             self._next = None
 
     def wait(self) -> None:
-        """Keep the page open after the loop, until Ctrl-C."""
+        """Keep the page open after the loop, until Ctrl-C. Another robot can still be chosen."""
+        last = self.page.last_time
+        self.page.on_change = lambda: self.page.draw(self._take(last))
         try:
             self.page.wait()
         except KeyboardInterrupt:

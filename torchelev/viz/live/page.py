@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -39,7 +40,7 @@ class Page:
 
     Raises:
         ModuleNotFoundError: viser is missing.
-        ValueError: the port is none.
+        ValueError: the port is none, or the host no address of this machine.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Page:
         import viser
 
         require(0 < port <= _MAX_PORT, "port", f"must lie in [1, {_MAX_PORT}]", port, "use 8080")
+        _require_own_address(host)
         # A browser that connects in advance and then does not ask is no error worth a traceback.
         logging.getLogger("websockets.server").addFilter(lambda record: "handshake failed" not in record.msg)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
@@ -83,6 +85,11 @@ class Page:
     def env(self) -> int:
         """The environment to show."""
         return 0 if self._env is None else int(self._env.value)
+
+    @property
+    def last_time(self) -> float:
+        """Time [s] of the snapshot on the page; 0 before the first."""
+        return 0.0 if self._last is None else self._last.time
 
     def _add_controls(self, layers: tuple[str, ...], num_envs: int) -> None:
         gui = self.server.gui
@@ -172,4 +179,15 @@ class Page:
 
     def stop(self) -> None:
         """Close the page."""
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # its farewell
+            self.server.stop()
+
+
+def _require_own_address(host: str) -> None:
+    """Refuse an address that the server would wait for in vain."""
+    try:
+        with socket.create_server((host, 0)):
+            pass
+    except OSError as error:
+        actual, hint = f"{host!r} ({error.strerror})", "use 127.0.0.1, or 0.0.0.0 to let other machines connect"
+        raise ValueError(f"host: must be an address of this machine, got {actual}; {hint}") from error

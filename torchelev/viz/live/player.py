@@ -66,6 +66,7 @@ class Player:
         self._latest: Snapshot | None = None
         self._now = self._shown = -1  # number of the last scan, and of the one on the page
         self._wanted: int | None = None  # the scan that the user asked for
+        self._is_over = False  # all scans are mapped
         self._start: tuple[float, float] | None = None  # wall time and recording's time [s] since it plays
         self._drawn_at = 0.0
         self._changed = threading.Condition()
@@ -94,7 +95,11 @@ class Player:
         """Do what a button says."""
         if button == "play":
             with self._changed:
-                self._is_playing, self._wanted = True, self._now if self._shown < self._now else None
+                self._is_playing, self._wanted = True, None
+                if not self._is_over and self._shown < self._now:
+                    self._wanted = self._now  # go on with the mapping
+                elif self._is_over and self._shown >= self._now:
+                    self._shown = -1  # play again
                 self._restart_clock()
                 self._changed.notify_all()
             return
@@ -131,13 +136,24 @@ class Player:
             self._show_earlier()
 
     def hold(self) -> None:
-        """Stay on the page after the last scan, so that one can go back. Returns at Ctrl-C, by raising it."""
+        """Stay on the page after the last scan, so that one can go back and play again, until Ctrl-C raises."""
         if self._latest is not None:
             self._draw(self._now, self._latest)
+        self._is_playing, self._is_over = False, True
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._wanted is not None, timeout=0.5)
+                self._changed.wait_for(lambda: self._wanted is not None or self._is_replaying, timeout=0.5)
             self._show_earlier()
+            if self._is_replaying:
+                number = self._shown + 1
+                snapshot = self._history.at(number)
+                self._wait_until_due(snapshot.time)
+                if self._is_replaying:
+                    self._draw(number, snapshot)
+
+    @property
+    def _is_replaying(self) -> bool:
+        return self._is_over and self._is_playing and self._wanted is None and self._shown < self._now
 
     def _wait_until_due(self, time_now: float) -> None:
         """Wait until the wall clock has come to a time of the recording [s], or somebody asks for another scan."""

@@ -81,43 +81,56 @@ def take_snapshot(
     Raises:
         ValueError: the environment does not exist, or a shape differs.
     """
+    B = emap.num_envs
+    base = _pick("T_map_base", T_map_base, env, B, (4, 4), (2, 3))
+    sensor = _pick("T_map_sensor", T_map_sensor, env, B, (4, 4), (2, 3, 4))
+    cloud = _pick("points", points, env, B, (3,), (2, 3, 4))
+    is_flat = scan is not None and tuple(np.shape(scan))[-1:] == (2,)
+    policy = _pick("scan", scan, env, B, (2,) if is_flat else (3,), (2, 3))
+    planned = _pick("plan", plan, env, B, (3,), (2,))
     saved = take(emap, env, (*LAYERS, *(name for name in layers if name not in LAYERS)))
-    base, sensor = _pick("T_map_base", T_map_base, env, (4, 4)), _pick("T_map_sensor", T_map_sensor, env, (4, 4))
-    sensor = None if sensor is None else sensor.reshape(-1, 4, 4)
-    cloud = _pick("points", points, env, (3,))
-    flat = scan is not None and scan.shape[-1] == 2
-    policy = _pick("scan", scan, env, (2,) if flat else (3,))
-    policy = _onto(saved, policy.reshape(-1, 2)) if policy is not None and flat else policy
-    require(cloud is None or sensor is not None, "T_map_sensor", "expected the poses of `points`", None, "give both")
+    policy = _onto(saved, policy) if policy is not None and is_flat else policy
     return Snapshot(
         saved,
-        None if base is None else base.reshape(4, 4),
-        sensor,
-        _NO_POINTS if cloud is None or sensor is None else _to_map_frame(cloud, sensor),
-        _points_or_none(policy),
-        _points_or_none(None if plan is None else _to_numpy(plan)),
+        base,
+        None if sensor is None else sensor.reshape(-1, 4, 4),
+        _NO_POINTS if cloud is None else _to_map_frame(cloud, sensor),
+        _drop_unknown(policy),
+        _drop_unknown(planned),
         time,
     )
 
 
-def _pick(name: str, values: Any, env: int, ending: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """Return one environment's values (..., *ending), or the values as they are if they have no batch dimension."""
+def _pick(
+    name: str, values: Any, env: int, num_envs: int, ending: tuple[int, ...], dims: tuple[int, ...]
+) -> NDArray[np.float64] | None:
+    """Return one environment's values, or the values as they are if they have no batch dimension, as arrays.
+
+    Args:
+        name: of the argument.
+        values: (..., *ending) tensor or array.
+        env: the environment.
+        num_envs: B.
+        ending: the last dimensions.
+        dims: numbers of dimensions that are allowed; the lowest is without a batch.
+    """
     if values is None:
         return None
-    shape = tuple(values.shape)
-    num_own = 2  # a matrix, or a number of points and their coordinates
-    fits = len(shape) >= num_own and shape[-len(ending) :] == ending
-    require(fits, name, f"expected (B, ..., {', '.join(map(str, ending))})", shape, "see take_snapshot")
-    return _to_numpy(values[env] if len(shape) > num_own else values)
+    shape = tuple(np.shape(values))
+    fits = len(shape) in dims and shape[-len(ending) :] == ending
+    fits = fits and (len(shape) == dims[0] or shape[0] == num_envs)
+    rule = f"expected ({num_envs}, ..., {', '.join(map(str, ending))}) with {' or '.join(map(str, dims))} dimensions"
+    require(fits, name, rule, shape, "the first dimension is the environment's; leave it out for a single robot")
+    return _to_numpy(values[env] if len(shape) > dims[0] else values)
 
 
 def _to_numpy(values: Any) -> NDArray[np.float64]:
     return values.detach().double().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values, float)
 
 
-def _points_or_none(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    points = _NO_POINTS if points is None else points.reshape(-1, 3)
-    return points[np.isfinite(points).all(1)]
+def _drop_unknown(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return the points (N, 3) that are finite."""
+    return _NO_POINTS if points is None else points[np.isfinite(points).all(1)]
 
 
 def _onto(saved: SavedMap, xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,8 +142,12 @@ def _onto(saved: SavedMap, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([xy, np.where(is_inside, heights[i, j], np.nan)])
 
 
-def _to_map_frame(points: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_map_frame(points: NDArray[np.float64], T: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """Return at most `_MAX_POINTS` of the points of all sensors, map frame."""
-    points = points.reshape(len(T), -1, 3)
+    expected, actual = (1,) if points.ndim == 2 else points.shape[:1], None if T is None else T.shape
+    rule = f"expected the poses of the {expected[0]} clouds of points"
+    require(T is not None and (T.shape[:-2] or (1,)) == expected, "T_map_sensor", rule, actual, "give one for each")
+    assert T is not None
+    T, points = T.reshape(-1, 4, 4), points.reshape(*expected, -1, 3)
     points = points[:, :: max(1, -(-points.shape[0] * points.shape[1] // _MAX_POINTS))]
-    return _points_or_none(points @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3])
+    return _drop_unknown((points @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]).reshape(-1, 3))

@@ -45,7 +45,7 @@ def bound_sheet(saved: SavedMap, origin: NDArray[np.float64]) -> tuple[NDArray[n
 
 
 def find_cell(saved: SavedMap, start: NDArray[np.float64], direction: NDArray[np.float64]) -> tuple[int, int] | None:
-    """Return the first cell (i, j) whose elevation a ray meets, or None.
+    """Return the first cell (i, j) whose elevation a ray meets from above, or None.
 
     Args:
         saved: the map.
@@ -56,7 +56,10 @@ def find_cell(saved: SavedMap, start: NDArray[np.float64], direction: NDArray[np
     reach = float(np.linalg.norm(start - saved.center)) + 2 * max(heights.shape) * saved.resolution
     points = start + np.arange(0, reach, step)[:, None] * (direction / np.linalg.norm(direction))
     cells = np.floor((points[:, :2] - saved.center[:2]) / saved.resolution + np.array(heights.shape) / 2).astype(int)
-    is_inside = ((cells >= 0) & (cells < heights.shape)).all(1)
-    cells, points = cells[is_inside], points[is_inside]
-    met = np.flatnonzero(points[:, 2] <= heights[cells[:, 0], cells[:, 1]])  # never at NaN
-    return (int(cells[met[0], 0]), int(cells[met[0], 1])) if len(met) else None
+    is_inside = np.all((cells >= 0) & (cells < heights.shape), axis=1)
+    i, j = np.where(is_inside[:, None], cells, 0).T
+    above = points[:, 2] - np.where(is_inside, heights[i, j], np.nan)
+    met = np.flatnonzero(above <= 0)[:1]  # never at NaN
+    # A ray that was not above known ground before has come in through a hole or the side, under the surface.
+    is_hit = len(met) and met[0] > 0 and above[met[0] - 1] > 0
+    return (int(i[met[0]]), int(j[met[0]])) if is_hit else None
