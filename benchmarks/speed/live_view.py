@@ -137,12 +137,21 @@ def _run(work: Workload, view: LiveView | None, period: float) -> float:
 
 def table(result: dict[str, Any]) -> str:
     """Tabulate the rates by clients, and the slowdown by threads."""
-    rows = [[f"pictures a second, {row['clients']} clients", f"{row['pictures_per_s']:.0f}"] for row in result["rates"]]
+    rows = [
+        [f"pictures a second, {_count(row['clients'], 'client')}", f"{row['pictures_per_s']:.0f}"]
+        for row in result["rates"]
+    ]
     for row in result["loops"]:
         loop = f"loop at {1 / row['period_s']:.0f} Hz" if row["period_s"] else "loop without a pause"
-        rows.append([f"{loop}, {row['threads']} threads: updates slower by", f"{100 * (row['ratio'] - 1):.1f} %"])
-        rows.append([f"{loop}, {row['threads']} threads: pictures a second", f"{row['pictures_per_s']:.1f}"])
+        rows.append(
+            [f"{loop}, {_count(row['threads'], 'thread')}: updates slower by", f"{100 * (row['ratio'] - 1):.1f} %"]
+        )
+        rows.append([f"{loop}, {_count(row['threads'], 'thread')}: pictures a second", f"{row['pictures_per_s']:.1f}"])
     return markdown_table(["250 × 250 cells", ""], rows)
+
+
+def _count(number: int, of: str) -> str:
+    return f"{number} {of}{'s' if number > 1 else ''}"
 
 
 @click.command(help=__doc__)

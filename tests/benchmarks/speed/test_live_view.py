@@ -26,4 +26,4 @@ def test_two_pictures_are_measured_and_tabulated(tmp_path, monkeypatch):
     assert result.exit_code == 0
     written = json.loads((tmp_path / "live_view.json").read_text())
     assert written["rates"][0]["pictures_per_s"] > 0 and all(loop["ratio"] > 0 for loop in written["loops"])
-    assert "| pictures a second, 1 clients |" in result.output
+    assert "| pictures a second, 1 client |" in result.output
