@@ -19,10 +19,10 @@ _UNKNOWN = (217, 217, 217, 255)
 
 
 class Limits(NamedTuple):
-    """The values of the lowest and the highest colour."""
+    """The range of values that the colours span."""
 
-    low: float
-    high: float
+    low: float  #: value of the lowest colour, in the layer's unit
+    high: float  #: value of the highest colour
 
 
 def choose_limits(layer: str, values: NDArray, before: Limits | None = None) -> Limits:
