@@ -1,6 +1,7 @@
 """What all tests share: hypothesis' profile, one thread, the compiler's backend, and how workers share the tests."""
 
 import collections
+import socket
 
 import pytest
 import torch
@@ -53,3 +54,11 @@ def compile_with(monkeypatch):
     yield use
     graphs_of.cache_clear()
     torch._dynamo.reset()
+
+
+@pytest.fixture
+def port():
+    """A port that is free."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]

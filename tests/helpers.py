@@ -1,6 +1,7 @@
 """What the tests share: small configs, poses, clouds, random states, and how two states are compared."""
 
 import math
+import time
 
 import numpy as np
 import torch
@@ -161,3 +162,11 @@ class NoGenerator:
 
     def manual_seed(self, seed):
         return None
+
+
+def wait_for(claim, seconds=10.0):
+    """Wait until a claim is true; fail if it is not in time."""
+    end = time.monotonic() + seconds
+    while not claim():
+        assert time.monotonic() < end
+        time.sleep(0.01)

@@ -31,7 +31,7 @@ def main(scans: int) -> None:
     """Walk, open the page, take the picture."""
     demo = DemoWalk(scans * DT)
     page = Page("demo", demo.emap.layers)
-    Player(page, len(DemoWalk()))  # for its controls
+    Player(page, len(demo.path.times))  # for its controls
     for scan in demo:
         scene = scan.T_map_base, scan.T_map_sensor, scan.points
         page.draw(take_snapshot(demo.emap, *scene), f"Scan {scans}, {scan.time:.1f} s")
@@ -43,9 +43,8 @@ def main(scans: int) -> None:
         picture = Image.open(io.BytesIO(browser.picture())).convert("RGB")
     page.stop()
     with atomic_file(PICTURE) as file:
-        picture.crop((0, 0, _SIZE[0], 720)).quantize(_COLORS, dither=Image.Dither.NONE).save(
-            file, format="png", optimize=True
-        )
+        small = picture.crop((0, 0, *_SHOWN)).quantize(_COLORS, dither=Image.Dither.NONE)
+        small.save(file, format="png", optimize=True)
 
 
 if __name__ == "__main__":

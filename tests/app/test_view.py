@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import urllib.request
@@ -15,13 +14,6 @@ from tests.io.bags.synthetic import write_drive
 from torchelev.io import export
 
 viser = pytest.importorskip("viser", reason="needs torchelev[view]")
-
-
-@pytest.fixture
-def port():
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
 
 
 @pytest.fixture

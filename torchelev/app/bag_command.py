@@ -13,7 +13,7 @@ from torchelev.io.bags.recording import TRANSFORMS
 from torchelev.io.bags.scans import CLOUDS, IMAGES
 from torchelev.io.bags.transforms import TransformTree
 
-_TIMED = 20  # messages, of which the rate is told
+_TIMED = 20  # messages that give a topic's rate
 _HAVE_FRAMES = (*CLOUDS, *IMAGES, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 
 

@@ -75,11 +75,9 @@ def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
     with Bag(request.recording) as bag:
         scans = open_bag(bag, wanted, lambda m: show_progress(m, "reading poses", "message"))
         click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}")
+        options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base)
         try:
-            yield (
-                scans,
-                MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base),
-            )
+            yield scans, options
         finally:
             for note in scans.warnings:
                 click.echo(f"warning: {note}", err=True)

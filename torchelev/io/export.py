@@ -54,6 +54,19 @@ class SavedMap(NamedTuple):
         x, y = float(self.center[0]), float(self.center[1])
         return x - half_x, x + half_x, y - half_y, y + half_y
 
+    def find_cells(self, xy: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the cells i, j (M,) that hold points (M, 2) [m], and which points are inside; others get 0, 0."""
+        shape = np.array(next(iter(self.layers.values())).shape)
+        cell = np.floor((xy - self.center[:2]) / self.resolution + shape / 2)
+        is_inside = np.all((cell >= 0) & (cell < shape), axis=1)
+        i, j = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
+        return i, j, is_inside
+
+    def cell_center(self, cell: tuple[int, int]) -> tuple[float, float]:
+        """Return the centre (x, y) [m] of cell (i, j), map frame."""
+        x_min, _, y_min, _ = self.extent
+        return x_min + (cell[0] + 0.5) * self.resolution, y_min + (cell[1] + 0.5) * self.resolution
+
 
 def take(emap: ElevationMap, env: int = 0, layers: Sequence[str] | None = None) -> SavedMap:
     """Copy one environment to NumPy arrays.

@@ -84,17 +84,17 @@ def _deploy_all(runs: Path) -> dict[str, Any]:
     rows = []
     for case in tqdm(CASES):
         folder = _folder(runs, *case)
-        rows.append(_kept(folder / "deployed.json", functools.partial(_row, runs, *case), folder / "policy.pt"))
+        rows.append(_load_or_make(folder / "deployed.json", functools.partial(_row, runs, *case), folder / "policy.pt"))
     fixed = {
         "seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS,
         "levels": cfg.terrain.num_levels, "difficulty": cfg.terrain.difficulty,
     }  # fmt: skip
-    trot = _kept(runs / "trot.json", lambda: _deploy(stand_in_trot, "blind"))
+    trot = _load_or_make(runs / "trot.json", lambda: _deploy(stand_in_trot, "blind"))
     return {"config": fixed, "trot": trot, "rows": rows}
 
 
-def _kept(path: Path, make: Callable[[], dict[str, Any]], policy: Path | None = None) -> dict[str, Any]:
-    """Return the result that the file holds, made anew and written there if it came from other settings or weights."""
+def _load_or_make(path: Path, make: Callable[[], dict[str, Any]], policy: Path | None = None) -> dict[str, Any]:
+    """Return the result in a file; make and write it first if the file is missing or of other settings or weights."""
     source = json.loads(json.dumps(_settings() | {"policy": policy and sha256(policy.read_bytes()).hexdigest()}))
     kept = json.loads(path.read_text()) if path.exists() else {}
     if kept.get("source") != source:

@@ -78,7 +78,7 @@ def test_a_kept_result_is_made_anew_when_its_constants_or_its_policy_change(tmp_
         return {"number": made[-1]}
 
     def kept():
-        return experiment._kept(folder / "deployed.json", make, weights)["number"]
+        return experiment._load_or_make(folder / "deployed.json", make, weights)["number"]
 
     assert [kept(), kept()] == [0, 0]
     weights.write_bytes(b"two")

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from docs.browser import Browser, find_browser
-from tests.helpers import pose
+from tests.helpers import pose, wait_for
 from tests.viz.live.test_page import mapped_step
 from torchelev.viz.live import LiveView
 
@@ -35,13 +35,6 @@ def num_colored(picture):
     return int((picture.max(-1) - picture.min(-1) > 40).sum())
 
 
-def wait_until(claim, seconds=120.0):
-    end = time.monotonic() + seconds
-    while not claim():
-        assert time.monotonic() < end
-        time.sleep(0.2)
-
-
 def click_on(browser, kind, text):
     """Click on an element once it stands still."""
     place, before = browser.wait_for(_CENTER_OF % (kind, text)), None
@@ -57,7 +50,7 @@ def test_the_page_in_a_browser(port):
         assert view.show(pose((0, 0, 0.5)), T)
         with Browser(view.page.url, SIZE) as browser:
             browser.wait_for("document.querySelector('canvas') !== null")
-            wait_until(lambda: num_colored(pixels(browser)) > 1000)
+            wait_for(lambda: num_colored(pixels(browser)) > 1000, seconds=120)
             browser.wait_for("document.body.innerText.includes('elevation [m]')")
 
             click_on(browser, "input", "elevation")
@@ -72,5 +65,7 @@ def test_the_page_in_a_browser(port):
 
             first = pixels(browser)
             emap.reset()
-            wait_until(lambda: view.show(pose((0, 0, 0.5)), T))
-            wait_until(lambda: num_colored(pixels(browser)) < num_colored(first) / 3)  # the map is gone from the page
+            wait_for(lambda: view.show(pose((0, 0, 0.5)), T), seconds=120)
+            wait_for(
+                lambda: num_colored(pixels(browser)) < num_colored(first) / 3, seconds=120
+            )  # the map is gone from the page

@@ -5,20 +5,13 @@ import time
 import numpy as np
 import pytest
 
-from tests.helpers import mapped, pose
+from tests.helpers import mapped, pose, wait_for
 from torchelev.viz.live import LiveView
 
 
 @pytest.fixture
 def emap():
     return mapped(num_envs=3)
-
-
-def wait_for(claim, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not claim():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def test_it_shows_the_robot_that_was_chosen(emap, port, capsys):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.helpers import mapped
+from tests.helpers import mapped, wait_for
 from torchelev.viz.live import Page, Player, take_snapshot
 from torchelev.viz.live.player import History
 
@@ -42,13 +42,6 @@ def play(player, snapshot, spacing=0.02):
     thread = threading.Thread(target=feed, daemon=True)
     thread.start()
     return thread
-
-
-def wait_for(claim, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not claim():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def scrub(player, number):

@@ -36,7 +36,7 @@ class TransformTree:
         self.max_extrapolation = max_extrapolation
         self._edges: dict[str, _Edge] = {}
         self._sorted: dict[str, NDArray] = {}
-        self._parents: dict[str, list[str]] = {}  # of each frame, in the order in which they came
+        self._parents: dict[str, list[str]] = {}  # of each frame, in order of arrival
         self._requested: set[str] = set()  # frames whose transforms are replaced by a topic of poses
 
     @property

@@ -55,8 +55,7 @@ class Page:
 
         require(0 < port <= _MAX_PORT, "port", f"must lie in [1, {_MAX_PORT}]", port, "use 8080")
         _require_own_address(host)
-        # A browser that connects in advance and then does not ask is no error worth a traceback.
-        logging.getLogger("websockets.server").addFilter(lambda record: "handshake failed" not in record.msg)
+        logging.getLogger("websockets.server").addFilter(_is_worth_logging)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server: Any = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
@@ -166,8 +165,7 @@ class Page:
         cell = find_cell(snapshot.map, *self._ray)
         if cell is None:
             return f"No known cell there. {_CLICK_HINT}"
-        half = np.array(layers["elevation"].shape) / 2
-        x, y = snapshot.map.center[:2] + (np.array(cell) + 0.5 - half) * snapshot.map.resolution
+        x, y = snapshot.map.cell_center(cell)
         rows = [f"| {name} | {describe(name, float(values[cell]))} |" for name, values in layers.items()]
         head = [f"**Cell at ({x:.2f} m, {y:.2f} m)**", "", "| layer | value |", "| --- | --- |"]
         return "\n".join(head + rows)
@@ -181,6 +179,11 @@ class Page:
         """Close the page."""
         with contextlib.redirect_stdout(io.StringIO()):  # its farewell
             self.server.stop()
+
+
+def _is_worth_logging(record: logging.LogRecord) -> bool:
+    """Tell whether to log a server's message: browsers may connect in advance and then ask for nothing."""
+    return "handshake failed" not in record.getMessage()
 
 
 def _require_own_address(host: str) -> None:

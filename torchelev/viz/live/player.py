@@ -32,7 +32,7 @@ class History:
         self._snapshots: list[Snapshot] = []
 
     def add(self, number: int, snapshot: Snapshot) -> None:
-        """Keep the snapshot of a scan, if its turn it is."""
+        """Keep the snapshot of a scan, if the scan falls on the spacing."""
         if number % self._spacing:
             return
         self._numbers.append(number)

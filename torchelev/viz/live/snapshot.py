@@ -135,11 +135,8 @@ def _drop_unknown(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
 
 def _onto(saved: SavedMap, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points (M, 3) on the elevation of their cells, NaN where it is unknown."""
-    heights = saved.layers["elevation"]
-    cell = np.floor((xy - saved.center[:2]) / saved.resolution + np.array(heights.shape) / 2)
-    is_inside = np.all((cell >= 0) & (cell < heights.shape), axis=1)
-    i, j = np.where(is_inside[:, None], cell, 0).astype(int).T
-    return np.column_stack([xy, np.where(is_inside, heights[i, j], np.nan)])
+    i, j, is_inside = saved.find_cells(xy)
+    return np.column_stack([xy, np.where(is_inside, saved.layers["elevation"][i, j], np.nan)])
 
 
 def _to_map_frame(points: NDArray[np.float64], T: NDArray[np.float64] | None) -> NDArray[np.float64]:

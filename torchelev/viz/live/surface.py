@@ -55,9 +55,7 @@ def find_cell(saved: SavedMap, start: NDArray[np.float64], direction: NDArray[np
     heights, step = saved.layers["elevation"], saved.resolution / 4
     reach = float(np.linalg.norm(start - saved.center)) + 2 * max(heights.shape) * saved.resolution
     points = start + np.arange(0, reach, step)[:, None] * (direction / np.linalg.norm(direction))
-    cells = np.floor((points[:, :2] - saved.center[:2]) / saved.resolution + np.array(heights.shape) / 2).astype(int)
-    is_inside = np.all((cells >= 0) & (cells < heights.shape), axis=1)
-    i, j = np.where(is_inside[:, None], cells, 0).T
+    i, j, is_inside = saved.find_cells(points[:, :2])
     above = points[:, 2] - np.where(is_inside, heights[i, j], np.nan)
     met = np.flatnonzero(above <= 0)[:1]  # never at NaN
     # A ray that was not above known ground before has come in through a hole or the side, under the surface.
