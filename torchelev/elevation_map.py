@@ -28,7 +28,7 @@ from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import require_reverse_mode
 from torchelev.pipeline import rate_surface, update_in_place, write
 from torchelev.readable_map import ReadableMap
-from torchelev.stages.initialize import METHODS, initialize
+from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure import measure
 from torchelev.state import MapState, Measurement, forget
 from torchelev.traversability.net import TraversabilityNet
@@ -245,15 +245,19 @@ class ElevationMap(ReadableMap):
             TypeError: if an argument has the wrong type or dtype.
             ValueError: if an id is out of range or repeated, a shape or device is wrong, or both are given.
         """
+        env_ids, mask = self._check_choice(env_ids, mask)
+        self._filtered.clear()
+        self._history.forget(env_ids, mask)
+        with torch.no_grad():
+            forget(self.state, self.cfg.grid, env_ids, mask)
+
+    def _check_choice(self, env_ids: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         require(env_ids is None or mask is None, "env_ids, mask", "exclude each other", "both", "give one of them")
         if mask is not None:
             mask = checks.check_mask(mask, self.num_envs, self.device)
         if env_ids is not None:
             env_ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
-        self._filtered.clear()
-        self._history.forget(env_ids, mask)
-        with torch.no_grad():
-            forget(self.state, self.cfg.grid, env_ids, mask)
+        return env_ids, mask
 
     def initialize(self, feet: Float[Tensor, "B K 3"], method: str = "linear") -> None:
         """Estimate the unknown cells from ground points, such as the feet that a robot stands on.
@@ -271,6 +275,43 @@ class ElevationMap(ReadableMap):
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         feet = checks.check_feet(feet, self.num_envs, self.device, self.check_values)
         state = initialize(self.state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
+        self._filtered.clear()
+        with torch.no_grad():
+            write(self.state, rate_surface(state, self.cfg, self._weights))
+
+    def initialize_from(
+        self,
+        site: Site,
+        T_map_base: Float[Tensor, "B 4 4"] | None = None,
+        *,
+        env_ids: Int[Tensor, "K"] | None = None,
+        mask: Bool[Tensor, "B"] | None = None,
+    ) -> None:
+        """Start with what a site knows: heights, their variances at their present age, and upper bounds.
+
+        Only unknown cells are filled, and what comes from the site does not count as measured when it is merged back.
+        Heights are the site's; those of a robot that has merged since its last `reset` are raised by its offset.
+
+        Args:
+            site: a `torchelev.site.SiteMap` of the same resolution.
+            T_map_base: poses of the robots, on which their windows are centred first, (B, 4, 4). None: they stay.
+            env_ids: environments to fill, int64, none twice; None: all.
+            mask: True for the environments to fill, in place of `env_ids`.
+
+        Raises:
+            TypeError: if an argument has the wrong type or dtype.
+            ValueError: if the site has another resolution, an id is out of range or repeated, a shape or device is
+                wrong, or both ids and a mask are given. Nothing has changed then.
+        """
+        require(hasattr(site, "give"), "site", "must be a SiteMap", type(site).__name__, "give one", TypeError)
+        if T_map_base is not None:
+            shape = (self.num_envs, 4, 4)
+            T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
+        env_ids, mask = self._check_choice(env_ids, mask)
+        if mask is None:
+            mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+            mask[slice(None) if env_ids is None else env_ids] = True
+        state = site.give(self, T_map_base, mask)
         self._filtered.clear()
         with torch.no_grad():
             write(self.state, rate_surface(state, self.cfg, self._weights))

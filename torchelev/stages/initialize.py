@@ -1,9 +1,9 @@
-"""A first estimate of the ground from the feet that stand on it."""
+"""A first estimate of the ground: from the feet that stand on it, or from what was known of it before."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -32,6 +32,48 @@ def initialize(
         validity=state.validity | found,
         time=torch.where(found, 0.0, state.time),
         support=torch.where(found, 0.0, state.support),
+    )
+
+
+class Site(Protocol):
+    """Where what was known before is kept; see `torchelev.site.SiteMap`."""
+
+    def give(self, emap: Any, T_map_base: Tensor | None, chosen: Tensor) -> MapState:
+        """Return the map's state with what is known filled in, and remember that it comes from here."""
+
+
+class Remembered(NamedTuple):
+    """What was known of B windows before, NaN where nothing."""
+
+    elevation: Float[Tensor, "B H W"]  #: [m]
+    variance: Float[Tensor, "B H W"]  #: [m^2]
+    time: Float[Tensor, "B H W"]  #: [s] since the last measurement
+    upper_bound: Float[Tensor, "B H W"]  #: [m]
+
+
+def recall(
+    state: MapState, before: Remembered, chosen: Bool[Tensor, "B"], max_variance: float, support: float
+) -> MapState:
+    """Give the unknown cells of the chosen environments what was known of them before.
+
+    The support [points] is how many measurements that disagree it takes to replace it.
+    """
+    is_open = chosen[:, None, None] & ~state.validity
+    found = is_open & before.elevation.isfinite() & (before.variance < max_variance)
+    bounded = is_open & ~found & ~state.bounded & before.upper_bound.isfinite()
+
+    def fill(mask: Tensor, values: Tensor, others: Tensor) -> Tensor:
+        return torch.where(mask, values.to(others.dtype), others)
+
+    return state._replace(
+        elevation=fill(found, before.elevation, state.elevation),
+        variance=fill(found, before.variance, state.variance),
+        validity=state.validity | found,
+        time=fill(found, before.time, state.time),
+        support=torch.where(found, support, state.support),
+        challenger_support=torch.where(found, 0, state.challenger_support),
+        upper_bound=fill(bounded, before.upper_bound, state.upper_bound),
+        bounded=state.bounded & ~found | bounded,
     )
 
 

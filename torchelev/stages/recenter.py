@@ -22,12 +22,15 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     World-fixed cells keep their value to the bit, entering cells are blank. Environments move independently.
     Without a base pose the window stays.
     """
-    if m.base is None:
-        return state
-    moves = torch.isfinite(m.base).all(1)
-    corner, shift = move_corner(state, m.base, m.anchor, moves, grid)
+    return state if m.base is None else follow(state, m.base, m.anchor, grid)
+
+
+def follow(state: MapState, base: Float[Tensor, "B 3"], anchor: Int[Tensor, "B 2"], grid: GridConfig) -> MapState:
+    """Move the windows by whole cells to `base` [m], whose x, y count from cell `anchor`; not where it is NaN."""
+    moves = torch.isfinite(base).all(1)
+    corner, shift = move_corner(state, base, anchor, moves, grid)
     layers: dict[str, Any] = move_layers({name: getattr(state, name) for name in LAYERS}, shift, BLANK)
-    base_height = torch.where(moves, m.base[:, 2], state.base_height)
+    base_height = torch.where(moves, base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **layers)
 
 

@@ -1,0 +1,10 @@
+"""A world map that grows: what many robots saw becomes one, on disk, and is given back to each of them.
+
+Robot-centric windows live in `torchelev.elevation_map`, single files of maps in `torchelev.io`.
+"""
+
+from torchelev.site.config import SiteConfig
+from torchelev.site.merge import MergeReport
+from torchelev.site.site_map import SiteMap
+
+__all__ = ["MergeReport", "SiteConfig", "SiteMap"]

@@ -1,0 +1,240 @@
+"""Fusing the heights of windows into cells: those that agree are averaged, others kept apart."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.site.config import SiteConfig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+_KEPT_SHARE = 1e-3  # of a cell's information, below which what other robots told of it is rounding
+
+
+class Heights(NamedTuple):
+    """Heights in the site's frame. Variances are those right after the last measurement."""
+
+    elevation: Float[Tensor, "C"]  #: [m]
+    variance: Float[Tensor, "C"]  #: [m^2]
+    time: Float[Tensor, "C"]  #: [s] of the last measurement, NaN where unknown
+
+    @property
+    def known(self) -> Bool[Tensor, "C"]:
+        """Which of them are known."""
+        return self.time == self.time  # NaN is not; a third of the time of isfinite
+
+    def at(self, cells: Tensor) -> Heights:
+        """Return some of them, by number."""
+        return Heights(*(value.index_select(0, cells) for value in self))
+
+    def where(self, mask: Tensor, others: Heights) -> Heights:
+        """Return these where the mask is true, and the others elsewhere."""
+        return Heights(*(torch.where(mask, a, b) for a, b in zip(self, others, strict=True)))
+
+    def information(self, time: Tensor, rate: float) -> Float[Tensor, "C"]:
+        """Return 1 / variance [1/m^2] at a later time, 0 where unknown; the variance grows at a rate [m^2/s]."""
+        return (1.0 / (self.variance + rate * (time - self.time))).nan_to_num(nan=0.0)
+
+
+class Entries(NamedTuple):
+    """K heights of cells."""
+
+    cell: Int[Tensor, "K"]  #: number of the cell
+    heights: Heights  #: (K,) each
+    relief: Float[Tensor, "K"]  #: [m^2] variance of heights within the cell
+    told: Heights | None  #: what the site already has from the same robots; None: nothing
+
+    def select(self, chosen: Int[Tensor, "k"], number: Int[Tensor, "C"]) -> Entries:
+        """Return some of them, whose cells get new numbers."""
+        cell, relief = self.cell.index_select(0, chosen), self.relief.index_select(0, chosen)
+        told = None if self.told is None else self.told.at(chosen)
+        return Entries(number.index_select(0, cell), self.heights.at(chosen), relief, told)
+
+
+class Fused(NamedTuple):
+    """C cells after a fusion."""
+
+    first: Heights  #: what the site says
+    other: Heights  #: what contradicts it
+    is_contradicted: Bool[Tensor, "K"]  #: entries of cells in which heights contradict each other
+
+
+def fuse(first: Heights, other: Heights, entries: Entries, rate: float, cfg: SiteConfig) -> Fused:
+    """Fuse entries into cells. The result does not depend on the order of the entries, up to rounding.
+
+    Where all heights of a cell, the site's included, lie within the gate of their mean, the mean is the cell's new
+    height. Elsewhere the surest height is the reference: what lies within the gate of it is averaged, the rest forms
+    the cell's other height in the same way, and what agrees with neither is dropped.
+
+    Args:
+        first: what the site says of the cells.
+        other: what contradicts it.
+        entries: what the windows say.
+        rate: [m^2/s] sigma_t^2, the process noise (paper, Sec. II-C).
+        cfg: settings.
+    """
+    scale = _weigh(first, entries, rate)
+    agrees, is_kept = _find_near(first, entries, scale, scale.mean, cfg)
+    fused = _average(first, entries, scale, scale.mean, agrees, is_kept, rate, cfg)
+    mask = ((first.known & ~is_kept) & (scale.total > scale.own)).index_fill_(0, entries.cell[~agrees], True)
+    cells = mask.nonzero()[:, 0]
+    if not len(cells):
+        return Fused(fused, other, ~agrees)
+    number = torch.zeros_like(mask, dtype=torch.int64)
+    number[cells] = torch.arange(len(cells), device=cells.device)
+    is_contradicted = mask.index_select(0, entries.cell)
+    contested = entries.select(is_contradicted.nonzero()[:, 0], number)
+    resolved = _resolve(first.at(cells), other.at(cells), contested, rate, cfg)
+    fused, other = (
+        Heights(*(value.index_copy(0, cells, part) for value, part in zip(all_, parts, strict=True)))
+        for all_, parts in zip((fused, other), resolved, strict=True)
+    )
+    return Fused(fused, other, is_contradicted)
+
+
+def _resolve(first: Heights, other: Heights, entries: Entries, rate: float, cfg: SiteConfig) -> tuple[Heights, Heights]:
+    """Return the heights of cells whose heights contradict each other: the site's, and the other one."""
+    fused, agrees, is_kept = _average_near_surest(first, entries, rate, cfg)
+    lost = (first.known & ~is_kept).nonzero()[:, 0]
+    same = torch.arange(len(first.time), device=lost.device)
+    rest, site = entries.select((~agrees).nonzero()[:, 0], same), first.at(lost)
+    heights = Heights(*(torch.cat(pair) for pair in zip(rest.heights, site, strict=True)))
+    relief = torch.cat([rest.relief, torch.zeros_like(site.time)])
+    second, _, _ = _average_near_surest(other, Entries(torch.cat([rest.cell, lost]), heights, relief, None), rate, cfg)
+    wins = _replaces(second, fused, rate, cfg)
+    return second.where(wins, fused), fused.where(wins, second)
+
+
+class _Weights(NamedTuple):
+    """The information [1/m^2] of heights, at the time of the newest measurement of their cell."""
+
+    newest: Float[Tensor, "C"]  # [s]
+    own: Float[Tensor, "C"]  # of the cell before
+    new: Float[Tensor, "K"]  # of the entries
+    total: Float[Tensor, "C"]
+    mean: Float[Tensor, "C"]  # [m] of all heights
+
+
+def _weigh(prior: Heights, entries: Entries, rate: float) -> _Weights:
+    cell = entries.cell
+    newest = prior.time.nan_to_num(nan=-torch.inf).scatter_reduce(0, cell, entries.heights.time, "amax")
+    own, new = prior.information(newest, rate), entries.heights.information(newest.index_select(0, cell), rate)
+    total = own.scatter_add(0, cell, new)
+    # About one of the heights, so that float32 keeps millimetres at any altitude.
+    about = prior.elevation.nan_to_num(nan=0.0)
+    about = torch.where(own > 0, about, about.scatter(0, cell, entries.heights.elevation))
+    moment = torch.zeros_like(own).scatter_add_(
+        0, cell, new * (entries.heights.elevation - about.index_select(0, cell))
+    )
+    return _Weights(newest, own, new, total, about + moment / total)
+
+
+def _average_near_surest(
+    prior: Heights, entries: Entries, rate: float, cfg: SiteConfig
+) -> tuple[Heights, Tensor, Tensor]:
+    """Average what agrees with each cell's surest height; return which entries (K,) and priors (C,) do, too."""
+    weights = _weigh(prior, entries, rate)
+    reference = _find_surest(prior, entries, weights)
+    agrees, is_kept = _find_near(prior, entries, weights, reference, cfg)
+    return _average(prior, entries, weights, reference, agrees, is_kept, rate, cfg), agrees, is_kept
+
+
+def _find_surest(prior: Heights, entries: Entries, weights: _Weights) -> Float[Tensor, "C"]:
+    """Return the height of the largest information; of several, the one nearest to the mean, and then the lowest."""
+    cell, heights = entries.cell, entries.heights.elevation
+    best = weights.own.scatter_reduce(0, cell, weights.new, "amax")
+    is_best = weights.new >= best.index_select(0, cell), weights.own >= best
+    from_mean = (heights - weights.mean.index_select(0, cell)).abs(), (prior.elevation - weights.mean).abs()
+    far = [torch.where(mask, distance, torch.inf) for mask, distance in zip(is_best, from_mean, strict=True)]
+    nearest = far[1].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, far[0], "amin")
+    own = torch.where(far[1] <= nearest, prior.elevation, torch.inf)
+    return own.scatter_reduce(0, cell, torch.where(far[0] <= nearest.index_select(0, cell), heights, torch.inf), "amin")
+
+
+def _find_near(
+    prior: Heights, entries: Entries, weights: _Weights, reference: Tensor, cfg: SiteConfig
+) -> tuple[Bool[Tensor, "K"], Bool[Tensor, "C"]]:
+    """Tell which entries, and which priors, lie within the gate of the reference."""
+    cell, certain = entries.cell, 1.0 / weights.total
+    z = entries.heights.elevation - reference.index_select(0, cell)
+    variance = 1.0 / weights.new + certain.index_select(0, cell)
+    agrees = z.square() <= cfg.gate**2 * (variance.clamp(max=cfg.max_gate_std**2) + entries.relief)
+    is_kept = prior.known
+    if is_kept.any():
+        relief = torch.zeros_like(certain).scatter_reduce_(0, cell, entries.relief, "amax")
+        variance = (1.0 / weights.own + certain).clamp(max=cfg.max_gate_std**2) + relief
+        is_kept = is_kept & ((prior.elevation - reference).square() <= cfg.gate**2 * variance)
+    return agrees, is_kept
+
+
+def _average(
+    prior: Heights,
+    entries: Entries,
+    weights: _Weights,
+    reference: Tensor,
+    agrees: Tensor,
+    is_kept: Tensor,
+    rate: float,
+    cfg: SiteConfig,
+) -> Heights:
+    """Average the entries and priors that agree, by the information form of the paper's eq. 1 and 2.
+
+    With the information 1 / sigma^2 of all at the time of the cell's newest measurement:
+
+        1 / sigma^2 <- 1 / sigma^2 + sum (1 / sigma_k^2 - 1 / sigma_told^2),
+        h <- sigma^2 (h / sigma^2 + sum (h_k / sigma_k^2 - h_told / sigma_told^2)),
+
+    so that what a robot told before is replaced by what it knows now, and counts once.
+    """
+    cell, heights, own = entries.cell, entries.heights, weights.own
+    all_agree = bool(agrees.all())
+    new = weights.new if all_agree else torch.where(agrees, weights.new, 0.0)
+    added = torch.zeros_like(own).scatter_add_(0, cell, new)
+    moment = new * (heights.elevation - reference.index_select(0, cell))
+    moment = torch.zeros_like(own).scatter_add_(0, cell, moment)
+    is_touched, newest = added > 0, weights.newest
+    if is_kept.any():
+        kept, moment_kept = torch.where(is_kept, own, 0.0), own * (prior.elevation - reference)
+        if entries.told is not None:
+            told, moment_told = _sum_told(
+                prior, entries, weights, reference, agrees & is_kept.index_select(0, cell), rate, cfg
+            )
+            kept, moment_kept = kept - told, moment_kept - moment_told
+            kept = torch.where(kept > _KEPT_SHARE * own, kept, 0.0)
+        added, moment = added + kept, moment + torch.where(kept > 0, moment_kept, 0.0)
+    if not all_agree or not (is_kept | ~is_touched | ~prior.known).all():
+        newest = torch.where(is_kept, prior.time, -torch.inf)
+        newest = newest.scatter_reduce(0, cell, torch.where(agrees, heights.time, -torch.inf), "amax")
+    return Heights(reference + moment / added, 1.0 / added, newest).where(is_touched, prior)
+
+
+def _sum_told(
+    prior: Heights, entries: Entries, weights: _Weights, reference: Tensor, counts: Tensor, rate: float, cfg: SiteConfig
+) -> tuple[Float[Tensor, "C"], Float[Tensor, "C"]]:
+    """Return the information that robots told the prior before, and its moment about the reference, per cell.
+
+    A robot that knows less than it told, as after a reset, tells nothing new.
+    """
+    cell, told = entries.cell, entries.told
+    assert told is not None
+    information = told.information(weights.newest.index_select(0, cell), rate)
+    from_prior = told.elevation - prior.elevation.index_select(0, cell)
+    holds = counts & (from_prior.square() <= cfg.gate**2 * (cfg.max_gate_std**2 + entries.relief))
+    height = torch.where(information >= weights.new, entries.heights.elevation, told.elevation)
+    information = torch.where(holds, torch.minimum(information, weights.new), 0.0)
+    moment = torch.where(holds, information * (height - reference.index_select(0, cell)), 0.0)
+    nothing = torch.zeros_like(reference)
+    return nothing.scatter_add(0, cell, information), nothing.scatter_add(0, cell, moment)
+
+
+def _replaces(other: Heights, first: Heights, rate: float, cfg: SiteConfig) -> Bool[Tensor, "C"]:
+    """Tell where the other height is to be the site's: newer and about as sure, or as new and surer."""
+    newest = torch.maximum(other.time, first.time)
+    ratio = first.information(newest, rate) / other.information(newest, rate)
+    limit = torch.where(other.time > first.time, cfg.max_newer_ratio, 1.0)
+    limit = torch.where(other.time < first.time, 1.0 / cfg.max_newer_ratio, limit)
+    return other.known & (ratio < limit)

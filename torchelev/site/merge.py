@@ -1,0 +1,72 @@
+"""One merge: the windows of B robots, in the site's frame, into tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.site.align import Alignment
+from torchelev.site.config import SiteConfig
+from torchelev.site.entries import read_entries, rise
+from torchelev.site.fuse import Heights, fuse
+from torchelev.site.pieces import Pieces, cut
+from torchelev.site.tiles import LAYERS, Tile, Tiles
+from torchelev.site.windows import Windows
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+_BOUND, _TIME = LAYERS.index("upper_bound"), LAYERS.index("time")
+
+
+class MergeReport(NamedTuple):
+    """What a merge did, per robot."""
+
+    offsets: Float[Tensor, "B"]  #: [m] how much the robot's heights lie above the site's; subtracted before fusing
+    tilts: Float[Tensor, "B 2"]  #: rise over run along x and y; subtracted, too
+    is_isolated: Bool[Tensor, "B"]  #: overlaps nothing on flat, certain ground: its heights are taken as they are
+    new_cells: Int[Tensor, "B"]  #: measured since its last merge
+    contradictions: Int[Tensor, "B"]  #: of these, cells whose height contradicts another one: kept apart
+
+
+class Merged(NamedTuple):
+    """Tiles after a merge."""
+
+    tiles: list[Tile]
+    values: Float[Tensor, "L n T T"]
+    contradictions: Int[Tensor, "B"]  #: cells of each robot
+
+
+def merge_windows(
+    tiles: Tiles, windows: Windows, alignment: Alignment, resolution: float, rate: float, cfg: SiteConfig
+) -> Iterator[Merged]:
+    """Yield the tiles that the windows touch, after their fusion, some at a time; changes none in memory."""
+    touched, groups = cut(windows.known.corner, windows.is_new | windows.is_bounded)
+    tiles.reserve(sum(tile not in tiles for tile in touched))
+    for pieces in groups:
+        values = tiles.read(pieces.tiles)
+        layers = values.flatten(1)
+        robot, cell, place = pieces.select(windows.is_new)
+        entries = read_entries(windows, alignment, robot, cell, place, resolution)
+        fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
+        for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
+            layers[row] = value
+        _lower_bounds(layers, windows, alignment, pieces, resolution)
+        yield Merged(
+            pieces.tiles, values, torch.bincount(robot[fused.is_contradicted], minlength=len(alignment.offset))
+        )
+
+
+def _lower_bounds(layers: Tensor, windows: Windows, alignment: Alignment, pieces: Pieces, resolution: float) -> None:
+    """Lower the upper bounds of unknown cells to those of the windows, in place."""
+    robot, cell, place = pieces.select(windows.is_bounded)
+    if not len(cell):
+        return
+    heights = windows.upper_bound.view(-1).index_select(0, place) - rise(
+        windows.known, alignment, robot, place, resolution
+    )
+    bound = layers[_BOUND].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, heights, "amin")
+    layers[_BOUND] = torch.where((layers[_TIME] == layers[_TIME]) | (bound == torch.inf), torch.nan, bound)

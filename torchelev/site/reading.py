@@ -1,0 +1,120 @@
+"""Reading a site: areas, and samples at points. Variances and ages are those at the site's time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import require
+from torchelev.site.tiles import LAYERS as STORED
+from torchelev.site.tiles import TILE, Tiles, locate
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+LAYERS = (*STORED, "validity")
+_SOURCES = {  # what a layer is computed from, first of all the mask of where it is known
+    "elevation": ("elevation",),
+    "variance": ("variance", "time"),
+    "time": ("time",),
+    "upper_bound": ("upper_bound", "elevation"),
+    "other_elevation": ("other_elevation",),
+    "other_variance": ("other_variance", "other_time"),
+    "other_time": ("other_time",),
+    "validity": ("time",),
+}
+
+
+class Clock(NamedTuple):
+    """What ages the layers."""
+
+    time: float  #: [s] the site's, from its epoch
+    rate: float  #: [m^2/s] at which variances grow
+
+
+def check_layers(layers: Sequence[str] | None) -> tuple[str, ...]:
+    """Return names of layers; None: all. KeyError if one does not exist."""
+    names = LAYERS if layers is None else tuple(layers)
+    for name in names:
+        require(
+            name in LAYERS, "layers", "must be names of layers", repr(name), f"there are {', '.join(LAYERS)}", KeyError
+        )
+    return names
+
+
+def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock) -> Tensor:
+    """Compute a layer from the stored ones, NaN where unknown."""
+    first, *others = (stored[source] for source in _SOURCES[name])
+    if name.endswith("variance"):
+        return first + clock.rate * (clock.time - others[0])
+    if name.endswith("time"):
+        return clock.time - first
+    if name == "upper_bound":
+        return torch.where(others[0].isnan(), first, others[0])
+    return (~first.isnan()).to(first.dtype) if name == "validity" else first
+
+
+def sources_of(names: Sequence[str]) -> list[str]:
+    """Return the stored layers that these layers are computed from."""
+    return [layer for layer in STORED if any(layer in _SOURCES[name] for name in names)]
+
+
+def read_area(
+    tiles: Tiles, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str], clock: Clock
+) -> dict[str, Float[Tensor, "H W"]]:
+    """Return layers of the cells from `corner` on, on the CPU; NaN where unknown."""
+    sources = sources_of(names)
+    rows = [STORED.index(source) for source in sources]
+    area = torch.full((len(sources), *size), torch.nan)
+    for tile in _tiles_of(corner, size):
+        if tile in tiles:
+            start = [TILE * k - c for k, c in zip(tile, corner, strict=True)]
+            to = tuple(slice(max(0, s), min(s + TILE, n)) for s, n in zip(start, size, strict=True))
+            within = tuple(slice(t.start - s, t.stop - s) for t, s in zip(to, start, strict=True))
+            area[:, to[0], to[1]] = tiles.read([tile])[rows, 0, within[0], within[1]].cpu()
+    stored = dict(zip(sources, area, strict=True))
+    return {name: compute_layer(name, stored, clock) for name in names}
+
+
+def _tiles_of(corner: tuple[int, int], size: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return the tiles that an area touches."""
+    x, y = (range(c // TILE, (c + n - 1) // TILE + 1) for c, n in zip(corner, size, strict=True))
+    return [(a, b) for a in x for b in y]
+
+
+def sample_tiles(
+    tiles: Tiles, cells: Float[Tensor, "M 2"], name: str, mode: str, clock: Clock
+) -> tuple[Float[Tensor, "M"], Bool[Tensor, "M"]]:
+    """Sample a layer at points, as `ElevationMap.sample` does.
+
+    Args:
+        tiles: of the site.
+        cells: points, float64, in cells of the lattice.
+        name: of the layer.
+        mode: "bilinear" or "nearest".
+        clock: of the site.
+
+    Returns:
+        Values, 0 where not valid, and the mask of where they are.
+    """
+    finite = cells.isfinite().all(1)
+    cells = torch.where(finite[:, None], cells, 0.0)
+    if mode == "nearest":
+        corners, weights = cells.floor().long()[:, None], torch.ones_like(cells[:, :1])
+    else:
+        low = (cells - 0.5).floor()
+        part = cells - 0.5 - low
+        steps = torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]], device=cells.device)
+        corners = low.long()[:, None] + steps
+        weights = torch.where(steps.bool(), part[:, None], 1 - part[:, None]).prod(2)
+    sources = sources_of([name])
+    found = tiles.look_up(locate(*corners.view(-1, 2).unbind(1)), sources)
+    values = compute_layer(name, dict(zip(sources, found, strict=True)), clock).view(weights.shape)
+    weights = torch.where(values.isnan(), 0.0, weights)
+    total = weights.sum(1)
+    valid = finite & (total >= 0.5)
+    mean = (weights * values.nan_to_num(nan=0.0)).sum(1) / total.clamp(min=0.5)
+    return torch.where(valid, mean, 0.0).float(), valid

@@ -1,0 +1,111 @@
+"""The windows of B robots, as they are merged: what they know now, and what of it the site knows already."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.layers import absolute_variance
+from torchelev.site.align import Alignment
+from torchelev.state import MapState
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+    from torchelev.elevation_map import ElevationMap
+
+_NANOSECONDS = 1e-9
+
+
+class Known(NamedTuple):
+    """What B windows know, in the robots' frames. Values count where `is_known`."""
+
+    corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the lattice
+    elevation: Float[Tensor, "B H W"]  #: [m]
+    variance: Float[Tensor, "B H W"]  #: [m^2] now
+    age: Float[Tensor, "B H W"]  #: [s] since the last measurement
+    is_known: Bool[Tensor, "B H W"]
+    now: Float[Tensor, "B"]  #: [s] the site's time at which they know it
+    rate: Float[Tensor, "B"]  #: [m^2/s] at which the variance has grown since the last measurement
+
+
+class Windows(NamedTuple):
+    """The windows of B robots at a merge."""
+
+    known: Known
+    gradient_x: Float[Tensor, "B H W"]  #: dz/dx
+    gradient_y: Float[Tensor, "B H W"]  #: dz/dy
+    has_normal: Bool[Tensor, "B H W"]  #: elsewhere the gradient is unknown
+    upper_bound: Float[Tensor, "B H W"]  #: [m]
+    is_bounded: Bool[Tensor, "B H W"]  #: unknown cells that have an upper bound
+    is_new: Bool[Tensor, "B H W"]  #: measured since the last merge
+    told: Told | None  #: None: nothing
+
+
+class Told(NamedTuple):
+    """What a map knew at its last merge, and how that was aligned: the site has it."""
+
+    known: Known
+    alignment: Alignment
+    elapsed: Int[Tensor, "B"]  #: [ns] of the maps' clocks
+
+
+def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | None) -> Windows:
+    """Read a map's windows, which share memory with it.
+
+    Cells whose variance has grown to the map's maximum hold no information, nor do those that feet initialised.
+
+    Args:
+        emap: the map.
+        state: its state, or the same state with the windows moved.
+        now: the site's time [s].
+        told: what the map told the site before.
+    """
+    variance = sideways_variance(state)
+    is_known = state.validity & (variance < emap.cfg.fusion.max_variance)
+    per_robot = torch.ones(emap.num_envs, dtype=torch.float64, device=emap.device)
+    rate = emap.cfg.aging.variance_rate
+    known = Known(state.corner, state.elevation, variance, state.time, is_known, now * per_robot, rate * per_robot)
+    surface = state.gradient_x, state.gradient_y, state.has_normal
+    bound = state.upper_bound, state.bounded & ~state.validity
+    return Windows(known, *surface, *bound, is_known & _measured_since(state, told), told)
+
+
+def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
+    """Return the variance [m^2] of the elevations, with what the horizontal errors of the poses add on slopes.
+
+    The vertical error is shared by the window; the offset takes it out.
+    """
+    if not state.pose_covariance.any():
+        return state.variance
+    covariance = state.pose_covariance.clone()
+    covariance[:, 2] = covariance[:, :, 2] = 0.0
+    return absolute_variance(state._replace(pose_covariance=covariance))
+
+
+def drop_reset(told: Told, state: MapState) -> Told:
+    """Drop what environments told before they were reset: all that they know now is new."""
+    was_reset = state.elapsed < told.elapsed
+    if not was_reset.any():
+        return told
+    known = told.known._replace(is_known=told.known.is_known & ~was_reset[:, None, None])
+    offset, tilt, is_isolated = told.alignment
+    offset, tilt = torch.where(was_reset, 0.0, offset), torch.where(was_reset[:, None], 0.0, tilt)
+    return Told(known, Alignment(offset, tilt, is_isolated), torch.where(was_reset, 0, told.elapsed))
+
+
+def _measured_since(state: MapState, told: Told | None) -> Bool[Tensor, "B H W"]:
+    """Tell which cells were measured since the last merge, or are not part of what was told then."""
+    if told is None:
+        return torch.ones_like(state.validity)
+    since = ((state.elapsed - told.elapsed).double() * _NANOSECONDS)[:, None, None]
+    # Ages are sums in float32, whose rounding must not make an old measurement new.
+    return state.time < since * (1 - 1e-4) - 1e-6
+
+
+def snapshot(windows: Windows, alignment: Alignment, elapsed: Int[Tensor, "B"]) -> Told:
+    """Return copies of what a merge told the site."""
+    known = Known(*(value.clone() for value in windows.known))
+    return Told(known, alignment, elapsed.clone())
