@@ -687,3 +687,81 @@ def feet_plane(x, y, feet):
     """The height at a position of the least-squares plane through the feet."""
     A = np.column_stack([feet[:, :2], np.ones(len(feet))])
     return float(np.array([x, y, 1.0]) @ np.linalg.lstsq(A, feet[:, 2], rcond=None)[0])
+
+
+# Sites ----------------------------------------------------------------------------------------------------------------
+
+
+def information(height, time, rate):
+    """1 / sigma^2 of a height at a later time; 0 without one. A height is a dict of h [m], v [m^2] and t [s]."""
+    return 1.0 / (height["v"] + rate * (time - height["t"])) if height else 0.0
+
+
+def fuse_site_cell(first, other, entries, rate, *, gate, max_gate_std, max_newer_ratio):
+    """What a site's cell says after a merge, what contradicts that, and whether heights contradicted each other.
+
+    Entries are heights with the relief [m^2] of their cell, and `told`, what the same robot told before.
+    """
+    limits = dict(rate=rate, gate=gate, max_gate_std=max_gate_std)
+    fused, left, is_kept = average_site_cell(first, entries, None, **limits)
+    if not left and is_kept:
+        return fused, other, False
+    fused, left, is_kept = average_site_cell(first, entries, surest, **limits)
+    rest = [{**e, "told": None} for e in left] + ([] if is_kept else [{**first, "relief": 0.0, "told": None}])
+    second, _, _ = average_site_cell(other, rest, surest, **limits)
+    if second and replaces(second, fused, rate, max_newer_ratio):
+        fused, second = second, fused
+    return fused, second, True
+
+
+def surest(heights, weights, mean):
+    """The height of the most information; of several, the one nearest to the mean, and then the lowest."""
+    best = max(weights)
+    return min((h for h, w in zip(heights, weights) if w >= best), key=lambda h: (abs(h - mean), h))
+
+
+def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
+    """The mean of what lies near the reference, the entries that do not, and whether the prior does."""
+    if not entries:
+        return prior, [], True
+    newest = max(x["t"] for x in [*entries, prior or entries[0]])
+    heights = [e["h"] for e in entries] + ([prior["h"]] if prior else [])
+    weights = [information(e, newest, rate) for e in [*entries, *([prior] if prior else [])]]
+    total = sum(weights)
+    mean = sum(h * w for h, w in zip(heights, weights)) / total
+    reference = mean if choose is None else choose(heights, weights, mean)
+
+    def is_near(height, weight, relief):
+        return (height - reference) ** 2 <= gate**2 * (min(1 / weight + 1 / total, max_gate_std**2) + relief)
+
+    near = [e for e, w in zip(entries, weights) if is_near(e["h"], w, e["relief"])]
+    relief = max(e["relief"] for e in entries)
+    is_kept = bool(prior) and is_near(prior["h"], weights[-1], relief)
+    if not near:
+        return prior, entries, is_kept or not prior
+    own = information(prior, newest, rate) if is_kept else 0.0
+    moment = own * (prior["h"] - reference) if is_kept else 0.0
+    kept = own
+    for e in near if is_kept else []:
+        told = e["told"]
+        if not told or (told["h"] - prior["h"]) ** 2 > gate**2 * (max_gate_std**2 + e["relief"]):
+            continue
+        new, before = information(e, newest, rate), information(told, newest, rate)
+        kept -= min(new, before)
+        moment -= min(new, before) * ((e if before >= new else told)["h"] - reference)
+    if kept <= 1e-3 * own:
+        kept = moment = 0.0
+    total = kept + sum(information(e, newest, rate) for e in near)
+    moment += sum(information(e, newest, rate) * (e["h"] - reference) for e in near)
+    times = [e["t"] for e in near] + ([prior["t"]] if is_kept else [])
+    left = [e for e in entries if not any(e is n for n in near)]
+    return dict(h=reference + moment / total, v=1 / total, t=max(times)), left, is_kept or not prior
+
+
+def replaces(other, first, rate, max_newer_ratio):
+    """Whether a site is to say the other height: newer and about as sure, or as new and surer."""
+    newest = max(other["t"], first["t"])
+    ratio = information(first, newest, rate) / information(other, newest, rate)
+    if other["t"] == first["t"]:
+        return ratio < 1
+    return ratio < (max_newer_ratio if other["t"] > first["t"] else 1 / max_newer_ratio)

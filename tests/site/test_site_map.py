@@ -1,0 +1,271 @@
+"""A site as a whole, against a dense array and against what the maps know."""
+
+import copy
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+
+from tests import reference
+from tests.helpers import nans, pose, random_clouds, random_poses, small_map
+from tests.site.helpers import fill, ground, known_cells, live, robots
+from torchelev import ElevationMap
+from torchelev.site import SiteMap
+
+
+def dense_means(emap):
+    """The information-weighted mean of all windows, cell by cell."""
+    sums = {}
+    for b in range(emap.num_envs):
+        for i, j in np.ndindex(*emap.elevation.shape[1:]):
+            if emap.state.validity[b, i, j]:
+                weight = 1 / float(emap.state.variance[b, i, j])
+                cell = (int(emap.corner[b, 0]) + i, int(emap.corner[b, 1]) + j)
+                total, moment = sums.get(cell, (0.0, 0.0))
+                sums[cell] = total + weight, moment + weight * float(emap.elevation[b, i, j])
+    return {cell: (moment / total, 1 / total) for cell, (total, moment) in sums.items()}
+
+
+def test_a_merge_is_the_weighted_mean_of_all_windows():
+    emap = robots([(0, 0), (10, -5), (-70, 40), (100, 100)], cells=(20, 30), noise=0.003, known=0.8)
+    site = SiteMap(0.1)
+    site.merge(emap, align=False)
+    expected = dense_means(emap)
+    elevation, variance = (known_cells(site, layer) for layer in ("elevation", "variance"))
+    assert elevation.keys() == expected.keys()
+    for cell, (height, sigma2) in expected.items():
+        assert elevation[cell] == pytest.approx(height, abs=1e-5) and variance[cell] == pytest.approx(sigma2, rel=1e-5)
+
+
+@given(st.permutations(range(5)), st.integers(0, 50))
+def test_the_order_of_the_robots_does_not_matter(order, seed):
+    rng = np.random.default_rng(seed)
+    corners = rng.integers(-40, 40, (5, 2)).tolist()
+    emap = robots(corners, cells=(24, 24), offsets=rng.uniform(-0.1, 0.1, 5), noise=0.005, known=0.9, seed=seed)
+    other = small_map(5, (24, 24))
+    with torch.no_grad():
+        for name, value in emap.state._asdict().items():
+            if name != "statistics":
+                getattr(other.state, name).copy_(value[list(order)])
+    sites = SiteMap(0.1), SiteMap(0.1)
+    reports = [site.merge(m) for site, m in zip(sites, (emap, other), strict=True)]
+    torch.testing.assert_close(reports[0].offsets[list(order)], reports[1].offsets, atol=1e-6, rtol=0.0)
+    for layer in ("elevation", "variance", "other_elevation"):
+        a, b = (known_cells(site, layer) for site in sites)
+        assert a.keys() == b.keys() and all(a[cell] == pytest.approx(b[cell], abs=1e-5) for cell in a)
+
+
+def test_merging_twice_without_a_new_measurement_changes_no_bit():
+    emap = robots([(0, 0), (20, 10)], noise=0.003)
+    site = SiteMap(0.1)
+    site.merge(emap)
+    before = {layer: known_cells(site, layer) for layer in ("elevation", "variance")}
+    report = site.merge(emap)
+    assert not report.new_cells.any()
+    assert before == {layer: known_cells(site, layer) for layer in ("elevation", "variance")}
+
+
+def test_merging_later_without_a_new_measurement_only_ages():
+    emap = robots([(0, 0)])
+    site = SiteMap(0.1)
+    site.merge(emap)
+    live(emap, 100.0)
+    site.merge(emap)
+    assert site.time == pytest.approx(100.0)
+    rate = emap.cfg.aging.variance_rate
+    assert set(known_cells(site, "variance").values()) == {pytest.approx(1e-4 + 100 * rate, rel=1e-4)}
+    assert set(known_cells(site, "time").values()) == {pytest.approx(100.0)}
+
+
+def test_a_site_of_one_robot_is_its_map_however_often_it_is_merged():
+    rng = np.random.default_rng(3)
+    emap, site = small_map(1, (16, 16)), SiteMap(0.1)
+    for _ in range(6):
+        for _ in range(3):
+            T = random_poses(rng, 1)
+            emap.update(random_clouds(rng, T, 150, cells=(16, 16)), T, dt=0.1)
+        site.merge(emap)
+    for layer in ("elevation", "variance", "time"):
+        window = site.window((0.0, 0.0), 1.6, 1.6, [layer]).layers[layer]
+        expected = emap.layer(layer)[0].numpy()
+        known = np.isfinite(expected)
+        assert known.mean() > 0.5
+        np.testing.assert_allclose(window[known], expected[known], rtol=2e-3, atol=2e-4)
+
+
+def test_what_leaves_the_window_stays_in_the_site():
+    emap, site = robots([(0, 0)]), SiteMap(0.1)
+    site.merge(emap)
+    fill(emap, [(500, 0)])
+    emap.state.elapsed.add_(10**9)
+    site.merge(emap)
+    value, valid = site.sample([[1.0, 1.0], [51.0, 1.0]])
+    assert valid.all()
+    torch.testing.assert_close(value, ground(*torch.tensor([[1.0, 51.0], [1.0, 1.0]])), atol=2e-3, rtol=0.0)
+
+
+def test_a_robot_that_was_reset_measures_independently():
+    emap, site = robots([(0, 0)]), SiteMap(0.1)
+    live(emap, 5.0)
+    site.merge(emap)
+    emap.reset()
+    fill(emap, [(0, 0)])
+    site.merge(emap)
+    assert set(known_cells(site, "variance").values()) == {pytest.approx(0.5e-4, rel=0.05)}
+
+
+def test_a_changed_place_is_kept_apart_and_reported():
+    emap, site = robots([(0, 0)], std=0.003), SiteMap(0.1)
+    site.merge(emap)
+    box = robots([(0, 0)], std=0.003)
+    box.state.elevation[0, 10:20, 10:20] += 0.5
+    box.state.elapsed.add_(60 * 10**9)
+    report = site.merge(box)
+    assert report.contradictions.tolist() == [100]
+    value, other = (site.sample([[1.55, 1.55]], layer, "nearest")[0] for layer in ("elevation", "other_elevation"))
+    assert float(value - other) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_upper_bounds_are_the_lowest_and_end_where_the_ground_is_known():
+    emap = small_map(2, (8, 8))
+    emap.corner.copy_(torch.tensor([[0, 0], [0, 0]]))
+    emap.state.bounded.fill_(True)
+    emap.state.upper_bound.copy_(torch.tensor([0.4, 0.3])[:, None, None].expand(2, 8, 8))
+    site = SiteMap(0.1)
+    site.merge(emap)
+    assert set(known_cells(site, "upper_bound").values()) == {pytest.approx(0.3)}
+    assert not known_cells(site, "elevation")
+    fill(emap, [(0, 0), (0, 0)], lambda x, y: 0.0 * x)
+    emap.state.elapsed.add_(10**9)
+    site.merge(emap)
+    assert set(known_cells(site, "upper_bound").values()) == {0.0}
+
+
+@pytest.mark.parametrize("mode", ["nearest", "bilinear"])
+def test_samples_are_those_of_the_reference(mode):
+    emap = robots([(-30, -8)], cells=(60, 50), known=0.7)
+    site = SiteMap(0.1)
+    site.merge(emap)
+    xy = np.random.default_rng(0).uniform(-4, 5, (300, 2))
+    values, valid = site.sample(torch.from_numpy(xy), mode=mode)
+    layer, known = emap.elevation[0].double().numpy(), emap.state.validity[0].numpy()
+    for k, (x, y) in enumerate(xy):
+        expected = reference.sample(layer, known, x, y, (-30, -8), 0.1, mode)
+        assert (float(values[k]), bool(valid[k])) == (pytest.approx(expected[0], abs=1e-5), expected[1])
+
+
+def test_samples_far_away_and_of_no_place_are_not_valid():
+    site = SiteMap(0.1)
+    site.merge(robots([(0, 0)]))
+    values, valid = site.sample([[1e8, -1e8], [float("nan"), 0.0], [1.0, 1.0]])
+    assert valid.tolist() == [False, False, True] and values[:2].tolist() == [0.0, 0.0]
+
+
+def test_a_window_lines_up_with_the_lattice():
+    emap = robots([(3, -7)])
+    site = SiteMap(0.1)
+    site.merge(emap)
+    window = site.window((2.31, 1.12), 4.0, 3.6)
+    assert window.center[:2] == pytest.approx([2.3, 1.1]) and window.layers["elevation"].shape == (40, 36)
+    np.testing.assert_allclose(window.layers["elevation"], emap.elevation[0], atol=1e-6)
+
+
+def test_a_site_100_km_away_is_as_precise():
+    far = 1_000_000
+    emap = robots([(far, -far)])
+    site = SiteMap(0.1)
+    site.merge(emap)
+    xy = emap.cell_centers()[0].flatten(0, 1)
+    values, valid = site.sample(xy, mode="nearest")
+    assert valid.all()
+    torch.testing.assert_close(values, emap.elevation[0].flatten(), atol=0.0, rtol=1e-6)
+
+
+# Giving back ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_robot_that_comes_back_starts_with_what_is_known():
+    first, site = robots([(0, 0)]), SiteMap(0.1)
+    live(first, 50.0)
+    site.merge(first)
+    emap = small_map(2, (20, 20))
+    poses = pose((2.0, 1.8, 0.5), num_envs=2)
+    emap.initialize_from(site, poses, env_ids=torch.tensor([1]))
+    assert not emap.state.validity[0].any() and emap.state.validity[1].all()
+    xy = emap.cell_centers()[1]
+    torch.testing.assert_close(emap.layer("elevation")[1], ground(xy[..., 0], xy[..., 1]).float(), atol=1e-5, rtol=0.0)
+    expected = 1e-4 + 50 * first.cfg.aging.variance_rate
+    assert emap.layer("variance")[1].unique().tolist() == pytest.approx([expected], rel=1e-4)
+    assert emap.layer("time")[1].unique().tolist() == pytest.approx([50.0])
+    assert emap.layer("traversability")[1].isfinite().any()
+
+
+def test_what_was_given_does_not_come_back_as_a_measurement():
+    first, site = robots([(0, 0)]), SiteMap(0.1)
+    site.merge(first)
+    before = known_cells(site, "variance")
+    emap = small_map(1, (20, 20))
+    emap.initialize_from(site, pose((2.0, 1.8, 0.5)))
+    site.merge(emap)
+    assert known_cells(site, "variance") == pytest.approx(before, rel=1e-5)
+    emap.update(nans(1), pose((2.0, 1.8, 0.5)), pose((2.0, 1.8, 0.5)), dt=1.0)
+    site.merge(emap)
+    aged = {cell: value + emap.cfg.aging.variance_rate for cell, value in before.items()}
+    assert known_cells(site, "variance") == pytest.approx(aged, rel=1e-4)
+
+
+def test_measured_cells_are_not_overwritten():
+    site = SiteMap(0.1)
+    site.merge(robots([(0, 0)]))
+    emap = robots([(0, 0)], offsets=[0.3], known=0.5)
+    measured, mask = emap.layer("elevation"), emap.state.validity.clone()
+    emap.initialize_from(site)
+    torch.testing.assert_close(emap.layer("elevation")[mask], measured[mask])
+    assert emap.state.validity.all()
+
+
+def test_a_mask_chooses_the_environments():
+    site = SiteMap(0.1)
+    site.merge(robots([(0, 0)]))
+    emap = fill(small_map(2, (20, 20)), [(0, 0), (0, 0)], known=0.0)
+    emap.initialize_from(site, mask=torch.tensor([True, False]))
+    assert emap.state.validity.flatten(1).any(1).tolist() == [True, False]
+
+
+def test_a_copy_of_a_map_is_another_robot():
+    emap, site = robots([(0, 0)]), SiteMap(0.1)
+    site.merge(emap)
+    site.merge(copy.deepcopy(emap))
+    assert set(known_cells(site, "variance").values()) == {pytest.approx(0.5e-4)}
+
+
+# Bad input ------------------------------------------------------------------------------------------------------------
+
+
+def test_bad_arguments_are_refused_by_name():
+    site = SiteMap(0.1)
+    site.merge(robots([(0, 0)]))
+    before = known_cells(site)
+    with pytest.raises(ValueError, match=r"emap: must have the site's resolution, 0\.1 m, got 0\.05 m"):
+        site.merge(small_map(1, resolution=0.05))
+    with pytest.raises(TypeError, match="emap: must be an ElevationMap, got str"):
+        site.merge("map")
+    with pytest.raises(ValueError, match="time: must be a finite number"):
+        site.merge(robots([(0, 0)]), time=float("nan"))
+    with pytest.raises(ValueError, match="resolution: must be a positive number"):
+        SiteMap(0.0)
+    with pytest.raises(KeyError, match="layers: must be names of layers, got 'height'"):
+        site.sample([[0.0, 0.0]], "height")
+    with pytest.raises(ValueError, match=r"xy: expected \(M, 2\)"):
+        site.sample([[0.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match="mode"):
+        site.sample([[0.0, 0.0]], mode="cubic")
+    with pytest.raises(ValueError, match="length_x"):
+        site.window((0.0, 0.0), 0.123, 1.0)
+    with pytest.raises(ValueError, match="emap: must have the site's resolution"):
+        small_map(1, resolution=0.05).initialize_from(site)
+    with pytest.raises(TypeError, match="site: must be a SiteMap, got str"):
+        ElevationMap().initialize_from("site")
+    assert known_cells(site) == before
