@@ -715,9 +715,9 @@ def fuse_site_cell(first, other, entries, rate, *, gate, max_gate_std, max_newer
 
 
 def surest(heights, weights, mean):
-    """The height of the most information; of several, the one nearest to the mean, and then the lowest."""
+    """The height of the most information; of several, the one nearest to the mean [mm], and then the lowest."""
     best = max(weights)
-    return min((h for h, w in zip(heights, weights) if w >= best), key=lambda h: (abs(h - mean), h))
+    return min((h for h, w in zip(heights, weights) if w >= best), key=lambda h: (round(1e3 * abs(h - mean)), h))
 
 
 def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):

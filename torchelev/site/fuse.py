@@ -144,12 +144,15 @@ def _average_near_surest(
 
 
 def _find_surest(prior: Heights, entries: Entries, weights: _Weights) -> Float[Tensor, "C"]:
-    """Return the height of the largest information; of several, the one nearest to the mean, and then the lowest."""
+    """Return the height of the largest information; of several, the one nearest to the mean, and then the lowest.
+
+    Distances count in millimetres, so that rounding does not choose between two that are equally far.
+    """
     cell, heights = entries.cell, entries.heights.elevation
     best = weights.own.scatter_reduce(0, cell, weights.new, "amax")
     is_best = weights.new >= best.index_select(0, cell), weights.own >= best
     from_mean = (heights - weights.mean.index_select(0, cell)).abs(), (prior.elevation - weights.mean).abs()
-    far = [torch.where(mask, distance, torch.inf) for mask, distance in zip(is_best, from_mean, strict=True)]
+    far = [torch.where(mask, (1e3 * distance).round(), torch.inf) for mask, distance in zip(is_best, from_mean, strict=True)]
     nearest = far[1].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, far[0], "amin")
     own = torch.where(far[1] <= nearest, prior.elevation, torch.inf)
     return own.scatter_reduce(0, cell, torch.where(far[0] <= nearest.index_select(0, cell), heights, torch.inf), "amin")
