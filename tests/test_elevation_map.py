@@ -115,7 +115,7 @@ def test_update_neither_changes_nor_keeps_its_arguments():
 
 
 def test_an_environment_without_returns_only_ages():
-    """A row of NaN leaves its map to the bit, but for time and variance; the others are as if alone."""
+    """A row of NaN leaves its map to the bit, but for its times and variance; the others are as if alone."""
     emap, alone = mapped(3, drift=None), mapped(3, drift=None)
     cloud, T = scan(9, 3)
     cloud[1] = torch.nan
@@ -123,7 +123,7 @@ def test_an_environment_without_returns_only_ages():
     emap.update(cloud, T, None, 0.5)
     alone.update(scan(9, 3)[0], T, None, 0.5)
     rows = [n for n in before._fields[:-1] if not torch.equal(getattr(before, n)[1], getattr(emap.state, n)[1])]
-    assert set(rows) == {"time", "variance"}
+    assert set(rows) == {"elapsed", "time", "variance"}
     torch.testing.assert_close(emap.time[1], before.time[1] + 0.5)
     growth = emap.cfg.aging.variance_rate * 0.5
     torch.testing.assert_close(emap.variance[1], (before.variance[1] + growth).clamp(max=1.0))

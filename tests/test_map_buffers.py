@@ -44,6 +44,15 @@ def test_filtered_layers_and_the_diagnosis_are_those_of_the_new_state():
     assert emap.read_layer("smooth")[1].any() and not emap.diagnose()
 
 
+def test_a_checkpoint_keeps_the_elapsed_time_and_an_older_one_begins_at_zero():
+    saved, emap = mapped().state_dict(), small_map(2)
+    emap.load_state_dict(saved)
+    assert emap.state.elapsed.tolist() == [2 * round(float(torch.tensor(0.3)) * 1e9)] * 2
+    del saved["elapsed"]
+    emap.load_state_dict(saved)
+    assert emap.state.elapsed.tolist() == [0, 0] and emap.validity.any()
+
+
 @pytest.mark.parametrize("num_envs, cells, name", [(3, (12, 10), "corner"), (2, (12, 11), "elevation")])
 def test_refuses_a_state_of_another_size_and_changes_nothing(num_envs, cells, name):
     emap = mapped()

@@ -118,8 +118,8 @@ class MapBuffers(nn.Module):
         fields = [name for name in fields if not name.startswith(ignored)]
         hint = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", hint)
-        # Checkpoints of before poses had a covariance.
-        state_dict.setdefault(f"{prefix}pose_covariance", torch.zeros_like(self.state.pose_covariance))
+        for name in ("pose_covariance", "elapsed"):  # absent from older checkpoints
+            state_dict.setdefault(f"{prefix}{name}", torch.zeros_like(self.get_buffer(name)))
         self._forget_derived()
         super()._load_from_state_dict(state_dict, prefix, *args)
 

@@ -39,6 +39,7 @@ class MapState(NamedTuple):
     corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the map frame's lattice
     base_height: Float[Tensor, "B"]  #: [m] z of the last T_map_base
     pose_covariance: Float[Tensor, "B 3 3"]  #: [m^2] of the position that all elevations count from; see `pose_error`
+    elapsed: Int[Tensor, "B"]  #: [ns] sum of all dt since the reset; a cell's last hit was at elapsed * 1e-9 - time [s]
     elevation: Float[Tensor, "B H W"]  #: [m] map frame
     variance: Float[Tensor, "B H W"]  #: [m^2]
     validity: Bool[Tensor, "B H W"]  #: elevation is known
@@ -78,7 +79,7 @@ class Measurement(NamedTuple):
     pose_covariance: Float[Tensor, "B 3 3"] | None = None  #: [m^2] of the first sensor's position
 
 
-LAYERS = MapState._fields[3:-1]  # (B, H, W)
+LAYERS = MapState._fields[4:-1]  # (B, H, W)
 MASKS = ("validity", "bounded", "has_normal", "rated")  # layers that are true or false
 # What an unknown cell holds, by layer; everything else is zero.
 BLANK = {"variance": 1.0}
@@ -100,7 +101,7 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
     values = {name: (layer + BLANK.get(name, 0.0)).to(kinds.get(name, dtype)) for name in LAYERS}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))
     covariance = number.new_zeros(num_envs, 3, 3)
-    own = dict(corner=corner, base_height=number, pose_covariance=covariance)
+    own = dict(corner=corner, base_height=number, pose_covariance=covariance, elapsed=zero)
     return MapState(**own, statistics=statistics, **values)
 
 

@@ -209,11 +209,21 @@ def test_refuses_arrays_that_do_not_fit(path, changes, message):
 
 
 def test_reads_a_file_of_version_1(path):
-    """From before cells had challengers."""
+    """From before cells had challengers, poses a covariance and maps a clock."""
     rewrite_header(path, version=1)
-    rewrite(path, challenger=None, challenger_support=None)
+    rewrite(path, challenger=None, challenger_support=None, pose_covariance=None, elapsed=None)
     emap = load_map(path)
+    assert not emap.state.pose_covariance.any() and not emap.state.elapsed.any()
     assert emap.validity.any() and not emap.challenger.any() and not emap.challenger_support.any()
+
+
+def test_reads_a_file_of_version_2_without_the_younger_fields(path):
+    whole = load_map(path)
+    rewrite(path, pose_covariance=None, elapsed=None)
+    emap = load_map(path, env_ids=[1])
+    assert emap.state.elapsed.tolist() == [0] and not emap.state.pose_covariance.any()
+    others = load_map(path).state
+    assert differences(others, whole.state) == ["pose_covariance", "elapsed"]
 
 
 @pytest.mark.parametrize("env_ids", [[2], [-1], [], [[0]], [0.0], torch.tensor([True, False])])

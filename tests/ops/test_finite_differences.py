@@ -9,8 +9,16 @@ from torchelev import DriftConfig, LearnedTraversabilityConfig, TraversabilityCo
 from torchelev.state import MapState
 
 CELLS = (6, 5)
-MASKS = ("corner", "validity", "bounded", "has_normal", "rated", "challenger_support")  # no numbers, or whole ones
-LAYERS = [name for name in MapState._fields[:-1] if name not in (*MASKS, "challenger")]  # which has no gradient
+DISCRETE = (
+    "corner",
+    "elapsed",
+    "validity",
+    "bounded",
+    "has_normal",
+    "rated",
+    "challenger_support",
+)  # masks and integers
+LAYERS = [name for name in MapState._fields[:-1] if name not in (*DISCRETE, "challenger")]  # which has no gradient
 NUMBERS = ["drift_error", "drift_correction"]
 LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 HEADS = {"analytic": TraversabilityConfig(), "learned": LearnedTraversabilityConfig(), "none": None}

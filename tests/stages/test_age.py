@@ -7,9 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
-from tests.helpers import nans, pose, random_state, small_map
+from tests.helpers import nans, pose, random_state, scan, small_map
 from torchelev import AgingConfig, FusionConfig
 from torchelev.stages.age import age
+from torchelev.stages.measure import time_step
 
 
 @given(st.integers(0, 10_000), st.floats(0, 5))
@@ -25,6 +26,7 @@ def test_agrees_with_the_reference(seed, rate):
         variance, time = reference.age(*args)
         np.testing.assert_allclose(after.variance[b], variance, rtol=1e-12)
         np.testing.assert_allclose(after.time[b], time, rtol=1e-12)
+        assert after.elapsed[b] == state.elapsed[b] + round(dt[b].item() * 1e9)
 
 
 def test_each_environment_has_its_own_dt():
@@ -36,6 +38,59 @@ def test_each_environment_has_its_own_dt():
     assert torch.equal(grown[0], torch.zeros_like(grown[0])) and torch.equal(passed[0], torch.zeros_like(passed[0]))
     torch.testing.assert_close(grown[1], torch.full_like(grown[1], 0.02))
     torch.testing.assert_close(passed[1], torch.full_like(passed[1], 2.0))
+
+
+def test_elapsed_sums_dt_per_environment_until_a_reset():
+    emap = small_map(3)
+    for dt in (0.5, torch.tensor([0.0, 0.25, 2.0]), 0.125):
+        emap.update(nans(3), pose(num_envs=3), None, dt)
+    assert emap.state.elapsed.tolist() == [625_000_000, 875_000_000, 2_625_000_000]
+    emap.reset(torch.tensor([1]))
+    assert emap.state.elapsed.tolist() == [625_000_000, 0, 2_625_000_000]
+    emap.reset(mask=torch.tensor([True, False, False]))
+    assert emap.state.elapsed.tolist() == [0, 0, 2_625_000_000]
+
+
+def test_elapsed_has_no_rounding_errors_at_any_precision():
+    """After a year, too, where a float32 counts in steps of two seconds."""
+    emap = small_map(1)
+    year = 365 * 86_400_000_000_000
+    emap.state.elapsed.fill_(year)
+    for _ in range(3):
+        emap.update(nans(1), pose(), None, 0.02)
+    step = round(float(torch.tensor(0.02)) * 1e9)  # of the map's dtype
+    for dtype in (torch.float16, torch.bfloat16, torch.float64):
+        assert emap.to(dtype).state.elapsed.tolist() == [year + 3 * step]
+
+
+def test_no_time_passes_by_a_dt_that_is_not_finite_or_negative():
+    emap = small_map(4)
+    m = emap.measure(nans(4), pose(num_envs=4), None, 1.0)
+    dt = time_step(torch.tensor([torch.nan, torch.inf, -torch.inf, -1.0]), torch.float32)
+    assert not age(emap.state, m._replace(dt=dt), AgingConfig()).elapsed.any()
+
+
+def test_elapsed_has_no_gradient():
+    emap = small_map(1)
+    dt = torch.tensor([0.5], requires_grad=True)
+    after = emap(emap.state, emap.measure(nans(1), pose(), None, dt))
+    assert after.time.requires_grad and not after.elapsed.requires_grad and after.elapsed.tolist() == [500_000_000]
+
+
+def test_the_time_of_a_cells_last_hit_stays_until_it_is_hit_again():
+    emap = small_map(2)
+    cloud, T = scan(0)
+    emap.update(nans(2), T, T, 1.0)
+    emap.update(cloud, T, T, 0.3)
+    hit = emap.validity.clone()
+    assert hit.any() and not hit.all()
+    for dt in (0.1, torch.tensor([0.7, 0.0]), 5.0):
+        emap.update(nans(2), T, T, dt)
+        last_hit = emap.state.elapsed[:, None, None] * 1e-9 - emap.time
+        torch.testing.assert_close(last_hit[hit], torch.full_like(last_hit[hit], 1.3))
+    emap.update(cloud, T, T, 0.3)
+    now = emap.state.elapsed[:, None, None] * 1e-9
+    torch.testing.assert_close((now - emap.time)[hit], now.expand_as(emap.time)[hit])
 
 
 def test_the_variance_grows_to_its_maximum():

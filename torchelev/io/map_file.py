@@ -25,6 +25,7 @@ from torchelev.traversability.net import TraversabilityNet
 
 FORMAT, VERSION = "torchelev map", 2
 _NEW_LAYERS = {"has_normal", "rated", "challenger", "challenger_support"}  # absent from version 1
+_OPTIONAL = {"pose_covariance", "elapsed"}  # absent from older files of both versions
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
 
 
@@ -152,10 +153,10 @@ def _ids(env_ids: Sequence[int] | Tensor | None, num_envs: int) -> Tensor:
 
 
 def _state(path: str | Path, arrays: dict[str, NDArray], like: MapState, ids: Tensor, version: int) -> MapState:
-    """Return the state of environments `ids` from a file's arrays; what version 1 lacks is taken from `like`."""
+    """Return the state of environments `ids` from a file's arrays; what older files lack is taken from `like`."""
     B, values = len(arrays["corner"]), {}
     for name, blank in name_tensors(like).items():
-        if version < VERSION and name in _NEW_LAYERS:
+        if (version < VERSION and name in _NEW_LAYERS) or (name in _OPTIONAL and name not in arrays):
             values[name] = blank[:1].expand(len(ids), *blank.shape[1:])
             continue
         values[name] = torch.from_numpy(_array(path, arrays, name, blank, (B, *blank.shape[1:])))[ids]

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.state import MapState, Measurement
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +27,18 @@ class AgingConfig:
 
 
 def age(state: MapState, m: Measurement, cfg: AgingConfig) -> MapState:
-    """Add the time variance, sigma_m^2 += sigma_t^2 * dt (paper, Sec. II-C); `fuse` keeps it below its maximum."""
+    """Advance the clocks and add the time variance, sigma_m^2 += sigma_t^2 * dt (paper, Sec. II-C).
+
+    `fuse` keeps it below its maximum.
+    """
     dt = m.dt[:, None, None]
-    return state._replace(time=state.time + dt, variance=state.variance + cfg.variance_rate * dt)
+    return state._replace(
+        elapsed=state.elapsed + nanoseconds(m.dt),
+        time=state.time + dt,
+        variance=state.variance + cfg.variance_rate * dt,
+    )
+
+
+def nanoseconds(dt: Float[Tensor, "B"]) -> Int[Tensor, "B"]:
+    """Return a time [s] in whole nanoseconds, whose sum has no rounding errors. No gradient."""
+    return torch.round(dt.detach().double() * 1e9).to(torch.int64)

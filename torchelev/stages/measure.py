@@ -192,7 +192,7 @@ def gate_points(
 
 
 @stored
-def elapsed(dt: Tensor, dtype: torch.dtype) -> Float[Tensor, "B"]:
+def time_step(dt: Tensor, dtype: torch.dtype) -> Float[Tensor, "B"]:
     """Return dt [s]; no time passes where it is not finite or negative."""
     return dt.to(dtype).nan_to_num(0.0, 0.0).clamp(min=0)
 
@@ -247,7 +247,7 @@ def measure(
         casts=gates.casts,
         origin=origin,
         base=None if base is None else nan_where_unsound(base, sound),
-        dt=elapsed(dt, dtype),
+        dt=time_step(dt, dtype),
         rejected_invalid=points.shape[1] * points.shape[2] - finite,
         rejected_range=finite - in_range,
         rejected_body=in_range - casts,
