@@ -27,7 +27,10 @@ class AgingConfig:
 
 
 def age(state: MapState, m: Measurement, cfg: AgingConfig) -> MapState:
-    """Add the time variance, sigma_m^2 += sigma_t^2 * dt (paper, Sec. II-C); `fuse` keeps it below its maximum."""
+    """Advance the clocks and add the time variance, sigma_m^2 += sigma_t^2 * dt (paper, Sec. II-C).
+
+    `fuse` keeps it below its maximum.
+    """
     dt = m.dt[:, None, None]
     return state._replace(
         elapsed=state.elapsed + nanoseconds(m.dt),
