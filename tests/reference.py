@@ -741,17 +741,14 @@ def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
         return prior, entries, is_kept or not prior
     own = information(prior, newest, rate) if is_kept else 0.0
     moment = own * (prior["h"] - reference) if is_kept else 0.0
-    kept = own
+    total = own + sum(information(e, newest, rate) for e in near)
     for e in near if is_kept else []:
         told = e["told"]
         if not told or (told["h"] - prior["h"]) ** 2 > gate**2 * (max_gate_std**2 + e["relief"]):
             continue
         new, before = information(e, newest, rate), information(told, newest, rate)
-        kept -= min(new, before)
+        total -= min(new, before)
         moment -= min(new, before) * ((e if before >= new else told)["h"] - reference)
-    if kept <= 1e-3 * own:
-        kept = moment = 0.0
-    total = kept + sum(information(e, newest, rate) for e in near)
     moment += sum(information(e, newest, rate) * (e["h"] - reference) for e in near)
     times = [e["t"] for e in near] + ([prior["t"]] if is_kept else [])
     left = [e for e in entries if not any(e is n for n in near)]

@@ -56,6 +56,8 @@ class ElevationMap(ReadableMap):
         ValueError: if a number is out of range, or the head does not suit the robot or the resolution.
     """
 
+    num_resets: Tensor
+
     def __init__(
         self,
         cfg: ElevationMapConfig | None = None,
@@ -74,6 +76,9 @@ class ElevationMap(ReadableMap):
         self._update_cfg = dataclasses.replace(cfg, filters=())  # compiled graphs are shared by maps of equal ones
         self._compiled = False
         self._history = InputHistory()
+        with torch.inference_mode(False):
+            #: (B,) how often each environment was reset: what it told a site before does not count as its own
+            self.register_buffer("num_resets", self.corner.new_zeros(self.num_envs), persistent=False)
 
     # Updating -------------------------------------------------------------------------------------------------------
 
@@ -248,6 +253,7 @@ class ElevationMap(ReadableMap):
         env_ids, mask = self._check_choice(env_ids, mask)
         self._filtered.clear()
         self._history.forget(env_ids, mask)
+        self.num_resets.add_(self._choose(env_ids, mask))
         with torch.no_grad():
             forget(self.state, self.cfg.grid, env_ids, mask)
 
@@ -258,6 +264,13 @@ class ElevationMap(ReadableMap):
         if env_ids is not None:
             env_ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
         return env_ids, mask
+
+    def _choose(self, env_ids: Tensor | None, mask: Tensor | None) -> Bool[Tensor, "B"]:
+        """Return which environments the ids or the mask choose; without both, all."""
+        if mask is not None:
+            return mask
+        chosen = torch.zeros_like(self.num_resets, dtype=torch.bool)
+        return chosen.fill_(True) if env_ids is None else chosen.index_fill_(0, env_ids, True)
 
     def initialize(self, feet: Float[Tensor, "B K 3"], method: str = "linear") -> None:
         """Estimate the unknown cells from ground points, such as the feet that a robot stands on.
@@ -307,11 +320,7 @@ class ElevationMap(ReadableMap):
         if T_map_base is not None:
             shape = (self.num_envs, 4, 4)
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
-        env_ids, mask = self._check_choice(env_ids, mask)
-        if mask is None:
-            mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-            mask[slice(None) if env_ids is None else env_ids] = True
-        state = site.give(self, T_map_base, mask)
+        state = site.give(self, T_map_base, self._choose(*self._check_choice(env_ids, mask)))
         self._filtered.clear()
         with torch.no_grad():
             write(self.state, rate_surface(state, self.cfg, self._weights))

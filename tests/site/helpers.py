@@ -53,3 +53,9 @@ def known_cells(site, layer="elevation", margin=0):
     first = np.round(np.array([x_min, y_min]) / site.resolution).astype(int)
     i, j = np.nonzero(np.isfinite(values))
     return {(int(a + first[0]), int(b + first[1])): float(values[a, b]) for a, b in zip(i, j, strict=True)}
+
+
+def limits(site, layer):
+    """The lowest and the highest value of a layer."""
+    values = known_cells(site, layer).values()
+    return [min(values), max(values)]

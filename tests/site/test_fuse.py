@@ -108,7 +108,9 @@ def test_what_was_told_before_counts_once():
     again = run([told], [None], [[entry(0.1, v=1e-4, t=5.0, told=told)]])
     assert float(again.first.variance) == pytest.approx(1e-4)
     better = run([told], [None], [[entry(0.11, v=2.5e-5, t=6.0, told=told)]], rate=0.0)
-    assert float(better.first.elevation) == pytest.approx(0.11) and float(better.first.variance) == pytest.approx(2.5e-5)
+    assert float(better.first.elevation) == pytest.approx(0.11) and float(better.first.variance) == pytest.approx(
+        2.5e-5
+    )
 
 
 def test_what_others_told_stays():

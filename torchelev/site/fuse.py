@@ -12,8 +12,6 @@ from torchelev.site.config import SiteConfig
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_KEPT_SHARE = 1e-3  # of a cell's information, below which what other robots told of it is rounding
-
 
 class Heights(NamedTuple):
     """Heights in the site's frame. Variances are those right after the last measurement."""
@@ -152,7 +150,10 @@ def _find_surest(prior: Heights, entries: Entries, weights: _Weights) -> Float[T
     best = weights.own.scatter_reduce(0, cell, weights.new, "amax")
     is_best = weights.new >= best.index_select(0, cell), weights.own >= best
     from_mean = (heights - weights.mean.index_select(0, cell)).abs(), (prior.elevation - weights.mean).abs()
-    far = [torch.where(mask, (1e3 * distance).round(), torch.inf) for mask, distance in zip(is_best, from_mean, strict=True)]
+    far = [
+        torch.where(mask, (1e3 * distance).round(), torch.inf)
+        for mask, distance in zip(is_best, from_mean, strict=True)
+    ]
     nearest = far[1].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, far[0], "amin")
     own = torch.where(far[1] <= nearest, prior.elevation, torch.inf)
     return own.scatter_reduce(0, cell, torch.where(far[0] <= nearest.index_select(0, cell), heights, torch.inf), "amin")
@@ -201,14 +202,12 @@ def _average(
     moment = torch.zeros_like(own).scatter_add_(0, cell, moment)
     is_touched, newest = added > 0, weights.newest
     if is_kept.any():
-        kept, moment_kept = torch.where(is_kept, own, 0.0), own * (prior.elevation - reference)
+        added = added + torch.where(is_kept, own, 0.0)
+        moment = moment + torch.where(is_kept, own * (prior.elevation - reference), 0.0)
         if entries.told is not None:
-            told, moment_told = _sum_told(
-                prior, entries, weights, reference, agrees & is_kept.index_select(0, cell), rate, cfg
-            )
-            kept, moment_kept = kept - told, moment_kept - moment_told
-            kept = torch.where(kept > _KEPT_SHARE * own, kept, 0.0)
-        added, moment = added + kept, moment + torch.where(kept > 0, moment_kept, 0.0)
+            counts = agrees & is_kept.index_select(0, cell)
+            told, moment_told = _sum_told(prior, entries, weights, reference, counts, rate, cfg)
+            added, moment = added - told, moment - moment_told
     if not all_agree or not (is_kept | ~is_touched | ~prior.known).all():
         newest = torch.where(is_kept, prior.time, -torch.inf)
         newest = newest.scatter_reduce(0, cell, torch.where(agrees, heights.time, -torch.inf), "amax")

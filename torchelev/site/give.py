@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.site.align import no_alignment
-from torchelev.site.windows import Known, Told, Windows
+from torchelev.site.windows import BEFORE_ALL, Known, Told, Windows
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter import follow
 from torchelev.state import MapState
@@ -41,7 +41,9 @@ def fill(state: MapState, emap: ElevationMap, site: SiteMap, offset: Float[Tenso
     return recall(state, before, chosen, emap.cfg.fusion.max_variance, SUPPORT)
 
 
-def remember_given(windows: Windows, after: MapState, told: Told | None, chosen: Bool[Tensor, "B"], now: float) -> Told:
+def remember_given(
+    emap: ElevationMap, windows: Windows, after: MapState, told: Told | None, chosen: Bool[Tensor, "B"], now: float
+) -> Told:
     """Return what the site knows of B maps, now that the chosen ones were filled from it.
 
     It knows all that they know, less what they have measured and not merged yet.
@@ -52,7 +54,7 @@ def remember_given(windows: Windows, after: MapState, told: Told | None, chosen:
     given = Known(after.corner, after.elevation, after.variance, after.time, is_old, time, known.rate)
     if told is None:
         nothing = no_alignment(len(chosen), chosen.device)
-        return Told(_clone(given), nothing, torch.zeros_like(after.elapsed))
+        return Told(_clone(given), nothing, torch.full_like(after.elapsed, BEFORE_ALL), emap.num_resets.clone())
 
     def choose(new: Tensor, old: Tensor) -> Tensor:
         return torch.where(chosen.view(-1, *[1] * (new.ndim - 1)), new, old)

@@ -156,7 +156,7 @@ class SiteMap:
         now = self._advance(emap, told, time)
         windows = read_windows(emap, emap.state, now, told)
         alignment = self._align(windows, align, tilt)
-        told = snapshot(windows, alignment, emap.state.elapsed)
+        told = snapshot(emap, windows, alignment)
         if self._store is None:  # if it is interrupted, what is in memory may hold a part, which must not count twice
             _told.setdefault(emap, {})[self._id] = told
         contradictions = self._fuse(windows, alignment, now)
@@ -166,7 +166,7 @@ class SiteMap:
     def _recall_told(self, emap: ElevationMap) -> Told | None:
         """Return what a map has told since its last reset; None: nothing."""
         told = _told.get(emap, {}).get(self._id)
-        return None if told is None else drop_reset(told, emap.state)
+        return None if told is None else drop_reset(told, emap.num_resets)
 
     def _check_merge(self, emap: ElevationMap, time: float | None) -> None:
         actual, hint = type(emap).__name__, "give an ElevationMap"
@@ -192,7 +192,7 @@ class SiteMap:
         elapsed = emap.state.elapsed
         if told is None:
             return max(self._time, float(elapsed.max()) * 1e-9)
-        lived = torch.where(elapsed >= told.elapsed, elapsed - told.elapsed, elapsed)
+        lived = torch.where(told.elapsed >= 0, elapsed - told.elapsed, elapsed)  # an environment that was reset
         return self._time + float(lived.max()) * 1e-9
 
     def _align(self, windows: Windows, with_offsets: bool, with_tilt: bool) -> Alignment:
@@ -236,7 +236,7 @@ class SiteMap:
         windows = read_windows(emap, state, self._time, told)
         offset = torch.zeros(emap.num_envs) if told is None else told.alignment.offset
         after = fill(state, emap, self, offset, chosen)
-        _told.setdefault(emap, {})[self._id] = remember_given(windows, after, told, chosen, self._time)
+        _told.setdefault(emap, {})[self._id] = remember_given(emap, windows, after, told, chosen, self._time)
         return after
 
     # Reading --------------------------------------------------------------------------------------------------------
@@ -322,7 +322,8 @@ class SiteMap:
         grid = GridConfig(resolution=self.resolution, length_x=length_x, length_y=length_y)
         x, y = (float(value) for value in center[:2])
         size = (grid.height, grid.width)
-        corner = tuple(math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip((x, y), size, strict=True))
+        first = [math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip((x, y), size, strict=True)]
+        corner = (first[0], first[1])
         names = check_layers(layers)
         area = read_area(self._tiles, corner, size, names, self._clock)
         middle = [(c + n / 2) * self.resolution for c, n in zip(corner, size, strict=True)]
@@ -334,8 +335,8 @@ class SiteMap:
         self, corner: Int[Tensor, "B 2"], height: int, width: int, layers: Sequence[str]
     ) -> dict[str, Float[Tensor, "B H W"]]:
         """Return layers of B areas of height x width cells, whose first cells have these numbers on the lattice."""
-        places = [tuple(c) for c in corner.tolist()]
-        areas = [read_area(self._tiles, c, (height, width), check_layers(layers), self._clock) for c in places]
+        names, size = check_layers(layers), (height, width)
+        areas = [read_area(self._tiles, (x, y), size, names, self._clock) for x, y in corner.tolist()]
         return {name: torch.stack([area[name] for area in areas]) for name in layers}
 
     # Files ----------------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ class Located(NamedTuple):
     """Where K cells lie in a list of tiles."""
 
     tiles: list[Tile]
-    index: Int[Tensor, "K"]  #: number of the tile * CELLS + number of the cell in it
+    place: Int[Tensor, "K"]  #: number of the tile * CELLS + number of the cell in it
 
 
 def locate(x: Int[Tensor, "K"], y: Int[Tensor, "K"]) -> Located:
@@ -114,7 +114,7 @@ class Tiles:
 
     def look_up(self, located: Located, layers: Sequence[str]) -> Float[Tensor, "l K"]:
         """Return layers of cells, NaN where unknown."""
-        values = self.values.new_full((len(layers), len(located.index)), torch.nan)
+        values = self.values.new_full((len(layers), len(located.place)), torch.nan)
         rows = [LAYERS.index(layer) for layer in layers]
         stored = [k for k, tile in enumerate(located.tiles) if tile in self]
         step = len(stored) if self._storage is None else self._capacity
@@ -122,9 +122,9 @@ class Tiles:
             chosen = stored[start : start + step]
             slots = torch.full((len(located.tiles),), -1, dtype=torch.int64, device=self.device)
             slots[chosen] = self._fetch([located.tiles[k] for k in chosen])
-            slot = slots[located.index // CELLS]
+            slot = slots[located.place // CELLS]
             is_here = slot >= 0
-            place = slot.clamp(min=0) * CELLS + located.index % CELLS
+            place = slot.clamp(min=0) * CELLS + located.place % CELLS
             for row, value in zip(rows, values, strict=True):
                 value.copy_(torch.where(is_here, self.values[row].view(-1)[place], value))
         return values

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
 _NANOSECONDS = 1e-9
+BEFORE_ALL = -(10**18)  # [ns] on a map's clock
 
 
 class Known(NamedTuple):
@@ -50,6 +51,7 @@ class Told(NamedTuple):
     known: Known
     alignment: Alignment
     elapsed: Int[Tensor, "B"]  #: [ns] of the maps' clocks
+    num_resets: Int[Tensor, "B"]  #: of the maps until then
 
 
 def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | None) -> Windows:
@@ -85,15 +87,16 @@ def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
     return absolute_variance(state._replace(pose_covariance=covariance))
 
 
-def drop_reset(told: Told, state: MapState) -> Told:
+def drop_reset(told: Told, num_resets: Int[Tensor, "B"]) -> Told:
     """Drop what environments told before they were reset: all that they know now is new."""
-    was_reset = state.elapsed < told.elapsed
+    was_reset = told.num_resets != num_resets
     if not was_reset.any():
         return told
     known = told.known._replace(is_known=told.known.is_known & ~was_reset[:, None, None])
     offset, tilt, is_isolated = told.alignment
     offset, tilt = torch.where(was_reset, 0.0, offset), torch.where(was_reset[:, None], 0.0, tilt)
-    return Told(known, Alignment(offset, tilt, is_isolated), torch.where(was_reset, 0, told.elapsed))
+    elapsed = torch.where(was_reset, BEFORE_ALL, told.elapsed)
+    return Told(known, Alignment(offset, tilt, is_isolated), elapsed, num_resets.clone())
 
 
 def _measured_since(state: MapState, told: Told | None) -> Bool[Tensor, "B H W"]:
@@ -105,7 +108,7 @@ def _measured_since(state: MapState, told: Told | None) -> Bool[Tensor, "B H W"]
     return state.time < since * (1 - 1e-4) - 1e-6
 
 
-def snapshot(windows: Windows, alignment: Alignment, elapsed: Int[Tensor, "B"]) -> Told:
-    """Return copies of what a merge told the site."""
+def snapshot(emap: ElevationMap, windows: Windows, alignment: Alignment) -> Told:
+    """Return copies of what a merge of a map told the site."""
     known = Known(*(value.clone() for value in windows.known))
-    return Told(known, alignment, elapsed.clone())
+    return Told(known, alignment, emap.state.elapsed.clone(), emap.num_resets.clone())
