@@ -12,6 +12,8 @@ from typing import TypeVar
 
 from filelock import FileLock, Timeout
 
+from torchelev.errors import message
+
 LOCK, STAGED, COMMITTED = ".lock", ".staged", ".committed"
 
 T = TypeVar("T")
@@ -38,11 +40,11 @@ def lock_folder(path: Path) -> FileLock:
         lock.acquire()
     except Timeout as error:
         hint = "close the other one, or open it with read_only=True"
-        raise OSError(errno.EAGAIN, f"{path}: expected one writer at a time, got a second one; {hint}") from error
+        raise OSError(message(str(path), "expected one writer at a time", "a second one", hint)) from error
     except OSError as error:
         reason = error.strerror or str(error)
-        text = f"{path}: must be writable, got {reason!r}; open it with read_only=True"
-        raise OSError(error.errno or errno.EIO, text) from error
+        text = message(str(path), "must be writable", reason, "open it with read_only=True")
+        raise type(error)(error.errno, text) from error
     return lock
 
 
@@ -84,11 +86,9 @@ def finish(path: Path) -> bool:
     source = path / COMMITTED
     if not source.is_dir():
         return False
-    files = [Path(folder, name) for folder, _, names in os.walk(source) for name in names]
-    for file in sorted(files, key=lambda file: (file.suffix == ".json", -len(file.parts))):
-        target = path / file.relative_to(source)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(file, target)
+    files = [os.path.join(folder, name) for folder, _, names in os.walk(source) for name in names]
+    for file in sorted(files, key=lambda file: (file.endswith(".json"), -file.count(os.sep))):
+        _move(file, os.path.join(path, os.path.relpath(file, source)))
     shutil.rmtree(source)
     return True
 
@@ -123,3 +123,11 @@ def discard(path: Path) -> None:
     """Remove the files of a transaction that was not committed."""
     if (path / STAGED).exists():
         shutil.rmtree(path / STAGED)
+
+
+def _move(file: str, target: str) -> None:
+    try:
+        os.replace(file, target)
+    except FileNotFoundError:
+        os.makedirs(os.path.dirname(target), exist_ok=True)
+        os.replace(file, target)
