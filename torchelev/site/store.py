@@ -57,7 +57,7 @@ class TileStore:
             OSError: the folder cannot be written, or another process makes a site there.
             ModuleNotFoundError: tensorstore is missing.
         """
-        path, header = Path(path), new_header(layers, tile_size, attributes)
+        path, header = Path(path).absolute(), new_header(layers, tile_size, attributes)
         encode_metadata(header.metadata())
         import_tensorstore()
         require_empty(path)
@@ -80,7 +80,7 @@ class TileStore:
             OSError: there is no such folder, another writer has it open, or it cannot be written.
             ModuleNotFoundError: tensorstore is missing.
         """
-        path = Path(path)
+        path = Path(path).absolute()  # the working folder may change
         read_header(path)
         return cls(path, None) if read_only else cls._lock_and_open(path)
 

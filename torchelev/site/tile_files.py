@@ -40,9 +40,13 @@ class TileFiles:
 
     def stage(self, tiles: Sequence[Tile], values: NDArray[np.float32]) -> None:
         """Write (n, L, T, T) values to the folder of staged files."""
-        pairs = zip(tiles, values, strict=True)
+        writes: list[Any] = []
         options: dict[str, Any] = {"can_reference_source_data_indefinitely": True}  # saves a copy
-        wait_for([self._view(STAGED, tile).write(value, **options) for tile, value in pairs])
+        try:
+            for tile, value in zip(tiles, values, strict=True):
+                writes.append(self._view(STAGED, tile).write(value, **options))
+        finally:
+            wait_for(writes)
 
     def list_tiles(self) -> frozenset[Tile]:
         """Return all tiles that are stored."""

@@ -105,7 +105,12 @@ def import_tensorstore() -> Any:
 
 def wait_for(writes: Sequence[Any]) -> None:
     """Wait for all futures of tensorstore's writes; raise OSError if one failed."""
-    errors = [error for error in [write.exception() for write in writes] if error is not None]
+    try:
+        errors = [error for error in [write.exception() for write in writes] if error is not None]
+    except BaseException:  # Ctrl-C: a write that goes on would end up in the next commit
+        for write in writes:
+            write.exception()
+        raise
     if errors:
         found = _OS_ERROR_CODE.search(str(errors[0]))
         code = int(found[1] or found[2]) if found else errno.EIO
