@@ -10,31 +10,16 @@ import torch
 from torch import Tensor
 
 from torchelev.site.config import SiteConfig
+from torchelev.site.windows import Alignment, Windows
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
-
-    from torchelev.site.windows import Windows
 
 _NEIGHBORS = 8  # windows of a cell that each window is compared with; the others follow through these
 _MAX_PAIRS = 1 << 17
 _ROUNDS = 8  # of reweighting
 _WIDEST = 0.5  # [m] scale of the first round; it halves until it is the noise
 _TILT_STD = 0.05  # [rad] a priori, which keeps windows with little overlap level
-
-
-class Alignment(NamedTuple):
-    """How B windows lie in the site's frame: site = elevation - offset - tilt . (xy - center of the window)."""
-
-    offset: Float[Tensor, "B"]  #: [m]
-    tilt: Float[Tensor, "B 2"]  #: rise over run along x and y
-    is_isolated: Bool[Tensor, "B"]  #: overlaps no other window and not the site; its offset is 0
-
-
-def no_alignment(num_windows: int, device: torch.device) -> Alignment:
-    """Return the alignment of windows that lie in the site's frame."""
-    zero = torch.zeros(num_windows, 3, dtype=torch.float64, device=device)
-    return Alignment(zero[:, 0], zero[:, 1:], torch.zeros(num_windows, dtype=torch.bool, device=device))
 
 
 class Pairs(NamedTuple):

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.site.align import no_alignment
-from torchelev.site.windows import BEFORE_ALL, Known, Told, Windows
+from torchelev.site.windows import BEFORE_ALL, Known, Told, Windows, no_alignment
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter import follow
 from torchelev.state import MapState
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
     from torchelev.elevation_map import ElevationMap
-    from torchelev.site.site_map import SiteMap
 
 SUPPORT = 6.0  # points that must disagree until what a site remembers is replaced
 
@@ -31,10 +29,10 @@ def center_on(state: MapState, emap: ElevationMap, T_map_base: Float[Tensor, "B 
     return follow(state, near, anchor.long(), emap.cfg.grid)
 
 
-def fill(state: MapState, emap: ElevationMap, site: SiteMap, offset: Float[Tensor, "B"], chosen: Tensor) -> MapState:
+def fill(
+    state: MapState, emap: ElevationMap, areas: dict[str, Tensor], offset: Float[Tensor, "B"], chosen: Tensor
+) -> MapState:
     """Fill the unknown cells of the chosen environments; `offset` [m] is added to the site's heights."""
-    H, W = state.elevation.shape[1:]
-    areas = site.windows(state.corner, H, W, Remembered._fields)
     elevation, variance, time, bound = (areas[name].to(state.elevation.device) for name in Remembered._fields)
     shift = offset.to(elevation)[:, None, None]
     before = Remembered(elevation + shift, variance, time, bound + shift)

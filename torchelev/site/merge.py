@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.align import Alignment
 from torchelev.site.config import SiteConfig
 from torchelev.site.entries import read_entries, rise
 from torchelev.site.fuse import Heights, fuse
 from torchelev.site.pieces import Pieces, cut
 from torchelev.site.tiles import LAYERS, Tile, Tiles
-from torchelev.site.windows import Windows
+from torchelev.site.windows import Alignment, Windows
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -22,20 +23,21 @@ from torchelev.inputs import checks
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
 from torchelev.ops.storage import keep_freed_memory
-from torchelev.site.align import Alignment, align, no_alignment
+from torchelev.site.align import align
 from torchelev.site.config import SiteConfig
 from torchelev.site.give import center_on, fill, remember_given
 from torchelev.site.merge import MergeReport, merge_windows
 from torchelev.site.reading import Clock, check_layers, read_area, sample_tiles
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
-from torchelev.site.windows import Told, Windows, drop_reset, read_windows, snapshot
+from torchelev.site.windows import Alignment, Told, Windows, drop_reset, no_alignment, read_windows, snapshot
+from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from torchelev.site.store import TileStore
+    from torchelev.site.storage.store import TileStore
 
 # By map and site: what a map has told. Of all sites of a process, so that a site may be closed and opened again.
 _told: WeakKeyDictionary[ElevationMap, dict[str, Told]] = WeakKeyDictionary()
@@ -108,7 +110,7 @@ class SiteMap:
             FileNotFoundError: there is nothing.
             ValueError: it is no site, is damaged, or of a newer version, or another process writes to it.
         """
-        from torchelev.site.store import TileStore
+        from torchelev.site.storage.store import TileStore
 
         site = cls.__new__(cls)
         site._store = TileStore.open(path, read_only=read_only)
@@ -173,7 +175,7 @@ class SiteMap:
         require(isinstance(emap, ElevationMap), "emap", "must be an ElevationMap", actual, hint, TypeError)
         self.require_resolution(emap)
         require(time is None or math.isfinite(time), "time", "must be a finite number", time, "give seconds")
-        read_only = self._store is not None and self._store.read_only
+        read_only = self._store is not None and self._store.is_read_only
         require(not read_only, "site", "must be open for writing", "a read-only site", "open it without read_only")
 
     def require_resolution(self, emap: ElevationMap) -> None:
@@ -208,20 +210,16 @@ class SiteMap:
     def _fuse(self, windows: Windows, alignment: Alignment, now: float) -> Int[Tensor, "B"]:
         """Fuse windows into tiles, on disk first; return each robot's contradictions."""
         contradictions = torch.zeros(len(windows.known.corner), dtype=torch.int64, device=self._tiles.device)
-        staged = None if self._store is None else self._store.begin()
         time, rate = max(self._time, now), self._clock.rate
+        parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg)
         try:
-            for part in merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg):
-                if staged is not None:
-                    staged.write(part.tiles, part.values.cpu().numpy())
-                self._tiles.write(part.tiles, part.values)
-                contradictions += part.contradictions
-            if staged is not None:
-                staged.commit(self._attributes(time))
+            with self._transaction(time) as write:
+                for part in parts:
+                    write(part.tiles, part.values.transpose(0, 1).cpu().numpy())
+                    self._tiles.write(part.tiles, part.values)
+                    contradictions += part.contradictions
         except BaseException:
-            if staged is not None:
-                staged.discard()
-                self._tiles.forget()
+            self._tiles.forget()
             raise
         self._time = time
         return contradictions
@@ -235,9 +233,20 @@ class SiteMap:
             state = center_on(state, emap, T_map_base, chosen)
         windows = read_windows(emap, state, self._time, told)
         offset = torch.zeros(emap.num_envs) if told is None else told.alignment.offset
-        after = fill(state, emap, self, offset, chosen)
+        grid = emap.cfg.grid
+        areas = self.windows(state.corner, grid.height, grid.width, Remembered._fields)
+        after = fill(state, emap, areas, offset, chosen)
         _told.setdefault(emap, {})[self._id] = remember_given(emap, windows, after, told, chosen, self._time)
         return after
+
+    @contextmanager
+    def _transaction(self, time: float) -> Iterator[Callable[..., None]]:
+        """Yield what writes tiles to disk; in memory alone, nothing does."""
+        if self._store is None:
+            yield lambda tiles, values: None
+        else:
+            with self._store.transaction(self._attributes(time)) as write:
+                yield write
 
     # Reading --------------------------------------------------------------------------------------------------------
 
@@ -374,10 +383,10 @@ class SiteMap:
 
 def _create_or_open(path: str | Path, resolution: float) -> TileStore:
     """Create a site's folder, or open one that is there, of the same resolution."""
-    from torchelev.site.store import TileStore
+    from torchelev.site.storage.store import TileStore
 
     path = Path(path)
-    if not path.is_dir() or not any(path.iterdir()):
+    if not (path / "zarr.json").exists():
         return TileStore.create(path, layers=STORED, tile_size=TILE, attributes={"resolution": resolution})
     store = TileStore.open(path)
     actual = float(store.attributes["resolution"])

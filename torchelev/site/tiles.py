@@ -28,7 +28,9 @@ Tile = tuple[int, int]
 class Storage(Protocol):
     """What keeps the tiles that are not in memory."""
 
-    tiles: set[Tile]
+    @property
+    def tiles(self) -> Collection[Tile]:
+        """The tiles that it has."""
 
     def read(self, tiles: Sequence[Tile]) -> NDArray[np.float32]:
         """Return tiles (n, L, TILE, TILE)."""

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchelev.layers import absolute_variance
-from torchelev.site.align import Alignment
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -18,6 +17,20 @@ if TYPE_CHECKING:
 
 _NANOSECONDS = 1e-9
 BEFORE_ALL = -(10**18)  # [ns] on a map's clock
+
+
+class Alignment(NamedTuple):
+    """How B windows lie in the site's frame: site = elevation - offset - tilt . (xy - center of the window)."""
+
+    offset: Float[Tensor, "B"]  #: [m]
+    tilt: Float[Tensor, "B 2"]  #: rise over run along x and y
+    is_isolated: Bool[Tensor, "B"]  #: overlaps no other window and not the site; its offset is 0
+
+
+def no_alignment(num_windows: int, device: torch.device) -> Alignment:
+    """Return the alignment of windows that lie in the site's frame."""
+    zero = torch.zeros(num_windows, 3, dtype=torch.float64, device=device)
+    return Alignment(zero[:, 0], zero[:, 1:], torch.zeros(num_windows, dtype=torch.bool, device=device))
 
 
 class Known(NamedTuple):
