@@ -207,7 +207,7 @@ map, which finds these offsets from the ground that they have in common.
 \b
   torchelev fleet                                 16 robots, 60 x 60 m
   torchelev fleet --robots 4 --size 30 --seed 7
-  torchelev fleet --site hill/                    keep the site map, go on later
+  torchelev fleet --site hill/                    keep the map, go on later
   torchelev fleet --live                          watch it grow in the browser
 
 The mission ends when nothing is left to explore, or after --seconds. Ctrl-C

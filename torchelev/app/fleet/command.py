@@ -41,8 +41,8 @@ def run_fleet(request: FleetRequest, quiet: bool = False) -> int:
             click.echo("interrupted: nothing was mapped yet", err=True)
             return _INTERRUPTED
         with defer_interrupts():
-            click.echo(finish(mission, time.perf_counter() - start))
-        click.echo(f"wrote {request.out}  {request.numbers}" + (f"  {request.site}" if request.site else ""))
+            click.echo(finish(mission, start))
+            click.echo(f"wrote {request.out}  {request.numbers}" + (f"  {request.site}" if request.site else ""))
         if is_interrupted:
             click.echo(f"interrupted: kept the map of {mission.time:.0f} of {request.seconds:.0f} s", err=True)
         elif view:
@@ -97,11 +97,17 @@ def show_progress(bar: tqdm, mission: Mission) -> None:
     bar.update(int(mission.time + 1e-6) - bar.n)
 
 
-def finish(mission: Mission, wall_seconds: float) -> FleetNumbers:
-    """Merge what was seen since the last merge; write picture and numbers, and return the latter."""
+def finish(mission: Mission, start: float) -> FleetNumbers:
+    """Merge what was seen since the last merge; write picture and numbers, and return the latter.
+
+    Args:
+        mission: that has ended.
+        start: when it began, by the performance counter [s].
+    """
     from torchelev.app.fleet.picture import draw_fleet
 
-    mission.merge()
+    mission.finish()
+    wall_seconds = time.perf_counter() - start
     comparison = compare(mission)
     numbers = assess(mission, comparison, wall_seconds)
     draw_fleet(mission.request.out, comparison, np.array(mission.robots.tracks), numbers)

@@ -64,17 +64,13 @@ class Explorer:
 
     Attributes:
         goals: (B,) numbers of coarse cells, row by row; -1: none.
+        is_done: the last plan found nothing to explore.
     """
 
     def __init__(self, num_robots: int, size: float, coarse: float) -> None:
         self.num_cells, self.coarse = round(size / coarse), coarse
-        self.goals = np.full(num_robots, _NONE)
+        self.goals, self.is_done = np.full(num_robots, _NONE), False
         self._given_up = np.zeros(self.num_cells**2, dtype=bool)  # goals that were reached without learning more
-
-    @property
-    def is_done(self) -> bool:
-        """Whether there is nothing left to explore."""
-        return bool((self.goals == _NONE).all())
 
     def plan(self, area: CoarseMap, xy: NDArray) -> list[NDArray]:
         """Choose goals and return paths (K, 2) [m] to them; robots at xy (B, 2) [m] without a goal get an empty one."""
@@ -84,6 +80,7 @@ class Explorer:
         cost[start] = 1.0  # what is seen of the ground below a robot later must not hold it
         way = cost_to_go(cost, start, resolution=self.coarse)
         self._choose_goals(area, way.flatten(1).numpy(), xy)
+        self.is_done = bool((self.goals == _NONE).all())
         return self._trace(way, cost)
 
     def _choose_goals(self, area: CoarseMap, way: NDArray, xy: NDArray) -> None:

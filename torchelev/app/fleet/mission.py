@@ -33,7 +33,8 @@ class Mission:
         folder: of the site map.
 
     Attributes:
-        time: [s] since the start.
+        time: [s] since the first scan.
+        scan: what all robots saw last.
         saved: the area as the site map knows it; None before the first merge.
         coverage: share of the area's cells that are known.
         report: of the last merge.
@@ -52,7 +53,8 @@ class Mission:
         grid = GridConfig(resolution=request.resolution, length_x=request.window, length_y=request.window)
         self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs=request.robots)
         self.site = SiteMap(resolution=request.resolution, path=folder)
-        self.time, self.num_scans, self.coverage = 0.0, 0, 0.0
+        self.time, self.coverage = 0.0, 0.0
+        self.num_scans, self._num_unmerged = 0, 0
         self.saved: SavedMap | None = None
         self.history: list[tuple[float, float]] = []
         self.contradictions = 0
@@ -62,7 +64,7 @@ class Mission:
     @property
     def is_done(self) -> bool:
         """Whether time is up, or nothing is left to explore."""
-        return self.time >= self.request.seconds - DT / 2 or (bool(self.merge_ms) and self.explorer.is_done)
+        return self.time >= self.request.seconds - DT / 2 or self.explorer.is_done
 
     def step(self) -> None:
         """Walk and map for the time of one scan; merge and choose new goals if it is time to."""
@@ -72,15 +74,16 @@ class Mission:
         start = time.perf_counter()
         self.emap.update(scan.points, scan.T_map_sensor, scan.T_map_base, DT)
         self.update_ms.append(1e3 * (time.perf_counter() - start))
-        self.num_scans, self.time = self.num_scans + 1, self.time + DT
-        self.scan = scan
-        if self.num_scans % SCANS_PER_MERGE == 1:
+        self.scan, self.time = scan, DT * self.num_scans
+        self.num_scans, self._num_unmerged = self.num_scans + 1, self._num_unmerged + 1
+        if self._num_unmerged == SCANS_PER_MERGE or self.saved is None:
             self.merge()
-            self.plan()
+            self._plan()
 
     def merge(self) -> None:
         """Merge all robots' maps into the site map."""
         start = time.perf_counter()
+        self._num_unmerged = 0
         self.report = self.site.merge(self.emap)
         self.merge_ms.append(1e3 * (time.perf_counter() - start))
         self.contradictions += int(self.report.contradictions.sum())
@@ -89,7 +92,12 @@ class Mission:
         self.coverage = float(np.isfinite(self.saved.layers["elevation"]).mean())
         self.history.append((round(self.time, 3), self.coverage))
 
-    def plan(self) -> None:
+    def finish(self) -> None:
+        """Merge what was seen since the last merge."""
+        if self._num_unmerged:
+            self.merge()
+
+    def _plan(self) -> None:
         """Choose goals and paths from what the site map knows."""
         assert self.saved is not None
         area = coarsen(torch.as_tensor(self.saved.layers["elevation"]), self.request.resolution)

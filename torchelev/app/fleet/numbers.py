@@ -42,14 +42,14 @@ class FleetNumbers:
     rmse_off_steps: float  #: [m] without cells at steps
     seams: float  #: [m] 95th percentile of how much the mean errors of neighbouring blocks of 1 m differ
     common_offset: float  #: [m] of the site map
-    largest_height_error: float  #: [m] of the robots' poses, less the common offset
+    height_error_span: float  #: [m] between the highest and the lowest height error of the robots' poses
     largest_offset_error: float  #: [m] by which the site misjudged a robot's height error
     contradictions: int  #: cells at which a robot and the site disagreed, in all merges
     ms_per_update: float  #: [ms] median, all robots
     ms_per_merge: float  #: [ms] median, all robots
     num_bytes: int  #: of the site map on disk
     wall_seconds: float  #: [s] the mission took
-    #: per robot [m]: height error of its pose at the last merge, and that which the site found
+    #: per robot [m]: height error of its pose at the last merge, less the common offset, and that which the site found
     offsets: list[tuple[float, float]] = field(repr=False)
     history: list[tuple[float, float]] = field(repr=False)  #: time [s] and coverage of each merge
 
@@ -63,7 +63,10 @@ class FleetNumbers:
             ("coverage", f"{100 * self.coverage:.1f} % of the area's cells"),
             ("RMSE", f"{_cm(self.rmse)}, {_cm(self.rmse_off_steps)} away from steps"),
             ("seams", f"{_cm(self.seams)} between neighbouring blocks of {_BLOCK:g} m (95th percentile)"),
-            ("offsets", f"up to {_cm(self.largest_height_error)}, found within {_cm(self.largest_offset_error)}"),
+            (
+                "offsets",
+                f"over {_cm(self.height_error_span)} between robots, found within {_cm(self.largest_offset_error)}",
+            ),
             ("disagreed", f"{self.contradictions:,} cells in {len(self.history)} merges"),
             ("update", f"{self.ms_per_update:.1f} ms (median, all robots)"),
             ("merge", f"{self.ms_per_merge:.1f} ms (median, all robots)"),
@@ -111,7 +114,7 @@ def assess(mission: Mission, comparison: Comparison, wall_seconds: float) -> Fle
         rmse_off_steps=_rms(smooth),
         seams=measure_seams(smooth, comparison.saved.resolution),
         common_offset=comparison.common_offset,
-        largest_height_error=float(np.abs(expected).max()),
+        height_error_span=float(np.ptp(expected)),
         largest_offset_error=float(np.abs(found - expected).max()),
         contradictions=mission.contradictions,
         ms_per_update=_median(mission.update_ms),

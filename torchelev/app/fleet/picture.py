@@ -7,23 +7,22 @@ from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
-import torch
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import LightSource, Normalize
 from numpy.typing import NDArray
 
-from torchelev.app.fleet.explore import coarsen
 from torchelev.app.fleet.numbers import Comparison, FleetNumbers
-from torchelev.viz.relief import draw_relief, rgb
+from torchelev.viz.relief import draw_relief
 from torchelev.viz.style import ERRORS, HEIGHTS, UNKNOWN_COLOR, draw_cells, make_figure, styled, write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from torchelev.io.export import SavedMap
+
 _MAX_ERROR = 5.0  # [cm] of the error's colours
 _WIDTH, _HEIGHT = 8.6, 7.6  # [inches]
-_OBSTACLE_COLOR = "#8c8c8c"
 _PATH_COLORS = "turbo"
 
 
@@ -38,15 +37,12 @@ def draw_fleet(path: str | Path, comparison: Comparison, tracks: NDArray, number
         numbers: for the title.
     """
     figure = make_figure(_WIDTH, _HEIGHT)
-    axes = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
-    low, high = (float(v) for v in np.percentile(comparison.truth, [1, 99]))
-    high = max(high, low + 0.1)
-    elevation = comparison.saved.layers["elevation"] - comparison.common_offset
-    _draw_heights(figure, axes[0], "ground truth", comparison.truth, comparison, (low, high))
-    _draw_heights(figure, axes[1], f"site map of {numbers.robots} robots", elevation, comparison, (low, high))
-    _draw_error(figure, axes[2], comparison)
-    _draw_paths(axes[3], comparison, tracks)
-    _label(axes)
+    figure.set_layout_engine("compressed")
+    (truth, site), (paths, error) = figure.subplots(2, 2, sharex=True, sharey=True)
+    _draw_heights(figure, truth, site, comparison, numbers)
+    _draw_paths(paths, comparison.saved, tracks)
+    _draw_error(figure, paths, error, comparison)
+    _label(truth, site, paths, error)
     figure.suptitle(_title(comparison, numbers), fontsize=12)
     write(figure, path)
 
@@ -59,34 +55,34 @@ def _title(comparison: Comparison, numbers: FleetNumbers) -> str:
     )
 
 
-def _draw_heights(
-    figure: Figure, ax: Axes, title: str, heights: NDArray, comparison: Comparison, limits: tuple[float, float]
-) -> None:
-    pixels = draw_relief(heights, comparison.saved.resolution, *limits)
-    ax.imshow(pixels[::-1], extent=comparison.saved.extent, origin="lower", interpolation="antialiased")
-    ax.set_title(title)
-    bar = figure.colorbar(ScalarMappable(Normalize(*limits), HEIGHTS), ax=ax, pad=0.02)
+def _draw_heights(figure: Figure, truth: Axes, site: Axes, comparison: Comparison, numbers: FleetNumbers) -> None:
+    """Draw both heights with the same colours."""
+    saved = comparison.saved
+    low, high = (float(v) for v in np.percentile(comparison.truth, [1, 99]))
+    high = max(high, low + 0.1)
+    elevation = saved.layers["elevation"] - comparison.common_offset
+    panels = {"ground truth": (truth, comparison.truth), f"site map of {numbers.robots} robots": (site, elevation)}
+    for title, (ax, heights) in panels.items():
+        pixels = draw_relief(heights, saved.resolution, low, high)
+        ax.imshow(pixels[::-1], extent=saved.extent, origin="lower", interpolation="antialiased")
+        ax.set_title(title)
+    bar = figure.colorbar(ScalarMappable(Normalize(low, high), HEIGHTS), ax=[truth, site], pad=0.02, aspect=30)
     bar.set_label("[m]")
 
 
-def _draw_error(figure: Figure, ax: Axes, comparison: Comparison) -> None:
-    extent, values = comparison.saved.extent, 100 * comparison.error
-    image = draw_cells(ax, np.ma.masked_invalid(values), extent, ERRORS, -_MAX_ERROR, _MAX_ERROR)
+def _draw_error(figure: Figure, beside: Axes, ax: Axes, comparison: Comparison) -> None:
+    values = np.ma.masked_invalid(100 * comparison.error)
+    image = draw_cells(ax, values, comparison.saved.extent, ERRORS, -_MAX_ERROR, _MAX_ERROR)
     ax.set_title("error: site map - ground truth")
-    figure.colorbar(image, ax=ax, pad=0.02).set_label("[cm]")
+    figure.colorbar(image, ax=[beside, ax], pad=0.02, aspect=30).set_label("[cm]")
 
 
-def _draw_paths(ax: Axes, comparison: Comparison, tracks: NDArray) -> None:
-    """Draw the robots' paths over what is known: white where robots can walk, dark where it is too steep."""
-    elevation, extent = comparison.saved.layers["elevation"], comparison.saved.extent
-    area = coarsen(torch.as_tensor(elevation), comparison.saved.resolution)
-    blocked = (area.known & ~area.free).numpy()
-    count = [n // m for n, m in zip(elevation.shape, blocked.shape, strict=True)]
-    pixels = np.full((*elevation.shape, 3), 255, np.uint8)
-    pixels[np.kron(blocked, np.ones(count, bool))] = rgb(_OBSTACLE_COLOR)
-    pixels[~np.isfinite(elevation)] = rgb(UNKNOWN_COLOR)
-    ax.imshow(pixels.swapaxes(0, 1), extent=extent, origin="lower", interpolation="nearest")
-    ax.set_title("paths (dark: too steep, light grey: unknown)")
+def _draw_paths(ax: Axes, saved: SavedMap, tracks: NDArray) -> None:
+    """Draw the robots' paths over the known ground, lit from the upper left; a large dot ends a path."""
+    shade = LightSource(315, 45).hillshade(saved.layers["elevation"].T[::-1], dx=saved.resolution, dy=saved.resolution)
+    ax.set_facecolor(UNKNOWN_COLOR)
+    ax.imshow(shade[::-1], extent=saved.extent, origin="lower", cmap="gray", vmin=-1.0, vmax=0.75)
+    ax.set_title("paths of the robots (grey: unknown)")
     colors = matplotlib.colormaps[_PATH_COLORS](np.linspace(0.03, 0.97, tracks.shape[1]))
     for track, color in zip(tracks.swapaxes(0, 1), colors, strict=True):
         ax.plot(*track.T, color=color, linewidth=1.3)
@@ -94,7 +90,7 @@ def _draw_paths(ax: Axes, comparison: Comparison, tracks: NDArray) -> None:
         ax.plot(*track[-1], "o", color=color, markeredgecolor="black", markersize=6)
 
 
-def _label(axes: NDArray) -> None:
+def _label(*axes: Axes) -> None:
     for k, ax in enumerate(axes):
         for spine in ax.spines.values():
             spine.set_visible(True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from torchelev.output_files import require_writable
 
 _WINDOW = 8.0  # [m] side of each robot's map, about
 _MAX_ROBOTS, _MAX_SIZE = 256, 150.0
+_PICTURES = (".png", ".svg", ".pdf")
 _FINEST, _COARSEST = 0.04, 0.25  # [m]
 
 
@@ -44,14 +46,14 @@ class FleetRequest:
         is_enough, rule = 0 < self.seconds < 1e5, "must be a positive number of seconds"
         require(is_enough, "--seconds", rule, f"{self.seconds:g}", "give 120")
         require_count("--seed", self.seed, "give 0", minimum=0)
+        is_picture = self.out.suffix in _PICTURES
+        require(is_picture, "--out", f"must end with {', '.join(_PICTURES)}", self.out.name, "give fleet.png")
         self._check_size()
 
     def _check_size(self) -> None:
         """Refuse an area in which the camp has no room, or whose border cuts through coarse cells."""
-        smallest = 2 * self.camp_radius + 2.0
-        hint = f"give {smallest:.0f} or more, or fewer robots"
-        fits, rule = self.size >= smallest - 0.5, f"must hold the camp of {self.robots} robots"
-        require(fits, "--size", rule, f"{self.size:g} m", hint)
+        smallest, rule = math.ceil(2 * self.camp_radius + 2.0), f"must hold the camp of {self.robots} robots"
+        require(self.size >= smallest, "--size", rule, f"{self.size:g} m", f"give {smallest} or more, or fewer robots")
         require(self.size <= _MAX_SIZE, "--size", f"must be at most {_MAX_SIZE:g} m", f"{self.size:g}", "give 60")
         whole_cells("--size", self.size, 2 * self.coarse)
 
