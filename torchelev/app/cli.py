@@ -239,8 +239,8 @@ Output files:
     "--site",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Keep the site map there. One that is there is continued: give the same --seed, --size and --resolution.  "
-    "[default: a temporary folder]",
+    help="Keep the site map there. One that is there is continued: give the same --seed, --size and --resolution. "
+    "Needs torchelev[site].  [default: a temporary folder]",
 )
 @click.option("--live", is_flag=True, help="Show the growing map in the browser; needs torchelev[view].")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Of --live; 0.0.0.0: let other machines connect.")

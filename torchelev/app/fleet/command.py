@@ -5,7 +5,8 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,25 +36,33 @@ def run_fleet(request: FleetRequest, quiet: bool = False) -> int:
     """
     with user_errors(), site_folder(request) as folder:
         request.require_outputs()
-        view, mission, start = open_view(request), Mission(request, folder), time.perf_counter()
-        is_interrupted = explore(mission, view, quiet)
-        if mission.saved is None:
-            click.echo("interrupted: nothing was mapped yet", err=True)
-            return _INTERRUPTED
-        with defer_interrupts():
-            click.echo(finish(mission, start))
-            click.echo(f"wrote {request.out}  {request.numbers}" + (f"  {request.site}" if request.site else ""))
-        if is_interrupted:
-            click.echo(f"interrupted: kept the map of {mission.time:.0f} of {request.seconds:.0f} s", err=True)
-        elif view:
+        view, mission = open_view(request), Mission(request, folder)
+        with closing(mission.site):
+            is_interrupted = explore_and_report(mission, view, quiet)
+        if view and not is_interrupted:
             hold(view)
         return _INTERRUPTED if is_interrupted else 0
 
 
+def explore_and_report(mission: Mission, view: FleetView | None, quiet: bool) -> bool:
+    """Run the mission, write and print what it gave, and return whether Ctrl-C ended it."""
+    request, start = mission.request, time.perf_counter()
+    is_interrupted = explore(mission, view, quiet)
+    if mission.saved is None:
+        click.echo("interrupted: nothing was mapped yet", err=True)
+        return True
+    with defer_interrupts():
+        click.echo(finish(mission, start))
+        click.echo(f"wrote {request.out}  {request.numbers}" + (f"  {request.site}" if request.site else ""))
+    if is_interrupted:
+        click.echo(f"interrupted: kept the map of {mission.time:.0f} of {request.seconds:.0f} s", err=True)
+    return is_interrupted
+
+
 @contextmanager
-def site_folder(request: FleetRequest) -> Iterator[Path]:
-    """Yield the folder of the site map; a temporary one is removed at the end."""
-    if request.site is not None:
+def site_folder(request: FleetRequest) -> Iterator[Path | None]:
+    """Yield the folder of the site map; a temporary one is removed at the end. None: keep it in memory."""
+    if request.site is not None or find_spec("tensorstore") is None:
         yield request.site
         return
     with tempfile.TemporaryDirectory() as folder:

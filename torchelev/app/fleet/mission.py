@@ -30,7 +30,7 @@ class Mission:
 
     Args:
         request: what to simulate.
-        folder: of the site map.
+        folder: of the site map; None: in memory.
 
     Attributes:
         time: [s] since the first scan.
@@ -40,12 +40,12 @@ class Mission:
         report: of the last merge.
         height_errors: (B,) [m] true height errors of the robots' poses at the last merge.
         history: time [s] and coverage of each merge.
-        contradictions: cells at which robots and the site disagreed, in all merges.
+        contradictions: how often a robot contradicted the site or another robot at a cell, in all merges.
         update_ms: times of all updates [ms].
         merge_ms: times of all merges [ms].
     """
 
-    def __init__(self, request: FleetRequest, folder: Path) -> None:
+    def __init__(self, request: FleetRequest, folder: Path | None) -> None:
         self.request = request
         self.world = World(request.size, request.camp_radius, request.seed)
         self.robots = Robots(self.world, request.robots, request.seed)

@@ -44,10 +44,10 @@ class FleetNumbers:
     common_offset: float  #: [m] of the site map
     height_error_span: float  #: [m] between the highest and the lowest height error of the robots' poses
     largest_offset_error: float  #: [m] by which the site misjudged a robot's height error
-    contradictions: int  #: cells at which a robot and the site disagreed, in all merges
+    contradictions: int  #: how often a robot contradicted the site or another robot at a cell, in all merges
     ms_per_update: float  #: [ms] median, all robots
     ms_per_merge: float  #: [ms] median, all robots
-    num_bytes: int  #: of the site map on disk
+    num_bytes: int  #: of the site map on disk; 0: it is in memory
     wall_seconds: float  #: [s] the mission took
     #: per robot [m]: height error of its pose at the last merge, less the common offset, and that which the site found
     offsets: list[tuple[float, float]] = field(repr=False)
@@ -67,10 +67,10 @@ class FleetNumbers:
                 "offsets",
                 f"over {_cm(self.height_error_span)} between robots, found within {_cm(self.largest_offset_error)}",
             ),
-            ("disagreed", f"{self.contradictions:,} cells in {len(self.history)} merges"),
+            ("disagreed", f"{self.contradictions:,} times a cell, in {len(self.history)} merges"),
             ("update", f"{self.ms_per_update:.1f} ms (median, all robots)"),
             ("merge", f"{self.ms_per_merge:.1f} ms (median, all robots)"),
-            ("on disk", f"{self.num_bytes / 1e6:.2f} MB"),
+            ("on disk", f"{self.num_bytes / 1e6:.2f} MB" if self.num_bytes else "nothing: the site map is in memory"),
             ("took", f"{self.wall_seconds:.0f} s"),
         ]
         return "\n".join(align(rows))
