@@ -102,6 +102,22 @@ def test_ctrl_c_before_the_first_scan_writes_nothing(run, monkeypatch, tmp_path)
     assert (code, out) == (130, "") and "nothing was mapped" in err and not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow(4)
+def test_a_site_on_disk_is_continued(run, tmp_path):
+    pytest.importorskip("tensorstore", reason="needs torchelev[site]")
+    options = ("--robots", 2, "--size", 12, "--seconds", 2, "--site", tmp_path / "hill", "--quiet")
+    histories = []
+    for name in ("a.png", "b.png"):
+        code, out, err = run("fleet", *options, "--out", name)
+        assert (code, err) == (0, "") and f"{tmp_path / 'hill'}" in out
+        numbers = json.loads((tmp_path / name).with_suffix(".json").read_text())
+        assert numbers["num_bytes"] > 0 and numbers["rmse_off_steps"] < 0.03
+        histories.append(numbers["history"])
+    assert histories[1][0][1] >= histories[0][-1][1]
+    code, out, err = run("fleet", *options, "--resolution", 0.2)
+    assert code == 2 and "must be 0.1 m" in err and err.count("\n") == 1
+
+
 def test_help_says_what_happens(run):
     code, out, _ = run("fleet", "--help")
     assert code == 0 and max(map(len, out.splitlines())) <= 80
