@@ -157,4 +157,4 @@ def test_numbers_are_written_in_place_of_older_ones(tmp_path):
     mission = Mission(request, None)
     mission.step()
     numbers = finish(mission, 0.0)
-    assert json.loads(request.numbers.read_text())["robots"] == 1 and "1 robots, 0 s" in str(numbers)
+    assert json.loads(request.numbers.read_text())["robots"] == 1 and "1 robot, 0 s" in str(numbers)

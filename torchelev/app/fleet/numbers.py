@@ -59,7 +59,7 @@ class FleetNumbers:
 
     def __str__(self) -> str:
         rows = [
-            ("simulated", f"{self.robots} robots, {self.seconds:.0f} s, {self.walked:.0f} m walked"),
+            ("simulated", f"{count_robots(self.robots)}, {self.seconds:.0f} s, {self.walked:.0f} m walked"),
             ("coverage", f"{100 * self.coverage:.1f} % of the area's cells"),
             ("RMSE", f"{_cm(self.rmse)}, {_cm(self.rmse_off_steps)} away from steps"),
             ("seams", f"{_cm(self.seams)} between neighbouring blocks of {_BLOCK:g} m (95th percentile)"),
@@ -74,6 +74,11 @@ class FleetNumbers:
             ("took", f"{self.wall_seconds:.0f} s"),
         ]
         return "\n".join(align(rows))
+
+
+def count_robots(number: int) -> str:
+    """Return a number of robots in words."""
+    return "1 robot" if number == 1 else f"{number} robots"
 
 
 def _cm(metres: float) -> str:

@@ -11,7 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize
 from numpy.typing import NDArray
 
-from torchelev.app.fleet.numbers import Comparison, FleetNumbers
+from torchelev.app.fleet.numbers import Comparison, FleetNumbers, count_robots
 from torchelev.viz.relief import draw_relief
 from torchelev.viz.style import ERRORS, HEIGHTS, UNKNOWN_COLOR, draw_cells, make_figure, styled, write
 
@@ -50,7 +50,7 @@ def draw_fleet(path: str | Path, comparison: Comparison, tracks: NDArray, number
 def _title(comparison: Comparison, numbers: FleetNumbers) -> str:
     x_min, x_max, y_min, y_max = comparison.saved.extent
     return (
-        f"{numbers.robots} robots map {x_max - x_min:g} x {y_max - y_min:g} m in {numbers.seconds:.0f} s: "
+        f"{count_robots(numbers.robots)}, {x_max - x_min:g} x {y_max - y_min:g} m, {numbers.seconds:.0f} s: "
         f"{100 * numbers.coverage:.1f} % known, RMSE {100 * numbers.rmse_off_steps:.1f} cm away from steps"
     )
 
@@ -61,7 +61,10 @@ def _draw_heights(figure: Figure, truth: Axes, site: Axes, comparison: Compariso
     low, high = (float(v) for v in np.percentile(comparison.truth, [1, 99]))
     high = max(high, low + 0.1)
     elevation = saved.layers["elevation"] - comparison.common_offset
-    panels = {"ground truth": (truth, comparison.truth), f"site map of {numbers.robots} robots": (site, elevation)}
+    panels = {
+        "ground truth": (truth, comparison.truth),
+        f"site map of {count_robots(numbers.robots)}": (site, elevation),
+    }
     for title, (ax, heights) in panels.items():
         pixels = draw_relief(heights, saved.resolution, low, high)
         ax.imshow(pixels[::-1], extent=saved.extent, origin="lower", interpolation="antialiased")
