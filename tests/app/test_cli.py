@@ -22,7 +22,7 @@ def test_help_tells_a_newcomer_what_to_give(run):
     assert max(map(len, out.splitlines())) <= 80
 
 
-@pytest.mark.parametrize("command", ["map", "demo", "filters"])
+@pytest.mark.parametrize("command", ["map", "demo", "fleet", "filters"])
 def test_every_command_is_listed_with_a_whole_sentence(run, command):
     line = next(line for line in run("--help")[1].splitlines() if line.split()[:1] == [command])
     assert line.endswith(".") and not line.endswith("...")

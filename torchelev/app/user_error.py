@@ -10,7 +10,8 @@ import click
 from torchelev.io.errors import RecordingError
 
 BAD_INPUT = 2  # exit code
-_EXTRAS = {"rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view"}  # of packages
+# The extra of torchelev that installs a package.
+_EXTRAS = {"rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site"}
 
 
 class UserError(click.ClickException):
