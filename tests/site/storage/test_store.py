@@ -14,7 +14,8 @@ import pytest
 
 pytest.importorskip("tensorstore", reason="needs torchelev[site]")
 
-from torchelev.site.storage import tile_files, transaction, zarr_files
+from torchelev.site.storage import store as store_module
+from torchelev.site.storage import transaction, zarr_files
 from torchelev.site.storage.store import TileStore
 
 ROOT = Path(__file__).parents[2]
@@ -360,7 +361,7 @@ def test_a_full_disk_is_an_error_that_says_so(store, monkeypatch, text):
 
     commit_number(store, 1)
     before = files_in(store.path)
-    monkeypatch.setattr(tile_files, "wait_for", lambda writes: zarr_files.wait_for([*writes, Refused()]))
+    monkeypatch.setattr(store_module, "wait_for", lambda writes: zarr_files.wait_for([*writes, Refused()]))
     with pytest.raises(OSError, match="No space left on device.*stored before is unchanged.*make room") as caught:
         commit_number(store, 2)
     assert caught.value.errno == errno.ENOSPC
