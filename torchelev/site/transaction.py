@@ -25,7 +25,7 @@ class CommitError(OSError):
     """A commit failed. All that was stored before is unchanged, and the store can be used on."""
 
     def __init__(self, path: Path, error: OSError) -> None:
-        hint = _HINTS.get(error.errno, "commit again")
+        hint = _HINTS.get(error.errno or 0, "commit again")
         reason = error.strerror or str(error) or type(error).__name__
         super().__init__(f"{path}: cannot be written ({reason}); all that was stored before is unchanged: {hint}")
         self.errno = error.errno
