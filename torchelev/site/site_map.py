@@ -22,6 +22,7 @@ from torchelev.grid import GridConfig
 from torchelev.inputs import checks
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
+from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.align import align
 from torchelev.site.config import SiteConfig
@@ -123,7 +124,8 @@ class SiteMap:
 
     # Merging --------------------------------------------------------------------------------------------------------
 
-    @torch.inference_mode()
+    @torch.inference_mode(False)  # whose tensors could not be written outside of it
+    @torch.no_grad()
     def merge(
         self, emap: ElevationMap, *, time: float | None = None, align: bool = True, tilt: bool = False
     ) -> MergeReport:
@@ -163,7 +165,7 @@ class SiteMap:
             _told.setdefault(emap, {})[self._id] = told
         contradictions = self._fuse(windows, alignment, now)
         _told.setdefault(emap, {})[self._id] = told
-        return MergeReport(*alignment, windows.is_new.sum((1, 2)), contradictions)
+        return MergeReport(*alignment, count(windows.is_new), contradictions)
 
     def _recall_told(self, emap: ElevationMap) -> Told | None:
         """Return what a map has told since its last reset; None: nothing."""
@@ -224,7 +226,8 @@ class SiteMap:
         self._time = time
         return contradictions
 
-    @torch.inference_mode()
+    @torch.inference_mode(False)  # whose tensors could not be written outside of it
+    @torch.no_grad()
     def give(self, emap: ElevationMap, T_map_base: Tensor | None, chosen: Bool[Tensor, "B"]) -> MapState:
         """Return a map's state with what the site knows filled in; `ElevationMap.initialize_from` calls it."""
         self.require_resolution(emap)
