@@ -732,7 +732,10 @@ def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
     reference = mean if choose is None else choose(heights, weights, mean)
 
     def is_near(height, weight, relief):
-        return (height - reference) ** 2 <= gate**2 * (min(1 / weight + 1 / total, max_gate_std**2) + relief)
+        others = max(total - weight, 1e-6 * total)
+        distance = (height - mean) * total / others if choose is None else height - reference
+        variance = 1 / weight + 1 / (others if choose is None else max(weights))
+        return distance**2 <= gate**2 * (min(variance, max_gate_std**2) + relief)
 
     near = [e for e, w in zip(entries, weights, strict=False) if is_near(e["h"], w, e["relief"])]
     relief = max(e["relief"] for e in entries)
