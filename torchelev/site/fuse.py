@@ -105,8 +105,11 @@ def _resolve(first: Heights, other: Heights, entries: Entries, rate: float, cfg:
     rest, site = entries.select((~agrees).nonzero()[:, 0], same), first.at(lost)
     heights = Heights(*(torch.cat(pair) for pair in zip(rest.heights, site, strict=True)))
     relief = torch.cat([rest.relief, torch.zeros_like(site.time)])
-    second, _, _ = _average_near_surest(other, Entries(torch.cat([rest.cell, lost]), heights, relief, None), rate, cfg)
-    wins = _replaces(second, fused, rate, cfg)
+    rest_of_all = Entries(torch.cat([rest.cell, lost]), heights, relief, None)
+    second, _, _ = _average_near_surest(other, rest_of_all, rate, cfg, among_entries=True)
+    nowhere, ours = torch.zeros_like(is_kept), entries.cell[agrees]
+    holds_new = nowhere.index_fill(0, ours, True), nowhere.index_fill(0, rest.cell, True)
+    wins = _replaces(second, fused, holds_new, rate, cfg)
     return second.where(wins, fused), fused.where(wins, second)
 
 
@@ -135,12 +138,16 @@ def _weigh(prior: Heights, entries: Entries, rate: float) -> _Weights:
 
 
 def _average_near_surest(
-    prior: Heights, entries: Entries, rate: float, cfg: SiteConfig
+    prior: Heights, entries: Entries, rate: float, cfg: SiteConfig, among_entries: bool = False
 ) -> tuple[Heights, Tensor, Tensor]:
-    """Average what agrees with each cell's surest height; return which entries (K,) and priors (C,) do, too."""
+    """Average what agrees with each cell's surest height; return which entries (K,) and priors (C,) do, too.
+
+    With `among_entries`, the surest one is an entry, where there is one.
+    """
     weights = _weigh(prior, entries, rate)
-    best = weights.own.scatter_reduce(0, entries.cell, weights.new, "amax")
-    reference = _find_surest(prior, entries, weights, best)
+    own = weights.own.index_fill(0, entries.cell, 0.0) if among_entries else weights.own
+    best = own.scatter_reduce(0, entries.cell, weights.new, "amax")
+    reference = _find_surest(prior, entries, weights._replace(own=own), best)
     distance = (h - r for h, r in _pair(prior.elevation, entries, reference, entries.heights.elevation))
     variance = (1 / w + 1 / b for w, b in _pair(weights.own, entries, best, weights.new))
     agrees, is_kept = _pass_gate(prior, entries, [*distance], [*variance], cfg)
@@ -258,10 +265,18 @@ def _sum_told(
     return nothing.scatter_add(0, cell, information), nothing.scatter_add(0, cell, moment)
 
 
-def _replaces(other: Heights, first: Heights, rate: float, cfg: SiteConfig) -> Bool[Tensor, "C"]:
-    """Tell where the other height is to be the site's: newer and about as sure, or as new and surer."""
+def _replaces(
+    other: Heights, first: Heights, holds_new: tuple[Tensor, Tensor], rate: float, cfg: SiteConfig
+) -> Bool[Tensor, "C"]:
+    """Tell where the other height is to be the site's: newer and about as sure, or as new and surer.
+
+    `holds_new` tells where the first and the other hold what was merged just now, which decides between equal times.
+    """
     newest = torch.maximum(other.time, first.time)
     ratio = first.information(newest, rate) / other.information(newest, rate)
-    limit = torch.where(other.time > first.time, cfg.max_newer_ratio, 1.0)
-    limit = torch.where(other.time < first.time, 1.0 / cfg.max_newer_ratio, limit)
+    is_tie, (first_is_new, other_is_new) = other.time == first.time, holds_new
+    is_newer = (other.time > first.time) | (is_tie & other_is_new & ~first_is_new)
+    is_older = (other.time < first.time) | (is_tie & first_is_new & ~other_is_new)
+    limit = torch.where(is_newer, cfg.max_newer_ratio, 1.0)
+    limit = torch.where(is_older, 1.0 / cfg.max_newer_ratio, limit)
     return other.known & (ratio < limit)

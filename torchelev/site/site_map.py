@@ -87,7 +87,8 @@ class SiteMap:
         self.cfg = checks.given_or_default(SiteConfig, cfg)
         self._store = None if path is None else _create_or_open(path, self.resolution)
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
-        self._id, self._epoch, self._time, self._rate = uuid.uuid4().hex, 0.0, 0.0, self.cfg.variance_rate
+        self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
+        self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._read_attributes()
 
     @classmethod
@@ -118,7 +119,7 @@ class SiteMap:
         site.resolution = float(site._store.attributes["resolution"])
         site.cfg = checks.given_or_default(SiteConfig, cfg)
         site._tiles = Tiles(site._store, site.cfg.cache_tiles, device)
-        site._id, site._epoch, site._time, site._rate = "", 0.0, 0.0, site.cfg.variance_rate
+        site._id, site._rate, site._epoch, site._time, site._opened = "", site.cfg.variance_rate, 0.0, 0.0, 0.0
         site._read_attributes()
         return site
 
@@ -195,7 +196,7 @@ class SiteMap:
             return time - self._epoch
         elapsed = emap.state.elapsed
         if told is None:
-            return max(self._time, float(elapsed.max()) * 1e-9)
+            return max(self._time, self._opened + float(elapsed.max()) * 1e-9)
         lived = torch.where(told.elapsed >= 0, elapsed - told.elapsed, elapsed)  # an environment that was reset
         return self._time + float(lived.max()) * 1e-9
 
@@ -381,6 +382,7 @@ class SiteMap:
         if self._store is not None and "id" in self._store.attributes:
             stored = self._store.attributes
             self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
+            self._opened = self._time
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
 
 
