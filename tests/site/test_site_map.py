@@ -293,3 +293,12 @@ def test_inference_mode_leaves_nothing_that_cannot_be_written_later():
     report.offsets.sub_(report.offsets.mean())
     site.sample([[1.0, 1.0]])[0].add_(1.0)
     emap.initialize_from(site)
+
+
+def test_maps_of_half_precision_merge_as_precisely_as_they_are():
+    exact, half = robots([(0, 0), (20, 0)], offsets=[0.1, -0.1]), robots([(0, 0), (20, 0)], offsets=[0.1, -0.1])
+    sites = SiteMap(0.1), SiteMap(0.1)
+    offsets = [site.merge(emap).offsets for site, emap in zip(sites, (exact, half.to(torch.bfloat16)), strict=True)]
+    torch.testing.assert_close(*offsets, atol=2e-3, rtol=0.0)
+    a, b = (known_cells(site) for site in sites)
+    assert a == pytest.approx(b, abs=5e-3)

@@ -98,6 +98,7 @@ def _comparable(windows: Windows, cfg: SiteConfig) -> tuple[Tensor, ...]:
     is_flat = has_normal & (gradient_x.square() + gradient_y.square() <= cfg.max_slope**2)
     good = (is_known & is_flat & (variance <= cfg.max_std**2)).nonzero()[:, 0]
     window, i, j, height, variance = (value[good] for value in (window, i, j, height, variance))
+    height, variance = height.float(), variance.float()
     return window, corner[window, 0] + i, corner[window, 1] + j, height, variance
 
 
