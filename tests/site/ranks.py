@@ -10,6 +10,7 @@ import time
 import warnings
 
 import torch
+import torch._dynamo.convert_frame  # once, and not in each process
 import torch.distributed as dist
 
 from tests.helpers import small_map

@@ -38,9 +38,7 @@ def assert_same(actual, expected):
 
 
 @pytest.mark.slow(3)
-@pytest.mark.parametrize(
-    ("size", "on_disk", "tilt"), [(2, True, False), (4, False, True), (8, True, False)]
-)
+@pytest.mark.parametrize(("size", "on_disk", "tilt"), [(2, True, False), (4, False, True), (8, True, False)])
 def test_ranks_hold_what_one_process_with_all_robots_holds(size, on_disk, tilt, alone, tmp_path):
     path = tmp_path / "site" if on_disk else None
     results = results_of(run_ranks(ranks.fly, size, tmp_path / "ranks", path, SHARES[size], tilt))
