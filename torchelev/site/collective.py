@@ -7,6 +7,13 @@ A merge of R ranks takes these steps, of which those marked * wait for all ranks
 3.   align and fuse. A rank may read tiles from disk, which are as of the last merge.
 4. * on disk: all have read what they need. Rank 0 commits; before, a rank could have read what it fuses again.
 5. * on disk: rank 0 has committed. What a rank reads from now on is as of this merge.
+
+A rank that raises ends its steps: the others wait for it no longer than the timeout of `init_process_group`, 30 minutes
+with gloo unless another is given, and then raise `LostRankError`. They do at once if its process has ended. With NCCL,
+torch ends the processes that wait instead, see TORCH_NCCL_ASYNC_ERROR_HANDLING.
+
+Ranks compute the same from the same windows. On machines with different processors, or on GPUs, they may differ by
+rounding; on disk is what rank 0 has computed.
 """
 
 from __future__ import annotations
@@ -125,13 +132,14 @@ class Ranks:
         if self._lost is not None:
             raise self._lost
         device = torch.device("cuda") if dist.get_backend(self.group) == "nccl" else torch.device("cpu")
-        gathered = torch.empty(self.size * len(rows), *rows.shape[1:], dtype=rows.dtype, device=device)
+        sent = rows.to(device).contiguous()
+        gathered = [torch.empty_like(sent) for _ in range(self.size)]
         try:
-            dist.all_gather_into_tensor(gathered, rows.to(device).contiguous(), group=self.group)
+            dist.all_gather(gathered, sent, group=self.group)
         except RuntimeError as error:
             self._lost = _lost(call, error)
             raise self._lost from error
-        return gathered.to(rows.device).view(self.size, *rows.shape)
+        return torch.stack(gathered).to(rows.device)
 
     # A site's steps -------------------------------------------------------------------------------------------------
 
