@@ -107,7 +107,7 @@ def table(result: dict[str, Any]) -> str:
 def main(robots: int, merges: int, processes: str) -> None:
     """Measure, write JSON and print the table."""
     torch.set_num_threads(1)
-    result = {"resolution": RESOLUTION, "length": LENGTH, "merges": merges}
+    result: dict[str, Any] = {"resolution": RESOLUTION, "length": LENGTH, "merges": merges}
     result["rows"] = measure(robots, [int(size) for size in processes.split(",")], merges)
     write_json(RESULTS / "site_ranks.json", result)
     click.echo(table(result))

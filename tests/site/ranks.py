@@ -7,7 +7,6 @@ import os
 import pickle
 import signal
 import time
-import warnings
 
 import torch
 import torch._dynamo.convert_frame  # once, and not in each process
@@ -23,12 +22,12 @@ CORNERS = [(0, 0), (12, -9), (20, 25), (-30, 6), (8, 20), (45, 30), (160, 0), (1
 GIVEN = 3, 7  # robots that start anew with what the site knows
 
 
-def run_ranks(work, size, folder, *args, timeout=60.0):
+def run_ranks(work, size, folder, *args):
     """Run work(rank, *args) in `size` processes; return what each returns or raises, None if it was killed."""
     context = multiprocessing.get_context("forkserver")  # imports once for all; tensorstore must not be forked
     context.set_forkserver_preload(["tests.site.ranks"])
     folder.mkdir(exist_ok=True)
-    ranks = [context.Process(target=_run, args=(work, rank, size, folder, timeout, args)) for rank in range(size)]
+    ranks = [context.Process(target=_run, args=(work, rank, size, folder, args)) for rank in range(size)]
     for process in ranks:
         process.start()
     for process in ranks:
@@ -41,14 +40,11 @@ def run_ranks(work, size, folder, *args, timeout=60.0):
     return [pickle.loads(file.read_bytes()) if file.exists() else None for file in files]
 
 
-def _run(work, rank, size, folder, timeout, args):
-    warnings.simplefilter("ignore")
+def _run(work, rank, size, folder, args):
     torch.set_num_threads(1)
     os.environ["GLOO_SOCKET_IFNAME"] = "lo"
     store = dist.FileStore(str(folder / "store"), size)
-    dist.init_process_group(
-        "gloo", store=store, rank=rank, world_size=size, timeout=datetime.timedelta(seconds=timeout)
-    )
+    dist.init_process_group("gloo", store=store, rank=rank, world_size=size, timeout=datetime.timedelta(seconds=60))
     try:
         result = work(rank, *args)
     except Exception as error:
@@ -158,9 +154,11 @@ def lose(rank, path, how):
     """Merge once; then one rank ends, and the others call again."""
     site = open_site(path)
     site.merge(one_robot(rank))
-    how, lost = how.split()
+    how, lost, *_ = how.split()
     if rank == int(lost):
         _end(how)
+    if how == "hangs":  # from here on, or a rank that starts late would count as lost
+        dist.distributed_c10d._set_pg_timeout(datetime.timedelta(seconds=1.0), dist.group.WORLD)
     start = time.monotonic()
     texts = []
     for _ in range(2):
@@ -177,7 +175,7 @@ def _end(how):
     if how == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
     if how == "hangs":
-        time.sleep(4.0)
+        time.sleep(3.0)
         os._exit(1)
     if how == "before_commit":
         os.rename = lambda *paths: os.kill(os.getpid(), signal.SIGKILL)

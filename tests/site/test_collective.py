@@ -9,7 +9,7 @@ from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
 from torchelev.site.packing import Layout, pack, unpack
-from torchelev.site.windows import Windows, read_windows, snapshot
+from torchelev.site.windows import Alignment, Windows, read_windows, snapshot
 
 SHARES = {
     2: [[0], list(range(1, 11))],
@@ -70,20 +70,21 @@ def test_no_rank_reads_tiles_of_another_merge(slow, tmp_path):
 
 
 @pytest.mark.slow(2)
-@pytest.mark.parametrize("how", ["exits 1", "killed 0", "hangs 1", "before_commit 0"])
+@pytest.mark.parametrize("how", ["exits 1", "exits 0 in memory", "killed 0", "hangs 1", "before_commit 0"])
 def test_a_rank_that_ends_leaves_the_last_merge_and_an_error(how, tmp_path):
-    lost, path = int(how[-1]), tmp_path / "site"
-    results = run_ranks(ranks.lose, 3, tmp_path / "ranks", path, how, timeout=2.0)
+    lost, path = int(how.split()[1]), None if "memory" in how else tmp_path / "site"
+    results = run_ranks(ranks.lose, 3, tmp_path / "ranks", path, how)
     expected = SiteMap(0.1)
     both = ranks.small_map(3, (30, 26))
     expected.merge(ranks.fill(both, [(0, 0), (10, 0), (20, 0)], lambda x, y: 0.1 * x))
     assert results[lost] is None
     for texts, seconds, contents in (result for rank, result in enumerate(results) if rank != lost):
-        assert len(texts) == 2 and texts[0] == texts[1] and seconds < 5.0
+        assert len(texts) == 2 and texts[0] == texts[1] and seconds < 20.0
         assert texts[0].startswith("merge: a rank has ended or did not answer within the timeout")
         assert "as of the last merge that rank 0 committed: end all ranks" in texts[0]
         assert_same(contents, ranks.contents(expected))
-    with SiteMap(0.1, path) as site:
+    if path:
+        site = SiteMap(0.1, path)
         assert_same(ranks.contents(site), ranks.contents(expected))
         assert site.merge(both).new_cells.all()
 
@@ -146,8 +147,6 @@ def test_packed_windows_are_exact_and_as_large_as_documented(with_told):
 
 
 def ranks_alignment(emap):
-    from torchelev.site.windows import Alignment
-
     generator = torch.Generator().manual_seed(0)
     shifts = torch.rand(emap.num_envs, 3, dtype=torch.float64, generator=generator)
     return Alignment(shifts[:, 0], shifts[:, 1:], torch.zeros(emap.num_envs, dtype=torch.bool))
