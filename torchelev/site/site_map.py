@@ -26,10 +26,11 @@ from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.align import align
-from torchelev.site.collective import Ranks
+from torchelev.site.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.config import SiteConfig
 from torchelev.site.give import center_on, fill, remember_given
 from torchelev.site.merge import MergeReport, merge_windows
+from torchelev.site.ranks import Ranks
 from torchelev.site.reading import Clock, check_layers, read_area, sample_tiles
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
@@ -96,7 +97,9 @@ class SiteMap:
     ) -> None:
         self._ranks = Ranks(group)
         self._ranks.exchange("SiteMap", lambda: {"same": self._set_up(resolution, path, cfg)})
-        self._store = None if path is None else self._ranks.open("SiteMap", partial(_open, path, self.resolution))
+        self._store = (
+            None if path is None else open_shared(self._ranks, "SiteMap", partial(_open, path, self.resolution))
+        )
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
         self._id, self._epoch, self._time, self._rate = uuid.uuid4().hex, 0.0, 0.0, self.cfg.variance_rate
         self._read_attributes()
@@ -191,7 +194,7 @@ class SiteMap:
         now = max(plan["now"] for plan in plans)  # the first that all agree on
         now = now if time is None else self._advance(emap, told, now)
         windows = read_windows(emap, emap.state, now, told)
-        all_windows, own = self._ranks.gather(windows, plans)
+        all_windows, own = gather_windows(self._ranks, windows, plans)
         all_aligned = self._align(all_windows, align, tilt)
         alignment = Alignment(*(value[own] for value in all_aligned))
         told = snapshot(emap, windows, alignment)
@@ -291,7 +294,7 @@ class SiteMap:
     @contextmanager
     def _transaction(self, time: float) -> Iterator[Callable[..., None]]:
         """Yield what writes tiles to disk; in memory alone, nothing does."""
-        with self._ranks.transaction(self._store, self._attributes(time)) as write:
+        with shared_transaction(self._ranks, self._store, self._attributes(time)) as write:
             yield write
 
     # Reading --------------------------------------------------------------------------------------------------------
