@@ -191,7 +191,7 @@ class SiteMap:
         told = self._recall_told(emap)
         if self._rate is None:
             self._rate = plans[0]["rate"]
-        now = max(plan["now"] for plan in plans)  # the first that all agree on
+        now = max(plan["now"] for plan in plans)  # of all ranks
         now = now if time is None else self._advance(emap, told, now)
         windows = read_windows(emap, emap.state, now, told)
         all_windows, own = gather_windows(self._ranks, windows, plans)
