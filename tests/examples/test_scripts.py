@@ -11,7 +11,9 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(path.stem for path in (ROOT / "examples").glob("*.py") if path.stem != "stand_ins")
+LAUNCH = {"fleet_torchrun": "-m torch.distributed.run --standalone --nproc-per-node 2"}
 QUICK = {
+    "fleet_torchrun": "--steps 11",
     "gymnasium_observation": "--steps 5",
     "isaac_lab_term": "--steps 5",
     "live_view": "--num-envs 4 --steps 5",
@@ -26,7 +28,8 @@ QUICK = {
 
 def run(name, folder, **environment):
     """Run an example in an empty folder; return what it prints, and its picture."""
-    command = [sys.executable, ROOT / "examples" / f"{name}.py", *QUICK[name].split(), "--picture", "picture.png"]
+    script = [ROOT / "examples" / f"{name}.py", *QUICK[name].split(), "--picture", "picture.png"]
+    command = [sys.executable, *LAUNCH.get(name, "").split(), *script]
     env = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
     result = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
@@ -35,6 +38,13 @@ def run(name, folder, **environment):
 
 def numbers(text):
     return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
+
+
+def check_fleet(out):
+    for line in (line for line in out.splitlines() if "drifted" in line):
+        _, *offsets = numbers(line)
+        assert len(offsets) == 4 and all(abs(a - b) < 10 for a, b in zip(offsets[:2], offsets[2:], strict=True)), line
+    assert out.count("the site of 4 robots has 4 tiles") == 2
 
 
 def check_mujoco(out):
@@ -58,6 +68,7 @@ def check_own_head(out):
 
 
 CHECKS = {
+    "fleet_torchrun": check_fleet,
     "gymnasium_observation": lambda out: "'map': (2, 16, 10)" in out,
     "isaac_lab_term": lambda out: "observation (8, 187)" in out,
     "live_view": lambda out: "the live view is at http://localhost" in out and " pictures in 5 steps" in out,

@@ -6,6 +6,8 @@ import math
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -25,9 +27,11 @@ from torchelev.layers import MODES
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.align import align
+from torchelev.site.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.config import SiteConfig
 from torchelev.site.give import center_on, fill, remember_given
 from torchelev.site.merge import MergeReport, merge_windows
+from torchelev.site.ranks import Ranks
 from torchelev.site.reading import Clock, check_layers, read_area, sample_tiles
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
@@ -37,6 +41,7 @@ from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
+    from torch.distributed import ProcessGroup
 
     from torchelev.site.storage.store import TileStore
 
@@ -58,19 +63,27 @@ class SiteMap:
     It is made of square tiles, of which a merge touches those below the windows alone. On disk, a merge is written
     completely or not at all, and memory does not grow with the area.
 
+    With a `group`, all its ranks hold one site, and `merge` takes the robots of all of them, in the order of the ranks:
+    call it on all ranks, which wait for each other. Reading is up to each rank. On disk, rank 0 writes, and the others
+    read the same folder. See `torchelev.site.collective`.
+
     Args:
         resolution: [m] of the cells, as of the maps that are merged.
         path: the folder to keep it in, which needs ``torchelev[site]``. A site that is there already is continued.
             None: in memory, 28 bytes for each cell of a tile.
         cfg: how windows are aligned and fused.
         device: that fuses.
+        group: processes that share the site, such as `torch.distributed.group.WORLD`; None: this one alone. Give
+            `init_process_group` a `timeout` that is longer than ranks wait for each other, such as a minute: after it,
+            those that wait for a rank that has died raise `LostRankError`.
 
     Attributes:
         resolution: [m].
         cfg: settings.
 
     Raises:
-        ValueError: the resolution is not positive or not that of the site at `path`, or there is something else.
+        ValueError: the resolution is not positive or not that of the site at `path`, or there is something else; or
+            the group is not initialised, or its ranks open the site differently.
         ModuleNotFoundError: tensorstore is missing.
     """
 
@@ -81,15 +94,36 @@ class SiteMap:
         *,
         cfg: SiteConfig | None = None,
         device: torch.device | str = "cpu",
+        group: ProcessGroup | None = None,
     ) -> None:
-        require_positive(resolution=resolution)
-        self.resolution = float(resolution)
-        self.cfg = checks.given_or_default(SiteConfig, cfg)
-        self._store = None if path is None else _create_or_open(path, self.resolution)
+        self._ranks = Ranks(group)
+        self._ranks.exchange("SiteMap", lambda: {"same": self._set_up(resolution, path, cfg)})
+        self._store = (
+            None if path is None else open_shared(self._ranks, "SiteMap", partial(_open, path, self.resolution))
+        )
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._read_attributes()
+        self._agree_on_id()
+
+    def _set_up(self, resolution: float, path: str | Path | None, cfg: SiteConfig | None) -> dict[str, Any]:
+        """Take the settings, and return those that all ranks must share."""
+        require_positive(resolution=resolution)
+        self.resolution = float(resolution)
+        self.cfg = checks.given_or_default(SiteConfig, cfg)
+        settings = {f"cfg.{name}": value for name, value in asdict(self.cfg).items() if name != "cache_tiles"}
+        return {"resolution": self.resolution, "path": "in memory" if path is None else "on disk", **settings}
+
+    def _agree_on_id(self) -> None:
+        """Take the id of rank 0; raise ValueError if ranks have opened different sites."""
+        stored = None if self._store is None else self._store.attributes.get("id")
+        try:
+            plans = self._ranks.exchange("SiteMap", lambda: {"id": self._id, "same": {"path: id of the site": stored}})
+        except BaseException:
+            self.close()
+            raise
+        self._id = plans[0]["id"]
 
     @classmethod
     def open(
@@ -115,6 +149,7 @@ class SiteMap:
         from torchelev.site.storage.store import TileStore
 
         site = cls.__new__(cls)
+        site._ranks = Ranks(None)
         site._store = TileStore.open(path, read_only=read_only)
         site.resolution = float(site._store.attributes["resolution"])
         site.cfg = checks.given_or_default(SiteConfig, cfg)
@@ -151,20 +186,24 @@ class SiteMap:
             TypeError: `emap` is no ElevationMap.
             ValueError: it has another resolution, or the site is open read-only. Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
+            LostRankError: of a group, another rank has ended; the site is as it was before.
         """
-        self._check_merge(emap, time)
+        plans = self._ranks.exchange("merge", lambda: self._plan(emap, time, align, tilt))
         if emap.device.type == "cpu":
             keep_freed_memory()
         told = self._recall_told(emap)
         if self._rate is None:
-            self._rate = emap.cfg.aging.variance_rate
-        now = self._advance(emap, told, time)
+            self._rate = plans[0]["rate"]
+        now = max(plan["now"] for plan in plans)  # of all ranks
+        now = now if time is None else self._advance(emap, told, now)
         windows = read_windows(emap, emap.state, now, told)
-        alignment = self._align(windows, align, tilt)
+        all_windows, own = gather_windows(self._ranks, windows, plans)
+        all_aligned = self._align(all_windows, align, tilt)
+        alignment = Alignment(*(value[own] for value in all_aligned))
         told = snapshot(emap, windows, alignment)
         if self._store is None:  # if it is interrupted, what is in memory may hold a part, which must not count twice
             _told.setdefault(emap, {})[self._id] = told
-        contradictions = self._fuse(windows, alignment, now)
+        contradictions = self._fuse(all_windows, all_aligned, now)[own]
         _told.setdefault(emap, {})[self._id] = told
         return MergeReport(*alignment, count(windows.is_new), contradictions)
 
@@ -173,12 +212,25 @@ class SiteMap:
         told = _told.get(emap, {}).get(self._id)
         return None if told is None else drop_reset(told, emap.num_resets)
 
+    def _plan(self, emap: ElevationMap, time: float | None, align: bool, tilt: bool) -> dict[str, Any]:
+        """Return what this rank is about to merge; raise if it cannot."""
+        self._check_merge(emap, time)
+        told = self._recall_told(emap)
+        now = self._advance(emap, told, None) if time is None else time
+        merged = {"tiles": len(self), "time of the site": self.time}
+        time_is = "not given" if time is None else "given"
+        options = {"time": time_is, "align": bool(align), "tilt": bool(tilt)}
+        grid = emap.cfg.grid
+        same = {"size of the window": [grid.height, grid.width], **options, **merged}
+        rate = emap.cfg.aging.variance_rate
+        return {"same": same, "robots": emap.num_envs, "told": told is not None, "now": now, "rate": rate}
+
     def _check_merge(self, emap: ElevationMap, time: float | None) -> None:
         actual, hint = type(emap).__name__, "give an ElevationMap"
         require(isinstance(emap, ElevationMap), "emap", "must be an ElevationMap", actual, hint, TypeError)
         self.require_resolution(emap)
         require(time is None or math.isfinite(time), "time", "must be a finite number", time, "give seconds")
-        read_only = self._store is not None and self._store.is_read_only
+        read_only = self._store is not None and self._store.is_read_only and self._ranks.rank == 0
         require(not read_only, "site", "must be open for writing", "a read-only site", "open it without read_only")
 
     def require_resolution(self, emap: ElevationMap) -> None:
@@ -246,11 +298,8 @@ class SiteMap:
     @contextmanager
     def _transaction(self, time: float) -> Iterator[Callable[..., None]]:
         """Yield what writes tiles to disk; in memory alone, nothing does."""
-        if self._store is None:
-            yield lambda tiles, values: None
-        else:
-            with self._store.transaction(self._attributes(time)) as write:
-                yield write
+        with shared_transaction(self._ranks, self._store, self._attributes(time)) as write:
+            yield write
 
     # Reading --------------------------------------------------------------------------------------------------------
 
@@ -386,14 +435,16 @@ class SiteMap:
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
 
 
-def _create_or_open(path: str | Path, resolution: float) -> TileStore:
+def _open(path: str | Path, resolution: float, read_only: bool) -> TileStore:
     """Create a site's folder, or open one that is there, of the same resolution."""
     from torchelev.site.storage.store import TileStore
 
     path = Path(path)
-    if not (path / "zarr.json").exists():
+    exists = (path / "zarr.json").exists()
+    if not exists and not read_only:
         return TileStore.create(path, layers=STORED, tile_size=TILE, attributes={"resolution": resolution})
-    store = TileStore.open(path)
+    require(exists, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
+    store = TileStore.open(path, read_only=read_only)
     actual = float(store.attributes["resolution"])
     if not math.isclose(actual, resolution, rel_tol=1e-9):
         store.close()

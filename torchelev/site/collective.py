@@ -1,0 +1,104 @@
+"""One site in many processes: each rank merges its own robots, and all hold the same site.
+
+A merge of R ranks takes these steps, of which those marked * wait for all ranks:
+
+1. * what each rank is about to do (2 KiB): bad use raises on all of them, before anything changes on any.
+2. * all windows, in one all_gather, see `packing.Layout` for their size. From here on, all ranks compute the same.
+3.   align and fuse. A rank may read tiles from disk, which are as of the last merge.
+4. * on disk: all have read what they need. Rank 0 commits; before, a rank could have read what it fuses again.
+5. * on disk: rank 0 has committed. What a rank reads from now on is as of this merge.
+
+A rank that raises ends its steps: the others wait for it no longer than the timeout of `init_process_group`, 30 minutes
+with gloo unless another is given, and then raise `LostRankError`. They do at once if its process has ended. With NCCL,
+torch ends the processes that wait instead, see TORCH_NCCL_ASYNC_ERROR_HANDLING.
+
+Ranks compute the same from the same windows. On machines with different processors, or on GPUs, they may differ by
+rounding; on disk is what rank 0 has computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchelev.errors import require
+from torchelev.site.packing import Layout, pack, unpack
+from torchelev.site.ranks import Ranks
+from torchelev.site.windows import Windows
+
+if TYPE_CHECKING:
+    from torchelev.site.storage.store import TileStore
+
+
+def open_shared(ranks: Ranks, call: str, open_store: Callable[[bool], TileStore]) -> TileStore:
+    """Open a store on rank 0 for writing, and then on the others, to whose `open_store` True says: read-only."""
+    store = None
+    try:
+        for turn in (True, False):
+            with ranks.together(call):
+                if (ranks.rank == 0) == turn:
+                    store = open_store(not turn)
+    except BaseException:
+        if store is not None:
+            store.close()
+        raise
+    assert store is not None
+    return store
+
+
+def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) -> tuple[Windows, slice]:
+    """Return the windows of all ranks' robots, in the order of the ranks, and where those of this rank are.
+
+    Args:
+        ranks: of the site.
+        windows: of this rank.
+        plans: what the ranks have told by `exchange`: their numbers of `robots`, and whether any was `told`.
+    """
+    numbers = [plan["robots"] for plan in plans]
+    own = slice(sum(numbers[: ranks.rank]), sum(numbers[: ranks.rank + 1]))
+    if ranks.size == 1:
+        return windows, own
+    H, W = windows.known.elevation.shape[1:]
+    layout = Layout(H, W, any(plan["told"] for plan in plans))
+    rows = pack(windows, layout)
+    padded = torch.nn.functional.pad(rows, (0, 0, 0, max(numbers) - len(rows)))
+    gathered = ranks.all_gather("merge", padded)
+    return unpack(torch.cat([rows[:number] for rows, number in zip(gathered, numbers, strict=True)]), layout), own
+
+
+@contextmanager
+def shared_transaction(
+    ranks: Ranks, store: TileStore | None, attributes: Mapping[str, Any]
+) -> Iterator[Callable[..., None]]:
+    """Yield what writes tiles, which rank 0 commits once all ranks are at the end; without a store, nothing does.
+
+    If the block or the commit raises on one rank, nothing is committed, and all raise.
+    """
+    if store is None:
+        yield _write_nothing
+        return
+    with ranks.together("merge"):
+        with store.transaction(attributes) if ranks.rank == 0 else nullcontext(_write_nothing) as write:
+            with ranks.together("merge"):
+                yield write
+    if ranks.rank:
+        store.refresh()
+        _require_current(store, attributes)
+
+
+def _write_nothing(*args: object) -> None:
+    pass
+
+
+def _require_current(store: TileStore, attributes: Mapping[str, Any]) -> None:
+    """Raise OSError unless a store shows what rank 0 has just committed."""
+    names = "id", "time"
+    actual, expected = ([values.get(name) for name in names] for values in (store.attributes, attributes))
+    rule, hint = (
+        f"must show what rank 0 has committed, {expected}",
+        "give all ranks one folder, mounted without a cache",
+    )
+    require(actual == expected, str(store.path), rule, actual, hint, OSError)

@@ -1,0 +1,117 @@
+"""Windows as rows of bytes, one for each robot, to be sent to other processes."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.site.windows import Known, Told, Windows, no_alignment
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, UInt8
+
+
+class Layout(NamedTuple):
+    """What the rows hold: the same on all ranks.
+
+    Cell numbers are int64, times, rates and offsets float64, layers float32 and masks bits: 20.5 bytes per cell and 32
+    per robot; with what was told, 32.625 bytes per cell and 88 per robot.
+    """
+
+    height: int  #: H, cells
+    width: int  #: W, cells
+    with_told: bool  #: whether any robot has told the site anything before
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of a robot."""
+        return sum(_width(dtype, shape) for dtype, shape in self.parts())
+
+    def parts(self) -> list[tuple[torch.dtype, tuple[int, ...]]]:
+        """Return the type and the shape, per robot, of all that a row holds, in its order."""
+        layer = (self.height, self.width)
+        known = [(torch.int64, (2,)), *2 * [(torch.float64, ())], *3 * [(torch.float32, layer)], (torch.bool, layer)]
+        surface = [*2 * [(torch.float32, layer)], *3 * [(torch.bool, layer)]]
+        told = [*known, (torch.float64, ()), (torch.float64, (2,))]
+        return [*known, *surface, *(told if self.with_told else [])]
+
+
+def pack(windows: Windows, layout: Layout) -> UInt8[Tensor, "B n"]:
+    """Return the rows of B robots."""
+    values = _values(windows, layout.with_told)
+    rows = [_to_bytes(value.to(dtype)) for value, (dtype, _) in zip(values, layout.parts(), strict=True)]
+    return torch.cat(rows, 1)
+
+
+def unpack(rows: UInt8[Tensor, "B n"], layout: Layout) -> Windows:
+    """Return the windows that `pack` was given, as far as a merge reads them."""
+    parts = layout.parts()
+    columns = rows.split([_width(dtype, shape) for dtype, shape in parts], 1)
+    values = [_from_bytes(column, dtype, shape) for column, (dtype, shape) in zip(columns, parts, strict=True)]
+    known, (gradient_x, gradient_y, has_normal, is_bounded, is_new) = _known(values[:7]), values[7:12]
+    told = _told(values[12:]) if layout.with_told else None
+    return Windows(known, gradient_x, gradient_y, has_normal, known.elevation, is_bounded, is_new, told)
+
+
+def _values(windows: Windows, with_told: bool) -> list[Tensor]:
+    """Return what a row holds. A cell has a height or an upper bound, so that one layer holds both."""
+    known = windows.known
+    height = torch.where(windows.is_bounded, windows.upper_bound, known.elevation)
+    surface = windows.gradient_x, windows.gradient_y, windows.has_normal, windows.is_bounded, windows.is_new
+    values = [*_of_known(known._replace(elevation=height)), *surface]
+    if with_told:
+        told = windows.told or _nothing(known)
+        values += [*_of_known(told.known), told.alignment.offset, told.alignment.tilt]
+    return values
+
+
+def _of_known(known: Known) -> list[Tensor]:
+    return [known.corner, known.now, known.rate, known.elevation, known.variance, known.age, known.is_known]
+
+
+def _known(values: list[Tensor]) -> Known:
+    corner, now, rate, elevation, variance, age, is_known = values
+    return Known(corner, elevation, variance, age, is_known, now, rate)
+
+
+def _told(values: list[Tensor]) -> Told:
+    """Return what was told, without the clocks and resets of the maps, which only their own rank needs."""
+    known, zero = _known(values[:7]), values[0].new_zeros(len(values[0]))
+    alignment = no_alignment(len(zero), zero.device)._replace(offset=values[7], tilt=values[8])
+    return Told(known, alignment, zero, zero)
+
+
+def _nothing(known: Known) -> Told:
+    """Return what robots have told that told nothing."""
+    zero = torch.zeros_like(known.corner[:, 0])
+    blank = known._replace(is_known=torch.zeros_like(known.is_known))
+    return Told(blank, no_alignment(len(zero), zero.device), zero, zero)
+
+
+def _width(dtype: torch.dtype, shape: tuple[int, ...]) -> int:
+    number = math.prod(shape)
+    return math.ceil(number / 8) if dtype == torch.bool else number * dtype.itemsize
+
+
+def _to_bytes(values: Tensor) -> UInt8[Tensor, "B n"]:
+    flat = values.reshape(len(values), -1).clone(memory_format=torch.contiguous_format)  # of one robot, strides too
+    return _pack_bits(flat) if values.dtype == torch.bool else flat.view(torch.uint8)
+
+
+def _from_bytes(column: UInt8[Tensor, "B n"], dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    flat = column.clone(memory_format=torch.contiguous_format)  # numbers must be aligned
+    values = _unpack_bits(flat, math.prod(shape)) if dtype == torch.bool else flat.view(dtype)
+    return values.view(len(column), *shape)
+
+
+def _pack_bits(mask: Bool[Tensor, "B n"]) -> UInt8[Tensor, "B m"]:
+    padded = torch.nn.functional.pad(mask.to(torch.uint8), (0, -mask.shape[1] % 8)).view(len(mask), -1, 8)
+    return (padded << torch.arange(8, dtype=torch.uint8, device=mask.device)).sum(2, dtype=torch.uint8)
+
+
+def _unpack_bits(packed: UInt8[Tensor, "B m"], number: int) -> Bool[Tensor, "B n"]:
+    bits = (packed[:, :, None] >> torch.arange(8, dtype=torch.uint8, device=packed.device)) & 1
+    return bits.flatten(1)[:, :number].bool().contiguous()

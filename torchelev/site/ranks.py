@@ -1,0 +1,140 @@
+"""The processes that share a site, and what they tell each other."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchelev.errors import message, require
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
+
+_MESSAGE_BYTES, _MAX_TEXT = 2048, 300
+_ERRORS = {error.__name__: error for error in (ValueError, TypeError, KeyError, OSError)}
+
+
+class LostRankError(RuntimeError):
+    """Another rank has ended, or did not answer in time. The site is as of the last merge, and can be read on."""
+
+
+class Ranks:
+    """The processes that share a site. Alone, no call waits for anybody.
+
+    Args:
+        group: of `torch.distributed`; None: this process alone.
+
+    Raises:
+        ValueError: `torch.distributed` is not initialised, or this process is not in the group.
+    """
+
+    def __init__(self, group: ProcessGroup | None) -> None:
+        self.group, self.rank, self.size = group, 0, 1
+        self._lost: LostRankError | None = None
+        if group is not None:
+            import torch.distributed as dist
+
+            is_ready = dist.is_available() and dist.is_initialized()
+            hint = "call torch.distributed.init_process_group first"
+            require(is_ready, "group", "must be initialised", "none", hint)
+            self.rank, self.size = dist.get_rank(group), dist.get_world_size(group)
+            require(self.rank >= 0, "group", "must hold this process", "another group", "call it on its ranks alone")
+
+    def exchange(self, call: str, make: Callable[[], dict[str, Any]]) -> list[dict[str, Any]]:
+        """Return what `make` returns on each rank: JSON values. If it raises on one rank, all raise.
+
+        Args:
+            call: name of the method that is called, for errors.
+            make: returns values; those below "same" must not differ between ranks.
+
+        Raises:
+            ValueError: ranks call different methods, or what must be the same differs. On all ranks.
+            LostRankError: another rank has ended, or did not answer in time.
+        """
+        if self.size == 1:
+            return [make()]
+        failure, own = None, {}
+        try:
+            own = make()
+        except LostRankError:
+            raise
+        except Exception as error:
+            failure = error
+        values = self._exchange(call, own | {"call": call, "error": failure and _describe(failure)})
+        for rank, value in enumerate(values):
+            if value["error"]:
+                name, text = value["error"]
+                raise _ERRORS.get(name, RuntimeError)(f"rank {rank}: {text}") from failure
+        self._require_same(values)
+        return values
+
+    @contextmanager
+    def together(self, call: str) -> Iterator[None]:
+        """Wait at the end of the block for all ranks; if it raises on one rank, all raise."""
+        if self.size == 1:
+            yield
+            return
+        failure = None
+        try:
+            yield
+        except LostRankError:
+            raise
+        except Exception as error:
+            failure = error
+        self.exchange(call, lambda: _raise(failure))
+
+    def _exchange(self, call: str, values: dict[str, Any]) -> list[dict[str, Any]]:
+        encoded = json.dumps(values).encode()
+        assert len(encoded) <= _MESSAGE_BYTES
+        sent = torch.tensor([list(encoded.ljust(_MESSAGE_BYTES))], dtype=torch.uint8)
+        return [json.loads(bytes(row.tolist())) for row in self.all_gather(call, sent)[:, 0]]
+
+    def _require_same(self, values: list[dict[str, Any]]) -> None:
+        """Raise the same ValueError on all ranks if they are about to do different things."""
+        plans = [{"call": value["call"]} | value.get("same", {}) for value in values]
+        for name, first in plans[0].items():
+            rank = next((rank for rank, plan in enumerate(plans) if plan.get(name, first) != first), None)
+            if rank is not None:
+                actual = f"{first} on rank 0 and {plans[rank][name]} on rank {rank}"
+                raise ValueError(message(name, "must be the same on all ranks", actual, "call all ranks alike"))
+
+    def all_gather(self, call: str, rows: Tensor) -> Tensor:
+        """Return the rows (R, ...) of all ranks, on the device of these."""
+        import torch.distributed as dist
+
+        if self._lost is not None:
+            raise self._lost
+        device = torch.device("cuda") if dist.get_backend(self.group) == "nccl" else torch.device("cpu")
+        sent = rows.to(device).contiguous()
+        gathered = [torch.empty_like(sent) for _ in range(self.size)]
+        try:
+            dist.all_gather(gathered, sent, group=self.group)
+        except RuntimeError as error:
+            self._lost = _lost(call, error)
+            raise self._lost from error
+        return torch.stack(gathered).to(rows.device)
+
+
+def _lost(call: str, error: Exception) -> LostRankError:
+    reason = " ".join(str(error).split())[:_MAX_TEXT]
+    return LostRankError(
+        f"{call}: a rank has ended or did not answer within the timeout of init_process_group ({reason}); the site on "
+        "disk is as of the last merge that rank 0 committed: end all ranks, start them again, and open it anew"
+    )
+
+
+def _describe(error: Exception) -> tuple[str, str]:
+    name = next((name for name, known in _ERRORS.items() if isinstance(error, known)), "")
+    text = str(error) if name else f"{type(error).__name__}: {error}"
+    return name, text[:_MAX_TEXT].encode("ascii", "replace").decode()
+
+
+def _raise(error: Exception | None) -> dict[str, Any]:
+    if error is not None:
+        raise error
+    return {}
