@@ -716,8 +716,8 @@ def fuse_site_cell(first, other, entries, rate, *, gate, max_gate_std, max_newer
 
 def surest(heights, weights, mean):
     """The height of the most information; of several, the one nearest to the mean [mm], and then the lowest."""
-    best = max(weights)
-    return min((h for h, w in zip(heights, weights) if w >= best), key=lambda h: (round(1e3 * abs(h - mean)), h))
+    certain = [h for h, w in zip(heights, weights, strict=True) if w >= max(weights)]
+    return min(certain, key=lambda h: (round(1e3 * abs(h - mean)), h))
 
 
 def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
@@ -728,13 +728,13 @@ def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
     heights = [e["h"] for e in entries] + ([prior["h"]] if prior else [])
     weights = [information(e, newest, rate) for e in [*entries, *([prior] if prior else [])]]
     total = sum(weights)
-    mean = sum(h * w for h, w in zip(heights, weights)) / total
+    mean = sum(h * w for h, w in zip(heights, weights, strict=True)) / total
     reference = mean if choose is None else choose(heights, weights, mean)
 
     def is_near(height, weight, relief):
         return (height - reference) ** 2 <= gate**2 * (min(1 / weight + 1 / total, max_gate_std**2) + relief)
 
-    near = [e for e, w in zip(entries, weights) if is_near(e["h"], w, e["relief"])]
+    near = [e for e, w in zip(entries, weights, strict=False) if is_near(e["h"], w, e["relief"])]
     relief = max(e["relief"] for e in entries)
     is_kept = bool(prior) and is_near(prior["h"], weights[-1], relief)
     if not near:

@@ -11,7 +11,7 @@ from torchelev.map_buffers import name_tensors, state_of, without_shared_memory
 def test_tensors_by_name_are_the_buffers_and_make_the_state_again():
     emap = mapped()
     named = name_tensors(emap.state)
-    assert named.keys() == dict(emap.named_buffers()).keys()
+    assert named.keys() == dict(emap.named_buffers()).keys() - {"num_resets"}
     assert all(value is emap.get_buffer(name) for name, value in named.items())
     assert differences(state_of(named), emap.state) == []
 

@@ -34,8 +34,8 @@ class MergeReport(NamedTuple):
 class Merged(NamedTuple):
     """Tiles after a merge."""
 
-    tiles: list[Tile]
-    values: Float[Tensor, "L n T T"]
+    tiles: list[Tile]  #: that the windows touch
+    values: Float[Tensor, "L n T T"]  #: all layers of these tiles
     contradictions: Int[Tensor, "B"]  #: cells of each robot
 
 

@@ -20,8 +20,8 @@ _GROUP = 16  # tiles at a time: what is computed of them stays in a CPU's caches
 class Pieces(NamedTuple):
     """The parts of windows that lie on a group of tiles."""
 
-    tiles: list[Tile]
-    robot: Int[Tensor, "P"]
+    tiles: list[Tile]  #: the group
+    robot: Int[Tensor, "P"]  #: whose window it is
     tile: Int[Tensor, "P"]  #: number in `tiles`
     place: Int[Tensor, "P T T"]  #: of each of the tile's cells in the flat windows
     is_inside: Bool[Tensor, "P T T"]  #: the window holds that cell

@@ -39,7 +39,7 @@ class Storage(Protocol):
 class Located(NamedTuple):
     """Where K cells lie in a list of tiles."""
 
-    tiles: list[Tile]
+    tiles: list[Tile]  #: all different
     place: Int[Tensor, "K"]  #: number of the tile * CELLS + number of the cell in it
 
 

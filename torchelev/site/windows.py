@@ -40,7 +40,7 @@ class Known(NamedTuple):
     elevation: Float[Tensor, "B H W"]  #: [m]
     variance: Float[Tensor, "B H W"]  #: [m^2] now
     age: Float[Tensor, "B H W"]  #: [s] since the last measurement
-    is_known: Bool[Tensor, "B H W"]
+    is_known: Bool[Tensor, "B H W"]  #: the other layers count here
     now: Float[Tensor, "B"]  #: [s] the site's time at which they know it
     rate: Float[Tensor, "B"]  #: [m^2/s] at which the variance has grown since the last measurement
 
@@ -48,7 +48,7 @@ class Known(NamedTuple):
 class Windows(NamedTuple):
     """The windows of B robots at a merge."""
 
-    known: Known
+    known: Known  #: now
     gradient_x: Float[Tensor, "B H W"]  #: dz/dx
     gradient_y: Float[Tensor, "B H W"]  #: dz/dy
     has_normal: Bool[Tensor, "B H W"]  #: elsewhere the gradient is unknown
@@ -61,8 +61,8 @@ class Windows(NamedTuple):
 class Told(NamedTuple):
     """What a map knew at its last merge, and how that was aligned: the site has it."""
 
-    known: Known
-    alignment: Alignment
+    known: Known  #: then
+    alignment: Alignment  #: by which it was fused
     elapsed: Int[Tensor, "B"]  #: [ns] of the maps' clocks
     num_resets: Int[Tensor, "B"]  #: of the maps until then
 

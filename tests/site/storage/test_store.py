@@ -286,6 +286,15 @@ def test_a_crash_between_two_moves_is_completed(store, monkeypatch, moved):
     assert not (store.path / ".committed").exists()
 
 
+def test_metadata_are_moved_after_what_they_describe(store, monkeypatch):
+    commit_number(store, 1)
+    replace, moved = os.replace, []
+    monkeypatch.setattr(transaction.os, "replace", lambda *paths: (moved.append(Path(paths[1])), replace(*paths)))
+    commit_number(store, 2)
+    names = [str(path.relative_to(store.path)) for path in moved]
+    assert names[-2:] == ["keyframes/last/zarr.json", "zarr.json"] and len(names) == len(TILES) + 3
+
+
 def test_a_crash_before_the_commit_point_changes_nothing(store, monkeypatch):
     commit_number(store, 1)
     before = files_in(store.path)

@@ -47,7 +47,6 @@ def check_names(path: Path, names: list[str]) -> None:
 def stage_array(path: Path, staged: Path, name: str, array: NDArray, attributes: Mapping[str, Any]) -> None:
     """Write an array, and the groups above it that `path` lacks, below the folder `staged`."""
     array = np.asarray(array)
-    array = np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape)
     metadata = array_metadata(array, attributes)
     write_metadata(staged / name / METADATA, metadata)
     for group in Path(name).parents:

@@ -16,6 +16,8 @@ from torchelev.errors import message
 
 LOCK, STAGED, COMMITTED = ".lock", ".staged", ".committed"
 
+_FULL, _FORBIDDEN = "make room and commit again", "choose a folder that you may write to"
+_HINTS = {errno.ENOSPC: _FULL, errno.EDQUOT: _FULL, errno.EACCES: _FORBIDDEN, errno.EROFS: _FORBIDDEN}
 T = TypeVar("T")
 
 
@@ -23,7 +25,7 @@ class CommitError(OSError):
     """A commit failed. All that was stored before is unchanged, and the store can be used on."""
 
     def __init__(self, path: Path, error: OSError) -> None:
-        hint = "make room and commit again" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "commit again"
+        hint = _HINTS.get(error.errno or 0, "commit again")
         reason = error.strerror or str(error) or type(error).__name__
         super().__init__(f"{path}: cannot be written ({reason}); all that was stored before is unchanged: {hint}")
         self.errno = error.errno
