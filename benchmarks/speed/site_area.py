@@ -1,11 +1,11 @@
 """Measure how a site on disk behaves while it grows to a square kilometre in cells of 10 cm.
 
-    python -m benchmarks.speed.site_area                           # benchmarks/results/site_area.json, ten minutes, 2 GB
-    python -m benchmarks.speed.site_area --sides 100 --out here    # quicker: 100 x 100 m alone
+    python -m benchmarks.speed.site_area                         # benchmarks/results/site_area.json; 2 GB of disk
+    python -m benchmarks.speed.site_area --sides 100 --out here  # quicker: 100 x 100 m alone
 
-16 robots with windows of 16 x 16 m hop over the area, with 4 m of overlap; all cells of each window are new. For each area
-a new process explores it, and another one then opens, samples and reads it. Memory is the largest that a process had
-(VmHWM, without the file cache), beyond that of a process that imports torch alone.
+16 robots with windows of 16 x 16 m hop over the area, with 4 m of overlap; all cells of each window are new. For each
+area a new process explores it, and another one then opens, samples and reads it. Memory is the largest that a process
+had (VmHWM, without the file cache), beyond that of a process that imports torch alone.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NUM_SAMPLES, WINDOW, SECONDS = 10_000, 20.0, 2.0  # points, [m] of an area that 
 
 
 def hops(side: float) -> torch.Tensor:
-    """Return the corners (K, B, 2) [cells] of the windows over an area of `side` [m], back and forth; some come twice."""
+    """Return the corners (K, B, 2) [cells] of windows that cover a square of `side` [m]; the last ones start anew."""
     count = max(1, round((side / RESOLUTION - CELLS) / HOP) + 1)
     number = torch.arange(-(-(count**2) // ROBOTS) * ROBOTS) % count**2
     row, column = number // count, number % count

@@ -1,4 +1,4 @@
-"""Windows over synthetic ground for the benchmarks of sites: the map's state is filled directly, without casting rays."""
+"""Windows over synthetic ground for the benchmarks of sites: maps whose state is filled, without casting rays."""
 
 from __future__ import annotations
 
@@ -41,19 +41,25 @@ class Windows:
         """Let time pass, move the windows to corners (B, 2) [cells], and measure all of their cells."""
         state = self.emap.state
         state.corner.copy_(corner)
-        x, y = self.emap.cell_centers().unbind(-1)
-        noise = _NOISE * torch.randn(x.shape, generator=self._generator)
-        state.elevation.copy_(ground(x, y) + self.offsets[:, None, None] + noise)
-        low, high = _STD
-        state.variance.copy_((low + (high - low) * torch.rand(x.shape, generator=self._generator)).square())
         state.validity.fill_(True)
-        state.time.copy_(0.9 * seconds * torch.rand(x.shape, generator=self._generator))
-        step = RESOLUTION / 2
-        for axis, gradient in enumerate((state.gradient_x, state.gradient_y)):
-            dx, dy = (step, 0.0) if axis == 0 else (0.0, step)
-            gradient.copy_((ground(x + dx, y + dy) - ground(x - dx, y - dy)) / (2 * step))
         state.has_normal.fill_(True)
         state.elapsed.add_(round(1e9 * seconds))
+        for robot in range(len(corner)):  # one after the other, so that what is computed takes little memory
+            self._measure(robot, seconds)
+
+    def _measure(self, robot: int, seconds: float) -> None:
+        state, generator = self.emap.state, self._generator
+        first, size = state.corner[robot], state.elevation.shape[1:]
+        x, y = (RESOLUTION * (torch.arange(n) + first[axis] + 0.5) for axis, n in enumerate(size))
+        x, y = x[:, None], y[None, :]
+        noise = _NOISE * torch.randn(size, generator=generator)
+        state.elevation[robot] = ground(x, y) + self.offsets[robot] + noise
+        low, high = _STD
+        state.variance[robot] = (low + (high - low) * torch.rand(size, generator=generator)).square()
+        state.time[robot] = 0.9 * seconds * torch.rand(size, generator=generator)
+        step = RESOLUTION / 2
+        state.gradient_x[robot] = (ground(x + step, y) - ground(x - step, y)) / (2 * step)
+        state.gradient_y[robot] = (ground(x, y + step) - ground(x, y - step)) / (2 * step)
 
 
 def lattice(num_robots: int, spacing: int) -> Tensor:
