@@ -47,9 +47,9 @@ def measure(num_robots: int, rounds: int) -> dict[str, Any]:
             error = report.offsets - windows["disk"].offsets
             windows["memory"].look(corner + STEP * (rounds + 1))
             peak = peak_bytes(lambda: in_memory.merge(windows["memory"].emap))
-            row = {"robots": num_robots, "tiles": len(on_disk), "disk_bytes": on_disk.num_bytes, "peak_bytes": peak}
-    row |= {place: {"first": times[0], "steady": median(times[1:]), "all": times} for place, times in ms.items()}
-    return row | {"offset_spread_m": float(error.max() - error.min())}
+            size = {"tiles": len(on_disk), "disk_bytes": on_disk.num_bytes, "peak_bytes": peak}
+    times = {place: {"first": values[0], "steady": median(values[1:]), "all": values} for place, values in ms.items()}
+    return {"robots": num_robots} | size | times | {"offset_spread_m": float(error.max() - error.min())}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
