@@ -1,6 +1,6 @@
 """Measure how a site on disk behaves while it grows to a square kilometre in cells of 10 cm.
 
-    python -m benchmarks.speed.site_area                         # benchmarks/results/site_area.json; 2 GB of disk
+    python -m benchmarks.speed.site_area                         # benchmarks/results/site_area.json; six minutes, 1 GB
     python -m benchmarks.speed.site_area --sides 100 --out here  # quicker: 100 x 100 m alone
 
 16 robots with windows of 16 x 16 m hop over the area, with 4 m of overlap; all cells of each window are new. For each
