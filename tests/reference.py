@@ -708,8 +708,9 @@ def fuse_site_cell(first, other, entries, rate, *, gate, max_gate_std, max_newer
         return fused, other, False
     fused, left, is_kept = average_site_cell(first, entries, surest, **limits)
     rest = [{**e, "told": None} for e in left] + ([] if is_kept else [{**first, "relief": 0.0, "told": None}])
-    second, _, _ = average_site_cell(other, rest, surest, **limits)
-    if second and replaces(second, fused, rate, max_newer_ratio):
+    second, _, _ = average_site_cell(other, rest, surest, **limits, among_entries=True)
+    is_new = len(left) < len(entries), bool(left)
+    if second and replaces(second, fused, is_new, rate, max_newer_ratio):
         fused, second = second, fused
     return fused, second, True
 
@@ -720,7 +721,7 @@ def surest(heights, weights, mean):
     return min(certain, key=lambda h: (round(1e3 * abs(h - mean)), h))
 
 
-def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
+def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std, among_entries=False):
     """The mean of what lies near the reference, the entries that do not, and whether the prior does."""
     if not entries:
         return prior, [], True
@@ -729,10 +730,14 @@ def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
     weights = [information(e, newest, rate) for e in [*entries, *([prior] if prior else [])]]
     total = sum(weights)
     mean = sum(h * w for h, w in zip(heights, weights, strict=True)) / total
-    reference = mean if choose is None else choose(heights, weights, mean)
+    eligible = weights[: len(entries)] if among_entries else weights
+    reference = mean if choose is None else choose(heights[: len(eligible)], eligible, mean)
 
     def is_near(height, weight, relief):
-        return (height - reference) ** 2 <= gate**2 * (min(1 / weight + 1 / total, max_gate_std**2) + relief)
+        others = max(total - weight, 1e-6 * total)
+        distance = (height - mean) * total / others if choose is None else height - reference
+        variance = 1 / weight + 1 / (others if choose is None else max(eligible))
+        return distance**2 <= gate**2 * (min(variance, max_gate_std**2) + relief)
 
     near = [e for e, w in zip(entries, weights, strict=False) if is_near(e["h"], w, e["relief"])]
     relief = max(e["relief"] for e in entries)
@@ -755,10 +760,14 @@ def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std):
     return dict(h=reference + moment / total, v=1 / total, t=max(times)), left, is_kept or not prior
 
 
-def replaces(other, first, rate, max_newer_ratio):
-    """Whether a site is to say the other height: newer and about as sure, or as new and surer."""
+def replaces(other, first, is_new, rate, max_newer_ratio):
+    """Whether a site is to say the other height: newer and about as sure, or as new and surer.
+
+    Of the same time, one that holds what is merged now, `is_new` of the first and of the other, is newer.
+    """
     newest = max(other["t"], first["t"])
     ratio = information(first, newest, rate) / information(other, newest, rate)
-    if other["t"] == first["t"]:
+    ages = (first["t"], is_new[0]), (other["t"], is_new[1])
+    if ages[0] == ages[1]:
         return ratio < 1
-    return ratio < (max_newer_ratio if other["t"] > first["t"] else 1 / max_newer_ratio)
+    return ratio < (max_newer_ratio if ages[1] > ages[0] else 1 / max_newer_ratio)

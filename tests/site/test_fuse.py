@@ -93,6 +93,23 @@ def test_a_false_step_is_not_averaged():
     assert fused.is_contradicted.all()
 
 
+def test_of_two_heights_of_one_time_the_one_merged_later_wins():
+    fused = run([dict(h=0.0, v=1e-4, t=10.0)], [None], [[entry(0.5, v=1e-4, t=10.0)]])
+    assert float(fused.first.elevation) == 0.5
+
+
+def test_what_contradicted_the_elevation_long_ago_does_not_keep_a_newer_height_out():
+    long_ago = dict(h=-0.5, v=1e-6, t=1.0)
+    fused = run([dict(h=0.0, v=1e-4, t=10.0)], [long_ago], [[entry(0.5, v=1e-4, t=11.0)]])
+    assert float(fused.first.elevation) == 0.5 and float(fused.other.elevation) == 0.0
+
+
+@pytest.mark.parametrize("apart, is_step", [(0.05, False), (0.065, True)])
+def test_two_heights_contradict_each_other_beyond_the_gate_of_their_difference(apart, is_step):
+    fused = run([dict(h=0.0, v=1e-4, t=10.0)], [None], [[entry(apart, v=1e-4)]])  # 4 sigma are 5.7 cm
+    assert bool(fused.is_contradicted) == is_step and bool(fused.other.known) == is_step
+
+
 def test_a_much_less_certain_newer_height_does_not_replace_the_elevation():
     fused = run([dict(h=0.0, v=1e-6, t=10.0)], [None], [[entry(0.5, v=1e-4, t=11.0)]])
     assert float(fused.first.elevation) == 0.0 and float(fused.other.elevation) == 0.5

@@ -281,3 +281,15 @@ def test_bad_arguments_are_refused_by_name():
     with pytest.raises(TypeError, match="site: must be a SiteMap, got str"):
         ElevationMap().initialize_from("site")
     assert known_cells(site) == before
+
+
+def test_inference_mode_leaves_nothing_that_cannot_be_written_later():
+    emap, site = robots([(0, 0), (20, 0)], offsets=[0.1, -0.1]), SiteMap(0.1)
+    with torch.inference_mode():
+        site.merge(emap)
+    fill(emap, [(0, 0), (20, 0)])
+    emap.state.elapsed.add_(10**9)
+    report = site.merge(emap)
+    report.offsets.sub_(report.offsets.mean())
+    site.sample([[1.0, 1.0]])[0].add_(1.0)
+    emap.initialize_from(site)

@@ -93,7 +93,7 @@ def _comparable(windows: Windows, cfg: SiteConfig) -> tuple[Tensor, ...]:
     ]
     window, i, j = (on_lattice[0][:, :, None] & on_lattice[1][:, None]).nonzero().unbind(1)
     place = (window * H + i) * W + j
-    read = [layer.flatten()[place] for layer in (*known[1:3], known.is_known, *windows[1:4])]
+    read = [layer.reshape(-1).index_select(0, place) for layer in (*known[1:3], known.is_known, *windows[1:4])]
     height, variance, is_known, gradient_x, gradient_y, has_normal = read
     is_flat = has_normal & (gradient_x.square() + gradient_y.square() <= cfg.max_slope**2)
     good = (is_known & is_flat & (variance <= cfg.max_std**2)).nonzero()[:, 0]

@@ -14,7 +14,7 @@ class SiteConfig:
     #: [m^2/s] added to the variance of cells while nobody measures them; None: the `aging.variance_rate` of the first
     #: map that is merged
     variance_rate: float | None = None
-    gate: float = 5.0  #: Mahalanobis distance beyond which two heights of a cell contradict each other
+    gate: float = 4.0  #: Mahalanobis distance beyond which two heights of a cell contradict each other
     max_gate_std: float = 0.03  #: [m] the gate of uncertain heights grows no wider, or steps would be averaged
     #: a newer height replaces one that it contradicts once its variance is at most so many times that one's
     max_newer_ratio: float = 4.0

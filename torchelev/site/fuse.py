@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
+_ALONE = 1e-6  # share of a cell's information, below which the other heights say nothing
+
+
 class Heights(NamedTuple):
     """Heights in the site's frame. Variances are those right after the last measurement."""
 
@@ -64,9 +67,9 @@ class Fused(NamedTuple):
 def fuse(first: Heights, other: Heights, entries: Entries, rate: float, cfg: SiteConfig) -> Fused:
     """Fuse entries into cells. The result does not depend on the order of the entries, up to rounding.
 
-    Where all heights of a cell, the site's included, lie within the gate of their mean, the mean is the cell's new
-    height. Elsewhere the surest height is the reference: what lies within the gate of it is averaged, the rest forms
-    the cell's other height in the same way, and what agrees with neither is dropped.
+    Where every height of a cell, the site's included, lies within the gate of the mean of the others, the mean of all
+    is the cell's new height. Elsewhere the surest height is the reference: what lies within the gate of it is averaged,
+    the rest forms the cell's other height in the same way, and what agrees with neither is dropped.
 
     Args:
         first: what the site says of the cells.
@@ -76,7 +79,7 @@ def fuse(first: Heights, other: Heights, entries: Entries, rate: float, cfg: Sit
         cfg: settings.
     """
     scale = _weigh(first, entries, rate)
-    agrees, is_kept = _find_near(first, entries, scale, scale.mean, cfg)
+    agrees, is_kept = _agree_with_others(first, entries, scale, cfg)
     fused = _average(first, entries, scale, scale.mean, agrees, is_kept, rate, cfg)
     mask = ((first.known & ~is_kept) & (scale.total > scale.own)).index_fill_(0, entries.cell[~agrees], True)
     cells = mask.nonzero()[:, 0]
@@ -102,8 +105,11 @@ def _resolve(first: Heights, other: Heights, entries: Entries, rate: float, cfg:
     rest, site = entries.select((~agrees).nonzero()[:, 0], same), first.at(lost)
     heights = Heights(*(torch.cat(pair) for pair in zip(rest.heights, site, strict=True)))
     relief = torch.cat([rest.relief, torch.zeros_like(site.time)])
-    second, _, _ = _average_near_surest(other, Entries(torch.cat([rest.cell, lost]), heights, relief, None), rate, cfg)
-    wins = _replaces(second, fused, rate, cfg)
+    rest_of_all = Entries(torch.cat([rest.cell, lost]), heights, relief, None)
+    second, _, _ = _average_near_surest(other, rest_of_all, rate, cfg, among_entries=True)
+    nowhere, ours = torch.zeros_like(is_kept), entries.cell[agrees]
+    holds_new = nowhere.index_fill(0, ours, True), nowhere.index_fill(0, rest.cell, True)
+    wins = _replaces(second, fused, holds_new, rate, cfg)
     return second.where(wins, fused), fused.where(wins, second)
 
 
@@ -132,22 +138,33 @@ def _weigh(prior: Heights, entries: Entries, rate: float) -> _Weights:
 
 
 def _average_near_surest(
-    prior: Heights, entries: Entries, rate: float, cfg: SiteConfig
+    prior: Heights, entries: Entries, rate: float, cfg: SiteConfig, among_entries: bool = False
 ) -> tuple[Heights, Tensor, Tensor]:
-    """Average what agrees with each cell's surest height; return which entries (K,) and priors (C,) do, too."""
+    """Average what agrees with each cell's surest height; return which entries (K,) and priors (C,) do, too.
+
+    With `among_entries`, the surest one is an entry, where there is one.
+    """
     weights = _weigh(prior, entries, rate)
-    reference = _find_surest(prior, entries, weights)
-    agrees, is_kept = _find_near(prior, entries, weights, reference, cfg)
+    own = weights.own.index_fill(0, entries.cell, 0.0) if among_entries else weights.own
+    best = own.scatter_reduce(0, entries.cell, weights.new, "amax")
+    reference = _find_surest(prior, entries, weights._replace(own=own), best)
+    distance = (h - r for h, r in _pair(prior.elevation, entries, reference, entries.heights.elevation))
+    variance = (1 / w + 1 / b for w, b in _pair(weights.own, entries, best, weights.new))
+    agrees, is_kept = _pass_gate(prior, entries, [*distance], [*variance], cfg)
     return _average(prior, entries, weights, reference, agrees, is_kept, rate, cfg), agrees, is_kept
 
 
-def _find_surest(prior: Heights, entries: Entries, weights: _Weights) -> Float[Tensor, "C"]:
+def _pair(of_priors: Tensor, entries: Entries, of_cells: Tensor, of_entries: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Return the values of the entries, and of the priors, each with that of its cell."""
+    return [(of_entries, of_cells.index_select(0, entries.cell)), (of_priors, of_cells)]
+
+
+def _find_surest(prior: Heights, entries: Entries, weights: _Weights, best: Tensor) -> Float[Tensor, "C"]:
     """Return the height of the largest information; of several, the one nearest to the mean, and then the lowest.
 
     Distances count in millimetres, so that rounding does not choose between two that are equally far.
     """
     cell, heights = entries.cell, entries.heights.elevation
-    best = weights.own.scatter_reduce(0, cell, weights.new, "amax")
     is_best = weights.new >= best.index_select(0, cell), weights.own >= best
     from_mean = (heights - weights.mean.index_select(0, cell)).abs(), (prior.elevation - weights.mean).abs()
     far = [
@@ -159,19 +176,34 @@ def _find_surest(prior: Heights, entries: Entries, weights: _Weights) -> Float[T
     return own.scatter_reduce(0, cell, torch.where(far[0] <= nearest.index_select(0, cell), heights, torch.inf), "amin")
 
 
-def _find_near(
-    prior: Heights, entries: Entries, weights: _Weights, reference: Tensor, cfg: SiteConfig
+def _agree_with_others(
+    prior: Heights, entries: Entries, weights: _Weights, cfg: SiteConfig
 ) -> tuple[Bool[Tensor, "K"], Bool[Tensor, "C"]]:
-    """Tell which entries, and which priors, lie within the gate of the reference."""
-    cell, certain = entries.cell, 1.0 / weights.total
-    z = entries.heights.elevation - reference.index_select(0, cell)
-    variance = 1.0 / weights.new + certain.index_select(0, cell)
-    agrees = z.square() <= cfg.gate**2 * (variance.clamp(max=cfg.max_gate_std**2) + entries.relief)
+    """Tell which entries, and which priors, lie within the gate of the mean of the other heights of their cell.
+
+    With the mean m of all, whose information is W, the mean of all but the height h of information w lies
+    (h - m) W / (W - w) away from it.
+    """
+    distance, variance = [], []
+    heights = _pair(prior.elevation, entries, weights.mean, entries.heights.elevation)
+    informations = _pair(weights.own, entries, weights.total, weights.new)
+    for (h, mean), (w, total) in zip(heights, informations, strict=True):
+        others = (total - w).clamp(min=_ALONE * total)  # of a height that is alone, the distance is 0
+        distance.append((h - mean) * (total / others))
+        variance.append(1 / w + 1 / others)
+    return _pass_gate(prior, entries, distance, variance, cfg)
+
+
+def _pass_gate(
+    prior: Heights, entries: Entries, distance: list[Tensor], variance: list[Tensor], cfg: SiteConfig
+) -> tuple[Bool[Tensor, "K"], Bool[Tensor, "C"]]:
+    """Tell which entries, and which priors, have a distance [m] within the gate, given its variance [m^2]."""
+    limits = [v.clamp(max=cfg.max_gate_std**2) for v in variance]
+    agrees = distance[0].square() <= cfg.gate**2 * (limits[0] + entries.relief)
     is_kept = prior.known
     if is_kept.any():
-        relief = torch.zeros_like(certain).scatter_reduce_(0, cell, entries.relief, "amax")
-        variance = (1.0 / weights.own + certain).clamp(max=cfg.max_gate_std**2) + relief
-        is_kept = is_kept & ((prior.elevation - reference).square() <= cfg.gate**2 * variance)
+        relief = torch.zeros_like(limits[1]).scatter_reduce_(0, entries.cell, entries.relief, "amax")
+        is_kept = is_kept & (distance[1].square() <= cfg.gate**2 * (limits[1] + relief))
     return agrees, is_kept
 
 
@@ -233,10 +265,18 @@ def _sum_told(
     return nothing.scatter_add(0, cell, information), nothing.scatter_add(0, cell, moment)
 
 
-def _replaces(other: Heights, first: Heights, rate: float, cfg: SiteConfig) -> Bool[Tensor, "C"]:
-    """Tell where the other height is to be the site's: newer and about as sure, or as new and surer."""
+def _replaces(
+    other: Heights, first: Heights, holds_new: tuple[Tensor, Tensor], rate: float, cfg: SiteConfig
+) -> Bool[Tensor, "C"]:
+    """Tell where the other height is to be the site's: newer and about as sure, or as new and surer.
+
+    `holds_new` tells where the first and the other hold what was merged just now, which decides between equal times.
+    """
     newest = torch.maximum(other.time, first.time)
     ratio = first.information(newest, rate) / other.information(newest, rate)
-    limit = torch.where(other.time > first.time, cfg.max_newer_ratio, 1.0)
-    limit = torch.where(other.time < first.time, 1.0 / cfg.max_newer_ratio, limit)
+    is_tie, (first_is_new, other_is_new) = other.time == first.time, holds_new
+    is_newer = (other.time > first.time) | (is_tie & other_is_new & ~first_is_new)
+    is_older = (other.time < first.time) | (is_tie & first_is_new & ~other_is_new)
+    limit = torch.where(is_newer, cfg.max_newer_ratio, 1.0)
+    limit = torch.where(is_older, 1.0 / cfg.max_newer_ratio, limit)
     return other.known & (ratio < limit)

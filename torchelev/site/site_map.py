@@ -22,6 +22,7 @@ from torchelev.grid import GridConfig
 from torchelev.inputs import checks
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
+from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.align import align
 from torchelev.site.config import SiteConfig
@@ -86,7 +87,8 @@ class SiteMap:
         self.cfg = checks.given_or_default(SiteConfig, cfg)
         self._store = None if path is None else _create_or_open(path, self.resolution)
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
-        self._id, self._epoch, self._time, self._rate = uuid.uuid4().hex, 0.0, 0.0, self.cfg.variance_rate
+        self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
+        self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._read_attributes()
 
     @classmethod
@@ -117,13 +119,14 @@ class SiteMap:
         site.resolution = float(site._store.attributes["resolution"])
         site.cfg = checks.given_or_default(SiteConfig, cfg)
         site._tiles = Tiles(site._store, site.cfg.cache_tiles, device)
-        site._id, site._epoch, site._time, site._rate = "", 0.0, 0.0, site.cfg.variance_rate
+        site._id, site._rate, site._epoch, site._time, site._opened = "", site.cfg.variance_rate, 0.0, 0.0, 0.0
         site._read_attributes()
         return site
 
     # Merging --------------------------------------------------------------------------------------------------------
 
-    @torch.inference_mode()
+    @torch.inference_mode(False)  # whose tensors could not be written outside of it
+    @torch.no_grad()
     def merge(
         self, emap: ElevationMap, *, time: float | None = None, align: bool = True, tilt: bool = False
     ) -> MergeReport:
@@ -163,7 +166,7 @@ class SiteMap:
             _told.setdefault(emap, {})[self._id] = told
         contradictions = self._fuse(windows, alignment, now)
         _told.setdefault(emap, {})[self._id] = told
-        return MergeReport(*alignment, windows.is_new.sum((1, 2)), contradictions)
+        return MergeReport(*alignment, count(windows.is_new), contradictions)
 
     def _recall_told(self, emap: ElevationMap) -> Told | None:
         """Return what a map has told since its last reset; None: nothing."""
@@ -193,7 +196,7 @@ class SiteMap:
             return time - self._epoch
         elapsed = emap.state.elapsed
         if told is None:
-            return max(self._time, float(elapsed.max()) * 1e-9)
+            return max(self._time, self._opened + float(elapsed.max()) * 1e-9)
         lived = torch.where(told.elapsed >= 0, elapsed - told.elapsed, elapsed)  # an environment that was reset
         return self._time + float(lived.max()) * 1e-9
 
@@ -224,7 +227,8 @@ class SiteMap:
         self._time = time
         return contradictions
 
-    @torch.inference_mode()
+    @torch.inference_mode(False)  # whose tensors could not be written outside of it
+    @torch.no_grad()
     def give(self, emap: ElevationMap, T_map_base: Tensor | None, chosen: Bool[Tensor, "B"]) -> MapState:
         """Return a map's state with what the site knows filled in; `ElevationMap.initialize_from` calls it."""
         self.require_resolution(emap)
@@ -378,6 +382,7 @@ class SiteMap:
         if self._store is not None and "id" in self._store.attributes:
             stored = self._store.attributes
             self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
+            self._opened = self._time
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
 
 

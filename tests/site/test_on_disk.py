@@ -1,0 +1,171 @@
+"""A site on disk: it continues, it is bounded in memory, and nothing that was merged is lost."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from tests.site.helpers import fill, known_cells, robots
+from torchelev.site import SiteConfig, SiteMap
+from torchelev.site.storage import store as store_module
+
+pytest.importorskip("tensorstore")
+CORNERS = [(0, 0), (70, 0), (0, 70), (200, -90)]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "site"
+
+
+def everything(site):
+    return {layer: known_cells(site, layer) for layer in ("elevation", "variance", "other_elevation", "upper_bound")}
+
+
+def test_a_site_on_disk_is_the_one_in_memory(path):
+    emap = robots(CORNERS, noise=0.005)
+    in_memory = SiteMap(0.1)
+    with SiteMap(0.1, path) as on_disk:
+        for site in (in_memory, on_disk):
+            site.merge(emap)
+        assert everything(on_disk) == everything(in_memory) and on_disk.num_bytes > 0
+    assert everything(SiteMap.open(path, read_only=True)) == everything(in_memory)
+
+
+def test_opening_continues(path):
+    emap = robots(CORNERS)
+    emap.state.elapsed.add_(5 * 10**9)
+    with SiteMap(0.1, path) as site:
+        site.merge(emap)
+        before = everything(site)
+    with SiteMap(0.1, path) as site:
+        assert site.time == pytest.approx(5.0)
+        site.merge(emap)  # which has measured nothing since
+        assert everything(site) == before
+        other = robots([(0, 0)])
+        site.merge(other)
+        assert min(known_cells(site, "variance").values()) == pytest.approx(0.5e-4, rel=0.01)
+
+
+def test_memory_is_bounded_by_the_cache(path):
+    corners = [(300 * k, 0) for k in range(12)]
+    cfg = SiteConfig(cache_tiles=4)
+    emap, dense = robots(corners[:2]), SiteMap(0.1)
+    with SiteMap(0.1, path, cfg=cfg) as site:
+        for a, b in zip(corners[::2], corners[1::2], strict=True):
+            fill(emap, [a, b])
+            emap.state.elapsed.add_(10**9)
+            for target in (site, dense):
+                target.merge(emap, align=False)
+        assert len(site) == len(dense) > 8 >= site._tiles.values.shape[1]
+        xy = torch.tensor(corners) * 0.1 + 0.55
+        for layer in ("elevation", "variance"):
+            values, valid = site.sample(xy, layer)
+            assert valid.all() and torch.equal(values, dense.sample(xy, layer)[0])
+        assert everything(site) == everything(dense)
+
+
+def test_readers_beside_a_writer_see_what_was_merged(path):
+    emap = robots(CORNERS[:1])
+    with SiteMap(0.1, path) as site:
+        site.merge(emap)
+        reader = SiteMap.open(path, read_only=True)
+        fill(emap, CORNERS[1:2])
+        emap.state.elapsed.add_(10**9)
+        site.merge(emap)
+        reader.refresh()
+        assert everything(reader) == everything(site) and reader.time == site.time
+        with pytest.raises(ValueError, match="site: must be open for writing, got a read-only site"):
+            reader.merge(emap)
+        with pytest.raises(OSError, match="one writer at a time"):
+            SiteMap.open(path)
+
+
+def test_a_full_disk_loses_nothing_and_the_next_merge_makes_up_for_it(path, monkeypatch):
+    emap = robots(CORNERS)
+    with SiteMap(0.1, path) as site:
+        site.merge(emap)
+        before, clock = everything(site), site.time
+        fill(emap, [(x + 20, y) for x, y in CORNERS])
+        emap.state.elapsed.add_(10**9)
+
+        def refuse(writes):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with monkeypatch.context() as patch:
+            patch.setattr(store_module, "wait_for", refuse)
+            with pytest.raises(OSError, match="No space left on device.*make room"):
+                site.merge(emap)
+        assert everything(site) == before and site.time == clock
+        site.merge(emap)
+        assert len(known_cells(site)) > len(before["elevation"])
+        after = everything(site)
+    dense, same = SiteMap(0.1), robots(CORNERS)
+    dense.merge(same)
+    fill(same, [(x + 20, y) for x, y in CORNERS])
+    same.state.elapsed.add_(10**9)
+    dense.merge(same)
+    assert after == everything(dense)
+
+
+WRITER = """
+import sys, torch
+from tests.site.helpers import fill, robots
+from torchelev.site import SiteMap
+
+corners = [(0, 0), (30, 10), (64, 64), (-40, 20)]
+emap = robots(corners)
+with SiteMap(0.1, sys.argv[1]) as site:
+    for number in range(int(sys.argv[2]) + 1, 10000):
+        fill(emap, corners, lambda x, y: 0.0 * x + number)  # one height everywhere, which contradicts the one before
+        emap.state.elapsed.add_(10**9)
+        site.merge(emap, align=False)
+        print(number, flush=True)
+"""
+
+
+@pytest.mark.slow(12)
+def test_a_killed_merge_is_there_completely_or_not_at_all(path):
+    last = 0
+    for delay in (0.0, 0.013, 0.037, 0.061):
+        process = subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(path), str(last)], stdout=subprocess.PIPE, text=True, env={**os.environ}
+        )
+        for _ in range(3):
+            last = int(process.stdout.readline())
+        time.sleep(delay)
+        process.send_signal(signal.SIGKILL)
+        last = int(([str(last), *process.stdout.read().split()])[-1])
+        process.wait()
+        with SiteMap.open(path) as site:
+            heights = set(known_cells(site).values())
+            assert len(heights) == 1 and heights <= {float(last), float(last + 1)}
+
+
+def test_bad_paths_and_sites_are_refused_and_left_alone(path, tmp_path):
+    emap = robots(CORNERS[:1])
+    with SiteMap(0.1, path) as site:
+        site.merge(emap)
+        before = everything(site)
+    with pytest.raises(ValueError, match=r"resolution: must be 0\.1 m, that of .*, got 0\.05"):
+        SiteMap(0.05, path)
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(ValueError, match="file"):
+        SiteMap(0.1, file)
+    with pytest.raises(OSError):
+        SiteMap.open(tmp_path / "nothing")
+    metadata = json.loads((path / "zarr.json").read_text())
+    metadata["attributes"]["version"] = 99
+    (path / "zarr.json").write_text(json.dumps(metadata))
+    with pytest.raises(ValueError, match="version"):
+        SiteMap.open(path)
+    metadata["attributes"]["version"] = 1
+    (path / "zarr.json").write_text(json.dumps(metadata))
+    assert file.read_text() == "mine" and everything(SiteMap.open(path)) == before
