@@ -84,7 +84,7 @@ class Tiles:
         self._storage, self._capacity = storage, capacity
         self._slots: OrderedDict[Tile, int] = OrderedDict()
         self._free: list[int] = []
-        with torch.inference_mode(False):  # a merge and a reader outside of inference mode both write to it
+        with torch.inference_mode(False):  # what reads in inference mode, or not, and a merge all write to it
             self.values = torch.empty(len(LAYERS), 0, TILE, TILE, device=device)
 
     @property
