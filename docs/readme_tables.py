@@ -20,7 +20,19 @@ from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
-from benchmarks.speed import bags, encoders, growth, head, live_view, long_run, loop, postprocessing, sight
+from benchmarks.speed import (
+    bags,
+    encoders,
+    growth,
+    head,
+    live_view,
+    long_run,
+    loop,
+    postprocessing,
+    sight,
+    site_area,
+    site_merge,
+)
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.nav import encoder_experiment, experiment
@@ -104,6 +116,16 @@ def _live_view() -> str:
 def _bags() -> str:
     """Tabulate how fast bags are mapped, and the memory over their length."""
     return bags.table(load("bags")["rows"])
+
+
+def _site_merge() -> str:
+    """Tabulate the times of merges into a site over the number of robots."""
+    return site_merge.table(load("site_merge")["rows"])
+
+
+def _site_area() -> str:
+    """Tabulate how a site on disk behaves over its area."""
+    return site_area.table(load("site_area")["rows"])
 
 
 def _sight() -> str:
@@ -203,6 +225,8 @@ TABLES = {
     "long_run": _long_run,
     "bags": _bags,
     "live_view": _live_view,
+    "site_merge": _site_merge,
+    "site_area": _site_area,
     "nav": _nav,
     "pose_covariance": _pose_covariance,
     "legs": _legs,
@@ -270,6 +294,7 @@ PAGES = {
     HOWTO / "mjlab.md": "../../",
     HOWTO / "legs.md": "../../",
     HOWTO / "encoders.md": "../../",
+    HOWTO / "many_robots.md": "../../",
 }
 
 if __name__ == "__main__":

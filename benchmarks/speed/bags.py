@@ -25,7 +25,7 @@ import torch
 
 from benchmarks import RESULTS
 from benchmarks.speed.bag_drive import CLOUDS, MAP_FRAME, POSES, SENSOR_FRAME, write_bag
-from benchmarks.speed.meter import progress
+from benchmarks.speed.meter import peak_megabytes, progress
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.app.results import markdown_table, write_json
 from torchelev.io import MappingRun
@@ -78,12 +78,6 @@ def measure_memory(path: Path) -> dict[str, float]:
             if frame is not None:
                 run.add(frame, frame.T_map_base)
     return {"scans": run.num_scans, "start": start, "peak": peak_megabytes()}
-
-
-def peak_megabytes() -> float:
-    """Return the largest memory that this process had in its life [MB]."""
-    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
-    return int(line.split()[1]) * 1024 / 1e6
 
 
 def measure(folder: Path) -> list[dict[str, Any]]:

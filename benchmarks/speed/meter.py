@@ -89,6 +89,12 @@ def peak_bytes(run: Callable[[], Any], device: str = "cpu") -> int:
     return peak
 
 
+def peak_megabytes() -> float:
+    """Return the largest memory that this process had in its life [MB]."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024 / 1e6
+
+
 def copy_bandwidth(device: str = "cpu", megabytes: int = 256) -> float:
     """Return the memory bandwidth of copying a large tensor [bytes/s], reads and writes together."""
     source = torch.ones(megabytes * 2**18, device=device)

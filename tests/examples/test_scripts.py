@@ -23,6 +23,7 @@ QUICK = {
     "own_head": "--batches 1 --steps 2",
     "planning": "--quick",
     "robot_50hz": "--seconds 1 --eager",
+    "world_map": "--steps 20",
 }
 
 
@@ -67,6 +68,15 @@ def check_own_head(out):
     assert (given["robot"].length, given["robot"].step_height) == (1.2, 0.3)
 
 
+def check_world_map(out):
+    lines = out.splitlines()
+    errors, offsets = zip(*(numbers(line)[1:] for line in lines[:4]), strict=True)
+    assert max(errors) - min(errors) > 10 and max(abs(a - b) for a, b in zip(errors, offsets, strict=True)) < 1
+    without, aligned = (numbers(line)[-1] for line in lines[4:6])
+    assert aligned < without / 3
+    assert lines[6].startswith("a robot that starts knows") and numbers(lines[6])[0] > 90
+
+
 CHECKS = {
     "fleet_torchrun": check_fleet,
     "gymnasium_observation": lambda out: "'map': (2, 16, 10)" in out,
@@ -77,6 +87,7 @@ CHECKS = {
     "mujoco_depth_camera": check_mujoco,
     "own_head": check_own_head,
     "planning": check_planning,
+    "world_map": check_world_map,
     "robot_50hz": lambda out: 0 < numbers(out)[0] <= 51 and "p99" in out,
 }
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 TILE = 64  # cells of a tile along x and y
 _SHIFT, _WITHIN = 6, TILE - 1
 CELLS, CELL_BITS = TILE * TILE, 2 * _SHIFT
+_GROUP = 32  # tiles that are read from disk at a time: what reads them takes several times their size
 _MAX_TABLE = 1 << 22  # tiles of the box around all cells, up to which a table finds their numbers
 # Heights [m], variances [m^2] right after the last measurement, and its time on the site's clock [s].
 LAYERS = ("elevation", "variance", "time", "upper_bound", "other_elevation", "other_variance", "other_time")
@@ -83,7 +84,8 @@ class Tiles:
         self._storage, self._capacity = storage, capacity
         self._slots: OrderedDict[Tile, int] = OrderedDict()
         self._free: list[int] = []
-        self.values = torch.empty(len(LAYERS), 0, TILE, TILE, device=device)
+        with torch.inference_mode(False):  # what reads in inference mode, or not, and a merge all write to it
+            self.values = torch.empty(len(LAYERS), 0, TILE, TILE, device=device)
 
     @property
     def device(self) -> torch.device:
@@ -153,8 +155,9 @@ class Tiles:
             slots = [self._free.pop() for _ in absent]
             self._slots.update(zip(absent, slots, strict=True))
             if not overwritten:
-                with torch.inference_mode():  # in which merges make `values`
-                    self.values[:, slots] = self._load(absent)
+                for start in range(0, len(absent), _GROUP):
+                    some = slice(start, start + _GROUP)
+                    self.values[:, slots[some]] = self._load(absent[some])
         return torch.tensor([self._slots[tile] for tile in tiles], dtype=torch.int64, device=self.device)
 
     def _load(self, tiles: list[Tile]) -> Tensor:
@@ -172,6 +175,7 @@ class Tiles:
         if short > 0:
             old, most = self.values, math.inf if self._storage is None else self._capacity
             size = max(old.shape[1] + short, int(min(2 * old.shape[1], most)))
-            self.values = old.new_empty(len(LAYERS), size, TILE, TILE)
+            with torch.inference_mode(False):
+                self.values = torch.empty(len(LAYERS), size, TILE, TILE, device=old.device)
             self.values[:, : old.shape[1]] = old
             self._free += range(old.shape[1], size)
