@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -26,8 +26,11 @@ from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.align import align
 from torchelev.site.config import SiteConfig
 from torchelev.site.give import center_on, fill, remember_given
-from torchelev.site.merge import MergeReport, merge_windows
+from torchelev.site.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
+from torchelev.site.keyframes import Keyframes, Recorded, correct, record
+from torchelev.site.merge import Merged, MergeReport, merge_windows
 from torchelev.site.reading import Clock, check_layers, read_area, sample_tiles
+from torchelev.site.rebuild import merge_recorded, rebuild_moved
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
 from torchelev.site.windows import Alignment, Told, Windows, drop_reset, no_alignment, read_windows, snapshot
@@ -63,13 +66,17 @@ class SiteMap:
             None: in memory, 28 bytes for each cell of a tile.
         cfg: how windows are aligned and fused.
         device: that fuses.
+        keyframes: keep what each merge tells, so that `move_keyframes` can correct poses later: 32 bytes for each cell
+            of the windows and merge, less what compression saves on disk. Holds from the first merge on; a site on disk
+            that has keyframes goes on to keep them.
 
     Attributes:
         resolution: [m].
         cfg: settings.
 
     Raises:
-        ValueError: the resolution is not positive or not that of the site at `path`, or there is something else.
+        ValueError: the resolution is not positive or not that of the site at `path`, there is something else, or
+            `keyframes` are to be kept by a site that was begun without.
         ModuleNotFoundError: tensorstore is missing.
     """
 
@@ -80,6 +87,7 @@ class SiteMap:
         *,
         cfg: SiteConfig | None = None,
         device: torch.device | str = "cpu",
+        keyframes: bool = False,
     ) -> None:
         require_positive(resolution=resolution)
         self.resolution = float(resolution)
@@ -87,7 +95,11 @@ class SiteMap:
         self._store = None if path is None else _create_or_open(path, self.resolution)
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
         self._id, self._epoch, self._time, self._rate = uuid.uuid4().hex, 0.0, 0.0, self.cfg.variance_rate
+        self._keyframes = KeyframeLog(self._store) if keyframes else None
         self._read_attributes()
+        if keyframes and self._keyframes is None:
+            self.close()
+            require(False, "keyframes", "must be kept from the first merge on", "a site without them", "begin another")
 
     @classmethod
     def open(
@@ -118,6 +130,7 @@ class SiteMap:
         site.cfg = checks.given_or_default(SiteConfig, cfg)
         site._tiles = Tiles(site._store, site.cfg.cache_tiles, device)
         site._id, site._epoch, site._time, site._rate = "", 0.0, 0.0, site.cfg.variance_rate
+        site._keyframes = None
         site._read_attributes()
         return site
 
@@ -125,7 +138,13 @@ class SiteMap:
 
     @torch.inference_mode()
     def merge(
-        self, emap: ElevationMap, *, time: float | None = None, align: bool = True, tilt: bool = False
+        self,
+        emap: ElevationMap,
+        *,
+        time: float | None = None,
+        align: bool = True,
+        tilt: bool = False,
+        T_map_base: Float[Tensor, "B 4 4"] | None = None,
     ) -> MergeReport:
         """Fuse what B robots have measured since their last merge.
 
@@ -140,6 +159,8 @@ class SiteMap:
                 what the map has lived since its last merge.
             align: find the robots' offsets; otherwise their heights count as they are.
             tilt: also find how their windows tilt, in roll and pitch.
+            T_map_base: the robots' poses, as they were given to `ElevationMap.update`. Required if keyframes are kept,
+                of no use otherwise.
 
         Returns:
             Offsets and counts, per robot.
@@ -150,6 +171,8 @@ class SiteMap:
             OSError: the disk is full; the site is as it was before.
         """
         self._check_merge(emap, time)
+        if self._keyframes is not None:
+            T_map_base = _require_poses(emap, T_map_base)
         if emap.device.type == "cpu":
             keep_freed_memory()
         told = self._recall_told(emap)
@@ -158,10 +181,11 @@ class SiteMap:
         now = self._advance(emap, told, time)
         windows = read_windows(emap, emap.state, now, told)
         alignment = self._align(windows, align, tilt)
-        told = snapshot(emap, windows, alignment)
+        new = self._record(windows, alignment, T_map_base, now)
+        told = snapshot(emap, windows, alignment, torch.full_like(emap.num_resets, -1) if new is None else new.ids)
         if self._store is None:  # if it is interrupted, what is in memory may hold a part, which must not count twice
             _told.setdefault(emap, {})[self._id] = told
-        contradictions = self._fuse(windows, alignment, now)
+        contradictions = self._fuse(windows, alignment, now, new)
         _told.setdefault(emap, {})[self._id] = told
         return MergeReport(*alignment, windows.is_new.sum((1, 2)), contradictions)
 
@@ -175,6 +199,9 @@ class SiteMap:
         require(isinstance(emap, ElevationMap), "emap", "must be an ElevationMap", actual, hint, TypeError)
         self.require_resolution(emap)
         require(time is None or math.isfinite(time), "time", "must be a finite number", time, "give seconds")
+        self._require_writable()
+
+    def _require_writable(self) -> None:
         read_only = self._store is not None and self._store.is_read_only
         require(not read_only, "site", "must be open for writing", "a read-only site", "open it without read_only")
 
@@ -207,13 +234,31 @@ class SiteMap:
         elevation, variance, time = self._tiles.look_up(locate(x, y), ("elevation", "variance", "time"))
         return elevation, variance + self._clock.rate * (self._time - time)
 
-    def _fuse(self, windows: Windows, alignment: Alignment, now: float) -> Int[Tensor, "B"]:
-        """Fuse windows into tiles, on disk first; return each robot's contradictions."""
-        contradictions = torch.zeros(len(windows.known.corner), dtype=torch.int64, device=self._tiles.device)
-        time, rate = max(self._time, now), self._clock.rate
-        parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg)
+    def _record(self, windows: Windows, alignment: Alignment, T_map_base: Tensor | None, now: float) -> Recorded | None:
+        """Return the keyframes of a merge; None if none are kept."""
+        if self._keyframes is None or T_map_base is None:
+            return None
+        rows, number, time = self._keyframes.rows, self._keyframes.num_merges, self._epoch + max(self._time, now)
+        return record(windows, alignment, T_map_base, rows, number, time, self.resolution)
+
+    def _fuse(self, windows: Windows, alignment: Alignment, now: float, new: Recorded | None) -> Int[Tensor, "B"]:
+        """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
+        rate, time = self._clock.rate, max(self._time, now)
+        if self._keyframes is None or new is None:
+            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg)
+            return self._write(parts, time, len(windows.known.corner))
+        parts = merge_recorded(self._tiles, self._keyframes.rows, new, self.resolution, rate, self.cfg)
+        contradictions = self._write(parts, time, len(new.ids), arrays_of(new), 1)
+        self._keyframes.append(new)
+        return contradictions
+
+    def _write(
+        self, parts: Iterable[Merged], time: float, size: int, arrays: Arrays | None = None, merges: int = 0
+    ) -> Int[Tensor, "B"]:
+        """Write tiles and arrays, on disk first; return the sum of the contradictions."""
+        contradictions = torch.zeros(size, dtype=torch.int64, device=self._tiles.device)
         try:
-            with self._transaction(time) as write:
+            with self._transaction(self._attributes(time, merges), arrays) as write:
                 for part in parts:
                     write(part.tiles, part.values.transpose(0, 1).cpu().numpy())
                     self._tiles.write(part.tiles, part.values)
@@ -223,6 +268,51 @@ class SiteMap:
             raise
         self._time = time
         return contradictions
+
+    # Keyframes ------------------------------------------------------------------------------------------------------
+
+    @property
+    def keyframes(self) -> Keyframes:
+        """Ids, robots, times and poses of the keyframes; ValueError if the site keeps none."""
+        return self._require_keyframes().list()
+
+    @torch.inference_mode()
+    def move_keyframes(self, ids: Int[Tensor, "K"], T_map_base: Float[Tensor, "K 4 4"]) -> None:
+        """Correct the poses of keyframes, as a pose graph does after it closed a loop.
+
+        The tiles below them are made again of all keyframes that lie there, in the order of their merges, so that the
+        site becomes what mapping with these poses from the start gives: exactly for corrections along z and by whole
+        cells, otherwise to the nearest cell. A pose replaces the offset and tilt of its merge, too. Other tiles keep
+        every bit. On disk, all of it is written or nothing.
+
+        The robots' own maps stay as they are. If they are not corrected, too, what they measure next lies where they
+        believe to be.
+
+        Args:
+            ids: of the keyframes; see `keyframes`.
+            T_map_base: their new poses; `keyframes.T_map_base` has the present ones.
+
+        Raises:
+            TypeError: an argument is no tensor of the right kind.
+            ValueError: the site keeps no keyframes or is open read-only, an id is unknown or repeats, or the poses are
+                not rigid (K, 4, 4). Nothing has changed then.
+            OSError: the disk is full; the site is as it was before.
+        """
+        log = self._require_keyframes()
+        self._require_writable()
+        after = correct(log.rows, ids, T_map_base)
+        arrays = changed_arrays(log.rows, after)
+        if arrays:
+            parts = rebuild_moved(self._tiles, log, after, self.resolution, self._clock.rate, self.cfg)
+            parts = (part._replace(contradictions=part.contradictions.sum()[None]) for part in parts)
+            self._write(parts if self._store else list(parts), self._time, 1, arrays)
+            log.replace(after)
+
+    def _require_keyframes(self) -> KeyframeLog:
+        hint = "make it with SiteMap(..., keyframes=True)"
+        require(self._keyframes is not None, "keyframes", "must be kept by the site", "a site without them", hint)
+        assert self._keyframes is not None
+        return self._keyframes
 
     @torch.inference_mode()
     def give(self, emap: ElevationMap, T_map_base: Tensor | None, chosen: Bool[Tensor, "B"]) -> MapState:
@@ -240,12 +330,12 @@ class SiteMap:
         return after
 
     @contextmanager
-    def _transaction(self, time: float) -> Iterator[Callable[..., None]]:
+    def _transaction(self, attributes: dict[str, Any], arrays: Arrays | None) -> Iterator[Callable[..., None]]:
         """Yield what writes tiles to disk; in memory alone, nothing does."""
         if self._store is None:
             yield lambda tiles, values: None
         else:
-            with self._store.transaction(self._attributes(time)) as write:
+            with self._store.transaction(attributes, arrays) as write:
                 yield write
 
     # Reading --------------------------------------------------------------------------------------------------------
@@ -370,15 +460,25 @@ class SiteMap:
     ) -> None:
         self.close()
 
-    def _attributes(self, time: float) -> dict[str, Any]:
+    def _attributes(self, time: float, new_merges: int) -> dict[str, Any]:
         own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}
-        return own | {"variance_rate": self._rate}
+        merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
+        return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
     def _read_attributes(self) -> None:
         if self._store is not None and "id" in self._store.attributes:
             stored = self._store.attributes
             self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
+            merges = stored.get("keyframe_merges")
+            self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
+
+
+def _require_poses(emap: ElevationMap, T_map_base: Tensor | None) -> Tensor:
+    """Return the poses of the robots; TypeError or ValueError if there are none or bad ones."""
+    hint = "give the poses of the last update"
+    require(T_map_base is not None, "T_map_base", "must be given, as keyframes are kept", None, hint)
+    return checks.check_pose("T_map_base", T_map_base, (emap.num_envs, 4, 4), emap.device, True)
 
 
 def _create_or_open(path: str | Path, resolution: float) -> TileStore:
