@@ -67,10 +67,10 @@ class KeyframeLog:
         assert self._store is not None
         poses, attributes = self._store.read_array(_merge(number))
         first, now = torch.from_numpy(poses)
-        dtypes = (torch.int64,) * 4 + (torch.float64,)
-        lists = [torch.tensor(attributes[name], dtype=dtype) for name, dtype in zip(_LISTS, dtypes, strict=True)]
-        time = torch.full((len(first),), attributes["time"], dtype=torch.float64)
-        return Rows(torch.full_like(lists[0], number), *lists, time, first, now)
+        values = {name: torch.tensor(attributes[name]) for name in _LISTS}
+        values["heights"] = values["heights"].double()
+        merge, time = torch.full((len(first),), number), torch.full((len(first),), attributes["time"]).double()
+        return Rows(merge=merge, time=time, T_first=first, T_now=now, **values)
 
 
 def arrays_of(new: Recorded) -> Arrays:

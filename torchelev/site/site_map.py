@@ -183,7 +183,7 @@ class SiteMap:
         alignment = self._align(windows, align, tilt)
         new = self._record(windows, alignment, T_map_base, now)
         told = snapshot(emap, windows, alignment, torch.full_like(emap.num_resets, -1) if new is None else new.ids)
-        if self._store is None:  # if it is interrupted, what is in memory may hold a part, which must not count twice
+        if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _told.setdefault(emap, {})[self._id] = told
         contradictions = self._fuse(windows, alignment, now, new)
         _told.setdefault(emap, {})[self._id] = told
@@ -248,7 +248,7 @@ class SiteMap:
             parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg)
             return self._write(parts, time, len(windows.known.corner))
         parts = merge_recorded(self._tiles, self._keyframes.rows, new, self.resolution, rate, self.cfg)
-        contradictions = self._write(parts, time, len(new.ids), arrays_of(new), 1)
+        contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1)
         self._keyframes.append(new)
         return contradictions
 

@@ -153,7 +153,8 @@ class Tiles:
             slots = [self._free.pop() for _ in absent]
             self._slots.update(zip(absent, slots, strict=True))
             if not overwritten:
-                self.values[:, slots] = self._load(absent)
+                with torch.inference_mode():  # in which merges have made the values
+                    self.values[:, slots] = self._load(absent)
         return torch.tensor([self._slots[tile] for tile in tiles], dtype=torch.int64, device=self.device)
 
     def _load(self, tiles: list[Tile]) -> Tensor:
