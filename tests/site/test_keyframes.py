@@ -219,6 +219,27 @@ def test_a_move_that_fails_changes_nothing(site, monkeypatch):
     assert known_cells(site) != before
 
 
+def test_a_keyframe_without_news_moves_what_later_ones_replace():
+    """The second merge tells nothing new, but the third replaces what the robot knew then: its pose counts."""
+
+    def run(rise):
+        site, emap = SiteMap(0.1, keyframes=True), robots([(0, 0)], std=0.01)
+        site.merge(emap, T_map_base=at([(0, 0)]), align=False)
+        live(emap, 1.0)
+        emap.state.elevation.add_(rise)
+        site.merge(emap, T_map_base=at([(0, 0)], 0.5 + rise), align=False)
+        emap.state.elapsed.add_(10**9)
+        fill(emap, [(0, 0)], std=0.008)
+        site.merge(emap, T_map_base=at([(0, 0)]), align=False)
+        return site
+
+    site, truth = run(0.02), run(0.0)
+    with pytest.raises(AssertionError):
+        assert_same(site, truth)
+    site.move_keyframes([1], at([(0, 0)]))
+    assert_same(site, truth)
+
+
 def test_a_robot_that_knows_nothing_leaves_an_empty_keyframe(site):
     emap = fill(small_map(2, CELLS), [(0, 0), (10, 0)])
     emap.state.validity[1] = False

@@ -25,6 +25,7 @@ from torchelev.layers import MODES
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.align import align
 from torchelev.site.config import SiteConfig
+from torchelev.site.export import Place, choose_area, export
 from torchelev.site.give import center_on, fill, remember_given
 from torchelev.site.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
 from torchelev.site.keyframes import Keyframes, Recorded, correct, record
@@ -422,9 +423,13 @@ class SiteMap:
         x, y = (float(value) for value in center[:2])
         size = (grid.height, grid.width)
         first = [math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip((x, y), size, strict=True)]
-        corner = (first[0], first[1])
-        names = check_layers(layers)
+        return self._copy((first[0], first[1]), size, check_layers(layers))
+
+    def _copy(self, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str]) -> SavedMap:
+        """Copy an area whose first cell has these numbers on the lattice."""
         area = read_area(self._tiles, corner, size, names, self._clock)
+        length_x, length_y = (cells * self.resolution for cells in size)
+        grid = GridConfig(resolution=self.resolution, length_x=length_x, length_y=length_y)
         middle = [(c + n / 2) * self.resolution for c, n in zip(corner, size, strict=True)]
         arrays = {name: value.numpy() for name, value in area.items()}
         config = ElevationMapConfig(grid=grid).to_dict()
@@ -439,6 +444,45 @@ class SiteMap:
         return {name: torch.stack([area[name] for area in areas]) for name in layers}
 
     # Files ----------------------------------------------------------------------------------------------------------
+
+    def export(
+        self,
+        path: str | Path,
+        layers: Sequence[str] = ("elevation",),
+        area: Sequence[float] | None = None,
+        *,
+        epsg: int | None = None,
+        origin: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Write an area to a file of the kind that its suffix says, completely or not at all.
+
+        - `.tif`: a GeoTIFF with a float32 band for each layer, NaN where unknown. Written block by block, so that
+          memory does not grow with the area. Needs ``torchelev[geo]``.
+        - `.png`: a picture of one layer, shaded and coloured, transparent where unknown. Its text says which values
+          the colours stand for, and the world file `.pgw` beside it where the picture lies. Needs ``torchelev[io]``.
+        - `.ply`: one layer as a triangle mesh, as `torchelev.io.export.save_mesh` writes it. Needs ``torchelev[io]``.
+        - `.npz`: arrays, which `torchelev.io.export.load_npz` reads.
+
+        Pictures and GeoTIFFs have north up: x points east, y north.
+
+        Args:
+            path: of the file.
+            layers: names as in `window`; one for `.png` and `.ply`.
+            area: x_min, x_max, y_min, y_max [m], map frame, made larger to whole cells. None: all that is known.
+            epsg: code of the projected coordinate system, such as 32632 for UTM zone 32N, for `.tif`.
+            origin: easting and northing [m] of the map frame's origin in it, for `.tif` and `.png`.
+
+        Raises:
+            KeyError: a layer does not exist.
+            ValueError: another argument breaks its rule, the area is too large for the kind, or nothing is known yet.
+            WriteError: the file cannot be written; an existing one is left as it was.
+            ModuleNotFoundError: a package is missing; the text says which extra installs it.
+        """
+        export(
+            path,
+            choose_area(self._tiles, check_layers(layers), area, self.resolution, self._copy),
+            Place(epsg, origin),
+        )
 
     def refresh(self) -> None:
         """Read again what another process has written since. Only of use for a site that is open read-only."""
