@@ -189,6 +189,7 @@ def test_samples_of_a_site_on_disk_read_what_memory_has_no_room_for(tmp_path):
     emap = robots([(0, 0), (500, 0), (1000, 0)])
     with SiteMap(0.1, tmp_path / "site", cfg=SiteConfig(cache_tiles=1)) as site:
         site.merge(emap)
+        site.refresh()
         values, valid = site.sample(emap.cell_centers()[:, 7, 9], mode="nearest")
     assert valid.all()
     torch.testing.assert_close(values, emap.elevation[:, 7, 9])

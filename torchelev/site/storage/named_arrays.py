@@ -96,8 +96,9 @@ def _read_metadata(path: Path, name: str) -> dict[str, Any]:
         metadata = read_newest(path, lambda folder: read_metadata(folder / name / METADATA))
     except FileNotFoundError:
         metadata = {"node_type": "none"}
-    is_array = metadata["node_type"] == "array" and name != CELLS
-    require(is_array, "name", "must be that of an array", repr(name), f"{path} has {list_arrays(path)}", KeyError)
+    if metadata["node_type"] != "array" or name == CELLS:  # only then, as there may be very many of them
+        names = list_arrays(path)
+        require(False, "name", "must be that of an array", repr(name), f"{path} has {names}", KeyError)
     return metadata
 
 
