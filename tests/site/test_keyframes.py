@@ -1,10 +1,13 @@
 """Moving keyframes: the site becomes what mapping with the corrected poses from the start gives."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
 
 from tests.helpers import pose, rotation, small_map
+from tests.processes import run_python
 from tests.site.helpers import fill, ground, known_cells, live, robots
 from torchelev.site import SiteMap, rebuild
 
@@ -217,6 +220,33 @@ def test_a_move_that_fails_changes_nothing(site, monkeypatch):
     assert every_bit(site) == before and torch.equal(site.keyframes.T_map_base, poses)
     site.move_keyframes(torch.arange(12), moved)
     assert known_cells(site) != before
+
+
+KILLED = """
+import os, signal, torch
+from torchelev.site import SiteMap, rebuild
+fuse, calls = rebuild.fuse_entries, []
+def die(*args):
+    calls.append(1)
+    if len(calls) == 6:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return fuse(*args)
+rebuild.fuse_entries = die
+site = SiteMap.open({path!r})
+T = site.keyframes.T_map_base
+T[:, 2, 3] += 1.0
+site.move_keyframes(torch.arange(12), T)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
+def test_a_killed_move_changes_nothing(tmp_path):
+    with SiteMap(0.1, tmp_path, keyframes=True) as site:
+        drive(site)
+        before, poses = every_bit(site), site.keyframes.T_map_base
+    assert run_python(KILLED.format(path=str(tmp_path))).returncode == -9
+    with SiteMap(0.1, tmp_path) as site:
+        assert every_bit(site) == before and torch.equal(site.keyframes.T_map_base, poses)
 
 
 def test_a_keyframe_without_news_moves_what_later_ones_replace():

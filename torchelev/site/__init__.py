@@ -4,7 +4,8 @@ Robot-centric windows live in `torchelev.elevation_map`, single files of maps in
 """
 
 from torchelev.site.config import SiteConfig
+from torchelev.site.keyframes import Keyframes
 from torchelev.site.merge import MergeReport
 from torchelev.site.site_map import SiteMap
 
-__all__ = ["MergeReport", "SiteConfig", "SiteMap"]
+__all__ = ["Keyframes", "MergeReport", "SiteConfig", "SiteMap"]

@@ -36,7 +36,7 @@ class Area(NamedTuple):
 
     corner: tuple[int, int]  #: number of the first cell
     size: tuple[int, int]  #: H, W in cells
-    layers: tuple[str, ...]
+    layers: tuple[str, ...]  #: names
     resolution: float  #: [m]
     copy: Copy  #: reads a part of it
 
@@ -44,7 +44,7 @@ class Area(NamedTuple):
 class Place(NamedTuple):
     """Where the map frame lies on the Earth."""
 
-    epsg: int | None
+    epsg: int | None  #: code of the projected coordinate system
     origin: tuple[float, float]  #: [m] easting and northing
 
 

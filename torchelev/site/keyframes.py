@@ -24,7 +24,7 @@ LAYERS = ("elevation", "variance", "time", "relief", "upper_bound", "told_elevat
 class Keyframes(NamedTuple):
     """The keyframes of a site, in the order of their merges."""
 
-    ids: Int[Tensor, "K"]
+    ids: Int[Tensor, "K"]  #: numbers, from 0 on
     robots: Int[Tensor, "K"]  #: numbers of the robots, in the order in which the site met them
     times: Float[Tensor, "K"]  #: [s] of the merges, on the site's clock
     T_map_base: Float[Tensor, "K 4 4"]  #: poses as the site believes them: without the offset and tilt of the merge
@@ -33,7 +33,7 @@ class Keyframes(NamedTuple):
 class Rows(NamedTuple):
     """What is known of K keyframes without reading them, on the CPU."""
 
-    merge: Int[Tensor, "K"]
+    merge: Int[Tensor, "K"]  #: number of the merge
     robot: Int[Tensor, "K"]
     told_of: Int[Tensor, "K"]  #: keyframe with which moves what the robot had told before; itself: nothing told
     corner: Int[Tensor, "K 2"]  #: number of the first cell, before any move
@@ -47,8 +47,8 @@ class Rows(NamedTuple):
 class Recorded(NamedTuple):
     """The keyframes of one merge."""
 
-    ids: Int[Tensor, "B"]
-    rows: Rows
+    ids: Int[Tensor, "B"]  #: numbers
+    rows: Rows  #: of each
     layers: list[Tensor]  #: (8, H, W) of each; see `LAYERS`
 
 

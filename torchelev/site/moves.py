@@ -17,7 +17,7 @@ _BORDER = 1e-6  # of a cell, less than which rounding moves borders
 class Moves(NamedTuple):
     """K rigid motions, p' = R (p - before) + after, float64. About the robot, so that they stay precise far away."""
 
-    R: Float[Tensor, "K 3 3"]
+    R: Float[Tensor, "K 3 3"]  #: rotation
     before: Float[Tensor, "K 3"]  #: [m] the robot
     after: Float[Tensor, "K 3"]  #: [m]
 

@@ -26,22 +26,22 @@ _BLOCK = 8  # tiles along x and y that are rebuilt at a time
 class Placed(NamedTuple):
     """Keyframes where they lie now."""
 
-    ids: Int[Tensor, "K"]
-    merge: Int[Tensor, "K"]
+    ids: Int[Tensor, "K"]  #: of the keyframes
+    merge: Int[Tensor, "K"]  #: number of their merges, ascending
     corner: Int[Tensor, "K 2"]  #: of their layers, before the move
-    moves: Moves
+    moves: Moves  #: since their merges
     told_moves: Moves  #: of what the robots had told before
     first: Int[Tensor, "K 2"]  #: cells of the boxes that hold them
-    last: Int[Tensor, "K 2"]
+    last: Int[Tensor, "K 2"]  #: the last of these cells
     read: Callable[[int], Tensor]  #: returns the layers of one, by id
 
 
 class Share(NamedTuple):
     """What one keyframe says of a block's cells."""
 
-    entries: Entries
-    bound_cell: Int[Tensor, "U"]
-    bound: Float[Tensor, "U"]  #: [m]
+    entries: Entries  #: heights
+    bound_cell: Int[Tensor, "U"]  #: number of the cell
+    bound: Float[Tensor, "U"]  #: [m] upper bounds of these
 
 
 def place(rows: Rows, ids: Tensor, read: Callable[[int], Tensor], resolution: float) -> Placed:
