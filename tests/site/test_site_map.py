@@ -12,7 +12,7 @@ from tests import reference
 from tests.helpers import nans, off_borders, pose, seen_from, small_map
 from tests.site.helpers import fill, ground, known_cells, limits, live, robots
 from torchelev import ElevationMap
-from torchelev.site import SiteMap
+from torchelev.site import SiteConfig, SiteMap
 
 
 def dense_means(emap):
@@ -183,6 +183,16 @@ def test_a_site_100_km_away_is_as_precise():
     values, valid = site.sample(xy, mode="nearest")
     assert valid.all()
     torch.testing.assert_close(values, emap.elevation[0].flatten(), atol=0.0, rtol=1e-6)
+
+
+def test_samples_of_a_site_on_disk_read_what_memory_has_no_room_for(tmp_path):
+    emap = robots([(0, 0), (500, 0), (1000, 0)])
+    with SiteMap(0.1, tmp_path / "site", cfg=SiteConfig(cache_tiles=1)) as site:
+        site.merge(emap)
+        site.refresh()
+        values, valid = site.sample(emap.cell_centers()[:, 7, 9], mode="nearest")
+    assert valid.all()
+    torch.testing.assert_close(values, emap.elevation[:, 7, 9])
 
 
 # Giving back ----------------------------------------------------------------------------------------------------------

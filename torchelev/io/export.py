@@ -106,7 +106,11 @@ def save_npz(path: str | Path, emap: ElevationMap, env: int = 0) -> None:
         ValueError: the environment does not exist, or a filter's layer has a reserved name.
         WriteError: the file cannot be written; an existing one is left as it was.
     """
-    saved = take(emap, env)
+    write_npz(path, take(emap, env))
+
+
+def write_npz(path: str | Path, saved: SavedMap) -> None:
+    """Write layers and their geometry, as `save_npz` does."""
     clash = [name for name in (*_GEOMETRY, "file") if name in saved.layers]  # `file` is an argument of NumPy's savez
     rule = f"must not be named {', '.join(_GEOMETRY)}, file"
     require(not clash, "layers", rule, ", ".join(clash), "rename the filter's layer")
@@ -183,7 +187,7 @@ def save_cloud(path: str | Path, emap: ElevationMap, env: int = 0, layer: str = 
         WriteError: the file cannot be written; an existing one is left as it was.
     """
     points = to_points(emap, env, layer)
-    _write_ply(path, points)
+    write_ply(path, points)
     return len(points)
 
 
@@ -226,7 +230,7 @@ def save_mesh(path: str | Path, emap: ElevationMap, env: int = 0, layer: str = "
         WriteError: the file cannot be written; an existing one is left as it was.
     """
     vertices, triangles = to_mesh(emap, env, layer)
-    _write_ply(path, vertices, triangles)
+    write_ply(path, vertices, triangles)
     return len(triangles)
 
 
@@ -260,7 +264,8 @@ def _known_points(heights: NDArray, center: NDArray, resolution: float) -> NDArr
     return np.stack([x, y, heights[i, j].astype(np.float64)], axis=-1)
 
 
-def _write_ply(path: str | Path, vertices: NDArray, triangles: NDArray | None = None) -> None:
+def write_ply(path: str | Path, vertices: NDArray, triangles: NDArray | None = None) -> None:
+    """Write vertices (V, 3) and triangles (F, 3), or vertices alone, as a binary `.ply`."""
     import plyfile
 
     vertex = np.zeros(len(vertices), dtype=[(axis, "f8") for axis in "xyz"])

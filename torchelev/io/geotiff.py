@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchelev.errors import require
 from torchelev.io.export import take
@@ -49,30 +50,68 @@ def save_geotiff(
         ValueError: the environment does not exist, or `epsg` is no code.
         ModuleNotFoundError: tifffile is missing.
     """
-    import tifffile
+    import tifffile  # noqa: F401  # before the layers are read
 
-    is_code = epsg is None or (isinstance(epsg, int) and 1024 <= epsg <= 32767)
-    require(is_code, "epsg", "must be the code of a projected system, 1024 to 32767", repr(epsg), "give 32632, say")
+    check_epsg(epsg)
     names = list(emap.layers if layers is None else layers)
     taken = take(emap, env, names)
     bands = np.stack([np.flipud(taken.layers[name].T) for name in names]).astype(np.float32)
     x_min, _, _, y_max = taken.extent
+    north_west = x_min + origin[0], y_max + origin[1]
+    write_bands(path, bands, bands.shape[1:], names, taken.resolution, north_west, epsg)
+
+
+def check_epsg(epsg: object) -> None:
+    """Raise ValueError unless it may be the code of a projected coordinate system, or None."""
+    is_code = epsg is None or (isinstance(epsg, int) and 1024 <= epsg <= 32767)
+    require(is_code, "epsg", "must be the code of a projected system, 1024 to 32767", repr(epsg), "give 32632, say")
+
+
+def write_bands(
+    path: str | Path,
+    bands: NDArray[np.float32] | Iterator[NDArray[np.float32]],
+    shape: tuple[int, ...],
+    names: Sequence[str],
+    resolution: float,
+    north_west: tuple[float, float],
+    epsg: int | None,
+    block: int | None = None,
+) -> None:
+    """Write bands as a GeoTIFF, rows from north to south.
+
+    Args:
+        path: of the file.
+        bands: (L, rows, columns), or its blocks of block x block pixels: all of the first band, row by row, and so on.
+        shape: rows, columns.
+        names: of the L bands.
+        resolution: [m].
+        north_west: easting and northing [m] of the first pixel's outer corner.
+        epsg: code of the projected coordinate system; None: none is written.
+        block: pixels on the side of a block, a multiple of 16; None: `bands` is an array.
+    """
+    import tifffile
+
+    tags = _make_tags(names, resolution, north_west, epsg)
+    options: dict[str, Any] = dict(photometric="minisblack", metadata=None, shape=(len(names), *shape))
+    if len(names) > 1:
+        options["planarconfig"] = "separate"
+    if block is not None:
+        options.update(tile=(block, block), maxworkers=1)  # in one thread, so that few blocks wait in memory
+    with atomic_file(path) as file:
+        tifffile.imwrite(file, bands, dtype=np.float32, compression="zlib", extratags=tags, **options)
+
+
+def _make_tags(names: Sequence[str], resolution: float, north_west: tuple[float, float], epsg: int | None) -> list:
     keys = {_RASTER_TYPE: _PIXEL_IS_AREA}
     if epsg is not None:
         keys = {_MODEL_TYPE: _PROJECTED, **keys, _PROJECTED_CRS: epsg}
-    resolution = taken.resolution
-    tags = [
+    return [
         (_PIXEL_SCALE, _DOUBLE, 3, (resolution, resolution, 0.0), True),
-        (_TIE_POINT, _DOUBLE, 6, (0.0, 0.0, 0.0, x_min + origin[0], y_max + origin[1], 0.0), True),
+        (_TIE_POINT, _DOUBLE, 6, (0.0, 0.0, 0.0, *north_west, 0.0), True),
         _geo_keys(keys),
         (_GDAL_METADATA, _ASCII, 0, _describe(names), True),
         (_GDAL_NODATA, _ASCII, 0, "nan", True),
     ]
-    options: dict[str, Any] = dict(photometric="minisblack", metadata=None)
-    if len(bands) > 1:
-        options["planarconfig"] = "separate"
-    with atomic_file(path) as file:
-        tifffile.imwrite(file, bands, compression="zlib", extratags=tags, **options)
 
 
 def _geo_keys(keys: dict[int, int]) -> tuple:

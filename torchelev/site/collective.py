@@ -71,7 +71,7 @@ def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) 
 
 @contextmanager
 def shared_transaction(
-    ranks: Ranks, store: TileStore | None, attributes: Mapping[str, Any]
+    ranks: Ranks, store: TileStore | None, attributes: Mapping[str, Any], arrays: Mapping[str, Any] | None = None
 ) -> Iterator[Callable[..., None]]:
     """Yield what writes tiles, which rank 0 commits once all ranks are at the end; without a store, nothing does.
 
@@ -81,7 +81,7 @@ def shared_transaction(
         yield _write_nothing
         return
     with ranks.together("merge"):
-        with store.transaction(attributes) if ranks.rank == 0 else nullcontext(_write_nothing) as write:
+        with store.transaction(attributes, arrays) if ranks.rank == 0 else nullcontext(_write_nothing) as write:
             with ranks.together("merge"):
                 yield write
     if ranks.rank:

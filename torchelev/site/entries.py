@@ -26,7 +26,7 @@ def read_entries(
         place: (K,) numbers of the windows' cells.
         resolution: [m].
     """
-    heights = _read(windows.known, alignment, robot, place, resolution)
+    heights = read_heights(windows.known, alignment, robot, place, resolution)
     slope = (
         windows.gradient_x.view(-1).index_select(0, place).square()
         + windows.gradient_y.view(-1).index_select(0, place).square()
@@ -46,7 +46,8 @@ def rise(known: Known, alignment: Alignment, robot: Tensor, place: Tensor, resol
     return shift
 
 
-def _read(known: Known, alignment: Alignment, robot: Tensor, place: Tensor, resolution: float) -> Heights:
+def read_heights(known: Known, alignment: Alignment, robot: Tensor, place: Tensor, resolution: float) -> Heights:
+    """Return a window's heights in the site's frame, (K,) each."""
     elevation, variance, age = (layer.view(-1).index_select(0, place).float() for layer in known[1:4])
     elevation = elevation - rise(known, alignment, robot, place, resolution)
     variance = (variance - known.rate.float().index_select(0, robot) * age).clamp(min=_MIN_VARIANCE)
@@ -60,6 +61,6 @@ def _read_told(windows: Windows, told: Told, robot: Tensor, place: Tensor, resol
     i, j = place // W % H + shift[:, 0], place % W + shift[:, 1]
     inside = (i >= 0) & (i < H) & (j >= 0) & (j < W)
     place = (robot * H + i.clamp(0, H - 1)) * W + j.clamp(0, W - 1)
-    elevation, variance, time = _read(told.known, told.alignment, robot, place, resolution)
+    elevation, variance, time = read_heights(told.known, told.alignment, robot, place, resolution)
     counts = inside & told.known.is_known.view(-1).index_select(0, place)
     return Heights(elevation, variance, torch.where(counts, time, torch.nan))

@@ -52,7 +52,8 @@ def remember_given(
     given = Known(after.corner, after.elevation, after.variance, after.time, is_old, time, known.rate)
     if told is None:
         nothing = no_alignment(len(chosen), chosen.device)
-        return Told(_clone(given), nothing, torch.full_like(after.elapsed, BEFORE_ALL), emap.num_resets.clone())
+        never = torch.full_like(after.elapsed, BEFORE_ALL)
+        return Told(_clone(given), nothing, never, emap.num_resets.clone(), torch.full_like(after.elapsed, -1))
 
     def choose(new: Tensor, old: Tensor) -> Tensor:
         return torch.where(chosen.view(-1, *[1] * (new.ndim - 1)), new, old)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.site.config import SiteConfig
 from torchelev.site.entries import read_entries, rise
-from torchelev.site.fuse import Heights, fuse
+from torchelev.site.fuse import Entries, Heights, fuse
 from torchelev.site.pieces import Pieces, cut
 from torchelev.site.tiles import LAYERS, Tile, Tiles
 from torchelev.site.windows import Alignment, Windows
@@ -50,22 +50,29 @@ def merge_windows(
         layers = values.flatten(1)
         robot, cell, place = pieces.select(windows.is_new)
         entries = read_entries(windows, alignment, robot, cell, place, resolution)
-        fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
-        for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
-            layers[row] = value
-        _lower_bounds(layers, windows, alignment, pieces, resolution)
-        yield Merged(
-            pieces.tiles, values, torch.bincount(robot[fused.is_contradicted], minlength=len(alignment.offset))
-        )
+        is_contradicted = fuse_entries(layers, entries, rate, cfg)
+        lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
+        yield Merged(pieces.tiles, values, torch.bincount(robot[is_contradicted], minlength=len(alignment.offset)))
 
 
-def _lower_bounds(layers: Tensor, windows: Windows, alignment: Alignment, pieces: Pieces, resolution: float) -> None:
-    """Lower the upper bounds of unknown cells to those of the windows, in place."""
+def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:
+    """Fuse entries into the layers of tiles, in place; tell which contradict other heights of their cells."""
+    fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
+    for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
+        layers[row] = value
+    return fused.is_contradicted
+
+
+def _read_bounds(windows: Windows, alignment: Alignment, pieces: Pieces, resolution: float) -> tuple[Tensor, Tensor]:
+    """Return the cells that have an upper bound in the windows, and these bounds in the site's frame."""
     robot, cell, place = pieces.select(windows.is_bounded)
+    above = rise(windows.known, alignment, robot, place, resolution)
+    return cell, windows.upper_bound.view(-1).index_select(0, place) - above
+
+
+def lower_bounds(layers: Float[Tensor, "L C"], cell: Int[Tensor, "U"], heights: Float[Tensor, "U"]) -> None:
+    """Lower the upper bounds of unknown cells to these heights, in place."""
     if not len(cell):
         return
-    heights = windows.upper_bound.view(-1).index_select(0, place) - rise(
-        windows.known, alignment, robot, place, resolution
-    )
     bound = layers[_BOUND].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, heights, "amin")
     layers[_BOUND] = torch.where((layers[_TIME] == layers[_TIME]) | (bound == torch.inf), torch.nan, bound)

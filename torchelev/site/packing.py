@@ -81,14 +81,14 @@ def _told(values: list[Tensor]) -> Told:
     """Return what was told, without the clocks and resets of the maps, which only their own rank needs."""
     known, zero = _known(values[:7]), values[0].new_zeros(len(values[0]))
     alignment = no_alignment(len(zero), zero.device)._replace(offset=values[7], tilt=values[8])
-    return Told(known, alignment, zero, zero)
+    return Told(known, alignment, zero, zero, zero - 1)
 
 
 def _nothing(known: Known) -> Told:
     """Return what robots have told that told nothing."""
     zero = torch.zeros_like(known.corner[:, 0])
     blank = known._replace(is_known=torch.zeros_like(known.is_known))
-    return Told(blank, no_alignment(len(zero), zero.device), zero, zero)
+    return Told(blank, no_alignment(len(zero), zero.device), zero, zero, zero - 1)
 
 
 def _width(dtype: torch.dtype, shape: tuple[int, ...]) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -29,10 +29,14 @@ from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.align import align
 from torchelev.site.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.config import SiteConfig
+from torchelev.site.export import Place, choose_area, export
 from torchelev.site.give import center_on, fill, remember_given
-from torchelev.site.merge import MergeReport, merge_windows
+from torchelev.site.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
+from torchelev.site.keyframes import Keyframes, Recorded, correct, record
+from torchelev.site.merge import Merged, MergeReport, merge_windows
 from torchelev.site.ranks import Ranks
 from torchelev.site.reading import Clock, check_layers, read_area, sample_tiles
+from torchelev.site.rebuild import merge_recorded, rebuild_moved
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
 from torchelev.site.windows import Alignment, Told, Windows, drop_reset, no_alignment, read_windows, snapshot
@@ -76,14 +80,18 @@ class SiteMap:
         group: processes that share the site, such as `torch.distributed.group.WORLD`; None: this one alone. Give
             `init_process_group` a `timeout` that is longer than ranks wait for each other, such as a minute: after it,
             those that wait for a rank that has died raise `LostRankError`.
+        keyframes: keep what each merge tells, so that `move_keyframes` can correct poses later: 32 bytes for each cell
+            of the windows and merge, less what compression saves on disk. Holds from the first merge on; a site on disk
+            that has keyframes goes on to keep them.
 
     Attributes:
         resolution: [m].
         cfg: settings.
 
     Raises:
-        ValueError: the resolution is not positive or not that of the site at `path`, or there is something else; or
-            the group is not initialised, or its ranks open the site differently.
+        ValueError: the resolution is not positive or not that of the site at `path`, or there is something else; the
+            group is not initialised, or its ranks open the site differently; or `keyframes` are to be kept by a group,
+            or by a site that was begun without.
         ModuleNotFoundError: tensorstore is missing.
     """
 
@@ -95,6 +103,7 @@ class SiteMap:
         cfg: SiteConfig | None = None,
         device: torch.device | str = "cpu",
         group: ProcessGroup | None = None,
+        keyframes: bool = False,
     ) -> None:
         self._ranks = Ranks(group)
         self._ranks.exchange("SiteMap", lambda: {"same": self._set_up(resolution, path, cfg)})
@@ -104,8 +113,21 @@ class SiteMap:
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
+        self._keyframes = KeyframeLog(self._store) if keyframes else None
         self._read_attributes()
+        self._check_keyframes(keyframes)
         self._agree_on_id()
+
+    def _check_keyframes(self, wanted: bool) -> None:
+        """Raise ValueError unless the site can keep keyframes as wanted."""
+        kept, hint = self._keyframes is not None, "begin another"
+        try:
+            require(kept or not wanted, "keyframes", "must be kept from the first merge on", "a site without", hint)
+            hint = "merge in one process, or without keyframes"
+            require(not kept or self._ranks.size == 1, "keyframes, group", "exclude each other", "both", hint)
+        except ValueError:
+            self.close()
+            raise
 
     def _set_up(self, resolution: float, path: str | Path | None, cfg: SiteConfig | None) -> dict[str, Any]:
         """Take the settings, and return those that all ranks must share."""
@@ -155,6 +177,7 @@ class SiteMap:
         site.cfg = checks.given_or_default(SiteConfig, cfg)
         site._tiles = Tiles(site._store, site.cfg.cache_tiles, device)
         site._id, site._rate, site._epoch, site._time, site._opened = "", site.cfg.variance_rate, 0.0, 0.0, 0.0
+        site._keyframes = None
         site._read_attributes()
         return site
 
@@ -163,7 +186,13 @@ class SiteMap:
     @torch.inference_mode(False)  # whose tensors could not be written outside of it
     @torch.no_grad()
     def merge(
-        self, emap: ElevationMap, *, time: float | None = None, align: bool = True, tilt: bool = False
+        self,
+        emap: ElevationMap,
+        *,
+        time: float | None = None,
+        align: bool = True,
+        tilt: bool = False,
+        T_map_base: Float[Tensor, "B 4 4"] | None = None,
     ) -> MergeReport:
         """Fuse what B robots have measured since their last merge.
 
@@ -178,6 +207,8 @@ class SiteMap:
                 what the map has lived since its last merge.
             align: find the robots' offsets; otherwise their heights count as they are.
             tilt: also find how their windows tilt, in roll and pitch.
+            T_map_base: the robots' poses, as they were given to `ElevationMap.update`. Required if keyframes are kept,
+                of no use otherwise.
 
         Returns:
             Offsets and counts, per robot.
@@ -188,6 +219,8 @@ class SiteMap:
             OSError: the disk is full; the site is as it was before.
             LostRankError: of a group, another rank has ended; the site is as it was before.
         """
+        if self._keyframes is not None:
+            T_map_base = _require_poses(emap, T_map_base)
         plans = self._ranks.exchange("merge", lambda: self._plan(emap, time, align, tilt))
         if emap.device.type == "cpu":
             keep_freed_memory()
@@ -200,10 +233,11 @@ class SiteMap:
         all_windows, own = gather_windows(self._ranks, windows, plans)
         all_aligned = self._align(all_windows, align, tilt)
         alignment = Alignment(*(value[own] for value in all_aligned))
-        told = snapshot(emap, windows, alignment)
-        if self._store is None:  # if it is interrupted, what is in memory may hold a part, which must not count twice
+        new = self._record(windows, alignment, T_map_base, now)
+        told = snapshot(emap, windows, alignment, torch.full_like(emap.num_resets, -1) if new is None else new.ids)
+        if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _told.setdefault(emap, {})[self._id] = told
-        contradictions = self._fuse(all_windows, all_aligned, now)[own]
+        contradictions = self._fuse(all_windows, all_aligned, now, new)[own]
         _told.setdefault(emap, {})[self._id] = told
         return MergeReport(*alignment, count(windows.is_new), contradictions)
 
@@ -230,6 +264,9 @@ class SiteMap:
         require(isinstance(emap, ElevationMap), "emap", "must be an ElevationMap", actual, hint, TypeError)
         self.require_resolution(emap)
         require(time is None or math.isfinite(time), "time", "must be a finite number", time, "give seconds")
+        self._require_writable()
+
+    def _require_writable(self) -> None:
         read_only = self._store is not None and self._store.is_read_only and self._ranks.rank == 0
         require(not read_only, "site", "must be open for writing", "a read-only site", "open it without read_only")
 
@@ -262,13 +299,31 @@ class SiteMap:
         elevation, variance, time = self._tiles.look_up(locate(x, y), ("elevation", "variance", "time"))
         return elevation, variance + self._clock.rate * (self._time - time)
 
-    def _fuse(self, windows: Windows, alignment: Alignment, now: float) -> Int[Tensor, "B"]:
-        """Fuse windows into tiles, on disk first; return each robot's contradictions."""
-        contradictions = torch.zeros(len(windows.known.corner), dtype=torch.int64, device=self._tiles.device)
-        time, rate = max(self._time, now), self._clock.rate
-        parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg)
+    def _record(self, windows: Windows, alignment: Alignment, T_map_base: Tensor | None, now: float) -> Recorded | None:
+        """Return the keyframes of a merge; None if none are kept."""
+        if self._keyframes is None or T_map_base is None:
+            return None
+        rows, number, time = self._keyframes.rows, self._keyframes.num_merges, self._epoch + max(self._time, now)
+        return record(windows, alignment, T_map_base, rows, number, time, self.resolution)
+
+    def _fuse(self, windows: Windows, alignment: Alignment, now: float, new: Recorded | None) -> Int[Tensor, "B"]:
+        """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
+        rate, time = self._clock.rate, max(self._time, now)
+        if self._keyframes is None or new is None:
+            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg)
+            return self._write(parts, time, len(windows.known.corner))
+        parts = merge_recorded(self._tiles, self._keyframes.rows, new, self.resolution, rate, self.cfg)
+        contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1)
+        self._keyframes.append(new)
+        return contradictions
+
+    def _write(
+        self, parts: Iterable[Merged], time: float, size: int, arrays: Arrays | None = None, merges: int = 0
+    ) -> Int[Tensor, "B"]:
+        """Write tiles and arrays, on disk first; return the sum of the contradictions."""
+        contradictions = torch.zeros(size, dtype=torch.int64, device=self._tiles.device)
         try:
-            with self._transaction(time) as write:
+            with self._transaction(self._attributes(time, merges), arrays) as write:
                 for part in parts:
                     write(part.tiles, part.values.transpose(0, 1).cpu().numpy())
                     self._tiles.write(part.tiles, part.values)
@@ -278,6 +333,52 @@ class SiteMap:
             raise
         self._time = time
         return contradictions
+
+    # Keyframes ------------------------------------------------------------------------------------------------------
+
+    @property
+    def keyframes(self) -> Keyframes:
+        """Ids, robots, times and poses of the keyframes; ValueError if the site keeps none."""
+        return self._require_keyframes().list()
+
+    @torch.inference_mode(False)  # whose tensors could not be written outside of it
+    @torch.no_grad()
+    def move_keyframes(self, ids: Int[Tensor, "K"], T_map_base: Float[Tensor, "K 4 4"]) -> None:
+        """Correct the poses of keyframes, as a pose graph does after it closed a loop.
+
+        The tiles below them are made again of all keyframes that lie there, in the order of their merges, so that the
+        site becomes what mapping with these poses from the start gives: exactly for corrections along z and by whole
+        cells, otherwise to the nearest cell. A pose replaces the offset and tilt of its merge, too. Other tiles keep
+        every bit. On disk, all of it is written or nothing.
+
+        The robots' own maps stay as they are. If they are not corrected, too, what they measure next lies where they
+        believe to be.
+
+        Args:
+            ids: of the keyframes; see `keyframes`.
+            T_map_base: their new poses; `keyframes.T_map_base` has the present ones.
+
+        Raises:
+            TypeError: an argument is no tensor of the right kind.
+            ValueError: the site keeps no keyframes or is open read-only, an id is unknown or repeats, or the poses are
+                not rigid (K, 4, 4). Nothing has changed then.
+            OSError: the disk is full; the site is as it was before.
+        """
+        log = self._require_keyframes()
+        self._require_writable()
+        after = correct(log.rows, ids, T_map_base)
+        arrays = changed_arrays(log.rows, after)
+        if arrays:
+            parts = rebuild_moved(self._tiles, log, after, self.resolution, self._clock.rate, self.cfg)
+            parts = (part._replace(contradictions=part.contradictions.sum()[None]) for part in parts)
+            self._write(parts if self._store else list(parts), self._time, 1, arrays)
+            log.replace(after)
+
+    def _require_keyframes(self) -> KeyframeLog:
+        hint = "make it with SiteMap(..., keyframes=True)"
+        require(self._keyframes is not None, "keyframes", "must be kept by the site", "a site without them", hint)
+        assert self._keyframes is not None
+        return self._keyframes
 
     @torch.inference_mode(False)  # whose tensors could not be written outside of it
     @torch.no_grad()
@@ -296,9 +397,9 @@ class SiteMap:
         return after
 
     @contextmanager
-    def _transaction(self, time: float) -> Iterator[Callable[..., None]]:
+    def _transaction(self, attributes: dict[str, Any], arrays: Arrays | None) -> Iterator[Callable[..., None]]:
         """Yield what writes tiles to disk; in memory alone, nothing does."""
-        with shared_transaction(self._ranks, self._store, self._attributes(time)) as write:
+        with shared_transaction(self._ranks, self._store, attributes, arrays) as write:
             yield write
 
     # Reading --------------------------------------------------------------------------------------------------------
@@ -385,9 +486,13 @@ class SiteMap:
         x, y = (float(value) for value in center[:2])
         size = (grid.height, grid.width)
         first = [math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip((x, y), size, strict=True)]
-        corner = (first[0], first[1])
-        names = check_layers(layers)
+        return self._copy((first[0], first[1]), size, check_layers(layers))
+
+    def _copy(self, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str]) -> SavedMap:
+        """Copy an area whose first cell has these numbers on the lattice."""
         area = read_area(self._tiles, corner, size, names, self._clock)
+        length_x, length_y = (cells * self.resolution for cells in size)
+        grid = GridConfig(resolution=self.resolution, length_x=length_x, length_y=length_y)
         middle = [(c + n / 2) * self.resolution for c, n in zip(corner, size, strict=True)]
         arrays = {name: value.numpy() for name, value in area.items()}
         config = ElevationMapConfig(grid=grid).to_dict()
@@ -402,6 +507,45 @@ class SiteMap:
         return {name: torch.stack([area[name] for area in areas]) for name in layers}
 
     # Files ----------------------------------------------------------------------------------------------------------
+
+    def export(
+        self,
+        path: str | Path,
+        layers: Sequence[str] = ("elevation",),
+        area: Sequence[float] | None = None,
+        *,
+        epsg: int | None = None,
+        origin: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Write an area to a file of the kind that its suffix says, completely or not at all.
+
+        - `.tif`: a GeoTIFF with a float32 band for each layer, NaN where unknown. Written block by block, so that
+          memory does not grow with the area. Needs ``torchelev[geo]``.
+        - `.png`: a picture of one layer, shaded and coloured, transparent where unknown. Its text says which values
+          the colours stand for, and the world file `.pgw` beside it where the picture lies. Needs ``torchelev[io]``.
+        - `.ply`: one layer as a triangle mesh, as `torchelev.io.export.save_mesh` writes it. Needs ``torchelev[io]``.
+        - `.npz`: arrays, which `torchelev.io.export.load_npz` reads.
+
+        Pictures and GeoTIFFs have north up: x points east, y north.
+
+        Args:
+            path: of the file.
+            layers: names as in `window`; one for `.png` and `.ply`.
+            area: x_min, x_max, y_min, y_max [m], map frame, made larger to whole cells. None: all that is known.
+            epsg: code of the projected coordinate system, such as 32632 for UTM zone 32N, for `.tif`.
+            origin: easting and northing [m] of the map frame's origin in it, for `.tif` and `.png`.
+
+        Raises:
+            KeyError: a layer does not exist.
+            ValueError: another argument breaks its rule, the area is too large for the kind, or nothing is known yet.
+            WriteError: the file cannot be written; an existing one is left as it was.
+            ModuleNotFoundError: a package is missing; the text says which extra installs it.
+        """
+        export(
+            path,
+            choose_area(self._tiles, check_layers(layers), area, self.resolution, self._copy),
+            Place(epsg, origin),
+        )
 
     def refresh(self) -> None:
         """Read again what another process has written since. Only of use for a site that is open read-only."""
@@ -423,9 +567,10 @@ class SiteMap:
     ) -> None:
         self.close()
 
-    def _attributes(self, time: float) -> dict[str, Any]:
+    def _attributes(self, time: float, new_merges: int) -> dict[str, Any]:
         own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}
-        return own | {"variance_rate": self._rate}
+        merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
+        return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
     def _read_attributes(self) -> None:
         if self._store is not None and "id" in self._store.attributes:
@@ -433,6 +578,15 @@ class SiteMap:
             self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
             self._opened = self._time
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
+            merges = stored.get("keyframe_merges")
+            self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
+
+
+def _require_poses(emap: ElevationMap, T_map_base: Tensor | None) -> Tensor:
+    """Return the poses of the robots; TypeError or ValueError if there are none or bad ones."""
+    hint = "give the poses of the last update"
+    require(T_map_base is not None, "T_map_base", "must be given, as keyframes are kept", None, hint)
+    return checks.check_pose("T_map_base", T_map_base, (emap.num_envs, 4, 4), emap.device, True)
 
 
 def _open(path: str | Path, resolution: float, read_only: bool) -> TileStore:

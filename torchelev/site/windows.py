@@ -65,6 +65,7 @@ class Told(NamedTuple):
     alignment: Alignment  #: by which it was fused
     elapsed: Int[Tensor, "B"]  #: [ns] of the maps' clocks
     num_resets: Int[Tensor, "B"]  #: of the maps until then
+    keyframe: Int[Tensor, "B"]  #: id of that merge's keyframe; -1: none was kept
 
 
 def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | None) -> Windows:
@@ -109,7 +110,8 @@ def drop_reset(told: Told, num_resets: Int[Tensor, "B"]) -> Told:
     offset, tilt, is_isolated = told.alignment
     offset, tilt = torch.where(was_reset, 0.0, offset), torch.where(was_reset[:, None], 0.0, tilt)
     elapsed = torch.where(was_reset, BEFORE_ALL, told.elapsed)
-    return Told(known, Alignment(offset, tilt, is_isolated), elapsed, num_resets.clone())
+    alignment = Alignment(offset, tilt, is_isolated)
+    return Told(known, alignment, elapsed, num_resets.clone(), told.keyframe)
 
 
 def _measured_since(state: MapState, told: Told | None) -> Bool[Tensor, "B H W"]:
@@ -121,7 +123,7 @@ def _measured_since(state: MapState, told: Told | None) -> Bool[Tensor, "B H W"]
     return state.time < since * (1 - 1e-4) - 1e-6
 
 
-def snapshot(emap: ElevationMap, windows: Windows, alignment: Alignment) -> Told:
-    """Return copies of what a merge of a map told the site."""
+def snapshot(emap: ElevationMap, windows: Windows, alignment: Alignment, keyframe: Int[Tensor, "B"]) -> Told:
+    """Return copies of what a merge of a map told the site, and kept as these keyframes."""
     known = Known(*(value.clone() for value in windows.known))
-    return Told(known, alignment, emap.state.elapsed.clone(), emap.num_resets.clone())
+    return Told(known, alignment, emap.state.elapsed.clone(), emap.num_resets.clone(), keyframe)

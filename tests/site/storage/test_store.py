@@ -522,7 +522,7 @@ def flip(data):
 @pytest.mark.parametrize("damage", [None, lambda data: b"", flip])
 def test_a_damaged_array_is_named(store, damage):
     store.commit([], noise([]), {}, {"a": (np.arange(100.0), {})})
-    file = store.path / "a/c/0"
+    file = store.path / "a/c.0"
     file.write_bytes(damage(file.read_bytes())) if damage else file.unlink()
     with pytest.raises(ValueError, match=rf"{store.path}/a: must be readable, got damaged data"):
         store.read_array("a")

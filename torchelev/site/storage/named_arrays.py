@@ -31,17 +31,29 @@ _CHUNKS = "c"  # folder of an array's chunks
 
 
 def check_names(path: Path, names: list[str]) -> None:
-    """Raise ValueError unless the names fit a folder: a name with others below it is a group, and no array."""
-    arrays = {*names, *list_arrays(path)} if names else set()
+    """Raise ValueError unless the names fit a folder: a name with others below it is a group, and no array.
+
+    Looks at what bears these names alone: a site may have very many arrays.
+    """
     for name in names:
         parts = name.split("/")
         is_name = _NAME.fullmatch(name) and _CHUNKS not in parts and parts[0] != CELLS
         rule = f"must be named by letters, digits, _ and -, not {_CHUNKS} or {CELLS}"
         require(bool(is_name), "arrays", rule, repr(name), 'name them "keyframes/0001", say')
-        groups = {"/".join(parts[:depth]) for depth in range(1, len(parts))} & arrays
-        require(not groups, "arrays", "must not lie below an array", repr(name), f"{', '.join(groups)} is one")
-        is_group = any(other.startswith(f"{name}/") for other in arrays)
+    groups = {"/".join(name.split("/")[:depth]): name for name in names for depth in range(1, name.count("/") + 1)}
+    for group, name in groups.items():
+        is_array = group in names or _read_kind(path, group) == "array"
+        require(not is_array, "arrays", "must not lie below an array", repr(name), f"{group} is one")
+    for name in names:
+        is_group = name in groups or _read_kind(path, name) == "group"
         require(not is_group, "arrays", "must not have arrays below them", repr(name), "choose another name")
+
+
+def _read_kind(path: Path, name: str) -> str:
+    try:
+        return str(read_newest(path, lambda folder: read_metadata(folder / name / METADATA))["node_type"])
+    except FileNotFoundError:
+        return "none"
 
 
 def stage_array(path: Path, staged: Path, name: str, array: NDArray, attributes: Mapping[str, Any]) -> None:
@@ -83,8 +95,9 @@ def _read_metadata(path: Path, name: str) -> dict[str, Any]:
         metadata = read_newest(path, lambda folder: read_metadata(folder / name / METADATA))
     except FileNotFoundError:
         metadata = {"node_type": "none"}
-    is_array = metadata["node_type"] == "array" and name != CELLS
-    require(is_array, "name", "must be that of an array", repr(name), f"{path} has {list_arrays(path)}", KeyError)
+    if metadata["node_type"] != "array" or name == CELLS:  # only then, as there may be very many of them
+        names = list_arrays(path)
+        require(False, "name", "must be that of an array", repr(name), f"{path} has {names}", KeyError)
     return metadata
 
 

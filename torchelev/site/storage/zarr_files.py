@@ -32,7 +32,7 @@ def cells_metadata(num_layers: int, tile_size: int) -> dict[str, Any]:
     """Return the metadata of the array of all cells, (L, N, N) with N = TILES_PER_AXIS * tile_size, a file per tile."""
     cells = TILES_PER_AXIS * tile_size
     shape, chunk = [num_layers, cells, cells], [num_layers, tile_size, tile_size]
-    return _array(shape, chunk, "float32", "NaN", {}) | {"dimension_names": ["layer", "x", "y"]}
+    return _array(shape, chunk, "float32", "NaN", {}, "/") | {"dimension_names": ["layer", "x", "y"]}
 
 
 def array_metadata(array: NDArray, attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -42,17 +42,21 @@ def array_metadata(array: NDArray, attributes: Mapping[str, Any]) -> dict[str, A
         array.dtype.kind in _KINDS and name != "float128", "arrays", "must hold bools or numbers", name, "convert them"
     )
     fill_value = {"b": False, "f": "NaN"}.get(array.dtype.kind, 0)
-    return _array(list(array.shape), [max(1, size) for size in array.shape], name, fill_value, dict(attributes))
+    chunk = [max(1, size) for size in array.shape]
+    # The file lies in the array's own folder: making and removing further ones takes longer than writing it.
+    return _array(list(array.shape), chunk, name, fill_value, dict(attributes), ".")
 
 
-def _array(shape: list[int], chunk: list[int], dtype: str, fill_value: object, attributes: dict) -> dict[str, Any]:
+def _array(
+    shape: list[int], chunk: list[int], dtype: str, fill_value: object, attributes: dict, separator: str
+) -> dict[str, Any]:
     return {
         "zarr_format": 3,
         "node_type": "array",
         "shape": shape,
         "data_type": dtype,
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": separator}},
         "fill_value": fill_value,
         "codecs": _codecs(np.dtype(dtype).itemsize),
         "attributes": attributes,
