@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _BLOCK = 256  # cells along x and y of a GeoTIFF's tiles
-_MAX_CELLS = {".png": 8192**2, ".ply": 4000**2, ".npz": 8192**2}  # so that less than 2 GB of memory are needed
+_MAX_CELLS = {".png": 8192**2, ".ply": 4000**2, ".npz": 8192**2}  # which need about 3 GB of memory
 _PACKAGES = {".tif": ("tifffile", "geo"), ".png": ("cv2", "io"), ".ply": ("plyfile", "io")}  # and the extras
 _ROUNDING = 1e-6  # of a cell
 _AMBIENT = 0.35  # brightness of slopes that face away from the light

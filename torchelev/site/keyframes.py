@@ -34,7 +34,7 @@ class Rows(NamedTuple):
     """What is known of K keyframes without reading them, on the CPU."""
 
     merge: Int[Tensor, "K"]  #: number of the merge
-    robot: Int[Tensor, "K"]
+    robot: Int[Tensor, "K"]  #: number of the robot
     told_of: Int[Tensor, "K"]  #: keyframe with which moves what the robot had told before; itself: nothing told
     corner: Int[Tensor, "K 2"]  #: number of the first cell, before any move
     size: Int[Tensor, "K 2"]  #: H, W in cells
