@@ -19,6 +19,7 @@ _NEIGHBORS = 8  # windows of a cell that each window is compared with; the other
 _MAX_PAIRS = 1 << 17
 _ROUNDS = 8  # of reweighting
 _WIDEST = 0.5  # [m] scale of the first round; it halves until it is the noise
+_CONVERGED = 1e-6  # [m]
 _TILT_STD = 0.05  # [rad] a priori, which keeps windows with little overlap level
 
 
@@ -124,6 +125,7 @@ def _solve(pairs: Pairs, groups: Int[Tensor, "N"], size: int) -> Float[Tensor, "
     ]
     unknowns, scale = pairs.difference.new_zeros(N, size), _WIDEST
     for _ in range(_ROUNDS if len(edges) else 0):
+        before = unknowns
         terms = (_to_columns(size) @ (unknowns[ends].flatten(1, 2)[..., None]))[..., 0].T  # per edge
         residual = pairs.difference - sum(column * term[edge] for column, term in zip(columns, terms, strict=True))
         noise = 1.4826 * float(residual.abs().median())
@@ -133,6 +135,8 @@ def _solve(pairs: Pairs, groups: Int[Tensor, "N"], size: int) -> Float[Tensor, "
         unknowns = _solve_normal_equations(
             _sum_moments(weight, columns, pairs.difference, edge, len(edges)), ends, groups, size
         )
+        if scale == noise and (unknowns - before).abs().max() < _CONVERGED:
+            break
     return unknowns[:-1]
 
 
@@ -176,4 +180,5 @@ def _solve_normal_equations(total: Tensor, ends: Tensor, groups: Tensor, size: i
     A[:, :, 0, 0] += is_same
     A[-1], A[:, -1], b[-1] = 0.0, 0.0, 0.0
     A[-1, -1] = torch.eye(size)
-    return torch.linalg.solve(A.transpose(1, 2).reshape(N * size, N * size), b.flatten()).view(N, size)
+    L = torch.linalg.cholesky(A.transpose(1, 2).reshape(N * size, N * size))
+    return torch.cholesky_solve(b.view(-1, 1), L).view(N, size)

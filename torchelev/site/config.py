@@ -22,7 +22,7 @@ class SiteConfig:
     max_std: float = 0.05  #: [m] of these cells
     min_overlap: int = 20  #: such cells that two windows, or a window and the site, must share to be compared
     max_compared: int = 32768  #: cells of all windows that are compared; more are thinned on the lattice
-    cache_tiles: int = 512  #: tiles of a site on disk that stay in memory: 59 MB
+    cache_tiles: int = 256  #: tiles of a site on disk that stay in memory: 29 MB
 
     def __post_init__(self) -> None:
         names = ("gate", "max_gate_std", "max_newer_ratio", "max_slope", "max_std")

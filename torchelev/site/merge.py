@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.ops.parallel import map_in_order
 from torchelev.site.config import SiteConfig
 from torchelev.site.entries import read_entries, rise
 from torchelev.site.fuse import Entries, Heights, fuse
-from torchelev.site.pieces import Pieces, cut
+from torchelev.site.pieces import Group, Pieces, group_tiles
 from torchelev.site.tiles import LAYERS, Tile, Tiles
 from torchelev.site.windows import Alignment, Windows
 
@@ -42,17 +43,21 @@ class Merged(NamedTuple):
 def merge_windows(
     tiles: Tiles, windows: Windows, alignment: Alignment, resolution: float, rate: float, cfg: SiteConfig
 ) -> Iterator[Merged]:
-    """Yield the tiles that the windows touch, after their fusion, some at a time; changes none in memory."""
-    touched, groups = cut(windows.known.corner, windows.is_new | windows.is_bounded)
-    tiles.reserve(sum(tile not in tiles for tile in touched))
-    for pieces in groups:
-        values = tiles.read(pieces.tiles)
-        layers = values.flatten(1)
+    """Return the tiles that the windows touch, after their fusion, some at a time; changes none in memory."""
+    groups = group_tiles(windows.known.corner, windows.is_new | windows.is_bounded)
+    tiles.reserve(sum(tile not in tiles for group in groups for tile in group.tiles))
+
+    def fuse_group(group_and_values: tuple[Group, Tensor]) -> Merged:
+        group, values = group_and_values
+        pieces, layers = group.cut(), values.flatten(1)
         robot, cell, place = pieces.select(windows.is_new)
         entries = read_entries(windows, alignment, robot, cell, place, resolution)
         is_contradicted = fuse_entries(layers, entries, rate, cfg)
         lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
-        yield Merged(pieces.tiles, values, torch.bincount(robot[is_contradicted], minlength=len(alignment.offset)))
+        contradictions = torch.bincount(robot[is_contradicted], minlength=len(alignment.offset))
+        return Merged(pieces.tiles, values, contradictions)
+
+    return map_in_order(fuse_group, ((group, tiles.read(group.tiles)) for group in groups))
 
 
 def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:

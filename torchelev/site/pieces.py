@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -34,26 +35,29 @@ class Pieces(NamedTuple):
         return self.robot.index_select(0, piece), cell, self.place.view(-1).index_select(0, chosen)
 
 
-def cut(corner: Int[Tensor, "B 2"], mask: Bool[Tensor, "B H W"]) -> tuple[list[Tile], Iterator[Pieces]]:
-    """Cut windows into the pieces that hold cells of the mask.
+class Group(NamedTuple):
+    """Some tiles, and how to cut what lies on them, which takes a while."""
 
-    Returns:
-        The tiles that these lie on, in ascending order, and their pieces, group of tiles by group.
-    """
+    tiles: list[Tile]  #: in ascending order
+    cut: Callable[[], Pieces]  #: cuts the windows
+
+
+def group_tiles(corner: Int[Tensor, "B 2"], mask: Bool[Tensor, "B H W"]) -> list[Group]:
+    """Return the tiles below windows that hold cells of the mask, in groups."""
     first, lines = corner // TILE, mask.float()  # bytes take ten times as long
     rows, columns = _touched(corner[:, 0], lines.amax(2)), _touched(corner[:, 1], lines.amax(1))
     robot, i, j = (rows[:, :, None] & columns[:, None, :]).nonzero().unbind(1)
     tiles, number = locate_tiles(first[robot, 0] + i, first[robot, 1] + j)
     order = torch.argsort(number, stable=True)
-    return tiles, _group(tiles, robot[order], number[order], corner, mask.shape[1:])
-
-
-def _group(tiles: list[Tile], robot: Tensor, number: Tensor, corner: Tensor, size: tuple[int, ...]) -> Iterator[Pieces]:
-    """Yield the pieces of `_GROUP` tiles at a time, given those of each robot, sorted by the tiles' numbers."""
+    robot, number = robot[order], number[order]
     starts = torch.arange(0, len(tiles), _GROUP, device=number.device)
     ends = [*torch.searchsorted(number, starts).tolist(), len(number)]
+    groups = []
     for k, (start, end) in zip(starts.tolist(), itertools.pairwise(ends), strict=True):
-        yield _piece(tiles[k : k + _GROUP], robot[start:end], number[start:end] - k, corner, size)
+        chosen = tiles[k : k + _GROUP]
+        cut = partial(_cut, chosen, robot[start:end], number[start:end] - k, corner, mask.shape[1:])
+        groups.append(Group(chosen, cut))
+    return groups
 
 
 def _touched(corner: Int[Tensor, "B"], lines: Float[Tensor, "B size"]) -> Bool[Tensor, "B t"]:
@@ -63,7 +67,7 @@ def _touched(corner: Int[Tensor, "B"], lines: Float[Tensor, "B size"]) -> Bool[T
     return lines.new_zeros(len(corner), size // TILE + 2).scatter_add_(1, tile, lines) > 0
 
 
-def _piece(tiles: list[Tile], robot: Tensor, tile: Tensor, corner: Tensor, size: tuple[int, ...]) -> Pieces:
+def _cut(tiles: list[Tile], robot: Tensor, tile: Tensor, corner: Tensor, size: tuple[int, ...]) -> Pieces:
     H, W = size
     origin = torch.tensor(tiles, device=corner.device)[tile] * TILE - corner[robot]
     within = torch.arange(TILE, device=corner.device)
