@@ -8,8 +8,10 @@ from torch.utils._pytree import tree_leaves
 
 from tests.helpers import pose, random_poses, small_config
 from tests.robot_body.bodies import random_body
+from tests.site.helpers import known_cells, robots
 from torchelev import BodyConfig, ElevationMap, SensorConfig
 from torchelev.ops import operators
+from torchelev.site import SiteMap
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 OPERATORS = [
@@ -133,3 +135,17 @@ def test_captured_update_equals_plain(compiled):
     both = plain.validity & captured.validity
     assert (plain.validity == captured.validity).float().mean() > 0.999
     assert (plain.elevation - captured.elevation)[both].abs().quantile(0.999) < 1e-4
+
+
+@needs_gpu
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_a_site_takes_maps_of_a_gpu_and_gives_back(device):
+    maps = [robots([(0, 0), (20, 10)], offsets=[0.1, -0.1], noise=0.003) for _ in range(2)]
+    sites = SiteMap(0.1), SiteMap(0.1, device=device)
+    reports = [site.merge(emap) for site, emap in zip(sites, (maps[0], maps[1].cuda()), strict=True)]
+    torch.testing.assert_close(reports[0].offsets, reports[1].offsets.cpu(), atol=1e-5, rtol=0.0)
+    a, b = (known_cells(site) for site in sites)
+    assert a == pytest.approx(b, abs=1e-5)
+    newcomer = ElevationMap(small_config((20, 20)), 1, "cuda")
+    newcomer.initialize_from(sites[1], pose((2.0, 2.0, 0.5)).cuda())
+    assert newcomer.state.validity.any()

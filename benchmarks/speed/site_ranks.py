@@ -27,7 +27,7 @@ from benchmarks import RESULTS
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap
-from torchelev.site.packing import Layout
+from torchelev.site.shared.packing import Layout
 
 RESOLUTION, LENGTH, SPACING = 0.1, 12.0, 8.0
 

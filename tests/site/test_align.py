@@ -8,7 +8,7 @@ import torch
 
 from tests.site.helpers import fill, ground, robots
 from torchelev.site import SiteConfig, SiteMap
-from torchelev.site.align import find_groups
+from torchelev.site.fusion.align import find_groups
 
 
 def grid_of(number, spacing=24):

@@ -8,8 +8,8 @@ import torch.distributed as dist
 from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
-from torchelev.site.packing import Layout, pack, unpack
-from torchelev.site.windows import Alignment, Windows, read_windows, snapshot
+from torchelev.site.fusion.windows import Alignment, Windows, read_windows, snapshot
+from torchelev.site.shared.packing import Layout, pack, unpack
 
 SHARES = {
     2: [[0], list(range(1, 11))],
@@ -136,7 +136,9 @@ def test_packed_windows_are_exact_and_as_large_as_documented(with_told):
     ranks.measure(emap, 1)
     emap.corner.add_(2**40)
     windows = read_windows(emap, emap.state, 1e9 + 1e-7, None)
-    told = snapshot(emap, windows, ranks_alignment(emap), emap.num_resets - 1) if with_told else None
+    told = (
+        snapshot(emap, windows, ranks_alignment(emap), emap.state.elapsed, emap.num_resets - 1) if with_told else None
+    )
     windows, layout = windows._replace(told=told), Layout(30, 26, with_told)
     rows = pack(windows, layout)
     assert rows.shape == (ranks.NUM_ROBOTS, layout.num_bytes)

@@ -10,7 +10,7 @@ from hypothesis import given
 
 from tests import reference
 from torchelev.site.config import SiteConfig
-from torchelev.site.fuse import Entries, Heights, fuse
+from torchelev.site.fusion.fuse import Entries, Heights, fuse
 
 CFG = SiteConfig()
 LIMITS = dict(gate=CFG.gate, max_gate_std=CFG.max_gate_std, max_newer_ratio=CFG.max_newer_ratio)

@@ -9,7 +9,8 @@ import torch
 from tests.helpers import pose, rotation, small_map
 from tests.processes import run_python
 from tests.site.helpers import fill, ground, known_cells, live, robots
-from torchelev.site import SiteMap, rebuild
+from torchelev.site import SiteMap
+from torchelev.site.keyframes import rebuild
 
 LAYERS = ("elevation", "variance", "time", "upper_bound", "other_elevation", "other_variance")
 STARTS = np.array([(0, 0), (25, 10), (-30, 20)])  # [cells] corners of three robots' windows that overlap
@@ -224,7 +225,8 @@ def test_a_move_that_fails_changes_nothing(site, monkeypatch):
 
 KILLED = """
 import os, signal, torch
-from torchelev.site import SiteMap, rebuild
+from torchelev.site import SiteMap
+from torchelev.site.keyframes import rebuild
 fuse, calls = rebuild.fuse_entries, []
 def die(*args):
     calls.append(1)

@@ -4,9 +4,9 @@ Robot-centric windows live in `torchelev.elevation_map`, single files of maps in
 """
 
 from torchelev.site.config import SiteConfig
-from torchelev.site.keyframes import Keyframes
-from torchelev.site.merge import MergeReport
-from torchelev.site.ranks import LostRankError
+from torchelev.site.fusion.merge import MergeReport
+from torchelev.site.keyframes.keyframes import Keyframes
+from torchelev.site.shared.ranks import LostRankError
 from torchelev.site.site_map import SiteMap
 
 __all__ = ["Keyframes", "LostRankError", "MergeReport", "SiteConfig", "SiteMap"]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.site.windows import BEFORE_ALL, Known, Told, Windows, no_alignment
+from torchelev.site.fusion.windows import BEFORE_ALL, Known, Told, Windows, no_alignment
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter import follow
 from torchelev.state import MapState
@@ -53,7 +53,13 @@ def remember_given(
     if told is None:
         nothing = no_alignment(len(chosen), chosen.device)
         never = torch.full_like(after.elapsed, BEFORE_ALL)
-        return Told(_clone(given), nothing, never, emap.num_resets.clone(), torch.full_like(after.elapsed, -1))
+        return Told(
+            _clone(given),
+            nothing,
+            never,
+            emap.num_resets.to(chosen.device, copy=True),
+            torch.full_like(after.elapsed, -1),
+        )
 
     def choose(new: Tensor, old: Tensor) -> Tensor:
         return torch.where(chosen.view(-1, *[1] * (new.ndim - 1)), new, old)

@@ -4,44 +4,37 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
-from torchelev.grid import GridConfig
 from torchelev.inputs import checks
-from torchelev.io.export import SavedMap
-from torchelev.layers import MODES
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
-from torchelev.site.align import align
-from torchelev.site.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.config import SiteConfig
-from torchelev.site.export import Place, choose_area, export
+from torchelev.site.fusion.align import align
+from torchelev.site.fusion.merge import Merged, MergeReport, merge_windows
+from torchelev.site.fusion.windows import Alignment, Told, Windows, drop_reset, no_alignment, read_windows, snapshot
 from torchelev.site.give import center_on, fill, remember_given
-from torchelev.site.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
-from torchelev.site.keyframes import Keyframes, Recorded, correct, record
-from torchelev.site.merge import Merged, MergeReport, merge_windows
-from torchelev.site.ranks import Ranks
-from torchelev.site.reading import Clock, check_layers, read_area, sample_tiles
-from torchelev.site.rebuild import merge_recorded, rebuild_moved
+from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
+from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
+from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
+from torchelev.site.readable_site import ReadableSite
+from torchelev.site.shared.collective import gather_windows, open_shared, shared_transaction
+from torchelev.site.shared.ranks import Ranks
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
-from torchelev.site.windows import Alignment, Told, Windows, drop_reset, no_alignment, read_windows, snapshot
 from torchelev.stages.initialize import Remembered
-from torchelev.state import MapState
+from torchelev.state import MapState, map_layers
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -53,7 +46,7 @@ if TYPE_CHECKING:
 _told: WeakKeyDictionary[ElevationMap, dict[str, Told]] = WeakKeyDictionary()
 
 
-class SiteMap:
+class SiteMap(ReadableSite):
     """A world map that grows: the windows of many robots, in one frame.
 
     ```python
@@ -69,14 +62,14 @@ class SiteMap:
 
     With a `group`, all its ranks hold one site, and `merge` takes the robots of all of them, in the order of the ranks:
     call it on all ranks, which wait for each other. Reading is up to each rank. On disk, rank 0 writes, and the others
-    read the same folder. See `torchelev.site.collective`.
+    read the same folder. See `torchelev.site.shared.collective`.
 
     Args:
         resolution: [m] of the cells, as of the maps that are merged.
         path: the folder to keep it in, which needs ``torchelev[site]``. A site that is there already is continued.
             None: in memory, 28 bytes for each cell of a tile.
         cfg: how windows are aligned and fused.
-        device: that fuses.
+        device: that fuses; maps may lie on another one.
         group: processes that share the site, such as `torch.distributed.group.WORLD`; None: this one alone. Give
             `init_process_group` a `timeout` that is longer than ranks wait for each other, such as a minute: after it,
             those that wait for a rank that has died raise `LostRankError`.
@@ -229,12 +222,14 @@ class SiteMap:
             self._rate = plans[0]["rate"]
         now = max(plan["now"] for plan in plans)  # of all ranks
         now = now if time is None else self._advance(emap, told, now)
-        windows = read_windows(emap, emap.state, now, told)
+        state = self._bring(emap)
+        windows = read_windows(emap, state, now, told)
         all_windows, own = gather_windows(self._ranks, windows, plans)
         all_aligned = self._align(all_windows, align, tilt)
         alignment = Alignment(*(value[own] for value in all_aligned))
         new = self._record(windows, alignment, T_map_base, now)
-        told = snapshot(emap, windows, alignment, torch.full_like(emap.num_resets, -1) if new is None else new.ids)
+        keyframes = torch.full_like(state.elapsed, -1) if new is None else new.ids
+        told = snapshot(emap, windows, alignment, state.elapsed, keyframes)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _told.setdefault(emap, {})[self._id] = told
         contradictions = self._fuse(all_windows, all_aligned, now, new)[own]
@@ -244,7 +239,12 @@ class SiteMap:
     def _recall_told(self, emap: ElevationMap) -> Told | None:
         """Return what a map has told since its last reset; None: nothing."""
         told = _told.get(emap, {}).get(self._id)
-        return None if told is None else drop_reset(told, emap.num_resets)
+        return None if told is None else drop_reset(told, emap.num_resets.to(told.num_resets.device))
+
+    def _bring(self, emap: ElevationMap) -> MapState:
+        """Return a map's state on the site's device."""
+        device = self._tiles.device
+        return emap.state if emap.device == device else map_layers(lambda value: value.to(device), emap.state)
 
     def _plan(self, emap: ElevationMap, time: float | None, align: bool, tilt: bool) -> dict[str, Any]:
         """Return what this rank is about to merge; raise if it cannot."""
@@ -283,7 +283,7 @@ class SiteMap:
             if not len(self._tiles):
                 self._epoch = time
             return time - self._epoch
-        elapsed = emap.state.elapsed
+        elapsed = emap.state.elapsed.to(self._tiles.device)
         if told is None:
             return max(self._time, self._opened + float(elapsed.max()) * 1e-9)
         lived = torch.where(told.elapsed >= 0, elapsed - told.elapsed, elapsed)  # an environment that was reset
@@ -385,187 +385,23 @@ class SiteMap:
     def give(self, emap: ElevationMap, T_map_base: Tensor | None, chosen: Bool[Tensor, "B"]) -> MapState:
         """Return a map's state with what the site knows filled in; `ElevationMap.initialize_from` calls it."""
         self.require_resolution(emap)
-        told, state = self._recall_told(emap), emap.state
+        told, state, device = self._recall_told(emap), self._bring(emap), self._tiles.device
+        chosen = chosen.to(device)
         if T_map_base is not None:
-            state = center_on(state, emap, T_map_base, chosen)
+            state = center_on(state, emap, T_map_base.to(device), chosen)
         windows = read_windows(emap, state, self._time, told)
-        offset = torch.zeros(emap.num_envs) if told is None else told.alignment.offset
+        offset = torch.zeros(emap.num_envs, device=device) if told is None else told.alignment.offset
         grid = emap.cfg.grid
         areas = self.windows(state.corner, grid.height, grid.width, Remembered._fields)
         after = fill(state, emap, areas, offset, chosen)
         _told.setdefault(emap, {})[self._id] = remember_given(emap, windows, after, told, chosen, self._time)
-        return after
+        return map_layers(lambda value: value.to(emap.device), after)
 
     @contextmanager
     def _transaction(self, attributes: dict[str, Any], arrays: Arrays | None) -> Iterator[Callable[..., None]]:
         """Yield what writes tiles to disk; in memory alone, nothing does."""
         with shared_transaction(self._ranks, self._store, attributes, arrays) as write:
             yield write
-
-    # Reading --------------------------------------------------------------------------------------------------------
-
-    @property
-    def time(self) -> float:
-        """The site's time [s]: that of the last merge. Variances and ages are read as of then."""
-        return self._epoch + self._time
-
-    @property
-    def _clock(self) -> Clock:
-        return Clock(self._time, self._rate or 0.0)
-
-    def __len__(self) -> int:
-        """Return the number of tiles, of 64 x 64 cells."""
-        return len(self._tiles)
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """The outer borders x_min, x_max, y_min, y_max [m] of its tiles, map frame; all 0 while there are none."""
-        tiles = np.array(list(self._tiles) or [(0, 0)])
-        (x_min, y_min), (x_max, y_max) = tiles.min(0) * TILE, (tiles.max(0) + bool(len(self))) * TILE
-        return tuple(float(cells * self.resolution) for cells in (x_min, x_max, y_min, y_max))  # type: ignore[return-value]
-
-    @property
-    def num_bytes(self) -> int:
-        """Bytes on disk; 0 in memory."""
-        return 0 if self._store is None else self._store.num_bytes
-
-    def sample(
-        self, xy: Float[Tensor, "M 2"], layer: str = "elevation", mode: str = "bilinear"
-    ) -> tuple[Float[Tensor, "M"], Bool[Tensor, "M"]]:
-        """Read a layer at points.
-
-        Args:
-            xy: points, map frame [m]; give float64 far from the origin.
-            layer: one of `window`'s.
-            mode: "bilinear" renormalises over the known ones of the four surrounding cells, and is valid where these
-                carry at least half of the weight; "nearest" reads the cell that holds the point.
-
-        Returns:
-            values: (M,), 0 where not valid.
-            valid: (M,) bool.
-
-        Raises:
-            KeyError: there is no such layer.
-            ValueError: the mode is unknown, or `xy` is not (M, 2).
-        """
-        xy = torch.as_tensor(xy)
-        is_list = xy.ndim == 2 and xy.shape[1] == 2
-        require(is_list, "xy", "expected (M, 2)", tuple(xy.shape), "give one x and y for each point")
-        require(mode in MODES, "mode", f"must be one of {', '.join(MODES)}", repr(mode), "use bilinear")
-        (layer,) = check_layers([layer])
-        cells = xy.detach().to(self._tiles.device, torch.float64) / self.resolution
-        return sample_tiles(self._tiles, cells, layer, mode, self._clock)
-
-    def window(
-        self,
-        center: Sequence[float] | Tensor,
-        length_x: float,
-        length_y: float,
-        layers: Sequence[str] | None = None,
-    ) -> SavedMap:
-        """Copy an area to NumPy arrays, as of the site's time.
-
-        - elevation [m], variance [m^2], time [s] since the last measurement, upper_bound [m] and validity are those of
-          `ElevationMap.layer`.
-        - other_elevation [m], other_variance [m^2] and other_time [s]: what contradicts the elevation.
-
-        Args:
-            center: x, y [m], map frame; the area's centre is the nearest point at which its cells line up.
-            length_x: [m], a whole number of cells.
-            length_y: [m], a whole number of cells.
-            layers: names; None: all.
-
-        Returns:
-            The layers (H, W), NaN where unknown, and their geometry.
-
-        Raises:
-            KeyError: a layer does not exist.
-            ValueError: a length is no whole number of cells.
-        """
-        grid = GridConfig(resolution=self.resolution, length_x=length_x, length_y=length_y)
-        x, y = (float(value) for value in center[:2])
-        size = (grid.height, grid.width)
-        first = [math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip((x, y), size, strict=True)]
-        return self._copy((first[0], first[1]), size, check_layers(layers))
-
-    def _copy(self, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str]) -> SavedMap:
-        """Copy an area whose first cell has these numbers on the lattice."""
-        area = read_area(self._tiles, corner, size, names, self._clock)
-        length_x, length_y = (cells * self.resolution for cells in size)
-        grid = GridConfig(resolution=self.resolution, length_x=length_x, length_y=length_y)
-        middle = [(c + n / 2) * self.resolution for c, n in zip(corner, size, strict=True)]
-        arrays = {name: value.numpy() for name, value in area.items()}
-        config = ElevationMapConfig(grid=grid).to_dict()
-        return SavedMap(arrays, self.resolution, np.array([*middle, 0.0]), config)
-
-    def windows(
-        self, corner: Int[Tensor, "B 2"], height: int, width: int, layers: Sequence[str]
-    ) -> dict[str, Float[Tensor, "B H W"]]:
-        """Return layers of B areas of height x width cells, whose first cells have these numbers on the lattice."""
-        names, size = check_layers(layers), (height, width)
-        areas = [read_area(self._tiles, (x, y), size, names, self._clock) for x, y in corner.tolist()]
-        return {name: torch.stack([area[name] for area in areas]) for name in layers}
-
-    # Files ----------------------------------------------------------------------------------------------------------
-
-    def export(
-        self,
-        path: str | Path,
-        layers: Sequence[str] = ("elevation",),
-        area: Sequence[float] | None = None,
-        *,
-        epsg: int | None = None,
-        origin: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
-        """Write an area to a file of the kind that its suffix says, completely or not at all.
-
-        - `.tif`: a GeoTIFF with a float32 band for each layer, NaN where unknown. Written block by block, so that
-          memory does not grow with the area. Needs ``torchelev[geo]``.
-        - `.png`: a picture of one layer, shaded and coloured, transparent where unknown. Its text says which values
-          the colours stand for, and the world file `.pgw` beside it where the picture lies. Needs ``torchelev[io]``.
-        - `.ply`: one layer as a triangle mesh, as `torchelev.io.export.save_mesh` writes it. Needs ``torchelev[io]``.
-        - `.npz`: arrays, which `torchelev.io.export.load_npz` reads.
-
-        Pictures and GeoTIFFs have north up: x points east, y north.
-
-        Args:
-            path: of the file.
-            layers: names as in `window`; one for `.png` and `.ply`.
-            area: x_min, x_max, y_min, y_max [m], map frame, made larger to whole cells. None: all that is known.
-            epsg: code of the projected coordinate system, such as 32632 for UTM zone 32N, for `.tif`.
-            origin: easting and northing [m] of the map frame's origin in it, for `.tif` and `.png`.
-
-        Raises:
-            KeyError: a layer does not exist.
-            ValueError: another argument breaks its rule, the area is too large for the kind, or nothing is known yet.
-            WriteError: the file cannot be written; an existing one is left as it was.
-            ModuleNotFoundError: a package is missing; the text says which extra installs it.
-        """
-        export(
-            path,
-            choose_area(self._tiles, check_layers(layers), area, self.resolution, self._copy),
-            Place(epsg, origin),
-        )
-
-    def refresh(self) -> None:
-        """Read again what another process has written since. Only of use for a site that is open read-only."""
-        if self._store is not None:
-            self._store.refresh()
-            self._tiles.forget()
-            self._read_attributes()
-
-    def close(self) -> None:
-        """Let other processes write to the site's folder. All merges are on disk already."""
-        if self._store is not None:
-            self._store.close()
-
-    def __enter__(self) -> SiteMap:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _attributes(self, time: float, new_merges: int) -> dict[str, Any]:
         own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}

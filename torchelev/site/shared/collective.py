@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchelev.errors import require
-from torchelev.site.packing import Layout, pack, unpack
-from torchelev.site.ranks import Ranks
-from torchelev.site.windows import Windows
+from torchelev.site.fusion.windows import Windows
+from torchelev.site.shared.packing import Layout, pack, unpack
+from torchelev.site.shared.ranks import Ranks
 
 if TYPE_CHECKING:
     from torchelev.site.storage.store import TileStore

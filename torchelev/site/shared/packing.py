@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.windows import Known, Told, Windows, no_alignment
+from torchelev.site.fusion.windows import Known, Told, Windows, no_alignment
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, UInt8

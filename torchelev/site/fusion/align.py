@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.site.config import SiteConfig
-from torchelev.site.windows import Alignment, Windows
+from torchelev.site.fusion.windows import Alignment, Windows
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -126,7 +126,7 @@ def _solve(pairs: Pairs, groups: Int[Tensor, "N"], size: int) -> Float[Tensor, "
     unknowns, scale = pairs.difference.new_zeros(N, size), _WIDEST
     for _ in range(_ROUNDS if len(edges) else 0):
         before = unknowns
-        terms = (_to_columns(size) @ (unknowns[ends].flatten(1, 2)[..., None]))[..., 0].T  # per edge
+        terms = (_to_columns(size, ends.device) @ (unknowns[ends].flatten(1, 2)[..., None]))[..., 0].T  # per edge
         residual = pairs.difference - sum(column * term[edge] for column, term in zip(columns, terms, strict=True))
         noise = 1.4826 * float(residual.abs().median())
         scale = max(noise, scale / 2)
@@ -140,14 +140,14 @@ def _solve(pairs: Pairs, groups: Int[Tensor, "N"], size: int) -> Float[Tensor, "
     return unknowns[:-1]
 
 
-def _to_columns(size: int) -> Float[Tensor, "m 2s"]:
+def _to_columns(size: int, device: torch.device) -> Float[Tensor, "m 2s"]:
     """Return the matrix that takes the unknowns of both ends of a pair to the factors of 1, x_a, y_a, x_b, y_b."""
     if size == 1:
-        return torch.tensor([[1.0, -1.0]], dtype=torch.float64)
+        return torch.tensor([[1.0, -1.0]], dtype=torch.float64, device=device)
     factors = torch.zeros(5, 6, dtype=torch.float64)
     factors[0, 0], factors[0, 3] = 1.0, -1.0
     factors[range(1, 5), (1, 2, 4, 5)] = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=torch.float64)
-    return factors
+    return factors.to(device)
 
 
 def _sum_moments(
@@ -167,7 +167,7 @@ def _sum_moments(
 
 def _solve_normal_equations(total: Tensor, ends: Tensor, groups: Tensor, size: int) -> Float[Tensor, "N size"]:
     """Solve for all windows, given the moments of each edge's pairs."""
-    N, factors = len(groups), _to_columns(size)
+    N, factors = len(groups), _to_columns(size, groups.device)
     blocks = factors.T @ total[..., :-1] @ factors
     blocks = blocks.view(-1, 2, size, 2, size).transpose(2, 3).reshape(-1, size, size)
     place = (ends[:, :, None] * N + ends[:, None]).flatten()
@@ -179,6 +179,6 @@ def _solve_normal_equations(total: Tensor, ends: Tensor, groups: Tensor, size: i
     is_same = (groups[:, None] == groups) & ~of_site  # the mean offset of a group without the site is 0
     A[:, :, 0, 0] += is_same
     A[-1], A[:, -1], b[-1] = 0.0, 0.0, 0.0
-    A[-1, -1] = torch.eye(size)
+    A[-1, -1] = torch.eye(size, device=A.device)
     L = torch.linalg.cholesky(A.transpose(1, 2).reshape(N * size, N * size))
     return torch.cholesky_solve(b.view(-1, 1), L).view(N, size)

@@ -81,7 +81,7 @@ def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | N
     """
     variance = sideways_variance(state)
     is_known = state.validity & (variance < emap.cfg.fusion.max_variance)
-    per_robot = torch.ones(emap.num_envs, dtype=torch.float64, device=emap.device)
+    per_robot = torch.ones(emap.num_envs, dtype=torch.float64, device=state.corner.device)
     rate = emap.cfg.aging.variance_rate
     known = Known(state.corner, state.elevation, variance, state.time, is_known, now * per_robot, rate * per_robot)
     surface = state.gradient_x, state.gradient_y, state.has_normal
@@ -123,7 +123,9 @@ def _measured_since(state: MapState, told: Told | None) -> Bool[Tensor, "B H W"]
     return state.time < since * (1 - 1e-4) - 1e-6
 
 
-def snapshot(emap: ElevationMap, windows: Windows, alignment: Alignment, keyframe: Int[Tensor, "B"]) -> Told:
-    """Return copies of what a merge of a map told the site, and kept as these keyframes."""
+def snapshot(
+    emap: ElevationMap, windows: Windows, alignment: Alignment, elapsed: Int[Tensor, "B"], keyframe: Int[Tensor, "B"]
+) -> Told:
+    """Return copies of what a merge of a map told the site, and kept as these keyframes, at these clocks."""
     known = Known(*(value.clone() for value in windows.known))
-    return Told(known, alignment, emap.state.elapsed.clone(), emap.num_resets.clone(), keyframe)
+    return Told(known, alignment, elapsed.clone(), emap.num_resets.to(elapsed.device, copy=True), keyframe)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchelev.site.fuse import Entries, Heights
-from torchelev.site.windows import Alignment, Known, Told, Windows
+from torchelev.site.fusion.fuse import Entries, Heights
+from torchelev.site.fusion.windows import Alignment, Known, Told, Windows
 
 _WITHIN_CELL = 1 / 12  # variance of a position that is uniform in a cell of size 1
 _STEEPEST = 1.0  # slope taken where the known neighbours of a cell span no plane

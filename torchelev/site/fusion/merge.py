@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
 from torchelev.site.config import SiteConfig
-from torchelev.site.entries import read_entries, rise
-from torchelev.site.fuse import Entries, Heights, fuse
-from torchelev.site.pieces import Group, Pieces, group_tiles
+from torchelev.site.fusion.entries import read_entries, rise
+from torchelev.site.fusion.fuse import Entries, Heights, fuse
+from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
+from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.tiles import LAYERS, Tile, Tiles
-from torchelev.site.windows import Alignment, Windows
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

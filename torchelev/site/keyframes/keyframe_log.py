@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchelev.site.keyframes import LAYERS, Keyframes, Recorded, Rows, join, no_rows
+from torchelev.site.keyframes.keyframes import LAYERS, Keyframes, Recorded, Rows, join, no_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

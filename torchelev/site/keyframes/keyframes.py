@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.inputs import checks
-from torchelev.site.entries import read_entries, read_heights, rise
-from torchelev.site.windows import Alignment, Told, Windows
+from torchelev.site.fusion.entries import read_entries, read_heights, rise
+from torchelev.site.fusion.windows import Alignment, Told, Windows
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

@@ -1,0 +1,1 @@
+"""A merge: the windows of robots, aligned with the site and fused into its tiles."""
