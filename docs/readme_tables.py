@@ -18,6 +18,7 @@ import benchmarks
 import training
 from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
+from benchmarks.quality.real import merged
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
 from benchmarks.speed import (
@@ -32,6 +33,7 @@ from benchmarks.speed import (
     sight,
     site_area,
     site_merge,
+    site_ranks,
 )
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
@@ -121,6 +123,16 @@ def _bags() -> str:
 def _site_merge() -> str:
     """Tabulate the times of merges into a site over the number of robots."""
     return site_merge.table(load("site_merge")["rows"])
+
+
+def _site_ranks() -> str:
+    """Tabulate the times of merges over the number of processes."""
+    return site_ranks.table(load("site_ranks"))
+
+
+def _real_merged() -> str:
+    """Tabulate the merges of real scans."""
+    return merged.table(load("real_merged")["rows"])
 
 
 def _site_area() -> str:
@@ -227,6 +239,8 @@ TABLES = {
     "live_view": _live_view,
     "site_merge": _site_merge,
     "site_area": _site_area,
+    "site_ranks": _site_ranks,
+    "real_merged": _real_merged,
     "nav": _nav,
     "pose_covariance": _pose_covariance,
     "legs": _legs,

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from benchmarks import RESULTS
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.app.results import write_json
+from torchelev.app.results import markdown_table, write_json
 from torchelev.io import Frame, open_recording
 from torchelev.site import MergeReport, SiteMap
 
@@ -76,14 +76,28 @@ def merge(frames: list[Frame], seed: int = 0) -> dict[str, Any]:
     }
 
 
+def table(rows: list[dict[str, Any]]) -> str:
+    """Tabulate the rows, lengths in centimetres."""
+    head = ["recording", "robots", "largest error of an added offset", "seam before", "after", "of the given poses"]
+    names = ("seam_before", "seam_after", "seam_of_exact_poses")
+    lines = []
+    for row in rows:
+        error = "below 0.01 mm" if row["offset_error_max"] < 1e-5 else f"{1e3 * row['offset_error_max']:.2f} mm"
+        seams = [f"{100 * row[name]:.1f} cm" for name in names]
+        lines.append([row["recording"], str(row["robots"]), error, *seams])
+    return markdown_table(head, lines)
+
+
 @click.command(help=__doc__)
 @click.argument("recordings", type=click.Path(path_type=Path, exists=True))
 def main(recordings: Path) -> None:
     """Merge all recordings."""
     car = list(open_recording(recordings / "parked_car"))
     field = open_recording(recordings / "offroad")[0]
-    results = {"parked_car": merge(car), "offroad": merge(split(field, 4))}
-    write_json(RESULTS / "real_merged.json", results)
+    cases = {"parked_car": car, "offroad": split(field, 4)}
+    rows = [{"recording": name, **merge(frames)} for name, frames in cases.items()]
+    write_json(RESULTS / "real_merged.json", {"rows": rows})
+    print(table(rows))
 
 
 if __name__ == "__main__":
