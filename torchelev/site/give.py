@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.windows import BEFORE_ALL, Known, Told, Windows, no_alignment
+from torchelev.site.fusion.windows import BEFORE_ALL, Alignment, Known, Told, move_known, no_alignment
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter import follow
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     from torchelev.elevation_map import ElevationMap
 
@@ -29,43 +29,53 @@ def center_on(state: MapState, emap: ElevationMap, T_map_base: Float[Tensor, "B 
     return follow(state, near, anchor.long(), emap.cfg.grid)
 
 
+def nothing_told(emap: ElevationMap, state: MapState) -> Told:
+    """Return that the environments have told nothing."""
+    zero = torch.zeros_like(state.elapsed)
+    time = zero.double()
+    blank = torch.zeros_like(state.elevation)
+    known = Known(state.corner, blank, blank, blank, torch.zeros_like(state.validity), time, time)
+    num_resets = emap.num_resets.to(zero.device, copy=True)
+    return Told(known, no_alignment(len(zero), zero.device), zero + BEFORE_ALL, num_resets, zero - 1)
+
+
+def move_told(told: Told, corner: Int[Tensor, "B 2"], now: float, resolution: float) -> Told:
+    """Return what was told, of the windows at other corners, and as of another time [s]."""
+    known = move_known(told.known, corner)
+    passed = (now - known.now)[:, None, None]
+    age, variance = known.age + passed, known.variance + known.rate[:, None, None] * passed
+    known = known._replace(age=age.to(known.age), variance=variance.to(known.variance), now=known.now * 0 + now)
+    moved = (corner - told.known.corner) * resolution  # tilts turn about the windows' centres
+    offset = told.alignment.offset + (told.alignment.tilt * moved).sum(1)
+    return told._replace(known=known, alignment=told.alignment._replace(offset=offset))
+
+
 def fill(
-    state: MapState, emap: ElevationMap, areas: dict[str, Tensor], offset: Float[Tensor, "B"], chosen: Tensor
+    state: MapState, emap: ElevationMap, known: Remembered, alignment: Alignment, chosen: Tensor, resolution: float
 ) -> MapState:
-    """Fill the unknown cells of the chosen environments; `offset` [m] is added to the site's heights."""
-    elevation, variance, time, bound = (areas[name].to(state.elevation.device) for name in Remembered._fields)
-    shift = offset.to(elevation)[:, None, None]
-    before = Remembered(elevation + shift, variance, time, bound + shift)
+    """Fill the unknown cells of the chosen environments with what a site knows, raised by how they lie above it."""
+    B, H, W = state.elevation.shape
+    xy = torch.stack(torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij"), -1).to(chosen.device)
+    from_center = (xy + 0.5 - torch.tensor([H / 2, W / 2], device=chosen.device)) * resolution
+    rise = alignment.offset[:, None, None] + (alignment.tilt[:, None, None] * from_center).sum(-1)
+    rise = rise.to(known.elevation)
+    before = known._replace(elevation=known.elevation + rise, upper_bound=known.upper_bound + rise)
     return recall(state, before, chosen, emap.cfg.fusion.max_variance, SUPPORT)
 
 
-def remember_given(
-    emap: ElevationMap, windows: Windows, after: MapState, told: Told | None, chosen: Bool[Tensor, "B"], now: float
-) -> Told:
-    """Return what the site knows of B maps, now that the chosen ones were filled from it.
-
-    It knows all that they know, less what they have measured and not merged yet.
-    """
-    known = windows.known
-    is_old = after.validity & ~windows.is_new
-    time = torch.full_like(known.now, now)
-    given = Known(after.corner, after.elevation, after.variance, after.time, is_old, time, known.rate)
-    if told is None:
-        nothing = no_alignment(len(chosen), chosen.device)
-        never = torch.full_like(after.elapsed, BEFORE_ALL)
-        return Told(
-            _clone(given),
-            nothing,
-            never,
-            emap.num_resets.to(chosen.device, copy=True),
-            torch.full_like(after.elapsed, -1),
-        )
+def remember_given(told: Told, before: MapState, after: MapState, rate: float, chosen: Bool[Tensor, "B"]) -> Told:
+    """Return what a site knows of B maps, now that the chosen ones were filled from it; `rate` is the site's."""
+    given, known = after.validity & ~before.validity, told.known
 
     def choose(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(chosen.view(-1, *[1] * (new.ndim - 1)), new, old)
+        return torch.where(given, new.to(old.dtype), old)
 
-    return told._replace(known=Known(*(choose(new, old) for new, old in zip(given, told.known, strict=True))))
-
-
-def _clone(known: Known) -> Known:
-    return Known(*(value.clone() for value in known))
+    return told._replace(
+        known=known._replace(
+            elevation=choose(after.elevation, known.elevation),
+            variance=choose(after.variance, known.variance),
+            age=choose(after.time, known.age),
+            is_known=known.is_known | given,
+            rate=torch.where(chosen, rate, known.rate),
+        )
+    )

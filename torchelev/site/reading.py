@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 LAYERS = (*STORED, "validity")
+_FARTHEST = 2.0**40  # cells
 _SOURCES = {  # what a layer is computed from, first of all the mask of where it is known
     "elevation": ("elevation",),
     "variance": ("variance", "time"),
@@ -100,7 +101,7 @@ def sample_tiles(
     Returns:
         Values, 0 where not valid, and the mask of where they are.
     """
-    finite = cells.isfinite().all(1)
+    finite = (cells.abs() < _FARTHEST).all(1)  # NaN is not
     cells = torch.where(finite[:, None], cells, 0.0)
     if mode == "nearest":
         corners, weights = cells.floor().long()[:, None], torch.ones_like(cells[:, :1])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,7 @@ from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.align import align
 from torchelev.site.fusion.merge import Merged, MergeReport, merge_windows
 from torchelev.site.fusion.windows import Alignment, Told, Windows, drop_reset, no_alignment, read_windows, snapshot
-from torchelev.site.give import center_on, fill, remember_given
+from torchelev.site.give import center_on, fill, move_told, nothing_told, remember_given
 from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
@@ -88,6 +87,8 @@ class SiteMap(ReadableSite):
         ModuleNotFoundError: tensorstore is missing.
     """
 
+    _interrupted: BaseException | None
+
     def __init__(
         self,
         resolution: float = 0.1,
@@ -106,6 +107,7 @@ class SiteMap(ReadableSite):
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
+        self._num_commits, self._interrupted = 0, None
         self._keyframes = KeyframeLog(self._store) if keyframes else None
         self._read_attributes()
         self._check_keyframes(keyframes)
@@ -169,7 +171,9 @@ class SiteMap(ReadableSite):
         site.resolution = float(site._store.attributes["resolution"])
         site.cfg = checks.given_or_default(SiteConfig, cfg)
         site._tiles = Tiles(site._store, site.cfg.cache_tiles, device)
-        site._id, site._rate, site._epoch, site._time, site._opened = "", site.cfg.variance_rate, 0.0, 0.0, 0.0
+        site._id, site._rate = uuid.uuid4().hex, site.cfg.variance_rate
+        site._epoch = site._time = site._opened = 0.0
+        site._num_commits, site._interrupted = 0, None
         site._keyframes = None
         site._read_attributes()
         return site
@@ -234,12 +238,17 @@ class SiteMap(ReadableSite):
             _told.setdefault(emap, {})[self._id] = told
         contradictions = self._fuse(all_windows, all_aligned, now, new)[own]
         _told.setdefault(emap, {})[self._id] = told
+        self._raise_interrupted()
         return MergeReport(*alignment, count(windows.is_new), contradictions)
 
     def _recall_told(self, emap: ElevationMap) -> Told | None:
         """Return what a map has told since its last reset; None: nothing."""
         told = _told.get(emap, {}).get(self._id)
-        return None if told is None else drop_reset(told, emap.num_resets.to(told.num_resets.device))
+        return (
+            None
+            if told is None
+            else drop_reset(told, emap.num_resets.to(told.elapsed.device), emap.state.elapsed.to(told.elapsed.device))
+        )
 
     def _bring(self, emap: ElevationMap) -> MapState:
         """Return a map's state on the site's device."""
@@ -287,7 +296,7 @@ class SiteMap(ReadableSite):
         if told is None:
             return max(self._time, self._opened + float(elapsed.max()) * 1e-9)
         lived = torch.where(told.elapsed >= 0, elapsed - told.elapsed, elapsed)  # an environment that was reset
-        return self._time + float(lived.max()) * 1e-9
+        return max(self._time, float((told.known.now + 1e-9 * lived.double()).max()))
 
     def _align(self, windows: Windows, with_offsets: bool, with_tilt: bool) -> Alignment:
         if not with_offsets:
@@ -322,17 +331,26 @@ class SiteMap(ReadableSite):
     ) -> Int[Tensor, "B"]:
         """Write tiles and arrays, on disk first; return the sum of the contradictions."""
         contradictions = torch.zeros(size, dtype=torch.int64, device=self._tiles.device)
+        attributes = self._attributes(time, merges)
         try:
-            with self._transaction(self._attributes(time, merges), arrays) as write:
+            with shared_transaction(self._ranks, self._store, attributes, arrays) as write:
                 for part in parts:
                     write(part.tiles, part.values.transpose(0, 1).cpu().numpy())
                     self._tiles.write(part.tiles, part.values)
                     contradictions += part.contradictions
-        except BaseException:
+        except BaseException as error:
             self._tiles.forget()
-            raise
-        self._time = time
+            if self._store is None or self._store.attributes.get("num_commits") != attributes["num_commits"]:
+                raise
+            self._interrupted = error  # after the commit: raised once memory has followed
+        self._time, self._num_commits = time, attributes["num_commits"]
         return contradictions
+
+    def _raise_interrupted(self) -> None:
+        """Raise what interrupted a merge that was committed."""
+        if self._interrupted is not None:
+            error, self._interrupted = self._interrupted, None
+            raise error
 
     # Keyframes ------------------------------------------------------------------------------------------------------
 
@@ -373,6 +391,7 @@ class SiteMap(ReadableSite):
             parts = (part._replace(contradictions=part.contradictions.sum()[None]) for part in parts)
             self._write(parts if self._store else list(parts), self._time, 1, arrays)
             log.replace(after)
+            self._raise_interrupted()
 
     def _require_keyframes(self) -> KeyframeLog:
         hint = "make it with SiteMap(..., keyframes=True)"
@@ -389,22 +408,23 @@ class SiteMap(ReadableSite):
         chosen = chosen.to(device)
         if T_map_base is not None:
             state = center_on(state, emap, T_map_base.to(device), chosen)
-        windows = read_windows(emap, state, self._time, told)
-        offset = torch.zeros(emap.num_envs, device=device) if told is None else told.alignment.offset
-        grid = emap.cfg.grid
-        areas = self.windows(state.corner, grid.height, grid.width, Remembered._fields)
-        after = fill(state, emap, areas, offset, chosen)
-        _told.setdefault(emap, {})[self._id] = remember_given(emap, windows, after, told, chosen, self._time)
+        told = nothing_told(emap, state) if told is None else told
+        told = move_told(told, state.corner, self._time, self.resolution)
+        known = self._read_chosen(state, chosen)
+        after = fill(state, emap, known, told.alignment, chosen, self.resolution)
+        _told.setdefault(emap, {})[self._id] = remember_given(told, state, after, self._clock.rate, chosen)
         return map_layers(lambda value: value.to(emap.device), after)
 
-    @contextmanager
-    def _transaction(self, attributes: dict[str, Any], arrays: Arrays | None) -> Iterator[Callable[..., None]]:
-        """Yield what writes tiles to disk; in memory alone, nothing does."""
-        with shared_transaction(self._ranks, self._store, attributes, arrays) as write:
-            yield write
+    def _read_chosen(self, state: MapState, chosen: Bool[Tensor, "B"]) -> Remembered:
+        """Return what the site knows of the windows of the chosen environments, NaN of others."""
+        ids, size = chosen.nonzero()[:, 0], state.elevation.shape[1:]
+        areas = self.windows(state.corner[ids], size[0], size[1], Remembered._fields) if len(ids) else {}
+        unknown = torch.full(state.elevation.shape, torch.nan, device=chosen.device)
+        return Remembered(*(unknown.index_copy(0, ids, areas[n]) if areas else unknown for n in Remembered._fields))
 
     def _attributes(self, time: float, new_merges: int) -> dict[str, Any]:
         own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}
+        own["num_commits"] = self._num_commits + 1
         merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
         return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
@@ -412,7 +432,7 @@ class SiteMap(ReadableSite):
         if self._store is not None and "id" in self._store.attributes:
             stored = self._store.attributes
             self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
-            self._opened = self._time
+            self._opened, self._num_commits = self._time, stored["num_commits"]
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
             merges = stored.get("keyframe_merges")
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)

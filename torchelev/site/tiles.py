@@ -152,12 +152,13 @@ class Tiles:
                 self._slots.move_to_end(tile)
         if absent:
             self._make_room(len(absent), len(tiles))
-            slots = [self._free.pop() for _ in absent]
-            self._slots.update(zip(absent, slots, strict=True))
-            if not overwritten:
+            slots = self._free[-len(absent) :]
+            if not overwritten:  # first, as reading may fail
                 for start in range(0, len(absent), _GROUP):
                     some = slice(start, start + _GROUP)
                     self.values[:, slots[some]] = self._load(absent[some])
+            del self._free[-len(absent) :]
+            self._slots.update(zip(absent, slots, strict=True))
         return torch.tensor([self._slots[tile] for tile in tiles], dtype=torch.int64, device=self.device)
 
     def _load(self, tiles: list[Tile]) -> Tensor:

@@ -56,9 +56,17 @@ def align(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteCon
     overlap = count + count.T >= cfg.min_overlap
     pairs = Pairs(*(value[overlap[pairs.first, pairs.second]] for value in pairs))
     groups = find_groups(overlap)
-    unknowns = _solve(pairs, groups, 3 if with_tilt else 1)
+    unknowns = _solve(pairs, groups, _known_offsets(windows), 3 if with_tilt else 1)
     tilt = unknowns[:, 1:] if with_tilt else unknowns.new_zeros(B, 2)
     return Alignment(unknowns[:, 0], tilt, ~overlap[:B].any(1))
+
+
+def _known_offsets(windows: Windows) -> Float[Tensor, "B"]:
+    """Return the offsets of the last merge [m], NaN of windows that have told nothing."""
+    told = windows.told
+    if told is None:
+        return torch.full(windows.known.now.shape, torch.nan, dtype=torch.float64, device=windows.known.now.device)
+    return torch.where(told.known.is_known.flatten(1).any(1), told.alignment.offset, torch.nan)
 
 
 def find_pairs(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteConfig) -> Pairs:
@@ -87,7 +95,9 @@ def _comparable(windows: Windows, cfg: SiteConfig) -> tuple[Tensor, ...]:
     """Return window, cell numbers x and y, height [m] and variance [m^2] of flat and certain cells, (K,) each."""
     known, corner = windows.known, windows.known.corner
     H, W = known.elevation.shape[1:]
-    stride = max(1, math.ceil(math.sqrt(known.elevation.numel() / cfg.max_compared)))
+    stride = math.ceil(math.sqrt(known.elevation.numel() / cfg.max_compared))
+    # Of many windows, each keeps enough cells that overlaps are found.
+    stride = max(1, min(stride, math.isqrt(H * W // (16 * cfg.min_overlap))))
     on_lattice = [
         (torch.arange(size, device=corner.device) + corner[:, axis, None]) % stride == 0
         for axis, size in enumerate((H, W))
@@ -115,8 +125,11 @@ def find_groups(overlap: Bool[Tensor, "N N"]) -> Int[Tensor, "N"]:
         lowest = near
 
 
-def _solve(pairs: Pairs, groups: Int[Tensor, "N"], size: int) -> Float[Tensor, "B size"]:
-    """Return the offsets and tilts by iteratively reweighted least squares, float64."""
+def _solve(pairs: Pairs, groups: Int[Tensor, "N"], before: Float[Tensor, "B"], size: int) -> Float[Tensor, "B size"]:
+    """Return the offsets and tilts by iteratively reweighted least squares, float64.
+
+    The mean offset of a group that the site does not fix stays what it was `before`, or is 0.
+    """
     N = len(groups)
     edges, edge = torch.unique(pairs.first * N + pairs.second, return_inverse=True)
     ends = torch.stack([edges // N, edges % N], 1)
@@ -125,7 +138,7 @@ def _solve(pairs: Pairs, groups: Int[Tensor, "N"], size: int) -> Float[Tensor, "
     ]
     unknowns, scale = pairs.difference.new_zeros(N, size), _WIDEST
     for _ in range(_ROUNDS if len(edges) else 0):
-        before = unknowns
+        last = unknowns
         terms = (_to_columns(size, ends.device) @ (unknowns[ends].flatten(1, 2)[..., None]))[..., 0].T  # per edge
         residual = pairs.difference - sum(column * term[edge] for column, term in zip(columns, terms, strict=True))
         noise = 1.4826 * float(residual.abs().median())
@@ -133,10 +146,12 @@ def _solve(pairs: Pairs, groups: Int[Tensor, "N"], size: int) -> Float[Tensor, "
         variance = pairs.variance.clamp(min=noise**2)
         weight = (1 + residual.square() / (9 * variance.clamp(min=scale**2))).square().reciprocal() / variance
         unknowns = _solve_normal_equations(
-            _sum_moments(weight, columns, pairs.difference, edge, len(edges)), ends, groups, size
+            _sum_moments(weight, columns, pairs.difference, edge, len(edges)), ends, groups, before, size
         )
-        if scale == noise and (unknowns - before).abs().max() < _CONVERGED:
+        if scale == noise and (unknowns - last).abs().max() < _CONVERGED:
             break
+    if not len(edges):
+        unknowns[:-1, 0] = before.nan_to_num(nan=0.0)
     return unknowns[:-1]
 
 
@@ -165,7 +180,9 @@ def _sum_moments(
     return total
 
 
-def _solve_normal_equations(total: Tensor, ends: Tensor, groups: Tensor, size: int) -> Float[Tensor, "N size"]:
+def _solve_normal_equations(
+    total: Tensor, ends: Tensor, groups: Tensor, before: Tensor, size: int
+) -> Float[Tensor, "N size"]:
     """Solve for all windows, given the moments of each edge's pairs."""
     N, factors = len(groups), _to_columns(size, groups.device)
     blocks = factors.T @ total[..., :-1] @ factors
@@ -175,10 +192,18 @@ def _solve_normal_equations(total: Tensor, ends: Tensor, groups: Tensor, size: i
     right = (total[..., -1] @ factors).view(-1, size)
     b = total.new_zeros(N, size).index_add_(0, ends.flatten(), right)
     A.diagonal(dim1=2, dim2=3)[range(N), range(N), 1:] += _TILT_STD**-2
-    of_site = groups == groups[-1]
-    is_same = (groups[:, None] == groups) & ~of_site  # the mean offset of a group without the site is 0
-    A[:, :, 0, 0] += is_same
+    gauge = _find_gauge(groups, before)
+    A[:, :, 0, 0] += gauge.T @ gauge
+    b[:, 0] += gauge.T @ (gauge[:, :-1] @ before.nan_to_num(nan=0.0))
     A[-1], A[:, -1], b[-1] = 0.0, 0.0, 0.0
     A[-1, -1] = torch.eye(size, device=A.device)
     L = torch.linalg.cholesky(A.transpose(1, 2).reshape(N * size, N * size))
     return torch.cholesky_solve(b.view(-1, 1), L).view(N, size)
+
+
+def _find_gauge(groups: Int[Tensor, "N"], before: Float[Tensor, "B"]) -> Float[Tensor, "N N"]:
+    """Return for each group without the site the windows whose mean offset is fixed: those with one before, or all."""
+    member = groups == torch.arange(len(groups), device=groups.device)[:, None]
+    member[groups[-1]] = False
+    had = member & torch.cat([before.isfinite(), before.new_zeros(1, dtype=torch.bool)])
+    return torch.where(had.any(1, keepdim=True), had, member).double()

@@ -57,7 +57,8 @@ def merge_windows(
         contradictions = torch.bincount(robot[is_contradicted], minlength=len(alignment.offset))
         return Merged(pieces.tiles, values, contradictions)
 
-    return map_in_order(fuse_group, ((group, tiles.read(group.tiles)) for group in groups))
+    work = ((group, tiles.read(group.tiles)) for group in groups)
+    return map_in_order(fuse_group, work) if tiles.device.type == "cpu" else map(fuse_group, work)
 
 
 def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:

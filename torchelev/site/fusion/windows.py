@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.layers import absolute_variance
+from torchelev.ops.moving import move_layers
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | N
     known = Known(state.corner, state.elevation, variance, state.time, is_known, now * per_robot, rate * per_robot)
     surface = state.gradient_x, state.gradient_y, state.has_normal
     bound = state.upper_bound, state.bounded & ~state.validity
-    return Windows(known, *surface, *bound, is_known & _measured_since(state, told), told)
+    return Windows(known, *surface, *bound, _find_new(state, known, told), told)
 
 
 def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
@@ -101,9 +102,9 @@ def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
     return absolute_variance(state._replace(pose_covariance=covariance))
 
 
-def drop_reset(told: Told, num_resets: Int[Tensor, "B"]) -> Told:
-    """Drop what environments told before they were reset: all that they know now is new."""
-    was_reset = told.num_resets != num_resets
+def drop_reset(told: Told, num_resets: Int[Tensor, "B"], elapsed: Int[Tensor, "B"]) -> Told:
+    """Drop what environments told before they were reset, or loaded an earlier state: all that they know now is new."""
+    was_reset = (told.num_resets != num_resets) | (elapsed < told.elapsed)
     if not was_reset.any():
         return told
     known = told.known._replace(is_known=told.known.is_known & ~was_reset[:, None, None])
@@ -114,13 +115,29 @@ def drop_reset(told: Told, num_resets: Int[Tensor, "B"]) -> Told:
     return Told(known, alignment, elapsed, num_resets.clone(), told.keyframe)
 
 
-def _measured_since(state: MapState, told: Told | None) -> Bool[Tensor, "B H W"]:
-    """Tell which cells were measured since the last merge, or are not part of what was told then."""
+def _find_new(state: MapState, known: Known, told: Told | None) -> Bool[Tensor, "B H W"]:
+    """Tell which known cells are not what was told before: measured since, or not part of it.
+
+    What `initialize_from` gave may be younger than the last merge; it is told, and stays the same to the bit.
+    """
     if told is None:
-        return torch.ones_like(state.validity)
+        return known.is_known
     since = ((state.elapsed - told.elapsed).double() * _NANOSECONDS)[:, None, None]
     # Ages are sums in float32, whose rounding must not make an old measurement new.
-    return state.time < since * (1 - 1e-4) - 1e-6
+    is_younger = state.time < since * (1 - 1e-4) - 1e-6
+    layers = move_known(told.known, state.corner)
+    has_changed = (known.elevation != layers.elevation) | (known.variance < layers.variance)
+    return known.is_known & (~layers.is_known | (is_younger & has_changed))
+
+
+def move_known(known: Known, corner: Int[Tensor, "B 2"]) -> Known:
+    """Return what windows know, of the windows at other corners."""
+    H, W = known.elevation.shape[1:]
+    shift = (corner - known.corner).clamp(-max(H, W), max(H, W))
+    if not shift.any():
+        return known
+    layers = {name: getattr(known, name) for name in ("elevation", "variance", "age", "is_known")}
+    return known._replace(corner=corner.clone(), **move_layers(layers, shift, {}))
 
 
 def snapshot(
