@@ -707,7 +707,7 @@ def fuse_site_cell(first, other, entries, rate, *, gate, max_gate_std, max_newer
     if not left and is_kept:
         return fused, other, False
     fused, left, is_kept = average_site_cell(first, entries, surest, **limits)
-    rest = [{**e, "told": None} for e in left] + ([] if is_kept else [{**first, "relief": 0.0, "told": None}])
+    rest = left + ([] if is_kept else [{**first, "relief": 0.0, "told": None}])
     second, _, _ = average_site_cell(other, rest, surest, **limits, among_entries=True)
     is_new = len(left) < len(entries), bool(left)
     if second and replaces(second, fused, is_new, rate, max_newer_ratio):

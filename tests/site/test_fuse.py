@@ -51,9 +51,10 @@ def test_every_cell_is_that_of_the_reference(seed):
         cell = []
         for _ in range(rng.integers(0, 5)):
             e = {**draw_height(rng, levels), "relief": rng.choice([0.0, 1e-5, 1e-3]), "told": None}
-            if first[-1] and rng.random() < 0.5:
-                told = {**draw_height(rng, [first[-1]["h"]]), "t": min(e["t"], first[-1]["t"])}
-                told["v"] = max(told["v"], 1.2 * first[-1]["v"])
+            source = other[-1] if other[-1] and rng.random() < 0.4 else first[-1]
+            if source and rng.random() < 0.5:
+                told = {**draw_height(rng, [source["h"]]), "t": min(e["t"], source["t"])}
+                told["v"] = max(told["v"], 1.2 * source["v"])
                 e["told"] = told
             cell.append(e)
         cells.append(cell)
@@ -128,6 +129,12 @@ def test_what_was_told_before_counts_once():
     assert float(better.first.elevation) == pytest.approx(0.11) and float(better.first.variance) == pytest.approx(
         2.5e-5
     )
+
+
+def test_what_contradicts_the_elevation_counts_once_too():
+    site, other = dict(h=0.0, v=1e-6, t=5.0), dict(h=0.5, v=1e-4, t=5.0)
+    fused = run([site], [other], [[entry(0.5, v=9e-5, t=5.0, told=other)]], rate=0.0)
+    assert float(fused.other.variance) == pytest.approx(9e-5) and float(fused.first.variance) == pytest.approx(1e-6)
 
 
 def test_what_others_told_stays():

@@ -114,6 +114,39 @@ def test_a_full_disk_loses_nothing_and_the_next_merge_makes_up_for_it(path, monk
     assert after == everything(dense)
 
 
+def test_new_sites_that_were_opened_again_are_told_apart(tmp_path):
+    emap, names = robots(CORNERS), ("a", "b")
+    for name in names:
+        SiteMap(0.1, tmp_path / name).close()
+    sites = [SiteMap.open(tmp_path / name) for name in names]
+    for site in sites:
+        assert int(site.merge(emap).new_cells.sum()) == 4 * 40 * 36
+        site.close()
+
+
+@pytest.mark.parametrize("keyframes", [False, True])
+def test_a_merge_that_is_interrupted_after_its_commit_counts_once(path, monkeypatch, keyframes):
+    emap = robots(CORNERS[:1])
+    T = torch.eye(4, dtype=torch.float64)[None]
+    with SiteMap(0.1, path, keyframes=keyframes) as site:
+        site.merge(emap, T_map_base=T)
+        fill(emap, CORNERS[:1], std=0.005)
+        emap.state.elapsed.add_(10**9)
+
+        def interrupt(folder):
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(store_module, "finish", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                site.merge(emap, T_map_base=T)
+        assert site.time == pytest.approx(1.0)
+        assert int(site.merge(emap, T_map_base=T).new_cells) == 0
+        assert max(known_cells(site, "variance").values()) == pytest.approx(0.25e-4, rel=0.01)
+        if keyframes:
+            assert len(site.keyframes.ids) == 3
+
+
 WRITER = """
 import sys, torch
 from tests.site.helpers import fill, robots

@@ -13,6 +13,7 @@ from tests.helpers import nans, off_borders, pose, seen_from, small_map
 from tests.site.helpers import fill, ground, known_cells, limits, live, robots
 from torchelev import ElevationMap
 from torchelev.site import SiteConfig, SiteMap
+from torchelev.site.tiles import Tiles
 
 
 def dense_means(emap):
@@ -312,3 +313,91 @@ def test_maps_of_half_precision_merge_as_precisely_as_they_are():
     torch.testing.assert_close(*offsets, atol=2e-3, rtol=0.0)
     a, b = (known_cells(site) for site in sites)
     assert a == pytest.approx(b, abs=5e-3)
+
+
+# What a review found --------------------------------------------------------------------------------------------------
+
+
+def test_a_read_that_fails_leaves_no_garbage_in_the_cache():
+    class Broken:
+        tiles = frozenset([(0, 0)])
+
+        def read(self, tiles):
+            raise OSError("damaged")
+
+    cache = Tiles(Broken(), 4, "cpu")
+    for _ in range(2):
+        with pytest.raises(OSError, match="damaged"):
+            cache.read([(0, 0)])
+
+
+def test_given_cells_are_not_new_and_do_not_contradict_a_site_that_has_changed():
+    site, first = SiteMap(0.1), robots([(0, 0)], std=0.003)
+    site.merge(first)
+    newcomer = small_map(1, (20, 20))
+    newcomer.initialize_from(site, pose((2.0, 1.8, 0.5)))
+    box = robots([(0, 0)], std=0.003, offsets=[0.5])
+    site.merge(box, align=False)
+    report = site.merge(newcomer, align=False)
+    assert not report.new_cells.any() and not report.contradictions.any()
+    value, _ = site.sample([[1.55, 1.55]], mode="nearest")
+    assert float(value) == pytest.approx(float(box.elevation[0, 15, 15]), abs=1e-5)
+
+
+def test_measured_cells_that_are_not_merged_yet_still_count_once_after_initialize_from():
+    sites, maps = [SiteMap(0.1), SiteMap(0.1)], [robots([(0, 0)], cells=(20, 20)) for _ in range(2)]
+    for k, (site, emap) in enumerate(zip(sites, maps, strict=True)):
+        site.merge(emap, align=False)
+        emap.state.elapsed.add_(10**9)
+        emap.state.variance.mul_(0.5)
+        emap.state.elevation.add_(1e-3)
+        if k:
+            emap.initialize_from(site)
+        site.merge(emap, align=False)
+    assert known_cells(sites[0], "variance") == pytest.approx(known_cells(sites[1], "variance"))
+    assert limits(sites[1], "variance") == pytest.approx([0.5e-4, 0.5e-4])
+
+
+def test_a_robot_keeps_its_offset_where_it_shares_no_ground():
+    site = SiteMap(0.1)
+    site.merge(robots([(0, 0)]))
+    emap = robots([(10, 0)], offsets=[0.5])
+    site.merge(emap)
+    fill(emap, [(1000, 0)], offsets=[0.5])
+    emap.state.elapsed.add_(10**9)
+    report = site.merge(emap)
+    assert bool(report.is_isolated) and float(report.offsets) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_many_windows_are_aligned_too():
+    corners = [(12 * (k % 50), 12 * (k // 50)) for k in range(2000)]
+    offsets = torch.linspace(-0.2, 0.2, 2000)
+    report = SiteMap(0.1).merge(robots(corners, cells=(24, 24), offsets=offsets))
+    assert not report.is_isolated.any()
+    error = report.offsets - offsets
+    assert float((error - error.mean()).abs().max()) < 2e-3
+
+
+def test_a_map_that_loads_an_earlier_state_is_merged_on():
+    site, emap = SiteMap(0.1), robots([(0, 0)])
+    early = {name: value.clone() for name, value in emap.state_dict().items() if name != "_extra_state"}
+    emap.state.elapsed.add_(10**9)
+    site.merge(emap)
+    emap.load_state_dict({**early, "_extra_state": emap.get_extra_state()})
+    fill(emap, [(100, 0)])
+    assert int(site.merge(emap).new_cells) == 40 * 36
+
+
+def test_the_clocks_of_several_maps_do_not_add_up():
+    site, maps = SiteMap(0.1), [robots([(0, 0)]), robots([(10, 0)])]
+    for _ in range(10):
+        for emap in maps:
+            live(emap, 1.0)
+            site.merge(emap)
+    assert site.time == pytest.approx(10.0)
+
+
+def test_a_point_absurdly_far_away_does_not_spoil_the_others():
+    site = SiteMap(0.1)
+    site.merge(robots([(0, 0)]))
+    assert site.sample(torch.tensor([[1e18, 0.0], [1.0, 1.0]], dtype=torch.float64))[1].tolist() == [False, True]

@@ -105,7 +105,9 @@ def _resolve(first: Heights, other: Heights, entries: Entries, rate: float, cfg:
     rest, site = entries.select((~agrees).nonzero()[:, 0], same), first.at(lost)
     heights = Heights(*(torch.cat(pair) for pair in zip(rest.heights, site, strict=True)))
     relief = torch.cat([rest.relief, torch.zeros_like(site.time)])
-    rest_of_all = Entries(torch.cat([rest.cell, lost]), heights, relief, None)
+    nothing = Heights(*[torch.full_like(site.time, torch.nan)] * 3)
+    told = None if rest.told is None else Heights(*(torch.cat(pair) for pair in zip(rest.told, nothing, strict=True)))
+    rest_of_all = Entries(torch.cat([rest.cell, lost]), heights, relief, told)
     second, _, _ = _average_near_surest(other, rest_of_all, rate, cfg, among_entries=True)
     nowhere, ours = torch.zeros_like(is_kept), entries.cell[agrees]
     holds_new = nowhere.index_fill(0, ours, True), nowhere.index_fill(0, rest.cell, True)
