@@ -40,7 +40,6 @@ def drive(site, cell_shifts=None, rises=None, heights=ground, merges=NUM_MERGES,
         state = emap.state
         state.bounded.copy_(~state.validity & (state.elevation == 0))
         state.upper_bound.copy_(rise[:, None, None] + 0.7 + 0.1 * k)
-        state.time[:, :10].fill_(5.0)  # old: the last merge told it
         if k == 2:
             state.elevation[1, 5:15, 20:30] += 0.4  # contradicts the others
         emap.corner.copy_(torch.from_numpy(corners + shift))
