@@ -104,14 +104,18 @@ class SiteMap(ReadableSite):
         self._store = (
             None if path is None else open_shared(self._ranks, "SiteMap", partial(_open, path, self.resolution))
         )
+        self._keyframes = KeyframeLog(self._store) if keyframes else None
+        self._begin(device)
+        self._check_keyframes(keyframes)
+        self._agree_on_id()
+
+    def _begin(self, device: torch.device | str) -> None:
+        """Start with what is stored, or with nothing."""
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._num_commits, self._interrupted = 0, None
-        self._keyframes = KeyframeLog(self._store) if keyframes else None
         self._read_attributes()
-        self._check_keyframes(keyframes)
-        self._agree_on_id()
 
     def _check_keyframes(self, wanted: bool) -> None:
         """Raise ValueError unless the site can keep keyframes as wanted."""
@@ -161,7 +165,8 @@ class SiteMap(ReadableSite):
 
         Raises:
             FileNotFoundError: there is nothing.
-            ValueError: it is no site, is damaged, or of a newer version, or another process writes to it.
+            ValueError: it is no site, is damaged, or of a newer version.
+            OSError: another process writes to it.
         """
         from torchelev.site.storage.store import TileStore
 
@@ -170,12 +175,8 @@ class SiteMap(ReadableSite):
         site._store = TileStore.open(path, read_only=read_only)
         site.resolution = float(site._store.attributes["resolution"])
         site.cfg = checks.given_or_default(SiteConfig, cfg)
-        site._tiles = Tiles(site._store, site.cfg.cache_tiles, device)
-        site._id, site._rate = uuid.uuid4().hex, site.cfg.variance_rate
-        site._epoch = site._time = site._opened = 0.0
-        site._num_commits, site._interrupted = 0, None
         site._keyframes = None
-        site._read_attributes()
+        site._begin(device)
         return site
 
     # Merging --------------------------------------------------------------------------------------------------------

@@ -40,8 +40,8 @@ def align(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteCon
     """Find the offsets by robust least squares over all pairs of overlapping windows, and of windows and the site.
 
     Minimises the sum of rho((h_a - o_a) - (h_b - o_b)) over the cells that are flat and certain in both, with o = 0 for
-    the site. Windows that overlap each other but not the site get offsets whose mean is 0. rho is that of Geman and
-    McClure, made narrower from round to round, so that moved objects do not count.
+    the site. Windows that overlap each other but not the site keep the mean of their last offsets, or 0. rho is that
+    of Geman and McClure, made narrower from round to round, so that moved objects do not count.
 
     Args:
         windows: B windows.

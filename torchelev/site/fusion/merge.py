@@ -27,7 +27,7 @@ class MergeReport(NamedTuple):
 
     offsets: Float[Tensor, "B"]  #: [m] how much the robot's heights lie above the site's; subtracted before fusing
     tilts: Float[Tensor, "B 2"]  #: rise over run along x and y; subtracted, too
-    is_isolated: Bool[Tensor, "B"]  #: overlaps nothing on flat, certain ground: its heights are taken as they are
+    is_isolated: Bool[Tensor, "B"]  #: overlaps nothing on flat, certain ground: it keeps its last offset, or 0
     new_cells: Int[Tensor, "B"]  #: measured since its last merge
     contradictions: Int[Tensor, "B"]  #: of these, cells whose height contradicts another one: kept apart
 

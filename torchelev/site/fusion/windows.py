@@ -25,7 +25,7 @@ class Alignment(NamedTuple):
 
     offset: Float[Tensor, "B"]  #: [m]
     tilt: Float[Tensor, "B 2"]  #: rise over run along x and y
-    is_isolated: Bool[Tensor, "B"]  #: overlaps no other window and not the site; its offset is 0
+    is_isolated: Bool[Tensor, "B"]  #: overlaps no other window and not the site; its offset is its last one, or 0
 
 
 def no_alignment(num_windows: int, device: torch.device) -> Alignment:
