@@ -309,3 +309,20 @@ def test_bad_arguments_are_refused_by_name(tmp_path):
         begun.merge(emap)
     with pytest.raises(ValueError, match="keyframes: must be kept from the first merge on"):
         SiteMap(0.1, tmp_path / "b", keyframes=True)
+
+
+def test_a_robot_that_was_reset_and_given_the_corrected_site_does_not_spoil_it(site):
+    emap = fill(small_map(1, CELLS), [(0, 0)])
+    site.merge(emap, T_map_base=at([(0, 0)]))
+    site.move_keyframes(site.keyframes.ids, at([(10, 0)]))
+    emap.reset()
+    emap.initialize_from(site, at([(10, 0)]))
+    before = known_cells(site)
+    emap.state.elapsed.add_(10**9)
+    known = emap.state.validity
+    emap.state.variance.copy_(torch.where(known, 0.5 * emap.state.variance, 1.0))  # measured again, at the same heights
+    emap.state.elevation.add_(1e-5 * known)
+    emap.state.time.zero_()
+    site.merge(emap, T_map_base=at([(10, 0)]))
+    after = known_cells(site)
+    assert before.keys() == after.keys() and max(abs(after[c] - before[c]) for c in before) < 1e-4

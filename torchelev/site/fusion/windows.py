@@ -112,7 +112,8 @@ def drop_reset(told: Told, num_resets: Int[Tensor, "B"], elapsed: Int[Tensor, "B
     offset, tilt = torch.where(was_reset, 0.0, offset), torch.where(was_reset[:, None], 0.0, tilt)
     elapsed = torch.where(was_reset, BEFORE_ALL, told.elapsed)
     alignment = Alignment(offset, tilt, is_isolated)
-    return Told(known, alignment, elapsed, num_resets.clone(), told.keyframe)
+    keyframe = torch.where(was_reset, -1, told.keyframe)
+    return Told(known, alignment, elapsed, num_resets.clone(), keyframe)
 
 
 def _find_new(state: MapState, known: Known, told: Told | None) -> Bool[Tensor, "B H W"]:
