@@ -401,3 +401,17 @@ def test_a_point_absurdly_far_away_does_not_spoil_the_others():
     site = SiteMap(0.1)
     site.merge(robots([(0, 0)]))
     assert site.sample(torch.tensor([[1e18, 0.0], [1.0, 1.0]], dtype=torch.float64))[1].tolist() == [False, True]
+
+
+def test_what_was_given_without_a_pose_stays_where_it_was_as_the_window_moves():
+    site = SiteMap(0.1)
+    site.merge(robots([(-30, -30)], cells=(60, 60)))
+    before = known_cells(site, "variance")
+    emap = small_map(1, (20, 20))
+    emap.initialize_from(site)
+    moved = pose((0.7, 0.4, 0.5))
+    emap.update(nans(1), moved, moved, dt=1.0)
+    report = site.merge(emap)
+    assert not report.new_cells.any()
+    aged = {cell: value + emap.cfg.aging.variance_rate for cell, value in before.items()}
+    assert known_cells(site, "variance") == pytest.approx(aged, rel=1e-4)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.windows import BEFORE_ALL, Alignment, Known, Told, move_known, no_alignment
+from torchelev.site.fusion.windows import Alignment, Told, move_known
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter import follow
 from torchelev.state import MapState
@@ -27,16 +27,6 @@ def center_on(state: MapState, emap: ElevationMap, T_map_base: Float[Tensor, "B 
     near = torch.cat([position[:, :2] - anchor * emap.cfg.grid.resolution, position[:, 2:]], 1)
     near = torch.where(chosen[:, None], near, torch.nan).to(state.elevation.dtype)
     return follow(state, near, anchor.long(), emap.cfg.grid)
-
-
-def nothing_told(emap: ElevationMap, state: MapState) -> Told:
-    """Return that the environments have told nothing."""
-    zero = torch.zeros_like(state.elapsed)
-    time = zero.double()
-    blank = torch.zeros_like(state.elevation)
-    known = Known(state.corner, blank, blank, blank, torch.zeros_like(state.validity), time, time)
-    num_resets = emap.num_resets.to(zero.device, copy=True)
-    return Told(known, no_alignment(len(zero), zero.device), zero + BEFORE_ALL, num_resets, zero - 1)
 
 
 def move_told(told: Told, corner: Int[Tensor, "B 2"], now: float, resolution: float) -> Told:

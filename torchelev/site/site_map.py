@@ -22,8 +22,18 @@ from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.align import align
 from torchelev.site.fusion.merge import Merged, MergeReport, merge_windows
-from torchelev.site.fusion.windows import Alignment, Told, Windows, drop_reset, no_alignment, read_windows, snapshot
-from torchelev.site.give import center_on, fill, move_told, nothing_told, remember_given
+from torchelev.site.fusion.windows import (
+    Alignment,
+    Told,
+    Windows,
+    drop_reset,
+    no_alignment,
+    nothing_told,
+    read_known,
+    read_windows,
+    snapshot,
+)
+from torchelev.site.give import center_on, fill, move_told, remember_given
 from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
@@ -409,7 +419,8 @@ class SiteMap(ReadableSite):
         chosen = chosen.to(device)
         if T_map_base is not None:
             state = center_on(state, emap, T_map_base.to(device), chosen)
-        told = nothing_told(emap, state) if told is None else told
+        if told is None:
+            told = nothing_told(read_known(emap, state, self._time), emap.num_resets.to(device))
         told = move_told(told, state.corner, self._time, self.resolution)
         known = self._read_chosen(state, chosen)
         after = fill(state, emap, known, told.alignment, chosen, self.resolution)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
 _NANOSECONDS = 1e-9
-BEFORE_ALL = -(10**18)  # [ns] on a map's clock
+BEFORE_ALL = -(10**18)  # [ns] earlier than anything on a map's clock
 
 
 class Alignment(NamedTuple):
@@ -69,10 +69,28 @@ class Told(NamedTuple):
     keyframe: Int[Tensor, "B"]  #: id of that merge's keyframe; -1: none was kept
 
 
-def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | None) -> Windows:
-    """Read a map's windows, which share memory with it.
+def nothing_told(known: Known, num_resets: Int[Tensor, "B"]) -> Told:
+    """Return that B maps, which know this and were reset so often, have told nothing; shares no memory with them."""
+    blank = Known(*(value.clone() for value in known))._replace(is_known=torch.zeros_like(known.is_known))
+    never = torch.full_like(num_resets, BEFORE_ALL)
+    alignment = no_alignment(len(never), never.device)
+    return Told(blank, alignment, never, num_resets.clone(), torch.full_like(never, -1))
+
+
+def read_known(emap: ElevationMap, state: MapState, now: float) -> Known:
+    """Return what a map's windows know, which shares memory with it; arguments as of `read_windows`.
 
     Cells whose variance has grown to the map's maximum hold no information, nor do those that feet initialised.
+    """
+    variance = sideways_variance(state)
+    is_known = state.validity & (variance < emap.cfg.fusion.max_variance)
+    per_robot = torch.ones(emap.num_envs, dtype=torch.float64, device=state.corner.device)
+    rate = emap.cfg.aging.variance_rate
+    return Known(state.corner, state.elevation, variance, state.time, is_known, now * per_robot, rate * per_robot)
+
+
+def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | None) -> Windows:
+    """Read a map's windows, which share memory with it.
 
     Args:
         emap: the map.
@@ -80,11 +98,7 @@ def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | N
         now: the site's time [s].
         told: what the map told the site before.
     """
-    variance = sideways_variance(state)
-    is_known = state.validity & (variance < emap.cfg.fusion.max_variance)
-    per_robot = torch.ones(emap.num_envs, dtype=torch.float64, device=state.corner.device)
-    rate = emap.cfg.aging.variance_rate
-    known = Known(state.corner, state.elevation, variance, state.time, is_known, now * per_robot, rate * per_robot)
+    known = read_known(emap, state, now)
     surface = state.gradient_x, state.gradient_y, state.has_normal
     bound = state.upper_bound, state.bounded & ~state.validity
     return Windows(known, *surface, *bound, _find_new(state, known, told), told)
@@ -119,7 +133,7 @@ def drop_reset(told: Told, num_resets: Int[Tensor, "B"], elapsed: Int[Tensor, "B
 def _find_new(state: MapState, known: Known, told: Told | None) -> Bool[Tensor, "B H W"]:
     """Tell which known cells are not what was told before: measured since, or not part of it.
 
-    What `initialize_from` gave may be younger than the last merge; it is told, and stays the same to the bit.
+    What `initialize_from` gave may be younger than the last merge, but nobody has measured it: no bit of it changes.
     """
     if told is None:
         return known.is_known

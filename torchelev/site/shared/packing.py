@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.windows import Known, Told, Windows, no_alignment
+from torchelev.site.fusion.windows import Known, Told, Windows, no_alignment, nothing_told
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, UInt8
@@ -63,7 +63,7 @@ def _values(windows: Windows, with_told: bool) -> list[Tensor]:
     surface = windows.gradient_x, windows.gradient_y, windows.has_normal, windows.is_bounded, windows.is_new
     values = [*_of_known(known._replace(elevation=height)), *surface]
     if with_told:
-        told = windows.told or _nothing(known)
+        told = windows.told or nothing_told(known, torch.zeros_like(known.corner[:, 0]))
         values += [*_of_known(told.known), told.alignment.offset, told.alignment.tilt]
     return values
 
@@ -82,13 +82,6 @@ def _told(values: list[Tensor]) -> Told:
     known, zero = _known(values[:7]), values[0].new_zeros(len(values[0]))
     alignment = no_alignment(len(zero), zero.device)._replace(offset=values[7], tilt=values[8])
     return Told(known, alignment, zero, zero, zero - 1)
-
-
-def _nothing(known: Known) -> Told:
-    """Return what robots have told that told nothing."""
-    zero = torch.zeros_like(known.corner[:, 0])
-    blank = known._replace(is_known=torch.zeros_like(known.is_known))
-    return Told(blank, no_alignment(len(zero), zero.device), zero, zero, zero - 1)
 
 
 def _width(dtype: torch.dtype, shape: tuple[int, ...]) -> int:
