@@ -101,18 +101,22 @@ def sample_layers(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: Gri
     return sampled
 
 
+def surrounding_cells(uv: Float[Tensor, "B M 2"], mode: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the whole numbers i, j of the K cells that points [cells] are read from, and their weights, (B, K, M)."""
+    u, v = uv.unbind(-1)
+    if mode == "nearest":
+        i, j = (torch.floor(w)[:, None] for w in (u, v))
+        return i, j, torch.ones_like(i)
+    low_i, low_j = torch.floor(u - 0.5), torch.floor(v - 0.5)
+    a, b = u - 0.5 - low_i, v - 0.5 - low_j
+    i, j = torch.stack([low_i, low_i, low_i + 1, low_i + 1], 1), torch.stack([low_j, low_j + 1] * 2, 1)
+    return i, j, torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], 1)
+
+
 def _find_corners(uv: Tensor, grid: GridConfig, mode: str) -> _Corners:
     finite = torch.isfinite(uv).all(-1, keepdim=True)
     far = min(1e6, torch.finfo(uv.dtype).max)
-    u, v = torch.where(finite, uv.clamp(-far, far), -far).unbind(-1)
-    if mode == "nearest":
-        i, j = (torch.floor(w)[:, None] for w in (u, v))
-        weight = torch.ones_like(i)
-    else:
-        low_i, low_j = torch.floor(u - 0.5), torch.floor(v - 0.5)
-        a, b = u - 0.5 - low_i, v - 0.5 - low_j
-        i, j = torch.stack([low_i, low_i, low_i + 1, low_i + 1], 1), torch.stack([low_j, low_j + 1] * 2, 1)
-        weight = torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], 1)
+    i, j, weight = surrounding_cells(torch.where(finite, uv.clamp(-far, far), -far), mode)
     inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
     cell = (i * grid.width + j).clamp(0, grid.num_cells - 1).to(torch.int64)
     return _Corners(cell.flatten(1), inside.flatten(1), weight)
@@ -128,6 +132,11 @@ def _average(values: Tensor, corners: _Corners) -> Layer:
     """Return the weighted mean over the known corners of each point, and where their weight suffices."""
     read = values.flatten(1).gather(1, corners.cell)
     corner = torch.where(corners.counts, read, 0.0).view_as(corners.weight)  # what is unknown must not reach gradients
-    total = corners.weight.sum(1)
+    return weighted_mean(corner, corners.weight)
+
+
+def weighted_mean(values: Float[Tensor, "B K M"], weight: Float[Tensor, "B K M"]) -> Layer:
+    """Return the weighted mean over K of finite values, and where their weight suffices: at least one half."""
+    total = weight.sum(1)
     valid = total >= 0.5
-    return (corners.weight * corner).sum(1) * valid / torch.where(valid, total, 1.0), valid
+    return (weight * values).sum(1) * valid / torch.where(valid, total, 1.0), valid

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.windows import Alignment, Told, move_known
+from torchelev.site.fusion.entries import rise
+from torchelev.site.fusion.windows import Told, move_known
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter import follow
 from torchelev.state import MapState
@@ -41,15 +42,13 @@ def move_told(told: Told, corner: Int[Tensor, "B 2"], now: float, resolution: fl
 
 
 def fill(
-    state: MapState, emap: ElevationMap, known: Remembered, alignment: Alignment, chosen: Tensor, resolution: float
+    state: MapState, emap: ElevationMap, known: Remembered, told: Told, chosen: Tensor, resolution: float
 ) -> MapState:
     """Fill the unknown cells of the chosen environments with what a site knows, raised by how they lie above it."""
-    B, H, W = state.elevation.shape
-    xy = torch.stack(torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij"), -1).to(chosen.device)
-    from_center = (xy + 0.5 - torch.tensor([H / 2, W / 2], device=chosen.device)) * resolution
-    rise = alignment.offset[:, None, None] + (alignment.tilt[:, None, None] * from_center).sum(-1)
-    rise = rise.to(known.elevation)
-    before = known._replace(elevation=known.elevation + rise, upper_bound=known.upper_bound + rise)
+    place = torch.arange(state.elevation.numel(), device=chosen.device)
+    robot = place // state.elevation[0].numel()
+    above = rise(told.known, told.alignment, robot, place, resolution).view_as(known.elevation)
+    before = known._replace(elevation=known.elevation + above, upper_bound=known.upper_bound + above)
     return recall(state, before, chosen, emap.cfg.fusion.max_variance, SUPPORT)
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.layers import surrounding_cells, weighted_mean
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
 
@@ -102,20 +103,10 @@ def sample_tiles(
         Values, 0 where not valid, and the mask of where they are.
     """
     finite = (cells.abs() < _FARTHEST).all(1)  # NaN is not
-    cells = torch.where(finite[:, None], cells, 0.0)
-    if mode == "nearest":
-        corners, weights = cells.floor().long()[:, None], torch.ones_like(cells[:, :1])
-    else:
-        low = (cells - 0.5).floor()
-        part = cells - 0.5 - low
-        steps = torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]], device=cells.device)
-        corners = low.long()[:, None] + steps
-        weights = torch.where(steps.bool(), part[:, None], 1 - part[:, None]).prod(2)
+    i, j, weight = surrounding_cells(torch.where(finite[:, None], cells, 0.0)[None], mode)
     sources = sources_of([name])
-    found = tiles.look_up(locate(*corners.view(-1, 2).unbind(1)), sources)
-    values = compute_layer(name, dict(zip(sources, found, strict=True)), clock).view(weights.shape)
-    weights = torch.where(values.isnan(), 0.0, weights)
-    total = weights.sum(1)
-    valid = finite & (total >= 0.5)
-    mean = (weights * values.nan_to_num(nan=0.0)).sum(1) / total.clamp(min=0.5)
-    return torch.where(valid, mean, 0.0).float(), valid
+    found = tiles.look_up(locate(i.flatten().long(), j.flatten().long()), sources)
+    values = compute_layer(name, dict(zip(sources, found, strict=True)), clock).view(weight.shape)
+    weight = torch.where(values.isnan() | ~finite, 0.0, weight)
+    mean, valid = weighted_mean(values.nan_to_num(nan=0.0), weight)
+    return mean[0].float(), valid[0]

@@ -255,11 +255,10 @@ class SiteMap(ReadableSite):
     def _recall_told(self, emap: ElevationMap) -> Told | None:
         """Return what a map has told since its last reset; None: nothing."""
         told = _told.get(emap, {}).get(self._id)
-        return (
-            None
-            if told is None
-            else drop_reset(told, emap.num_resets.to(told.elapsed.device), emap.state.elapsed.to(told.elapsed.device))
-        )
+        if told is None:
+            return None
+        device = told.elapsed.device
+        return drop_reset(told, emap.num_resets.to(device), emap.state.elapsed.to(device))
 
     def _bring(self, emap: ElevationMap) -> MapState:
         """Return a map's state on the site's device."""
@@ -423,7 +422,7 @@ class SiteMap(ReadableSite):
             told = nothing_told(read_known(emap, state, self._time), emap.num_resets.to(device))
         told = move_told(told, state.corner, self._time, self.resolution)
         known = self._read_chosen(state, chosen)
-        after = fill(state, emap, known, told.alignment, chosen, self.resolution)
+        after = fill(state, emap, known, told, chosen, self.resolution)
         _told.setdefault(emap, {})[self._id] = remember_given(told, state, after, self._clock.rate, chosen)
         return map_layers(lambda value: value.to(emap.device), after)
 
@@ -467,15 +466,9 @@ def _open(path: str | Path, resolution: float, read_only: bool) -> TileStore:
         return TileStore.create(path, layers=STORED, tile_size=TILE, attributes={"resolution": resolution})
     require(exists, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
     store = TileStore.open(path, read_only=read_only)
-    actual = float(store.attributes["resolution"])
-    if not math.isclose(actual, resolution, rel_tol=1e-9):
+    actual, hint = float(store.attributes["resolution"]), "give that resolution, or another path"
+    is_same = math.isclose(actual, resolution, rel_tol=1e-9)
+    if not is_same:
         store.close()
-    hint = "give that resolution, or another path"
-    require(
-        math.isclose(actual, resolution, rel_tol=1e-9),
-        "resolution",
-        f"must be {actual:g} m, that of {path}",
-        resolution,
-        hint,
-    )
+    require(is_same, "resolution", f"must be {actual:g} m, that of {path}", resolution, hint)
     return store
