@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +70,6 @@ def _features() -> str:
     return markdown_table(["feature", "figure", "on", "off", "baseline", "bar", ""], rows)
 
 
-def _changes() -> str:
-    """Tabulate how soon changes show."""
-    return changes.tables(load("changes"))
-
-
 def _real() -> str:
     """Tabulate the errors at held-out points on flat cells."""
     head = ["recording", "cell", "method", "median", "p90", "coverage", "ms / scan"]
@@ -100,64 +96,9 @@ def _speed() -> str:
     return f"{tables.report(load(SPEED))}\n\n{picture}"
 
 
-def _loop() -> str:
-    """Tabulate a 50 Hz loop, on an idle machine and beside a busy process."""
-    return loop.table(load("loop")["rows"])
-
-
 def _long_run() -> str:
     """Tabulate growth over long runs."""
     return growth.table({name: values for name, values in load("long_run").items() if name in long_run.CASES})
-
-
-def _live_view() -> str:
-    """Tabulate the rate of pictures, and how much the live view slows a loop down."""
-    return live_view.table(load("live_view"))
-
-
-def _bags() -> str:
-    """Tabulate how fast bags are mapped, and the memory over their length."""
-    return bags.table(load("bags")["rows"])
-
-
-def _site_merge() -> str:
-    """Tabulate the times of merges into a site over the number of robots."""
-    return site_merge.table(load("site_merge")["rows"])
-
-
-def _site_ranks() -> str:
-    """Tabulate the times of merges over the number of processes."""
-    return site_ranks.table(load("site_ranks"))
-
-
-def _real_merged() -> str:
-    """Tabulate the merges of real scans."""
-    return merged.table(load("real_merged")["rows"])
-
-
-def _site_area() -> str:
-    """Tabulate how a site on disk behaves over its area."""
-    return site_area.table(load("site_area")["rows"])
-
-
-def _sight() -> str:
-    """Tabulate what perception costs in a training."""
-    return sight.table(load("sight")["rows"])
-
-
-def _mjlab() -> str:
-    """Tabulate how the scan of a map differs from mjlab's own."""
-    return mjlab_task.table(load("mjlab"))
-
-
-def _self_filter_walking() -> str:
-    """Tabulate what the self-filter removes while a quadruped walks."""
-    return walking.table(load("self_filter")["walking"])
-
-
-def _head() -> str:
-    """Tabulate what the traversability heads cost."""
-    return head.table(load("head")["rows"])
 
 
 def _postprocessing() -> str:
@@ -171,46 +112,6 @@ def _self_filter() -> str:
     return self_filter.tables({name: value for name, value in load("self_filter").items() if name != "walking"})
 
 
-def _nav() -> str:
-    """Tabulate the success of policies by what they were trained with."""
-    return experiment.table(load("nav", training.RESULTS))
-
-
-def _pose_covariance() -> str:
-    """Tabulate how often the truth lies within two standard deviations of the map."""
-    return pose_covariance.table(load("pose_covariance"))
-
-
-def _legs() -> str:
-    """Tabulate the tiles that walking policies crossed, by what they were trained with."""
-    return legs.table(load("quadruped", training.RESULTS))
-
-
-def _legs_stairs() -> str:
-    """Tabulate the stairs that walking policies crossed, by their height."""
-    return legs.stairs_table(load("quadruped", training.RESULTS))
-
-
-def _legs_walk() -> str:
-    """Tabulate how policies keep to the commanded speed on flat and rough ground."""
-    return legs.walk_table(load("quadruped", training.RESULTS))
-
-
-def _legs_step_time() -> str:
-    """Tabulate where the time of a training step of the quadruped goes."""
-    return step_time.table(load("quadruped-step-time", training.RESULTS))
-
-
-def _encoder_success() -> str:
-    """Tabulate the success of navigation policies by their encoder."""
-    return encoder_experiment.table(load("encoders", training.RESULTS))
-
-
-def _encoder_cost() -> str:
-    """Tabulate what encoders of the map cost."""
-    return encoders.table(load("encoders")["rows"])
-
-
 def _traversability() -> str:
     """Tabulate the quality of the traversability heads on each split."""
     result = load("traversability", training.RESULTS)
@@ -222,41 +123,43 @@ def _traversability() -> str:
     return "\n\n".join(f"{title}:\n\n{evaluate.table(result, split)}" for split, title in titles.items())
 
 
-def _block() -> str:
-    """Tabulate the ratings beside a sharp step."""
-    return block.table(load("block", training.RESULTS)["profiles"])
+def _made_by(
+    make: Callable[[Any], str], name: str, part: str | None = None, folder: Path = benchmarks.RESULTS
+) -> Callable[[], str]:
+    """Return what tabulates a result, or a part of it, by the function of its module."""
+    return lambda: make(load(name, folder) if part is None else load(name, folder)[part])
 
 
 TABLES = {
     "accuracy": _accuracy,
     "features": _features,
-    "changes": _changes,
+    "changes": _made_by(changes.tables, "changes"),
     "real": _real,
     "speed": _speed,
-    "loop": _loop,
+    "loop": _made_by(loop.table, "loop", "rows"),
     "long_run": _long_run,
-    "bags": _bags,
-    "live_view": _live_view,
-    "site_merge": _site_merge,
-    "site_area": _site_area,
-    "site_ranks": _site_ranks,
-    "real_merged": _real_merged,
-    "nav": _nav,
-    "pose_covariance": _pose_covariance,
-    "legs": _legs,
-    "legs_stairs": _legs_stairs,
-    "legs_walk": _legs_walk,
-    "legs_step_time": _legs_step_time,
-    "encoder_success": _encoder_success,
-    "encoder_cost": _encoder_cost,
-    "sight": _sight,
-    "mjlab": _mjlab,
-    "self_filter_walking": _self_filter_walking,
+    "bags": _made_by(bags.table, "bags", "rows"),
+    "live_view": _made_by(live_view.table, "live_view"),
+    "site_merge": _made_by(site_merge.table, "site_merge", "rows"),
+    "site_area": _made_by(site_area.table, "site_area", "rows"),
+    "site_ranks": _made_by(site_ranks.table, "site_ranks"),
+    "real_merged": _made_by(merged.table, "real_merged", "rows"),
+    "nav": _made_by(experiment.table, "nav", folder=training.RESULTS),
+    "pose_covariance": _made_by(pose_covariance.table, "pose_covariance"),
+    "legs": _made_by(legs.table, "quadruped", folder=training.RESULTS),
+    "legs_stairs": _made_by(legs.stairs_table, "quadruped", folder=training.RESULTS),
+    "legs_walk": _made_by(legs.walk_table, "quadruped", folder=training.RESULTS),
+    "legs_step_time": _made_by(step_time.table, "quadruped-step-time", folder=training.RESULTS),
+    "encoder_success": _made_by(encoder_experiment.table, "encoders", folder=training.RESULTS),
+    "encoder_cost": _made_by(encoders.table, "encoders", "rows"),
+    "sight": _made_by(sight.table, "sight", "rows"),
+    "mjlab": _made_by(mjlab_task.table, "mjlab"),
+    "self_filter_walking": _made_by(walking.table, "self_filter", "walking"),
     "postprocessing": _postprocessing,
     "occlusion": _occlusion,
     "traversability": _traversability,
-    "head": _head,
-    "block": _block,
+    "head": _made_by(head.table, "head", "rows"),
+    "block": _made_by(block.table, "block", "profiles", folder=training.RESULTS),
     "self_filter": _self_filter,
 }
 
