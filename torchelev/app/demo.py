@@ -20,7 +20,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.grid import GridConfig
 from torchelev.output_files import require_writable
-from torchelev.sim import DepthCamera, Scene, Trajectory, mount, outliers, range_noise, walk
+from torchelev.sim import DepthCamera, Scene, Trajectory, mount, outliers, range_noise, steps, walk
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -172,11 +172,8 @@ def _assess(emap: ElevationMap, scene: Scene, hit: _HitCells, update_ms: list[fl
 
 
 def find_steps(scene: Scene, xy: Tensor, t: float) -> Tensor:
-    """Find the cells, given by centres (H, W, 2) [m], in or next to which the ground rises by 5 cm or more, (H, W)."""
-    offset = GRID.resolution * torch.tensor([-1.5, -0.5, 0.5, 1.5], dtype=torch.float64)
-    neighbors = torch.cartesian_prod(offset, offset)
-    z = scene.truth(xy[..., None, :] + neighbors, t)
-    return z.amax(-1) - z.amin(-1) > 0.05
+    """Find the cells, given by centres (H, W, 2) [m], in or next to which it rises by more than 5 cm, (H, W)."""
+    return steps.find_steps(lambda places: scene.truth(places, t), xy, GRID.resolution, 0.05)
 
 
 def _draw(out: str | Path, emap: ElevationMap, scene: Scene, path_xy: Tensor, t: float, result: DemoResult) -> None:

@@ -14,6 +14,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.grid import GridConfig
 from torchelev.sim import Box
+from torchelev.sim.steps import find_steps
 
 GRID = GridConfig(resolution=0.04, length_x=10.0, length_y=10.0)
 _HALF_WORLD = 400  # [cells] half the side of the lattice
@@ -64,9 +65,7 @@ def percent(part: Tensor, of: Tensor) -> float:
 
 def near_step(recording: SimulatedRun, xy: Tensor, k: int = -1) -> Tensor:
     """Return which places (..., 2) [m] have a step of more than 5 cm in the truth within 1.5 cells."""
-    reach = GRID.resolution * torch.tensor([-1.5, -0.5, 0.5, 1.5], dtype=torch.float64)
-    z = recording.truth(xy[..., None, :] + torch.cartesian_prod(reach, reach), k)
-    return z.amax(-1) - z.amin(-1) > 0.05
+    return find_steps(lambda places: recording.truth(places, k), xy, GRID.resolution, 0.05)
 
 
 def hits(recording: SimulatedRun, wall: Box, above: float) -> Tensor:

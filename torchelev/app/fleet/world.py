@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.sim import HeightField, terrain_grid
+from torchelev.sim.steps import find_steps
 from torchelev.sim.waves import Waves
 
 if TYPE_CHECKING:
@@ -51,10 +52,8 @@ class World:
         return self.field.height(tile, xy.reshape(1, -1, 2)).view(xy.shape[:-1])
 
     def find_steps(self, xy: Float[Tensor, "*M 2"], resolution: float) -> Bool[Tensor, "*M"]:
-        """Find the cells, given by centres [m], in or next to which the ground rises by 8 cm or more."""
-        offset = resolution * torch.tensor([-1.5, -0.5, 0.5, 1.5], dtype=xy.dtype)
-        z = torch.stack([self.truth(xy + neighbor) for neighbor in torch.cartesian_prod(offset, offset)])
-        return z.amax(0) - z.amin(0) > 0.08
+        """Find the cells, given by centres [m], in or next to which the ground rises by more than 8 cm."""
+        return find_steps(self.truth, xy, resolution, 0.08)
 
 
 def _join_tiles(num_samples: int, seed: int) -> Float[Tensor, "N N"]:
