@@ -196,6 +196,64 @@ def test_samples_of_a_site_on_disk_read_what_memory_has_no_room_for(tmp_path):
     torch.testing.assert_close(values, emap.elevation[:, 7, 9])
 
 
+# Times ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_time_before_the_newest_is_reported_and_counts_as_that_old():
+    sites, maps = [SiteMap(0.1), SiteMap(0.1)], [robots([(0, 0)]), robots([(10, 0)], std=0.02)]
+    sites[0].merge(maps[1], time=500.0)
+    sites[0].merge(maps[0], time=1000.0)
+    sites[1].merge(maps[0], time=1000.0)
+    with pytest.warns(
+        RuntimeWarning, match=r"^time: .* got 500\.000, 500\.000 s before the site's .*; give all"
+    ) as told:
+        sites[1].merge(maps[1], time=500.0)
+    assert told[0].filename == __file__
+    for layer in ("elevation", "variance", "time"):
+        expected, actual = (known_cells(site, layer) for site in sites)
+        assert actual == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert [site.time for site in sites] == [1000.0, 1000.0]
+
+
+def test_clocks_that_are_mixed_are_reported():
+    site, emap = SiteMap(0.1), robots([(0, 0)])
+    live(emap, 5.0)
+    site.merge(emap)
+    with pytest.warns(RuntimeWarning, match=r"time: .* got 1764143370\.000, 1764143365\.000 s after the site's newest"):
+        site.merge(emap, time=1764143370.0)
+
+
+def test_times_of_one_clock_are_not_reported(recwarn):
+    site, emap = SiteMap(0.1), small_map(1, (40, 36))
+    live(emap, 10.0)
+    site.merge(emap)  # knows nothing yet: the first time that is given starts the clock
+    fill(emap, [(0, 0)])
+    for time in (0.1, 1.1, 1764.3, 1764.3):
+        site.merge(emap, time=time)
+        assert site.time == pytest.approx(time)
+    site.merge(emap)
+    before_zero = SiteMap(0.1)
+    for time in (-999.1, 4.6, 4.6):  # whose difference float64 rounds
+        before_zero.merge(emap, time=time)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    ("time", "error", "text"),
+    [
+        ("x", TypeError, "time: must be a number of seconds, got 'x'; give a float"),
+        (True, TypeError, "time: must be a number of seconds, got True"),
+        (float("nan"), ValueError, "time: must be a finite number, got nan"),
+        (1764143370123456789, ValueError, r"time: must be in seconds, .* got 1\.76414e\+18; convert it: nanoseconds"),
+    ],
+)
+def test_times_that_are_no_seconds_are_refused(time, error, text):
+    site, emap = SiteMap(0.1), robots([(0, 0)])
+    with pytest.raises(error, match=text):
+        site.merge(emap, time=time)
+    assert not len(site) and site.time == 0.0
+
+
 # Giving back ----------------------------------------------------------------------------------------------------------
 
 
@@ -275,8 +333,6 @@ def test_bad_arguments_are_refused_by_name():
         site.merge(small_map(1, resolution=0.05))
     with pytest.raises(TypeError, match="emap: must be an ElevationMap, got str"):
         site.merge("map")
-    with pytest.raises(ValueError, match="time: must be a finite number"):
-        site.merge(robots([(0, 0)]), time=float("nan"))
     with pytest.raises(ValueError, match="resolution: must be a positive number"):
         SiteMap(0.0)
     with pytest.raises(KeyError, match="layers: must be names of layers, got 'height'"):

@@ -42,6 +42,7 @@ from torchelev.site.shared.collective import gather_windows, open_shared, shared
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
+from torchelev.site.times import check_time, continue_time, warn_of_other_clock
 from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
 
@@ -211,8 +212,9 @@ class SiteMap(ReadableSite):
 
         Args:
             emap: the map, of the site's resolution. The site recognises it, not copies of it.
-            time: [s] now, on any clock that all merges share, such as `time.time()`. None: the site's time goes on by
-                what the map has lived since its last merge.
+            time: [s] now, on any clock that all merges share, such as `time.time()`. A time before the site's newest
+                one, or more than a year after it, counts as it is, with a RuntimeWarning. None: the site's time goes on
+                by what the map has lived since its last merge.
             align: find the robots' offsets; otherwise their heights count as they are.
             tilt: also find how their windows tilt, in roll and pitch.
             T_map_base: the robots' poses, as they were given to `ElevationMap.update`. Required if keyframes are kept,
@@ -222,21 +224,22 @@ class SiteMap(ReadableSite):
             Offsets and counts, per robot.
 
         Raises:
-            TypeError: `emap` is no ElevationMap.
-            ValueError: it has another resolution, or the site is open read-only. Nothing has changed then.
+            TypeError: `emap` is no ElevationMap, or `time` no number.
+            ValueError: `emap` has another resolution, `time` is not in seconds, or the site is read-only or closed.
+                Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
             LostRankError: of a group, another rank has ended; the site is as it was before.
         """
+        plans = self._ranks.exchange("merge", lambda: self._plan(emap, time, align, tilt))
         if self._keyframes is not None:
             T_map_base = _require_poses(emap, T_map_base)
-        plans = self._ranks.exchange("merge", lambda: self._plan(emap, time, align, tilt))
         if emap.device.type == "cpu":
             keep_freed_memory()
         told = self._recall_told(emap)
         if self._rate is None:
             self._rate = plans[0]["rate"]
         now = max(plan["now"] for plan in plans)  # of all ranks
-        now = now if time is None else self._advance(emap, told, now)
+        now = now if time is None else self._since_epoch(now)
         state = self._bring(emap)
         windows = read_windows(emap, state, now, told)
         all_windows, own = gather_windows(self._ranks, windows, plans)
@@ -267,9 +270,10 @@ class SiteMap(ReadableSite):
 
     def _plan(self, emap: ElevationMap, time: float | None, align: bool, tilt: bool) -> dict[str, Any]:
         """Return what this rank is about to merge; raise if it cannot."""
-        self._check_merge(emap, time)
-        told = self._recall_told(emap)
-        now = self._advance(emap, told, None) if time is None else time
+        self._check_merge(emap)
+        time, told = check_time(time), self._recall_told(emap)
+        elapsed = emap.state.elapsed.to(self._tiles.device)
+        now = continue_time(elapsed, told, self._time, self._opened) if time is None else time
         merged = {"tiles": len(self), "time of the site": self.time}
         time_is = "not given" if time is None else "given"
         options = {"time": time_is, "align": bool(align), "tilt": bool(tilt)}
@@ -278,11 +282,10 @@ class SiteMap(ReadableSite):
         rate = emap.cfg.aging.variance_rate
         return {"same": same, "robots": emap.num_envs, "told": told is not None, "now": now, "rate": rate}
 
-    def _check_merge(self, emap: ElevationMap, time: float | None) -> None:
+    def _check_merge(self, emap: ElevationMap) -> None:
         actual, hint = type(emap).__name__, "give an ElevationMap"
         require(isinstance(emap, ElevationMap), "emap", "must be an ElevationMap", actual, hint, TypeError)
         self.require_resolution(emap)
-        require(time is None or math.isfinite(time), "time", "must be a finite number", time, "give seconds")
         self._require_writable()
 
     def _require_writable(self) -> None:
@@ -296,17 +299,13 @@ class SiteMap(ReadableSite):
             math.isclose(actual, self.resolution, rel_tol=1e-9), "emap", rule, f"{actual:g} m", "cells must line up"
         )
 
-    def _advance(self, emap: ElevationMap, told: Told | None, time: float | None) -> float:
-        """Return the time of a merge, from the epoch. The first time that is given becomes the epoch."""
-        if time is not None:
-            if not len(self._tiles):
-                self._epoch = time
-            return time - self._epoch
-        elapsed = emap.state.elapsed.to(self._tiles.device)
-        if told is None:
-            return max(self._time, self._opened + float(elapsed.max()) * 1e-9)
-        lived = torch.where(told.elapsed >= 0, elapsed - told.elapsed, elapsed)  # an environment that was reset
-        return max(self._time, float((told.known.now + 1e-9 * lived.double()).max()))
+    def _since_epoch(self, time: float) -> float:
+        """Return a time that was given, from the epoch. The first one becomes the epoch."""
+        if len(self._tiles):
+            warn_of_other_clock(time, self.time)
+        else:
+            self._epoch, self._time = time, 0.0
+        return time - self._epoch
 
     def _align(self, windows: Windows, with_offsets: bool, with_tilt: bool) -> Alignment:
         if not with_offsets:
