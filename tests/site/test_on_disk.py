@@ -11,6 +11,7 @@ import time
 import pytest
 import torch
 
+from tests.helpers import pose, small_map
 from tests.site.helpers import fill, known_cells, robots
 from torchelev.site import SiteConfig, SiteMap
 from torchelev.site.storage import store as store_module
@@ -181,6 +182,31 @@ def test_a_killed_merge_is_there_completely_or_not_at_all(path):
             assert len(heights) == 1 and heights <= {float(last), float(last + 1)}
 
 
+def test_a_closed_site_says_so_and_can_be_read_on(path, tmp_path):
+    emap, poses = robots(CORNERS[:1]), pose()
+    site = SiteMap(0.1, path, keyframes=True)
+    site.merge(emap, T_map_base=poses)
+    before = everything(site)
+    reader = SiteMap.open(path, read_only=True)
+    with pytest.raises(ValueError, match=r"site: must be open for writing, got a read-only site; open it without"):
+        reader.merge(emap, T_map_base=poses)
+    for closed in (site, reader):
+        closed.close()
+        text = r"site: must be open, got a site after close\(\); open it again with SiteMap\(resolution=\.\.\., path="
+        with pytest.raises(ValueError, match=text):
+            closed.merge(emap, T_map_base=poses)
+        with pytest.raises(ValueError, match=text):
+            closed.merge(emap)
+        with pytest.raises(ValueError, match=text):
+            closed.move_keyframes(closed.keyframes.ids, closed.keyframes.T_map_base)
+        small_map(1, (40, 36)).initialize_from(closed)
+        closed.export(tmp_path / "site.npz")
+        closed.refresh()
+        assert everything(closed) == before and closed.num_bytes > 0
+    with SiteMap(0.1, path) as again:
+        again.merge(emap, T_map_base=poses)
+
+
 def test_bad_paths_and_sites_are_refused_and_left_alone(path, tmp_path):
     emap = robots(CORNERS[:1])
     with SiteMap(0.1, path) as site:
@@ -192,8 +218,11 @@ def test_bad_paths_and_sites_are_refused_and_left_alone(path, tmp_path):
     file.write_text("mine")
     with pytest.raises(ValueError, match="file"):
         SiteMap(0.1, file)
-    with pytest.raises(OSError):
+    hint = r"give the folder of a site; SiteMap\(resolution=\.\.\., path=\.\.\.\) makes one"
+    with pytest.raises(FileNotFoundError, match=f"nothing: must be a folder, got a path where nothing is; {hint}"):
         SiteMap.open(tmp_path / "nothing")
+    with pytest.raises(ValueError, match=f"must be a site, got a folder without zarr.json; {hint}"):
+        SiteMap.open(tmp_path)
     metadata = json.loads((path / "zarr.json").read_text())
     metadata["attributes"]["version"] = 99
     (path / "zarr.json").write_text(json.dumps(metadata))

@@ -189,7 +189,10 @@ class ReadableSite:
             self._read_attributes()
 
     def close(self) -> None:
-        """Let other processes write to the site's folder. All merges are on disk already."""
+        """Let other processes write to the site's folder. All merges are on disk already.
+
+        From then on, `merge` and `move_keyframes` raise ValueError; reading goes on to work. In memory, does nothing.
+        """
         if self._store is not None:
             self._store.close()
 

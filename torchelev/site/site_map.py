@@ -175,7 +175,7 @@ class SiteMap(ReadableSite):
             device: that fuses.
 
         Raises:
-            FileNotFoundError: there is nothing.
+            FileNotFoundError: there is nothing; ``SiteMap(resolution=..., path=...)`` makes a site.
             ValueError: it is no site, is damaged, or of a newer version.
             OSError: another process writes to it.
         """
@@ -289,8 +289,11 @@ class SiteMap(ReadableSite):
         self._require_writable()
 
     def _require_writable(self) -> None:
-        read_only = self._store is not None and self._store.is_read_only and self._ranks.rank == 0
-        require(not read_only, "site", "must be open for writing", "a read-only site", "open it without read_only")
+        if self._store is not None:
+            hint = "open it again with SiteMap(resolution=..., path=...)"
+            require(not self._store.is_closed, "site", "must be open", "a site after close()", hint)
+            is_reader = self._store.is_read_only and self._ranks.rank == 0
+            require(not is_reader, "site", "must be open for writing", "a read-only site", "open it without read_only")
 
     def require_resolution(self, emap: ElevationMap) -> None:
         """Raise ValueError unless a map has the site's resolution."""
@@ -387,8 +390,8 @@ class SiteMap(ReadableSite):
 
         Raises:
             TypeError: an argument is no tensor of the right kind.
-            ValueError: the site keeps no keyframes or is open read-only, an id is unknown or repeats, or the poses are
-                not rigid (K, 4, 4). Nothing has changed then.
+            ValueError: the site keeps no keyframes, is read-only or closed, an id is unknown or repeats, or the poses
+                are not rigid (K, 4, 4). Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
         """
         log = self._require_keyframes()

@@ -67,7 +67,7 @@ def require_empty(path: Path) -> None:
     if not os.path.lexists(path):
         return
     require(path.is_dir(), str(path), "must be a folder", "a file", "choose another path")
-    require(not is_site(path), str(path), "must be empty", "a site", "open it with TileStore.open")
+    require(not is_site(path), str(path), "must be empty", "a site", "open it with SiteMap.open")
     names = sorted(set(os.listdir(path)) - {LOCK, STAGED})
     require(not names, str(path), "must be an empty folder", f"one with {', '.join(names[:5])}", "choose another path")
 
@@ -92,7 +92,7 @@ def read_header(path: Path) -> Header:
         FileNotFoundError: there is no such folder.
         ValueError: it is not a site, one of a newer version, or its metadata are damaged.
     """
-    hint = "give the folder of a site; TileStore.create makes one"
+    hint = "give the folder of a site; SiteMap(resolution=..., path=...) makes one"
     require(os.path.lexists(path), str(path), "must be a folder", "a path where nothing is", hint, FileNotFoundError)
     require(path.is_dir(), str(path), "must be a folder", "a file", hint)
     require(is_site(path), str(path), "must be a site", f"a folder without {METADATA}", hint)

@@ -36,7 +36,7 @@ class TileStore:
 
     def __init__(self, path: Path, lock: FileLock | None) -> None:
         self.path = path
-        self._lock, self._committing = lock, Lock()
+        self._lock, self._committing, self.is_closed = lock, Lock(), False
         self._files = TileFiles(path, read_header(path))
         self.refresh()
 
@@ -225,7 +225,7 @@ class TileStore:
         with self._committing:
             if self._lock:
                 self._lock.release()
-            self._lock = None
+            self._lock, self.is_closed = None, True
 
     def __enter__(self) -> TileStore:
         return self
@@ -243,7 +243,7 @@ class TileStore:
 
     def _prepare(self, names: list[str]) -> None:
         """Complete a commit that could not be moved into place yet; raise unless another one is possible."""
-        actual, hint = "a store that is read-only or closed", "open it with TileStore.open"
+        actual, hint = "a store that is read-only or closed", "open it again for writing"
         require(self._lock is not None, str(self.path), "must be open for writing", actual, hint)
         if clean(self.path):
             self.refresh()

@@ -16,7 +16,7 @@ from torchelev.errors import message
 
 LOCK, STAGED, COMMITTED = ".lock", ".staged", ".committed"
 
-_FULL, _FORBIDDEN = "make room and commit again", "choose a folder that you may write to"
+_FULL, _FORBIDDEN = "make room and try again", "choose a folder that you may write to"
 _HINTS = {errno.ENOSPC: _FULL, errno.EDQUOT: _FULL, errno.EACCES: _FORBIDDEN, errno.EROFS: _FORBIDDEN}
 T = TypeVar("T")
 
@@ -25,7 +25,7 @@ class CommitError(OSError):
     """A commit failed. All that was stored before is unchanged, and the store can be used on."""
 
     def __init__(self, path: Path, error: OSError) -> None:
-        hint = _HINTS.get(error.errno or 0, "commit again")
+        hint = _HINTS.get(error.errno or 0, "try again")
         reason = error.strerror or str(error) or type(error).__name__
         super().__init__(f"{path}: cannot be written ({reason}); all that was stored before is unchanged: {hint}")
         self.errno = error.errno
@@ -41,11 +41,11 @@ def lock_folder(path: Path) -> FileLock:
     try:
         lock.acquire()
     except Timeout as error:
-        hint = "close the other one, or open it with read_only=True"
+        hint = "close the other one, or read beside it with SiteMap.open(path, read_only=True)"
         raise OSError(message(str(path), "expected one writer at a time", "a second one", hint)) from error
     except OSError as error:
         reason = error.strerror or str(error)
-        text = message(str(path), "must be writable", reason, "open it with read_only=True")
+        text = message(str(path), "must be writable", reason, "read it with SiteMap.open(path, read_only=True)")
         raise type(error)(error.errno, text) from error
     return lock
 
