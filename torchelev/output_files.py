@@ -37,8 +37,8 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         The temporary file, open for writing bytes.
 
     Raises:
-        WriteError: if `path` is a folder or a device, or writing fails. The temporary file is removed then, and an
-            older file is unchanged.
+        WriteError: if `path` is a folder or a device, its folder does not exist, or writing fails. The temporary file
+            is removed then, and an older file is unchanged.
     """
     target = _resolve(path)
     unfinished = _name_temporary(target)
@@ -96,6 +96,8 @@ def _resolve(path: str | Path) -> Path:
         target = Path(os.path.realpath(path))
         kind = target.stat().st_mode
     except FileNotFoundError:
+        if not target.parent.is_dir():
+            raise WriteError(path, f"there is no folder {target.parent}: make it first") from None
         return target
     except OSError as error:
         raise WriteError(path, _describe(error)) from error

@@ -126,8 +126,10 @@ def test_the_area_ends_with_what_is_known(site, tmp_path):
 def test_wrong_arguments_write_nothing(site, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"path: must end with \.tif, \.png, \.ply, \.npz, got .*jpg"):
         site.export(tmp_path / "a.jpg")
-    with pytest.raises(KeyError, match="layers: must be names of layers, got 'height'"):
+    with pytest.raises(KeyError, match="layers: must be one of elevation, .*, got 'height'"):
         site.export(tmp_path / "a.tif", ("height",))
+    with pytest.raises(TypeError, match=r"layers: must be a list of names, got 'time'; give \['time'\]"):
+        site.export(tmp_path / "a.tif", "time")
     with pytest.raises(ValueError, match=r"layers: must be one for \.ply, got 2"):
         site.export(tmp_path / "a.ply", ("elevation", "time"))
     with pytest.raises(ValueError, match="area: expected x_min, x_max, y_min, y_max"):
@@ -144,12 +146,27 @@ def test_wrong_arguments_write_nothing(site, tmp_path, monkeypatch):
         site.export(tmp_path / "a.png", epsg=32632)
     with pytest.raises(ValueError, match="origin: must be"):
         site.export(tmp_path / "a.ply", origin=(1.0, 0.0))
-    with pytest.raises(ValueError, match="site: must know something"):
-        SiteMap(0.1).export(tmp_path / "a.tif")
+    text = "site: must have known cells to export, got none of"
+    with pytest.raises(ValueError, match=f"{text} elevation, time; merge a map that has measured first"):
+        SiteMap(0.1).export(tmp_path / "a.tif", ("elevation", "time"))
+    with pytest.raises(ValueError, match=f"{text} other_elevation; choose other layers"):
+        site.export(tmp_path / "a.tif", ("other_elevation",))
     monkeypatch.setitem(sys.modules, "tifffile", None)
     with pytest.raises(ModuleNotFoundError, match=r"\.tif needs tifffile: pip install \"torchelev\[geo\]\""):
         site.export(tmp_path / "a.tif")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png", "ply", "npz"])
+def test_a_place_where_no_file_can_be_is_named_as_it_was_given(site, tmp_path, monkeypatch, suffix):
+    monkeypatch.chdir(tmp_path)
+    text = rf"^no/such/z\.{suffix}: cannot be written \(there is no folder {tmp_path}/no/such: make it first\)"
+    with pytest.raises(OSError, match=text):
+        site.export(f"no/such/z.{suffix}")
+    (tmp_path / f"folder.{suffix}").mkdir()
+    with pytest.raises(OSError, match=rf"^folder\.{suffix}: cannot be written \(it is a folder\)"):
+        site.export(f"folder.{suffix}")
+    assert [file.name for file in tmp_path.rglob("*")] == [f"folder.{suffix}"]
 
 
 def test_a_file_that_fails_leaves_the_older_one(site, tmp_path, monkeypatch):

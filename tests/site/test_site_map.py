@@ -335,14 +335,27 @@ def test_bad_arguments_are_refused_by_name():
         site.merge("map")
     with pytest.raises(ValueError, match="resolution: must be a positive number"):
         SiteMap(0.0)
-    with pytest.raises(KeyError, match="layers: must be names of layers, got 'height'"):
+    with pytest.raises(KeyError, match="layer: must be one of elevation, variance, .* validity, got 'height'; check"):
         site.sample([[0.0, 0.0]], "height")
+    with pytest.raises(KeyError, match="layers: must be one of elevation, .*, got 'height'"):
+        site.window((0.0, 0.0), 1.0, 1.0, ["time", "height"])
+    with pytest.raises(TypeError, match=r"layers: must be a list of names, got 'time'; give \['time'\]"):
+        site.window((0.0, 0.0), 1.0, 1.0, "time")
     with pytest.raises(ValueError, match=r"xy: expected \(M, 2\)"):
         site.sample([[0.0, 0.0, 0.0]])
     with pytest.raises(ValueError, match="mode"):
         site.sample([[0.0, 0.0]], mode="cubic")
-    with pytest.raises(ValueError, match="length_x"):
+    with pytest.raises(
+        ValueError, match=r"^length_x: must be a whole number of times 0\.1 m, got 1\.23 times; try 0\.1"
+    ):
         site.window((0.0, 0.0), 0.123, 1.0)
+    with pytest.raises(ValueError, match="^length_y: must be a positive number"):
+        site.window((0.0, 0.0), 1.0, 0.0)
+    for center in ((0.0,), (0.0, float("nan"))):
+        with pytest.raises(
+            ValueError, match=r"center: expected x, y in metres, got \[0\.0.*\]; give \(0\.0, 0\.0\), say"
+        ):
+            site.window(center, 1.0, 1.0)
     with pytest.raises(ValueError, match="emap: must have the site's resolution"):
         small_map(1, resolution=0.05).initialize_from(site)
     with pytest.raises(TypeError, match="site: must be a SiteMap, got str"):

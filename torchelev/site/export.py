@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.io.export import SavedMap, triangulate, write_npz, write_ply
 from torchelev.io.geotiff import check_epsg, write_bands
-from torchelev.output_files import MARK, atomic_file
+from torchelev.output_files import MARK, atomic_file, require_writable
 from torchelev.site.reading import sources_of
 from torchelev.site.tiles import LAYERS, TILE, Tiles
 
@@ -54,8 +54,7 @@ def choose_area(
     """Return the area of an extent x_min, x_max, y_min, y_max [m]; None: the box around all known cells."""
     require(len(layers) > 0, "layers", "must be names of one or more layers", "none", 'give ("elevation",), say')
     if extent is None:
-        rows = [LAYERS.index(source) for source in sources_of(layers)]
-        sides = [[_find_border(tiles, rows, axis, end) for end in (False, True)] for axis in (0, 1)]
+        sides = [[_find_border(tiles, layers, axis, end) for end in (False, True)] for axis in (0, 1)]
     else:
         is_box = len(extent) == 4 and all(math.isfinite(value) for value in extent)
         is_box = is_box and extent[0] < extent[1] and extent[2] < extent[3]
@@ -76,11 +75,13 @@ def export(path: str | Path, area: Area, place: Place) -> None:
         require(len(area.layers) == 1, "layers", f"must be one for {suffix}", len(area.layers), "write .tif or .npz")
     _check_size(suffix, area)
     _import(suffix)
+    require_writable(path)  # before anything is, as there may be two files
     writers[suffix](path, area, place)
 
 
-def _find_border(tiles: Tiles, rows: list[int], axis: int, is_end: bool) -> int:
+def _find_border(tiles: Tiles, layers: tuple[str, ...], axis: int, is_end: bool) -> int:
     """Return the first number on an axis of a cell that is known, or the one behind the last; look there alone."""
+    rows = [LAYERS.index(source) for source in sources_of(layers)]
     for line in sorted({tile[axis] for tile in tiles}, reverse=is_end):
         chosen = [tile for tile in tiles if tile[axis] == line]
         known = np.zeros(TILE, bool)
@@ -89,8 +90,8 @@ def _find_border(tiles: Tiles, rows: list[int], axis: int, is_end: bool) -> int:
             known |= is_known.any(0).any(1 - axis).cpu().numpy()
         if known.any():
             return int(line * TILE + (known.nonzero()[0][-1] + 1 if is_end else known.nonzero()[0][0]))
-    require(False, "site", "must know something of these layers", "nothing known yet", "merge a map first")
-    raise AssertionError
+    hint = "choose other layers" if len(tiles) else "merge a map that has measured first"
+    raise ValueError(message("site", "must have known cells to export", f"none of {', '.join(layers)}", hint))
 
 
 def _check_place(suffix: str, place: Place) -> None:

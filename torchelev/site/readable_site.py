@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
-from torchelev.errors import require
+from torchelev.errors import require, whole_cells
 from torchelev.grid import GridConfig
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
 from torchelev.site.export import Place, choose_area, export
-from torchelev.site.reading import Clock, check_layers, read_area, sample_tiles
+from torchelev.site.reading import Clock, check_layer, check_layers, read_area, sample_tiles
 from torchelev.site.tiles import TILE, Tiles
 
 if TYPE_CHECKING:
@@ -86,9 +86,8 @@ class ReadableSite:
         is_list = xy.ndim == 2 and xy.shape[1] == 2
         require(is_list, "xy", "expected (M, 2)", tuple(xy.shape), "give one x and y for each point")
         require(mode in MODES, "mode", f"must be one of {', '.join(MODES)}", repr(mode), "use bilinear")
-        (layer,) = check_layers([layer])
         cells = xy.detach().to(self._tiles.device, torch.float64) / self.resolution
-        return sample_tiles(self._tiles, cells, layer, mode, self._clock)
+        return sample_tiles(self._tiles, cells, check_layer("layer", layer), mode, self._clock)
 
     def window(
         self,
@@ -114,13 +113,16 @@ class ReadableSite:
 
         Raises:
             KeyError: a layer does not exist.
-            ValueError: a length is no whole number of cells.
+            TypeError: `layers` is one name, not a list.
+            ValueError: a length is no whole number of cells, or the centre is no point.
         """
-        grid = GridConfig(resolution=self.resolution, length_x=length_x, length_y=length_y)
-        x, y = (float(value) for value in center[:2])
-        size = (grid.height, grid.width)
-        first = [math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip((x, y), size, strict=True)]
-        return self._copy((first[0], first[1]), size, check_layers(layers))
+        lengths = {"length_x": length_x, "length_y": length_y}
+        height, width = (whole_cells(name, length, self.resolution) for name, length in lengths.items())
+        point = [float(value) for value in center[:2]]
+        is_point = len(point) == 2 and all(map(math.isfinite, point))
+        require(is_point, "center", "expected x, y in metres", point, "give (0.0, 0.0), say")
+        x, y = (math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip(point, (height, width), strict=True))
+        return self._copy((x, y), (height, width), check_layers(layers))
 
     def _copy(self, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str]) -> SavedMap:
         """Copy an area whose first cell has these numbers on the lattice."""
@@ -171,8 +173,9 @@ class ReadableSite:
 
         Raises:
             KeyError: a layer does not exist.
+            TypeError: `layers` is one name, not a list.
             ValueError: another argument breaks its rule, the area is too large for the kind, or nothing is known yet.
-            WriteError: the file cannot be written; an existing one is left as it was.
+            WriteError: the file cannot be written, or its folder does not exist; an existing file is left as it was.
             ModuleNotFoundError: a package is missing; the text says which extra installs it.
         """
         export(

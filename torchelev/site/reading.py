@@ -38,13 +38,16 @@ class Clock(NamedTuple):
 
 
 def check_layers(layers: Sequence[str] | None) -> tuple[str, ...]:
-    """Return names of layers; None: all. KeyError if one does not exist."""
-    names = LAYERS if layers is None else tuple(layers)
-    for name in names:
-        require(
-            name in LAYERS, "layers", "must be names of layers", repr(name), f"there are {', '.join(LAYERS)}", KeyError
-        )
-    return names
+    """Return names of layers; None: all. TypeError if they are no list, KeyError if one does not exist."""
+    is_list, hint = not isinstance(layers, str), f"give [{layers!r}]"
+    require(is_list, "layers", "must be a list of names", repr(layers), hint, TypeError)
+    return LAYERS if layers is None else tuple(check_layer("layers", name) for name in layers)
+
+
+def check_layer(argument: str, name: str) -> str:
+    """Return the name of a layer; KeyError if it does not exist."""
+    require(name in LAYERS, argument, f"must be one of {', '.join(LAYERS)}", repr(name), "check its spelling", KeyError)
+    return name
 
 
 def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock) -> Tensor:
