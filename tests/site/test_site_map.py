@@ -131,6 +131,46 @@ def test_a_changed_place_is_kept_apart_and_reported():
     assert float(value - other) == pytest.approx(0.5, abs=1e-3)
 
 
+def test_a_single_scan_replaces_well_known_ground_after_the_age_that_the_guide_says():
+    for age, wins in ((239.0, False), (241.0, True)):  # [s] (1 cm^2 / 4 - 1 mm^2) / 1e-7 m^2/s = 240 s
+        site = SiteMap(0.1)
+        site.merge(robots([(0, 0)], std=0.001), time=0.0)
+        site.merge(robots([(0, 0)], std=0.01, heights=lambda x, y: ground(x, y) + 0.5), time=age, align=False)
+        value, _ = site.sample([[1.55, 1.55]], mode="nearest")
+        assert (float(value) > float(ground(torch.tensor(1.55), torch.tensor(1.55))) + 0.4) == wins
+
+
+def test_the_first_merge_fixes_the_heights():
+    corners, errors = [(0, 0), (20, 0)], [0.1, 0.3]
+    batch, one_by_one = SiteMap(0.1), SiteMap(0.1)
+    report = batch.merge(robots(corners, offsets=errors))
+    assert report.offsets.tolist() == pytest.approx([-0.1, 0.1], abs=1e-3) and not report.is_isolated.any()
+    reports = [
+        one_by_one.merge(robots([corner], offsets=[error])) for corner, error in zip(corners, errors, strict=True)
+    ]
+    assert [float(report.offsets) for report in reports] == pytest.approx([0.0, 0.2], abs=1e-3)
+    assert [bool(report.is_isolated) for report in reports] == [True, False]
+    heights = [float(site.sample([[0.55, 0.55]], mode="nearest")[0]) for site in (batch, one_by_one)]
+    true = float(ground(torch.tensor(0.55), torch.tensor(0.55)))
+    assert heights == pytest.approx([true + 0.2, true + 0.1], abs=1e-3)
+
+
+def test_a_bilinear_sample_mixes_across_a_contradiction_and_the_nearest_does_not():
+    site = SiteMap(0.1)
+    site.merge(robots([(0, 0)], heights=lambda x, y: 0.0 * x, std=0.003))
+    crate = robots([(0, 0)], heights=lambda x, y: 0.5 * (x > 1.0), std=0.003)
+    site.merge(crate, time=site.time + 60.0, align=False)
+    heights = [float(site.sample([[1.02, 1.0]], mode=mode)[0]) for mode in ("bilinear", "nearest")]
+    assert heights == pytest.approx([0.35, 0.5], abs=1e-3)
+
+
+def test_the_extent_is_that_of_the_tiles():
+    site = SiteMap(0.1)
+    assert site.extent == (0.0, 0.0, 0.0, 0.0)
+    site.merge(robots([(-10, 50)]))
+    assert site.extent == pytest.approx((-6.4, 6.4, 0.0, 12.8))
+
+
 def test_upper_bounds_are_the_lowest_and_end_where_the_ground_is_known():
     emap = small_map(2, (8, 8))
     emap.corner.copy_(torch.tensor([[0, 0], [0, 0]]))

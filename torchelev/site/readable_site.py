@@ -53,7 +53,10 @@ class ReadableSite:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """The outer borders x_min, x_max, y_min, y_max [m] of its tiles, map frame; all 0 while there are none."""
+        """The outer borders x_min, x_max, y_min, y_max [m] of its tiles, map frame; all 0 while there are none.
+
+        Tiles are 64 cells wide and may be known in part: the known cells may end up to 63 cells before these borders.
+        """
         tiles = np.array(list(self._tiles) or [(0, 0)])
         (x_min, y_min), (x_max, y_max) = tiles.min(0) * TILE, (tiles.max(0) + bool(len(self))) * TILE
         return tuple(float(cells * self.resolution) for cells in (x_min, x_max, y_min, y_max))  # type: ignore[return-value]
@@ -72,7 +75,8 @@ class ReadableSite:
             xy: points, map frame [m]; give float64 far from the origin.
             layer: one of `window`'s.
             mode: "bilinear" renormalises over the known ones of the four surrounding cells, and is valid where these
-                carry at least half of the weight; "nearest" reads the cell that holds the point.
+                carry at least half of the weight; "nearest" reads the cell that holds the point. Bilinear means mix
+                the two heights of a contradiction where neighbouring cells say different ones: use "nearest" there.
 
         Returns:
             values: (M,), 0 where not valid.
