@@ -6,7 +6,6 @@ import math
 import uuid
 from collections.abc import Iterable
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -40,8 +39,7 @@ from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
 from torchelev.site.readable_site import ReadableSite
 from torchelev.site.shared.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.shared.ranks import Ranks
-from torchelev.site.tiles import LAYERS as STORED
-from torchelev.site.tiles import TILE, Tiles, locate
+from torchelev.site.tiles import Tiles, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
 from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
@@ -49,8 +47,6 @@ from torchelev.state import MapState, map_layers
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from torch.distributed import ProcessGroup
-
-    from torchelev.site.storage.store import TileStore
 
 # By map and site: what a map has told. Of all sites of a process, so that a site may be closed and opened again.
 _told: WeakKeyDictionary[ElevationMap, dict[str, Told]] = WeakKeyDictionary()
@@ -112,9 +108,7 @@ class SiteMap(ReadableSite):
     ) -> None:
         self._ranks = Ranks(group)
         self._ranks.exchange("SiteMap", lambda: {"same": self._set_up(resolution, path, cfg)})
-        self._store = (
-            None if path is None else open_shared(self._ranks, "SiteMap", partial(_open, path, self.resolution))
-        )
+        self._store = None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution)
         self._keyframes = KeyframeLog(self._store) if keyframes else None
         self._begin(device)
         self._check_keyframes(keyframes)
@@ -456,21 +450,3 @@ def _require_poses(emap: ElevationMap, T_map_base: Tensor | None) -> Tensor:
     hint = "give the poses of the last update"
     require(T_map_base is not None, "T_map_base", "must be given, as keyframes are kept", None, hint)
     return checks.check_pose("T_map_base", T_map_base, (emap.num_envs, 4, 4), emap.device, True)
-
-
-def _open(path: str | Path, resolution: float, read_only: bool) -> TileStore:
-    """Create a site's folder, or open one that is there, of the same resolution."""
-    from torchelev.site.storage.store import TileStore
-
-    path = Path(path)
-    exists = (path / "zarr.json").exists()
-    if not exists and not read_only:
-        return TileStore.create(path, layers=STORED, tile_size=TILE, attributes={"resolution": resolution})
-    require(exists, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
-    store = TileStore.open(path, read_only=read_only)
-    actual, hint = float(store.attributes["resolution"]), "give that resolution, or another path"
-    is_same = math.isclose(actual, resolution, rel_tol=1e-9)
-    if not is_same:
-        store.close()
-    require(is_same, "resolution", f"must be {actual:g} m, that of {path}", resolution, hint)
-    return store

@@ -18,8 +18,10 @@ rounding; on disk is what rank 0 has computed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -28,24 +30,43 @@ from torchelev.errors import require
 from torchelev.site.fusion.windows import Windows
 from torchelev.site.shared.packing import Layout, pack, unpack
 from torchelev.site.shared.ranks import Ranks
+from torchelev.site.tiles import LAYERS, TILE
 
 if TYPE_CHECKING:
     from torchelev.site.storage.store import TileStore
 
 
-def open_shared(ranks: Ranks, call: str, open_store: Callable[[bool], TileStore]) -> TileStore:
-    """Open a store on rank 0 for writing, and then on the others, to whose `open_store` True says: read-only."""
+def open_shared(ranks: Ranks, call: str, path: str | Path, resolution: float) -> TileStore:
+    """Create or open a site's folder on rank 0 for writing, and then open it on the others, read-only."""
     store = None
     try:
         for turn in (True, False):
             with ranks.together(call):
                 if (ranks.rank == 0) == turn:
-                    store = open_store(not turn)
+                    store = _open(path, resolution, not turn)
     except BaseException:
         if store is not None:
             store.close()
         raise
     assert store is not None
+    return store
+
+
+def _open(path: str | Path, resolution: float, read_only: bool) -> TileStore:
+    """Create a site's folder, or open one that is there, of the same resolution."""
+    from torchelev.site.storage.store import TileStore
+
+    path = Path(path)
+    exists = (path / "zarr.json").exists()
+    if not exists and not read_only:
+        return TileStore.create(path, layers=LAYERS, tile_size=TILE, attributes={"resolution": resolution})
+    require(exists, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
+    store = TileStore.open(path, read_only=read_only)
+    actual, hint = float(store.attributes["resolution"]), "give that resolution, or another path"
+    is_same = math.isclose(actual, resolution, rel_tol=1e-9)
+    if not is_same:
+        store.close()
+    require(is_same, "resolution", f"must be {actual:g} m, that of {path}", resolution, hint)
     return store
 
 
