@@ -132,8 +132,11 @@ def test_wrong_arguments_write_nothing(site, tmp_path, monkeypatch):
         site.export(tmp_path / "a.tif", "time")
     with pytest.raises(ValueError, match=r"layers: must be one for \.ply, got 2"):
         site.export(tmp_path / "a.ply", ("elevation", "time"))
-    with pytest.raises(ValueError, match="area: expected x_min, x_max, y_min, y_max"):
-        site.export(tmp_path / "a.tif", area=(1.0, 0.0, 0.0, 1.0))
+    for area in ((1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, float("nan")), (0.0, 1.0), ("a", 1.0, 0.0, 1.0), 5.0):
+        with pytest.raises(
+            ValueError, match=r"area: expected x_min, x_max, y_min, y_max in metres, got .*; see site\."
+        ):
+            site.export(tmp_path / "a.tif", area=area)
     with pytest.raises(ValueError, match=r"area: must be of at most 16000000 cells for \.ply, got 10000 x 2000 cells"):
         site.export(tmp_path / "a.ply", area=(0.0, 1000.0, 0.0, 200.0))
     with pytest.raises(ValueError, match=r"1000 x 1000 m; give an area such as 819\.2 x 819\.2 m, or write \.tif"):

@@ -537,7 +537,12 @@ def test_a_damaged_array_is_named(store, damage):
         ([(0, 0), (0, 0)], noise([0, 1]), {}, "tiles: must differ"),
         ([(0.5, 0)], noise([0]), {}, "tiles: expected n pairs of ints"),
         ([(0, 0, 0)], noise([0]), {}, "tiles: expected n pairs of ints"),
-        ([(2**17, 0)], noise([0]), {}, "tiles: must be from -131072 to 131071, got 0 to 131072"),
+        (
+            [(2**17, 0)],
+            noise([0]),
+            {},
+            "tiles: must be from -131072 to 131071, counted from the map frame's origin, got 0 to 131072",
+        ),
         ([(0, 0)], noise([0]), {"a": float("nan")}, "attributes: must be JSON"),
         ([(0, 0)], noise([0]), {"a": np.float32(1)}, "attributes: must be JSON"),
         ([(0, 0)], noise([0]), {"version": 1}, "attributes: must not be named"),

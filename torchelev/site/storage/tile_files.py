@@ -78,7 +78,8 @@ def as_tiles(tiles: Sequence[Tile] | NDArray) -> list[Tile]:
     require(are_pairs, "tiles", "expected n pairs of ints", f"{pairs.shape} {pairs.dtype}", "give [(0, -1)], say")
     is_inside = -_HALF <= pairs.min() and pairs.max() < _HALF
     actual = f"{pairs.min()} to {pairs.max()}"
-    require(bool(is_inside), "tiles", f"must be from {-_HALF} to {_HALF - 1}", actual, "move the map frame's origin")
+    rule = f"must be from {-_HALF} to {_HALF - 1}, counted from the map frame's origin"
+    require(bool(is_inside), "tiles", rule, actual, "begin another site, whose map frame has its origin nearer")
     return [(int(a), int(b)) for a, b in pairs]
 
 
