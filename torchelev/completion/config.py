@@ -1,0 +1,27 @@
+"""The settings of the completion stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchelev.errors import require
+
+WHEN = ("read", "update")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletionConfig:
+    """How the ground that no sensor saw is predicted: the layers `completed` and `completed_std`."""
+
+    weights: str | Path | None = None  #: file that `CompletionNet.save` wrote; None: the shipped weights
+    #: "read": when a layer is read, and kept until the map changes; "update": at the end of every update
+    when: str = "read"
+
+    def __post_init__(self) -> None:
+        is_path = self.weights is None or isinstance(self.weights, str | Path)
+        rule = "must be a path or None"
+        require(is_path, "completion.weights", rule, repr(self.weights), "give a str", TypeError)
+        require(self.when in WHEN, "completion.when", f"must be one of {', '.join(WHEN)}", repr(self.when), "use read")
+        if isinstance(self.weights, Path):
+            object.__setattr__(self, "weights", str(self.weights))  # as files of settings hold it

@@ -1,0 +1,110 @@
+"""The ground at unknown cells, predicted from the known ground in eight directions."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.completion.surroundings import Surroundings
+from torchelev.completion.parameters import Weights, affine, hidden, squash
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+_STEP = 0.1  # [m] distances count about logarithmically beyond it
+_FARTHEST = 10.0  # [m] distances beyond it make no difference
+_STEEPEST = 1.5  # slope to which ground is continued
+_SMALL_STEP = 0.01  # [m] steps count about logarithmically beyond it
+_MARGIN = 0.02  # [m] by which an answer may leave the range of the heights around
+_NO_SPREAD = 0.01  # [m] of candidates that agree
+_FADE = 2.0  # [m] from measurements, where prior and prediction count the same
+_NO_VOTE = -1e4  # logit of a candidate that does not exist
+_LARGEST_LOG = 5.0  # of the network's factor on a spread
+
+
+def predict(
+    weights: Weights,
+    around: Surroundings,
+    context: Float[Tensor, "K n"],
+    upper_bound: Float[Tensor, "n"],
+    bounded: Bool[Tensor, "n"],
+    level: Float[Tensor, "n"],
+    resolution: float,
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Return the mean and the standard deviation [m] of the ground at cells, from what is known around them.
+
+    Each direction proposes candidates: the height of the next known cell, that of the line to the opposite one, and
+    the continued slopes. The mean is their average by the softmax of the network's votes, plus a correction within the
+    range of the heights around, and not above the upper bound. No variance enters: to see the same ground again makes
+    no unseen cell surer. Far from known cells, the standard deviation becomes the prior's:
+
+        log std = (1 - t) log std_net + t log std_prior,    t = d^2 / (d^2 + 4 m^2).
+
+    Args:
+        weights: parameters.
+        around: the known ground around the cells.
+        context: of `describe_context`.
+        upper_bound: [m], arbitrary where not bounded.
+        bounded: where it counts.
+        level: [m] mean where no direction holds known ground.
+        resolution: [m].
+    """
+    known = around.is_known.to(around.height.dtype)
+    has_any = around.is_known.any(0)
+    distance = around.distance.clamp(max=_FARTHEST)
+    nearest = torch.where(around.is_known, distance, _FARTHEST).amin(0)
+    near = nearest / distance.clamp(min=1e-6) * known
+
+    # Heights from the mean of those around, first from the lowest, so that altitude costs no precision.
+    low = torch.where(has_any, torch.where(around.is_known, around.height, torch.inf).amin(0), level)
+    height = (around.height - low) * known
+    mean = (near * height).sum(0) / near.sum(0).clamp(min=1e-6)
+    height = (height - mean) * known
+    reference = low + mean
+    low, high = -mean, torch.where(around.is_known, height, -torch.inf).amax(0)
+    high = torch.where(has_any, high, 0.0)
+    bound = torch.where(bounded, upper_bound - reference, 0.0)
+    is_bounded = bounded.to(bound.dtype)
+
+    both = known * opposite(known)
+    share = opposite(distance) / (distance + opposite(distance)).clamp(min=1e-6) * both
+    step = (opposite(height) - height) * both
+    slopes, has_slope = around.slope.clamp(-_STEEPEST, _STEEPEST), around.has_slope.to(height.dtype)
+    features = [known, near, torch.log1p(distance / _STEP) * known, squash(height), squash(height - low) * known]
+    features += [both, share, squash(step), *has_slope, *slopes]
+    views = hidden(weights.view, torch.stack(features), weights.view_bias)
+    views = hidden(weights.view_inner, views, weights.view_inner_bias)
+
+    cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
+    cell += [torch.log1p(nearest / _STEP), torch.full_like(bound, math.log(resolution / 0.04)), known.mean(0)]
+    cell += squash(context[2::3], _SMALL_STEP).unbind() + context[0::3].unbind() + context[1::3].unbind()
+    pooled = torch.cat([views.mean(1), views.amax(1), torch.stack(cell)])
+    cells = hidden(weights.cell, pooled, weights.cell_bias)
+    cells = hidden(weights.cell_inner, cells, weights.cell_inner_bias)
+
+    views = torch.relu(views + affine(weights.to_view, cells, weights.to_view_bias)[:, None])
+    votes = (
+        torch.einsum("vc,cdn->vdn", weights.vote, views) + affine(weights.vote_cell, cells, weights.vote_bias)[:, None]
+    )
+    proposed = torch.cat([torch.stack([known, both]), has_slope])
+    candidates = torch.cat([torch.stack([height, height + (1 - share) * step]), height + slopes * distance])
+    ballot = torch.where(proposed > 0, votes, _NO_VOTE).flatten(0, 1).softmax(0)
+    candidates = candidates.flatten(0, 1)
+    answer = (ballot * candidates).sum(0)
+    spread = (ballot * (candidates - answer).square()).sum(0) + _NO_SPREAD**2
+
+    correction, factor = affine(weights.answer, cells, weights.answer_bias)
+    answer = answer + torch.tanh(correction) * (high - low + _MARGIN)
+    answer = torch.where(bounded, torch.minimum(answer, bound), answer)
+    log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
+    fade = nearest.square() / (nearest.square() + _FADE**2)
+    std = torch.exp((1 - fade) * log_std + fade * weights.prior)
+    return reference + torch.where(has_any, answer, 0.0), torch.where(has_any, std, weights.prior.exp())
+
+
+def opposite(values: Float[Tensor, "8 n"]) -> Float[Tensor, "8 n"]:
+    """Return for each direction the value of the opposite one."""
+    return values.view(4, 2, -1).flip(1).view_as(values)

@@ -1,0 +1,104 @@
+"""The known ground around a cell: the next known cells in eight directions."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+# Rows and columns of a step; each direction is followed by the opposite one. Quarter turns and mirrors permute them.
+DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
+REACHES = (0.3, 0.8)  # [m] beyond the next known cell, where the ground is read once more, for its slope
+NONE = 2**14  # [steps] where a direction holds no known cell
+
+
+class Surroundings(NamedTuple):
+    """The known ground in eight directions from n cells. Values are 0 where there is none."""
+
+    is_known: Bool[Tensor, "8 n"]  #: the direction holds a known cell, other than the cell itself
+    distance: Float[Tensor, "8 n"]  #: [m] of the next one
+    height: Float[Tensor, "8 n"]  #: [m] of it
+    slope: Float[Tensor, "R 8 n"]  #: rise over run towards the cell, of the ground from each of REACHES beyond it
+    has_slope: Bool[Tensor, "R 8 n"]  #: the ground at that reach is known, too
+
+
+@torch.library.custom_op("torchelev::count_steps", mutates_args=())
+def count_steps(known: Tensor) -> Tensor:
+    """Count the steps (8, B, H, W) int16 from each cell to the next known one in DIRECTIONS; NONE: there is none.
+
+    By doubling: what the cell 2^k steps on sees within 2^k steps, this one sees within 2^(k + 1).
+    """
+    H, W = known.shape[1:]
+    at_cells = torch.where(known, 0, NONE).to(torch.int16)
+    steps = torch.full((len(DIRECTIONS), *known.shape), NONE, dtype=torch.int16, device=known.device)
+    for (di, dj), counted in zip(DIRECTIONS, steps, strict=True):
+        within, reach = at_cells.clone(), 1
+        while reach < max(H * abs(di), W * abs(dj)) and reach < (H if di else W) and reach < (W if dj else H):
+            here, there = _overlap(within, reach * di, reach * dj)
+            torch.minimum(here, there + reach, out=here)
+            reach *= 2
+        here, there = _overlap(counted, di, dj)[0], _overlap(within, di, dj)[1]
+        torch.clamp(there + 1, max=NONE, out=here)
+    return steps
+
+
+@count_steps.register_fake
+def _(known: Tensor) -> Tensor:
+    return known.new_empty(len(DIRECTIONS), *known.shape, dtype=torch.int16)
+
+
+def _overlap(values: Tensor, i: int, j: int) -> tuple[Tensor, Tensor]:
+    """Return views of the cells (B, h, w) whose neighbour (i, j) cells on is inside, and of these neighbours."""
+    H, W = values.shape[1:]
+    here = values[:, max(0, -i) : H - max(0, i), max(0, -j) : W - max(0, j)]
+    there = values[:, max(0, i) : H + min(0, i), max(0, j) : W + min(0, j)]
+    return here, there
+
+
+def look_around(
+    elevation: Float[Tensor, "B H W"],
+    known: Bool[Tensor, "B H W"],
+    steps: Int[Tensor, "8 B H W"],
+    place: Int[Tensor, "n"],
+    resolution: float,
+) -> Surroundings:
+    """Return the known ground around cells.
+
+    Args:
+        elevation: [m], finite where known.
+        known: where it counts.
+        steps: of `count_steps`.
+        place: numbers of the cells in the flat maps.
+        resolution: [m].
+    """
+    H, W = known.shape[1:]
+    ground = torch.where(known, elevation, torch.inf).flatten()
+    i, j = place // W % H, place % W
+    steps = steps.flatten(1).index_select(1, place).to(torch.int64)
+    rows, columns = torch.tensor(DIRECTIONS, device=place.device).T[..., None]
+    lengths = torch.tensor([math.hypot(*step) for step in DIRECTIONS], device=place.device)[:, None] * resolution
+
+    def read(steps: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the heights so many steps on, 0 where unknown, and where they are known."""
+        row, column = i + rows * steps, j + columns * steps
+        inside = (row >= 0) & (row < H) & (column >= 0) & (column < W)
+        there = torch.where(inside, place + (rows * W + columns) * steps, place)
+        heights = ground.index_select(0, there.flatten()).view(steps.shape)
+        found = inside & (heights < torch.inf)
+        return torch.where(found, heights, 0.0), found
+
+    height, is_known = read(steps)
+    beyond = [(reach / lengths).round().clamp(min=3).to(torch.int64) for reach in REACHES]
+    farther = [read(steps + more) for more in beyond]
+    slopes = [
+        torch.where(found, (height - far) / (more * lengths), 0.0)
+        for more, (far, found) in zip(beyond, farther, strict=True)
+    ]
+    distance = torch.where(is_known, steps * lengths, 0.0).to(elevation.dtype)
+    has_slope = torch.stack([found for _, found in farther])
+    return Surroundings(is_known, distance, height, torch.stack(slopes).to(elevation.dtype), has_slope)
