@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchelev.completion.context import describe_context
-from torchelev.completion.predict import predict
+from torchelev.completion.parameters import Weights
+from torchelev.completion.predict import Seen, predict
 from torchelev.completion.refine import refine
 from torchelev.completion.surroundings import count_steps, look_around
-from torchelev.completion.parameters import Weights
 from torchelev.ops.parallel import map_in_order
 
 if TYPE_CHECKING:
@@ -50,30 +50,51 @@ def complete(weights: Weights, layers: CompletionInput, resolution: float) -> Co
         resolution: [m].
     """
     known, bounded = layers.validity, layers.bounded & ~layers.validity
-    mean, std = refine(weights, layers.elevation, known, layers.variance, layers.age, resolution)
-    steps = count_steps(known)
-    context = describe_context(layers.elevation, known, bounded, resolution).flatten(1)
-    level = torch.where(known, layers.elevation, 0.0).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)
-    flat_bound, flat_bounded = layers.upper_bound.flatten(), bounded.flatten()
-    per_map = known[0].numel()
-
-    def predict_at(place: Int[Tensor, "n"]) -> tuple[Tensor, Tensor]:
-        around = look_around(layers.elevation, known, steps, place, resolution)
-        bound = (values.index_select(0, place) for values in (flat_bound, flat_bounded))
-        at = level.index_select(0, place // per_map)
-        return predict(weights, around, context.index_select(1, place), *bound, at, resolution)
-
-    if _may_choose_cells(known):
-        unknown = (~known).flatten().nonzero()[:, 0]
-        parts = list(map_in_order(predict_at, unknown.split(_AT_A_TIME)))
-        for layer, values in zip((mean, std), zip(*parts, strict=True), strict=False):
-            layer.view(-1).index_copy_(0, unknown, torch.cat(values))
-        return Completion(mean, std)
+    of_cells = torch.full_like(layers.elevation, resolution)
+    mean, std = refine(weights, layers.elevation, known, layers.variance, layers.age, of_cells)
+    unseen = Unseen(layers.elevation, known, layers.upper_bound, bounded, resolution)
+    if _may_choose_cells(weights, layers):
+        return _fill_unknown(weights, unseen, Completion(mean, std))
     places = torch.arange(known.numel(), device=known.device).split(_AT_A_TIME_ON_GPU)
-    predicted = (torch.cat(values).view_as(mean) for values in zip(*map(predict_at, places), strict=True))
+    parts = [predict(weights, unseen.read(place)) for place in places]
+    predicted = [torch.cat(values).view_as(mean) for values in zip(*parts, strict=True)]
     return Completion(*(torch.where(known, old, new) for old, new in zip((mean, std), predicted, strict=True)))
 
 
-def _may_choose_cells(known: Tensor) -> bool:
+@torch.no_grad()
+def _fill_unknown(weights: Weights, unseen: Unseen, refined: Completion) -> Completion:
+    """Predict the unknown cells alone, in place, on all cores."""
+    places = (~unseen.known).flatten().nonzero()[:, 0].split(_AT_A_TIME)
+    parts = map_in_order(lambda place: predict(weights, unseen.read(place)), places)
+    for place, values in zip(places, parts, strict=True):
+        for layer, value in zip(refined, values, strict=True):
+            layer.view(-1).index_copy_(0, place, value)
+    return refined
+
+
+class Unseen:
+    """Predicts unknown cells of maps, whose surroundings it prepares."""
+
+    def __init__(
+        self, elevation: Tensor, known: Tensor, upper_bound: Tensor, bounded: Tensor, resolution: float
+    ) -> None:
+        self.elevation, self.known, self.resolution = elevation, known, resolution
+        self.steps = count_steps(known)
+        self.context = describe_context(elevation, known, bounded, resolution).flatten(1)
+        total = torch.where(known, elevation, 0.0).sum((1, 2))
+        self.level = total / known.sum((1, 2)).clamp(min=1)  # [m] where no direction holds known ground
+        self.bound, self.bounded = upper_bound.flatten(), bounded.flatten()
+
+    def read(self, place: Int[Tensor, "n"]) -> Seen:
+        """Return what the prediction at cells, numbered in the flat maps, depends on."""
+        around = look_around(self.elevation, self.known, self.steps, place, self.resolution)
+        bound, bounded = (values.index_select(0, place) for values in (self.bound, self.bounded))
+        level = self.level.index_select(0, place // self.known[0].numel())
+        context = self.context.index_select(1, place)
+        return Seen(around, context, bound, bounded, level, torch.full_like(bound, self.resolution))
+
+
+def _may_choose_cells(weights: Weights, layers: CompletionInput) -> bool:
     """Tell whether the number of computed cells may depend on the data: on a CPU, without gradients and compiler."""
-    return known.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+    is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in (*weights, *layers))
+    return layers.validity.device.type == "cpu" and not is_differentiated and not torch.compiler.is_compiling()

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.completion.surroundings import Surroundings
 from torchelev.completion.parameters import Weights, affine, hidden, squash
+from torchelev.completion.surroundings import Surroundings
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 _STEP = 0.1  # [m] distances count about logarithmically beyond it
 _FARTHEST = 10.0  # [m] distances beyond it make no difference
+_USUAL = 0.04  # [m] resolution
 _STEEPEST = 1.5  # slope to which ground is continued
 _SMALL_STEP = 0.01  # [m] steps count about logarithmically beyond it
 _MARGIN = 0.02  # [m] by which an answer may leave the range of the heights around
@@ -25,16 +25,19 @@ _NO_VOTE = -1e4  # logit of a candidate that does not exist
 _LARGEST_LOG = 5.0  # of the network's factor on a spread
 
 
-def predict(
-    weights: Weights,
-    around: Surroundings,
-    context: Float[Tensor, "K n"],
-    upper_bound: Float[Tensor, "n"],
-    bounded: Bool[Tensor, "n"],
-    level: Float[Tensor, "n"],
-    resolution: float,
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return the mean and the standard deviation [m] of the ground at cells, from what is known around them.
+class Seen(NamedTuple):
+    """What the prediction at n unknown cells depends on."""
+
+    around: Surroundings  #: the known ground in eight directions
+    context: Float[Tensor, "K n"]  #: of `describe_context`
+    upper_bound: Float[Tensor, "n"]  #: [m]
+    bounded: Bool[Tensor, "n"]  #: where it counts
+    level: Float[Tensor, "n"]  #: [m] mean where no direction holds known ground
+    resolution: Float[Tensor, "n"]  #: [m]
+
+
+def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Return the mean and the standard deviation [m] of the ground at unknown cells.
 
     Each direction proposes candidates: the height of the next known cell, that of the line to the opposite one, and
     the continued slopes. The mean is their average by the softmax of the network's votes, plus a correction within the
@@ -42,16 +45,8 @@ def predict(
     no unseen cell surer. Far from known cells, the standard deviation becomes the prior's:
 
         log std = (1 - t) log std_net + t log std_prior,    t = d^2 / (d^2 + 4 m^2).
-
-    Args:
-        weights: parameters.
-        around: the known ground around the cells.
-        context: of `describe_context`.
-        upper_bound: [m], arbitrary where not bounded.
-        bounded: where it counts.
-        level: [m] mean where no direction holds known ground.
-        resolution: [m].
     """
+    around, context, upper_bound, bounded, level, resolution = seen
     known = around.is_known.to(around.height.dtype)
     has_any = around.is_known.any(0)
     distance = around.distance.clamp(max=_FARTHEST)
@@ -79,7 +74,7 @@ def predict(
     views = hidden(weights.view_inner, views, weights.view_inner_bias)
 
     cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
-    cell += [torch.log1p(nearest / _STEP), torch.full_like(bound, math.log(resolution / 0.04)), known.mean(0)]
+    cell += [torch.log1p(nearest / _STEP), (resolution / _USUAL).log(), known.mean(0)]
     cell += squash(context[2::3], _SMALL_STEP).unbind() + context[0::3].unbind() + context[1::3].unbind()
     pooled = torch.cat([views.mean(1), views.amax(1), torch.stack(cell)])
     cells = hidden(weights.cell, pooled, weights.cell_bias)

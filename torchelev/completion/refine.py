@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
 
 _PAIRS = ((0, 7), (1, 6), (2, 5), (3, 4))  # opposite ones of `neighbours`
 _MIN_STD = 1e-3  # [m]
+_USUAL = 0.04  # [m] resolution
 _LONG_AGO = 60.0  # [s] ages count about logarithmically beyond a second, up to this
 
 
@@ -25,7 +25,7 @@ def refine(
     known: Bool[Tensor, "B H W"],
     variance: Float[Tensor, "B H W"],
     age: Float[Tensor, "B H W"],
-    resolution: float,
+    resolution: Float[Tensor, "B H W"],
 ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
     """Return the mean and the standard deviation [m] of the ground at measured cells; arbitrary but finite elsewhere.
 
@@ -47,7 +47,7 @@ def refine(
     )
     sigma = torch.where(known, variance, 0.0).clamp(min=_MIN_STD**2).sqrt()
     features = [sigma.log(), bend.abs() / (bend.abs() + sigma), squash(rough, 0.01), squash(tilt), count / 4]
-    features += [torch.log1p(age.clamp(0, _LONG_AGO)), torch.full_like(sigma, math.log(resolution / 0.04))]
+    features += [torch.log1p(age.clamp(0, _LONG_AGO)), (resolution / _USUAL).log()]
     flat = torch.stack(features).flatten(1)
     channels = hidden(weights.measured, flat, weights.measured_bias)
     gain, factor = (v.view_as(sigma) for v in affine(weights.measured_answer, channels, weights.measured_answer_bias))
@@ -57,6 +57,6 @@ def refine(
 
 
 def sum_in_pairs(values: list[Tensor]) -> Tensor:
-    """Return the sum of four values, to the bit the same when a turn or mirror exchanges those along axes or diagonals."""
+    """Return the sum of four values, to the bit the same when a turn or mirror exchanges two axes or diagonals."""
     diagonal, along_x, other_diagonal, along_y = values
     return (diagonal + other_diagonal) + (along_x + along_y)

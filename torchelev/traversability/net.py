@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
-from torchelev.traversability.rate import rate
 from torchelev.traversability import weight_file
+from torchelev.traversability.rate import rate
 from torchelev.traversability.weight_file import RANGES, Weights, require_in_ranges, weight_shapes
 from torchelev.weight_files import require_same_shapes
 
