@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.completion.context import describe_context
+from torchelev.completion.context import describe, sum_layers
 from torchelev.completion.parameters import Weights
 from torchelev.completion.predict import Seen, predict
 from torchelev.completion.refine import refine
@@ -80,17 +80,17 @@ class Unseen:
     ) -> None:
         self.elevation, self.known, self.resolution = elevation, known, resolution
         self.steps = count_steps(known)
-        self.context = describe_context(elevation, known, bounded, resolution).flatten(1)
-        total = torch.where(known, elevation, 0.0).sum((1, 2))
+        total = torch.where(known, elevation, 0.0).double().sum((1, 2))
         self.level = total / known.sum((1, 2)).clamp(min=1)  # [m] where no direction holds known ground
+        self.sums = sum_layers(elevation, known, bounded, self.level)
         self.bound, self.bounded = upper_bound.flatten(), bounded.flatten()
 
     def read(self, place: Int[Tensor, "n"]) -> Seen:
         """Return what the prediction at cells, numbered in the flat maps, depends on."""
         around = look_around(self.elevation, self.known, self.steps, place, self.resolution)
         bound, bounded = (values.index_select(0, place) for values in (self.bound, self.bounded))
-        level = self.level.index_select(0, place // self.known[0].numel())
-        context = self.context.index_select(1, place)
+        level = self.level.to(bound.dtype).index_select(0, place // self.known[0].numel())
+        context = describe(self.sums, self.level, place, self.resolution)
         return Seen(around, context, bound, bounded, level, torch.full_like(bound, self.resolution))
 
 

@@ -88,7 +88,7 @@ class CompletionNet(nn.Module):
             ValueError: if a layer has another shape or device, or the resolution is out of range.
         """
         require_resolution(resolution)
-        layers = _check_layers(self.prior, elevation, validity, variance, upper_bound, bounded, age)
+        layers = _check_layers(self.weights.prior, elevation, validity, variance, upper_bound, bounded, age)
         return complete(self.weights, layers, resolution)
 
     def save(self, path: str | Path) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.completion.context import Context
 from torchelev.completion.parameters import Weights, affine, hidden, squash
 from torchelev.completion.surroundings import Surroundings
 
@@ -29,7 +30,7 @@ class Seen(NamedTuple):
     """What the prediction at n unknown cells depends on."""
 
     around: Surroundings  #: the known ground in eight directions
-    context: Float[Tensor, "K n"]  #: of `describe_context`
+    context: Context  #: the ground in the squares around them
     upper_bound: Float[Tensor, "n"]  #: [m]
     bounded: Bool[Tensor, "n"]  #: where it counts
     level: Float[Tensor, "n"]  #: [m] mean where no direction holds known ground
@@ -54,11 +55,11 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     near = nearest / distance.clamp(min=1e-6) * known
 
     # Heights from the mean of those around, first from the lowest, so that altitude costs no precision.
-    low = torch.where(has_any, torch.where(around.is_known, around.height, torch.inf).amin(0), level)
-    height = (around.height - low) * known
+    low_height = torch.where(has_any, torch.where(around.is_known, around.height, torch.inf).amin(0), level)
+    height = (around.height - low_height) * known
     mean = (near * height).sum(0) / near.sum(0).clamp(min=1e-6)
     height = (height - mean) * known
-    reference = low + mean
+    reference = low_height + mean
     low, high = -mean, torch.where(around.is_known, height, -torch.inf).amax(0)
     high = torch.where(has_any, high, 0.0)
     bound = torch.where(bounded, upper_bound - reference, 0.0)
@@ -75,7 +76,10 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
 
     cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
     cell += [torch.log1p(nearest / _STEP), (resolution / _USUAL).log(), known.mean(0)]
-    cell += squash(context[2::3], _SMALL_STEP).unbind() + context[0::3].unbind() + context[1::3].unbind()
+    ground = (context.mean - (low_height + mean).double()).to(bound.dtype) * (context.known > 0)
+    squares = [context.known, context.bounded, squash(context.step, _SMALL_STEP), squash(ground)]
+    squares += [squash(context.std), context.skewness]
+    cell += torch.cat(squares).to(bound.dtype).unbind()
     pooled = torch.cat([views.mean(1), views.amax(1), torch.stack(cell)])
     cells = hidden(weights.cell, pooled, weights.cell_bias)
     cells = hidden(weights.cell_inner, cells, weights.cell_inner_bias)
