@@ -771,3 +771,143 @@ def replaces(other, first, is_new, rate, max_newer_ratio):
     if ages[0] == ages[1]:
         return ratio < 1
     return ratio < (max_newer_ratio if ages[1] > ages[0] else 1 / max_newer_ratio)
+
+
+# Completion -----------------------------------------------------------------------------------------------------------
+
+DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+def next_known(known, i, j, direction):
+    """The number of steps to the next known cell in a direction, None without any."""
+    H, W = known.shape
+    steps, (di, dj) = 1, direction
+    while 0 <= i + steps * di < H and 0 <= j + steps * dj < W:
+        if known[i + steps * di, j + steps * dj]:
+            return steps
+        steps += 1
+    return None
+
+
+def squash(height, scale=0.05):
+    """Linear below the scale [m], logarithmic above it."""
+    return math.copysign(math.log1p(abs(height) / scale), height)
+
+
+def square_around(elevation, known, bounded, i, j, radius, resolution):
+    """Shares of known and bounded cells, mean step, mean, standard deviation and skewness of a square of cells."""
+    cells = max(1, round(radius / resolution))
+    inside = [(a, b) for a in range(i - cells, i + cells + 1) for b in range(j - cells, j + cells + 1)
+              if 0 <= a < known.shape[0] and 0 <= b < known.shape[1]]  # fmt: skip
+    heights = [elevation[a, b] for a, b in inside if known[a, b]]
+    steps = []
+    for a, b in inside:
+        for c, d in ((a + 1, b), (a - 1, b), (a, b + 1), (a, b - 1)):
+            if 0 <= c < known.shape[0] and 0 <= d < known.shape[1] and known[a, b] and known[c, d]:
+                steps.append(abs(elevation[a, b] - elevation[c, d]))
+    area = (2 * cells + 1) ** 2
+    mean = float(np.mean(heights)) if heights else None
+    variance = float(np.mean([(h - mean) ** 2 for h in heights])) if heights else 0.0
+    third = float(np.mean([(h - mean) ** 3 for h in heights])) if heights else 0.0
+    spread = math.sqrt(variance + 0.01**2)
+    share, bound = len(heights) / area, sum(bounded[a, b] for a, b in inside) / area
+    return share, bound, float(np.mean(steps)) if steps else 0.0, mean, spread - 0.01, third / spread**3
+
+
+def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
+    """The mean and standard deviation [m] of the ground at an unknown cell; w holds the weights by name."""
+    views = []
+    for direction in DIRECTIONS:
+        length, steps = math.hypot(*direction) * resolution, next_known(known, i, j, direction)
+        if steps is None:
+            views.append(None)
+            continue
+        height, slopes = elevation[i + steps * direction[0], j + steps * direction[1]], []
+        for reach in (0.3, 0.8):
+            more = max(3, round(reach / length))
+            a, b = (k + (steps + more) * d for k, d in zip((i, j), direction, strict=True))
+            inside = 0 <= a < known.shape[0] and 0 <= b < known.shape[1] and known[a, b]
+            slopes.append((height - elevation[a, b]) / (more * length) if inside else None)
+        views.append(dict(d=min(steps * length, 10.0), far=steps * length, h=height, slopes=slopes))
+    found = [view for view in views if view]
+    if not found:
+        return (float(elevation[known].mean()) if known.any() else 0.0), math.exp(w["prior"][0])
+
+    nearest = min(view["d"] for view in found)
+    reference = sum(v["h"] * nearest / v["d"] for v in found) / sum(nearest / v["d"] for v in found)
+    low, high = (choose(v["h"] for v in found) - reference for choose in (min, max))
+    bound = upper_bound[i, j] - reference if bounded[i, j] else None
+
+    def relu(matrix, columns, bias):
+        return np.maximum(w[matrix] @ np.array(columns) + w[bias][:, 0], 0)
+
+    channels = []
+    for k, view in enumerate(views):
+        features = [0.0] * 12
+        if view:
+            height, other = view["h"] - reference, views[k ^ 1]
+            features[0], features[1], features[2] = 1.0, nearest / view["d"], math.log1p(view["d"] / 0.1)
+            features[3], features[4] = squash(height), squash(height - low)
+            if other:
+                features[5], features[6] = 1.0, other["d"] / (view["d"] + other["d"])
+                features[7] = squash(other["h"] - view["h"])
+            features[8:10] = [float(slope is not None) for slope in view["slopes"]]
+            features[10:12] = [float(np.clip(slope or 0.0, -1.5, 1.5)) for slope in view["slopes"]]
+        channels.append(relu("view_inner", relu("view", features, "view_bias"), "view_inner_bias"))
+
+    cell = [squash(high - low), squash(low)]
+    cell += [0.0, 0.0, 0.0] if bound is None else [1.0, squash(bound - low), squash(bound)]
+    cell += [math.log1p(nearest / 0.1), math.log(resolution / 0.04), len(found) / 8]
+    squares = [square_around(elevation, known, bounded, i, j, radius, resolution) for radius in (0.4, 1.2)]
+    share, bound_share, step, mean, std, skewness = zip(*squares, strict=True)
+    cell += [*share, *bound_share, *(squash(s, 0.01) for s in step)]
+    cell += [0.0 if m is None else squash(m - reference) for m in mean]
+    cell += [*(squash(s) for s in std), *skewness]
+    pooled = [*np.mean(channels, 0), *np.max(channels, 0), *cell]
+    cell = relu("cell_inner", relu("cell", pooled, "cell_bias"), "cell_inner_bias")
+
+    logits, heights = [], []
+    for k, view in enumerate(views):
+        told = np.maximum(channels[k] + w["to_view"] @ cell + w["to_view_bias"][:, 0], 0)
+        votes = w["vote"] @ told + w["vote_cell"] @ cell + w["vote_bias"][:, 0]
+        if not view:
+            continue
+        height, other = view["h"] - reference, views[k ^ 1]
+        proposed = [height, None, *(None if s is None else height + float(np.clip(s, -1.5, 1.5)) * view["d"]
+                                    for s in view["slopes"])]  # fmt: skip
+        if other:
+            proposed[1] = height + (other["h"] - view["h"]) * view["d"] / (view["d"] + other["d"])
+        for vote, candidate in zip(votes, proposed, strict=True):
+            if candidate is not None:
+                logits.append(vote)
+                heights.append(candidate)
+    share = np.exp(np.array(logits) - max(logits))
+    share, heights = share / share.sum(), np.array(heights)
+    answer = float(share @ heights)
+    spread = float(share @ (heights - answer) ** 2) + 0.01**2
+    correction, factor = w["answer"] @ cell + w["answer_bias"][:, 0]
+    answer += math.tanh(correction) * (high - low + 0.02)
+    answer = answer if bound is None else min(answer, bound)
+    reach = min(view["far"] for view in found)
+    fade = reach**2 / (reach**2 + 4.0)
+    log_std = 0.5 * math.log(spread) + float(np.clip(factor, -5, 5)) + w["calibration"][0]
+    return reference + answer, math.exp((1 - fade) * log_std + fade * w["prior"][0])
+
+
+def refine_cell(w, elevation, known, variance, age, i, j, resolution):
+    """The mean and standard deviation [m] of the ground at a measured cell."""
+    height, bends, tilts = elevation[i, j], [], []
+    for di, dj in ((1, 1), (1, 0), (1, -1), (0, 1)):
+        a, b = (i - di, j - dj), (i + di, j + dj)
+        inside = all(0 <= c < known.shape[0] and 0 <= d < known.shape[1] and known[c, d] for c, d in (a, b))
+        if inside:
+            bends.append((elevation[a] + elevation[b]) / 2 - height)
+            tilts.append(abs(elevation[a] - elevation[b]))
+    bend, rough, tilt = (float(np.mean(v)) if v else 0.0 for v in (bends, [abs(b) for b in bends], tilts))
+    sigma = math.sqrt(max(variance[i, j], 1e-6))
+    features = [math.log(sigma), abs(bend) / (abs(bend) + sigma), squash(rough, 0.01), squash(tilt), len(bends) / 4]
+    features += [math.log1p(min(max(age[i, j], 0.0), 60.0)), math.log(resolution / 0.04)]
+    channels = np.maximum(w["measured"] @ np.array(features) + w["measured_bias"][:, 0], 0)
+    gain, factor = w["measured_answer"] @ channels + w["measured_answer_bias"][:, 0]
+    mean = height + 2 * sigma * math.tanh(bend / (1 + math.exp(-gain)) / (2 * sigma))
+    return mean, math.sqrt(sigma**2 + math.exp(2 * min(max(factor, -10.0), 2.0))) * math.exp(w["calibration"][1])

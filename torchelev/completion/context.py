@@ -17,12 +17,12 @@ _SMALLEST_STD = 0.01  # [m] below which the skewness fades
 
 
 class Context(NamedTuple):
-    """The squares of RADII around n cells. Outside the window nothing is known."""
+    """The squares of RADII around n cells, float64. Outside the window nothing is known."""
 
     known: Float[Tensor, "R n"]  #: share of known cells
     bounded: Float[Tensor, "R n"]  #: share of bounded cells
     step: Float[Tensor, "R n"]  #: [m] mean difference of neighbours along x or y that are both known
-    mean: Float[Tensor, "R n"]  #: [m] of the known heights, float64; 0 without any
+    mean: Float[Tensor, "R n"]  #: [m] of the known heights; 0 without any
     std: Float[Tensor, "R n"]  #: [m] of these heights
     skewness: Float[Tensor, "R n"]  #: of these heights: below 0, they are mostly high
 
@@ -59,8 +59,6 @@ def describe(
     H, W = (size - 1 for size in sums.shape[1:3])
     robot, i, j = place // (H * W), place // W % H, place % W
     flat, described = sums.flatten(0, 2), []
-    dtype = torch.float32
-
     for radius in RADII:
         cells = max(1, round(radius / resolution))
         rows = [((i + k).clamp(0, H) + robot * (H + 1)) * (W + 1) for k in (-cells, cells + 1)]
@@ -76,5 +74,4 @@ def describe(
         absolute = torch.where(known > 0, level.index_select(0, robot) + mean, 0.0)
         values = known / area, bounded / area, steps / pairs.clamp(min=1), absolute, spread - _SMALLEST_STD
         described.append((*values, third / spread**3))
-    columns = [torch.stack(values) for values in zip(*described, strict=True)]
-    return Context(*(v if k == 3 else v.to(dtype) for k, v in enumerate(columns)))
+    return Context(*(torch.stack(values) for values in zip(*described, strict=True)))

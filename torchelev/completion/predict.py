@@ -76,10 +76,12 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
 
     cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
     cell += [torch.log1p(nearest / _STEP), (resolution / _USUAL).log(), known.mean(0)]
-    ground = (context.mean - (low_height + mean).double()).to(bound.dtype) * (context.known > 0)
-    squares = [context.known, context.bounded, squash(context.step, _SMALL_STEP), squash(ground)]
-    squares += [squash(context.std), context.skewness]
-    cell += torch.cat(squares).to(bound.dtype).unbind()
+    ground = (context.mean - (low_height + mean)) * (context.known > 0)
+    known_share, bounded_share, steps, ground, stds, skewness = (
+        values.to(bound.dtype) for values in context._replace(mean=ground)
+    )
+    cell += torch.cat([known_share, bounded_share, squash(steps, _SMALL_STEP), squash(ground)]).unbind()
+    cell += torch.cat([squash(stds), skewness]).unbind()
     pooled = torch.cat([views.mean(1), views.amax(1), torch.stack(cell)])
     cells = hidden(weights.cell, pooled, weights.cell_bias)
     cells = hidden(weights.cell_inner, cells, weights.cell_inner_bias)
@@ -99,7 +101,8 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     answer = answer + torch.tanh(correction) * (high - low + _MARGIN)
     answer = torch.where(bounded, torch.minimum(answer, bound), answer)
     log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
-    fade = nearest.square() / (nearest.square() + _FADE**2)
+    reach = torch.where(around.is_known, around.distance, _FARTHEST).amin(0).square()
+    fade = reach / (reach + _FADE**2)
     std = torch.exp((1 - fade) * log_std + fade * weights.prior)
     return reference + torch.where(has_any, answer, 0.0), torch.where(has_any, std, weights.prior.exp())
 

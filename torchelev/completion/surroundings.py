@@ -81,7 +81,7 @@ def look_around(
     i, j = place // W % H, place % W
     steps = steps.flatten(1).index_select(1, place).to(torch.int64)
     rows, columns = torch.tensor(DIRECTIONS, device=place.device).T[..., None]
-    lengths = torch.tensor([math.hypot(*step) for step in DIRECTIONS], device=place.device)[:, None] * resolution
+    lengths = elevation.new_tensor([[resolution * math.hypot(*step)] for step in DIRECTIONS])
 
     def read(steps: Tensor) -> tuple[Tensor, Tensor]:
         """Return the heights so many steps on, 0 where unknown, and where they are known."""
