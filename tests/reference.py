@@ -814,47 +814,59 @@ def square_around(elevation, known, bounded, i, j, radius, resolution):
     return share, bound, float(np.mean(steps)) if steps else 0.0, mean, spread - 0.01, third / spread**3
 
 
+def view_from(elevation, known, i, j, direction, resolution):
+    """The next known cell in a direction, and the slopes of the ground beyond it; None without any."""
+    length, steps = math.hypot(*direction) * resolution, next_known(known, i, j, direction)
+    if steps is None:
+        return None
+    height, slopes = elevation[i + steps * direction[0], j + steps * direction[1]], []
+    for reach in (0.3, 0.8):
+        more = max(3, round(reach / length))
+        a, b = (k + (steps + more) * d for k, d in zip((i, j), direction, strict=True))
+        inside = 0 <= a < known.shape[0] and 0 <= b < known.shape[1] and known[a, b]
+        slopes.append((height - elevation[a, b]) / (more * length) if inside else None)
+    return dict(d=min(steps * length, 10.0), far=steps * length, h=height, slopes=slopes)
+
+
+def view_features(view, other, nearest, reference, low):
+    """The features of a direction, given the opposite one."""
+    if not view:
+        return [0.0] * 12
+    height = view["h"] - reference
+    pair = [1.0, other["d"] / (view["d"] + other["d"]), squash(other["h"] - view["h"])] if other else [0.0] * 3
+    return [1.0, nearest / view["d"], math.log1p(view["d"] / 0.1), squash(height), squash(height - low), *pair,
+            *(float(slope is not None) for slope in view["slopes"]),
+            *(float(np.clip(slope or 0.0, -1.5, 1.5)) for slope in view["slopes"])]  # fmt: skip
+
+
+def view_candidates(view, other, reference):
+    """The heights that a direction proposes, None where it has none."""
+    if not view:
+        return [None] * 4
+    height, line = view["h"] - reference, None
+    if other:
+        line = height + (other["h"] - view["h"]) * view["d"] / (view["d"] + other["d"])
+    slopes = (None if s is None else height + float(np.clip(s, -1.5, 1.5)) * view["d"] for s in view["slopes"])
+    return [height, line, *slopes]
+
+
 def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     """The mean and standard deviation [m] of the ground at an unknown cell; w holds the weights by name."""
-    views = []
-    for direction in DIRECTIONS:
-        length, steps = math.hypot(*direction) * resolution, next_known(known, i, j, direction)
-        if steps is None:
-            views.append(None)
-            continue
-        height, slopes = elevation[i + steps * direction[0], j + steps * direction[1]], []
-        for reach in (0.3, 0.8):
-            more = max(3, round(reach / length))
-            a, b = (k + (steps + more) * d for k, d in zip((i, j), direction, strict=True))
-            inside = 0 <= a < known.shape[0] and 0 <= b < known.shape[1] and known[a, b]
-            slopes.append((height - elevation[a, b]) / (more * length) if inside else None)
-        views.append(dict(d=min(steps * length, 10.0), far=steps * length, h=height, slopes=slopes))
+    views = [view_from(elevation, known, i, j, direction, resolution) for direction in DIRECTIONS]
     found = [view for view in views if view]
     if not found:
         return (float(elevation[known].mean()) if known.any() else 0.0), math.exp(w["prior"][0])
-
     nearest = min(view["d"] for view in found)
     reference = sum(v["h"] * nearest / v["d"] for v in found) / sum(nearest / v["d"] for v in found)
     low, high = (choose(v["h"] for v in found) - reference for choose in (min, max))
     bound = upper_bound[i, j] - reference if bounded[i, j] else None
 
-    def relu(matrix, columns, bias):
-        return np.maximum(w[matrix] @ np.array(columns) + w[bias][:, 0], 0)
+    def relu(matrix, columns):
+        return np.maximum(w[matrix] @ np.array(columns) + w[f"{matrix}_bias"][:, 0], 0)
 
-    channels = []
-    for k, view in enumerate(views):
-        features = [0.0] * 12
-        if view:
-            height, other = view["h"] - reference, views[k ^ 1]
-            features[0], features[1], features[2] = 1.0, nearest / view["d"], math.log1p(view["d"] / 0.1)
-            features[3], features[4] = squash(height), squash(height - low)
-            if other:
-                features[5], features[6] = 1.0, other["d"] / (view["d"] + other["d"])
-                features[7] = squash(other["h"] - view["h"])
-            features[8:10] = [float(slope is not None) for slope in view["slopes"]]
-            features[10:12] = [float(np.clip(slope or 0.0, -1.5, 1.5)) for slope in view["slopes"]]
-        channels.append(relu("view_inner", relu("view", features, "view_bias"), "view_inner_bias"))
-
+    pairs = [(view, views[k ^ 1]) for k, view in enumerate(views)]
+    features = [view_features(*pair, nearest, reference, low) for pair in pairs]
+    channels = [relu("view_inner", relu("view", each)) for each in features]
     cell = [squash(high - low), squash(low)]
     cell += [0.0, 0.0, 0.0] if bound is None else [1.0, squash(bound - low), squash(bound)]
     cell += [math.log1p(nearest / 0.1), math.log(resolution / 0.04), len(found) / 8]
@@ -863,26 +875,14 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     cell += [*share, *bound_share, *(squash(s, 0.01) for s in step)]
     cell += [0.0 if m is None else squash(m - reference) for m in mean]
     cell += [*(squash(s) for s in std), *skewness]
-    pooled = [*np.mean(channels, 0), *np.max(channels, 0), *cell]
-    cell = relu("cell_inner", relu("cell", pooled, "cell_bias"), "cell_inner_bias")
+    cell = relu("cell_inner", relu("cell", [*np.mean(channels, 0), *np.max(channels, 0), *cell]))
 
-    logits, heights = [], []
-    for k, view in enumerate(views):
-        told = np.maximum(channels[k] + w["to_view"] @ cell + w["to_view_bias"][:, 0], 0)
-        votes = w["vote"] @ told + w["vote_cell"] @ cell + w["vote_bias"][:, 0]
-        if not view:
-            continue
-        height, other = view["h"] - reference, views[k ^ 1]
-        proposed = [height, None, *(None if s is None else height + float(np.clip(s, -1.5, 1.5)) * view["d"]
-                                    for s in view["slopes"])]  # fmt: skip
-        if other:
-            proposed[1] = height + (other["h"] - view["h"]) * view["d"] / (view["d"] + other["d"])
-        for vote, candidate in zip(votes, proposed, strict=True):
-            if candidate is not None:
-                logits.append(vote)
-                heights.append(candidate)
-    share = np.exp(np.array(logits) - max(logits))
-    share, heights = share / share.sum(), np.array(heights)
+    told = w["to_view"] @ cell + w["to_view_bias"][:, 0]
+    votes = [w["vote"] @ np.maximum(c + told, 0) + w["vote_cell"] @ cell + w["vote_bias"][:, 0] for c in channels]
+    proposed = [view_candidates(*pair, reference) for pair in pairs]
+    counted = [(v, c) for each in zip(votes, proposed) for v, c in zip(*each, strict=True) if c is not None]
+    logits, heights = (np.array(column) for column in zip(*counted, strict=True))
+    share = np.exp(logits - max(logits)) / np.exp(logits - max(logits)).sum()
     answer = float(share @ heights)
     spread = float(share @ (heights - answer) ** 2) + 0.01**2
     correction, factor = w["answer"] @ cell + w["answer_bias"][:, 0]

@@ -14,6 +14,7 @@ from torchelev.completion.surroundings import Surroundings
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+_NOWHERE = 1e6  # [m]
 _STEP = 0.1  # [m] distances count about logarithmically beyond it
 _FARTHEST = 10.0  # [m] distances beyond it make no difference
 _USUAL = 0.04  # [m] resolution
@@ -101,7 +102,7 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     answer = answer + torch.tanh(correction) * (high - low + _MARGIN)
     answer = torch.where(bounded, torch.minimum(answer, bound), answer)
     log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
-    reach = torch.where(around.is_known, around.distance, _FARTHEST).amin(0).square()
+    reach = torch.where(around.is_known, around.distance, _NOWHERE).amin(0).square()
     fade = reach / (reach + _FADE**2)
     std = torch.exp((1 - fade) * log_std + fade * weights.prior)
     return reference + torch.where(has_any, answer, 0.0), torch.where(has_any, std, weights.prior.exp())
