@@ -880,7 +880,9 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     told = w["to_view"] @ cell + w["to_view_bias"][:, 0]
     votes = [w["vote"] @ np.maximum(c + told, 0) + w["vote_cell"] @ cell + w["vote_bias"][:, 0] for c in channels]
     proposed = [view_candidates(*pair, reference) for pair in pairs]
-    counted = [(v, c) for each in zip(votes, proposed) for v, c in zip(*each, strict=True) if c is not None]
+    counted = [
+        (v, c) for each in zip(votes, proposed, strict=True) for v, c in zip(*each, strict=True) if c is not None
+    ]
     logits, heights = (np.array(column) for column in zip(*counted, strict=True))
     share = np.exp(logits - max(logits)) / np.exp(logits - max(logits)).sum()
     answer = float(share @ heights)
