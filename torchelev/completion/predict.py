@@ -49,35 +49,34 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
         log std = (1 - t) log std_net + t log std_prior,    t = d^2 / (d^2 + 4 m^2).
     """
     around, context, upper_bound, bounded, level, resolution = seen
-    known = around.is_known.to(around.height.dtype)
-    has_any = around.is_known.any(0)
+    known, nowhere = around.is_known, _NOWHERE * (1 - around.is_known)
+    has_any = known.amax(0) > 0
     distance = around.distance.clamp(max=_FARTHEST)
-    nearest = torch.where(around.is_known, distance, _FARTHEST).amin(0)
+    nearest = (distance + nowhere).amin(0).clamp(max=_FARTHEST)
     near = nearest / distance.clamp(min=1e-6) * known
 
     # Heights from the mean of those around, first from the lowest, so that altitude costs no precision.
-    low_height = torch.where(has_any, torch.where(around.is_known, around.height, torch.inf).amin(0), level)
+    low_height = torch.where(has_any, (around.height + nowhere).amin(0), level)
     height = (around.height - low_height) * known
     mean = (near * height).sum(0) / near.sum(0).clamp(min=1e-6)
     height = (height - mean) * known
     reference = low_height + mean
-    low, high = -mean, torch.where(around.is_known, height, -torch.inf).amax(0)
-    high = torch.where(has_any, high, 0.0)
+    low, high = -mean, torch.where(has_any, (height - nowhere).amax(0), 0.0)
     bound = torch.where(bounded, upper_bound - reference, 0.0)
     is_bounded = bounded.to(bound.dtype)
 
     both = known * opposite(known)
     share = opposite(distance) / (distance + opposite(distance)).clamp(min=1e-6) * both
     step = (opposite(height) - height) * both
-    slopes, has_slope = around.slope.clamp(-_STEEPEST, _STEEPEST), around.has_slope.to(height.dtype)
-    features = [known, near, torch.log1p(distance / _STEP) * known, squash(height), squash(height - low) * known]
+    slopes, has_slope = around.slope.clamp(-_STEEPEST, _STEEPEST), around.has_slope
+    features = [known, near, torch.log1p(distance / _STEP), squash(height), squash(height - low) * known]
     features += [both, share, squash(step), *has_slope, *slopes]
     views = hidden(weights.view, torch.stack(features), weights.view_bias)
     views = hidden(weights.view_inner, views, weights.view_inner_bias)
 
     cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
     cell += [torch.log1p(nearest / _STEP), (resolution / _USUAL).log(), known.mean(0)]
-    ground = (context.mean - (low_height + mean)) * (context.known > 0)
+    ground = (context.mean - low_height - mean) * (context.known > 0)
     known_share, bounded_share, steps, ground, stds, skewness = (
         values.to(bound.dtype) for values in context._replace(mean=ground)
     )
@@ -88,12 +87,11 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     cells = hidden(weights.cell_inner, cells, weights.cell_inner_bias)
 
     views = torch.relu(views + affine(weights.to_view, cells, weights.to_view_bias)[:, None])
-    votes = (
-        torch.einsum("vc,cdn->vdn", weights.vote, views) + affine(weights.vote_cell, cells, weights.vote_bias)[:, None]
-    )
+    votes = (weights.vote @ views.flatten(1)).unflatten(1, known.shape)
+    votes = votes + affine(weights.vote_cell, cells, weights.vote_bias)[:, None]
     proposed = torch.cat([torch.stack([known, both]), has_slope])
     candidates = torch.cat([torch.stack([height, height + (1 - share) * step]), height + slopes * distance])
-    ballot = torch.where(proposed > 0, votes, _NO_VOTE).flatten(0, 1).softmax(0)
+    ballot = (votes * proposed + _NO_VOTE * (1 - proposed)).flatten(0, 1).softmax(0)
     candidates = candidates.flatten(0, 1)
     answer = (ballot * candidates).sum(0)
     spread = (ballot * (candidates - answer).square()).sum(0) + _NO_SPREAD**2
@@ -102,7 +100,7 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     answer = answer + torch.tanh(correction) * (high - low + _MARGIN)
     answer = torch.where(bounded, torch.minimum(answer, bound), answer)
     log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
-    reach = torch.where(around.is_known, around.distance, _NOWHERE).amin(0).square()
+    reach = (around.distance + nowhere).amin(0).square()
     fade = reach / (reach + _FADE**2)
     std = torch.exp((1 - fade) * log_std + fade * weights.prior)
     return reference + torch.where(has_any, answer, 0.0), torch.where(has_any, std, weights.prior.exp())

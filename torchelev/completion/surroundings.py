@@ -15,16 +15,17 @@ if TYPE_CHECKING:
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
 REACHES = (0.3, 0.8)  # [m] beyond the next known cell, where the ground is read once more, for its slope
 NONE = 2**14  # [steps] where a direction holds no known cell
+UNKNOWN = 1e7  # [m] above all ground
 
 
 class Surroundings(NamedTuple):
     """The known ground in eight directions from n cells. Values are 0 where there is none."""
 
-    is_known: Bool[Tensor, "8 n"]  #: the direction holds a known cell, other than the cell itself
+    is_known: Float[Tensor, "8 n"]  #: 1 where the direction holds a known cell, other than the cell itself, else 0
     distance: Float[Tensor, "8 n"]  #: [m] of the next one
     height: Float[Tensor, "8 n"]  #: [m] of it
     slope: Float[Tensor, "R 8 n"]  #: rise over run towards the cell, of the ground from each of REACHES beyond it
-    has_slope: Bool[Tensor, "R 8 n"]  #: the ground at that reach is known, too
+    has_slope: Float[Tensor, "R 8 n"]  #: 1 where the ground at that reach is known, too, else 0
 
 
 @torch.library.custom_op("torchelev::count_steps", mutates_args=())
@@ -77,28 +78,34 @@ def look_around(
         resolution: [m].
     """
     H, W = known.shape[1:]
-    ground = torch.where(known, elevation, torch.inf).flatten()
-    i, j = place // W % H, place % W
-    steps = steps.flatten(1).index_select(1, place).to(torch.int64)
-    rows, columns = torch.tensor(DIRECTIONS, device=place.device).T[..., None]
+    place = place.to(torch.int32)
+    stride = place.new_tensor([[di * W + dj] for di, dj in DIRECTIONS])
     lengths = elevation.new_tensor([[resolution * math.hypot(*step)] for step in DIRECTIONS])
+    steps, room = steps.flatten(1).index_select(1, place).to(torch.int32), _count_room(place, H, W)
+    ground = torch.where(known, elevation, UNKNOWN).flatten()
 
     def read(steps: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the heights so many steps on, 0 where unknown, and where they are known."""
-        row, column = i + rows * steps, j + columns * steps
-        inside = (row >= 0) & (row < H) & (column >= 0) & (column < W)
-        there = torch.where(inside, place + (rows * W + columns) * steps, place)
-        heights = ground.index_select(0, there.flatten()).view(steps.shape)
-        found = inside & (heights < torch.inf)
-        return torch.where(found, heights, 0.0), found
+        """Return the heights so many steps on, 0 where unknown, and whether they are known, 1 or 0."""
+        inside = (steps <= room).to(torch.int32)
+        heights = ground.index_select(0, (place + stride * (steps * inside)).flatten()).view(steps.shape)
+        found = (heights < UNKNOWN).to(heights.dtype) * inside
+        return heights * found, found
 
     height, is_known = read(steps)
-    beyond = [(reach / lengths).round().clamp(min=3).to(torch.int64) for reach in REACHES]
-    farther = [read(steps + more) for more in beyond]
-    slopes = [
-        torch.where(found, (height - far) / (more * lengths), 0.0)
-        for more, (far, found) in zip(beyond, farther, strict=True)
-    ]
-    distance = torch.where(is_known, steps * lengths, 0.0).to(elevation.dtype)
-    has_slope = torch.stack([found for _, found in farther])
-    return Surroundings(is_known, distance, height, torch.stack(slopes).to(elevation.dtype), has_slope)
+    slopes, has_slope = [], []
+    for reach in REACHES:
+        more = (reach / lengths).round().clamp(min=3)
+        far, found = read(steps + more.to(torch.int32))
+        slopes.append((height - far) * found / (more * lengths))
+        has_slope.append(found)
+    distance = steps * lengths * is_known
+    return Surroundings(is_known, distance, height, torch.stack(slopes), torch.stack(has_slope))
+
+
+def _count_room(place: Int[Tensor, "n"], H: int, W: int) -> Int[Tensor, "8 n"]:
+    """Return how many steps in each direction end inside the map."""
+    i, j = place // W % H, place % W
+    room = {(1, 0): H - 1 - i, (-1, 0): i, (0, 1): W - 1 - j, (0, -1): j}
+    return torch.stack(
+        [room[di, dj] if di == 0 or dj == 0 else torch.minimum(room[di, 0], room[0, dj]) for di, dj in DIRECTIONS]
+    )

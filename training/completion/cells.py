@@ -48,7 +48,7 @@ def remove_cells(layers: CompletionInput, kept: Bool[Tensor, "B H W"]) -> Comple
 
 def nearest_known(seen: Surroundings) -> Float[Tensor, "n"]:
     """Return the distance [m] of the next known cell in any direction, inf without one."""
-    return torch.where(seen.is_known, seen.distance, torch.inf).amin(0)
+    return torch.where(seen.is_known > 0, seen.distance, torch.inf).amin(0)
 
 
 def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells]:
