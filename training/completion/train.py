@@ -24,10 +24,13 @@ from training.options import jobs_option
 from training.resume import checkpoint_path, write_result
 
 _POSITIVE = click.IntRange(1)
+_WALKS_SEED = 0
 
 
 @click.command()
-@click.option("--seed", default=0, show_default=True, help="Seed of walks, initial weights and drawn cells.")
+@click.option(
+    "--seed", default=0, show_default=True, help="Seed of initial weights and drawn cells; the walks stay the same."
+)
 @click.option("--walks", type=_POSITIVE, default=320, show_default=True, help="Training walks of four robots.")
 @click.option(
     "--steps", type=_POSITIVE, default=12000, show_default=True, help="Steps in total, including those before --resume."
@@ -55,7 +58,7 @@ def main(
     checkpoint = checkpoint_path(out, resume)
     data = data or out / "data"
     try:
-        cells = training_cells(Walks(data, "train", seed, WalkConfig()), walks, jobs)
+        cells = training_cells(Walks(data, "train", _WALKS_SEED, WalkConfig()), walks, jobs, seed)
         trainer = Trainer(*cells, FitConfig(steps=steps, seed=seed))
         if resume:
             trainer.resume(checkpoint)
@@ -72,11 +75,11 @@ def main(
     click.echo(f"Wrote weights.pt and result.json to {out}.")
 
 
-def training_cells(walks: Walks, count: int, jobs: int) -> tuple[UnknownCells, MeasuredCells]:
+def training_cells(walks: Walks, count: int, jobs: int, seed: int) -> tuple[UnknownCells, MeasuredCells]:
     """Return the cells of all walks, which are made where they are missing."""
     make_walks(walks, count, jobs)
     unknown, measured = [], []
-    generator = torch.Generator().manual_seed(walks.seed)
+    generator = torch.Generator().manual_seed(seed)
     before: list[TrueMap] = []
     for index in tqdm(range(count), desc="cells", unit="walk"):
         maps = walks.read(index)
