@@ -37,6 +37,7 @@ FILLS = {
     "Navier-Stokes": "inpaint_navier_stokes",
 }
 COMPLETED = "CompletionNet"
+Answer = Callable[[TrueMap], Sequence[Any]]  # mean (B, H, W) [m], and standard deviation or None
 
 
 class Errors(NamedTuple):
@@ -49,12 +50,21 @@ class Errors(NamedTuple):
     map: Tensor  #: number of the map in `kind`
 
 
-def fill(name: str, maps: TrueMap) -> Tensor:
-    """Return the elevation [m] that a filter completes, where it leaves cells unknown by the nearest known one."""
-    layer = maps.layers.elevation, maps.layers.validity
-    near, _ = Filter("inpaint_nearest")(layer, resolution=maps.resolution)
-    values, known = Filter(FILLS[name])(layer, resolution=maps.resolution)
-    return torch.where(known, values, near)
+def fill(name: str) -> Answer:
+    """Return a filter as an answer, which takes the nearest known height where the filter leaves a cell unknown."""
+
+    def answer(maps: TrueMap) -> tuple[Tensor, None]:
+        layer = maps.layers.elevation, maps.layers.validity
+        near, _ = Filter("inpaint_nearest")(layer, resolution=maps.resolution)
+        values, known = Filter(FILLS[name])(layer, resolution=maps.resolution)
+        return torch.where(known, values, near), None
+
+    return answer
+
+
+def learned(net: CompletionNet) -> Answer:
+    """Return a network as an answer."""
+    return lambda maps: net(*maps.layers, resolution=maps.resolution)
 
 
 @torch.no_grad()
@@ -67,21 +77,19 @@ def distances(maps: TrueMap) -> Tensor:
 
 
 @torch.no_grad()
-def all_errors(net: CompletionNet, maps: list[TrueMap]) -> dict[str, Errors]:
-    """Return the errors of the network, of the fills and of the maps themselves (where measured)."""
-    found: dict[str, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {}
+def all_errors(answers: dict[str, Answer], maps: list[TrueMap]) -> dict[str, Errors]:
+    """Return the errors of each answer."""
+    found: dict[str, list[list[Tensor]]] = {name: [] for name in answers}
     kinds: list[str] = []
     for entry in maps:
         distance = distances(entry)
         counts = entry.is_inside & (distance < FARTHEST)
         number = len(kinds) + torch.arange(len(entry.kinds))[:, None, None].expand_as(counts)
         kinds += entry.kinds
-        completion = net(*entry.layers, resolution=entry.resolution)
-        answers = {COMPLETED: completion} | {name: (fill(name, entry), None) for name in FILLS}
-        for name, (mean, std) in answers.items():
+        for name, answer in answers.items():
+            mean, std = answer(entry)
             std = torch.full_like(mean, torch.nan) if std is None else std
-            columns = (mean - entry.truth, std, distance, number)
-            found.setdefault(name, []).append(tuple(column[counts] for column in columns))  # type: ignore[arg-type]
+            found[name].append([column[counts] for column in (mean - entry.truth, std, distance, number)])
     joined = {name: [torch.cat(column) for column in zip(*parts, strict=True)] for name, parts in found.items()}
     return {name: Errors(error, std, distance, kinds, of) for name, (error, std, distance, of) in joined.items()}
 
@@ -110,45 +118,43 @@ def groups(errors: Errors) -> Iterator[tuple[str, Tensor]]:
         yield kind, (of_kind == k) & (distance > 0)
 
 
-def evaluate(net: CompletionNet, data: Path, num_walks: int, jobs: int) -> dict[str, Any]:
-    """Measure the network and the fills on held-out ground.
+def evaluate(answers: dict[str, Answer], data: Path, num_walks: int, jobs: int) -> dict[str, Any]:
+    """Measure answers, and the fills, on held-out ground.
 
     Args:
-        net: to be measured.
+        answers: by name.
         data: folder of the walks; missing ones are made.
         num_walks: for each split and resolution.
         jobs: processes that make walks.
 
     Returns:
-        `result[split][resolution][fill][group][metric]`.
+        `result[split][resolution][answer][group][metric]`.
     """
+    answers = answers | {name: fill(name) for name in FILLS}
     result: dict[str, Any] = {}
     for split in SPLITS:
         for resolution in RESOLUTIONS:
             walks = Walks(data, split, _SEED, WalkConfig(), resolution)
             make_walks(walks, num_walks, jobs)
             bar = tqdm(range(num_walks), desc=f"{split} at {100 * resolution:g} cm", unit="walk")
-            errors = all_errors(net, [maps for index in bar for maps in walks.read(index)])
+            errors = all_errors(answers, [maps for index in bar for maps in walks.read(index)])
             measured = {name: {g: measure(each, chosen) for g, chosen in groups(each)} for name, each in errors.items()}
             result.setdefault(split, {})[f"{resolution:g}"] = measured
     return result
 
 
 def table(result: dict[str, Any]) -> str:
-    """Tabulate the mean absolute errors [cm] of unknown cells."""
-    names = [COMPLETED, *FILLS]
-    lines = []
-    for split, of_split in result.items():
-        if split not in SPLITS:
-            continue
-        for resolution, of_fills in of_split.items():
-            for group in of_fills[COMPLETED]:
-                cells = [of_fills[name][group] for name in names]
-                if not cells[0]["cells"]:
+    """Tabulate the mean absolute errors [cm], and how often the first answer holds the ground within two std."""
+    lines: list[list[str]] = []
+    names: list[str] = []
+    for split in SPLITS:
+        for resolution, of_answers in result[split].items():
+            names = list(of_answers)
+            for group, first in of_answers[names[0]].items():
+                if not first["cells"]:
                     continue
-                within = cells[0].get("within_2_std")
-                values = [f"{100 * cell['mae']:.1f}" for cell in cells]
-                lines.append([split, resolution, group, *values, f"{100 * within:.1f}"])
+                values = [f"{100 * of_answers[name][group]['mae']:.1f}" for name in names]
+                lines.append([split, resolution, group, *values, f"{100 * first['within_2_std']:.1f}"])
     return markdown_table(["split", "resolution [m]", "cells", *names, "within 2 std [%]"], lines)
 
 
@@ -161,7 +167,7 @@ def table(result: dict[str, Any]) -> str:
 def main(weights: Path | None, walks: int, data: Path, out: Path | None, jobs: int) -> None:
     """Evaluate and print the table."""
     net = CompletionNet.from_pretrained(weights)
-    result = evaluate(net, data, walks, jobs)
+    result = evaluate({COMPLETED: learned(net)}, data, walks, jobs)
     if out is not None:
         write_json(out, result)
     click.echo(table(result))

@@ -17,7 +17,7 @@ from training.completion.cells import (
     draw_unknown,
     remove_cells,
 )
-from training.completion.evaluate import evaluate, table
+from training.completion.evaluate import COMPLETED, evaluate, learned, table
 from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
 from training.completion.trainer import FitConfig, Trainer
 from training.options import jobs_option
@@ -69,7 +69,7 @@ def main(
         raise click.ClickException("stopped; the progress is saved, continue with --resume") from None
     net = trainer.net.eval()
     net.save(out / "weights.pt")
-    result = evaluate(net, data, evaluation_walks, jobs)
+    result = evaluate({COMPLETED: learned(net)}, data, evaluation_walks, jobs)
     write_result(out / "result.json", {"training": trainer.settings, **result})
     click.echo(table(result))
     click.echo(f"Wrote weights.pt and result.json to {out}.")
