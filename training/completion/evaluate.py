@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import click
 import torch
@@ -37,7 +37,7 @@ FILLS = {
     "Navier-Stokes": "inpaint_navier_stokes",
 }
 COMPLETED = "CompletionNet"
-Answer = Callable[[TrueMap], Sequence[Any]]  # mean (B, H, W) [m], and standard deviation or None
+Answer: TypeAlias = Callable[[TrueMap], Sequence[Any]]  # mean (B, H, W) [m], and standard deviation or None
 
 
 class Errors(NamedTuple):
