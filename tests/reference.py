@@ -883,6 +883,8 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     counted = [
         (v, c) for each in zip(votes, proposed, strict=True) for v, c in zip(*each, strict=True) if c is not None
     ]
+    squares = w["vote_square"] @ cell + w["vote_square_bias"][:, 0]
+    counted += [(v, m - reference) for v, m in zip(squares, mean, strict=True) if m is not None]
     logits, heights = (np.array(column) for column in zip(*counted, strict=True))
     share = np.exp(logits - max(logits)) / np.exp(logits - max(logits)).sum()
     answer = float(share @ heights)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.completion.context import NUM_CONTEXT
+from torchelev.completion.context import NUM_CONTEXT, RADII
 from torchelev.completion.surroundings import REACHES
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ NUM_MEASURED = 7  # features of a measured cell
 class Weights(NamedTuple):
     """Parameters of `predict` and `refine`, a matrix and a bias for each layer.
 
-    F features, C channels of a direction, D of a cell, V candidates of a direction, K of a measured cell.
+    F features, C channels of a direction, D of a cell, V candidates of a direction, R squares, K of a measured cell.
     """
 
     view: Float[Tensor, "C F"]  #: the features of a direction
@@ -38,6 +38,8 @@ class Weights(NamedTuple):
     vote: Float[Tensor, "V C"]  #: logits of the candidates, from a direction
     vote_cell: Float[Tensor, "V D"]  #: from the cell
     vote_bias: Float[Tensor, "V 1"]
+    vote_square: Float[Tensor, "R D"]  #: logits of the mean heights of the squares
+    vote_square_bias: Float[Tensor, "R 1"]
     answer: Float[Tensor, "2 D"]  #: correction and spread
     answer_bias: Float[Tensor, "2 1"]
     measured: Float[Tensor, "K F"]  #: the features of a measured cell
@@ -59,6 +61,7 @@ def weight_shapes(view_channels: int, cell_channels: int, measured_channels: int
         to_view=(C, D),
         vote=(NUM_CANDIDATES, C),
         vote_cell=(NUM_CANDIDATES, D),
+        vote_square=(len(RADII), D),
         answer=(2, D),
         measured=(K, NUM_MEASURED),
         measured_answer=(2, K),

@@ -42,9 +42,10 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     """Return the mean and the standard deviation [m] of the ground at unknown cells.
 
     Each direction proposes candidates: the height of the next known cell, that of the line to the opposite one, and
-    the continued slopes. The mean is their average by the softmax of the network's votes, plus a correction within the
-    range of the heights around, and not above the upper bound. No variance enters: to see the same ground again makes
-    no unseen cell surer. Far from known cells, the standard deviation becomes the prior's:
+    the continued slopes; each square proposes its mean. The answer is their average by the softmax of the network's
+    votes, plus a correction within the range of the heights around, and not above the upper bound. No variance enters:
+    to see the same ground again makes no unseen cell surer. Far from known cells, the standard deviation becomes the
+    prior's:
 
         log std = (1 - t) log std_net + t log std_prior,    t = d^2 / (d^2 + 4 m^2).
     """
@@ -91,8 +92,10 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     votes = votes + affine(weights.vote_cell, cells, weights.vote_bias)[:, None]
     proposed = torch.cat([torch.stack([known, both]), has_slope])
     candidates = torch.cat([torch.stack([height, height + (1 - share) * step]), height + slopes * distance])
-    ballot = (votes * proposed + _NO_VOTE * (1 - proposed)).flatten(0, 1).softmax(0)
-    candidates = candidates.flatten(0, 1)
+    votes = torch.cat([votes.flatten(0, 1), affine(weights.vote_square, cells, weights.vote_square_bias)])
+    proposed = torch.cat([proposed.flatten(0, 1), (known_share > 0).to(votes.dtype)])
+    candidates = torch.cat([candidates.flatten(0, 1), ground])
+    ballot = (votes * proposed + _NO_VOTE * (1 - proposed)).softmax(0)
     answer = (ballot * candidates).sum(0)
     spread = (ballot * (candidates - answer).square()).sum(0) + _NO_SPREAD**2
 

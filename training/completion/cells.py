@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 NUM_UNKNOWN, NUM_MEASURED = 768, 192  # cells of each map, at most
-_NEAR = 0.1  # [m] unknown cells are drawn with a probability of 1 / (distance + this)
+_NEAR = 0.3  # [m] unknown cells are drawn with a probability of 1 / (distance + this)
 FARTHEST = 3.0  # [m] from known cells, of unknown ones
 _MIN_ERROR = 0.005  # [m]
 

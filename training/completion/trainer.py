@@ -22,6 +22,7 @@ from training.traversability.maps.data import save_atomically
 
 COVERAGE = 0.95  # of cells that are to lie within two standard deviations
 _MIN_DEVIATION = 1e-3  # [m]
+_LARGEST_SQUARE = 100.0  # of a weighted error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,15 +45,17 @@ def losses(error: Tensor, std: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Return the losses of the mean and of the standard deviation.
 
     The mean minimises the absolute error, as the ground behind an edge is high or low: the median is right more often
-    than the mean is near. The standard deviation minimises the likelihood of Laplace's distribution,
+    than the mean is near. Twice the standard deviation is the bound that COVERAGE = 95 % of the errors e stay below, as
+    of a normal distribution: it minimises the quantile loss of their logarithms,
 
-        |e| / std + log std,
+        max(0.95 u, -0.05 u),    u = log |e| - log(2 std),
 
-    at the errors as they are: no gradient reaches the mean, so that no cell is given up by calling it uncertain, which
-    is what beta-NLL mends in the Gaussian likelihood, whose squares the tails of the errors dominate.
+    which holds 95 % wherever the network can tell cells apart, however heavy the tails. Likelihoods, beta-NLL among
+    them, assume a shape of the errors and miss that share where the shape is another. No gradient of the standard
+    deviation reaches the mean, so that no cell is given up by calling it uncertain.
     """
-    deviation = error.detach().abs() + _MIN_DEVIATION
-    return (error.abs() * weight).mean(), (deviation / std + std.log()).mean()
+    excess = (error.detach().abs() + _MIN_DEVIATION).log() - (2 * std).log()
+    return (error.abs() * weight).mean(), torch.maximum(COVERAGE * excess, (COVERAGE - 1) * excess).mean()
 
 
 def predict_measured(net: CompletionNet, cells: MeasuredCells) -> tuple[Tensor, Tensor]:
@@ -106,9 +109,12 @@ class Trainer:
             ("measured", measured, predict_measured(self.net, measured)),
         ]
         for name, cells, (mean, std) in answers:
-            parts = losses(mean - cells.truth, std, cells.weight)
-            total = total + parts[0] + 0.3 * parts[1]
-            logged |= {f"{name}_error": float(parts[0].detach()), f"{name}_likelihood": float(parts[1].detach())}
+            error = mean - cells.truth
+            parts = losses(error, std, cells.weight)
+            total = total + parts[0] + parts[1]
+            if name == "measured":  # the root mean square must not rise either, which few large errors decide
+                total = total + (error * cells.weight).square().clamp(max=_LARGEST_SQUARE).mean()
+            logged |= {f"{name}_error": float(parts[0].detach()), f"{name}_quantile": float(parts[1].detach())}
         self.optimizer.zero_grad()
         total.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
