@@ -27,7 +27,7 @@ from training.traversability.maps.data import save_atomically
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
 WALKS, STEPS, EVALUATION_WALKS = 290, 10000, 8
-UNETS = {"U-Net of equal size": 3, "U-Net of 232,000 weights": 32}  # channels of the finest level
+UNETS = {"U-Net of equal size": 3}  # channels of the finest level
 UNET_STEPS = 4000
 
 
