@@ -158,6 +158,27 @@ def table(result: dict[str, Any]) -> str:
     return markdown_table(["split", "resolution [m]", "cells", *names, "within 2 std [%]"], lines)
 
 
+def summary(result: dict[str, Any]) -> str:
+    """Tabulate the mean absolute errors [cm] at 4 cm by kind of ground and by distance; of several seeds, their mean."""
+    lines: list[list[str]] = []
+    names: list[str] = []
+    for split in SPLITS:
+        answers = result[split]["0.04"]
+        seeds = [COMPLETED, *(name for name in answers if name.startswith("seed"))]
+        names = [name for name in answers if name not in seeds]
+        for group in answers[COMPLETED]:
+            cells = [answers[name][group] for name in seeds]
+            if not cells[0]["cells"]:
+                continue
+            own = [100 * cell["mae"] for cell in cells]
+            within = 100 * sum(cell["within_2_std"] for cell in cells) / len(cells)
+            spread = f" ({min(own):.1f} to {max(own):.1f})" if len(own) > 1 else ""
+            label = group.replace("_", " ") + (", never trained on" if split == "unseen" else "")
+            others = [f"{100 * answers[name][group]['mae']:.1f}" for name in names]
+            lines.append([label, f"{sum(own) / len(own):.1f}{spread}", *others, f"{within:.0f}"])
+    return markdown_table(["cells", COMPLETED, *names, "within 2 std [%]"], lines)
+
+
 @click.command(help=__doc__)
 @click.option("--weights", type=click.Path(path_type=Path, exists=True), default=None, help="Weights to evaluate.")
 @click.option("--walks", type=click.IntRange(1), default=10, show_default=True, help="Per split and resolution.")
