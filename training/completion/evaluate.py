@@ -159,7 +159,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def summary(result: dict[str, Any]) -> str:
-    """Tabulate the mean absolute errors [cm] at 4 cm by kind of ground and by distance; of several seeds, their mean."""
+    """Tabulate the mean absolute errors [cm] at 4 cm, by kind of ground and by distance; of seeds, their mean."""
     lines: list[list[str]] = []
     names: list[str] = []
     for split in SPLITS:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -125,7 +126,6 @@ class Walks(NamedTuple):
 
     def make(self, index: int) -> None:
         """Make a walk and write its file."""
-        torch.set_num_threads(1)
         seed = [list(SPLITS).index(self.split), self.seed, index]
         maps = walk(seed, SPLITS[self.split], self.resolution, self.cfg)
         plain = [entry._replace(layers=tuple(entry.layers))._asdict() for entry in maps]  # type: ignore[arg-type]
@@ -156,6 +156,10 @@ def make_walks(walks: Walks, count: int, jobs: int) -> None:
     if not missing:
         return
     bar = tqdm(total=count, initial=count - len(missing), desc=f"walks {walks.name}", unit="walk")
-    with multiprocessing.get_context("spawn").Pool(jobs) as pool, bar:
-        for _ in pool.imap_unordered(walks.make, missing):
+    with bar, contextlib.ExitStack() as stack:
+        made: Iterable[None] = map(walks.make, missing)
+        if jobs > 1:
+            pool = multiprocessing.get_context("spawn").Pool(jobs, torch.set_num_threads, (1,))
+            made = stack.enter_context(pool).imap_unordered(walks.make, missing)
+        for _ in made:
             bar.update()
