@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchelev import pipeline
 from torchelev.compiled_update import compile_ahead, compiled_update
+from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
 from torchelev.diagnosis.history import InputHistory
@@ -50,6 +51,8 @@ class ElevationMap(ReadableMap):
         chunk: update at most this many environments at a time, to save memory; results agree up to rounding. None: all
             on a GPU, and on a CPU as many as fit into its caches, which is also faster.
         head: trained traversability head, used as it is and not copied, in place of the weights that `cfg` names.
+        completion_net: trained completion network, used as it is and not copied, in place of the weights that `cfg`
+            names.
 
     Raises:
         TypeError: if `cfg` is no ElevationMapConfig.
@@ -66,14 +69,17 @@ class ElevationMap(ReadableMap):
         check_values: bool = False,
         chunk: int | None = None,
         head: TraversabilityNet | None = None,
+        completion_net: CompletionNet | None = None,
     ) -> None:
         cfg = checks.given_or_default(ElevationMapConfig, cfg)
-        super().__init__(cfg, require_count("num_envs", num_envs, "give the number of maps"), device, head)
+        num_envs = require_count("num_envs", num_envs, "give the number of maps")
+        super().__init__(cfg, num_envs, device, head, completion_net)
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
         self.pace = Pace()
         self._links = cfg.sensor.links
-        self._update_cfg = dataclasses.replace(cfg, filters=())  # compiled graphs are shared by maps of equal ones
+        # Compiled graphs are shared by maps of equal ones.
+        self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
         self._compiled = False
         self._history = InputHistory()
         with torch.inference_mode(False):
@@ -121,7 +127,7 @@ class ElevationMap(ReadableMap):
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
         self._history.add(inputs)
-        self._filtered.clear()
+        self._derived.clear()
         if self.device.type == "cpu":
             keep_freed_memory()
         weights = None if self._weights is None else self._weights.detached()
@@ -130,6 +136,8 @@ class ElevationMap(ReadableMap):
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         with torch.inference_mode():
             run_in_chunks(run, self.state, inputs, self.chunks)
+        if self.cfg.completion is not None and self.cfg.completion.when == "update":
+            self._complete()
 
     @requires_dt
     def measure(
@@ -251,7 +259,7 @@ class ElevationMap(ReadableMap):
             ValueError: if an id is out of range or repeated, a shape or device is wrong, or both are given.
         """
         env_ids, mask = self._check_choice(env_ids, mask)
-        self._filtered.clear()
+        self._derived.clear()
         self._history.forget(env_ids, mask)
         self.num_resets.add_(self._choose(env_ids, mask))
         with torch.no_grad():
@@ -288,7 +296,7 @@ class ElevationMap(ReadableMap):
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         feet = checks.check_feet(feet, self.num_envs, self.device, self.check_values)
         state = initialize(self.state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
-        self._filtered.clear()
+        self._derived.clear()
         with torch.no_grad():
             write(self.state, rate_surface(state, self.cfg, self._weights))
 
@@ -321,7 +329,7 @@ class ElevationMap(ReadableMap):
             shape = (self.num_envs, 4, 4)
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
         state = site.give(self, T_map_base, self._choose(*self._check_choice(env_ids, mask)))
-        self._filtered.clear()
+        self._derived.clear()
         with torch.no_grad():
             write(self.state, rate_surface(state, self.cfg, self._weights))
 

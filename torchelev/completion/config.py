@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchelev.completion.net import RESOLUTIONS
 from torchelev.errors import require
 
 WHEN = ("read", "update")
@@ -25,3 +26,10 @@ class CompletionConfig:
         require(self.when in WHEN, "completion.when", f"must be one of {', '.join(WHEN)}", repr(self.when), "use read")
         if isinstance(self.weights, Path):
             object.__setattr__(self, "weights", str(self.weights))  # as files of settings hold it
+
+    def require_resolution(self, resolution: float) -> None:
+        """Refuse a map's resolution for which the network is not trained. Raises ValueError."""
+        low, high = RESOLUTIONS
+        rule = f"must be {low:g} to {high:g} m for completion"
+        hint = "choose another resolution, or leave completion off with None"
+        require(low <= round(resolution, 6) <= high, "cfg.grid.resolution", rule, resolution, hint)
