@@ -29,9 +29,10 @@ from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import require_reverse_mode
 from torchelev.pipeline import rate_surface, update_in_place, write
 from torchelev.readable_map import ReadableMap
+from torchelev.stages.complete import forget_completed
 from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure import measure
-from torchelev.state import MapState, Measurement, forget
+from torchelev.state import MapState, Measurement, forget, map_layers
 from torchelev.traversability.net import TraversabilityNet
 
 if TYPE_CHECKING:
@@ -134,10 +135,23 @@ class ElevationMap(ReadableMap):
         run = compiled_update if self._compiled else update_in_place
         run = functools.partial(run, cfg=self._update_cfg, weights=weights)
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
+        before = self._take_out_predictions()
         with torch.inference_mode():
             run_in_chunks(run, self.state, inputs, self.chunks)
+        if before is not None:
+            with torch.no_grad():
+                write(self.state, self._write_back(before, self.state))
         if self.cfg.completion is not None and self.cfg.completion.when == "update":
             self._complete()
+
+    def _take_out_predictions(self) -> MapState | None:
+        """Make the cells that completion filled unknown, and return a copy of the state with them; None without."""
+        if not self._writes_back:
+            return None
+        with torch.no_grad():
+            before = map_layers(Tensor.clone, self.state)
+            write(self.state, self.measured_state)
+        return before
 
     @requires_dt
     def measure(
@@ -173,7 +187,10 @@ class ElevationMap(ReadableMap):
         """
         require_full_precision(state.elevation.dtype)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
+        before, state = state, forget_completed(state) if self._writes_back else state
         new = pipeline.forward(state, measurement, self.cfg, self._weights)
+        if self._writes_back:
+            new = self._write_back(before, new)
         return without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))
 
     def _check_inputs(self, *inputs: Any) -> Inputs:
@@ -295,7 +312,7 @@ class ElevationMap(ReadableMap):
         """
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         feet = checks.check_feet(feet, self.num_envs, self.device, self.check_values)
-        state = initialize(self.state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
+        state = initialize(self.measured_state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
         self._derived.clear()
         with torch.no_grad():
             write(self.state, rate_surface(state, self.cfg, self._weights))
@@ -345,7 +362,7 @@ class ElevationMap(ReadableMap):
         Returns:
             One sentence per finding; none if all is well, or if the inputs do not show it.
         """
-        return diagnose(self.cfg, self.state, self._history)
+        return diagnose(self.cfg, self.measured_state, self._history)
 
     def _forget_derived(self) -> None:
         super()._forget_derived()

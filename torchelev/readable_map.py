@@ -15,7 +15,13 @@ from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer
 from torchelev.map_buffers import MapBuffers
 from torchelev.pipeline import rate_surface
-from torchelev.stages.complete import COMPLETED, completed_layers, make_completion_net
+from torchelev.stages.complete import (
+    COMPLETED,
+    completed_layers,
+    forget_completed,
+    make_completion_net,
+    write_back,
+)
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
 from torchelev.traversability.net import Rating, TraversabilityNet
@@ -60,6 +66,22 @@ class ReadableMap(MapBuffers):
     @property
     def _weights(self) -> Weights | None:
         return None if self.head is None else self.head.weights
+
+    @property
+    def _writes_back(self) -> bool:
+        """Whether completion fills unknown cells of the map."""
+        return self.cfg.completion is not None and self.cfg.completion.write_back
+
+    @property
+    def measured_state(self) -> MapState:
+        """The state without cells that completion filled, of `CompletionConfig(write_back=True)`."""
+        return forget_completed(self.state) if self._writes_back else self.state
+
+    def _write_back(self, before: MapState, state: MapState) -> MapState:
+        """Return a state after an update with its unknown cells filled by completion."""
+        assert self.completion_net is not None and self.cfg.completion is not None
+        weights, max_std = self.completion_net.weights, self.cfg.completion.max_std
+        return write_back(before, state, self.cfg.grid, weights, max_std)
 
     @property
     def layers(self) -> tuple[str, ...]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
 
 from torchelev.completion.complete import Completion, CompletionInput, complete
 from torchelev.completion.config import CompletionConfig
@@ -11,9 +14,14 @@ from torchelev.completion.parameters import Weights
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer, pose_variance
-from torchelev.state import MapState
+from torchelev.ops.moving import move_layers
+from torchelev.state import BLANK, MapState
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool
 
 COMPLETED = ("completed", "completed_std")  # names of the layers
+WRITTEN_BACK = -1.0  # support of cells that hold a prediction; that of others is not negative
 
 
 def make_completion_net(cfg: CompletionConfig | None, given: CompletionNet | None) -> CompletionNet | None:
@@ -34,6 +42,7 @@ def make_completion_net(cfg: CompletionConfig | None, given: CompletionNet | Non
 
 def complete_map(state: MapState, grid: GridConfig, weights: Weights) -> Completion:
     """Predict the ground at every cell, in float32 or float64. The standard deviation lacks that of the poses."""
+    state = forget_completed(state)  # or one prediction would make the next one surer
     dtype = torch.promote_types(state.elevation.dtype, torch.float32)
     elevation, variance, upper_bound, time = (
         layer.to(dtype) for layer in (state.elevation, state.variance, state.upper_bound, state.time)
@@ -46,5 +55,63 @@ def completed_layers(state: MapState, grid: GridConfig, weights: Weights) -> dic
     """Return the layers COMPLETED of a state, known everywhere in environments that know the elevation of a cell."""
     mean, std = complete_map(state, grid, weights)
     std = (std.square() + pose_variance(state).to(std.dtype)).sqrt()
-    known = state.validity.any(2).any(1)[:, None, None].expand_as(state.validity)
+    known = _knows_any(state)[:, None, None].expand_as(state.validity)
     return {name: (value.to(state.elevation.dtype), known) for name, value in zip(COMPLETED, (mean, std), strict=True)}
+
+
+def _knows_any(state: MapState) -> Bool[Tensor, "B"]:
+    """Tell which environments know an elevation that is no prediction."""
+    return (state.validity & (state.support >= 0)).any(2).any(1)
+
+
+# Predictions as cells of the map ----------------------------------------------------------------------------------
+
+
+def forget_completed(state: MapState) -> MapState:
+    """Make the cells that `write_back` filled unknown again; their upper bounds were kept."""
+    written = state.validity & (state.support < 0)
+    return state._replace(
+        elevation=torch.where(written, 0.0, state.elevation),
+        variance=torch.where(written, BLANK["variance"], state.variance),
+        validity=state.validity & ~written,
+        support=torch.where(written, 0.0, state.support),
+    )
+
+
+def write_back(before: MapState, state: MapState, grid: GridConfig, weights: Weights, max_std: float) -> MapState:
+    """Give unknown cells the predicted height, or the prediction that they held before if that is surer.
+
+    Ratings and normals stay those of the other cells alone, as predictions are forgotten before the next update: what
+    is measured is then the same as in a map without them, and so is the first measurement of such a cell.
+
+    Args:
+        before: the map before the update, with earlier predictions.
+        state: the map after it, without predictions.
+        grid: the maps' grid.
+        weights: of the network.
+        max_std: [m] predictions that are less sure are left out.
+    """
+    mean, std = (value.to(state.elevation.dtype) for value in complete_map(state, grid, weights))
+    variance = torch.where(_knows_any(state)[:, None, None], std.square(), torch.inf)
+    height, earlier, held = _move_predictions(before, state)
+    holds = held & ~(state.bounded & (height > state.upper_bound))  # rays have passed below the others
+    is_surer = holds & (earlier < variance)
+    mean, variance = torch.where(is_surer, height, mean), torch.where(is_surer, earlier, variance)
+    found = ~state.validity & (variance < max_std**2)
+    return state._replace(
+        elevation=torch.where(found, mean, state.elevation),
+        variance=torch.where(found, variance, state.variance),
+        validity=state.validity | found,
+        time=torch.where(found, 0.0, state.time),
+        support=torch.where(found, WRITTEN_BACK, state.support),
+    )
+
+
+def _move_predictions(before: MapState, state: MapState) -> tuple[Tensor, Tensor, Bool[Tensor, "B H W"]]:
+    """Return heights [m] and variances [m^2] of earlier predictions in the present window, and where there are some."""
+    largest = max(state.validity.shape[1:])
+    shift = (state.corner - before.corner).clamp(-largest, largest)
+    held = before.validity & (before.support < 0)
+    moved = move_layers({"height": before.elevation, "variance": before.variance, "held": held}, shift, BLANK)
+    drift = state.statistics.drift_correction[:, None, None]
+    return moved["height"] + drift, moved["variance"], moved["held"]
