@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -21,6 +22,8 @@ NUM_UNKNOWN, NUM_MEASURED = 768, 192  # cells of each map, at most
 _NEAR = 0.3  # [m] unknown cells are drawn with a probability of 1 / (distance + this)
 FARTHEST = 3.0  # [m] from known cells, of unknown ones
 _MIN_ERROR = 0.005  # [m]
+_KEPT = (0.05, 0.6)  # share of the cells that thinned maps keep
+_RAISED = (0.03, 3.0)  # [m] by which bounds are raised
 
 
 class UnknownCells(NamedTuple):
@@ -44,6 +47,23 @@ def remove_cells(layers: CompletionInput, kept: Bool[Tensor, "B H W"]) -> Comple
     """Make the known cells that are not kept unknown, without a bound, as if no view had seen them."""
     lost = layers.validity & ~kept
     return layers._replace(validity=layers.validity & kept, bounded=layers.bounded & ~lost)
+
+
+def thin_out(layers: CompletionInput, generator: torch.Generator) -> CompletionInput:
+    """Keep a random share of each map's known cells, as of a sensor with few rays; bound the others by their height."""
+    share = _KEPT[0] + (_KEPT[1] - _KEPT[0]) * torch.rand(len(layers.validity), 1, 1, generator=generator)
+    kept = torch.rand(layers.validity.shape, generator=generator) < share
+    lost = layers.validity & ~kept
+    bound = torch.where(lost, layers.elevation, layers.upper_bound)
+    return layers._replace(validity=layers.validity & kept, upper_bound=bound, bounded=layers.bounded | lost)
+
+
+def vary_bounds(layers: CompletionInput, generator: torch.Generator) -> CompletionInput:
+    """Raise the bounds of some maps, as of a sensor that looks from higher up or sees less, and drop those of others."""
+    draw, size = torch.rand(2, len(layers.bounded), 1, 1, generator=generator)
+    low, high = map(math.log, _RAISED)
+    rise = torch.where(draw < 0.4, torch.exp(low + (high - low) * size), 0.0)
+    return layers._replace(upper_bound=layers.upper_bound + rise, bounded=layers.bounded & (draw < 0.75))
 
 
 def nearest_known(seen: Surroundings) -> Float[Tensor, "n"]:

@@ -83,9 +83,11 @@ def training_cells(walks: Walks, count: int, jobs: int, seed: int) -> tuple[Unkn
     before: list[TrueMap] = []
     for index in tqdm(range(count), desc="cells", unit="walk"):
         maps = walks.read(index)
-        for view in [*maps, *_as_seen_before(maps[-1], before)]:
-            unknown += draw_unknown(view, generator)
-            measured += draw_measured(view, generator)
+        thinned = [entry._replace(layers=thin_out(entry.layers, generator)) for entry in maps[-1:]]
+        for view in [*maps, *_as_seen_before(maps[-1], before), *thinned]:
+            varied = view._replace(layers=vary_bounds(view.layers, generator))
+            unknown += draw_unknown(varied, generator)
+            measured += draw_measured(varied, generator)
         before = maps
     return concatenate(unknown), concatenate(measured)
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 import training.completion.evaluate as evaluation
 import training.completion.train as training
 from torchelev.completion.complete import CompletionInput
-from training.completion.cells import draw_measured, draw_unknown, remove_cells
+from training.completion.cells import draw_measured, draw_unknown, remove_cells, thin_out, vary_bounds
 from training.completion.maps import TrueMap, WalkConfig, Walks, walk
 from training.completion.trainer import COVERAGE, FitConfig, Trainer, fit_std, losses
 from training.completion.unet import UNet, fit
@@ -68,6 +68,19 @@ def test_removed_cells_are_neither_known_nor_bounded():
     removed = remove_cells(layers, kept)
     assert torch.equal(removed.validity, layers.validity & kept)
     assert torch.equal(removed.bounded, ~(layers.validity & ~kept))
+
+
+def test_thinned_maps_bound_what_they_lost_and_bounds_stay_true():
+    layers, generator = flat_map(8, 20).layers, torch.Generator().manual_seed(0)
+    thinned = thin_out(layers, generator)
+    lost = layers.validity & ~thinned.validity
+    shares = thinned.validity.float().mean((1, 2)) / layers.validity.float().mean((1, 2))
+    assert 0.02 < float(shares.min()) < float(shares.max()) < 0.7
+    assert bool(thinned.bounded[lost].all()) and torch.equal(thinned.upper_bound[lost], layers.elevation[lost])
+    varied = vary_bounds(layers, generator)
+    kept = varied.bounded.flatten(1).any(1)
+    rise = (varied.upper_bound - layers.upper_bound).flatten(1)[:, 0]
+    assert 0 < int(kept.sum()) < 8 and float(rise.min()) == 0.0 < float(rise.max()) <= 3.0
 
 
 def test_the_standard_deviation_is_fitted_to_hold_95_percent():
