@@ -59,7 +59,7 @@ def thin_out(layers: CompletionInput, generator: torch.Generator) -> CompletionI
 
 
 def vary_bounds(layers: CompletionInput, generator: torch.Generator) -> CompletionInput:
-    """Raise the bounds of some maps, as of a sensor that looks from higher up or sees less, and drop those of others."""
+    """Raise the bounds of some maps, as of a sensor that looks from higher up, and drop those of others."""
     draw, size = torch.rand(2, len(layers.bounded), 1, 1, generator=generator)
     low, high = map(math.log, _RAISED)
     rise = torch.where(draw < 0.4, torch.exp(low + (high - low) * size), 0.0)

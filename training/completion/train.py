@@ -16,6 +16,8 @@ from training.completion.cells import (
     draw_measured,
     draw_unknown,
     remove_cells,
+    thin_out,
+    vary_bounds,
 )
 from training.completion.evaluate import COMPLETED, evaluate, learned, table
 from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
