@@ -855,7 +855,8 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     views = [view_from(elevation, known, i, j, direction, resolution) for direction in DIRECTIONS]
     found = [view for view in views if view]
     if not found:
-        return (float(elevation[known].mean()) if known.any() else 0.0), math.exp(w["prior"][0])
+        level = float(elevation[known].mean()) if known.any() else 0.0
+        return min(level, upper_bound[i, j] if bounded[i, j] else math.inf), math.exp(w["prior"][0])
     nearest = min(view["d"] for view in found)
     reference = sum(v["h"] * nearest / v["d"] for v in found) / sum(nearest / v["d"] for v in found)
     low, high = (choose(v["h"] for v in found) - reference for choose in (min, max))

@@ -41,7 +41,7 @@ def run(net, layers, resolution=RESOLUTION):
 
 
 def apply(function, layers):
-    return CompletionInput(*(function(layer).contiguous() for layer in layers))
+    return CompletionInput(*(function(layer) for layer in layers))
 
 
 def test_steps_lead_to_the_next_known_cell():
@@ -150,6 +150,16 @@ def test_unknown_cells_do_not_rise_above_their_bound():
         assert float(over.max()) > -1e-6  # the bound does hold some down
 
 
+def test_the_bound_holds_where_no_direction_leads_to_known_ground():
+    zero = torch.zeros(1, 40, 40, dtype=torch.float64)
+    known = zero == 1
+    known[:, 20, 20] = True
+    layers = CompletionInput(zero, known, zero, zero - 0.5, ~known, zero)
+    assert float(run(random_net(), layers).mean[~known].max()) <= -0.5
+    nothing = layers._replace(validity=known & False)
+    assert float(run(random_net(), nothing).mean[~known].max()) == -0.5
+
+
 def test_to_see_the_same_ground_again_makes_no_unknown_cell_surer():
     net, layers = random_net(), random_layers(8)
     again = layers._replace(variance=layers.variance / 10, age=torch.zeros_like(layers.age))
@@ -203,6 +213,53 @@ def test_heights_that_are_not_finite_count_as_unknown():
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("name", ["variance", "age", "upper_bound"])
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_other_layers_that_are_not_finite_do_not_count(name, bad):
+    net, layers = random_net(), random_layers(14)
+    spoilt = layers._replace(**{name: torch.full_like(layers.elevation, bad)})
+    missing = {"upper_bound": {"bounded": layers.bounded & False}}.get(name, {"validity": layers.validity & False})
+    for a, b in zip(run(net, spoilt), run(net, layers._replace(**missing)), strict=True):
+        assert bool(a.isfinite().all()) and torch.equal(a, b)
+
+
+def test_a_map_may_be_wider_than_16_bits_count():
+    net = random_net(dtype=torch.float32)
+    layers = random_layers(16, 1, H=40_000, W=1, known=0.0, dtype=torch.float32)
+    layers.validity[0, -1] = True
+    layers.elevation[0, -1] = 2.0
+    mean = run(net, layers._replace(bounded=layers.bounded & False)).mean
+    assert 1.9 < float(mean[0, 0]) < 2.1
+
+
+def test_level_ground_has_a_gradient():
+    """Heights that are exactly equal are where a logarithm of their difference is easily given none."""
+    net, zero = random_net(), torch.zeros(1, 9, 9, dtype=torch.float64, requires_grad=True)
+    known = torch.ones(1, 9, 9, dtype=torch.bool)
+    known[0, 4, 4] = False
+    blank = torch.zeros(1, 9, 9, dtype=torch.float64)
+    answer = net(zero, known, blank, blank, known & False, blank, resolution=RESOLUTION)
+    (gradient,) = torch.autograd.grad(answer.std[0, 4, 4], zero)
+    assert bool(gradient.isfinite().all()) and float(gradient.abs().max()) > 0
+
+
+def test_what_is_unknown_spoils_no_gradient():
+    net, layers = random_net(), random_layers(17)
+    net.requires_grad_(True)
+    unknown = ~layers.validity
+    spoilt = {name: getattr(layers, name).masked_fill(unknown, torch.nan) for name in ("elevation", "variance", "age")}
+    mean, std = run(net, layers._replace(**spoilt))
+    (mean.sum() + std.sum()).backward()
+    assert all(bool(value.grad.isfinite().all()) for value in net.parameters() if value.grad is not None)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1)])
+@pytest.mark.parametrize("known", [0.0, 0.5, 1.1])
+def test_maps_of_any_size(size, known):
+    layers = random_layers(18, 2, *size, known=known)
+    assert all(bool(layer.isfinite().all()) and layer.shape == (2, *size) for layer in run(random_net(), layers))
+
+
 def test_gradients_with_respect_to_elevation_and_weights():
     net, layers = random_net(), random_layers(12, 1, H=5, W=4, known=0.4)
     net.requires_grad_(True)
@@ -245,12 +302,14 @@ def test_the_shipped_weights_are_few_and_finite():
     ("change", "error", "text"),
     [
         ({"resolution": 0.01}, ValueError, "resolution: must be 0.02 to 0.1 m, got 0.01"),
-        ({"elevation": torch.zeros(2, 3)}, ValueError, r"elevation: must be \(B, H, W\)"),
+        ({"elevation": torch.zeros(2, 3)}, ValueError, r"elevation: must be \(B, H, W\), not empty"),
         ({"elevation": torch.zeros(1, 4, 4).half()}, TypeError, "elevation: must be torch.float32, got torch.float16"),
         ({"validity": torch.zeros(1, 4, 4)}, TypeError, "validity: must be torch.bool"),
         ({"variance": torch.zeros(1, 4, 5)}, ValueError, r"variance: must be \(1, 4, 4\)"),
         ({"upper_bound": torch.zeros(1, 4, 4)}, ValueError, "upper_bound, bounded: must come together"),
         ({"elevation": None}, TypeError, "elevation: must be a tensor"),
+        ({"elevation": torch.zeros(0, 4, 4)}, ValueError, r"elevation: must be \(B, H, W\), not empty"),
+        ({"variance": 0.1}, TypeError, "variance: must be a tensor, got float"),
     ],
 )
 def test_bad_input_is_refused(change, error, text):
@@ -259,3 +318,10 @@ def test_bad_input_is_refused(change, error, text):
     net(**good)
     with pytest.raises(error, match=text):
         net(**(good | change))
+
+
+def test_half_precision_is_refused():
+    layers = random_layers(dtype=torch.float32)
+    half = CompletionInput(*(layer.half() if layer.is_floating_point() else layer for layer in layers))
+    with pytest.raises(TypeError, match="weights: must be of float32 or float64, got torch.float16"):
+        run(CompletionNet().half(), half)

@@ -11,7 +11,7 @@ from torchelev.completion.context import describe, sum_layers
 from torchelev.completion.parameters import Weights
 from torchelev.completion.predict import Seen, predict
 from torchelev.completion.refine import refine
-from torchelev.completion.surroundings import count_steps, look_around
+from torchelev.completion.surroundings import UNKNOWN, count_steps, look_around
 from torchelev.ops.parallel import map_in_order
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class CompletionInput(NamedTuple):
 def complete(weights: Weights, layers: CompletionInput, resolution: float) -> Completion:
     """Return the mean and the standard deviation of the ground at every cell.
 
-    Without a known cell in a map, its mean is 0 and its standard deviation the prior's.
+    Without a known cell in a map, its mean is 0, or the upper bound below it, and its standard deviation the prior's.
 
     Args:
         weights: parameters.
@@ -54,7 +54,7 @@ def complete(weights: Weights, layers: CompletionInput, resolution: float) -> Co
     mean, std = refine(weights, layers.elevation, known, layers.variance, layers.age, of_cells)
     unseen = Unseen(layers.elevation, known, layers.upper_bound, bounded, resolution)
     if _may_choose_cells(weights, layers):
-        return _fill_unknown(weights, unseen, Completion(mean, std))
+        return _fill_unknown(weights, unseen, Completion(mean.contiguous(), std.contiguous()))
     places = torch.arange(known.numel(), device=known.device).split(_AT_A_TIME_ON_GPU)
     parts = [predict(weights, unseen.read(place)) for place in places]
     predicted = [torch.cat(values).view_as(mean) for values in zip(*parts, strict=True)]
@@ -78,7 +78,8 @@ class Unseen:
     def __init__(
         self, elevation: Tensor, known: Tensor, upper_bound: Tensor, bounded: Tensor, resolution: float
     ) -> None:
-        self.elevation, self.known, self.resolution = elevation, known, resolution
+        self.known, self.resolution = known, resolution
+        self.ground = torch.where(known, elevation, UNKNOWN)
         self.steps = count_steps(known)
         total = torch.where(known, elevation, 0.0).double().sum((1, 2))
         self.level = total / known.sum((1, 2)).clamp(min=1)  # [m] where no direction holds known ground
@@ -87,7 +88,7 @@ class Unseen:
 
     def read(self, place: Int[Tensor, "n"]) -> Seen:
         """Return what the prediction at cells, numbered in the flat maps, depends on."""
-        around = look_around(self.elevation, self.known, self.steps, place, self.resolution)
+        around = look_around(self.ground, self.steps, place, self.resolution)
         bound, bounded = (values.index_select(0, place) for values in (self.bound, self.bounded))
         level = self.level.to(bound.dtype).index_select(0, place // self.known[0].numel())
         context = describe(self.sums, self.level, place, self.resolution)

@@ -69,10 +69,12 @@ class CompletionNet(nn.Module):
         """Predict the ground at every cell of B maps.
 
         Measured cells stay within two standard deviations of their elevation. Unknown cells do not rise above their
-        upper bound. In a map without a known cell, the mean is 0 and the standard deviation the prior's.
+        upper bound. In a map without a known cell, the mean is 0, or the upper bound below it, and the standard
+        deviation the prior's.
 
         Args:
-            elevation: heights [m], arbitrary where not valid; heights that are not finite count as unknown.
+            elevation: heights [m] within 1000 km of 0, arbitrary where not valid. Cells whose height, variance or age
+                is not finite count as unknown.
             validity: True where the elevation is known.
             variance: of the elevation [m^2]; None: the heights are exact.
             upper_bound: of the ground [m] where its elevation is unknown; arbitrary where not bounded.
@@ -84,7 +86,8 @@ class CompletionNet(nn.Module):
             Mean and standard deviation [m], (B, H, W) each, finite everywhere.
 
         Raises:
-            TypeError: if a layer has another dtype than the weights, or a mask is not of bool.
+            TypeError: if a layer has another dtype than the weights, a mask is not of bool, or the weights are of half
+                precision.
             ValueError: if a layer has another shape or device, or the resolution is out of range.
         """
         require_resolution(resolution)
@@ -142,11 +145,15 @@ def _check_layers(
     """Return the layers, those that are None filled in."""
     is_pair = (upper_bound is None) == (bounded is None)
     require(is_pair, "upper_bound, bounded", "must come together", "one of them", "give both or none")
-    for name, layer in {"elevation": elevation, "validity": validity}.items():
-        require(isinstance(layer, Tensor), name, "must be a tensor", type(layer).__name__, "give a layer", TypeError)
-    require(elevation.ndim == 3, "elevation", "must be (B, H, W)", tuple(elevation.shape), "add a dimension")
-    zero, nowhere = torch.zeros_like(elevation), torch.zeros_like(validity)
     given = (elevation, validity, variance, upper_bound, bounded, age)
+    for name, layer in zip(CompletionInput._fields, given, strict=True):
+        is_layer = isinstance(layer, Tensor) or (layer is None and name not in ("elevation", "validity"))
+        require(is_layer, name, "must be a tensor", type(layer).__name__, "give a layer", TypeError)
+    rule, kinds = "must be of float32 or float64", (torch.float32, torch.float64)
+    require(weight.dtype in kinds, "weights", rule, weight.dtype, "convert the network with .float()", TypeError)
+    is_map = elevation.ndim == 3 and elevation.numel() > 0
+    require(is_map, "elevation", "must be (B, H, W), not empty", tuple(elevation.shape), "give (B, H, W)")
+    zero, nowhere = torch.zeros_like(elevation), torch.zeros_like(validity)
     blank = (zero, nowhere, zero, zero, nowhere, zero)
     layers = CompletionInput(*(b if layer is None else layer for layer, b in zip(given, blank, strict=True)))
     shape, device = tuple(elevation.shape), weight.device
@@ -156,4 +163,5 @@ def _check_layers(
         require(layer.dtype == dtype, name, f"must be {dtype}", layer.dtype, "convert it with .to()", TypeError)
         fits = tuple(layer.shape) == shape and layer.device == device
         require(fits, name, f"must be {shape} on {device}", actual, hint)
-    return layers._replace(validity=validity & elevation.isfinite())
+    validity = validity & elevation.isfinite() & layers.variance.isfinite() & layers.age.isfinite()
+    return layers._replace(validity=validity, bounded=layers.bounded & layers.upper_bound.isfinite())

@@ -17,6 +17,7 @@ NUM_VIEW = 8 + 2 * len(REACHES)  # features of a direction
 NUM_CELL = 8 + NUM_CONTEXT  # of a cell
 NUM_CANDIDATES = 2 + len(REACHES)  # heights that each direction proposes
 NUM_MEASURED = 7  # features of a measured cell
+_SMALL = 1e-6
 
 
 class Weights(NamedTuple):
@@ -83,4 +84,5 @@ def hidden(weight: Tensor, columns: Float[Tensor, "F *n"], bias: Tensor) -> Tens
 
 def squash(height: Tensor, scale: float = 0.05) -> Tensor:
     """Return sign(h) log(1 + |h| / scale): linear below the scale [m], logarithmic above it."""
-    return torch.copysign(torch.log1p(height.abs() / scale), height)
+    ratio = (height.abs() / scale).clamp(min=_SMALL)  # whose logarithm has a slope at 0, which a sign would not have
+    return height / scale * (torch.log1p(ratio) / ratio)

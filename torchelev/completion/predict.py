@@ -63,7 +63,7 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     height = (height - mean) * known
     reference = low_height + mean
     low, high = -mean, torch.where(has_any, (height - nowhere).amax(0), 0.0)
-    bound = torch.where(bounded, upper_bound - reference, 0.0)
+    bound = torch.where(bounded, upper_bound - low_height - mean, 0.0)
     is_bounded = bounded.to(bound.dtype)
 
     both = known * opposite(known)
@@ -100,13 +100,13 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     spread = (ballot * (candidates - answer).square()).sum(0) + _NO_SPREAD**2
 
     correction, factor = affine(weights.answer, cells, weights.answer_bias)
-    answer = answer + torch.tanh(correction) * (high - low + _MARGIN)
+    answer = torch.where(has_any, answer + torch.tanh(correction) * (high - low + _MARGIN), 0.0)
     answer = torch.where(bounded, torch.minimum(answer, bound), answer)
     log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
     reach = (around.distance + nowhere).amin(0).square()
     fade = reach / (reach + _FADE**2)
     std = torch.exp((1 - fade) * log_std + fade * weights.prior)
-    return reference + torch.where(has_any, answer, 0.0), torch.where(has_any, std, weights.prior.exp())
+    return reference + answer, torch.where(has_any, std, weights.prior.exp())
 
 
 def opposite(values: Float[Tensor, "8 n"]) -> Float[Tensor, "8 n"]:

@@ -34,7 +34,7 @@ def refine(
 
         mean = h + 2 sigma tanh(g u / (2 sigma)),
 
-    which stays within two standard deviations sigma of the map.
+    which stays within two standard deviations sigma of the map, a millimetre at least.
     """
     height = torch.where(known, elevation, 0.0)
     around, has = neighbours(height, 0.0), neighbours(known.to(height.dtype), 0.0)
@@ -47,7 +47,7 @@ def refine(
     )
     sigma = torch.where(known, variance, 0.0).clamp(min=_MIN_STD**2).sqrt()
     features = [sigma.log(), bend.abs() / (bend.abs() + sigma), squash(rough, 0.01), squash(tilt), count / 4]
-    features += [torch.log1p(age.clamp(0, _LONG_AGO)), (resolution / _USUAL).log()]
+    features += [torch.log1p(torch.where(known, age, 0.0).clamp(0, _LONG_AGO)), (resolution / _USUAL).log()]
     flat = torch.stack(features).flatten(1)
     channels = hidden(weights.measured, flat, weights.measured_bias)
     gain, factor = (v.view_as(sigma) for v in affine(weights.measured_answer, channels, weights.measured_answer_bias))

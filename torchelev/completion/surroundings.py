@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
 
 # Rows and columns of a step; each direction is followed by the opposite one. Quarter turns and mirrors permute them.
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
 REACHES = (0.3, 0.8)  # [m] beyond the next known cell, where the ground is read once more, for its slope
-NONE = 2**14  # [steps] where a direction holds no known cell
+NONE = 2**28  # [steps] where a direction holds no known cell; more than any map is wide
 UNKNOWN = 1e7  # [m] above all ground
 
 
@@ -30,16 +29,16 @@ class Surroundings(NamedTuple):
 
 @torch.library.custom_op("torchelev::count_steps", mutates_args=())
 def count_steps(known: Tensor) -> Tensor:
-    """Count the steps (8, B, H, W) int16 from each cell to the next known one in DIRECTIONS; NONE: there is none.
+    """Count the steps (8, B, H, W) int32 from each cell to the next known one in DIRECTIONS; NONE: there is none.
 
     By doubling: what the cell 2^k steps on sees within 2^k steps, this one sees within 2^(k + 1).
     """
     H, W = known.shape[1:]
-    at_cells = torch.where(known, 0, NONE).to(torch.int16)
-    steps = torch.full((len(DIRECTIONS), *known.shape), NONE, dtype=torch.int16, device=known.device)
+    at_cells = torch.where(known, 0, NONE).to(torch.int32)
+    steps = torch.full((len(DIRECTIONS), *known.shape), NONE, dtype=torch.int32, device=known.device)
     for (di, dj), counted in zip(DIRECTIONS, steps, strict=True):
         within, reach = at_cells.clone(), 1
-        while reach < max(H * abs(di), W * abs(dj)) and reach < (H if di else W) and reach < (W if dj else H):
+        while reach < min(H if di else W, W if dj else H):
             here, there = _overlap(within, reach * di, reach * dj)
             torch.minimum(here, there + reach, out=here)
             reach *= 2
@@ -50,7 +49,7 @@ def count_steps(known: Tensor) -> Tensor:
 
 @count_steps.register_fake
 def _(known: Tensor) -> Tensor:
-    return known.new_empty(len(DIRECTIONS), *known.shape, dtype=torch.int16)
+    return known.new_empty(len(DIRECTIONS), *known.shape, dtype=torch.int32)
 
 
 def _overlap(values: Tensor, i: int, j: int) -> tuple[Tensor, Tensor]:
@@ -62,8 +61,7 @@ def _overlap(values: Tensor, i: int, j: int) -> tuple[Tensor, Tensor]:
 
 
 def look_around(
-    elevation: Float[Tensor, "B H W"],
-    known: Bool[Tensor, "B H W"],
+    ground: Float[Tensor, "B H W"],
     steps: Int[Tensor, "8 B H W"],
     place: Int[Tensor, "n"],
     resolution: float,
@@ -71,18 +69,18 @@ def look_around(
     """Return the known ground around cells.
 
     Args:
-        elevation: [m], finite where known.
-        known: where it counts.
+        ground: [m] elevation, UNKNOWN where it does not count.
         steps: of `count_steps`.
         place: numbers of the cells in the flat maps.
         resolution: [m].
     """
-    H, W = known.shape[1:]
+    H, W = ground.shape[1:]
     place = place.to(torch.int32)
-    stride = place.new_tensor([[di * W + dj] for di, dj in DIRECTIONS])
-    lengths = elevation.new_tensor([[resolution * math.hypot(*step)] for step in DIRECTIONS])
+    rows, columns = _directions(place.device)
+    stride = rows * W + columns
+    lengths = resolution * (rows.square() + columns.square()).to(ground.dtype).sqrt()
     steps, room = steps.flatten(1).index_select(1, place).to(torch.int32), _count_room(place, H, W)
-    ground = torch.where(known, elevation, UNKNOWN).flatten()
+    ground = ground.flatten()
 
     def read(steps: Tensor) -> tuple[Tensor, Tensor]:
         """Return the heights so many steps on, 0 where unknown, and whether they are known, 1 or 0."""
@@ -100,6 +98,13 @@ def look_around(
         has_slope.append(found)
     distance = steps * lengths * is_known
     return Surroundings(is_known, distance, height, torch.stack(slopes), torch.stack(has_slope))
+
+
+def _directions(device: torch.device) -> tuple[Int[Tensor, "8 1"], Int[Tensor, "8 1"]]:
+    """Return the rows and columns of DIRECTIONS; computed, as a copy to a GPU would make the host wait."""
+    k = torch.arange(len(DIRECTIONS), device=device, dtype=torch.int32)[:, None]
+    pair, sign = k // 2, 1 - 2 * (k % 2)
+    return sign * (pair != 1), sign * ((pair > 0).to(torch.int32) - 2 * (pair == 3))
 
 
 def _count_room(place: Int[Tensor, "n"], H: int, W: int) -> Int[Tensor, "8 n"]:

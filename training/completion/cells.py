@@ -12,6 +12,7 @@ from torch import Tensor
 from torchelev.completion.complete import CompletionInput, Unseen
 from torchelev.completion.predict import Seen
 from torchelev.completion.surroundings import Surroundings
+from torchelev.errors import require
 from torchelev.filters import Filter
 from training.completion.maps import TrueMap
 
@@ -74,8 +75,8 @@ def nearest_known(seen: Surroundings) -> Float[Tensor, "n"]:
 def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells]:
     """Draw unknown cells of each map, the more the nearer to known ground.
 
-    Errors weigh by the inverse of the mean error of diffusion in the same map, so that each map counts the same,
-    however deep its holes.
+    Errors weigh by the inverse of the mean error of the nearest known heights in the same map, so that each map counts
+    the same, however deep its holes.
     """
     layers, drawn = maps.layers, []
     known = layers.validity
@@ -124,7 +125,8 @@ Cells = TypeVar("Cells", UnknownCells, MeasuredCells)
 
 
 def concatenate(parts: Sequence[Cells]) -> Cells:
-    """Concatenate cells."""
+    """Concatenate cells. Raises ValueError without any."""
+    require(len(parts) > 0, "walks", "must hold cells to train on", "none", "give more of them")
     return _map(lambda dim, *values: torch.cat(values, dim), _cell_dim(parts[0]), *parts)
 
 

@@ -33,9 +33,9 @@ _WALKS_SEED = 0
 @click.option(
     "--seed", default=0, show_default=True, help="Seed of initial weights and drawn cells; the walks stay the same."
 )
-@click.option("--walks", type=_POSITIVE, default=320, show_default=True, help="Training walks of four robots.")
+@click.option("--walks", type=_POSITIVE, default=290, show_default=True, help="Training walks of four robots.")
 @click.option(
-    "--steps", type=_POSITIVE, default=12000, show_default=True, help="Steps in total, including those before --resume."
+    "--steps", type=_POSITIVE, default=10000, show_default=True, help="Steps in total, including those before --resume."
 )
 @click.option(
     "--evaluation-walks", type=_POSITIVE, default=10, show_default=True, help="Evaluation walks per resolution."
