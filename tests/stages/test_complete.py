@@ -11,6 +11,7 @@ from torchelev import CompletionConfig
 from torchelev.io.map_file import load_map, save_map
 from torchelev.site import SiteMap
 from torchelev.stages.complete import complete_map, forget_completed, write_back
+from torchelev.state import tally
 
 EVERYWHERE = dict(write_back=True, max_std=1e3)
 
@@ -108,7 +109,7 @@ def test_a_prediction_above_the_bound_is_given_up():
     assert cell.any() and torch.equal(state.elevation, before.elevation)
 
 
-def test_it_moves_with_the_window():
+def test_it_moves_with_the_window_and_its_drift():
     _, emap = pair(1)
     look(emap, 0)
     before = snapshot(emap)
@@ -116,10 +117,12 @@ def test_it_moves_with_the_window():
     moved = forget_completed(sure)._replace(
         corner=before.corner + torch.tensor([2, -1]), validity=before.validity & False
     )
+    moved = tally(moved, drift_correction=torch.tensor([0.2]))
     state = write_back(sure, moved, emap.cfg.grid, emap.completion_net.weights, 1e3)
     ours, theirs = state.validity[0, :-2, 1:], predicted(emap)[0, 2:, :-1]
     assert torch.equal(ours, theirs) and ours.any() and not state.validity[0, -2:].any()
-    assert torch.equal(state.elevation[0, :-2, 1:][theirs], before.elevation[0, 2:, :-1][theirs])
+    expected = before.elevation[0, 2:, :-1][theirs] + 0.2
+    torch.testing.assert_close(state.elevation[0, :-2, 1:][theirs], expected)
 
 
 def test_forward_is_update():
