@@ -79,8 +79,6 @@ def completing_map(num_envs, device, **settings):
     return ElevationMap(small_config((40, 40), 0.05, **parts), num_envs, device, completion_net=net)
 
 
-# strict: remove the mark once `look_around` makes its constants on the device
-@pytest.mark.xfail(strict=True, raises=TypeError, reason="completion.surroundings copies constants from the host")
 @pytest.mark.parametrize("when", ["read", "update"])
 def test_completion_copies_nothing_from_the_host(monkeypatch, when):
     emap = completing_map(5, "meta", when=when)
