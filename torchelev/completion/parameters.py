@@ -27,26 +27,26 @@ class Weights(NamedTuple):
     """
 
     view: Float[Tensor, "C F"]  #: the features of a direction
-    view_bias: Float[Tensor, "C 1"]
+    view_bias: Float[Tensor, "C 1"]  #: first layer of a direction
     view_inner: Float[Tensor, "C C"]  #: second layer
-    view_inner_bias: Float[Tensor, "C 1"]
+    view_inner_bias: Float[Tensor, "C 1"]  #: second layer of a direction
     cell: Float[Tensor, "D 2C+F"]  #: mean and maximum over the directions, and the features of the cell
-    cell_bias: Float[Tensor, "D 1"]
+    cell_bias: Float[Tensor, "D 1"]  #: first layer of a cell
     cell_inner: Float[Tensor, "D D"]  #: second layer
-    cell_inner_bias: Float[Tensor, "D 1"]
+    cell_inner_bias: Float[Tensor, "D 1"]  #: second layer of a cell
     to_view: Float[Tensor, "C D"]  #: what the cell tells each direction
-    to_view_bias: Float[Tensor, "C 1"]
+    to_view_bias: Float[Tensor, "C 1"]  #: what the cell tells each direction
     vote: Float[Tensor, "V C"]  #: logits of the candidates, from a direction
     vote_cell: Float[Tensor, "V D"]  #: from the cell
-    vote_bias: Float[Tensor, "V 1"]
+    vote_bias: Float[Tensor, "V 1"]  #: logits of the candidates
     vote_square: Float[Tensor, "R D"]  #: logits of the mean heights of the squares
-    vote_square_bias: Float[Tensor, "R 1"]
+    vote_square_bias: Float[Tensor, "R 1"]  #: logits of the squares
     answer: Float[Tensor, "2 D"]  #: correction and spread
-    answer_bias: Float[Tensor, "2 1"]
+    answer_bias: Float[Tensor, "2 1"]  #: correction and spread
     measured: Float[Tensor, "K F"]  #: the features of a measured cell
-    measured_bias: Float[Tensor, "K 1"]
+    measured_bias: Float[Tensor, "K 1"]  #: layer of a measured cell
     measured_answer: Float[Tensor, "2 K"]  #: gain and spread
-    measured_answer_bias: Float[Tensor, "2 1"]
+    measured_answer_bias: Float[Tensor, "2 1"]  #: gain and spread
     prior: Float[Tensor, "1"]  #: logarithm of the prior's standard deviation [m]
     calibration: Float[Tensor, "2"]  #: logarithms of the factors on the standard deviations, of unknown and known cells
 
