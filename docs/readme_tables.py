@@ -19,11 +19,12 @@ import benchmarks
 import training
 from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
-from benchmarks.quality.real import merged
+from benchmarks.quality.real import completed, merged
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
 from benchmarks.speed import (
     bags,
+    completion,
     encoders,
     growth,
     head,
@@ -38,6 +39,7 @@ from benchmarks.speed import (
 )
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
+from training.completion import evaluate as filling
 from training.nav import encoder_experiment, experiment
 from training.quadruped import experiment as legs
 from training.quadruped import step_time
@@ -144,6 +146,9 @@ TABLES = {
     "site_area": _made_by(site_area.table, "site_area", "rows"),
     "site_ranks": _made_by(site_ranks.table, "site_ranks"),
     "real_merged": _made_by(merged.table, "real_merged", "rows"),
+    "completion": _made_by(filling.summary, "completion", folder=training.RESULTS),
+    "completion_speed": _made_by(completion.table, "completion_speed", "rows"),
+    "real_completed": _made_by(completed.table, "real_completed", "rows"),
     "nav": _made_by(experiment.table, "nav", folder=training.RESULTS),
     "pose_covariance": _made_by(pose_covariance.table, "pose_covariance"),
     "legs": _made_by(legs.table, "quadruped", folder=training.RESULTS),

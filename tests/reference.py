@@ -771,3 +771,148 @@ def replaces(other, first, is_new, rate, max_newer_ratio):
     if ages[0] == ages[1]:
         return ratio < 1
     return ratio < (max_newer_ratio if ages[1] > ages[0] else 1 / max_newer_ratio)
+
+
+# Completion -----------------------------------------------------------------------------------------------------------
+
+DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+def next_known(known, i, j, direction):
+    """The number of steps to the next known cell in a direction, None without any."""
+    H, W = known.shape
+    steps, (di, dj) = 1, direction
+    while 0 <= i + steps * di < H and 0 <= j + steps * dj < W:
+        if known[i + steps * di, j + steps * dj]:
+            return steps
+        steps += 1
+    return None
+
+
+def squash(height, scale=0.05):
+    """Linear below the scale [m], logarithmic above it."""
+    return math.copysign(math.log1p(abs(height) / scale), height)
+
+
+def square_around(elevation, known, bounded, i, j, radius, resolution):
+    """Shares of known and bounded cells, mean step, mean, standard deviation and skewness of a square of cells."""
+    cells = max(1, round(radius / resolution))
+    inside = [(a, b) for a in range(i - cells, i + cells + 1) for b in range(j - cells, j + cells + 1)
+              if 0 <= a < known.shape[0] and 0 <= b < known.shape[1]]  # fmt: skip
+    heights = [elevation[a, b] for a, b in inside if known[a, b]]
+    steps = []
+    for a, b in inside:
+        for c, d in ((a + 1, b), (a - 1, b), (a, b + 1), (a, b - 1)):
+            if 0 <= c < known.shape[0] and 0 <= d < known.shape[1] and known[a, b] and known[c, d]:
+                steps.append(abs(elevation[a, b] - elevation[c, d]))
+    area = (2 * cells + 1) ** 2
+    mean = float(np.mean(heights)) if heights else None
+    variance = float(np.mean([(h - mean) ** 2 for h in heights])) if heights else 0.0
+    third = float(np.mean([(h - mean) ** 3 for h in heights])) if heights else 0.0
+    spread = math.sqrt(variance + 0.01**2)
+    share, bound = len(heights) / area, sum(bounded[a, b] for a, b in inside) / area
+    return share, bound, float(np.mean(steps)) if steps else 0.0, mean, spread - 0.01, third / spread**3
+
+
+def view_from(elevation, known, i, j, direction, resolution):
+    """The next known cell in a direction, and the slopes of the ground beyond it; None without any."""
+    length, steps = math.hypot(*direction) * resolution, next_known(known, i, j, direction)
+    if steps is None:
+        return None
+    height, slopes = elevation[i + steps * direction[0], j + steps * direction[1]], []
+    for reach in (0.3, 0.8):
+        more = max(3, round(reach / length))
+        a, b = (k + (steps + more) * d for k, d in zip((i, j), direction, strict=True))
+        inside = 0 <= a < known.shape[0] and 0 <= b < known.shape[1] and known[a, b]
+        slopes.append((height - elevation[a, b]) / (more * length) if inside else None)
+    return dict(d=min(steps * length, 10.0), far=steps * length, h=height, slopes=slopes)
+
+
+def view_features(view, other, nearest, reference, low):
+    """The features of a direction, given the opposite one."""
+    if not view:
+        return [0.0] * 12
+    height = view["h"] - reference
+    pair = [1.0, other["d"] / (view["d"] + other["d"]), squash(other["h"] - view["h"])] if other else [0.0] * 3
+    return [1.0, nearest / view["d"], math.log1p(view["d"] / 0.1), squash(height), squash(height - low), *pair,
+            *(float(slope is not None) for slope in view["slopes"]),
+            *(float(np.clip(slope or 0.0, -1.5, 1.5)) for slope in view["slopes"])]  # fmt: skip
+
+
+def view_candidates(view, other, reference):
+    """The heights that a direction proposes, None where it has none."""
+    if not view:
+        return [None] * 4
+    height, line = view["h"] - reference, None
+    if other:
+        line = height + (other["h"] - view["h"]) * view["d"] / (view["d"] + other["d"])
+    slopes = (None if s is None else height + float(np.clip(s, -1.5, 1.5)) * view["d"] for s in view["slopes"])
+    return [height, line, *slopes]
+
+
+def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
+    """The mean and standard deviation [m] of the ground at an unknown cell; w holds the weights by name."""
+    views = [view_from(elevation, known, i, j, direction, resolution) for direction in DIRECTIONS]
+    found = [view for view in views if view]
+    if not found:
+        level = float(elevation[known].mean()) if known.any() else 0.0
+        return min(level, upper_bound[i, j] if bounded[i, j] else math.inf), math.exp(w["prior"][0])
+    nearest = min(view["d"] for view in found)
+    reference = sum(v["h"] * nearest / v["d"] for v in found) / sum(nearest / v["d"] for v in found)
+    low, high = (choose(v["h"] for v in found) - reference for choose in (min, max))
+    bound = upper_bound[i, j] - reference if bounded[i, j] else None
+
+    def relu(matrix, columns):
+        return np.maximum(w[matrix] @ np.array(columns) + w[f"{matrix}_bias"][:, 0], 0)
+
+    pairs = [(view, views[k ^ 1]) for k, view in enumerate(views)]
+    features = [view_features(*pair, nearest, reference, low) for pair in pairs]
+    channels = [relu("view_inner", relu("view", each)) for each in features]
+    cell = [squash(high - low), squash(low)]
+    cell += [0.0, 0.0, 0.0] if bound is None else [1.0, squash(bound - low), squash(bound)]
+    cell += [math.log1p(nearest / 0.1), math.log(resolution / 0.04), len(found) / 8]
+    squares = [square_around(elevation, known, bounded, i, j, radius, resolution) for radius in (0.4, 1.2)]
+    share, bound_share, step, mean, std, skewness = zip(*squares, strict=True)
+    cell += [*share, *bound_share, *(squash(s, 0.01) for s in step)]
+    cell += [0.0 if m is None else squash(m - reference) for m in mean]
+    cell += [*(squash(s) for s in std), *skewness]
+    cell = relu("cell_inner", relu("cell", [*np.mean(channels, 0), *np.max(channels, 0), *cell]))
+
+    told = w["to_view"] @ cell + w["to_view_bias"][:, 0]
+    votes = [w["vote"] @ np.maximum(c + told, 0) + w["vote_cell"] @ cell + w["vote_bias"][:, 0] for c in channels]
+    proposed = [view_candidates(*pair, reference) for pair in pairs]
+    counted = [
+        (v, c) for each in zip(votes, proposed, strict=True) for v, c in zip(*each, strict=True) if c is not None
+    ]
+    squares = w["vote_square"] @ cell + w["vote_square_bias"][:, 0]
+    counted += [(v, m - reference) for v, m in zip(squares, mean, strict=True) if m is not None]
+    logits, heights = (np.array(column) for column in zip(*counted, strict=True))
+    share = np.exp(logits - max(logits)) / np.exp(logits - max(logits)).sum()
+    answer = float(share @ heights)
+    spread = float(share @ (heights - answer) ** 2) + 0.01**2
+    correction, factor = w["answer"] @ cell + w["answer_bias"][:, 0]
+    answer += math.tanh(correction) * (high - low + 0.02)
+    answer = answer if bound is None else min(answer, bound)
+    reach = min(view["far"] for view in found)
+    fade = reach**2 / (reach**2 + 4.0)
+    log_std = 0.5 * math.log(spread) + float(np.clip(factor, -5, 5)) + w["calibration"][0]
+    return reference + answer, math.exp((1 - fade) * log_std + fade * w["prior"][0])
+
+
+def refine_cell(w, elevation, known, variance, age, i, j, resolution):
+    """The mean and standard deviation [m] of the ground at a measured cell."""
+    height, bends, tilts = elevation[i, j], [], []
+    for di, dj in ((1, 1), (1, 0), (1, -1), (0, 1)):
+        a, b = (i - di, j - dj), (i + di, j + dj)
+        inside = all(0 <= c < known.shape[0] and 0 <= d < known.shape[1] and known[c, d] for c, d in (a, b))
+        if inside:
+            bends.append((elevation[a] + elevation[b]) / 2 - height)
+            tilts.append(abs(elevation[a] - elevation[b]))
+    bend, rough, tilt = (float(np.mean(v)) if v else 0.0 for v in (bends, [abs(b) for b in bends], tilts))
+    sigma = math.sqrt(max(variance[i, j], 1e-6))
+    features = [math.log(sigma), abs(bend) / (abs(bend) + sigma), squash(rough, 0.01), squash(tilt), len(bends) / 4]
+    features += [math.log1p(min(max(age[i, j], 0.0), 60.0)), math.log(resolution / 0.04)]
+    channels = np.maximum(w["measured"] @ np.array(features) + w["measured_bias"][:, 0], 0)
+    gain, factor = w["measured_answer"] @ channels + w["measured_answer_bias"][:, 0]
+    mean = height + 2 * sigma * math.tanh(bend / (1 + math.exp(-gain)) / (2 * sigma))
+    return mean, math.sqrt(sigma**2 + math.exp(2 * min(max(factor, -10.0), 2.0))) * math.exp(w["calibration"][1])

@@ -1,5 +1,7 @@
 """torchelev: batched, differentiable elevation mapping in PyTorch, for robots that learn."""
 
+from torchelev.completion.config import CompletionConfig
+from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.filters.chain import FilterConfig
@@ -27,6 +29,8 @@ __all__ = [
     "BodyConfig",
     "Box",
     "Capsule",
+    "CompletionConfig",
+    "CompletionNet",
     "DriftConfig",
     "EdgeConfig",
     "ElevationMap",

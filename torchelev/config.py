@@ -8,6 +8,7 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any
 
+from torchelev.completion.config import CompletionConfig
 from torchelev.errors import require
 from torchelev.filters.chain import FilterConfig, filters_from_list
 from torchelev.grid import GridConfig
@@ -25,7 +26,8 @@ from torchelev.traversability.heads import LearnedTraversabilityConfig, Traversa
 class ElevationMapConfig:
     """Configuration of all stages of a map.
 
-    `drift`, `raycast`, `overlap`, `traversability` and `fusion.edges` can be None, which switches that stage off.
+    `drift`, `raycast`, `overlap`, `traversability`, `completion` and `fusion.edges` can be None, which switches that
+    stage off.
 
     Raises:
         TypeError: if a field has the wrong type.
@@ -47,6 +49,8 @@ class ElevationMapConfig:
     traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
         default_factory=TraversabilityConfig
     )
+    #: the layers `completed` and `completed_std`: what a network predicts of the ground that no sensor saw; None: none
+    completion: CompletionConfig | None = None
     filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
 
     def __post_init__(self) -> None:
@@ -62,6 +66,8 @@ class ElevationMapConfig:
             rule = f"must be {' or '.join('None' if kind is type(None) else f'a {kind.__name__}' for kind in kinds)}"
             hint = "give an object, or build the whole with ElevationMapConfig.from_dict"
             require(isinstance(value, annotation), f"cfg.{name}", rule, repr(value), hint, TypeError)
+        if self.completion is not None:
+            self.completion.require_resolution(self.grid.resolution)
 
     @property
     def drift_gate(self) -> float:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchelev import pipeline
 from torchelev.compiled_update import compile_ahead, compiled_update
+from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
 from torchelev.diagnosis.history import InputHistory
@@ -28,9 +29,10 @@ from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import require_reverse_mode
 from torchelev.pipeline import rate_surface, update_in_place, write
 from torchelev.readable_map import ReadableMap
+from torchelev.stages.complete import forget_completed
 from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure import measure
-from torchelev.state import MapState, Measurement, forget
+from torchelev.state import MapState, Measurement, forget, map_layers
 from torchelev.traversability.net import TraversabilityNet
 
 if TYPE_CHECKING:
@@ -50,6 +52,8 @@ class ElevationMap(ReadableMap):
         chunk: update at most this many environments at a time, to save memory; results agree up to rounding. None: all
             on a GPU, and on a CPU as many as fit into its caches, which is also faster.
         head: trained traversability head, used as it is and not copied, in place of the weights that `cfg` names.
+        completion_net: trained completion network, used as it is and not copied, in place of the weights that `cfg`
+            names.
 
     Raises:
         TypeError: if `cfg` is no ElevationMapConfig.
@@ -66,14 +70,17 @@ class ElevationMap(ReadableMap):
         check_values: bool = False,
         chunk: int | None = None,
         head: TraversabilityNet | None = None,
+        completion_net: CompletionNet | None = None,
     ) -> None:
         cfg = checks.given_or_default(ElevationMapConfig, cfg)
-        super().__init__(cfg, require_count("num_envs", num_envs, "give the number of maps"), device, head)
+        num_envs = require_count("num_envs", num_envs, "give the number of maps")
+        super().__init__(cfg, num_envs, device, head, completion_net)
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
         self.pace = Pace()
         self._links = cfg.sensor.links
-        self._update_cfg = dataclasses.replace(cfg, filters=())  # compiled graphs are shared by maps of equal ones
+        # Compiled graphs are shared by maps of equal ones.
+        self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
         self._compiled = False
         self._history = InputHistory()
         with torch.inference_mode(False):
@@ -121,15 +128,30 @@ class ElevationMap(ReadableMap):
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
         self._history.add(inputs)
-        self._filtered.clear()
+        self._derived.clear()
         if self.device.type == "cpu":
             keep_freed_memory()
         weights = None if self._weights is None else self._weights.detached()
         run = compiled_update if self._compiled else update_in_place
         run = functools.partial(run, cfg=self._update_cfg, weights=weights)
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
+        before = self._take_out_predictions()
         with torch.inference_mode():
             run_in_chunks(run, self.state, inputs, self.chunks)
+        if before is not None:
+            with torch.no_grad():
+                write(self.state, self._write_back(before, self.state))
+        if self.cfg.completion is not None and self.cfg.completion.when == "update":
+            self._complete()
+
+    def _take_out_predictions(self) -> MapState | None:
+        """Make the cells that completion filled unknown, and return a copy of the state with them; None without."""
+        if not self._writes_back:
+            return None
+        with torch.no_grad():
+            before = map_layers(Tensor.clone, self.state)
+            write(self.state, self.measured_state)
+        return before
 
     @requires_dt
     def measure(
@@ -165,7 +187,10 @@ class ElevationMap(ReadableMap):
         """
         require_full_precision(state.elevation.dtype)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
+        before, state = state, forget_completed(state) if self._writes_back else state
         new = pipeline.forward(state, measurement, self.cfg, self._weights)
+        if self._writes_back:
+            new = self._write_back(before, new)
         return without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))
 
     def _check_inputs(self, *inputs: Any) -> Inputs:
@@ -251,7 +276,7 @@ class ElevationMap(ReadableMap):
             ValueError: if an id is out of range or repeated, a shape or device is wrong, or both are given.
         """
         env_ids, mask = self._check_choice(env_ids, mask)
-        self._filtered.clear()
+        self._derived.clear()
         self._history.forget(env_ids, mask)
         self.num_resets.add_(self._choose(env_ids, mask))
         with torch.no_grad():
@@ -287,8 +312,8 @@ class ElevationMap(ReadableMap):
         """
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         feet = checks.check_feet(feet, self.num_envs, self.device, self.check_values)
-        state = initialize(self.state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
-        self._filtered.clear()
+        state = initialize(self.measured_state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
+        self._derived.clear()
         with torch.no_grad():
             write(self.state, rate_surface(state, self.cfg, self._weights))
 
@@ -321,7 +346,7 @@ class ElevationMap(ReadableMap):
             shape = (self.num_envs, 4, 4)
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
         state = site.give(self, T_map_base, self._choose(*self._check_choice(env_ids, mask)))
-        self._filtered.clear()
+        self._derived.clear()
         with torch.no_grad():
             write(self.state, rate_surface(state, self.cfg, self._weights))
 
@@ -337,7 +362,7 @@ class ElevationMap(ReadableMap):
         Returns:
             One sentence per finding; none if all is well, or if the inputs do not show it.
         """
-        return diagnose(self.cfg, self.state, self._history)
+        return diagnose(self.cfg, self.measured_state, self._history)
 
     def _forget_derived(self) -> None:
         super()._forget_derived()

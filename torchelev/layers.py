@@ -37,7 +37,12 @@ def _validity(state: MapState) -> Layer:
 
 
 def absolute_variance(state: MapState) -> Float[Tensor, "B H W"]:
-    """Return the variance [m^2] of each elevation in the map frame: its own, and n^T Sigma n of the pose's position.
+    """Return the variance [m^2] of each elevation in the map frame: its own, and that of the pose."""
+    return state.variance + pose_variance(state)
+
+
+def pose_variance(state: MapState) -> Float[Tensor, "B H W"]:
+    """Return n^T Sigma n [m^2] of the pose's position, at each cell.
 
     With n = (-dz/dx, -dz/dy, 1): on a slope, a map that is off sideways is off in height.
     """
@@ -45,7 +50,7 @@ def absolute_variance(state: MapState) -> Float[Tensor, "B H W"]:
     gx, gy = state.gradient_x, state.gradient_y
     level = C[:, 0, 0] * gx.square() + 2 * C[:, 0, 1] * gx * gy + C[:, 1, 1] * gy.square()
     shared = level + C[:, 2, 2] - 2 * (C[:, 0, 2] * gx + C[:, 1, 2] * gy)
-    return state.variance + shared.clamp(min=0)
+    return shared.clamp(min=0)
 
 
 LAYERS: dict[str, Callable[[MapState], Layer]] = {

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.filters.chain import FilterChain
@@ -14,6 +15,13 @@ from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer
 from torchelev.map_buffers import MapBuffers
 from torchelev.pipeline import rate_surface
+from torchelev.stages.complete import (
+    COMPLETED,
+    completed_layers,
+    forget_completed,
+    make_completion_net,
+    write_back,
+)
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
 from torchelev.traversability.net import Rating, TraversabilityNet
@@ -24,37 +32,65 @@ if TYPE_CHECKING:
 
 
 class ReadableMap(MapBuffers):
-    """B maps that can be read: with the trained head and the filters that the config asks for.
+    """B maps that can be read: with the networks and the filters that the config asks for.
 
     Args:
         cfg: configuration of all stages.
         num_envs: number of maps, B.
         device: device of the maps.
         head: trained head in place of the one that the config names.
+        completion_net: trained network in place of the one that the config names.
     """
 
     def __init__(
-        self, cfg: ElevationMapConfig, num_envs: int, device: torch.device | str, head: TraversabilityNet | None
+        self,
+        cfg: ElevationMapConfig,
+        num_envs: int,
+        device: torch.device | str,
+        head: TraversabilityNet | None,
+        completion_net: CompletionNet | None,
     ) -> None:
         super().__init__(cfg, num_envs, device)
         with torch.inference_mode(False):  # inference tensors could not be trained or written outside of that mode
             self.head = make_head(cfg.traversability, cfg.grid, head)
-        if self.head is not None:
-            self.head.to(device)
-        self.filters = FilterChain(cfg.filters, cfg.grid.resolution)
-        self._filtered: dict[str, Layer] = {}  # layers that filters made of the current state
+            self.completion_net = make_completion_net(cfg.completion, completion_net)
+        for net in (self.head, self.completion_net):
+            if net is not None:
+                net.to(device)
+        self.filters = FilterChain(cfg.filters, cfg.grid.resolution, self._own_layers)
+        self._derived: dict[str, Layer] = {}  # layers that completion and filters made of the current state
 
     def _forget_derived(self) -> None:
-        self._filtered.clear()
+        self._derived.clear()
 
     @property
     def _weights(self) -> Weights | None:
         return None if self.head is None else self.head.weights
 
     @property
+    def _writes_back(self) -> bool:
+        """Whether completion fills unknown cells of the map."""
+        return self.cfg.completion is not None and self.cfg.completion.write_back
+
+    @property
+    def measured_state(self) -> MapState:
+        """The state without cells that completion filled, of `CompletionConfig(write_back=True)`."""
+        return forget_completed(self.state) if self._writes_back else self.state
+
+    def _write_back(self, before: MapState, state: MapState) -> MapState:
+        """Return a state after an update with its unknown cells filled by completion."""
+        assert self.completion_net is not None and self.cfg.completion is not None
+        weights, max_std = self.completion_net.weights, self.cfg.completion.max_std
+        return write_back(before, state, self.cfg.grid, weights, max_std)
+
+    @property
     def layers(self) -> tuple[str, ...]:
-        """Names of all layers: the map's, then those of the configured filters."""
-        return (*LAYERS, *self.filters.inputs)
+        """Names of all layers: the map's, those of a configured completion, then those of the configured filters."""
+        return (*self._own_layers, *self.filters.inputs)
+
+    @property
+    def _own_layers(self) -> tuple[str, ...]:
+        return (*LAYERS, *(() if self.completion_net is None else COMPLETED))
 
     def layer(self, name: str, *, state: MapState | None = None) -> Float[Tensor, "B H W"]:
         """Return a layer as a fresh tensor, NaN where unknown.
@@ -65,6 +101,10 @@ class ReadableMap(MapBuffers):
           not exceed.
         - traversability, 0 (impassable) to 1, and normal_x, normal_y, normal_z of unit length: also unknown where the
           known neighbours do not span a plane. The learned head rates every known cell.
+        - completed and completed_std [m], with a `CompletionConfig`: the ground as a network predicts it, and the
+          standard deviation of that. Known in the whole window of an environment that knows any elevation, unknown in
+          the others. Computed once, and kept until the map changes; with `state`, each time, and differentiable in the
+          state and in the weights of `completion_net`.
         - a configured filter's: computed when read, with the layers that it needs, and kept until the map changes.
 
         Args:
@@ -85,13 +125,29 @@ class ReadableMap(MapBuffers):
             known: (B, H, W) bool. Both may share memory with the map: do not write into them.
         """
         if name not in self.filters:
-            hint = f"there are {', '.join(self.layers)}"
-            require(name in LAYERS, "layer", "must be a layer's name", repr(name), hint, KeyError)
-            return LAYERS[name](self.state if state is None else state)
+            return self._read_own(name, state)
         if state is not None:
             return self.filters.read(name, lambda source: self.read_layer(source, state), {})
         with torch.inference_mode(False), torch.no_grad():  # kept, and perhaps read outside of inference mode later
-            return self.filters.read(name, self.read_layer, self._filtered)
+            return self.filters.read(name, self.read_layer, self._derived)
+
+    def _read_own(self, name: str, state: MapState | None) -> Layer:
+        """Return a layer that no filter makes."""
+        hint = "give the config a CompletionConfig" if name in COMPLETED else f"there are {', '.join(self.layers)}"
+        require(name in self._own_layers, "layer", "must be a layer's name", repr(name), hint, KeyError)
+        if name in COMPLETED:
+            return self._complete(state)[name]
+        return LAYERS[name](self.state if state is None else state)
+
+    def _complete(self, state: MapState | None = None) -> dict[str, Layer]:
+        """Return the completed layers of a state; those of the map's own state are kept until it changes."""
+        assert self.completion_net is not None
+        if state is not None:
+            return completed_layers(state, self.cfg.grid, self.completion_net.weights)
+        if COMPLETED[0] not in self._derived:
+            with torch.inference_mode(False), torch.no_grad():
+                self._derived |= completed_layers(self.state, self.cfg.grid, self.completion_net.weights)
+        return self._derived
 
     def rate(self, *, state: MapState | None = None) -> Rating:
         """Return traversability and its confidence, (B, H, W) each, 0 to 1.

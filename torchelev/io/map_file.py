@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
@@ -33,8 +34,8 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     """Write a whole map, with all environments, its config and its precision, as an `.npz` without pickled objects.
 
     The arrays are `header` (JSON: format, version, dtype, config), each field of `MapState` by its name, each field of
-    `Statistics` as `last_<name>`, and the weights of a learned head as `head_<name>`. As in the map's state, unknown
-    cells have validity 0, not NaN.
+    `Statistics` as `last_<name>`, and the weights of a learned head as `head_<name>`, of a completion network as
+    `completion_net_<name>`. As in the map's state, unknown cells have validity 0, not NaN.
 
     Args:
         path: the file to write, under this name as it is.
@@ -45,9 +46,9 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     """
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
-    header |= {"head": None if emap.head is None else emap.head.config}
+    header |= {name: None if net is None else net.config for name, net in _nets(emap).items()}
     arrays: dict[str, Any] = {name: as_array(value) for name, value in name_tensors(emap.state).items()}
-    arrays |= {f"head_{name}": as_array(value) for name, value in _head(emap).items()}
+    arrays |= {name: as_array(value) for name, value in _weights(emap).items()}
     with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
@@ -74,14 +75,15 @@ def load_map(
     header = _header(path, arrays)
     ids = _ids(env_ids, _num_envs(path, arrays))
     try:
-        head = None if header.get("head") is None else TraversabilityNet(**header["head"]).requires_grad_(False)
-        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, head=head)
+        kinds: dict[str, type] = {"head": TraversabilityNet, "completion_net": CompletionNet}
+        found = {name: kind for name, kind in kinds.items() if header.get(name) is not None}
+        nets = {name: kind(**header[name]).requires_grad_(False) for name, kind in found.items()}
+        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, **nets)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
     emap = emap.to(_DTYPES[header["dtype"]])
-    for name, value in _head(emap).items():
-        found = _array(path, arrays, f"head_{name}", value, tuple(value.shape))
-        value.copy_(torch.from_numpy(found))
+    for name, value in _weights(emap).items():
+        value.copy_(torch.from_numpy(_array(path, arrays, name, value, tuple(value.shape))))
     state = _state(path, arrays, emap.state, ids, header["version"])
     if header["version"] < VERSION:
         state = rate_surface(state, emap.cfg, None if emap.head is None else emap.head.weights)
@@ -89,9 +91,15 @@ def load_map(
     return emap
 
 
-def _head(emap: ElevationMap) -> dict[str, Tensor]:
-    """Return the weights of the learned head by name; empty without one."""
-    return {} if emap.head is None else dict(emap.head.state_dict())
+def _nets(emap: ElevationMap) -> dict[str, TraversabilityNet | CompletionNet | None]:
+    """Return the map's networks by name; None for those that it lacks."""
+    return {"head": emap.head, "completion_net": emap.completion_net}
+
+
+def _weights(emap: ElevationMap) -> dict[str, Tensor]:
+    """Return the weights of the map's networks by the names of their arrays."""
+    nets = {name: net for name, net in _nets(emap).items() if net is not None}
+    return {f"{name}_{key}": value for name, net in nets.items() for key, value in net.state_dict().items()}
 
 
 def as_array(value: Tensor) -> NDArray:

@@ -12,17 +12,18 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.layers import LAYERS, Layer, sample_layers
+from torchelev.layers import Layer, sample_layers
 from torchelev.observations.ground import continue_ground
 from torchelev.ops.operators import padded
 from torchelev.ops.windows import window_moments
+from torchelev.readable_map import ReadableMap
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 MODES = ("bilinear", "nearest", "minimum")
-FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint")
+FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint", "completed")
 ORIGINAL = "original"
 
 
@@ -76,18 +77,27 @@ def read_points(layers: Sequence[Layer], uv: Float[Tensor, "B M 2"], grid: GridC
     return [_find_lowest(values.unflatten(1, (3, -1)), known.unflatten(1, (3, -1)), dim=1) for values, known in read]
 
 
-def filled_layers(fill: str | float, state: MapState, half_extent: tuple[int, int], rings: int) -> list[Layer]:
+def filled_layers(
+    fill: str | float, emap: ReadableMap, state: MapState | None, half_extent: tuple[int, int], rings: int
+) -> list[Layer]:
     """Return the layer that fills unknown heights, to be read at the same points; none for the other rules.
 
     Args:
         fill: one of FILLS, or a number.
-        state: the state of the maps.
+        emap: the maps.
+        state: the state to read; None: that of the maps.
         half_extent: as in `Query`.
         rings: how far "inpaint" reaches [cells].
+
+    Raises:
+        ValueError: if "completed" is asked of maps without completion.
     """
-    if fill == "upper_bound":
-        return [LAYERS["upper_bound"](state)]
-    return [inpaint((state.elevation, state.validity), half_extent, rings)] if fill == "inpaint" else []
+    if fill == "completed":
+        hint = "give ElevationMapConfig a CompletionConfig"
+        require(fill in emap.layers, "fill", "needs maps with completion", "'completed' of maps without", hint)
+    if fill in ("upper_bound", "completed"):
+        return [emap.read_layer(str(fill), state)]
+    return [inpaint(emap.read_layer("elevation", state), half_extent, rings)] if fill == "inpaint" else []
 
 
 def fill_unknown(fill: str | float, state: MapState, query: Query, read: Layer, filled: Sequence[Layer]) -> Layer:

@@ -21,7 +21,8 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-CHANNELS = ("elevation", "validity", "variance", "upper_bound", "traversability")
+CHANNELS = ("elevation", "validity", "variance", "upper_bound", "traversability", "completed", "completed_std")
+HEIGHTS = ("elevation", "upper_bound", "completed")  # they count from the ground below the base
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,7 @@ class MapImage:
     Channels:
 
     - "elevation" and "upper_bound" [m], above the ground `nominal_height` below the base
+    - "completed" [m] likewise, and "completed_std" [m]: maps whose config has a `CompletionConfig` predict them
     - "validity", 1 where the elevation is known
     - "variance" [m^2]
     - "traversability", 0 (bad) to 1 (good)
@@ -84,13 +86,14 @@ class MapImage:
 
         Raises:
             ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the image.
+            KeyError: for a channel "completed" or "completed_std" of maps without completion.
         """
         grid = emap.cfg.grid
         self._pattern.require_inside(grid)
         T_map_base = check_base(emap, T_map_base)
-        state = emap.state if state is None else state
+        current = emap.state if state is None else state
         base = T_map_base[:, None, :3, 3]
-        uv = self._pattern.place(T_map_base, base, state.corner, grid.resolution, state.elevation.dtype)
+        uv = self._pattern.place(T_map_base, base, current.corner, grid.resolution, current.elevation.dtype)
         reference = base[..., 2].to(uv.dtype) - self.nominal_height
         sources = dict.fromkeys("elevation" if name == "validity" else name for name in self.layers)
         sampled = read_points([emap.read_layer(name, state) for name in sources], uv, grid, self.mode)
@@ -112,4 +115,4 @@ def _channel(name: str, read: dict[str, Layer], reference: Float[Tensor, "B 1"])
     if name == "validity":
         return read["elevation"][1].to(reference.dtype)
     values, known = read[name]
-    return torch.where(known, values - reference, 0.0) if name in ("elevation", "upper_bound") else values
+    return torch.where(known, values - reference, 0.0) if name in HEIGHTS else values

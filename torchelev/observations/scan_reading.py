@@ -32,19 +32,19 @@ def read_scan(
         require(feet is None, "feet", "must be left out", "feet for a scan around the base", "use HeightScan.feet")
     origin = check_feet(emap, feet, scan.num_feet) if scan.num_feet else base
     error = draw_noise(emap, noise, scan.num_points, scan.noise)
-    state = emap.state if state is None else state
-    dtype = state.elevation.dtype
-    uv = scan.placement.place(T_map_base, origin, state.corner, grid.resolution, dtype)
-    base_uv, base_z = to_cells(base, state.corner, grid.resolution, dtype), base[..., 2].to(dtype)
+    current = emap.state if state is None else state
+    dtype = current.elevation.dtype
+    uv = scan.placement.place(T_map_base, origin, current.corner, grid.resolution, dtype)
+    base_uv, base_z = to_cells(base, current.corner, grid.resolution, dtype), base[..., 2].to(dtype)
     query = Query(uv, base_uv, base_z, scan.placement.half_extent(grid), grid)
     z = origin[..., 2:].to(dtype)
     # On a GPU the poses are not checked: they may not be finite.
     z, is_finite = (v.expand(-1, -1, len(scan.pattern)).flatten(1) for v in (z, torch.isfinite(z)))
     fill = scan.original if scan.fill == ORIGINAL else scan.fill
-    layers = filled_layers(fill, state, query.half_extent, scan.inpaint_rings)
-    (elevation, known), *filled = read_points([(state.elevation, state.validity), *layers], uv, grid, scan.mode)
+    layers = filled_layers(fill, emap, state, query.half_extent, scan.inpaint_rings)
+    (elevation, known), *filled = read_points([(current.elevation, current.validity), *layers], uv, grid, scan.mode)
     valid = known & is_finite
-    ground, has_ground = fill_unknown(fill, state, query, (elevation, valid), filled)
+    ground, has_ground = fill_unknown(fill, current, query, (elevation, valid), filled)
     standing_height = scan.nominal_height if scan.standing_height is None else scan.standing_height
     missing = standing_height - scan.nominal_height if isinstance(fill, str) else fill
     value = torch.where(has_ground & is_finite, z - ground - scan.nominal_height, missing)

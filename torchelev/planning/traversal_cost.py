@@ -22,6 +22,8 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
+UNKNOWN_LAYERS = ("upper_bound", "completed")
+
 
 @dataclass(frozen=True, kw_only=True)
 class TraversalCostConfig:
@@ -35,6 +37,8 @@ class TraversalCostConfig:
     weight_traversability: float = 4.0  #: cost added to a metre of ground rated 0; raise it for longer, safer paths
     weight_confidence: float = 1.0  #: cost added to a metre of unknown ground, or ground rated with confidence 0
     cross_unknown: bool = True  #: False makes all unknown ground impassable
+    #: tells how unknown ground is inclined: "upper_bound"; or "completed", of maps with completion
+    unknown_layer: str = "upper_bound"
     max_inclination: float = 0.5  #: [rad] unknown ground whose upper bound is steeper counts as a drop: impassable
     inclination_distance: float = 0.3  #: [m] over which the inclination is computed: half the span of the feet
     weight_inclination: float = 1.0  #: cost added to a metre of unknown ground inclined by max_inclination
@@ -45,7 +49,11 @@ class TraversalCostConfig:
     def __post_init__(self) -> None:
         is_bool = isinstance(self.cross_unknown, bool)
         require(is_bool, "cost.cross_unknown", "must be a bool", repr(self.cross_unknown), "give True or False")
+        is_layer, rule = self.unknown_layer in UNKNOWN_LAYERS, f"must be one of {', '.join(UNKNOWN_LAYERS)}"
+        require(is_layer, "cost.unknown_layer", rule, repr(self.unknown_layer), "use upper_bound")
         for field in fields(self):
+            if field.name == "unknown_layer":
+                continue
             value = getattr(self, field.name)
             in_range = isinstance(value, int | float) and 0 <= value < math.inf
             require(in_range, f"cost.{field.name}", "must be at least 0", repr(value), "leave it out for its default")
@@ -76,7 +84,7 @@ def traversal_cost(
     Behind an edge, rays that passed over it bound the unseen ground from above. The nearer the robot is, the steeper it
     looks down, and ground that its rays still miss falls away more steeply than they do. So a steep bound indicates a
     drop, and a gentle one ground that may continue (paper, Sec. II-H). From afar a drop looks gentle too: plan again
-    on the way.
+    on the way. With `unknown_layer="completed"`, the predicted ground takes the place of the elevation and its bound.
 
     Args:
         emap: the maps.
@@ -92,11 +100,12 @@ def traversal_cost(
 
     Raises:
         ValueError, TypeError: for a wrong shape, dtype or device, or a map without traversability.
+        KeyError: for `unknown_layer="completed"` of a map without completion.
     """
     cfg = given_or_default(TraversalCostConfig, cfg)
     hint = "give ElevationMapConfig a TraversabilityConfig"
     require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", hint)
-    state = emap.state if state is None else state
+    given, state = state, emap.state if state is None else state
     if confidence is None and emap.head is not None:
         confidence = emap.rate(state=state).confidence
     if confidence is not None:
@@ -104,7 +113,7 @@ def traversal_cost(
         shape = tuple(state.elevation.shape)
         fits = tuple(confidence.shape) == shape
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
-    rated, bound = emap.read_layer("traversability", state), emap.read_layer("upper_bound", state)
+    rated, bound = (emap.read_layer(name, given) for name in ("traversability", cfg.unknown_layer))
     below = None if standing is None else mark_standing_cells(emap, standing, state)
     return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, below)
 
@@ -122,7 +131,8 @@ def cost_of_layers(
 
     Args:
         rated: the traversability, and where it is known.
-        bound: the elevation where it is known, else its upper bound, and where either is known.
+        bound: the elevation where it is known, else its upper bound, and where either is known; or the predicted
+            ground.
         resolution: side of a cell [m].
         cfg: thresholds and weights.
         confidence: confidence of the traversability, 0 to 1; None: 1.

@@ -258,9 +258,9 @@ class SiteMap(ReadableSite):
         return drop_reset(told, emap.num_resets.to(device), emap.state.elapsed.to(device))
 
     def _bring(self, emap: ElevationMap) -> MapState:
-        """Return a map's state on the site's device."""
-        device = self._tiles.device
-        return emap.state if emap.device == device else map_layers(lambda value: value.to(device), emap.state)
+        """Return a map's state on the site's device, without predictions: a site keeps what was measured."""
+        device, state = self._tiles.device, emap.measured_state
+        return state if emap.device == device else map_layers(lambda value: value.to(device), state)
 
     def _plan(self, emap: ElevationMap, time: float | None, align: bool, tilt: bool) -> dict[str, Any]:
         """Return what this rank is about to merge; raise if it cannot."""

@@ -11,16 +11,10 @@ from torch import Tensor, nn
 
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
+from torchelev.traversability import weight_file
 from torchelev.traversability.rate import rate
-from torchelev.traversability.weight_file import (
-    RANGES,
-    Weights,
-    read_weights,
-    require_in_ranges,
-    require_same_shapes,
-    weight_shapes,
-    write_weights,
-)
+from torchelev.traversability.weight_file import RANGES, Weights, require_in_ranges, weight_shapes
+from torchelev.weight_files import require_same_shapes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -129,7 +123,7 @@ class TraversabilityNet(nn.Module):
         Raises:
             WriteError: if the file cannot be written.
         """
-        write_weights(path, self.config, self.state_dict())
+        weight_file.save(path, self.config, self.state_dict())
 
     @classmethod
     def from_pretrained(cls, path: str | Path | None = None) -> TraversabilityNet:
@@ -143,7 +137,7 @@ class TraversabilityNet(nn.Module):
             ValueError: if it does not hold finite weights of this version.
         """
         path = _PRETRAINED if path is None else Path(path)
-        config, state = read_weights(path)
+        config, state = weight_file.load(path)
         net = cls(**config)
         require_same_shapes(path, net.state_dict(), state)
         net.load_state_dict(state)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import torch
 from torch import Tensor
 
-from torchelev.errors import message, require
-from torchelev.output_files import atomic_file
+from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.traversability.features import NUM_FEATURES
+from torchelev.weight_files import read_weights, write_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -112,52 +110,22 @@ def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotCon
         require(fits, name, f"must be within {low:.3g} to {high:.3g}, as trained", f"{ratio:.4g}", hint)
 
 
-def write_weights(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
+def save(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
     """Write a head's config and weights to a file. Raises WriteError if it cannot be written."""
-    content = io.BytesIO()  # written to a file by torch itself, a full disk would raise RuntimeError
-    torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, content)
-    with atomic_file(path) as file:
-        file.write(content.getbuffer())
+    write_weights(path, VERSION, config, state)
 
 
-def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the config and the weights in a file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is damaged, or holds anything else or weights of another version.
-    """
-    hint = "write it with TraversabilityNet.save"
-    missing = "train weights: python -m training.traversability"
-    require(path.exists(), str(path), "must be a file of weights", "no file", missing, FileNotFoundError)
-    try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the type depends on which byte is damaged
-        raise ValueError(message(str(path), "must be a file of weights", type(error).__name__, hint)) from error
-    version = found.get("version") if isinstance(found, dict) else None
-    require(isinstance(version, int), str(path), "must be a file of weights", "something else", hint)
-    require(version == VERSION, str(path), f"must be of version {VERSION}", version, "train with this torchelev")
-    require(_is_complete(found), str(path), "must be a file of weights", "other parts or types", hint)
-    return found["config"], found["state_dict"]
+def load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the config and the weights in a file; errors are those of `read_weights`."""
+    hints = "TraversabilityNet.save", "python -m training.traversability"
+    return read_weights(path, VERSION, _is_config, *hints)
 
 
-def _is_complete(found: dict[str, Any]) -> bool:
-    """Tell whether a file's content has all its parts, of the right types."""
-    config, state = found.get("config"), found.get("state_dict")
-    if not isinstance(config, dict) or config.keys() != _CONFIG_KEYS or not isinstance(state, dict):
+def _is_config(config: dict[str, Any]) -> bool:
+    """Tell whether a config has all its parts, of the right types."""
+    if config.keys() != _CONFIG_KEYS:
         return False
     ranges = config["ranges"]
     has_sizes = all(type(config[name]) is int and config[name] > 0 for name in ("cell_channels", "stance_channels"))
-    has_tensors = all(isinstance(value, Tensor) for value in state.values())
     has_ranges = isinstance(ranges, dict) and ranges.keys() == RANGES.keys()
-    return has_sizes and has_tensors and has_ranges and all(len(pair) == 2 for pair in ranges.values())
-
-
-def require_same_shapes(path: Path, expected: Mapping[str, Tensor], actual: Mapping[str, Tensor]) -> None:
-    """Refuse weights of other names or shapes than expected, and weights that are not finite."""
-    shapes, found = ({name: tuple(value.shape) for name, value in each.items()} for each in (expected, actual))
-    wrong = [name for name in shapes | found if shapes.get(name) != found.get(name)]
-    text = ", ".join(f"{name} {found.get(name)} instead of {shapes.get(name)}" for name in wrong)
-    require(not wrong, str(path), "must hold weights of the shapes that its config says", text, "train them again")
-    bad = ", ".join(name for name, value in actual.items() if not bool(torch.isfinite(value).all()))
-    require(not bad, str(path), "must be finite", f"NaN or inf in {bad}", "train them again")
+    return has_sizes and has_ranges and all(len(pair) == 2 for pair in ranges.values())

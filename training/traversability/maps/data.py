@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -164,7 +164,7 @@ def data_set(
     return batches
 
 
-def save_atomically(values: dict[str, Any], path: Path) -> None:
+def save_atomically(values: Mapping[str, Any], path: Path) -> None:
     """Write a file by `torch.save`; an interruption leaves an older file intact."""
     with atomic_file(path) as file:
         torch.save(values, file)

@@ -1,0 +1,101 @@
+"""The completed map: measured cells refined, unknown ones predicted."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.completion.context import describe, sum_layers
+from torchelev.completion.parameters import Weights
+from torchelev.completion.predict import Seen, predict
+from torchelev.completion.refine import refine
+from torchelev.completion.surroundings import UNKNOWN, count_steps, look_around
+from torchelev.ops.parallel import map_in_order
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+_AT_A_TIME = 2**13  # unknown cells on a CPU: what is computed of them stays in its caches
+_AT_A_TIME_ON_GPU = 2**20
+
+
+class Completion(NamedTuple):
+    """The ground at every cell."""
+
+    mean: Float[Tensor, "B H W"]  #: [m]
+    std: Float[Tensor, "B H W"]  #: [m] standard deviation
+
+
+class CompletionInput(NamedTuple):
+    """The layers that are completed. Arbitrary but finite where they do not count."""
+
+    elevation: Float[Tensor, "B H W"]  #: [m]
+    validity: Bool[Tensor, "B H W"]  #: where the elevation is known
+    variance: Float[Tensor, "B H W"]  #: [m^2]
+    upper_bound: Float[Tensor, "B H W"]  #: [m]
+    bounded: Bool[Tensor, "B H W"]  #: where the upper bound counts, if the cell is not known
+    age: Float[Tensor, "B H W"]  #: [s] since the last measurement
+
+
+def complete(weights: Weights, layers: CompletionInput, resolution: float) -> Completion:
+    """Return the mean and the standard deviation of the ground at every cell.
+
+    Without a known cell in a map, its mean is 0, or the upper bound below it, and its standard deviation the prior's.
+
+    Args:
+        weights: parameters.
+        layers: the maps.
+        resolution: [m].
+    """
+    known, bounded = layers.validity, layers.bounded & ~layers.validity
+    of_cells = torch.full_like(layers.elevation, resolution)
+    mean, std = refine(weights, layers.elevation, known, layers.variance, layers.age, of_cells)
+    unseen = Unseen(layers.elevation, known, layers.upper_bound, bounded, resolution)
+    if _may_choose_cells(weights, layers):
+        return _fill_unknown(weights, unseen, Completion(mean.contiguous(), std.contiguous()))
+    places = torch.arange(known.numel(), device=known.device).split(_AT_A_TIME_ON_GPU)
+    parts = [predict(weights, unseen.read(place)) for place in places]
+    predicted = [torch.cat(values).view_as(mean) for values in zip(*parts, strict=True)]
+    return Completion(*(torch.where(known, old, new) for old, new in zip((mean, std), predicted, strict=True)))
+
+
+@torch.no_grad()
+def _fill_unknown(weights: Weights, unseen: Unseen, refined: Completion) -> Completion:
+    """Predict the unknown cells alone, in place, on all cores."""
+    places = (~unseen.known).flatten().nonzero()[:, 0].split(_AT_A_TIME)
+    parts = map_in_order(lambda place: predict(weights, unseen.read(place)), places)
+    for place, values in zip(places, parts, strict=True):
+        for layer, value in zip(refined, values, strict=True):
+            layer.view(-1).index_copy_(0, place, value)
+    return refined
+
+
+class Unseen:
+    """Predicts unknown cells of maps, whose surroundings it prepares."""
+
+    def __init__(
+        self, elevation: Tensor, known: Tensor, upper_bound: Tensor, bounded: Tensor, resolution: float
+    ) -> None:
+        self.known, self.resolution = known, resolution
+        self.ground = torch.where(known, elevation, UNKNOWN)
+        self.steps = count_steps(known)
+        total = torch.where(known, elevation, 0.0).double().sum((1, 2))
+        self.level = total / known.sum((1, 2)).clamp(min=1)  # [m] where no direction holds known ground
+        self.sums = sum_layers(elevation, known, bounded, self.level)
+        self.bound, self.bounded = upper_bound.flatten(), bounded.flatten()
+
+    def read(self, place: Int[Tensor, "n"]) -> Seen:
+        """Return what the prediction at cells, numbered in the flat maps, depends on."""
+        around = look_around(self.ground, self.steps, place, self.resolution)
+        bound, bounded = (values.index_select(0, place) for values in (self.bound, self.bounded))
+        level = self.level.to(bound.dtype).index_select(0, place // self.known[0].numel())
+        context = describe(self.sums, self.level, place, self.resolution)
+        return Seen(around, context, bound, bounded, level, torch.full_like(bound, self.resolution))
+
+
+def _may_choose_cells(weights: Weights, layers: CompletionInput) -> bool:
+    """Tell whether the number of computed cells may depend on the data: on a CPU, without gradients and compiler."""
+    is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in (*weights, *layers))
+    return layers.validity.device.type == "cpu" and not is_differentiated and not torch.compiler.is_compiling()

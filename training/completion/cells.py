@@ -1,0 +1,146 @@
+"""The cells of training: what a prediction at them depends on, and the true ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from torchelev.completion.complete import CompletionInput, Unseen
+from torchelev.completion.predict import Seen
+from torchelev.completion.surroundings import Surroundings
+from torchelev.errors import require
+from torchelev.filters import Filter
+from training.completion.maps import TrueMap
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+NUM_UNKNOWN, NUM_MEASURED = 768, 192  # cells of each map, at most
+_NEAR = 0.3  # [m] unknown cells are drawn with a probability of 1 / (distance + this)
+FARTHEST = 3.0  # [m] from known cells, of unknown ones
+_MIN_ERROR = 0.005  # [m]
+_KEPT = (0.05, 0.6)  # share of the cells that thinned maps keep
+_RAISED = (0.03, 3.0)  # [m] by which bounds are raised
+
+
+class UnknownCells(NamedTuple):
+    """n unknown cells."""
+
+    seen: Seen
+    truth: Float[Tensor, "n"]  #: [m]
+    weight: Float[Tensor, "n"]  #: [1/m] of an error
+
+
+class MeasuredCells(NamedTuple):
+    """m measured cells, each in the middle of a map of 3 x 3 cells."""
+
+    layers: CompletionInput  #: (m, 3, 3) each
+    truth: Float[Tensor, "m"]  #: [m]
+    weight: Float[Tensor, "m"]  #: [1/m] of an error
+    resolution: Float[Tensor, "m"]  #: [m]
+
+
+def remove_cells(layers: CompletionInput, kept: Bool[Tensor, "B H W"]) -> CompletionInput:
+    """Make the known cells that are not kept unknown, without a bound, as if no view had seen them."""
+    lost = layers.validity & ~kept
+    return layers._replace(validity=layers.validity & kept, bounded=layers.bounded & ~lost)
+
+
+def thin_out(layers: CompletionInput, generator: torch.Generator) -> CompletionInput:
+    """Keep a random share of each map's known cells, as of a sensor with few rays; bound the others by their height."""
+    share = _KEPT[0] + (_KEPT[1] - _KEPT[0]) * torch.rand(len(layers.validity), 1, 1, generator=generator)
+    kept = torch.rand(layers.validity.shape, generator=generator) < share
+    lost = layers.validity & ~kept
+    bound = torch.where(lost, layers.elevation, layers.upper_bound)
+    return layers._replace(validity=layers.validity & kept, upper_bound=bound, bounded=layers.bounded | lost)
+
+
+def vary_bounds(layers: CompletionInput, generator: torch.Generator) -> CompletionInput:
+    """Raise the bounds of some maps, as of a sensor that looks from higher up, and drop those of others."""
+    draw, size = torch.rand(2, len(layers.bounded), 1, 1, generator=generator)
+    low, high = map(math.log, _RAISED)
+    rise = torch.where(draw < 0.4, torch.exp(low + (high - low) * size), 0.0)
+    return layers._replace(upper_bound=layers.upper_bound + rise, bounded=layers.bounded & (draw < 0.75))
+
+
+def nearest_known(seen: Surroundings) -> Float[Tensor, "n"]:
+    """Return the distance [m] of the next known cell in any direction, inf without one."""
+    return torch.where(seen.is_known > 0, seen.distance, torch.inf).amin(0)
+
+
+def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells]:
+    """Draw unknown cells of each map, the more the nearer to known ground.
+
+    Errors weigh by the inverse of the mean error of the nearest known heights in the same map, so that each map counts
+    the same, however deep its holes.
+    """
+    layers, drawn = maps.layers, []
+    known = layers.validity
+    unseen = Unseen(layers.elevation, known, layers.upper_bound, layers.bounded & ~known, maps.resolution)
+    filled, _ = Filter("inpaint_nearest")((layers.elevation, known), resolution=maps.resolution)
+    for b in range(len(known)):
+        first = b * known[0].numel()
+        place = first + (maps.is_inside[b] & ~known[b]).flatten().nonzero()[:, 0]
+        seen = unseen.read(place)
+        distance = nearest_known(seen.around)
+        places = (distance < FARTHEST).nonzero()[:, 0]
+        if not len(places):
+            continue
+        chosen = places[_draw(1 / (distance[places] + _NEAR), NUM_UNKNOWN, generator)]
+        truth = maps.truth.flatten()[place[chosen]]
+        error = (filled.flatten()[place[chosen]] - truth).abs().mean() + _MIN_ERROR
+        drawn.append(UnknownCells(unseen.read(place[chosen]), truth, torch.full_like(truth, 1 / float(error))))
+    return drawn
+
+
+def draw_measured(maps: TrueMap, generator: torch.Generator) -> list[MeasuredCells]:
+    """Draw measured cells of each map. Errors weigh by the inverse of the mean error of the map's own elevation."""
+    layers, drawn = maps.layers, []
+    inner = maps.is_inside.clone()
+    inner[:, [0, -1]] = inner[:, :, [0, -1]] = False
+    for b in range(len(inner)):
+        i, j = (inner[b] & layers.validity[b]).nonzero().unbind(1)
+        if not len(i):
+            continue
+        chosen = _draw(torch.ones(len(i)), NUM_MEASURED, generator)
+        i, j = i[chosen], j[chosen]
+        around = torch.arange(-1, 2)
+        patches = [layer[b][i[:, None, None] + around[:, None], j[:, None, None] + around] for layer in layers]
+        truth = maps.truth[b][i, j]
+        error = (layers.elevation[b][i, j] - truth).abs().mean() + _MIN_ERROR
+        weight = torch.full_like(truth, 1 / float(error))
+        drawn.append(MeasuredCells(CompletionInput(*patches), truth, weight, torch.full_like(truth, maps.resolution)))
+    return drawn
+
+
+def _draw(weights: Tensor, number: int, generator: torch.Generator) -> Tensor:
+    return torch.multinomial(weights, min(number, len(weights)), generator=generator)
+
+
+Cells = TypeVar("Cells", UnknownCells, MeasuredCells)
+
+
+def concatenate(parts: Sequence[Cells]) -> Cells:
+    """Concatenate cells. Raises ValueError without any."""
+    require(len(parts) > 0, "walks", "must hold cells to train on", "none", "give more of them")
+    return _map(lambda dim, *values: torch.cat(values, dim), _cell_dim(parts[0]), *parts)
+
+
+def choose(cells: Cells, chosen: Int[Tensor, "k"]) -> Cells:
+    """Return some of the cells, by number."""
+    return _map(lambda dim, value: value.index_select(dim, chosen), _cell_dim(cells), cells)
+
+
+def _cell_dim(cells: UnknownCells | MeasuredCells) -> int:
+    return -1 if isinstance(cells, UnknownCells) else 0
+
+
+def _map(function: Callable[..., Tensor], dim: int, *values: Any) -> Any:
+    """Apply a function to the tensors of nested tuples of the same kind."""
+    if isinstance(values[0], Tensor):
+        return function(dim, *values)
+    return type(values[0])(*(_map(function, dim, *column) for column in zip(*values, strict=True)))

@@ -1,0 +1,174 @@
+"""The fit: losses, steps, calibration, and checkpoints from which a training resumes without a difference."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from torchelev.completion.net import CompletionNet
+from torchelev.completion.predict import predict
+from torchelev.completion.refine import refine
+from torchelev.errors import require, require_positive
+from training.completion.cells import Cells, MeasuredCells, UnknownCells, choose
+from training.resume import CHECKPOINT, deferred_interrupt
+from training.traversability.maps.data import save_atomically
+
+COVERAGE = 0.95  # of cells that are to lie within two standard deviations
+_MIN_DEVIATION = 1e-3  # [m]
+_LARGEST_SQUARE = 100.0  # of a weighted error
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """Settings of the fit."""
+
+    steps: int = 10000
+    unknown_per_step: int = 4096  #: cells
+    measured_per_step: int = 1024  #: cells
+    learning_rate: float = 4e-3  #: initial; decays to 0 along half a cosine
+    weight_decay: float = 1e-4
+    seed: int = 0  #: of the initial weights and the choice of cells
+
+    def __post_init__(self) -> None:
+        require_positive(steps=self.steps, learning_rate=self.learning_rate)
+        require_positive(unknown_per_step=self.unknown_per_step, measured_per_step=self.measured_per_step)
+
+
+def losses(error: Tensor, std: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the losses of the mean and of the standard deviation.
+
+    The mean minimises the absolute error, as the ground behind an edge is high or low: the median is right more often
+    than the mean is near. Twice the standard deviation is the bound that COVERAGE = 95 % of the errors e stay below, as
+    of a normal distribution: it minimises the quantile loss of their logarithms,
+
+        max(0.95 u, -0.05 u),    u = log |e| - log(2 std),
+
+    which holds 95 % wherever the network can tell cells apart, however heavy the tails. Likelihoods, beta-NLL among
+    them, assume a shape of the errors and miss that share where the shape is another. No gradient of the standard
+    deviation reaches the mean, so that no cell is given up by calling it uncertain.
+    """
+    excess = (error.detach().abs() + _MIN_DEVIATION).log() - (2 * std).log()
+    return (error.abs() * weight).mean(), torch.maximum(COVERAGE * excess, (COVERAGE - 1) * excess).mean()
+
+
+def predict_measured(net: CompletionNet, cells: MeasuredCells) -> tuple[Tensor, Tensor]:
+    """Return the mean and the standard deviation at measured cells."""
+    elevation, known, variance, _, _, age = cells.layers
+    resolution = cells.resolution[:, None, None].expand_as(elevation)
+    mean, std = refine(net.weights, elevation, known, variance, age, resolution)
+    return mean[:, 1, 1], std[:, 1, 1]
+
+
+def draw(cells: Cells, number: int, generator: torch.Generator) -> Cells:
+    """Draw cells, with repeats."""
+    return choose(cells, torch.randint(len(cells.truth), (number,), generator=generator))
+
+
+def fit_std(error: Tensor, std: Tensor) -> Tensor:
+    """Return the factor on standard deviations by which COVERAGE of the errors lie within two of them."""
+    return torch.quantile(error.abs() / (2 * std), COVERAGE)
+
+
+class Trainer:
+    """Fits a network to cells, which are drawn anew at each step.
+
+    Args:
+        unknown: unknown cells.
+        measured: measured cells.
+        cfg: settings of the fit.
+    """
+
+    def __init__(self, unknown: UnknownCells, measured: MeasuredCells, cfg: FitConfig) -> None:
+        torch.manual_seed(cfg.seed)
+        self.net = CompletionNet()
+        self.unknown, self.measured, self.cfg, self.step = unknown, measured, cfg, 0
+        sizes = {"unknown": len(unknown.truth), "measured": len(measured.truth)}
+        self.settings = dataclasses.asdict(cfg) | sizes | self.net.config
+        self.optimizer = torch.optim.AdamW(self.net.parameters(), cfg.learning_rate, weight_decay=cfg.weight_decay)
+
+    def advance(self) -> dict[str, float]:
+        """Make one step; return the values to log."""
+        rate = self.cfg.learning_rate * 0.5 * (1 + math.cos(math.pi * self.step / self.cfg.steps))
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        generator = torch.Generator().manual_seed(self.cfg.seed * 1_000_003 + self.step)
+        unknown = draw(self.unknown, self.cfg.unknown_per_step, generator)
+        measured = draw(self.measured, self.cfg.measured_per_step, generator)
+        logged: dict[str, float] = {}
+        total = torch.zeros(())
+        answers: list[tuple[str, UnknownCells | MeasuredCells, tuple[Tensor, Tensor]]] = [
+            ("unknown", unknown, predict(self.net.weights, unknown.seen)),
+            ("measured", measured, predict_measured(self.net, measured)),
+        ]
+        for name, cells, (mean, std) in answers:
+            error = mean - cells.truth
+            parts = losses(error, std, cells.weight)
+            total = total + parts[0] + parts[1]
+            if name == "measured":  # the root mean square must not rise either, which few large errors decide
+                total = total + (error * cells.weight).square().clamp(max=_LARGEST_SQUARE).mean()
+            logged |= {f"{name}_error": float(parts[0].detach()), f"{name}_quantile": float(parts[1].detach())}
+        self.optimizer.zero_grad()
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
+        self.optimizer.step()
+        self.step += 1
+        return logged | {"learning_rate": rate}
+
+    @torch.no_grad()
+    def calibrate(self) -> None:
+        """Scale the standard deviations such that COVERAGE of the cells lie within two of them."""
+        generator = torch.Generator().manual_seed(self.cfg.seed)
+        unknown, measured = draw(self.unknown, 2**18, generator), draw(self.measured, 2**18, generator)
+        mean, std = predict(self.net.weights, unknown.seen)
+        refined, refined_std = predict_measured(self.net, measured)
+        factors = [fit_std(mean - unknown.truth, std), fit_std(refined - measured.truth, refined_std)]
+        self.net.weights.calibration.add_(torch.stack(factors).log())
+
+    def save(self, path: Path) -> None:
+        """Write everything that a resume needs."""
+        state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
+        save_atomically({"settings": self.settings, "step": self.step} | state, path)
+
+    def resume(self, path: Path) -> None:
+        """Continue from a checkpoint.
+
+        Raises:
+            ValueError: the checkpoint has other settings; nothing has changed then.
+        """
+        found = torch.load(path, weights_only=True)
+        differ = [name for name, expected in self.settings.items() if found["settings"].get(name) != expected]
+        actual = ", ".join(f"{name} {found['settings'].get(name)}" for name in differ)
+        hint = "resume with the settings that it began with"
+        require(not differ, str(path), "must be of the same settings", actual, hint)
+        self.net.load_state_dict(found["net"])
+        self.optimizer.load_state_dict(found["optimizer"])
+        self.step = found["step"]
+
+    def run(self, folder: Path, every: int = 500) -> None:
+        """Train up to the last step, with a progress bar and a TensorBoard log, and calibrate.
+
+        Writes a checkpoint after `every` steps and at the end.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; the running step is finished and saved.
+        """
+        bar = tqdm(total=self.cfg.steps, initial=self.step, desc="training", unit="step")
+        with bar, SummaryWriter(str(folder)) as writer, deferred_interrupt("step") as is_interrupted:
+            while self.step < self.cfg.steps:
+                logged = self.advance()
+                for name, value in logged.items():
+                    writer.add_scalar(name, value, self.step)
+                bar.set_postfix({name: f"{value:.3g}" for name, value in logged.items()}, refresh=False)
+                bar.update()
+                if is_interrupted() or self.step == self.cfg.steps or self.step % every == 0:
+                    self.save(folder / CHECKPOINT)
+                if is_interrupted():
+                    raise KeyboardInterrupt
+        self.calibrate()
