@@ -48,6 +48,17 @@ def deferred_interrupt(unit: str) -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
+@contextlib.contextmanager
+def command_errors() -> Iterator[None]:
+    """Show the errors of a training's values, and Ctrl-C, as a command does: in a sentence."""
+    try:
+        yield
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    except KeyboardInterrupt:
+        raise click.ClickException("stopped; the progress is saved, continue with --resume") from None
+
+
 def write_result(path: Path, values: dict[str, Any]) -> None:
     """Write a result as strict JSON; an interruption leaves an older file intact."""
     with atomic_file(path) as file:

@@ -20,9 +20,9 @@ from training import RESULTS
 from training.completion.evaluate import COMPLETED, Answer, evaluate, learned, table
 from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
 from training.completion.unet import UNet, fit
+from training.fit import save_atomically
 from training.jobs import Job, train_all
 from training.options import jobs_option, runs_option
-from training.traversability.maps.data import save_atomically
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)

@@ -20,7 +20,7 @@ from torchelev import ElevationMap
 from torchelev.completion.complete import CompletionInput
 from torchelev.errors import require, require_positive
 from torchelev.sim import HeightField
-from training.traversability.maps.data import save_atomically
+from training.fit import save_atomically
 from training.traversability.maps.mapping import DataConfig, blank_map, tile_cell_centers, walk_and_look
 from training.traversability.maps.terrain import KINDS, LENGTH, LOOK_INTERVAL, UNSEEN_KINDS, draw_robot, make_tiles
 

@@ -23,7 +23,7 @@ from training.completion.evaluate import COMPLETED, evaluate, learned, table
 from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
 from training.completion.trainer import FitConfig, Trainer
 from training.options import jobs_option
-from training.resume import checkpoint_path, write_result
+from training.resume import checkpoint_path, command_errors, write_result
 
 _POSITIVE = click.IntRange(1)
 _WALKS_SEED = 0
@@ -59,16 +59,12 @@ def main(
     """
     checkpoint = checkpoint_path(out, resume)
     data = data or out / "data"
-    try:
+    with command_errors():
         cells = training_cells(Walks(data, "train", _WALKS_SEED, WalkConfig()), walks, jobs, seed)
         trainer = Trainer(*cells, FitConfig(steps=steps, seed=seed))
         if resume:
             trainer.resume(checkpoint)
         trainer.run(out)
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
-    except KeyboardInterrupt:
-        raise click.ClickException("stopped; the progress is saved, continue with --resume") from None
     net = trainer.net.eval()
     net.save(out / "weights.pt")
     result = evaluate({COMPLETED: learned(net)}, data, evaluation_walks, jobs)

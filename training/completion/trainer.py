@@ -1,24 +1,20 @@
-"""The fit: losses, steps, calibration, and checkpoints from which a training resumes without a difference."""
+"""The fit: losses, steps and calibration."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 from torchelev.completion.net import CompletionNet
 from torchelev.completion.predict import predict
 from torchelev.completion.refine import refine
-from torchelev.errors import require, require_positive
+from torchelev.errors import require_positive
 from training.completion.cells import Cells, MeasuredCells, UnknownCells, choose
-from training.resume import CHECKPOINT, deferred_interrupt
-from training.traversability.maps.data import save_atomically
+from training.fit import Fit
 
 COVERAGE = 0.95  # of cells that are to lie within two standard deviations
 _MIN_DEVIATION = 1e-3  # [m]
@@ -76,7 +72,7 @@ def fit_std(error: Tensor, std: Tensor) -> Tensor:
     return torch.quantile(error.abs() / (2 * std), COVERAGE)
 
 
-class Trainer:
+class Trainer(Fit):
     """Fits a network to cells, which are drawn anew at each step.
 
     Args:
@@ -85,19 +81,19 @@ class Trainer:
         cfg: settings of the fit.
     """
 
+    net: CompletionNet
+    cfg: FitConfig
+
     def __init__(self, unknown: UnknownCells, measured: MeasuredCells, cfg: FitConfig) -> None:
         torch.manual_seed(cfg.seed)
-        self.net = CompletionNet()
-        self.unknown, self.measured, self.cfg, self.step = unknown, measured, cfg, 0
+        net = CompletionNet()
+        self.unknown, self.measured = unknown, measured
         sizes = {"unknown": len(unknown.truth), "measured": len(measured.truth)}
-        self.settings = dataclasses.asdict(cfg) | sizes | self.net.config
-        self.optimizer = torch.optim.AdamW(self.net.parameters(), cfg.learning_rate, weight_decay=cfg.weight_decay)
+        super().__init__(net, cfg, dataclasses.asdict(cfg) | sizes | net.config)
 
     def advance(self) -> dict[str, float]:
         """Make one step; return the values to log."""
-        rate = self.cfg.learning_rate * 0.5 * (1 + math.cos(math.pi * self.step / self.cfg.steps))
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
+        rate = self._begin_step()
         generator = torch.Generator().manual_seed(self.cfg.seed * 1_000_003 + self.step)
         unknown = draw(self.unknown, self.cfg.unknown_per_step, generator)
         measured = draw(self.measured, self.cfg.measured_per_step, generator)
@@ -114,11 +110,8 @@ class Trainer:
             if name == "measured":  # the root mean square must not rise either, which few large errors decide
                 total = total + (error * cells.weight).square().clamp(max=_LARGEST_SQUARE).mean()
             logged |= {f"{name}_error": float(parts[0].detach()), f"{name}_quantile": float(parts[1].detach())}
-        self.optimizer.zero_grad()
         total.backward()
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
-        self.optimizer.step()
-        self.step += 1
+        self._end_step()
         return logged | {"learning_rate": rate}
 
     @torch.no_grad()
@@ -131,44 +124,7 @@ class Trainer:
         factors = [fit_std(mean - unknown.truth, std), fit_std(refined - measured.truth, refined_std)]
         self.net.weights.calibration.add_(torch.stack(factors).log())
 
-    def save(self, path: Path) -> None:
-        """Write everything that a resume needs."""
-        state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
-        save_atomically({"settings": self.settings, "step": self.step} | state, path)
-
-    def resume(self, path: Path) -> None:
-        """Continue from a checkpoint.
-
-        Raises:
-            ValueError: the checkpoint has other settings; nothing has changed then.
-        """
-        found = torch.load(path, weights_only=True)
-        differ = [name for name, expected in self.settings.items() if found["settings"].get(name) != expected]
-        actual = ", ".join(f"{name} {found['settings'].get(name)}" for name in differ)
-        hint = "resume with the settings that it began with"
-        require(not differ, str(path), "must be of the same settings", actual, hint)
-        self.net.load_state_dict(found["net"])
-        self.optimizer.load_state_dict(found["optimizer"])
-        self.step = found["step"]
-
-    def run(self, folder: Path, every: int = 500) -> None:
-        """Train up to the last step, with a progress bar and a TensorBoard log, and calibrate.
-
-        Writes a checkpoint after `every` steps and at the end.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed; the running step is finished and saved.
-        """
-        bar = tqdm(total=self.cfg.steps, initial=self.step, desc="training", unit="step")
-        with bar, SummaryWriter(str(folder)) as writer, deferred_interrupt("step") as is_interrupted:
-            while self.step < self.cfg.steps:
-                logged = self.advance()
-                for name, value in logged.items():
-                    writer.add_scalar(name, value, self.step)
-                bar.set_postfix({name: f"{value:.3g}" for name, value in logged.items()}, refresh=False)
-                bar.update()
-                if is_interrupted() or self.step == self.cfg.steps or self.step % every == 0:
-                    self.save(folder / CHECKPOINT)
-                if is_interrupted():
-                    raise KeyboardInterrupt
+    def run(self, folder: Path, every: int = 500, until: int | None = None) -> None:
+        """Train as `Fit.run` does, and calibrate."""
+        super().run(folder, every, until)
         self.calibrate()

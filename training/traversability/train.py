@@ -8,7 +8,7 @@ import click
 
 from torchelev.robot import RobotConfig
 from training.options import paper_weights_option
-from training.resume import checkpoint_path, write_result
+from training.resume import checkpoint_path, command_errors, write_result
 from training.traversability.evaluate import evaluate, table
 from training.traversability.heads import baselines
 from training.traversability.maps.data import data_set
@@ -70,17 +70,13 @@ def main(
     """
     checkpoint = checkpoint_path(out, resume)
     cfg, data = DataConfig(robot=robot), data or out / "data"
-    try:
+    with command_errors():
         baselines(paper_weights)  # raises now, not after the training, if the file cannot be read
         maps = data_set(data, "train", batches, seed, cfg) + data_set(data, "train_exact", exact_batches, seed, cfg)
         trainer = Trainer(maps, FitConfig(steps=steps, seed=seed), robot)
         if resume:
             trainer.resume(checkpoint)
         trainer.run(out)
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
-    except KeyboardInterrupt:
-        raise click.ClickException("stopped; the progress is saved, continue with --resume") from None
     _finish(trainer, cfg, out, data, evaluation_batches, paper_weights)
 
 

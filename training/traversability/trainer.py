@@ -1,25 +1,21 @@
-"""The fit: losses, steps, and checkpoints from which a training resumes without a difference."""
+"""The fit: losses and steps."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 from torchelev.errors import require, require_positive
 from torchelev.robot import RobotConfig
 from torchelev.traversability.net import TraversabilityNet
 from torchelev.traversability.weight_file import RESOLUTIONS, ratios
-from training.resume import CHECKPOINT, deferred_interrupt
-from training.traversability.maps.data import MappedTerrain, save_atomically
+from training.fit import Fit
+from training.traversability.maps.data import MappedTerrain
 from training.traversability.metrics import SAFE
 
 
@@ -63,7 +59,7 @@ def _input_ranges(robot: RobotConfig) -> dict[str, tuple[float, float]]:
     return {name: (value, coarsest[name]) for name, value in finest.items()}
 
 
-class Trainer:
+class Trainer(Fit):
     """Fits a net to batches, whose order depends only on the seed and the step.
 
     Args:
@@ -75,14 +71,16 @@ class Trainer:
         ValueError: there are no batches.
     """
 
+    net: TraversabilityNet
+    cfg: FitConfig
+
     def __init__(self, batches: list[MappedTerrain], cfg: FitConfig, robot: RobotConfig | None = None) -> None:
         require(len(batches) > 0, "batches", "must not be empty", len(batches), "give at least one")
         torch.manual_seed(cfg.seed)
-        self.net = TraversabilityNet(ranges=None if robot is None else _input_ranges(robot))
-        self.batches, self.cfg, self.step = batches, cfg, 0
+        net = TraversabilityNet(ranges=None if robot is None else _input_ranges(robot))
+        self.batches = batches
         data = {"data": len(batches), "robot": None if robot is None else dataclasses.asdict(robot)}
-        self.settings = dataclasses.asdict(cfg) | data
-        self.optimizer = torch.optim.AdamW(self.net.parameters(), cfg.learning_rate, weight_decay=cfg.weight_decay)
+        super().__init__(net, cfg, dataclasses.asdict(cfg) | data)
 
     def batch(self, number: int) -> MappedTerrain:
         """Return the batch at a position in the order; every batch comes once per epoch."""
@@ -91,10 +89,7 @@ class Trainer:
 
     def advance(self) -> dict[str, float]:
         """Make one step; return the values to log."""
-        rate = self.cfg.learning_rate * 0.5 * (1 + math.cos(math.pi * self.step / self.cfg.steps))
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        self.optimizer.zero_grad()
+        rate = self._begin_step()
         count = self.cfg.batches_per_step
         total = {"traversability": 0.0, "confidence": 0.0}
         for number in range(self.step * count, (self.step + 1) * count):
@@ -102,50 +97,5 @@ class Trainer:
             ((parts[0] + parts[1]) / count).backward()
             for name, part in zip(total, parts, strict=True):
                 total[name] += float(part.detach()) / count
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
-        self.optimizer.step()
-        self.step += 1
+        self._end_step()
         return total | {"learning_rate": rate}
-
-    def save(self, path: Path) -> None:
-        """Write everything that a resume needs."""
-        state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
-        save_atomically({"settings": self.settings, "step": self.step} | state, path)
-
-    def resume(self, path: Path) -> None:
-        """Continue from a checkpoint.
-
-        Raises:
-            ValueError: the checkpoint has other settings; nothing has changed then.
-        """
-        found = torch.load(path, weights_only=True)
-        differ = [name for name, expected in self.settings.items() if found["settings"].get(name) != expected]
-        actual = ", ".join(f"{name} {found['settings'].get(name)}" for name in differ)
-        require(
-            not differ, str(path), "must be of the same settings", actual, "resume with the settings that it began with"
-        )
-        self.net.load_state_dict(found["net"])
-        self.optimizer.load_state_dict(found["optimizer"])
-        self.step = found["step"]
-
-    def run(self, folder: Path, every: int = 200, until: int | None = None) -> None:
-        """Train up to the last step, or to `until`, with a progress bar and a TensorBoard log.
-
-        Writes a checkpoint after `every` steps and at the end.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed; the running step is finished and saved.
-        """
-        until = min(until or self.cfg.steps, self.cfg.steps)
-        bar = tqdm(total=self.cfg.steps, initial=self.step, desc="training", unit="step")
-        with bar, SummaryWriter(str(folder)) as writer, deferred_interrupt("step") as is_interrupted:
-            while self.step < until:
-                logged = self.advance()
-                for name, value in logged.items():
-                    writer.add_scalar(name, value, self.step)
-                bar.set_postfix({name: f"{value:.3g}" for name, value in logged.items()})
-                bar.update()
-                if is_interrupted() or self.step == until or self.step % every == 0:
-                    self.save(folder / CHECKPOINT)
-                if is_interrupted():
-                    raise KeyboardInterrupt

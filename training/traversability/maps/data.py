@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,9 +16,9 @@ from tqdm import tqdm
 
 from torchelev import ElevationMap
 from torchelev.errors import require
-from torchelev.output_files import atomic_file
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
+from training.fit import save_atomically
 from training.traversability.labels.labels import can_stand
 from training.traversability.maps.mapping import DataConfig, exact_maps, tile_cell_centers, walk_and_map
 from training.traversability.maps.terrain import KINDS, LENGTH, draw_robot, make_tiles
@@ -162,12 +162,6 @@ def data_set(
             save_atomically({"settings": settings, **batch._asdict(), "robot": dataclasses.asdict(batch.robot)}, path)
         batches.append(_load(path, settings))
     return batches
-
-
-def save_atomically(values: Mapping[str, Any], path: Path) -> None:
-    """Write a file by `torch.save`; an interruption leaves an older file intact."""
-    with atomic_file(path) as file:
-        torch.save(values, file)
 
 
 def _load(path: Path, settings: dict[str, Any]) -> MappedTerrain:
