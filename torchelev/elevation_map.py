@@ -134,8 +134,8 @@ class ElevationMap(ReadableMap):
         weights = None if self._weights is None else self._weights.detached()
         run = compiled_update if self._compiled else update_in_place
         run = functools.partial(run, cfg=self._update_cfg, weights=weights)
-        # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         before = self._take_out_predictions()
+        # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         with torch.inference_mode():
             run_in_chunks(run, self.state, inputs, self.chunks)
         if before is not None:

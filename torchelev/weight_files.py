@@ -1,17 +1,21 @@
-"""Files of a network's weights: its config and its tensors, checked before anything is made of them."""
+"""What all networks share: files of weights, checked before anything is made of them, and resolutions of maps."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchelev.errors import message, require
 from torchelev.output_files import atomic_file
+
+Net = TypeVar("Net", bound=nn.Module)
+RESOLUTIONS = (0.02, 0.1)  # [m] limits of the maps that networks are trained for
+_TOLERANCE = 1e-6  # relative, of limits
 
 
 def write_weights(path: str | Path, version: int, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
@@ -22,39 +26,47 @@ def write_weights(path: str | Path, version: int, config: Mapping[str, Any], sta
         file.write(content.getbuffer())
 
 
-def read_weights(
-    path: Path, version: int, is_config: Callable[[dict[str, Any]], bool], save: str, train: str
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the config and the weights in a file.
+class WeightFormat(NamedTuple):
+    """The files of one network."""
 
-    Args:
-        path: the file.
-        version: of the file format.
-        is_config: tells whether a dict is a config of the network.
-        save: the method that writes such files, for hints.
-        train: the command that trains the weights, for hints.
+    version: int  #: of the format
+    is_config: Callable[[dict[str, Any]], bool]  #: tells whether a dict is a config of the network
+    save: str  #: the method that writes such files, for hints
+    train: str  #: the command that trains the weights, for hints
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is damaged, or holds anything else or weights of another version.
-    """
-    hint, where = f"write it with {save}", str(path)
-    require(path.exists(), where, "must be a file of weights", "no file", f"train weights: {train}", FileNotFoundError)
-    try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the type depends on which byte is damaged
-        raise ValueError(message(where, "must be a file of weights", type(error).__name__, hint)) from error
-    actual = found.get("version") if isinstance(found, dict) else None
-    require(isinstance(actual, int), where, "must be a file of weights", "something else", hint)
-    require(actual == version, where, f"must be of version {version}", actual, "train with this torchelev")
-    config, state = found.get("config"), found.get("state_dict")
-    fits = isinstance(config, dict) and isinstance(state, dict) and is_config(config)
-    fits = fits and all(isinstance(value, Tensor) for value in state.values())
-    require(fits, where, "must be a file of weights", "other parts or types", hint)
-    return config, state
+    def build(self, path: Path, make: Callable[..., Net]) -> Net:
+        """Return the network in a file; `make` makes one of its config.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is damaged, holds anything else or weights of another version, or some are not
+                finite.
+        """
+        config, state = self._read(path)
+        net = make(**config)
+        _require_same_shapes(path, net.state_dict(), state)
+        net.load_state_dict(state)
+        return net
+
+    def _read(self, path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        hint, where, train = f"write it with {self.save}", str(path), f"train weights: {self.train}"
+        require(path.exists(), where, "must be a file of weights", "no file", train, FileNotFoundError)
+        try:
+            found = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # the type depends on which byte is damaged
+            raise ValueError(message(where, "must be a file of weights", type(error).__name__, hint)) from error
+        actual = found.get("version") if isinstance(found, dict) else None
+        require(isinstance(actual, int), where, "must be a file of weights", "something else", hint)
+        rule = f"must be of version {self.version}"
+        require(actual == self.version, where, rule, actual, "train with this torchelev")
+        config, state = found.get("config"), found.get("state_dict")
+        fits = isinstance(config, dict) and isinstance(state, dict) and self.is_config(config)
+        fits = fits and all(isinstance(value, Tensor) for value in state.values())
+        require(fits, where, "must be a file of weights", "other parts or types", hint)
+        return config, state
 
 
-def require_same_shapes(path: Path, expected: Mapping[str, Tensor], actual: Mapping[str, Tensor]) -> None:
+def _require_same_shapes(path: Path, expected: Mapping[str, Tensor], actual: Mapping[str, Tensor]) -> None:
     """Refuse weights of other names or shapes than expected, and weights that are not finite."""
     shapes, found = ({name: tuple(value.shape) for name, value in each.items()} for each in (expected, actual))
     wrong = [name for name in shapes | found if shapes.get(name) != found.get(name)]
@@ -62,3 +74,20 @@ def require_same_shapes(path: Path, expected: Mapping[str, Tensor], actual: Mapp
     require(not wrong, str(path), "must hold weights of the shapes that its config says", text, "train them again")
     bad = ", ".join(name for name, value in actual.items() if not bool(torch.isfinite(value).all()))
     require(not bad, str(path), "must be finite", f"NaN or inf in {bad}", "train them again")
+
+
+# What networks are trained for -----------------------------------------------------------------------------------
+
+
+def is_within(value: float, limits: tuple[float, float]) -> bool:
+    """Tell whether a value lies within limits, up to rounding."""
+    low, high = limits
+    return low * (1 - _TOLERANCE) <= value <= high * (1 + _TOLERANCE)
+
+
+def require_resolution(
+    resolution: float, name: str = "resolution", use: str = "", hint: str = "resample the map"
+) -> None:
+    """Refuse a resolution outside RESOLUTIONS; name, use and hint are for the error."""
+    low, high = RESOLUTIONS
+    require(is_within(resolution, RESOLUTIONS), name, f"must be {low:g} to {high:g} m{use}", resolution, hint)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchelev.completion.net import RESOLUTIONS
 from torchelev.errors import require, require_positive
+from torchelev.weight_files import require_resolution
 
 WHEN = ("read", "update")
 
@@ -34,7 +34,5 @@ class CompletionConfig:
 
     def require_resolution(self, resolution: float) -> None:
         """Refuse a map's resolution for which the network is not trained. Raises ValueError."""
-        low, high = RESOLUTIONS
-        rule = f"must be {low:g} to {high:g} m for completion"
         hint = "choose another resolution, or leave completion off with None"
-        require(low <= round(resolution, 6) <= high, "cfg.grid.resolution", rule, resolution, hint)
+        require_resolution(resolution, "cfg.grid.resolution", " for completion", hint)

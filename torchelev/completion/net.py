@@ -11,14 +11,12 @@ from torch import Tensor, nn
 from torchelev.completion.complete import Completion, CompletionInput, complete
 from torchelev.completion.parameters import Weights, weight_shapes
 from torchelev.errors import require
-from torchelev.weight_files import read_weights, require_same_shapes, write_weights
+from torchelev.weight_files import WeightFormat, require_resolution, write_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-RESOLUTIONS = (0.02, 0.1)  # [m] limits of the maps
 VERSION = 1  # of the file format; also counts what the weights are multiplied with
-_TOLERANCE = 1e-6  # relative, of limits
 _PRETRAINED = Path(__file__).parent / "weights" / "completion.pt"
 _SIZES = ("view_channels", "cell_channels", "measured_channels")
 
@@ -113,24 +111,14 @@ class CompletionNet(nn.Module):
             FileNotFoundError: if there is no such file.
             ValueError: if it does not hold finite weights of this version.
         """
-        path = _PRETRAINED if path is None else Path(path)
-        hints = "CompletionNet.save", "python -m training.completion"
-        config, state = read_weights(path, VERSION, _is_config, *hints)
-        net = cls(**config)
-        require_same_shapes(path, net.state_dict(), state)
-        net.load_state_dict(state)
-        return net
-
-
-def require_resolution(resolution: float) -> None:
-    """Refuse a resolution outside RESOLUTIONS."""
-    low, high = RESOLUTIONS
-    fits = low * (1 - _TOLERANCE) <= resolution <= high * (1 + _TOLERANCE)
-    require(fits, "resolution", f"must be {low:g} to {high:g} m", resolution, "resample the map")
+        return _FORMAT.build(_PRETRAINED if path is None else Path(path), cls)
 
 
 def _is_config(config: dict[str, Any]) -> bool:
     return config.keys() == set(_SIZES) and all(type(size) is int and size > 0 for size in config.values())
+
+
+_FORMAT = WeightFormat(VERSION, _is_config, "CompletionNet.save", "python -m training.completion")
 
 
 def _check_layers(

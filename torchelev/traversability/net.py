@@ -11,10 +11,16 @@ from torch import Tensor, nn
 
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
-from torchelev.traversability import weight_file
 from torchelev.traversability.rate import rate
-from torchelev.traversability.weight_file import RANGES, Weights, require_in_ranges, weight_shapes
-from torchelev.weight_files import require_same_shapes
+from torchelev.traversability.weight_file import (
+    FORMAT,
+    RANGES,
+    VERSION,
+    Weights,
+    require_in_ranges,
+    weight_shapes,
+)
+from torchelev.weight_files import write_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -123,7 +129,7 @@ class TraversabilityNet(nn.Module):
         Raises:
             WriteError: if the file cannot be written.
         """
-        weight_file.save(path, self.config, self.state_dict())
+        write_weights(path, VERSION, self.config, self.state_dict())
 
     @classmethod
     def from_pretrained(cls, path: str | Path | None = None) -> TraversabilityNet:
@@ -136,12 +142,7 @@ class TraversabilityNet(nn.Module):
             FileNotFoundError: if there is no such file.
             ValueError: if it does not hold finite weights of this version.
         """
-        path = _PRETRAINED if path is None else Path(path)
-        config, state = weight_file.load(path)
-        net = cls(**config)
-        require_same_shapes(path, net.state_dict(), state)
-        net.load_state_dict(state)
-        return net
+        return FORMAT.build(_PRETRAINED if path is None else Path(path), cls)
 
 
 def _check_layers(

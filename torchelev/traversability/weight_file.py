@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor
@@ -12,14 +11,12 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.traversability.features import NUM_FEATURES
-from torchelev.weight_files import read_weights, write_weights
+from torchelev.weight_files import WeightFormat, is_within, require_resolution
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-RESOLUTIONS = (0.02, 0.1)  # [m] limits for every head
 VERSION = 2  # of the file format
-_TOLERANCE = 1e-6  # relative, of limits
 _CONFIG_KEYS = {"cell_channels", "stance_channels", "ranges"}
 
 
@@ -100,25 +97,12 @@ def conditions(robot: RobotConfig, resolution: float) -> list[float]:
 
 def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotConfig, resolution: float) -> None:
     """Refuse a resolution outside RESOLUTIONS, and a robot whose ratios are outside the ranges."""
-    low, high = RESOLUTIONS
-    fits = low * (1 - _TOLERANCE) <= resolution <= high * (1 + _TOLERANCE)
-    require(fits, "resolution", f"must be {low:g} to {high:g} m", resolution, "resample the map")
+    require_resolution(resolution)
     hint = "train a head for this robot: python -m training.traversability --robot ..."
     for name, ratio in ratios(robot, resolution).items():
         low, high = ranges[name]
-        fits = low * (1 - _TOLERANCE) <= ratio <= high * (1 + _TOLERANCE)
+        fits = is_within(ratio, ranges[name])
         require(fits, name, f"must be within {low:.3g} to {high:.3g}, as trained", f"{ratio:.4g}", hint)
-
-
-def save(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
-    """Write a head's config and weights to a file. Raises WriteError if it cannot be written."""
-    write_weights(path, VERSION, config, state)
-
-
-def load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the config and the weights in a file; errors are those of `read_weights`."""
-    hints = "TraversabilityNet.save", "python -m training.traversability"
-    return read_weights(path, VERSION, _is_config, *hints)
 
 
 def _is_config(config: dict[str, Any]) -> bool:
@@ -129,3 +113,6 @@ def _is_config(config: dict[str, Any]) -> bool:
     has_sizes = all(type(config[name]) is int and config[name] > 0 for name in ("cell_channels", "stance_channels"))
     has_ranges = isinstance(ranges, dict) and ranges.keys() == RANGES.keys()
     return has_sizes and has_ranges and all(len(pair) == 2 for pair in ranges.values())
+
+
+FORMAT = WeightFormat(VERSION, _is_config, "TraversabilityNet.save", "python -m training.traversability")

@@ -20,6 +20,7 @@ from torchelev import ElevationMap
 from torchelev.completion.complete import CompletionInput
 from torchelev.errors import require, require_positive
 from torchelev.sim import HeightField
+from torchelev.weight_files import RESOLUTIONS
 from training.fit import save_atomically
 from training.traversability.maps.mapping import DataConfig, blank_map, tile_cell_centers, walk_and_look
 from training.traversability.maps.terrain import KINDS, LENGTH, LOOK_INTERVAL, UNSEEN_KINDS, draw_robot, make_tiles
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 VERSION = 1  # of the maps; increase it when their computation changes, so that old files are refused
-RESOLUTIONS = (0.02, 0.1)  # [m]
 SPLITS = {"train": KINDS, "held_out": KINDS, "unseen": UNSEEN_KINDS}
 
 

@@ -18,6 +18,7 @@ from torchelev import ElevationMap
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
+from torchelev.weight_files import RESOLUTIONS
 from training.fit import save_atomically
 from training.traversability.labels.labels import can_stand
 from training.traversability.maps.mapping import DataConfig, exact_maps, tile_cell_centers, walk_and_map
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 VERSION = 1  # of maps and labels; increase it when their computation changes, so that old files are refused
 _RATED_REACH = 0.3  # [m] from known cells within which unknown cells are rated
-RESOLUTIONS = (0.02, 0.1)  # [m]
 SPLITS = {"train": 0, "held_out": 1, "unseen": 2, "train_exact": 3, "held_out_exact": 4}
 _EXACT_SPLITS = ("train_exact", "held_out_exact")  # maps of the true heights
 
