@@ -17,6 +17,7 @@ NUM_VIEW = 8 + 2 * len(REACHES)  # features of a direction
 NUM_CELL = 8 + NUM_CONTEXT  # of a cell
 NUM_CANDIDATES = 2 + len(REACHES)  # heights that each direction proposes
 NUM_MEASURED = 7  # features of a measured cell
+USUAL = 0.04  # [m] resolution that the network's input is relative to
 _SMALL = 1e-6
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.completion.context import Context
-from torchelev.completion.parameters import Weights, affine, hidden, squash
+from torchelev.completion.parameters import USUAL, Weights, affine, hidden, squash
 from torchelev.completion.surroundings import Surroundings
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 _NOWHERE = 1e6  # [m]
 _STEP = 0.1  # [m] distances count about logarithmically beyond it
 _FARTHEST = 10.0  # [m] distances beyond it make no difference
-_USUAL = 0.04  # [m] resolution
 _STEEPEST = 1.5  # slope to which ground is continued
 _SMALL_STEP = 0.01  # [m] steps count about logarithmically beyond it
 _MARGIN = 0.02  # [m] by which an answer may leave the range of the heights around
@@ -76,7 +75,7 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     views = hidden(weights.view_inner, views, weights.view_inner_bias)
 
     cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
-    cell += [torch.log1p(nearest / _STEP), (resolution / _USUAL).log(), known.mean(0)]
+    cell += [torch.log1p(nearest / _STEP), (resolution / USUAL).log(), known.mean(0)]
     ground = (context.mean - low_height - mean) * (context.known > 0)
     known_share, bounded_share, steps, ground, stds, skewness = (
         values.to(bound.dtype) for values in context._replace(mean=ground)

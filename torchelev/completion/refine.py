@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.completion.parameters import Weights, affine, hidden, squash
+from torchelev.completion.parameters import USUAL, Weights, affine, hidden, squash
 from torchelev.ops.windows import neighbours
 
 if TYPE_CHECKING:
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 _PAIRS = ((0, 7), (1, 6), (2, 5), (3, 4))  # opposite ones of `neighbours`
 _MIN_STD = 1e-3  # [m]
-_USUAL = 0.04  # [m] resolution
 _LONG_AGO = 60.0  # [s] ages count about logarithmically beyond a second, up to this
 
 
@@ -47,7 +46,7 @@ def refine(
     )
     sigma = torch.where(known, variance, 0.0).clamp(min=_MIN_STD**2).sqrt()
     features = [sigma.log(), bend.abs() / (bend.abs() + sigma), squash(rough, 0.01), squash(tilt), count / 4]
-    features += [torch.log1p(torch.where(known, age, 0.0).clamp(0, _LONG_AGO)), (resolution / _USUAL).log()]
+    features += [torch.log1p(torch.where(known, age, 0.0).clamp(0, _LONG_AGO)), (resolution / USUAL).log()]
     flat = torch.stack(features).flatten(1)
     channels = hidden(weights.measured, flat, weights.measured_bias)
     gain, factor = (v.view_as(sigma) for v in affine(weights.measured_answer, channels, weights.measured_answer_bias))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchelev.completion.complete import CompletionInput, Unseen
 from torchelev.completion.predict import Seen
-from torchelev.completion.surroundings import Surroundings
+from torchelev.completion.surroundings import UNKNOWN, count_steps, look_around
 from torchelev.errors import require
 from torchelev.filters import Filter
 from training.completion.maps import TrueMap
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 NUM_UNKNOWN, NUM_MEASURED = 768, 192  # cells of each map, at most
 _NEAR = 0.3  # [m] unknown cells are drawn with a probability of 1 / (distance + this)
 FARTHEST = 3.0  # [m] from known cells, of unknown ones
-_MIN_ERROR = 0.005  # [m]
+MIN_ERROR = 0.005  # [m] added to the error by which errors are divided
 _KEPT = (0.05, 0.6)  # share of the cells that thinned maps keep
 _RAISED = (0.03, 3.0)  # [m] by which bounds are raised
 
@@ -67,9 +67,13 @@ def vary_bounds(layers: CompletionInput, generator: torch.Generator) -> Completi
     return layers._replace(upper_bound=layers.upper_bound + rise, bounded=layers.bounded & (draw < 0.75))
 
 
-def nearest_known(seen: Surroundings) -> Float[Tensor, "n"]:
-    """Return the distance [m] of the next known cell in any direction, inf without one."""
-    return torch.where(seen.is_known > 0, seen.distance, torch.inf).amin(0)
+def distances(maps: TrueMap) -> Float[Tensor, "B H W"]:
+    """Return the distance [m] of the nearest known cell in eight directions: 0 where known, inf without one."""
+    known = maps.layers.validity
+    ground, place = torch.where(known, 0.0, UNKNOWN), torch.arange(known.numel())
+    around = look_around(ground, count_steps(known), place, maps.resolution)
+    nearest = torch.where(around.is_known > 0, around.distance, torch.inf).amin(0)
+    return torch.where(known, 0.0, nearest.view(known.shape))
 
 
 def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells]:
@@ -82,18 +86,16 @@ def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells
     known = layers.validity
     unseen = Unseen(layers.elevation, known, layers.upper_bound, layers.bounded & ~known, maps.resolution)
     filled, _ = Filter("inpaint_nearest")((layers.elevation, known), resolution=maps.resolution)
+    distance = distances(maps)
+    counts = maps.is_inside & ~known & (distance < FARTHEST)
     for b in range(len(known)):
-        first = b * known[0].numel()
-        place = first + (maps.is_inside[b] & ~known[b]).flatten().nonzero()[:, 0]
-        seen = unseen.read(place)
-        distance = nearest_known(seen.around)
-        places = (distance < FARTHEST).nonzero()[:, 0]
-        if not len(places):
+        place = b * known[0].numel() + counts[b].flatten().nonzero()[:, 0]
+        if not len(place):
             continue
-        chosen = places[_draw(1 / (distance[places] + _NEAR), NUM_UNKNOWN, generator)]
-        truth = maps.truth.flatten()[place[chosen]]
-        error = (filled.flatten()[place[chosen]] - truth).abs().mean() + _MIN_ERROR
-        drawn.append(UnknownCells(unseen.read(place[chosen]), truth, torch.full_like(truth, 1 / float(error))))
+        chosen = place[_draw(1 / (distance.flatten()[place] + _NEAR), NUM_UNKNOWN, generator)]
+        truth = maps.truth.flatten()[chosen]
+        error = (filled.flatten()[chosen] - truth).abs().mean() + MIN_ERROR
+        drawn.append(UnknownCells(unseen.read(chosen), truth, torch.full_like(truth, 1 / float(error))))
     return drawn
 
 
@@ -111,7 +113,7 @@ def draw_measured(maps: TrueMap, generator: torch.Generator) -> list[MeasuredCel
         around = torch.arange(-1, 2)
         patches = [layer[b][i[:, None, None] + around[:, None], j[:, None, None] + around] for layer in layers]
         truth = maps.truth[b][i, j]
-        error = (layers.elevation[b][i, j] - truth).abs().mean() + _MIN_ERROR
+        error = (layers.elevation[b][i, j] - truth).abs().mean() + MIN_ERROR
         weight = torch.full_like(truth, 1 / float(error))
         drawn.append(MeasuredCells(CompletionInput(*patches), truth, weight, torch.full_like(truth, maps.resolution)))
     return drawn

@@ -17,10 +17,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchelev.app.results import markdown_table, write_json
-from torchelev.completion.complete import Unseen
 from torchelev.completion.net import CompletionNet
 from torchelev.filters import Filter
-from training.completion.cells import FARTHEST, nearest_known
+from training.completion.cells import FARTHEST, distances
 from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
 from training.options import jobs_option
 
@@ -65,15 +64,6 @@ def fill(name: str) -> Answer:
 def learned(net: CompletionNet) -> Answer:
     """Return a network as an answer."""
     return lambda maps: net(*maps.layers, resolution=maps.resolution)
-
-
-@torch.no_grad()
-def distances(maps: TrueMap) -> Tensor:
-    """Return the distance [m] of the nearest known cell in eight directions, 0 where known."""
-    layers, known = maps.layers, maps.layers.validity
-    unseen = Unseen(layers.elevation, known, layers.upper_bound, layers.bounded & ~known, maps.resolution)
-    around = unseen.read(torch.arange(known.numel())).around
-    return torch.where(known, 0.0, nearest_known(around).view(known.shape))
 
 
 @torch.no_grad()

@@ -10,14 +10,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from torchelev.completion.parameters import USUAL
 from torchelev.filters import Filter
-from training.completion.cells import FARTHEST
+from training.completion.cells import FARTHEST, MIN_ERROR
 from training.completion.maps import TrueMap
 
 _LEVELS = 3
 _SCALE = 0.1  # [m] heights count about logarithmically beyond it
 _CROP = 64  # cells along each side, in training
-_MIN_ERROR = 0.005  # [m]
 
 
 class UNet(nn.Module):
@@ -48,7 +48,7 @@ def complete(net: UNet, maps: TrueMap, near: Tensor) -> Tensor:
     level = torch.where(known, layers.elevation, 0.0).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)
     under = torch.where(bounded, layers.upper_bound - near, 0.0)
     heights = [torch.asinh(height / _SCALE) for height in (near - level[:, None, None], under)]
-    scale = torch.full_like(near, math.log(maps.resolution / 0.04))
+    scale = torch.full_like(near, math.log(maps.resolution / USUAL))
     values = torch.stack([known.to(near.dtype), bounded.to(near.dtype), *heights, scale], 1)
     filled = near + _run(net, values)
     return torch.where(bounded, torch.minimum(filled, layers.upper_bound), filled)
@@ -94,7 +94,7 @@ def _loss(net: UNet, maps: TrueMap) -> Tensor:
     def mean(error: Tensor) -> Tensor:
         return (error.abs() * counts).sum((1, 2)) / number
 
-    return (mean(complete(net, maps, near) - maps.truth) / (mean(near - maps.truth) + _MIN_ERROR)).mean()
+    return (mean(complete(net, maps, near) - maps.truth) / (mean(near - maps.truth) + MIN_ERROR)).mean()
 
 
 def _is_near(known: Tensor, resolution: float) -> Tensor:
