@@ -48,64 +48,113 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
 
         log std = (1 - t) log std_net + t log std_prior,    t = d^2 / (d^2 + 4 m^2).
     """
-    around, context, upper_bound, bounded, level, resolution = seen
-    known, nowhere = around.is_known, _NOWHERE * (1 - around.is_known)
-    has_any = known.amax(0) > 0
+    heights = _relate(seen)
+    proposals = _propose(seen.around, heights)
+    views = hidden(weights.view, proposals.features, weights.view_bias)
+    views = hidden(weights.view_inner, views, weights.view_inner_bias)
+    pooled = torch.cat([views.mean(1), views.amax(1), _describe_cell(seen, heights)])
+    cells = hidden(weights.cell, pooled, weights.cell_bias)
+    cells = hidden(weights.cell_inner, cells, weights.cell_inner_bias)
+    answer, spread = _vote(weights, views, cells, proposals, heights)
+
+    correction, factor = affine(weights.answer, cells, weights.answer_bias)
+    has_any, bounded = heights.has_any, seen.bounded
+    answer = answer + torch.tanh(correction) * (heights.high - heights.low + _MARGIN)
+    answer = torch.where(has_any, answer, 0.0)
+    answer = torch.where(bounded, torch.minimum(answer, heights.bound), answer)
+    log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
+    reach = (seen.around.distance + _nowhere(seen.around)).amin(0).square()
+    fade = reach / (reach + _FADE**2)
+    std = torch.exp((1 - fade) * log_std + fade * weights.prior)
+    return heights.reference + answer, torch.where(has_any, std, weights.prior.exp())
+
+
+class _Heights(NamedTuple):
+    """Heights [m] from the mean of those around each cell, in which nearer ones count more."""
+
+    has_any: Bool[Tensor, "n"]  # a direction holds known ground
+    reference: Float[Tensor, "n"]  # what they count from
+    height: Float[Tensor, "8 n"]  # of the next known cells
+    low: Float[Tensor, "n"]  # lowest of these
+    high: Float[Tensor, "n"]  # highest of these
+    bound: Float[Tensor, "n"]  # upper bound, 0 where there is none
+    squares: Float[Tensor, "R n"]  # means of the squares, 0 where there is none
+    has_square: Float[Tensor, "R n"]  # 1 where there is one, else 0
+    distance: Float[Tensor, "8 n"]  # [m] of the next known cells
+    nearest: Float[Tensor, "n"]  # [m] of the nearest of these
+
+
+class _Proposals(NamedTuple):
+    """What each direction sees and proposes."""
+
+    features: Float[Tensor, "F 8 n"]
+    candidates: Float[Tensor, "V 8 n"]  # [m]
+    exists: Float[Tensor, "V 8 n"]  # 1 or 0
+
+
+def _nowhere(around: Surroundings) -> Float[Tensor, "8 n"]:
+    """Return a large number where a direction holds no known ground, else 0."""
+    return _NOWHERE * (1 - around.is_known)
+
+
+def _relate(seen: Seen) -> _Heights:
+    around, context, known = seen.around, seen.context, seen.around.is_known
+    nowhere, has_any = _nowhere(around), known.amax(0) > 0
     distance = around.distance.clamp(max=_FARTHEST)
     nearest = (distance + nowhere).amin(0).clamp(max=_FARTHEST)
-    near = nearest / distance.clamp(min=1e-6) * known
-
-    # Heights from the mean of those around, first from the lowest, so that altitude costs no precision.
-    low_height = torch.where(has_any, (around.height + nowhere).amin(0), level)
-    height = (around.height - low_height) * known
+    near = _share_of_nearest(nearest, distance, known)
+    # First from the lowest, so that altitude costs no precision.
+    lowest = torch.where(has_any, (around.height + nowhere).amin(0), seen.level)
+    height = (around.height - lowest) * known
     mean = (near * height).sum(0) / near.sum(0).clamp(min=1e-6)
     height = (height - mean) * known
-    reference = low_height + mean
-    low, high = -mean, torch.where(has_any, (height - nowhere).amax(0), 0.0)
-    bound = torch.where(bounded, upper_bound - low_height - mean, 0.0)
-    is_bounded = bounded.to(bound.dtype)
+    high = torch.where(has_any, (height - nowhere).amax(0), 0.0)
+    bound = torch.where(seen.bounded, seen.upper_bound - lowest - mean, 0.0)
+    has_square = (context.known > 0).to(bound.dtype)
+    squares = (context.mean - lowest - mean).to(bound.dtype) * has_square
+    return _Heights(has_any, lowest + mean, height, -mean, high, bound, squares, has_square, distance, nearest)
 
+
+def _share_of_nearest(nearest: Tensor, distance: Tensor, known: Tensor) -> Float[Tensor, "8 n"]:
+    """Return the nearest distance over that of each direction, 0 where it holds no known ground."""
+    return nearest / distance.clamp(min=1e-6) * known
+
+
+def _propose(around: Surroundings, heights: _Heights) -> _Proposals:
+    known, distance, height = around.is_known, heights.distance, heights.height
     both = known * opposite(known)
     share = opposite(distance) / (distance + opposite(distance)).clamp(min=1e-6) * both
     step = (opposite(height) - height) * both
-    slopes, has_slope = around.slope.clamp(-_STEEPEST, _STEEPEST), around.has_slope
-    features = [known, near, torch.log1p(distance / _STEP), squash(height), squash(height - low) * known]
-    features += [both, share, squash(step), *has_slope, *slopes]
-    views = hidden(weights.view, torch.stack(features), weights.view_bias)
-    views = hidden(weights.view_inner, views, weights.view_inner_bias)
-
-    cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
-    cell += [torch.log1p(nearest / _STEP), (resolution / USUAL).log(), known.mean(0)]
-    ground = (context.mean - low_height - mean) * (context.known > 0)
-    known_share, bounded_share, steps, ground, stds, skewness = (
-        values.to(bound.dtype) for values in context._replace(mean=ground)
-    )
-    cell += torch.cat([known_share, bounded_share, squash(steps, _SMALL_STEP), squash(ground)]).unbind()
-    cell += torch.cat([squash(stds), skewness]).unbind()
-    pooled = torch.cat([views.mean(1), views.amax(1), torch.stack(cell)])
-    cells = hidden(weights.cell, pooled, weights.cell_bias)
-    cells = hidden(weights.cell_inner, cells, weights.cell_inner_bias)
-
-    views = torch.relu(views + affine(weights.to_view, cells, weights.to_view_bias)[:, None])
-    votes = (weights.vote @ views.flatten(1)).unflatten(1, known.shape)
-    votes = votes + affine(weights.vote_cell, cells, weights.vote_bias)[:, None]
-    proposed = torch.cat([torch.stack([known, both]), has_slope])
+    slopes = around.slope.clamp(-_STEEPEST, _STEEPEST)
+    features = [known, _share_of_nearest(heights.nearest, distance, known), torch.log1p(distance / _STEP)]
+    features += [squash(height), squash(height - heights.low) * known, both, share, squash(step)]
     candidates = torch.cat([torch.stack([height, height + (1 - share) * step]), height + slopes * distance])
-    votes = torch.cat([votes.flatten(0, 1), affine(weights.vote_square, cells, weights.vote_square_bias)])
-    proposed = torch.cat([proposed.flatten(0, 1), (known_share > 0).to(votes.dtype)])
-    candidates = torch.cat([candidates.flatten(0, 1), ground])
-    ballot = (votes * proposed + _NO_VOTE * (1 - proposed)).softmax(0)
-    answer = (ballot * candidates).sum(0)
-    spread = (ballot * (candidates - answer).square()).sum(0) + _NO_SPREAD**2
+    exists = torch.cat([torch.stack([known, both]), around.has_slope])
+    return _Proposals(torch.stack([*features, *around.has_slope, *slopes]), candidates, exists)
 
-    correction, factor = affine(weights.answer, cells, weights.answer_bias)
-    answer = torch.where(has_any, answer + torch.tanh(correction) * (high - low + _MARGIN), 0.0)
-    answer = torch.where(bounded, torch.minimum(answer, bound), answer)
-    log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
-    reach = (around.distance + nowhere).amin(0).square()
-    fade = reach / (reach + _FADE**2)
-    std = torch.exp((1 - fade) * log_std + fade * weights.prior)
-    return reference + answer, torch.where(has_any, std, weights.prior.exp())
+
+def _describe_cell(seen: Seen, heights: _Heights) -> Float[Tensor, "F n"]:
+    low, high, bound, is_bounded = heights.low, heights.high, heights.bound, seen.bounded.to(heights.bound.dtype)
+    cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
+    cell += [torch.log1p(heights.nearest / _STEP), (seen.resolution / USUAL).log(), seen.around.is_known.mean(0)]
+    known, bounded, steps, _, stds, skewness = (values.to(bound.dtype) for values in seen.context)
+    squares = [known, bounded, squash(steps, _SMALL_STEP), squash(heights.squares), squash(stds), skewness]
+    return torch.cat([torch.stack(cell), *squares])
+
+
+def _vote(
+    weights: Weights, views: Tensor, cells: Tensor, proposals: _Proposals, heights: _Heights
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Return the mean of the candidates [m] by the network's votes, and their variance [m^2]."""
+    views = torch.relu(views + affine(weights.to_view, cells, weights.to_view_bias)[:, None])
+    votes = (weights.vote @ views.flatten(1)).unflatten(1, heights.height.shape)
+    votes = votes + affine(weights.vote_cell, cells, weights.vote_bias)[:, None]
+    votes = torch.cat([votes.flatten(0, 1), affine(weights.vote_square, cells, weights.vote_square_bias)])
+    exists = torch.cat([proposals.exists.flatten(0, 1), heights.has_square])
+    candidates = torch.cat([proposals.candidates.flatten(0, 1), heights.squares])
+    ballot = (votes * exists + _NO_VOTE * (1 - exists)).softmax(0)
+    answer = (ballot * candidates).sum(0)
+    return answer, (ballot * (candidates - answer).square()).sum(0) + _NO_SPREAD**2
 
 
 def opposite(values: Float[Tensor, "8 n"]) -> Float[Tensor, "8 n"]:
