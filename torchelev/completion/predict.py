@@ -63,7 +63,7 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
     answer = torch.where(has_any, answer, 0.0)
     answer = torch.where(bounded, torch.minimum(answer, heights.bound), answer)
     log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
-    reach = (seen.around.distance + _nowhere(seen.around)).amin(0).square()
+    reach = heights.reach.square()
     fade = reach / (reach + _FADE**2)
     std = torch.exp((1 - fade) * log_std + fade * weights.prior)
     return heights.reference + answer, torch.where(has_any, std, weights.prior.exp())
@@ -80,8 +80,9 @@ class _Heights(NamedTuple):
     bound: Float[Tensor, "n"]  # upper bound, 0 where there is none
     squares: Float[Tensor, "R n"]  # means of the squares, 0 where there is none
     has_square: Float[Tensor, "R n"]  # 1 where there is one, else 0
-    distance: Float[Tensor, "8 n"]  # [m] of the next known cells
-    nearest: Float[Tensor, "n"]  # [m] of the nearest of these
+    distance: Float[Tensor, "8 n"]  # [m] of the next known cells, _FARTHEST at most
+    reach: Float[Tensor, "n"]  # [m] of the nearest of these
+    near: Float[Tensor, "8 n"]  # nearest distance over that of each
 
 
 class _Proposals(NamedTuple):
@@ -92,17 +93,13 @@ class _Proposals(NamedTuple):
     exists: Float[Tensor, "V 8 n"]  # 1 or 0
 
 
-def _nowhere(around: Surroundings) -> Float[Tensor, "8 n"]:
-    """Return a large number where a direction holds no known ground, else 0."""
-    return _NOWHERE * (1 - around.is_known)
-
-
 def _relate(seen: Seen) -> _Heights:
     around, context, known = seen.around, seen.context, seen.around.is_known
-    nowhere, has_any = _nowhere(around), known.amax(0) > 0
+    nowhere, has_any = _NOWHERE * (1 - known), known.amax(0) > 0
     distance = around.distance.clamp(max=_FARTHEST)
-    nearest = (distance + nowhere).amin(0).clamp(max=_FARTHEST)
-    near = _share_of_nearest(nearest, distance, known)
+    reach = (around.distance + nowhere).amin(0)
+    nearest = reach.clamp(max=_FARTHEST)
+    near = nearest / distance.clamp(min=1e-6) * known
     # First from the lowest, so that altitude costs no precision.
     lowest = torch.where(has_any, (around.height + nowhere).amin(0), seen.level)
     height = (around.height - lowest) * known
@@ -112,12 +109,7 @@ def _relate(seen: Seen) -> _Heights:
     bound = torch.where(seen.bounded, seen.upper_bound - lowest - mean, 0.0)
     has_square = (context.known > 0).to(bound.dtype)
     squares = (context.mean - lowest - mean).to(bound.dtype) * has_square
-    return _Heights(has_any, lowest + mean, height, -mean, high, bound, squares, has_square, distance, nearest)
-
-
-def _share_of_nearest(nearest: Tensor, distance: Tensor, known: Tensor) -> Float[Tensor, "8 n"]:
-    """Return the nearest distance over that of each direction, 0 where it holds no known ground."""
-    return nearest / distance.clamp(min=1e-6) * known
+    return _Heights(has_any, lowest + mean, height, -mean, high, bound, squares, has_square, distance, reach, near)
 
 
 def _propose(around: Surroundings, heights: _Heights) -> _Proposals:
@@ -126,7 +118,7 @@ def _propose(around: Surroundings, heights: _Heights) -> _Proposals:
     share = opposite(distance) / (distance + opposite(distance)).clamp(min=1e-6) * both
     step = (opposite(height) - height) * both
     slopes = around.slope.clamp(-_STEEPEST, _STEEPEST)
-    features = [known, _share_of_nearest(heights.nearest, distance, known), torch.log1p(distance / _STEP)]
+    features = [known, heights.near, torch.log1p(distance / _STEP)]
     features += [squash(height), squash(height - heights.low) * known, both, share, squash(step)]
     candidates = torch.cat([torch.stack([height, height + (1 - share) * step]), height + slopes * distance])
     exists = torch.cat([torch.stack([known, both]), around.has_slope])
@@ -136,7 +128,11 @@ def _propose(around: Surroundings, heights: _Heights) -> _Proposals:
 def _describe_cell(seen: Seen, heights: _Heights) -> Float[Tensor, "F n"]:
     low, high, bound, is_bounded = heights.low, heights.high, heights.bound, seen.bounded.to(heights.bound.dtype)
     cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
-    cell += [torch.log1p(heights.nearest / _STEP), (seen.resolution / USUAL).log(), seen.around.is_known.mean(0)]
+    cell += [
+        torch.log1p(heights.reach.clamp(max=_FARTHEST) / _STEP),
+        (seen.resolution / USUAL).log(),
+        seen.around.is_known.mean(0),
+    ]
     known, bounded, steps, _, stds, skewness = (values.to(bound.dtype) for values in seen.context)
     squares = [known, bounded, squash(steps, _SMALL_STEP), squash(heights.squares), squash(stds), skewness]
     return torch.cat([torch.stack(cell), *squares])
