@@ -208,16 +208,14 @@ def _insert(table: str, match: re.Match[str]) -> str:
     return f"{match[1]}{table}\n{match[2]}"
 
 
-HOWTO = ROOT / "docs/howto"
-PAGES = {
-    ROOT / "README.md": "",
-    ROOT / "docs/benchmarks.md": "../",
-    HOWTO / "on_a_robot.md": "../../",
-    HOWTO / "mjlab.md": "../../",
-    HOWTO / "legs.md": "../../",
-    HOWTO / "encoders.md": "../../",
-    HOWTO / "many_robots.md": "../../",
-}
+def find_pages() -> dict[Path, str]:
+    """Return the README and the pages that hold tables, with the path from each to the root."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    depths = {page: len(page.relative_to(ROOT).parts) - 1 for page in pages if names_of_tables(page.read_text())}
+    return {page: "../" * depth for page, depth in depths.items()}
+
+
+PAGES = find_pages()
 
 if __name__ == "__main__":
     for page, to_root in PAGES.items():
