@@ -4,6 +4,7 @@ import functools
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
@@ -12,12 +13,14 @@ import training.completion.evaluate as evaluation
 import training.completion.train as training
 from torchelev.completion.complete import CompletionInput
 from training.completion.cells import draw_measured, draw_unknown, remove_cells, thin_out, vary_bounds
-from training.completion.maps import TrueMap, WalkConfig, Walks, walk
+from training.completion.maps import TrueMap, WalkConfig, Walks, drive, walk
 from training.completion.trainer import COVERAGE, FitConfig, Trainer, fit_std, losses
 from training.completion.unet import UNet, fit
+from training.completion.yards import LENGTH, draw_way, make_yard
 from training.resume import CHECKPOINT
 
 TINY = functools.partial(WalkConfig, num_maps=1, window=1.6, scans=(1, 2))
+TINY_YARD = WalkConfig(num_maps=1, window=6.0, scans=(2, 3))
 
 
 def invoke(main, *arguments):
@@ -58,6 +61,23 @@ def test_cells_come_with_their_truth_and_maps_count_the_same():
     measured = draw_measured(maps, generator)[0]
     assert measured.layers.elevation.shape[1:] == (3, 3) and bool(measured.layers.validity[:, 1, 1].all())
     assert float(measured.truth.abs().max()) == 0.0
+
+
+@pytest.mark.slow(4)
+def test_drives_leave_their_way_free_and_map_the_yard_near_the_truth():
+    rng = np.random.default_rng(3)
+    way = draw_way(4, rng)
+    heights = make_yard(way, 4, rng)
+    axis = torch.linspace(-LENGTH / 2, LENGTH / 2, len(heights), dtype=torch.float64)
+    x, y = torch.meshgrid(axis, axis, indexing="ij")
+    is_way = way.distance(x, y, 4) < 0.5
+    steps = heights.diff(dim=0).abs()[is_way[1:]]
+    assert float(steps.max()) < 0.5 < float(heights.diff(dim=0).abs().max()), "things are steep, the way is not"
+    places = torch.from_numpy(way.places(4))
+    assert float(way.distance(places[:, 0], places[:, 1], 4).max()) < 1e-9
+    maps = drive((3, 0, 0), 0.1, TINY_YARD)[-1]
+    known = maps.layers.validity & maps.is_inside
+    assert int(known.sum()) > 100 and float((maps.layers.elevation - maps.truth)[known].abs().median()) < 0.1
 
 
 def test_removed_cells_are_neither_known_nor_bounded():
@@ -143,13 +163,15 @@ def test_the_u_net_stays_below_the_bound_and_learns():
 def test_the_commands_train_evaluate_and_resume(tmp_path, monkeypatch):
     for module in (training, evaluation):
         monkeypatch.setattr(module, "WalkConfig", TINY)
-    monkeypatch.setattr(evaluation, "RESOLUTIONS", (0.08,))
+        monkeypatch.setattr(module, "YARD_CONFIG", TINY_YARD)
+    monkeypatch.setattr(evaluation, "SPLITS", dict.fromkeys(evaluation.SPLITS, (0.08,)))
     out = tmp_path / "run"
-    common = ("--out", out, "--walks", 2, "--evaluation-walks", 1, "--jobs", 1, "--steps", 2)
+    common = ("--out", out, "--walks", 2, "--drives", 1, "--evaluation-walks", 1, "--jobs", 1, "--steps", 2)
     done = invoke(training.main, *common)
     assert done.exit_code == 0 and "| held_out | 0.08 | unknown |" in done.output
     result = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
     cells = result["held_out"]["0.08"]["CompletionNet"]["unknown"]
+    assert result["held_out_yards"]["0.08"]["CompletionNet"]["unknown"]["cells"] > 10
     assert cells["cells"] > 10 and math.isfinite(cells["mae"]) and 0 <= cells["within_2_std"] <= 1
     assert "add --resume" in invoke(training.main, *common).output
     assert invoke(training.main, *common, "--resume").exit_code == 0, "nothing left: it only evaluates"
