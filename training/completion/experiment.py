@@ -26,7 +26,7 @@ from training.options import jobs_option, runs_option
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
-WALKS, DRIVES, STEPS, EVALUATION_WALKS = 290, 130, 10000, 8
+WALKS, DRIVES, STEPS, EVALUATION_WALKS = 290, 130, 15000, 8
 UNETS = {"U-Net of equal size": 3}  # channels of the finest level
 UNET_STEPS = 4000
 

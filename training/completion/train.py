@@ -13,6 +13,7 @@ from training.completion.cells import (
     MeasuredCells,
     UnknownCells,
     concatenate,
+    draw_evenly,
     draw_measured,
     draw_unknown,
     remove_cells,
@@ -36,7 +37,7 @@ _WALKS_SEED = 0
 @click.option("--walks", type=_POSITIVE, default=290, show_default=True, help="Training walks of four robots.")
 @click.option("--drives", type=_POSITIVE, default=130, show_default=True, help="Training drives of four vehicles.")
 @click.option(
-    "--steps", type=_POSITIVE, default=10000, show_default=True, help="Steps in total, including those before --resume."
+    "--steps", type=_POSITIVE, default=15000, show_default=True, help="Steps in total, including those before --resume."
 )
 @click.option(
     "--evaluation-walks", type=_POSITIVE, default=10, show_default=True, help="Evaluation walks per resolution."
@@ -85,9 +86,15 @@ def main(
     click.echo(f"Wrote weights.pt and result.json to {out}.")
 
 
-def training_cells(sets: list[tuple[Walks, int]], jobs: int, seed: int) -> tuple[UnknownCells, MeasuredCells]:
-    """Return the cells of some walks of each set, which are made where they are missing."""
+def training_cells(
+    sets: list[tuple[Walks, int]], jobs: int, seed: int
+) -> tuple[UnknownCells, MeasuredCells, UnknownCells]:
+    """Return the cells of some walks of each set, which are made where they are missing.
+
+    The third are unknown cells to calibrate with: of the maps as they were, evenly drawn.
+    """
     unknown: list[UnknownCells] = []
+    even: list[UnknownCells] = []
     measured: list[MeasuredCells] = []
     generator = torch.Generator().manual_seed(seed)
     for walks, count in sets:
@@ -95,13 +102,14 @@ def training_cells(sets: list[tuple[Walks, int]], jobs: int, seed: int) -> tuple
         before: list[TrueMap] = []
         for index in tqdm(range(count), desc=f"cells of {walks.name}", unit="walk"):
             maps = walks.read(index)
+            even += [cells for entry in maps for cells in draw_evenly(entry, generator)]
             thinned = [entry._replace(layers=thin_out(entry.layers, generator)) for entry in maps[-1:]]
             for view in [*maps, *_as_seen_before(maps[-1], before), *thinned]:
                 varied = view._replace(layers=vary_bounds(view.layers, generator))
                 unknown += draw_unknown(varied, generator)
                 measured += draw_measured(varied, generator)
             before = maps
-    return concatenate(unknown), concatenate(measured)
+    return concatenate(unknown), concatenate(measured), concatenate(even)
 
 
 def _as_seen_before(maps: TrueMap, before: list[TrueMap]) -> list[TrueMap]:

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import training.completion.evaluate as evaluation
 import training.completion.train as training
 from torchelev.completion.complete import CompletionInput
-from training.completion.cells import draw_measured, draw_unknown, remove_cells, thin_out, vary_bounds
+from training.completion.cells import draw_evenly, draw_measured, draw_unknown, remove_cells, thin_out, vary_bounds
 from training.completion.maps import TrueMap, WalkConfig, Walks, drive, walk
 from training.completion.trainer import COVERAGE, FitConfig, Trainer, fit_std, losses
 from training.completion.unet import UNet, fit
@@ -116,10 +116,21 @@ def test_the_standard_deviation_is_fitted_to_hold_95_percent():
     assert free.grad is None
 
 
+def test_cells_to_calibrate_with_are_drawn_evenly():
+    maps, generator = flat_map(40, 60), torch.Generator().manual_seed(0)
+    cells = draw_evenly(maps, generator)[0]
+    unknown = int((~maps.layers.validity).sum())
+    assert len(cells.truth) == pytest.approx(0.01 * unknown, rel=0.15)
+    assert bool((cells.truth == 0.1).all()) and bool((cells.weight == 1).all())
+    steps = cells.seen.around.distance[cells.seen.around.is_known > 0].view(-1)
+    assert float(steps.min()) == pytest.approx(0.08) and float(steps.max()) > 1.5, "near and far ones"
+
+
 def test_a_network_learns_a_step(tmp_path):
     """All unknown ground is 1.5 cm higher: after some steps, the network says so, and how sure that is."""
     maps, generator = flat_map(rise=0.015), torch.Generator().manual_seed(0)
-    cells = draw_unknown(maps, generator)[0], draw_measured(maps, generator)[0]
+    unknown = draw_unknown(maps, generator)[0]
+    cells = unknown, draw_measured(maps, generator)[0], unknown
     trainer = Trainer(*cells, FitConfig(steps=150, unknown_per_step=128, measured_per_step=32))
     trainer.run(tmp_path)
     with torch.no_grad():
@@ -131,7 +142,8 @@ def test_a_network_learns_a_step(tmp_path):
 
 def test_a_training_resumes_without_a_difference(tmp_path):
     maps, generator = flat_map(), torch.Generator().manual_seed(0)
-    cells = draw_unknown(maps, generator)[0], draw_measured(maps, generator)[0]
+    unknown = draw_unknown(maps, generator)[0]
+    cells = unknown, draw_measured(maps, generator)[0], unknown
     cfg = FitConfig(steps=6, unknown_per_step=32, measured_per_step=8)
     whole, first, second = (Trainer(*cells, cfg) for _ in range(3))
     for trainer, steps in ((whole, 6), (first, 3)):
