@@ -17,7 +17,7 @@ from torchelev.errors import message, require
 from torchelev.output_files import atomic_file
 from training.resume import CHECKPOINT, deferred_interrupt
 
-_ENCODER = "cnn"  # of configurations and checkpoints that name none
+_DEFAULTS = {"encoder": "cnn", "fill": "base"}  # of configurations and checkpoints that name none
 _HINT = "use the settings that it was trained with"
 _LOGGER_STATE = ("tot_timesteps", "tot_time", "rewbuffer", "lenbuffer", "cur_reward_sum", "cur_episode_length")
 
@@ -101,7 +101,8 @@ class ResumableRunner(OnPolicyRunner):
         shapes = {name: tuple(value.shape[1:]) for name, value in sorted(self.env.get_observations().items())}
         task = self.env.task
         settings = {"perception": task.perception, "num_envs": task.num_envs, "processes": self.gpu_world_size}
-        return {"observations": shapes, **settings, "encoder": self.cfg.get("encoder", _ENCODER)}
+        named = {name: self.cfg.get(name, default) for name, default in _DEFAULTS.items()}
+        return {"observations": shapes, **settings, **named}
 
     def _snapshot(self) -> dict[str, Any]:
         cuda = str(self.device).startswith("cuda")
@@ -117,15 +118,15 @@ class ResumableRunner(OnPolicyRunner):
         """Continue from a `checkpoint.pt`.
 
         Raises:
-            ValueError: the checkpoint is damaged, has other observations, weights of other sizes, another perception or
-                encoder, or another number of environments or processes; nothing has changed then.
+            ValueError: the checkpoint is damaged, has other observations, weights of other sizes, another perception,
+                encoder or fill, or another number of environments or processes; nothing has changed then.
         """
         path = self._own(Path(path))
         saved = _read(path, self.device)
         found: Any = saved.get("infos")
         require(found is not None, "checkpoint", "must hold the environments", str(path), f"give a {CHECKPOINT}")
         for name, expected in self._kind().items():
-            actual = ({"encoder": _ENCODER} | found["kind"])[name]
+            actual = (_DEFAULTS | found["kind"])[name]
             require(actual == expected, "checkpoint", f"must be of {name} {expected}", actual, _HINT)
         _require_sizes(saved, self.alg.save())
         self.load(str(path), map_location=self.device)

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from torchelev.errors import require
+from torchelev.observations.fill import FILLS
 from torchelev.sim import CourseConfig
 
 PERCEPTION = ("map", "truth", "blind")
@@ -57,11 +58,16 @@ class SightConfig:
     sensor_errors: str = "depth_camera"  #: preset of torchelev.sim
     pose_errors: str = "leg_odometry"  #: preset of torchelev.sim
     truth_noise: float = 0.1  #: [m] amplitude of the uniform noise on the heights of perception "truth"
+    #: what the elevation of perception "map" reads where the map is unknown, by the rules of `HeightScan`: "base" for
+    #: the nominal ground below the base, "inpaint", "completed", ...; the validity tells in any case what is unknown
+    fill: str = "base"
 
     def __post_init__(self) -> None:
         extent = 2 * math.hypot(self.crop_length / 2 + abs(self.crop_ahead), self.crop_length / 2)
         rule = f"must hold the crop at any heading, {extent:.2f} m and two cells"
         require(extent + 2 * self.resolution <= self.window, "sight.window", rule, self.window, "enlarge it")
+        rule = f"must be one of {', '.join(FILLS)}"
+        require(self.fill in FILLS, "sight.fill", rule, repr(self.fill), "use base")
 
 
 @dataclass(frozen=True, kw_only=True)

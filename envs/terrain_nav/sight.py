@@ -1,7 +1,8 @@
 """What TerrainNav's robots see: their map, the true ground with white noise, or nothing.
 
 Each sight returns an image (B, 4, n, n) of the same crop in the base's yaw frame: elevation and upper bound relative to
-the ground under the base [m], validity, traversability. `sense` takes a measurement and draws all random numbers;
+the ground under the base [m], validity, traversability. Unknown pixels are 0 in all of them, but for the elevation of
+`MapSight`, which `SightConfig.fill` fills. `sense` takes a measurement and draws all random numbers;
 `image` only reads.
 """
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 
 from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.course import RatedCourse
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig, MapImage
+from torchelev import CompletionConfig, ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
 from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, mount_on_rim, preset
 
 LAYERS = ("elevation", "upper_bound", "validity", "traversability")
@@ -29,6 +30,15 @@ def _make_crop(cfg: TerrainNavConfig) -> MapImage:
         layers=LAYERS,
         nominal_height=cfg.robot.body_height,
     )
+
+
+def _make_filled_scan(cfg: TerrainNavConfig, crop: MapImage) -> HeightScan | None:
+    """Return the scan that reads the crop's elevation and fills it; None for "base", where the crop reads 0 already."""
+    if cfg.sight.fill == "base":
+        return None
+    points = crop.xy(torch.eye(4)[None])[0]
+    # A scan counts downwards from the nominal height, an image upwards.
+    return HeightScan.points(points, nominal_height=cfg.robot.body_height, scale=-1.0, fill=cfg.sight.fill)
 
 
 class BlindSight(nn.Module):
@@ -109,7 +119,9 @@ class MapSight(BlindSight):
         super().__init__(cfg, course, num_envs)
         sight, device = cfg.sight, course.field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
-        self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs, device)
+        completion = CompletionConfig() if sight.fill == "completed" else None
+        self.emap = ElevationMap(ElevationMapConfig(grid=grid, completion=completion), num_envs, device)
+        self.filled_scan = _make_filled_scan(cfg, self.crop)
         if compiled:
             self.emap.compile()
         camera = DepthCamera(*sight.camera_pixels, *sight.camera_fov_deg, max_range=sight.max_range)
@@ -149,8 +161,12 @@ class MapSight(BlindSight):
         return torch.stack(clouds, 1), torch.stack(poses, 1)
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
-        """Return the image of the map."""
-        return self.crop(self.emap, self.T_estimated)
+        """Return the image of the map, its elevation filled where it is unknown."""
+        image = self.crop(self.emap, self.T_estimated)
+        if self.filled_scan is None:
+            return image
+        elevation, _ = self.filled_scan(self.emap, self.T_estimated)
+        return torch.cat([elevation.view_as(image[:, :1]), image[:, 1:]], 1)
 
 
 SIGHTS: dict[str, type[BlindSight]] = {"map": MapSight, "truth": TruthSight, "blind": BlindSight}

@@ -8,6 +8,7 @@ import torch
 
 from envs.terrain_nav import SightConfig, TerrainNav, TerrainNavConfig
 from tests.envs.terrain_nav_cases import FLAT, SMALL
+from torchelev.observations.fill import FILLS
 
 
 @pytest.mark.parametrize("perception", ["map", "truth", "blind"])
@@ -108,3 +109,31 @@ def test_the_map_is_placed_by_odometry_that_drifts():
     assert float(errors[-1].min()) > 1e-3 and float(errors[-1].mean()) > 2 * float(errors[0].mean())
     expected = torch.linalg.vector_norm(task.goal - task.xy, dim=-1) / 5  # where the goal is does not drift
     torch.testing.assert_close(task.observe()["policy"][:, 2], expected)
+
+
+@pytest.mark.slow(2)
+@pytest.mark.parametrize("fill", FILLS)
+def test_a_fill_changes_the_elevation_of_unknown_pixels_alone(fill):
+    plain, filled = (
+        TerrainNav(TerrainNavConfig(course=SMALL, sight=SightConfig(fill=name)), 3) for name in ("base", fill)
+    )
+    for task in (plain, filled):
+        for _ in range(3):
+            task.advance(torch.ones(3, 2))
+            task.sense()
+    image, usual = filled.observe()["map"], plain.observe()["map"]
+    known = usual[:, 2] == 1
+    assert 0.1 < float(known.float().mean()) < 0.9
+    assert torch.equal(image[:, 1:], usual[:, 1:]) and not bool(usual[:, 0][~known].any())
+    torch.testing.assert_close(image[:, 0][known], usual[:, 0][known], atol=1e-6, rtol=0)
+    assert bool(image[:, 0][~known].any()) == (fill != "base")
+
+
+def test_completed_pixels_are_those_of_the_completed_map():
+    task = TerrainNav(TerrainNavConfig(course=SMALL, sight=SightConfig(fill="completed")), 2)
+    task.advance(torch.ones(2, 2))
+    task.sense()
+    sight, image = task.sight, task.observe()["map"]
+    completed = dataclasses.replace(sight.crop, layers=("completed",))(sight.emap, sight.T_estimated)[:, 0]
+    unknown = image[:, 2] == 0
+    torch.testing.assert_close(image[:, 0][unknown], completed[unknown], atol=1e-6, rtol=0)

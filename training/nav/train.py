@@ -9,9 +9,10 @@ from typing import Any
 import click
 import torch
 
-from envs.terrain_nav import CourseConfig, TerrainNav, TerrainNavConfig
+from envs.terrain_nav import CourseConfig, SightConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.config import PERCEPTION
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
+from torchelev.observations.fill import FILLS
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export
@@ -48,9 +49,10 @@ def ppo_config(num_steps: int = 24, save_interval: int = 10, encoder: str = "cnn
     }
 
 
-def task_config(held_out: bool = False) -> TerrainNavConfig:
-    """Return the task on the training course, or on the held-out one."""
-    return TerrainNavConfig(course=CourseConfig(seed=_HELD_OUT_SEED if held_out else _TRAIN_SEED))
+def task_config(held_out: bool = False, fill: str = "base") -> TerrainNavConfig:
+    """Return the task on the training course, or on the held-out one, with a fill of `SightConfig`."""
+    course = CourseConfig(seed=_HELD_OUT_SEED if held_out else _TRAIN_SEED)
+    return TerrainNavConfig(course=course, sight=SightConfig(fill=fill))
 
 
 def make_runner(
@@ -61,12 +63,13 @@ def make_runner(
     log_dir: Path | None,
     compiled: bool = True,
     encoder: str = "cnn",
+    fill: str = "base",
 ) -> ResumableRunner:
     """Return a runner with its environments, all seeded."""
     rank = int(os.environ.get("RANK", "0"))
     torch.manual_seed(seed + 1000 * rank)
-    task = TerrainNav(task_config(), num_envs, device, perception, seed + 1000 * rank, compiled)
-    settings = ppo_config(encoder=encoder)
+    task = TerrainNav(task_config(fill=fill), num_envs, device, perception, seed + 1000 * rank, compiled)
+    settings = ppo_config(encoder=encoder) | {"fill": fill}
     return ResumableRunner(RslRlTerrainNav(task), settings, str(log_dir) if log_dir else None, device)
 
 
@@ -93,6 +96,13 @@ def make_runner(
     show_default=True,
     help="How the policy reads the map's image.",
 )
+@click.option(
+    "--fill",
+    type=click.Choice(FILLS),
+    default="base",
+    show_default=True,
+    help="What the image's elevation reads where the map is unknown.",
+)
 @click.option("--seed", default=0, show_default=True, help="Seed of weights, starts, goals and noise.")
 @click.option("--device", default=None, help="Default: a GPU if there is one, else the CPU.")
 @click.option(
@@ -106,6 +116,7 @@ def main(
     iterations: int,
     perception: str,
     encoder: str,
+    fill: str,
     seed: int,
     device: str | None,
     out: Path,
@@ -125,7 +136,7 @@ def main(
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
     checkpoint = checkpoint_path(out, resume)
-    runner = make_runner(num_envs, perception, seed, device, out, compiled, encoder)
+    runner = make_runner(num_envs, perception, seed, device, out, compiled, encoder, fill)
     if resume:
         try:
             runner.resume(checkpoint)
@@ -141,15 +152,15 @@ def main(
             raise click.ClickException(f"stopped; {checkpoint} is saved, continue with --resume") from None
     runner.close()
     if int(os.environ.get("RANK", "0")) == 0:
-        _finish(runner, out, episodes, compiled)
+        _finish(runner, out, episodes, compiled, task_config(held_out=True, fill=fill))
 
 
-def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> None:
-    """Evaluate with the map in the loop, draw an episode and export the policy."""
+def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool, cfg: TerrainNavConfig) -> None:
+    """Evaluate on held-out ground with the map in the loop, draw an episode and export the policy."""
     policy = runner.get_inference_policy(device=runner.device)
-    result = evaluate(policy, task_config(held_out=True), "map", episodes, runner.device, compiled)
+    result = evaluate(policy, cfg, "map", episodes, runner.device, compiled)
     click.echo(" ".join(f"{name} {value:.3f}" for name, value in result.items() if value is not None))
-    picture(policy, task_config(held_out=True), out / "episode.png", runner.device)
+    picture(policy, cfg, out / "episode.png", runner.device)
     export(runner, out)
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
     write_result(out / "result.json", {"training": training, "evaluation": result})

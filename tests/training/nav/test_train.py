@@ -16,7 +16,7 @@ def invoke(*arguments):
 
 @pytest.mark.slow(10)
 def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkeypatch):
-    monkeypatch.setattr(nav, "task_config", lambda held_out=False: CFG)
+    monkeypatch.setattr(nav, "task_config", lambda **settings: CFG)
     out = tmp_path / "run"
     common = ("--num-envs", 4, "--out", out, "--episodes", 4, "--perception", "map")
     assert invoke(*common, "--iterations", 2).exit_code == 0
