@@ -14,6 +14,7 @@ SHORTER = {
     "BATCHES, STEPS = 24, 600": "BATCHES, STEPS = 1, 3",
     "range(4)]": "range(1)]",
     "STEPS = 1000": "STEPS = 3",
+    "WALKS, STEPS = 12, 1500": "WALKS, STEPS = 1, 3",
 }
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 

@@ -30,8 +30,7 @@ from training.completion.stairs import NUM_EDGES, WINDOW, SeenStairs, Stairs, lo
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-# Fixed before the first full run.
-RISES, RUNS, SEEDS = (0.12, 0.16, 0.2), (0.25, 0.3, 0.36), 10  # [m], [m]
+RISES, RUNS, SEEDS = (0.12, 0.16, 0.2), (0.25, 0.3, 0.36), 10  # [m], [m], robots for each of the stairs
 NAME = "completion_edges"  # of the result
 TRUE_CELLS = "true cells"  # the true heights at the cells' centers: what the resolution leaves
 CLOSE = 0.02  # [m]
