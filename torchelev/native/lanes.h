@@ -71,7 +71,7 @@ inline Lanes sigmoid(Lanes x) { return 1 / (1 + exp(-x)); }
 
 // sign(x) log(1 + |x| / scale)
 inline Lanes squash(Lanes x, float scale) {
-    const Lanes y = log(1 + absolute(x) / scale);
+    const Lanes y = log(1 + absolute(x) * (1 / scale));
     return pick(x < 0, -y, y);
 }
 

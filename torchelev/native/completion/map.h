@@ -124,7 +124,7 @@ inline void look_around(const Map& map, const Cells& cells, Surroundings& around
             const int more = std::max(3, int(std::nearbyint(REACHES[r] / length)));
             const Lanes far = read(steps + more);
             around.has_slope[r][d] = one_if(far < UNKNOWN);
-            around.slope[r][d] = pick(far < UNKNOWN, (height - far) / (more * length), all(0));
+            around.slope[r][d] = pick(far < UNKNOWN, (height - far) * (1 / (more * length)), all(0));
         }
     }
 }
@@ -153,16 +153,20 @@ inline void describe(const Map& map, const Cells& cells, Context& context) {
             const Sums square = corner(bottom, right) - corner(bottom, left) - corner(top, right) + corner(top, left);
             for (int k = 0; k < NUM_SUMS; k++) sums[k][l] = square[k];
         }
+        const double per_area = 1 / area;
+        Lanes variance, third, pairs;
         for (int l = 0; l < LANES; l++) {
-            const double count = std::max(sums[0][l], 1.0), mean = sums[4][l] / count;
-            const double variance = std::max(sums[5][l] / count - mean * mean, 0.0);
-            const double third = sums[6][l] / count - 3 * mean * variance - mean * mean * mean;
-            const double spread = std::sqrt(variance + double(SMALLEST_STD) * SMALLEST_STD);
-            context.known[r][l] = float(sums[0][l] / area), context.bounded[r][l] = float(sums[1][l] / area);
-            context.step[r][l] = float(sums[3][l] / std::max(sums[2][l], 1.0));
-            context.std[r][l] = float(spread - SMALLEST_STD);
-            context.skewness[r][l] = float(third / (spread * spread * spread));
+            const double per_cell = 1 / std::max(sums[0][l], 1.0), mean = sums[4][l] * per_cell;
+            const double spread = sums[5][l] * per_cell - mean * mean;
+            variance[l] = float(std::max(spread, 0.0));
+            third[l] = float(sums[6][l] * per_cell - 3 * mean * std::max(spread, 0.0) - mean * mean * mean);
+            context.known[r][l] = float(sums[0][l] * per_area), context.bounded[r][l] = float(sums[1][l] * per_area);
+            context.step[r][l] = float(sums[3][l]), pairs[l] = float(std::max(sums[2][l], 1.0));
             context.mean[r][l] = mean;
         }
+        const Lanes spread = root(variance + float(SMALLEST_STD) * float(SMALLEST_STD));
+        context.step[r] /= pairs;
+        context.std[r] = spread - float(SMALLEST_STD);
+        context.skewness[r] = third / (spread * spread * spread);
     }
 }

@@ -54,15 +54,16 @@ inline Answer predict(const Weights& weights, const Map& map, const Cells& cells
 
     // What each direction proposes and what the network makes of it.
     Lanes candidates[NUM_CANDIDATES][NUM_DIRECTIONS], exists[NUM_CANDIDATES][NUM_DIRECTIONS];
-    Lanes views[NUM_DIRECTIONS][VIEWS], pooled[NUM_POOLED];
+    Lanes views[NUM_DIRECTIONS][VIEWS], pooled[NUM_POOLED], across;
     for (int d = 0; d < NUM_DIRECTIONS; d++) {
         const int o = d ^ 1;
         const Lanes known = around.known[d], both = known * around.known[o];
-        const Lanes share = distance[o] / larger(distance[d] + distance[o], all(1e-6f)) * both;
+        if (d < o) across = both / larger(distance[d] + distance[o], all(1e-6f));
+        const Lanes share = distance[o] * across;
         const Lanes step = (height[o] - height[d]) * both;
         candidates[0][d] = height[d], exists[0][d] = known;
         candidates[1][d] = height[d] + (1 - share) * step, exists[1][d] = both;
-        Lanes features[NUM_VIEW] = {known, near[d], log(1 + distance[d] / NEAR_STEP), squash(height[d], SQUASH),
+        Lanes features[NUM_VIEW] = {known, near[d], log(1 + distance[d] * (1 / NEAR_STEP)), squash(height[d], SQUASH),
                                     squash(height[d] - low, SQUASH) * known, both, share, squash(step, SQUASH)};
         for (int r = 0; r < NUM_REACHES; r++) {
             const Lanes slope = clamp(around.slope[r][d], -STEEPEST, STEEPEST);
@@ -79,7 +80,7 @@ inline Answer predict(const Weights& weights, const Map& map, const Cells& cells
             pooled[VIEWS + k] = d ? larger(pooled[VIEWS + k], views[d][k]) : views[d][k];
         }
     }
-    for (int k = 0; k < VIEWS; k++) pooled[k] /= NUM_DIRECTIONS;
+    for (int k = 0; k < VIEWS; k++) pooled[k] *= 1.0f / NUM_DIRECTIONS;
 
     // What it knows of the cell.
     Lanes num_known{};
@@ -87,8 +88,8 @@ inline Answer predict(const Weights& weights, const Map& map, const Cells& cells
     Lanes* cell = pooled + 2 * VIEWS;
     const Lanes usual = all(float(map.resolution) / USUAL);
     for (Lanes value : {squash(high - low, SQUASH), squash(low, SQUASH), is_bounded,
-                        squash(bound - low, SQUASH) * is_bounded, squash(bound, SQUASH), log(1 + nearest / NEAR_STEP),
-                        log(usual), num_known / NUM_DIRECTIONS})
+                        squash(bound - low, SQUASH) * is_bounded, squash(bound, SQUASH), log(1 + nearest * (1 / NEAR_STEP)),
+                        log(usual), num_known * (1.0f / NUM_DIRECTIONS)})
         *cell++ = value;
     for (int r = 0; r < NUM_RADII; r++) {
         const Lanes values[] = {context.known[r],           context.bounded[r], squash(context.step[r], SMALL_STEP),
@@ -129,12 +130,13 @@ inline Answer predict(const Weights& weights, const Map& map, const Cells& cells
     for (int v = 0; v < NUM_CANDIDATES; v++)
         for (int d = 0; d < NUM_DIRECTIONS; d++) votes[v][d] = count(votes[v][d], candidates[v][d]);
     for (int r = 0; r < NUM_RADII; r++) of_squares[r] = count(of_squares[r], squares[r]);
-    answer /= voters;
+    const Lanes per_voter = 1 / voters;
+    answer *= per_voter;
     auto deviate = [&](Lanes share, Lanes candidate) { spread += share * (candidate - answer) * (candidate - answer); };
     for (int v = 0; v < NUM_CANDIDATES; v++)
         for (int d = 0; d < NUM_DIRECTIONS; d++) deviate(votes[v][d], candidates[v][d]);
     for (int r = 0; r < NUM_RADII; r++) deviate(of_squares[r], squares[r]);
-    spread = spread / voters + NO_SPREAD * NO_SPREAD;
+    spread = spread * per_voter + NO_SPREAD * NO_SPREAD;
 
     Lanes last[2];  // correction and factor on the spread
     affine<2, CELLS>(weights.answer, weights.answer_bias, inner, last);

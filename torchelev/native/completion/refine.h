@@ -20,13 +20,13 @@ inline void refine(const Weights& weights, const Map& map, int i) {
             tilt += pick(both, absolute(ahead - behind), all(0));
         };
         for (int to : {map.stride + 1, map.stride, map.stride - 1, 1}) add(to);
-        const Lanes at_least_one = larger(pairs, all(1));
-        bend /= at_least_one, rough /= at_least_one, tilt /= at_least_one;
+        const Lanes per_pair = 1 / larger(pairs, all(1));
+        bend *= per_pair, rough *= per_pair, tilt *= per_pair;
         const Lanes variance = pick(known, load(map.layers.variance + place, count), all(0));
         const Lanes age = pick(known, load(map.layers.age + place, count), all(0));
         const Lanes sigma = root(larger(variance, all(MIN_STD * MIN_STD)));
         const Lanes features[NUM_MEASURED] = {log(sigma), absolute(bend) / (absolute(bend) + sigma),
-                                              squash(rough, 0.01f), squash(tilt, SQUASH), pairs / 4,
+                                              squash(rough, 0.01f), squash(tilt, SQUASH), pairs * 0.25f,
                                               log(1 + clamp(age, 0, LONG_AGO)),
                                               log(all(float(map.resolution) / USUAL))};
         Lanes channels[MEASURED], answer[2];
