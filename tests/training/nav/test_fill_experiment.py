@@ -21,7 +21,7 @@ def small_task(held_out=False, fill="base"):
 def result():
     """Success 0.5 to 0.9 with the nominal ground, 0.6 to 1.0 inpainted, 0.7 to 1.1 completed."""
     rows = []
-    for fill, seed in experiment.CASES:
+    for fill, seed in experiment.cases(3):
         success = 0.5 + 0.1 * FILLS.index(fill) + 0.2 * seed
         deployed = {"success": success, "fallen": 1 - success, "stuck": 0.0, "truncated": 0.0}
         curve = {"steps": [100, 200], "success": [0.0, success]}
@@ -32,7 +32,7 @@ def result():
 
 
 def test_every_fill_gets_the_same_training(tmp_path):
-    jobs = experiment._jobs(tmp_path)
+    jobs = experiment._jobs(tmp_path, 3)
     assert len({job.folder for job in jobs}) == len(jobs) == len(FILLS) * len(experiment.SEEDS)
     others = [{name: value for name, value in job.arguments.items() if name != "--fill"} for job in jobs]
     assert all(others.count(other) == len(FILLS) for other in others)
@@ -40,7 +40,7 @@ def test_every_fill_gets_the_same_training(tmp_path):
 
 def test_the_table_has_the_mean_and_the_extremes():
     lines = experiment.table(result()).split("\n")
-    expected = "| inpainted | 8.0 cm | 80.0 % (60.0 to 100.0) | 20.0 % | 0.0 % | 0.0 % | 2 |"
+    expected = "| inpainted | 8.0 cm | 3 | 80.0 % (60.0 to 100.0) | 20.0 % | 0.0 % | 0.0 % | 2 |"
     assert lines[3] == expected and len(lines) == 5
 
 
@@ -55,13 +55,11 @@ def test_trains_two_iterations_with_each_fill_and_deploys(tmp_path, monkeypatch)
     for module in (nav, experiment):
         monkeypatch.setattr(module, "task_config", small_task)
     monkeypatch.setattr(experiment, "evaluate", lambda *args, **_: nav.evaluate(*args[:3], episodes=4))
-    monkeypatch.setattr(experiment, "SEEDS", (0,))
-    monkeypatch.setattr(experiment, "CASES", [(fill, 0) for fill in FILLS])
-    for job in experiment._jobs(tmp_path):
+    for job in experiment._jobs(tmp_path, 1):
         options = {**job.arguments, "--iterations": 2, "--num-envs": 4, "--episodes": 4, "--out": job.folder}
         arguments = [str(part) for option in options.items() for part in option]
         assert CliRunner().invoke(nav.main, [*arguments, "--no-compile"], catch_exceptions=False).exit_code == 0
-    found = experiment.deploy_all(tmp_path)
+    found = experiment.deploy_all(tmp_path, 1)
     assert [row["fill"] for row in found["rows"]] == list(FILLS) and len(experiment.table(found).split("\n")) == 5
     assert all(row["training"]["steps"] == 2 * 24 * 4 and len(row["curve"]["steps"]) == 2 for row in found["rows"])
     assert len({round(error, 6) for error in found["unknown_error_m"].values()}) == len(FILLS)
