@@ -41,7 +41,7 @@ from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.completion import edges
 from training.completion import evaluate as filling
-from training.nav import encoder_experiment, experiment
+from training.nav import encoder_experiment, experiment, fill_experiment
 from training.quadruped import experiment as legs
 from training.quadruped import step_time
 from training.traversability import block, evaluate
@@ -158,6 +158,7 @@ TABLES = {
     "legs_walk": _made_by(legs.walk_table, "quadruped", folder=training.RESULTS),
     "legs_step_time": _made_by(step_time.table, "quadruped-step-time", folder=training.RESULTS),
     "encoder_success": _made_by(encoder_experiment.table, "encoders", folder=training.RESULTS),
+    "fill": _made_by(fill_experiment.table, "fill", folder=training.RESULTS),
     "encoder_cost": _made_by(encoders.table, "encoders", "rows"),
     "sight": _made_by(sight.table, "sight", "rows"),
     "mjlab": _made_by(mjlab_task.table, "mjlab"),
