@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterator
 import torch
 
 SETTINGS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")  # the environment's; where one is set, waits are left alone
-BUSY, FREE = 3, 10  # samples in a row before waits become short, and updates in a row before they become long
-_PAUSE = 2e-4  # [s] between samples; most of what the system itself does is over by then
+BUSY, FREE = 6, 10  # samples in a row before waits become short, and updates in a row before they become long
+_PAUSE = 5e-4  # [s] between samples; what the system itself does is mostly over by the last one
 _SPIN = 0.02  # [s] longest spinning after an update, until less has been seen
 _TAIL = 0.002  # [s] how much earlier than an update its last team may end
 _PARALLEL = 2**16  # elements; torch shares an operation on so many between all threads
