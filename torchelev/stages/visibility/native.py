@@ -119,9 +119,9 @@ def _polar(polar: PolarGrid) -> tuple[_Polar, list[Tensor]]:
     cosine, sine = accepted_rays.directions(near_azimuths, width)
     tensors = [torch.tensor(polar.widen, dtype=torch.int32), width, entry, cosine, sine]
     tensors = [value.contiguous() for value in tensors]
-    widen, width, entry, cosine, sine = (value.data_ptr() for value in tensors)
+    pointers = [value.data_ptr() for value in tensors]
     size = polar.ranges, polar.azimuths, len(polar.widen)
-    return _Polar(*size, widen, width, entry, near_ranges, near_azimuths, cosine, sine), tensors
+    return _Polar(*size, *pointers[:3], near_ranges, near_azimuths, *pointers[3:]), tensors
 
 
 def clear(
