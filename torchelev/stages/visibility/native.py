@@ -47,10 +47,16 @@ class _Settings(ctypes.Structure):
     ]
 
 
-@torch.compiler.assume_constant_result
-def is_available() -> bool:
-    """Tell whether there is a library."""
-    return _library() is not None
+class Availability:
+    """Whether there is a library, as it was found before the compiler came: graphs cannot look for it."""
+
+    found = False
+
+
+def look_for_library() -> bool:
+    """Tell whether there is a library, which is built if there is none yet; compiled updates then use it, too."""
+    Availability.found = _library() is not None
+    return Availability.found
 
 
 def _library() -> ctypes.CDLL | None:
@@ -64,7 +70,9 @@ def can_run(state: MapState, m: Measurement) -> bool:
     is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in floats)
     is_plain = torch.compiler.is_compiling() or type(state.elevation) is Tensor
     fits = state.elevation.device.type == "cpu" and state.elevation.dtype == m.points.dtype == torch.float32
-    return fits and is_plain and not is_differentiated and is_available()
+    if not (fits and is_plain) or is_differentiated:
+        return False
+    return Availability.found if torch.compiler.is_compiling() else look_for_library()
 
 
 @torch.library.custom_op("torchelev::clear_seen_through", mutates_args=())
