@@ -39,6 +39,7 @@ from benchmarks.speed import (
 )
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
+from training.completion import edges
 from training.completion import evaluate as filling
 from training.nav import encoder_experiment, experiment
 from training.quadruped import experiment as legs
@@ -147,6 +148,7 @@ TABLES = {
     "site_ranks": _made_by(site_ranks.table, "site_ranks"),
     "real_merged": _made_by(merged.table, "real_merged", "rows"),
     "completion": _made_by(filling.summary, "completion", folder=training.RESULTS),
+    "completion_edges": _made_by(edges.table, edges.NAME, folder=training.RESULTS),
     "completion_speed": _made_by(completion.table, "completion_speed", "rows"),
     "real_completed": _made_by(completed.table, "real_completed", "rows"),
     "nav": _made_by(experiment.table, "nav", folder=training.RESULTS),

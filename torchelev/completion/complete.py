@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.completion import native
 from torchelev.completion.context import describe, sum_layers
 from torchelev.completion.parameters import Weights
 from torchelev.completion.predict import Seen, predict
@@ -49,16 +50,28 @@ def complete(weights: Weights, layers: CompletionInput, resolution: float) -> Co
         layers: the maps.
         resolution: [m].
     """
-    known, bounded = layers.validity, layers.bounded & ~layers.validity
-    of_cells = torch.full_like(layers.elevation, resolution)
-    mean, std = refine(weights, layers.elevation, known, layers.variance, layers.age, of_cells)
-    unseen = Unseen(layers.elevation, known, layers.upper_bound, bounded, resolution)
     if _may_choose_cells(weights, layers):
-        return _fill_unknown(weights, unseen, Completion(mean.contiguous(), std.contiguous()))
+        return Completion(*complete_on_cpu(list(weights), list(layers), resolution))
+    known = layers.validity
+    unseen, (mean, std) = _prepare(weights, layers, resolution)
     places = torch.arange(known.numel(), device=known.device).split(_AT_A_TIME_ON_GPU)
     parts = [predict(weights, unseen.read(place)) for place in places]
     predicted = [torch.cat(values).view_as(mean) for values in zip(*parts, strict=True)]
     return Completion(*(torch.where(known, old, new) for old, new in zip((mean, std), predicted, strict=True)))
+
+
+@torch.library.custom_op("torchelev::complete_on_cpu", mutates_args=())
+def complete_on_cpu(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[Tensor, Tensor]:
+    """Return the same without gradients: in C++ where that can be built, else by tensors of the unknown cells alone."""
+    fields, named = Weights(*weights), CompletionInput(*layers)
+    fast = native.complete(fields, layers, resolution)
+    return _fill_unknown(fields, *_prepare(fields, named, resolution)) if fast is None else fast
+
+
+@complete_on_cpu.register_fake
+def _(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[Tensor, Tensor]:
+    shape = layers[0].shape
+    return layers[0].new_empty(shape), layers[0].new_empty(shape)
 
 
 @torch.no_grad()
@@ -70,6 +83,15 @@ def _fill_unknown(weights: Weights, unseen: Unseen, refined: Completion) -> Comp
         for layer, value in zip(refined, values, strict=True):
             layer.view(-1).index_copy_(0, place, value)
     return refined
+
+
+def _prepare(weights: Weights, layers: CompletionInput, resolution: float) -> tuple[Unseen, Completion]:
+    """Return what predicts the unknown cells, and the measured cells refined."""
+    known, bounded = layers.validity, layers.bounded & ~layers.validity
+    of_cells = torch.full_like(layers.elevation, resolution)
+    mean, std = refine(weights, layers.elevation, known, layers.variance, layers.age, of_cells)
+    unseen = Unseen(layers.elevation, known, layers.upper_bound, bounded, resolution)
+    return unseen, Completion(mean.contiguous(), std.contiguous())
 
 
 class Unseen:
@@ -96,6 +118,6 @@ class Unseen:
 
 
 def _may_choose_cells(weights: Weights, layers: CompletionInput) -> bool:
-    """Tell whether the number of computed cells may depend on the data: on a CPU, without gradients and compiler."""
+    """Tell whether the number of computed cells may depend on the data: on a CPU, without gradients."""
     is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in (*weights, *layers))
-    return layers.validity.device.type == "cpu" and not is_differentiated and not torch.compiler.is_compiling()
+    return layers.validity.device.type == "cpu" and not is_differentiated

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 RADII = (0.4, 1.2)  # [m] half the sides of the squares
 NUM_CONTEXT = 6 * len(RADII)
-_SMALLEST_STD = 0.01  # [m] below which the skewness fades
+SMALLEST_STD = 0.01  # [m] below which the skewness fades
 
 
 class Context(NamedTuple):
@@ -70,8 +70,8 @@ def describe(
         variance = (square - mean.square()).clamp(min=0)
         third = cube - 3 * mean * variance - mean**3
         area = (2 * cells + 1) ** 2
-        spread = (variance + _SMALLEST_STD**2).sqrt()
+        spread = (variance + SMALLEST_STD**2).sqrt()
         absolute = torch.where(known > 0, level.index_select(0, robot) + mean, 0.0)
-        values = known / area, bounded / area, steps / pairs.clamp(min=1), absolute, spread - _SMALLEST_STD
+        values = known / area, bounded / area, steps / pairs.clamp(min=1), absolute, spread - SMALLEST_STD
         described.append((*values, third / spread**3))
     return Context(*(torch.stack(values) for values in zip(*described, strict=True)))

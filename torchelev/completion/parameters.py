@@ -18,6 +18,7 @@ NUM_CELL = 8 + NUM_CONTEXT  # of a cell
 NUM_CANDIDATES = 2 + len(REACHES)  # heights that each direction proposes
 NUM_MEASURED = 7  # features of a measured cell
 USUAL = 0.04  # [m] resolution that the network's input is relative to
+SQUASH = 0.05  # [m] heights count about logarithmically beyond it
 _SMALL = 1e-6
 
 
@@ -83,7 +84,7 @@ def hidden(weight: Tensor, columns: Float[Tensor, "F *n"], bias: Tensor) -> Tens
     return torch.relu(affine(weight, columns, bias))
 
 
-def squash(height: Tensor, scale: float = 0.05) -> Tensor:
+def squash(height: Tensor, scale: float = SQUASH) -> Tensor:
     """Return sign(h) log(1 + |h| / scale): linear below the scale [m], logarithmic above it."""
     ratio = (height.abs() / scale).clamp(min=_SMALL)  # whose logarithm has a slope at 0, which a sign would not have
     return height / scale * (torch.log1p(ratio) / ratio)

@@ -14,16 +14,16 @@ from torchelev.completion.surroundings import Surroundings
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-_NOWHERE = 1e6  # [m]
-_STEP = 0.1  # [m] distances count about logarithmically beyond it
-_FARTHEST = 10.0  # [m] distances beyond it make no difference
-_STEEPEST = 1.5  # slope to which ground is continued
-_SMALL_STEP = 0.01  # [m] steps count about logarithmically beyond it
-_MARGIN = 0.02  # [m] by which an answer may leave the range of the heights around
-_NO_SPREAD = 0.01  # [m] of candidates that agree
-_FADE = 2.0  # [m] from measurements, where prior and prediction count the same
-_NO_VOTE = -1e4  # logit of a candidate that does not exist
-_LARGEST_LOG = 5.0  # of the network's factor on a spread
+NOWHERE = 1e6  # [m]
+STEP = 0.1  # [m] distances count about logarithmically beyond it
+FARTHEST = 10.0  # [m] distances beyond it make no difference
+STEEPEST = 1.5  # slope to which ground is continued
+SMALL_STEP = 0.01  # [m] steps count about logarithmically beyond it
+MARGIN = 0.02  # [m] by which an answer may leave the range of the heights around
+NO_SPREAD = 0.01  # [m] of candidates that agree
+FADE = 2.0  # [m] from measurements, where prior and prediction count the same
+NO_VOTE = -1e4  # logit of a candidate that does not exist
+LARGEST_LOG = 5.0  # of the network's factor on a spread
 
 
 class Seen(NamedTuple):
@@ -59,12 +59,12 @@ def predict(weights: Weights, seen: Seen) -> tuple[Float[Tensor, "n"], Float[Ten
 
     correction, factor = affine(weights.answer, cells, weights.answer_bias)
     has_any, bounded = heights.has_any, seen.bounded
-    answer = answer + torch.tanh(correction) * (heights.high - heights.low + _MARGIN)
+    answer = answer + torch.tanh(correction) * (heights.high - heights.low + MARGIN)
     answer = torch.where(has_any, answer, 0.0)
     answer = torch.where(bounded, torch.minimum(answer, heights.bound), answer)
-    log_std = 0.5 * spread.log() + factor.clamp(-_LARGEST_LOG, _LARGEST_LOG) + weights.calibration[0]
+    log_std = 0.5 * spread.log() + factor.clamp(-LARGEST_LOG, LARGEST_LOG) + weights.calibration[0]
     reach = heights.reach.square()
-    fade = reach / (reach + _FADE**2)
+    fade = reach / (reach + FADE**2)
     std = torch.exp((1 - fade) * log_std + fade * weights.prior)
     return heights.reference + answer, torch.where(has_any, std, weights.prior.exp())
 
@@ -80,7 +80,7 @@ class _Heights(NamedTuple):
     bound: Float[Tensor, "n"]  # upper bound, 0 where there is none
     squares: Float[Tensor, "R n"]  # means of the squares, 0 where there is none
     has_square: Float[Tensor, "R n"]  # 1 where there is one, else 0
-    distance: Float[Tensor, "8 n"]  # [m] of the next known cells, _FARTHEST at most
+    distance: Float[Tensor, "8 n"]  # [m] of the next known cells, FARTHEST at most
     reach: Float[Tensor, "n"]  # [m] of the nearest of these
     near: Float[Tensor, "8 n"]  # nearest distance over that of each
 
@@ -95,10 +95,10 @@ class _Proposals(NamedTuple):
 
 def _relate(seen: Seen) -> _Heights:
     around, context, known = seen.around, seen.context, seen.around.is_known
-    nowhere, has_any = _NOWHERE * (1 - known), known.amax(0) > 0
-    distance = around.distance.clamp(max=_FARTHEST)
+    nowhere, has_any = NOWHERE * (1 - known), known.amax(0) > 0
+    distance = around.distance.clamp(max=FARTHEST)
     reach = (around.distance + nowhere).amin(0)
-    nearest = reach.clamp(max=_FARTHEST)
+    nearest = reach.clamp(max=FARTHEST)
     near = nearest / distance.clamp(min=1e-6) * known
     # First from the lowest, so that altitude costs no precision.
     lowest = torch.where(has_any, (around.height + nowhere).amin(0), seen.level)
@@ -117,8 +117,8 @@ def _propose(around: Surroundings, heights: _Heights) -> _Proposals:
     both = known * opposite(known)
     share = opposite(distance) / (distance + opposite(distance)).clamp(min=1e-6) * both
     step = (opposite(height) - height) * both
-    slopes = around.slope.clamp(-_STEEPEST, _STEEPEST)
-    features = [known, heights.near, torch.log1p(distance / _STEP)]
+    slopes = around.slope.clamp(-STEEPEST, STEEPEST)
+    features = [known, heights.near, torch.log1p(distance / STEP)]
     features += [squash(height), squash(height - heights.low) * known, both, share, squash(step)]
     candidates = torch.cat([torch.stack([height, height + (1 - share) * step]), height + slopes * distance])
     exists = torch.cat([torch.stack([known, both]), around.has_slope])
@@ -129,12 +129,12 @@ def _describe_cell(seen: Seen, heights: _Heights) -> Float[Tensor, "F n"]:
     low, high, bound, is_bounded = heights.low, heights.high, heights.bound, seen.bounded.to(heights.bound.dtype)
     cell = [squash(high - low), squash(low), is_bounded, squash(bound - low) * is_bounded, squash(bound)]
     cell += [
-        torch.log1p(heights.reach.clamp(max=_FARTHEST) / _STEP),
+        torch.log1p(heights.reach.clamp(max=FARTHEST) / STEP),
         (seen.resolution / USUAL).log(),
         seen.around.is_known.mean(0),
     ]
     known, bounded, steps, _, stds, skewness = (values.to(bound.dtype) for values in seen.context)
-    squares = [known, bounded, squash(steps, _SMALL_STEP), squash(heights.squares), squash(stds), skewness]
+    squares = [known, bounded, squash(steps, SMALL_STEP), squash(heights.squares), squash(stds), skewness]
     return torch.cat([torch.stack(cell), *squares])
 
 
@@ -148,9 +148,9 @@ def _vote(
     votes = torch.cat([votes.flatten(0, 1), affine(weights.vote_square, cells, weights.vote_square_bias)])
     exists = torch.cat([proposals.exists.flatten(0, 1), heights.has_square])
     candidates = torch.cat([proposals.candidates.flatten(0, 1), heights.squares])
-    ballot = (votes * exists + _NO_VOTE * (1 - exists)).softmax(0)
+    ballot = (votes * exists + NO_VOTE * (1 - exists)).softmax(0)
     answer = (ballot * candidates).sum(0)
-    return answer, (ballot * (candidates - answer).square()).sum(0) + _NO_SPREAD**2
+    return answer, (ballot * (candidates - answer).square()).sum(0) + NO_SPREAD**2
 
 
 def opposite(values: Float[Tensor, "8 n"]) -> Float[Tensor, "8 n"]:

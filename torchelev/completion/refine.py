@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 _PAIRS = ((0, 7), (1, 6), (2, 5), (3, 4))  # opposite ones of `neighbours`
-_MIN_STD = 1e-3  # [m]
-_LONG_AGO = 60.0  # [s] ages count about logarithmically beyond a second, up to this
+MIN_STD = 1e-3  # [m]
+LONG_AGO = 60.0  # [s] ages count about logarithmically beyond a second, up to this
 
 
 def refine(
@@ -44,9 +44,9 @@ def refine(
     bend, rough, tilt = (
         sum_in_pairs(values) / count.clamp(min=1) for values in (bends, [bend.abs() for bend in bends], tilts)
     )
-    sigma = torch.where(known, variance, 0.0).clamp(min=_MIN_STD**2).sqrt()
+    sigma = torch.where(known, variance, 0.0).clamp(min=MIN_STD**2).sqrt()
     features = [sigma.log(), bend.abs() / (bend.abs() + sigma), squash(rough, 0.01), squash(tilt), count / 4]
-    features += [torch.log1p(torch.where(known, age, 0.0).clamp(0, _LONG_AGO)), (resolution / USUAL).log()]
+    features += [torch.log1p(torch.where(known, age, 0.0).clamp(0, LONG_AGO)), (resolution / USUAL).log()]
     flat = torch.stack(features).flatten(1)
     channels = hidden(weights.measured, flat, weights.measured_bias)
     gain, factor = (v.view_as(sigma) for v in affine(weights.measured_answer, channels, weights.measured_answer_bias))

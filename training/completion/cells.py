@@ -23,6 +23,7 @@ NUM_UNKNOWN, NUM_MEASURED = 768, 192  # cells of each map, at most
 _NEAR = 0.3  # [m] unknown cells are drawn with a probability of 1 / (distance + this)
 FARTHEST = 3.0  # [m] from known cells, of unknown ones
 MIN_ERROR = 0.005  # [m] added to the error by which errors are divided
+_SHARE = 0.01  # of the unknown cells, to calibrate with
 _KEPT = (0.05, 0.6)  # share of the cells that thinned maps keep
 _RAISED = (0.03, 3.0)  # [m] by which bounds are raised
 
@@ -82,10 +83,8 @@ def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells
     Errors weigh by the inverse of the mean error of the nearest known heights in the same map, so that each map counts
     the same, however deep its holes.
     """
-    layers, drawn = maps.layers, []
-    known = layers.validity
-    unseen = Unseen(layers.elevation, known, layers.upper_bound, layers.bounded & ~known, maps.resolution)
-    filled, _ = Filter("inpaint_nearest")((layers.elevation, known), resolution=maps.resolution)
+    drawn, unseen, known = [], _unseen(maps), maps.layers.validity
+    filled, _ = Filter("inpaint_nearest")((maps.layers.elevation, known), resolution=maps.resolution)
     distance = distances(maps)
     counts = maps.is_inside & ~known & (distance < FARTHEST)
     for b in range(len(known)):
@@ -97,6 +96,21 @@ def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells
         error = (filled.flatten()[chosen] - truth).abs().mean() + MIN_ERROR
         drawn.append(UnknownCells(unseen.read(chosen), truth, torch.full_like(truth, 1 / float(error))))
     return drawn
+
+
+def draw_evenly(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells]:
+    """Draw a fixed share of the unknown cells, each with the same probability and weight, to calibrate with."""
+    counts = maps.is_inside & ~maps.layers.validity & (distances(maps) < FARTHEST)
+    counts &= torch.rand(counts.shape, generator=generator) < _SHARE
+    chosen = counts.flatten().nonzero()[:, 0]
+    truth = maps.truth.flatten()[chosen]
+    return [UnknownCells(_unseen(maps).read(chosen), truth, torch.ones_like(truth))] if len(chosen) else []
+
+
+def _unseen(maps: TrueMap) -> Unseen:
+    layers = maps.layers
+    bounded = layers.bounded & ~layers.validity
+    return Unseen(layers.elevation, layers.validity, layers.upper_bound, bounded, maps.resolution)
 
 
 def draw_measured(maps: TrueMap, generator: torch.Generator) -> list[MeasuredCells]:

@@ -20,11 +20,14 @@ from torchelev.app.results import markdown_table, write_json
 from torchelev.completion.net import CompletionNet
 from torchelev.filters import Filter
 from training.completion.cells import FARTHEST, distances
-from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
+from training.completion.maps import YARD, YARD_CONFIG, TrueMap, WalkConfig, Walks, make_walks
 from training.options import jobs_option
 
-RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
-SPLITS = ("held_out", "unseen")
+SPLITS = {  # with the resolutions [m] of their maps
+    "held_out": (0.02, 0.04, 0.08),
+    "unseen": (0.02, 0.04, 0.08),
+    "held_out_yards": (0.04, 0.08),
+}
 DISTANCES = (0.0, 0.1, 0.3, 1.0, FARTHEST)  # [m] limits of the groups of unknown cells
 _SEED = 0  # of the maps, the same for all weights
 _WORST = 0.05  # share of the cells
@@ -36,6 +39,7 @@ FILLS = {
     "Navier-Stokes": "inpaint_navier_stokes",
 }
 COMPLETED = "CompletionNet"
+_SUFFIXES = {"held_out": "", "unseen": ", never trained on", "held_out_yards": ", in yards"}
 Answer: TypeAlias = Callable[[TrueMap], Sequence[Any]]  # mean (B, H, W) [m], and standard deviation or None
 
 
@@ -122,9 +126,9 @@ def evaluate(answers: dict[str, Answer], data: Path, num_walks: int, jobs: int) 
     """
     answers = answers | {name: fill(name) for name in FILLS}
     result: dict[str, Any] = {}
-    for split in SPLITS:
-        for resolution in RESOLUTIONS:
-            walks = Walks(data, split, _SEED, WalkConfig(), resolution)
+    for split, resolutions in SPLITS.items():
+        for resolution in resolutions:
+            walks = Walks(data, split, _SEED, YARD_CONFIG if "yards" in split else WalkConfig(), resolution)
             make_walks(walks, num_walks, jobs)
             bar = tqdm(range(num_walks), desc=f"{split} at {100 * resolution:g} cm", unit="walk")
             errors = all_errors(answers, [maps for index in bar for maps in walks.read(index)])
@@ -141,7 +145,7 @@ def table(result: dict[str, Any]) -> str:
         for resolution, of_answers in result[split].items():
             names = list(of_answers)
             for group, first in of_answers[names[0]].items():
-                if not first["cells"]:
+                if not first["cells"] or group == YARD:
                     continue
                 values = [f"{100 * of_answers[name][group]['mae']:.1f}" for name in names]
                 lines.append([split, resolution, group, *values, f"{100 * first['within_2_std']:.1f}"])
@@ -158,12 +162,12 @@ def summary(result: dict[str, Any]) -> str:
         names = [name for name in answers if name not in seeds]
         for group in answers[COMPLETED]:
             cells = [answers[name][group] for name in seeds]
-            if not cells[0]["cells"]:
+            if not cells[0]["cells"] or group == YARD:
                 continue
             own = [100 * cell["mae"] for cell in cells]
             within = 100 * sum(cell["within_2_std"] for cell in cells) / len(cells)
             spread = f" ({min(own):.1f} to {max(own):.1f})" if len(own) > 1 else ""
-            label = group.replace("_", " ") + (", never trained on" if split == "unseen" else "")
+            label = group.replace("_", " ") + _SUFFIXES[split]
             others = [f"{100 * answers[name][group]['mae']:.1f}" for name in names]
             lines.append([label, f"{sum(own) / len(own):.1f}{spread}", *others, f"{within:.0f}"])
     return markdown_table(["cells", COMPLETED, *names, "within 2 std [%]"], lines)

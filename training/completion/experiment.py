@@ -18,7 +18,7 @@ from torchelev.app.results import write_json
 from torchelev.completion.net import CompletionNet
 from training import RESULTS
 from training.completion.evaluate import COMPLETED, Answer, evaluate, learned, table
-from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
+from training.completion.maps import YARD_CONFIG, TrueMap, WalkConfig, Walks, make_walks
 from training.completion.unet import UNet, fit
 from training.fit import save_atomically
 from training.jobs import Job, train_all
@@ -26,15 +26,24 @@ from training.options import jobs_option, runs_option
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
-WALKS, STEPS, EVALUATION_WALKS = 290, 10000, 8
+WALKS, DRIVES, STEPS, EVALUATION_WALKS = 290, 130, 15000, 8
 UNETS = {"U-Net of equal size": 3}  # channels of the finest level
 UNET_STEPS = 4000
 
 
 def _jobs(runs: Path) -> list[Job]:
     """Return a training for each seed."""
-    fixed = {"--data": runs / "data", "--walks": WALKS, "--steps": STEPS, "--evaluation-walks": EVALUATION_WALKS}
-    return [Job("training.completion", {"--seed": seed, **fixed, "--jobs": 1}, runs / f"seed-{seed}") for seed in SEEDS]
+    fixed = {"--data": runs / "data", "--walks": WALKS, "--drives": DRIVES, "--steps": STEPS, "--jobs": 1}
+    fixed |= {"--evaluation-walks": EVALUATION_WALKS}
+    return [Job("training.completion", {"--seed": seed, **fixed}, runs / f"seed-{seed}") for seed in SEEDS]
+
+
+def _walks(runs: Path) -> list[tuple[Walks, int]]:
+    """Return the walks and drives of the trainings, and their numbers."""
+    return [
+        (Walks(runs / "data", "train", 0, WalkConfig()), WALKS),
+        (Walks(runs / "data", "yards", 0, YARD_CONFIG), DRIVES),
+    ]
 
 
 def fit_unet(runs: Path, channels: int) -> UNet:
@@ -44,8 +53,7 @@ def fit_unet(runs: Path, channels: int) -> UNet:
         net = UNet(channels)
         net.load_state_dict(torch.load(path, weights_only=True))
         return net.eval()
-    walks = Walks(runs / "data", "train", 0, WalkConfig())
-    maps: list[TrueMap] = [entry for index in range(WALKS) for entry in walks.read(index)]
+    maps: list[TrueMap] = [m for walks, count in _walks(runs) for index in range(count) for m in walks.read(index)]
     net = fit(maps, channels, UNET_STEPS)
     save_atomically(net.state_dict(), path)
     return net
@@ -61,13 +69,14 @@ def as_answer(net: UNet) -> Answer:
 @jobs_option
 def main(runs: Path, jobs: int) -> None:
     """Train, evaluate, write JSON and print the table."""
-    make_walks(Walks(runs / "data", "train", 0, WalkConfig()), WALKS, jobs)
+    for walks, count in _walks(runs):
+        make_walks(walks, count, jobs)
     train_all(_jobs(runs), jobs)
     nets = {seed: CompletionNet.from_pretrained(runs / f"seed-{seed}" / "weights.pt") for seed in SEEDS}
     answers = {COMPLETED if seed == SEEDS[0] else f"seed {seed}": learned(net) for seed, net in nets.items()}
     answers |= {name: as_answer(fit_unet(runs, channels)) for name, channels in UNETS.items()}
     result = evaluate(answers, runs / "data", EVALUATION_WALKS, jobs)
-    fixed = {"seeds": SEEDS, "walks": WALKS, "steps": STEPS, "unet_steps": UNET_STEPS}
+    fixed = {"seeds": SEEDS, "walks": WALKS, "drives": DRIVES, "steps": STEPS, "unet_steps": UNET_STEPS}
     write_json(RESULTS / "completion.json", result | {"training": fixed})
     click.echo(table(result))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 import multiprocessing
 from collections.abc import Iterable, Sequence
@@ -21,15 +22,18 @@ from torchelev.completion.complete import CompletionInput
 from torchelev.errors import require, require_positive
 from torchelev.sim import HeightField
 from torchelev.weight_files import RESOLUTIONS
+from training.completion.yards import drive_and_look
 from training.fit import save_atomically
-from training.traversability.maps.mapping import DataConfig, blank_map, tile_cell_centers, walk_and_look
-from training.traversability.maps.terrain import KINDS, LENGTH, LOOK_INTERVAL, UNSEEN_KINDS, draw_robot, make_tiles
+from training.traversability.maps.mapping import DataConfig, Look, blank_map, tile_cell_centers, walk_and_look
+from training.traversability.maps.terrain import KINDS, LOOK_INTERVAL, UNSEEN_KINDS, draw_robot, make_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 VERSION = 1  # of the maps; increase it when their computation changes, so that old files are refused
-SPLITS = {"train": KINDS, "held_out": KINDS, "unseen": UNSEEN_KINDS}
+YARD = "yard"
+_YARD_RESOLUTIONS = (0.04, 0.1)  # [m]
+SPLITS = {"train": KINDS, "held_out": KINDS, "unseen": UNSEEN_KINDS, "yards": (YARD,), "held_out_yards": (YARD,)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +48,9 @@ class WalkConfig:
         require_positive(num_maps=self.num_maps, window=self.window)
         ascends = len(self.scans) > 0 and self.scans[0] >= 1 and sorted(set(self.scans)) == list(self.scans)
         require(ascends, "scans", "must be positive and ascend", self.scans, "see its default")
+
+
+YARD_CONFIG = WalkConfig(window=12.0, scans=(1, 2, 4))  # of drives
 
 
 class TrueMap(NamedTuple):
@@ -73,18 +80,32 @@ def walk(seed: Sequence[int], kinds: Sequence[str], resolution: float | None, cf
     field = make_tiles(names, rng)
     emap = blank_map(resolution, cfg.window, cfg.num_maps)
     looks = walk_and_look(field, robot, DataConfig(num_maps=cfg.num_maps, window=cfg.window, looks=(last, last)), rng)
+    return _fuse(emap, field, looks, names, cfg)
+
+
+def drive(seed: Sequence[int], resolution: float | None, cfg: WalkConfig) -> list[TrueMap]:
+    """Drive through yards; return the maps after each of `cfg.scans`. Arguments are those of `walk`."""
+    rng = np.random.default_rng(list(seed))
+    resolution = resolution or round(math.exp(rng.uniform(*np.log(_YARD_RESOLUTIONS))), 3)
+    field, looks = drive_and_look(cfg.num_maps, cfg.scans[-1], rng)
+    emap = blank_map(resolution, cfg.window, cfg.num_maps)
+    return _fuse(emap, field, looks, (YARD,) * cfg.num_maps, cfg)
+
+
+def _fuse(
+    emap: ElevationMap, field: HeightField, looks: Iterable[Look], kinds: tuple[str, ...], cfg: WalkConfig
+) -> list[TrueMap]:
     maps = []
     for number, look in enumerate(looks, 1):
         emap.update(look.points, look.T_map_sensor, look.T_map_base, LOOK_INTERVAL)
         if number in cfg.scans:
-            maps.append(_with_truth(emap, field, look.T_tile_base, look.T_map_base, names, number))
+            maps.append(_with_truth(emap, field, look, kinds, number))
     return maps
 
 
-def _with_truth(
-    emap: ElevationMap, field: HeightField, T_tile_base: Tensor, T_map_base: Tensor, kinds: tuple[str, ...], scans: int
-) -> TrueMap:
+def _with_truth(emap: ElevationMap, field: HeightField, look: Look, kinds: tuple[str, ...], scans: int) -> TrueMap:
     """Return a copy of the maps, and the true height of their cells, given where the robots truly are."""
+    T_tile_base, T_map_base = look.T_tile_base, look.T_map_base
     T_tile_map = T_tile_base @ torch.linalg.inv(T_map_base)
     xy = tile_cell_centers(emap, T_tile_map)
     tiles = torch.arange(field.num_tiles)
@@ -93,7 +114,7 @@ def _with_truth(
     state = emap.state
     layers = (state.elevation, state.validity, state.variance, state.upper_bound, state.bounded, state.time)
     copies = CompletionInput(*(layer.clone() for layer in layers))
-    is_inside = xy.abs().amax(-1) <= LENGTH / 2
+    is_inside = xy.abs().amax(-1) <= (field.heights.shape[1] - 1) * field.resolution / 2
     return TrueMap(copies, height + rise[:, None, None], is_inside, emap.cfg.grid.resolution, kinds, scans)
 
 
@@ -127,7 +148,9 @@ class Walks(NamedTuple):
     def make(self, index: int) -> None:
         """Make a walk and write its file."""
         seed = [list(SPLITS).index(self.split), self.seed, index]
-        maps = walk(seed, SPLITS[self.split], self.resolution, self.cfg)
+        kinds = SPLITS[self.split]
+        make = drive if kinds == (YARD,) else functools.partial(walk, kinds=kinds)
+        maps = make(seed, resolution=self.resolution, cfg=self.cfg)
         plain = [entry._replace(layers=tuple(entry.layers))._asdict() for entry in maps]  # type: ignore[arg-type]
         save_atomically({"settings": self.settings, "maps": plain}, self.path(index))
 

@@ -13,6 +13,7 @@ from training.completion.cells import (
     MeasuredCells,
     UnknownCells,
     concatenate,
+    draw_evenly,
     draw_measured,
     draw_unknown,
     remove_cells,
@@ -20,7 +21,7 @@ from training.completion.cells import (
     vary_bounds,
 )
 from training.completion.evaluate import COMPLETED, evaluate, learned, table
-from training.completion.maps import TrueMap, WalkConfig, Walks, make_walks
+from training.completion.maps import YARD_CONFIG, TrueMap, WalkConfig, Walks, make_walks
 from training.completion.trainer import FitConfig, Trainer
 from training.options import jobs_option
 from training.resume import checkpoint_path, command_errors, write_result
@@ -34,8 +35,9 @@ _WALKS_SEED = 0
     "--seed", default=0, show_default=True, help="Seed of initial weights and drawn cells; the walks stay the same."
 )
 @click.option("--walks", type=_POSITIVE, default=290, show_default=True, help="Training walks of four robots.")
+@click.option("--drives", type=_POSITIVE, default=130, show_default=True, help="Training drives of four vehicles.")
 @click.option(
-    "--steps", type=_POSITIVE, default=10000, show_default=True, help="Steps in total, including those before --resume."
+    "--steps", type=_POSITIVE, default=15000, show_default=True, help="Steps in total, including those before --resume."
 )
 @click.option(
     "--evaluation-walks", type=_POSITIVE, default=10, show_default=True, help="Evaluation walks per resolution."
@@ -47,12 +49,21 @@ _WALKS_SEED = 0
 @jobs_option
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
 def main(
-    seed: int, walks: int, steps: int, evaluation_walks: int, out: Path, data: Path | None, jobs: int, resume: bool
+    seed: int,
+    walks: int,
+    drives: int,
+    steps: int,
+    evaluation_walks: int,
+    out: Path,
+    data: Path | None,
+    jobs: int,
+    resume: bool,
 ) -> None:
     """Train the completion network.
 
-    Lets simulated robots walk over random ground and map it, fits the network to the true ground below unknown and
-    measured cells, calibrates its standard deviations and evaluates it on held-out ground.
+    Lets simulated robots walk over random ground, and vehicles drive through yards, and map it; fits the network to the
+    true ground below unknown and measured cells, calibrates its standard deviations and evaluates it on held-out
+    ground.
 
     Writes TensorBoard logs, checkpoint.pt, weights.pt (for `CompletionNet.from_pretrained`) and result.json to OUT. The
     walks are kept for the next training.
@@ -60,7 +71,9 @@ def main(
     checkpoint = checkpoint_path(out, resume)
     data = data or out / "data"
     with command_errors():
-        cells = training_cells(Walks(data, "train", _WALKS_SEED, WalkConfig()), walks, jobs, seed)
+        sets = [(Walks(data, "train", _WALKS_SEED, WalkConfig()), walks)]
+        sets += [(Walks(data, "yards", _WALKS_SEED, YARD_CONFIG), drives)]
+        cells = training_cells(sets, jobs, seed)
         trainer = Trainer(*cells, FitConfig(steps=steps, seed=seed))
         if resume:
             trainer.resume(checkpoint)
@@ -73,21 +86,30 @@ def main(
     click.echo(f"Wrote weights.pt and result.json to {out}.")
 
 
-def training_cells(walks: Walks, count: int, jobs: int, seed: int) -> tuple[UnknownCells, MeasuredCells]:
-    """Return the cells of all walks, which are made where they are missing."""
-    make_walks(walks, count, jobs)
-    unknown, measured = [], []
+def training_cells(
+    sets: list[tuple[Walks, int]], jobs: int, seed: int
+) -> tuple[UnknownCells, MeasuredCells, UnknownCells]:
+    """Return the cells of some walks of each set, which are made where they are missing.
+
+    The third are unknown cells to calibrate with: of the maps as they were, evenly drawn.
+    """
+    unknown: list[UnknownCells] = []
+    even: list[UnknownCells] = []
+    measured: list[MeasuredCells] = []
     generator = torch.Generator().manual_seed(seed)
-    before: list[TrueMap] = []
-    for index in tqdm(range(count), desc="cells", unit="walk"):
-        maps = walks.read(index)
-        thinned = [entry._replace(layers=thin_out(entry.layers, generator)) for entry in maps[-1:]]
-        for view in [*maps, *_as_seen_before(maps[-1], before), *thinned]:
-            varied = view._replace(layers=vary_bounds(view.layers, generator))
-            unknown += draw_unknown(varied, generator)
-            measured += draw_measured(varied, generator)
-        before = maps
-    return concatenate(unknown), concatenate(measured)
+    for walks, count in sets:
+        make_walks(walks, count, jobs)
+        before: list[TrueMap] = []
+        for index in tqdm(range(count), desc=f"cells of {walks.name}", unit="walk"):
+            maps = walks.read(index)
+            even += [cells for entry in maps for cells in draw_evenly(entry, generator)]
+            thinned = [entry._replace(layers=thin_out(entry.layers, generator)) for entry in maps[-1:]]
+            for view in [*maps, *_as_seen_before(maps[-1], before), *thinned]:
+                varied = view._replace(layers=vary_bounds(view.layers, generator))
+                unknown += draw_unknown(varied, generator)
+                measured += draw_measured(varied, generator)
+            before = maps
+    return concatenate(unknown), concatenate(measured), concatenate(even)
 
 
 def _as_seen_before(maps: TrueMap, before: list[TrueMap]) -> list[TrueMap]:

@@ -25,7 +25,7 @@ _LARGEST_SQUARE = 100.0  # of a weighted error
 class FitConfig:
     """Settings of the fit."""
 
-    steps: int = 10000
+    steps: int = 15000
     unknown_per_step: int = 4096  #: cells
     measured_per_step: int = 1024  #: cells
     learning_rate: float = 4e-3  #: initial; decays to 0 along half a cosine
@@ -78,16 +78,17 @@ class Trainer(Fit):
     Args:
         unknown: unknown cells.
         measured: measured cells.
+        even: unknown cells that the standard deviations are calibrated with.
         cfg: settings of the fit.
     """
 
     net: CompletionNet
     cfg: FitConfig
 
-    def __init__(self, unknown: UnknownCells, measured: MeasuredCells, cfg: FitConfig) -> None:
+    def __init__(self, unknown: UnknownCells, measured: MeasuredCells, even: UnknownCells, cfg: FitConfig) -> None:
         torch.manual_seed(cfg.seed)
         net = CompletionNet()
-        self.unknown, self.measured = unknown, measured
+        self.unknown, self.measured, self.even = unknown, measured, even
         sizes = {"unknown": len(unknown.truth), "measured": len(measured.truth)}
         super().__init__(net, cfg, dataclasses.asdict(cfg) | sizes | net.config)
 
@@ -118,7 +119,7 @@ class Trainer(Fit):
     def calibrate(self) -> None:
         """Scale the standard deviations such that COVERAGE of the cells lie within two of them."""
         generator = torch.Generator().manual_seed(self.cfg.seed)
-        unknown, measured = draw(self.unknown, 2**18, generator), draw(self.measured, 2**18, generator)
+        unknown, measured = draw(self.even, 2**18, generator), draw(self.measured, 2**18, generator)
         mean, std = predict(self.net.weights, unknown.seen)
         refined, refined_std = predict_measured(self.net, measured)
         factors = [fit_std(mean - unknown.truth, std), fit_std(refined - measured.truth, refined_std)]

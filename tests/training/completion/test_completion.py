@@ -4,6 +4,7 @@ import functools
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
@@ -11,13 +12,15 @@ from click.testing import CliRunner
 import training.completion.evaluate as evaluation
 import training.completion.train as training
 from torchelev.completion.complete import CompletionInput
-from training.completion.cells import draw_measured, draw_unknown, remove_cells, thin_out, vary_bounds
-from training.completion.maps import TrueMap, WalkConfig, Walks, walk
+from training.completion.cells import draw_evenly, draw_measured, draw_unknown, remove_cells, thin_out, vary_bounds
+from training.completion.maps import TrueMap, WalkConfig, Walks, drive, walk
 from training.completion.trainer import COVERAGE, FitConfig, Trainer, fit_std, losses
 from training.completion.unet import UNet, fit
+from training.completion.yards import LENGTH, draw_way, make_yard
 from training.resume import CHECKPOINT
 
 TINY = functools.partial(WalkConfig, num_maps=1, window=1.6, scans=(1, 2))
+TINY_YARD = WalkConfig(num_maps=1, window=6.0, scans=(2, 3))
 
 
 def invoke(main, *arguments):
@@ -60,6 +63,23 @@ def test_cells_come_with_their_truth_and_maps_count_the_same():
     assert float(measured.truth.abs().max()) == 0.0
 
 
+@pytest.mark.slow(4)
+def test_drives_leave_their_way_free_and_map_the_yard_near_the_truth():
+    rng = np.random.default_rng(3)
+    way = draw_way(4, rng)
+    heights = make_yard(way, 4, rng)
+    axis = torch.linspace(-LENGTH / 2, LENGTH / 2, len(heights), dtype=torch.float64)
+    x, y = torch.meshgrid(axis, axis, indexing="ij")
+    is_way = way.distance(x, y, 4) < 0.5
+    steps = heights.diff(dim=0).abs()[is_way[1:]]
+    assert float(steps.max()) < 0.5 < float(heights.diff(dim=0).abs().max()), "things are steep, the way is not"
+    places = torch.from_numpy(way.places(4))
+    assert float(way.distance(places[:, 0], places[:, 1], 4).max()) < 1e-9
+    maps = drive((3, 0, 0), 0.1, TINY_YARD)[-1]
+    known = maps.layers.validity & maps.is_inside
+    assert int(known.sum()) > 100 and float((maps.layers.elevation - maps.truth)[known].abs().median()) < 0.1
+
+
 def test_removed_cells_are_neither_known_nor_bounded():
     layers = flat_map().layers
     layers = layers._replace(bounded=torch.ones_like(layers.bounded))
@@ -96,10 +116,21 @@ def test_the_standard_deviation_is_fitted_to_hold_95_percent():
     assert free.grad is None
 
 
+def test_cells_to_calibrate_with_are_drawn_evenly():
+    maps, generator = flat_map(40, 60), torch.Generator().manual_seed(0)
+    cells = draw_evenly(maps, generator)[0]
+    unknown = int((~maps.layers.validity).sum())
+    assert len(cells.truth) == pytest.approx(0.01 * unknown, rel=0.15)
+    assert bool((cells.truth == 0.1).all()) and bool((cells.weight == 1).all())
+    steps = cells.seen.around.distance[cells.seen.around.is_known > 0].view(-1)
+    assert float(steps.min()) == pytest.approx(0.08) and float(steps.max()) > 1.5, "near and far ones"
+
+
 def test_a_network_learns_a_step(tmp_path):
     """All unknown ground is 1.5 cm higher: after some steps, the network says so, and how sure that is."""
     maps, generator = flat_map(rise=0.015), torch.Generator().manual_seed(0)
-    cells = draw_unknown(maps, generator)[0], draw_measured(maps, generator)[0]
+    unknown = draw_unknown(maps, generator)[0]
+    cells = unknown, draw_measured(maps, generator)[0], unknown
     trainer = Trainer(*cells, FitConfig(steps=150, unknown_per_step=128, measured_per_step=32))
     trainer.run(tmp_path)
     with torch.no_grad():
@@ -111,7 +142,8 @@ def test_a_network_learns_a_step(tmp_path):
 
 def test_a_training_resumes_without_a_difference(tmp_path):
     maps, generator = flat_map(), torch.Generator().manual_seed(0)
-    cells = draw_unknown(maps, generator)[0], draw_measured(maps, generator)[0]
+    unknown = draw_unknown(maps, generator)[0]
+    cells = unknown, draw_measured(maps, generator)[0], unknown
     cfg = FitConfig(steps=6, unknown_per_step=32, measured_per_step=8)
     whole, first, second = (Trainer(*cells, cfg) for _ in range(3))
     for trainer, steps in ((whole, 6), (first, 3)):
@@ -143,13 +175,15 @@ def test_the_u_net_stays_below_the_bound_and_learns():
 def test_the_commands_train_evaluate_and_resume(tmp_path, monkeypatch):
     for module in (training, evaluation):
         monkeypatch.setattr(module, "WalkConfig", TINY)
-    monkeypatch.setattr(evaluation, "RESOLUTIONS", (0.08,))
+        monkeypatch.setattr(module, "YARD_CONFIG", TINY_YARD)
+    monkeypatch.setattr(evaluation, "SPLITS", dict.fromkeys(evaluation.SPLITS, (0.08,)))
     out = tmp_path / "run"
-    common = ("--out", out, "--walks", 2, "--evaluation-walks", 1, "--jobs", 1, "--steps", 2)
+    common = ("--out", out, "--walks", 2, "--drives", 1, "--evaluation-walks", 1, "--jobs", 1, "--steps", 2)
     done = invoke(training.main, *common)
     assert done.exit_code == 0 and "| held_out | 0.08 | unknown |" in done.output
     result = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
     cells = result["held_out"]["0.08"]["CompletionNet"]["unknown"]
+    assert result["held_out_yards"]["0.08"]["CompletionNet"]["unknown"]["cells"] > 10
     assert cells["cells"] > 10 and math.isfinite(cells["mae"]) and 0 <= cells["within_2_std"] <= 1
     assert "add --resume" in invoke(training.main, *common).output
     assert invoke(training.main, *common, "--resume").exit_code == 0, "nothing left: it only evaluates"

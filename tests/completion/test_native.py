@@ -1,0 +1,67 @@
+"""The completion in C++ against the same with tensors."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.completion.test_net import apply, random_layers, random_net
+from torchelev.completion import native
+from torchelev.completion.complete import complete
+from torchelev.native.library import find_compiler
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
+
+
+def by_tensors(net, layers, resolution):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHELEV_NATIVE", "0")
+        return complete(net.weights, layers, resolution)
+
+
+@given(
+    seed=st.integers(0, 2**16),
+    num_envs=st.integers(1, 3),
+    H=st.integers(1, 40),
+    W=st.integers(1, 40),
+    known=st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]),
+    resolution=st.sampled_from([0.02, 0.05, 0.1]),
+    threads=st.integers(1, 2),
+)
+def test_every_cell_equals_that_of_the_tensors(seed, num_envs, H, W, known, resolution, threads):
+    net, layers = random_net(seed, torch.float32), random_layers(seed, num_envs, H, W, known, torch.float32)
+    expected = by_tensors(net, layers, resolution)
+    torch.set_num_threads(threads)
+    mean, std = native.complete(net.weights, layers, resolution)
+    torch.testing.assert_close(mean, expected.mean, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(std, expected.std, rtol=1e-4, atol=0.0)
+
+
+def test_layers_may_be_views():
+    """Of cells that lie apart in memory, as in a transposed map."""
+    net, layers = random_net(1, torch.float32), random_layers(1, 2, 20, 30, dtype=torch.float32)
+    turned = apply(lambda layer: layer.mT, layers)
+    expected = native.complete(net.weights, apply(lambda layer: layer.mT.contiguous(), layers), 0.05)
+    for actual, same in zip(native.complete(net.weights, turned, 0.05), expected, strict=True):
+        assert torch.equal(actual, same)
+
+
+def test_altitude_costs_no_precision_and_large_values_nothing():
+    net, layers = random_net(2, torch.float32), random_layers(2, 1, 20, 20, dtype=torch.float32)
+    low = native.complete(net.weights, layers, 0.05)
+    rise = 2.0**10
+    high = native.complete(
+        net.weights,
+        layers._replace(elevation=layers.elevation + rise, upper_bound=layers.upper_bound + rise),
+        0.05,
+    )
+    torch.testing.assert_close(high[0] - rise, low[0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(high[1], low[1], rtol=0.05, atol=1e-3)
+    lost = torch.full_like(layers.elevation, torch.nan)
+    blank = layers._replace(upper_bound=torch.where(layers.bounded, layers.upper_bound, lost))
+    for actual, same in zip(native.complete(net.weights, blank, 0.05), low, strict=True):
+        assert torch.equal(actual, same)
+
+
+def test_doubles_are_left_to_the_tensors():
+    assert native.complete(random_net().weights, random_layers(), 0.05) is None

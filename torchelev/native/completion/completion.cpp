@@ -1,0 +1,56 @@
+// The completed maps: complete.py.
+
+#include "../threads.h"
+#include "predict.h"
+#include "refine.h"
+
+namespace {
+
+// Complete a row: all cells as measured ones, then the unknown ones.
+void complete_row(const Weights& weights, const Map& map, int i) {
+    refine(weights, map, i);
+    Cells cells;
+    int count = 0;
+    auto flush = [&] {
+        for (int l = count; l < LANES; l++) cells.row[l] = i, cells.column[l] = cells.column[0];
+        const Answer answer = predict(weights, map, cells);
+        for (int l = 0; l < count; l++) {
+            map.layers.mean[i * map.W + cells.column[l]] = answer.mean[l];
+            map.layers.std[i * map.W + cells.column[l]] = answer.std[l];
+        }
+        count = 0;
+    };
+    for (int j = 0; j < map.W; j++) {
+        if (map.layers.known[i * map.W + j]) continue;
+        cells.row[count] = i, cells.column[count++] = j;
+        if (count == LANES) flush();
+    }
+    if (count) flush();
+}
+
+}  // namespace
+
+// Layers of (B, H, W) and parameters as in complete.py; H and W are below 32767.
+extern "C" void complete(const float* weights, const float* elevation, const bool* known, const float* variance,
+                         const float* upper_bound, const bool* bounded, const float* age, float* mean, float* std,
+                         int B, int H, int W, double resolution, int num_threads) {
+    const Weights parameters(weights);
+    auto make_map = [&](int b) {
+        const size_t first = size_t(b) * H * W;
+        return Map({elevation + first, variance + first, upper_bound + first, age + first, known + first,
+                    bounded + first, mean + first, std + first}, H, W, resolution);
+    };
+    if (B >= num_threads) {
+        for_each(B, num_threads, [&](int b) {
+            Map map = make_map(b);
+            map.count_steps(), map.sum_layers();
+            for (int i = 0; i < H; i++) complete_row(parameters, map, i);
+        });
+        return;
+    }
+    for (int b = 0; b < B; b++) {
+        Map map = make_map(b);
+        for_each(2, num_threads, [&](int part) { part ? map.count_steps() : map.sum_layers(); });
+        for_each(H, num_threads, [&](int i) { complete_row(parameters, map, i); });
+    }
+}

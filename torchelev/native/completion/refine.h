@@ -1,0 +1,41 @@
+// The ground at measured cells: refine.py.
+#pragma once
+
+#include "map.h"
+
+// Refine a row of cells; unknown ones become finite.
+inline void refine(const Weights& weights, const Map& map, int i) {
+    for (int j = 0; j < map.W; j += LANES) {
+        const int count = std::min(LANES, map.W - j), place = i * map.W + j;
+        const float* here = &map.ground[map.index(i, j)];
+        const Lanes center = load(here);
+        const Flags known = center < UNKNOWN;
+        const Lanes height = pick(known, center, all(0));
+        Lanes pairs{}, bend{}, rough{}, tilt{};
+        auto add = [&](int to) {
+            const Lanes ahead = load(here + to), behind = load(here - to);
+            const Flags both = (ahead < UNKNOWN) & (behind < UNKNOWN) & known;
+            const Lanes bent = pick(both, 0.5f * ((ahead - height) + (behind - height)), all(0));
+            pairs += one_if(both), bend += bent, rough += absolute(bent);
+            tilt += pick(both, absolute(ahead - behind), all(0));
+        };
+        for (int to : {map.stride + 1, map.stride, map.stride - 1, 1}) add(to);
+        const Lanes per_pair = 1 / larger(pairs, all(1));
+        bend *= per_pair, rough *= per_pair, tilt *= per_pair;
+        const Lanes variance = pick(known, load(map.layers.variance + place, count), all(0));
+        const Lanes age = pick(known, load(map.layers.age + place, count), all(0));
+        const Lanes sigma = root(larger(variance, all(MIN_STD * MIN_STD)));
+        const Lanes features[NUM_MEASURED] = {log(sigma), absolute(bend) / (absolute(bend) + sigma),
+                                              squash(rough, 0.01f), squash(tilt, SQUASH), pairs * 0.25f,
+                                              log(1 + clamp(age, 0, LONG_AGO)),
+                                              log(all(float(map.resolution) / USUAL))};
+        Lanes channels[MEASURED], answer[2];
+        affine<MEASURED, NUM_MEASURED>(weights.measured, weights.measured_bias, features, channels);
+        relu<MEASURED>(channels);
+        affine<2, MEASURED>(weights.measured_answer, weights.measured_answer_bias, channels, answer);
+        const Lanes twice = 2 * sigma;
+        const Lanes extra = exp(2 * clamp(answer[1], -10, 2));
+        store(map.layers.mean + place, height + twice * tanh(sigmoid(answer[0]) * bend / twice), count);
+        store(map.layers.std + place, root(sigma * sigma + extra) * std::exp(weights.calibration[1]), count);
+    }
+}

@@ -1,0 +1,104 @@
+// Sixteen numbers at a time, and the functions of them that compilers do not vectorise alike.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+constexpr int LANES = 16;
+typedef float Lanes __attribute__((vector_size(4 * LANES)));
+typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparisons: -1 true, 0 false
+
+inline Lanes all(float value) { return Lanes{} + value; }  // of -0, 0
+inline Lanes pick(Flags flags, Lanes yes, Lanes no) { return flags ? yes : no; }
+inline Lanes one_if(Flags flags) { return pick(flags, all(1), all(0)); }
+inline Lanes smaller(Lanes a, Lanes b) { return pick(a < b, a, b); }
+inline Lanes larger(Lanes a, Lanes b) { return pick(a > b, a, b); }
+inline Lanes clamp(Lanes a, float low, float high) { return smaller(larger(a, all(low)), all(high)); }
+inline Lanes absolute(Lanes a) { return (Lanes)((Flags)a & 0x7fffffff); }
+
+inline Lanes copy_sign(Lanes size, Lanes sign) {
+    return (Lanes)((Flags)absolute(size) | ((Flags)sign & INT32_MIN));
+}
+
+inline Lanes root(Lanes a) {
+    for (int l = 0; l < LANES; l++) a[l] = __builtin_sqrtf(a[l]);
+    return a;
+}
+
+inline Lanes floor(Lanes a) {
+    for (int l = 0; l < LANES; l++) a[l] = __builtin_floorf(a[l]);
+    return a;
+}
+
+inline Lanes load(const float* values, int count = LANES) {
+    Lanes lanes{};
+    std::memcpy(&lanes, values, sizeof(float) * count);
+    return lanes;
+}
+
+inline void store(float* values, Lanes lanes, int count = LANES) { std::memcpy(values, &lanes, sizeof(float) * count); }
+
+inline Lanes gather(const float* values, Flags index) {
+    Lanes lanes;
+    for (int l = 0; l < LANES; l++) lanes[l] = values[index[l]];
+    return lanes;
+}
+
+inline Flags gather(const int16_t* values, Flags index) {
+    Flags lanes;
+    for (int l = 0; l < LANES; l++) lanes[l] = values[index[l]];
+    return lanes;
+}
+
+// Natural logarithm of positive normal numbers, by the polynomial of Cephes' logf: 1 unit in the last place.
+inline Lanes log(Lanes x) {
+    const Flags exponent = ((Flags)x - 0x3f3504f3) >> 23;  // such that the mantissa is in sqrt(1/2) to sqrt(2)
+    const Lanes m = (Lanes)((Flags)x - (exponent << 23)) - 1, e = __builtin_convertvector(exponent, Lanes);
+    Lanes y = all(7.0376836292e-2f);
+    for (float c : {-1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f, 1.4249322787e-1f, -1.6668057665e-1f,
+                    2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f})
+        y = y * m + c;
+    y = y * m * m * m - e * 2.12194440e-4f - 0.5f * m * m;
+    return m + y + e * 0.693359375f;
+}
+
+// Exponential, by the polynomial of Cephes' expf; arguments beyond +-87 are clamped.
+inline Lanes exp(Lanes x) {
+    x = clamp(x, -87, 87);
+    const float whole = 12582912.0f;  // adding it rounds to integers
+    const Lanes n = (x * 1.44269504088896341f + whole) - whole;
+    x = x - n * 0.693359375f + n * 2.12194440e-4f;
+    Lanes y = all(1.9875691500e-4f);
+    for (float c : {1.3981999507e-3f, 8.3334519073e-3f, 4.1665795894e-2f, 1.6666665459e-1f, 5.0000001201e-1f})
+        y = y * x + c;
+    y = y * x * x + x + 1;
+    return (Lanes)((Flags)y + (__builtin_convertvector(n, Flags) << 23));
+}
+
+inline Lanes tanh(Lanes x) { return 1 - 2 / (exp(2 * x) + 1); }
+inline Lanes sigmoid(Lanes x) { return 1 / (1 + exp(-x)); }
+
+// sign(x) log(1 + |x| / scale)
+inline Lanes squash(Lanes x, float scale) {
+    const Lanes y = log(1 + absolute(x) * (1 / scale));
+    return pick(x < 0, -y, y);
+}
+
+// y = w x + b for a matrix (OUT, IN), row by row; without b: y += w x.
+template <int OUT, int IN, int AT_A_TIME = OUT % 8 == 0 ? 8 : OUT % 4 == 0 ? 4 : OUT % 2 == 0 ? 2 : 1>
+inline void affine(const float* w, const float* b, const Lanes* x, Lanes* y) {
+    for (int first = 0; first < OUT; first += AT_A_TIME) {
+        Lanes sums[AT_A_TIME];
+#pragma GCC unroll 8
+        for (int k = 0; k < AT_A_TIME; k++) sums[k] = b ? all(b[first + k]) : y[first + k];
+        for (int in = 0; in < IN; in++)
+#pragma GCC unroll 8
+            for (int k = 0; k < AT_A_TIME; k++) sums[k] += w[(first + k) * IN + in] * x[in];
+#pragma GCC unroll 8
+        for (int k = 0; k < AT_A_TIME; k++) y[first + k] = sums[k];
+    }
+}
+
+template <int SIZE> inline void relu(Lanes* values) {
+    for (int k = 0; k < SIZE; k++) values[k] = larger(values[k], all(0));
+}
