@@ -8,12 +8,9 @@ times a second. Replace `sensor` by your driver.
 
 import argparse
 import itertools
-import os
 import queue
 import threading
 import time
-
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch; leave it out if the map has cores of its own
 
 import numpy as np
 

@@ -104,6 +104,9 @@ class ElevationMap(ReadableMap):
     ) -> None:
         """Fuse one cloud per environment into its map.
 
+        On a CPU, OpenMP's threads wait only briefly for each other while other processes want the cores, unless
+        `OMP_WAIT_POLICY` or `GOMP_SPINCOUNT` is set in the environment.
+
         Args:
             points: sensor-frame points [m], (B, N, 3), or (B, S, N, 3) of S sensors at one instant. Points that are NaN
                 or inf are ignored: pad ragged clouds with NaN.

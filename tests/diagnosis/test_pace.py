@@ -13,6 +13,7 @@ from torchelev.diagnosis.pace import PATIENCE, WINDOW, Pace
 @pytest.fixture(autouse=True)
 def _not_warned(monkeypatch):
     monkeypatch.setattr(pace, "has_warned", False)
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)  # `make test` sets it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -35,6 +36,17 @@ def test_updates_of_nine_times_their_usual_are_told_once_with_the_cure():
         noted([0.08], watch=watch)
     noted([0.08] * 50, watch=watch)
     noted([*USUAL, *[0.08] * 50])  # another map of the same process
+
+
+@pytest.mark.parametrize("by_user", [True, False])
+def test_short_waits_are_not_proposed_where_they_are(monkeypatch, by_user):
+    if by_user:
+        monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
+    else:
+        monkeypatch.setattr(pace, "are_waits_short", lambda: True)
+    with pytest.warns(RuntimeWarning, match=r"same cores\. Call torch.set_num_threads") as caught:
+        noted([*USUAL, *[0.08] * ENOUGH])
+    assert "PASSIVE" not in str(caught[0].message) and "spin" not in str(caught[0].message)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import statistics
 import time
 import warnings
@@ -13,6 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
 import torch
+
+from torchelev.ops.waiting import adapted_waits, are_waits_short
 
 WINDOW = 9  # updates per median; more than half of them must be slow, so that compiling a few does not count
 PATIENCE = 5  # slow medians in a row before the warning
@@ -61,25 +64,32 @@ def _warn(median: float, best: float) -> None:
     if has_warned:
         return
     has_warned = True
+    threads = f"call torch.set_num_threads with the number of free cores (now {torch.get_num_threads()})"
+    cause, cure = "", f"C{threads[1:]}"
+    if not (are_waits_short() or os.environ.get("OMP_WAIT_POLICY", "").strip().upper() == "PASSIVE"):
+        cause = ", and OpenMP's threads spin while they wait for each other"
+        cure = f"Set OMP_WAIT_POLICY=PASSIVE in the environment before torch is imported, or {threads}"
     warnings.warn(
         f"update: the last {WINDOW} updates took {1e3 * median:.3g} ms (median), {median / best:.0f} times the best, "
-        f"{1e3 * best:.3g} ms. The likely cause: other processes are busy on the same cores, and OpenMP's threads spin "
-        "while they wait for each other. Set OMP_WAIT_POLICY=PASSIVE in the environment before torch is imported, or "
-        f"call torch.set_num_threads with the number of free cores (now {torch.get_num_threads()}).",
+        f"{1e3 * best:.3g} ms. The likely cause: other processes are busy on the same cores{cause}. {cure}.",
         RuntimeWarning,
         stacklevel=4,
     )
 
 
 def paced(update: Update) -> Update:
-    """Note in a map's `pace` how long its `update` takes on a CPU. A GPU returns early, so nothing is noted there."""
+    """Keep a map's `update` steady on a CPU, see `ops.waiting`, and note in its `pace` how long it takes.
+
+    A GPU returns early, so nothing is noted there.
+    """
 
     @functools.wraps(update)
     def timed(emap: Any, /, *args: Any, **kwargs: Any) -> None:
         if torch.compiler.is_compiling():  # a graph of the caller's own cannot contain a clock
             return update(emap, *args, **kwargs)
         start = emap.pace.clock()
-        update(emap, *args, **kwargs)
+        with adapted_waits(emap.device):
+            update(emap, *args, **kwargs)
         points: Any = args[0] if args else kwargs["points"]
         if points.device.type == "cpu":
             emap.pace.note(emap.pace.clock() - start, points.numel() // 3)

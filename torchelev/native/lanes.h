@@ -8,7 +8,7 @@ constexpr int LANES = 16;
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparisons: -1 true, 0 false
 
-inline Lanes all(float value) { return Lanes{} + value; }
+inline Lanes all(float value) { return Lanes{} + value; }  // of -0, 0
 inline Lanes pick(Flags flags, Lanes yes, Lanes no) { return flags ? yes : no; }
 inline Lanes one_if(Flags flags) { return pick(flags, all(1), all(0)); }
 inline Lanes smaller(Lanes a, Lanes b) { return pick(a < b, a, b); }
@@ -16,8 +16,17 @@ inline Lanes larger(Lanes a, Lanes b) { return pick(a > b, a, b); }
 inline Lanes clamp(Lanes a, float low, float high) { return smaller(larger(a, all(low)), all(high)); }
 inline Lanes absolute(Lanes a) { return (Lanes)((Flags)a & 0x7fffffff); }
 
+inline Lanes copy_sign(Lanes size, Lanes sign) {
+    return (Lanes)((Flags)absolute(size) | ((Flags)sign & INT32_MIN));
+}
+
 inline Lanes root(Lanes a) {
     for (int l = 0; l < LANES; l++) a[l] = __builtin_sqrtf(a[l]);
+    return a;
+}
+
+inline Lanes floor(Lanes a) {
+    for (int l = 0; l < LANES; l++) a[l] = __builtin_floorf(a[l]);
     return a;
 }
 

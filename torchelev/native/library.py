@@ -19,7 +19,7 @@ _FLAGS = "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -fPIC 
 _OFF = ("0", "off", "false", "no")
 
 
-def load(source: str, defines: Mapping[str, str]) -> ctypes.CDLL | None:
+def load(source: str, defines: Mapping[str, str], *flags: str) -> ctypes.CDLL | None:
     """Return a library, which is built if it is not in the cache.
 
     The cache is the folder in the environment variable TORCHELEV_CACHE, else `torchelev` in the user's cache folder.
@@ -27,6 +27,7 @@ def load(source: str, defines: Mapping[str, str]) -> ctypes.CDLL | None:
     Args:
         source: file in this folder.
         defines: values of the constants that the source does not define.
+        flags: further ones of the compiler.
 
     Returns:
         The library; None without a compiler, or with TORCHELEV_NATIVE=0 in the environment. If the compiler fails, a
@@ -34,15 +35,15 @@ def load(source: str, defines: Mapping[str, str]) -> ctypes.CDLL | None:
     """
     if os.environ.get("TORCHELEV_NATIVE", "1").lower() in _OFF:
         return None
-    return _load(source, tuple(sorted(defines.items())))
+    return _load(source, tuple(sorted(defines.items())), flags)
 
 
 @functools.cache
-def _load(source: str, defines: tuple[tuple[str, str], ...]) -> ctypes.CDLL | None:
+def _load(source: str, defines: tuple[tuple[str, str], ...], further: tuple[str, ...]) -> ctypes.CDLL | None:
     compiler = find_compiler()
     if compiler is None:
         return None
-    flags = [*_FLAGS, *(f"-D{name}={value}" for name, value in defines)]
+    flags = [*_FLAGS, *further, *(f"-D{name}={value}" for name, value in defines)]
     try:
         path = cache_folder() / f"{Path(source).stem}-{_key(compiler, flags)}.so"
         if not path.exists():

@@ -24,12 +24,13 @@ from torchelev.app.results import markdown_table, write_json
 from torchelev.completion.net import CompletionNet
 from torchelev.sim import HeightField
 from training import RESULTS
-from training.completion.evaluate import COMPLETED, FILLS, RESOLUTIONS, Answer, fill, learned
+from training.completion.evaluate import COMPLETED, FILLS, Answer, fill, learned
 from training.completion.stairs import NUM_EDGES, WINDOW, SeenStairs, Stairs, look_at
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
 RISES, RUNS, SEEDS = (0.12, 0.16, 0.2), (0.25, 0.3, 0.36), 10  # [m], [m], robots for each of the stairs
 NAME = "completion_edges"  # of the result
 TRUE_CELLS = "true cells"  # the true heights at the cells' centers: what the resolution leaves
@@ -50,10 +51,8 @@ def find_edges(seen: SeenStairs) -> Iterator[tuple[int, Edge]]:
     maps = seen.maps
     known = maps.layers.validity.float()
     for k in range(1, NUM_EDGES):
-        tread, middle = (
-            _lines(seen, k + 0.5 + _SHARES),
-            _lines(seen, k + 0.5 + _SHARES / 3),
-        )  # without the risers' cells
+        tread = _lines(seen, k + 0.5 + _SHARES)
+        middle = _lines(seen, k + 0.5 + _SHARES / 3)  # without the risers' cells
         is_known, is_known_in_middle = (_read(known, xy, maps.resolution) > 0.5 for xy in (tread, middle))
         is_inside = tread.abs().amax((-2, -1)) < WINDOW / 2 - maps.resolution
         yield k, Edge(_lines(seen, k + _SHARES), is_inside & is_known_in_middle.any(-1) & ~is_known.all(-1))

@@ -33,12 +33,12 @@ def test_the_loop_is_timed_idle_and_beside_a_process():
     assert set(rows) == {"idle", "busy"} and all(row["updates"] == 3 and row["p50"] > 0 for row in rows.values())
 
 
-def test_both_policies_are_written(tmp_path, monkeypatch):
+def test_every_way_to_wait_is_written(tmp_path, monkeypatch):
     row = loop.figures([0.008, 0.03])
     asked = []
     monkeypatch.setattr(loop, "measure_apart", lambda *given: asked.append(given) or {"idle": row, "busy": row})
     result = CliRunner().invoke(loop.main, ["--seconds", "0.1", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    assert asked == [("default", 5, 2), ("PASSIVE", 5, 2)]
+    assert asked == [("long", 5, 2), ("adapted", 5, 2), ("PASSIVE", 5, 2)]
     assert "| PASSIVE | busy | 8.0 | 30.0 | 30.0 | 50.0 |" in result.output
     assert json.loads((tmp_path / "loop.json").read_text())["rows"]["PASSIVE"]["idle"] == row

@@ -54,6 +54,7 @@ def test_pictures_beyond_the_share_are_dropped(emap, port, monkeypatch):
             spent.append(0.01)
 
         monkeypatch.setattr(view.page, "draw", draw)
+        monkeypatch.setattr(view._load, "measure_idleness", lambda: 0.0)  # other programs may hold this one up
         start = time.perf_counter()
         while time.perf_counter() - start < 2.0:
             view.show(pose(num_envs=3))

@@ -165,8 +165,7 @@ def horizon(
     by gathering from the map: the running minimum, from the sensor outwards, of the fall to each bin's ground.
     """
     step = 2 * grid.resolution
-    polar = PolarGrid.of(grid, cfg)
-    ranges, azimuths = 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
+    ranges, azimuths = near_size(PolarGrid.of(grid, cfg))
     rho = (torch.arange(ranges, device=rays.r.device, dtype=rays.r.dtype) + 0.5)[:, None] * step
     x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(directions(azimuths, rays.r)))
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
@@ -178,6 +177,11 @@ def horizon(
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
     return torch.where(k >= 0, limit, NO_FALL)
+
+
+def near_size(polar: PolarGrid) -> tuple[int, int]:
+    """Return how many ranges and azimuths the table of `horizon` has."""
+    return 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
 
 
 @stored  # or each bin of every environment would compute them anew
