@@ -63,5 +63,23 @@ def test_altitude_costs_no_precision_and_large_values_nothing():
         assert torch.equal(actual, same)
 
 
-def test_doubles_are_left_to_the_tensors():
-    assert native.complete(random_net().weights, random_layers(), 0.05) is None
+def test_what_is_not_of_float32_or_of_one_shape_is_left_to_the_tensors():
+    double, single = random_net(), random_net(dtype=torch.float32)
+    layers = random_layers(dtype=torch.float32)
+    assert native.complete(single.weights, layers, 0.05) is not None
+    assert native.complete(double.weights, random_layers(), 0.05) is None
+    assert native.complete(double.weights, layers, 0.05) is None
+    assert native.complete(single.weights, layers._replace(variance=layers.variance.double()), 0.05) is None
+    assert native.complete(single.weights, layers._replace(age=layers.age[:, :1, :1]), 0.05) is None
+
+
+def test_forward_mode_and_vmap_are_refused():
+    net, layers = random_net(dtype=torch.float32), random_layers(dtype=torch.float32)
+
+    def mean(elevation):
+        return net(*layers._replace(elevation=elevation), resolution=0.05).mean
+
+    with pytest.raises(NotImplementedError, match="forward-mode"):
+        torch.func.jvp(mean, (layers.elevation,), (torch.ones_like(layers.elevation),))
+    with pytest.raises(NotImplementedError, match="vmap"):
+        torch.func.vmap(mean)(layers.elevation[None])

@@ -7,6 +7,8 @@ import pytest
 
 from torchelev.native import library
 
+SOURCES = library._SOURCES
+
 
 @pytest.fixture(autouse=True)
 def _fresh(tmp_path, monkeypatch):
@@ -57,9 +59,66 @@ def test_a_cache_that_cannot_be_written_is_told(tmp_path):
 
 
 def test_without_a_compiler_nothing_is_built(monkeypatch):
-    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(library.shutil, "which", lambda name: None)
     assert library.find_compiler() is None
     assert library.load("answer.cpp", {}) is None
+
+
+def test_a_compiler_that_is_not_there_is_told(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler -O1")
+    with pytest.warns(RuntimeWarning, match="CXX=no-such-compiler -O1 is no command"):
+        assert library.load("answer.cpp", {}) is None
+
+
+@needs_compiler
+def test_a_compiler_may_have_arguments(monkeypatch, tmp_path):
+    (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return VALUE; }')
+    monkeypatch.setenv("CXX", " ".join([*library.find_compiler(), "-DVALUE=5"]))
+    assert library.load("answer.cpp", {}).answer() == 5
+
+
+@needs_compiler
+def test_a_damaged_library_is_built_anew(tmp_path):
+    (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return 3; }')
+    assert library.load("answer.cpp", {}).answer() == 3
+    (built,) = (tmp_path / "cache").iterdir()
+    built.unlink()
+    built.write_bytes(b"")
+    library._load.cache_clear()
+    assert library.load("answer.cpp", {}).answer() == 3
+
+
+@needs_compiler
+def test_a_user_without_a_home_is_told(monkeypatch, tmp_path):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return 3; }')
+    monkeypatch.delenv("TORCHELEV_CACHE")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(library.Path, "home", no_home)
+    with pytest.warns(RuntimeWarning, match="Could not determine home directory.*TORCHELEV_CACHE"):
+        assert library.load("answer.cpp", {}) is None
+
+
+@needs_compiler
+def test_what_is_thrown_on_a_thread_is_no_crash(tmp_path):
+    (tmp_path / "threads.h").write_text((SOURCES / "threads.h").read_text())
+    (tmp_path / "throwing.cpp").write_text(
+        """
+        #include "threads.h"
+        #include <new>
+        extern "C" bool throwing(int count, int threads, int failing) {
+            auto work = [&](int k) { if (k == failing) throw std::bad_alloc(); };
+            return succeeds([&] { for_each(count, threads, work); });
+        }
+        """
+    )
+    throwing = library.load("throwing.cpp", {}).throwing
+    library.call(throwing, 100, 3, -1)
+    for threads in (1, 3):
+        with pytest.raises(MemoryError, match="throwing ran out of memory: give it fewer or smaller maps"):
+            library.call(throwing, 100, threads, 50)
 
 
 def test_it_can_be_switched_off(monkeypatch, tmp_path):

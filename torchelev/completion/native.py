@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.completion import context, parameters, predict, refine, surroundings
 from torchelev.completion.parameters import Weights
-from torchelev.native.library import load
+from torchelev.native.library import call, load
 
 _LARGEST = 2**15 - 2  # cells along a side, as steps are counted in 16 bits
 _FLOATS = {
@@ -44,7 +44,10 @@ def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> t
         resolution: [m].
     """
     elevation = layers[0]
-    if elevation.dtype != torch.float32 or max(elevation.shape[1:]) > _LARGEST:
+    numbers = [*weights, *(layer for layer in layers if layer.dtype != torch.bool)]
+    is_float = all(value.dtype == torch.float32 and value.device.type == "cpu" for value in numbers)
+    is_plain = is_float and all(layer.shape == elevation.shape for layer in layers)
+    if not is_plain or max(elevation.shape[1:]) > _LARGEST:
         return None
     sizes = {"VIEWS": weights.view, "CELLS": weights.cell, "MEASURED": weights.measured}
     defines = {name: str(len(weight)) for name, weight in sizes.items()}
@@ -56,5 +59,5 @@ def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> t
     mean, std = (torch.empty_like(elevation, memory_format=torch.contiguous_format) for _ in range(2))
     tensors = [flat, *(layer.contiguous() for layer in layers), mean, std]
     pointers = [ctypes.c_void_p(tensor.data_ptr()) for tensor in tensors]
-    library.complete(*pointers, *elevation.shape, ctypes.c_double(resolution), torch.get_num_threads())
+    call(library.complete, *pointers, *elevation.shape, ctypes.c_double(resolution), torch.get_num_threads())
     return mean, std

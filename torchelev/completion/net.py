@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchelev.completion.complete import Completion, CompletionInput, complete
 from torchelev.completion.parameters import Weights, weight_shapes
 from torchelev.errors import require
+from torchelev.ops.transforms import require_reverse_mode
 from torchelev.weight_files import WeightFormat, require_resolution, write_weights
 
 if TYPE_CHECKING:
@@ -87,8 +88,10 @@ class CompletionNet(nn.Module):
             TypeError: if a layer has another dtype than the weights, a mask is not of bool, or the weights are of half
                 precision.
             ValueError: if a layer has another shape or device, or the resolution is out of range.
+            NotImplementedError: in forward-mode differentiation, and if `torch.func.vmap` batches an input.
         """
         require_resolution(resolution)
+        require_reverse_mode([elevation, validity, variance, upper_bound, bounded, age, *self.weights])
         layers = _check_layers(self.weights.prior, elevation, validity, variance, upper_bound, bounded, age)
         return complete(self.weights, layers, resolution)
 

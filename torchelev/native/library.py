@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 _SOURCES = Path(__file__).parent
 _FLAGS = "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -fPIC -shared -pthread -Wno-psabi".split()
@@ -40,16 +43,17 @@ def load(source: str, defines: Mapping[str, str], *flags: str) -> ctypes.CDLL | 
 
 @functools.cache
 def _load(source: str, defines: tuple[tuple[str, str], ...], further: tuple[str, ...]) -> ctypes.CDLL | None:
-    compiler = find_compiler()
-    if compiler is None:
-        return None
     flags = [*_FLAGS, *further, *(f"-D{name}={value}" for name, value in defines)]
     try:
+        compiler = find_compiler()
+        if compiler is None:
+            return None
         path = cache_folder() / f"{Path(source).stem}-{_key(compiler, flags)}.so"
-        if not path.exists():
-            _build(compiler, flags, _SOURCES / source, path)
+        with contextlib.suppress(OSError):  # there is none, or a damaged one
+            return ctypes.CDLL(str(path))
+        _build(compiler, flags, _SOURCES / source, path)
         return ctypes.CDLL(str(path))
-    except (OSError, subprocess.SubprocessError) as error:
+    except (OSError, RuntimeError, subprocess.SubprocessError) as error:  # RuntimeError: a user without a home
         reason = getattr(error, "stderr", None) or error
         warnings.warn(
             f"{source} could not be built, and slower code does its work: {reason}. Set CXX to another compiler, "
@@ -60,10 +64,22 @@ def _load(source: str, defines: tuple[tuple[str, str], ...], further: tuple[str,
         return None
 
 
-def find_compiler() -> str | None:
-    """Return the C++ compiler: that of the environment variable CXX, else the first that is found."""
-    names = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
-    return next((path for path in map(shutil.which, names) if path), None)
+def call(function: Any, *arguments: Any) -> None:
+    """Call a library's function, which returns False where it ran out of memory. Raises MemoryError then."""
+    function.restype = ctypes.c_bool
+    if not function(*arguments):
+        raise MemoryError(f"{function.__name__} ran out of memory: give it fewer or smaller maps at a time")
+
+
+def find_compiler() -> list[str] | None:
+    """Return the C++ compiler: the command of the environment variable CXX, else the first that is found.
+
+    Raises FileNotFoundError if CXX names none.
+    """
+    chosen = shlex.split(os.environ.get("CXX", ""))
+    if chosen and not shutil.which(chosen[0]):
+        raise FileNotFoundError(f"CXX={os.environ['CXX']} is no command")
+    return chosen or next(([name] for name in ("c++", "g++", "clang++") if shutil.which(name)), None)
 
 
 def cache_folder() -> Path:
@@ -72,19 +88,19 @@ def cache_folder() -> Path:
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchelev"
 
 
-def _build(compiler: str, flags: list[str], source: Path, path: Path) -> None:
+def _build(compiler: list[str], flags: list[str], source: Path, path: Path) -> None:
     """Compile a file; the library appears whole or not at all, also if several processes build it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         built = Path(folder) / path.name
-        command = [compiler, *flags, str(source), "-o", str(built)]
+        command = [*compiler, *flags, str(source), "-o", str(built)]
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=300)
         os.replace(built, path)
 
 
-def _key(compiler: str, flags: list[str]) -> str:
+def _key(compiler: list[str], flags: list[str]) -> str:
     """Return a hash of all that the library depends on: sources, flags, compiler and processor."""
-    version = subprocess.run([compiler, "--version"], check=True, capture_output=True, timeout=60).stdout
+    version = subprocess.run([*compiler, "--version"], check=True, capture_output=True, timeout=60).stdout
     parts = [version, " ".join(flags).encode(), _processor()]
     parts += [path.read_bytes() for path in sorted(_SOURCES.rglob("*")) if path.suffix in (".cpp", ".h")]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]

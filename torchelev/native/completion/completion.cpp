@@ -30,8 +30,8 @@ void complete_row(const Weights& weights, const Map& map, int i) {
 
 }  // namespace
 
-// Layers of (B, H, W) and parameters as in complete.py; H and W are below 32767.
-extern "C" void complete(const float* weights, const float* elevation, const bool* known, const float* variance,
+// Layers of (B, H, W) and parameters as in complete.py; H and W are below 32767. False without memory.
+extern "C" bool complete(const float* weights, const float* elevation, const bool* known, const float* variance,
                          const float* upper_bound, const bool* bounded, const float* age, float* mean, float* std,
                          int B, int H, int W, double resolution, int num_threads) {
     const Weights parameters(weights);
@@ -40,17 +40,19 @@ extern "C" void complete(const float* weights, const float* elevation, const boo
         return Map({elevation + first, variance + first, upper_bound + first, age + first, known + first,
                     bounded + first, mean + first, std + first}, H, W, resolution);
     };
-    if (B >= num_threads) {
-        for_each(B, num_threads, [&](int b) {
+    return succeeds([&] {
+        if (B >= num_threads) {
+            for_each(B, num_threads, [&](int b) {
+                Map map = make_map(b);
+                map.count_steps(), map.sum_layers();
+                for (int i = 0; i < H; i++) complete_row(parameters, map, i);
+            });
+            return;
+        }
+        for (int b = 0; b < B; b++) {
             Map map = make_map(b);
-            map.count_steps(), map.sum_layers();
-            for (int i = 0; i < H; i++) complete_row(parameters, map, i);
-        });
-        return;
-    }
-    for (int b = 0; b < B; b++) {
-        Map map = make_map(b);
-        for_each(2, num_threads, [&](int part) { part ? map.count_steps() : map.sum_layers(); });
-        for_each(H, num_threads, [&](int i) { complete_row(parameters, map, i); });
-    }
+            for_each(2, num_threads, [&](int part) { part ? map.count_steps() : map.sum_layers(); });
+            for_each(H, num_threads, [&](int i) { complete_row(parameters, map, i); });
+        }
+    });
 }

@@ -1,5 +1,5 @@
-// Visibility clean-up and upper bounds on a CPU: what torchelev/stages/visibility computes with tensors, to the bit
-// the same as uncompiled. Names, units and equations are there; constants in capitals come from there.
+// Visibility clean-up and upper bounds on a CPU: what torchelev/stages/visibility computes with tensors, the
+// same to rounding. Names, units and equations are there; constants in capitals come from there.
 
 #include "rays.h"
 
@@ -97,8 +97,8 @@ void cast_rays(Map& map, int num_threads) {
 
 }  // namespace
 
-// Layers (B, H, W), of which the last four are changed; points (B, S, N, ...), origin (B, S, 3), offset and center (B, 2).
-extern "C" void clear_seen_through(const float* elevation, const float* variance, const float* support,
+// False without memory. Layers (B, H, W), of which the last four are changed; points (B, S, N, ...), origin (B, S, 3), offset and center (B, 2).
+extern "C" bool clear_seen_through(const float* elevation, const float* variance, const float* support,
                                    const float* challenger, const float* time, const float* gradient_x,
                                    const float* gradient_y, bool* validity, uint8_t* challenger_support,
                                    float* upper_bound, bool* bounded, const float* points, const float* point_variance,
@@ -118,7 +118,9 @@ extern "C" void clear_seen_through(const float* elevation, const float* variance
             cast_rays(map, threads);
         }
     };
-    if (B >= num_threads) for_each(B, num_threads, [&](int b) { run(b, 1); });
-    else
-        for (int b = 0; b < B; b++) run(b, num_threads);
+    return succeeds([&] {
+        if (B >= num_threads) for_each(B, num_threads, [&](int b) { run(b, 1); });
+        else
+            for (int b = 0; b < B; b++) run(b, num_threads);
+    });
 }

@@ -1,4 +1,4 @@
-"""The visibility clean-up in C++ (`torchelev/native/visibility`): to the bit the same as uncompiled, and faster."""
+"""The visibility clean-up in C++ (`torchelev/native/visibility`): the same to rounding, and faster."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.native.library import load
+from torchelev.native.library import call, load
 from torchelev.ops.masks import NOWHERE
 from torchelev.stages.visibility import accepted_rays
 from torchelev.stages.visibility.config import RaycastConfig
@@ -110,7 +110,7 @@ def clear_seen_through(
     pointers = [ctypes.c_void_p(value.data_ptr()) for value in (*read, *new, *inputs)]
     table = _polar(PolarGrid(polar[0], polar[1], bins, tuple(polar[2:])))[0]
     settings = _Settings(H, W, *cfg, torch.get_num_threads())
-    library.clear_seen_through(*pointers, ctypes.byref(table), ctypes.byref(settings), B, S, num_points)
+    call(library.clear_seen_through, *pointers, ctypes.byref(table), ctypes.byref(settings), B, S, num_points)
     return new
 
 
