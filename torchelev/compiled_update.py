@@ -20,7 +20,6 @@ from torchelev.stages.measure import measure
 from torchelev.stages.overlap import clear_other_floors
 from torchelev.stages.recenter import recenter
 from torchelev.stages.visibility.clean_up import clear_seen_through
-from torchelev.stages.visibility.native import look_for_library
 from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.traversability.weight_file import Weights
 
@@ -35,9 +34,8 @@ def compiled_update(
     inputs = [None if value is None else packed(value) for value in (points, *others)]
     mark_dynamic(2, inputs[0], inputs[4])  # points, and their variance
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
-    has_library = points.device.type == "cpu" and look_for_library()
     with announced_compilation():
-        graphs = graphs_of(cfg, (*kinds, has_library), points.shape[1])
+        graphs = graphs_of(cfg, kinds, points.shape[1])
         stored = with_masks(stored, as_bytes)
         m = graphs.move_window(stored, *inputs)
         mark_dynamic(1, m.points, m.variance, m.used, m.casts, m.noise)

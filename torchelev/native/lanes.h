@@ -3,6 +3,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 
 constexpr int LANES = 16;
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
@@ -20,14 +21,21 @@ inline Lanes copy_sign(Lanes size, Lanes sign) {
     return (Lanes)((Flags)absolute(size) | ((Flags)sign & INT32_MIN));
 }
 
-inline Lanes root(Lanes a) {
-    for (int l = 0; l < LANES; l++) a[l] = __builtin_sqrtf(a[l]);
+// A function of each number: a loop over memory, which compilers vectorise, where one over lanes stays a loop.
+template <class Function> inline Lanes of_each(Lanes a, Function function) {
+    float values[LANES];
+    std::memcpy(values, &a, sizeof a);
+    for (int l = 0; l < LANES; l++) values[l] = function(values[l]);
+    std::memcpy(&a, values, sizeof a);
     return a;
 }
 
+inline Lanes root(Lanes a) {
+    return of_each(a, [](float value) { return __builtin_sqrtf(value); });
+}
+
 inline Lanes floor(Lanes a) {
-    for (int l = 0; l < LANES; l++) a[l] = __builtin_floorf(a[l]);
-    return a;
+    return of_each(a, [](float value) { return __builtin_floorf(value); });
 }
 
 inline Lanes load(const float* values, int count = LANES) {
@@ -38,17 +46,18 @@ inline Lanes load(const float* values, int count = LANES) {
 
 inline void store(float* values, Lanes lanes, int count = LANES) { std::memcpy(values, &lanes, sizeof(float) * count); }
 
-inline Lanes gather(const float* values, Flags index) {
-    Lanes lanes;
-    for (int l = 0; l < LANES; l++) lanes[l] = values[index[l]];
+template <class Result, class Value> inline Result gather_as(const Value* values, Flags index) {
+    int32_t places[LANES];
+    std::remove_reference_t<decltype(Result{}[0])> found[LANES];
+    std::memcpy(places, &index, sizeof index);
+    for (int l = 0; l < LANES; l++) found[l] = values[places[l]];
+    Result lanes;
+    std::memcpy(&lanes, found, sizeof lanes);
     return lanes;
 }
 
-inline Flags gather(const int16_t* values, Flags index) {
-    Flags lanes;
-    for (int l = 0; l < LANES; l++) lanes[l] = values[index[l]];
-    return lanes;
-}
+inline Lanes gather(const float* values, Flags index) { return gather_as<Lanes>(values, index); }
+inline Flags gather(const int16_t* values, Flags index) { return gather_as<Flags>(values, index); }
 
 // Natural logarithm of positive normal numbers, by the polynomial of Cephes' logf: 1 unit in the last place.
 inline Lanes log(Lanes x) {

@@ -16,13 +16,11 @@ from torchelev.stages.visibility.config import RaycastConfig
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 
 
-def drive(use_native, seed, num_envs, length_x, length_y, sensors, threads, cfg=None, compiled=False):
+def drive(use_native, seed, num_envs, length_x, length_y, sensors, threads, cfg=None):
     """Return the state after four scans of rough ground, with walls that come and go, long returns and lost points."""
     generator = torch.Generator().manual_seed(seed)
     grid = GridConfig(resolution=0.1, length_x=length_x, length_y=length_y)
     emap = ElevationMap(ElevationMapConfig(grid=grid, raycast=cfg or RaycastConfig()), num_envs)
-    if compiled:
-        emap.compile()
     torch.set_num_threads(threads)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCHELEV_NATIVE", str(int(use_native)))

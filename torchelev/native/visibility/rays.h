@@ -12,12 +12,15 @@ struct Entries {
 inline Entries read_rays(const Map& map, int n) {
     const Sensor& s = map.sensor;
     const int count = std::min(LANES, s.N - n);
-    Lanes px{}, py{}, pz{};
-    Flags casts{}, used{};
+    float at_x[LANES] = {}, at_y[LANES] = {}, at_z[LANES] = {};
+    int32_t is_cast[LANES] = {}, is_used[LANES] = {};
     for (int l = 0; l < count; l++) {
-        px[l] = s.points[3 * (n + l)], py[l] = s.points[3 * (n + l) + 1], pz[l] = s.points[3 * (n + l) + 2];
-        casts[l] = s.casts[n + l] ? -1 : 0, used[l] = s.used[n + l] ? -1 : 0;
+        at_x[l] = s.points[3 * (n + l)], at_y[l] = s.points[3 * (n + l) + 1], at_z[l] = s.points[3 * (n + l) + 2];
+        is_cast[l] = -int32_t(s.casts[n + l]), is_used[l] = -int32_t(s.used[n + l]);
     }
+    const Lanes px = load(at_x), py = load(at_y), pz = load(at_z);
+    Flags casts, used;
+    std::memcpy(&casts, is_cast, sizeof casts), std::memcpy(&used, is_used, sizeof used);
     const Lanes x = px - s.x, y = py - s.y, z = pz - s.z;
     const Lanes r = root(larger(x * x + y * y, all(1e-12f))), slope = z / r, azimuth = azimuth_fraction(x, y);
     const Flags overhang = casts & ~used;

@@ -13,8 +13,9 @@ void clear_row(Map& map, int i) {
     const float x = (float(i) + map.sensor.center_x) * map.resolution - map.sensor.x;
     for (int j = 0; j < map.W; j += LANES) {
         const int count = std::min(LANES, map.W - j), c = i * map.W + j;
-        Lanes columns;
-        for (int l = 0; l < LANES; l++) columns[l] = float(j + l);
+        float place[LANES];
+        for (int l = 0; l < LANES; l++) place[l] = float(j + l);
+        const Lanes columns = load(place);
         const Lanes y = (columns + map.sensor.center_y) * map.resolution - map.sensor.y;
         const Lanes rho = root(larger(all(x * x) + y * y, all(1e-12f)));
         const Lanes k = smaller(floor(rho / map.resolution), all(float(polar.ranges)));
@@ -44,12 +45,17 @@ void clear_row(Map& map, int i) {
         const Flags gone = found & (depth > root(variance)) & (load(s.time + c, count) > min_time) &
                            ((incidence > float(map.cfg.min_incidence)) | (depth > margin + rise));
         const Flags refuted = found & (height < load(s.challenger + c, count) + sqrt_half * fall);
+        float heights[LANES];
+        int32_t is_gone[LANES], is_found[LANES], is_refuted[LANES];
+        store(heights, height);
+        std::memcpy(is_gone, &gone, sizeof gone), std::memcpy(is_found, &found, sizeof found);
+        std::memcpy(is_refuted, &refuted, sizeof refuted);
         for (int l = 0; l < count; l++) {
-            const bool is_valid = s.validity[c + l] && !gone[l], bounds = found[l] && !is_valid;
+            const bool is_valid = s.validity[c + l] && !is_gone[l], bounds = is_found[l] && !is_valid;
             const float bound = s.upper_bound[c + l];
-            if (bounds) s.upper_bound[c + l] = s.bounded[c + l] && bound < height[l] ? bound : height[l];
+            if (bounds) s.upper_bound[c + l] = s.bounded[c + l] && bound < heights[l] ? bound : heights[l];
             s.bounded[c + l] = bounds || (s.bounded[c + l] && !is_valid);
-            if (refuted[l] || !is_valid) s.challenger_support[c + l] = 0;
+            if (is_refuted[l] || !is_valid) s.challenger_support[c + l] = 0;
             s.validity[c + l] = is_valid;
         }
     }

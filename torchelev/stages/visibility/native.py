@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,35 +48,22 @@ class _Settings(ctypes.Structure):
     ]
 
 
-class Availability:
-    """Whether there is a library, as it was found before the compiler came: graphs cannot look for it."""
-
-    found = False
-
-
-def look_for_library() -> bool:
-    """Tell whether there is a library, which is built if there is none yet; compiled updates then use it, too."""
-    Availability.found = _library() is not None
-    return Availability.found
-
-
 def _library() -> ctypes.CDLL | None:
     defines = {name: f"{value!r}f" for name, value in _FLOATS.items()}
     return load("visibility/visibility.cpp", defines | {name: repr(value) for name, value in _DOUBLES.items()}, _EXACT)
 
 
 def can_run(state: MapState, m: Measurement) -> bool:
-    """Tell whether C++ may do the clean-up: on a CPU, in float32, without gradients."""
+    """Tell whether C++ may do the clean-up: uncompiled, on a CPU, in float32, without gradients."""
     floats = [value for value in (*state[:-1], m.points, m.variance, m.origin) if value.is_floating_point()]
     is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in floats)
-    is_plain = torch.compiler.is_compiling() or type(state.elevation) is Tensor
+    is_plain = (
+        not torch.compiler.is_compiling() and type(state.elevation) is Tensor
+    )  # graphs that stay whole are faster
     fits = state.elevation.device.type == "cpu" and state.elevation.dtype == m.points.dtype == torch.float32
-    if not (fits and is_plain) or is_differentiated:
-        return False
-    return Availability.found if torch.compiler.is_compiling() else look_for_library()
+    return fits and is_plain and not is_differentiated and _library() is not None
 
 
-@torch.library.custom_op("torchelev::clear_seen_through", mutates_args=())
 def clear_seen_through(
     layers: list[Tensor],
     changed: list[Tensor],
@@ -114,11 +102,6 @@ def clear_seen_through(
     return new
 
 
-@clear_seen_through.register_fake
-def _(layers, changed, points, origin, offset, center, polar, bins, cfg) -> list[Tensor]:
-    return [layer.new_empty(layer.shape) for layer in changed]
-
-
 @functools.cache
 def _polar(polar: PolarGrid) -> tuple[_Polar, list[Tensor]]:
     """Return the table's size for C++, and the tensors that it points into."""
@@ -148,4 +131,5 @@ def clear(
         polar.bins,
         [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.min_support, cfg.gate],
     )
-    return state._replace(**dict(zip(CHANGED, new, strict=True)))
+    changed: dict[str, Any] = dict(zip(CHANGED, new, strict=True))
+    return state._replace(**changed)
