@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.completion import context, parameters, predict, refine, surroundings
 from torchelev.completion.parameters import Weights
-from torchelev.native.library import call, load
+from torchelev.native.library import as_defines, call, load
 
 _LARGEST = 2**15 - 2  # cells along a side, as steps are counted in 16 bits
 _FLOATS = {
@@ -33,6 +33,7 @@ _FLOATS = {
     "LONG_AGO": refine.LONG_AGO,
 }
 _DOUBLES = {"RADIUS_0": context.RADII[0], "RADIUS_1": context.RADII[1], "SMALLEST_STD": context.SMALLEST_STD}
+_CONSTANTS = as_defines(_FLOATS, _DOUBLES)
 
 
 def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> tuple[Tensor, Tensor] | None:
@@ -51,8 +52,7 @@ def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> t
         return None
     sizes = {"VIEWS": weights.view, "CELLS": weights.cell, "MEASURED": weights.measured}
     defines = {name: str(len(weight)) for name, weight in sizes.items()}
-    defines |= {name: f"{value!r}f" for name, value in _FLOATS.items()}
-    library = load("completion/completion.cpp", defines | {name: repr(value) for name, value in _DOUBLES.items()})
+    library = load("completion/completion.cpp", _CONSTANTS | defines)
     if library is None:
         return None
     flat = torch.cat([weight.detach().flatten() for weight in weights])

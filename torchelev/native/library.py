@@ -22,6 +22,11 @@ _FLAGS = "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -fPIC 
 _OFF = ("0", "off", "false", "no")
 
 
+def as_defines(floats: Mapping[str, float], doubles: Mapping[str, float]) -> dict[str, str]:
+    """Return constants of the types float and double as C++ spells them."""
+    return {name: f"{value!r}f" for name, value in floats.items()} | {n: repr(value) for n, value in doubles.items()}
+
+
 def load(source: str, defines: Mapping[str, str], *flags: str) -> ctypes.CDLL | None:
     """Return a library, which is built if it is not in the cache.
 

@@ -25,11 +25,11 @@ from tqdm import tqdm
 from envs.terrain_nav import TerrainNav, TerrainNavConfig
 from envs.terrain_nav.sight import LAYERS
 from torchelev.app.results import markdown_table, write_json
-from torchelev.viz.style import make_figure, save, styled
 from training import RESULTS
 from training.jobs import Job, train_all
 from training.nav.evaluate import evaluate, straight_line
 from training.nav.runs import load_policy, read_curve
+from training.nav.success_plot import draw_success
 from training.nav.train import task_config
 from training.options import jobs_option, runs_option
 from training.runs import mean, spread
@@ -106,22 +106,9 @@ def table(result: dict[str, Any]) -> str:
     return markdown_table(head, lines)
 
 
-@styled()
 def plot(result: dict[str, Any], path: Path) -> None:
     """Draw the success during training and when deployed."""
-    figure = make_figure(8, 4.2)
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1))
-    for row in result["rows"]:
-        place = FILLS.index(row["fill"])
-        label = NAMES[row["fill"]] if row["seed"] == result["config"]["seeds"][0] else None
-        left.plot(*row["curve"].values(), color=f"C{place}", linewidth=1.2, label=label)
-        right.plot(place, row["deployed"]["success"], "o", color=f"C{place}")
-    left.set(xlabel="environment steps", ylabel="success", title="while training", ylim=(0, 1))
-    left.legend(loc="lower right")
-    left.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1e3:,.0f}k")
-    right.set(title="on held-out ground", ylim=(0, 1), xlim=(-0.4, len(FILLS) - 0.6), xlabel="unknown pixels show")
-    right.set_xticks(range(len(FILLS)), [NAMES[fill] for fill in FILLS])
-    save(figure, path)
+    draw_success(result, "fill", NAMES, "unknown pixels show", path)
 
 
 @click.command(help=__doc__)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from torchelev.stages.visibility.config import RaycastConfig
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
+NO_RAY = 1e4  # a slope above every ray's
 # A ray that leaves the window over no known ground is accepted if it ends at most CLEARANCE below the lowest ground
 # NEAR by, and taken for one that passes CLEARANCE above it: returns that are too long shall not bound below the truth.
 NEAR, CLEARANCE = 1.0, 0.05  # [m]

@@ -11,23 +11,25 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.native.library import call, load
+from torchelev.native.library import as_defines, call, load
 from torchelev.ops.masks import NOWHERE
+from torchelev.ops.transforms import is_transforming
+from torchelev.stages.cells import first_center, lattice_offset
 from torchelev.stages.visibility import accepted_rays
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.state import MapState, Measurement
 
-NO_RAY = 1e4  # a slope above every ray's
 _FLOATS = {
     "NOWHERE": NOWHERE,
     "NO_FALL": accepted_rays.NO_FALL,
-    "NO_RAY": NO_RAY,
+    "NO_RAY": accepted_rays.NO_RAY,
     "CLEARANCE": accepted_rays.CLEARANCE,
 }
 _DOUBLES = {"NEAR": accepted_rays.NEAR, "SQRT_HALF": math.sqrt(0.5)}
 _EXACT = "-ffp-contract=off"  # rounds after each operation, as tensors do
-CHANGED = ("validity", "challenger_support", "upper_bound", "bounded")
+_CONSTANTS = as_defines(_FLOATS, _DOUBLES)
+_CHANGED = ("validity", "challenger_support", "upper_bound", "bounded")
 _READ = ("elevation", "variance", "support", "challenger", "time", "gradient_x", "gradient_y")
 
 
@@ -49,57 +51,37 @@ class _Settings(ctypes.Structure):
 
 
 def _library() -> ctypes.CDLL | None:
-    defines = {name: f"{value!r}f" for name, value in _FLOATS.items()}
-    return load("visibility/visibility.cpp", defines | {name: repr(value) for name, value in _DOUBLES.items()}, _EXACT)
+    return load("visibility/visibility.cpp", _CONSTANTS, _EXACT)
 
 
 def can_run(state: MapState, m: Measurement) -> bool:
     """Tell whether C++ may do the clean-up: uncompiled, on a CPU, in float32, without gradients."""
+    if torch.compiler.is_compiling() or is_transforming():  # graphs that stay whole are faster
+        return False
     floats = [value for value in (*state[:-1], m.points, m.variance, m.origin) if value.is_floating_point()]
     is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in floats)
-    is_plain = (
-        not torch.compiler.is_compiling() and type(state.elevation) is Tensor
-    )  # graphs that stay whole are faster
-    fits = state.elevation.device.type == "cpu" and state.elevation.dtype == m.points.dtype == torch.float32
-    return fits and is_plain and not is_differentiated and _library() is not None
+    is_plain = type(state.elevation) is Tensor and state.elevation.device.type == "cpu"
+    fits = is_plain and state.elevation.dtype == m.points.dtype == torch.float32
+    return fits and not is_differentiated and _library() is not None
 
 
-def clear_seen_through(
-    layers: list[Tensor],
-    changed: list[Tensor],
-    points: list[Tensor],
-    origin: Tensor,
-    offset: Tensor,
-    center: Tensor,
-    polar: list[int],
-    bins: float,
-    cfg: list[float],
-) -> list[Tensor]:
-    """Return the layers CHANGED after the rays of all sensors were cast.
-
-    Args:
-        layers: (B, H, W) of the names _READ.
-        changed: (B, H, W) of the names CHANGED.
-        points: (B, M, ...) points, variances, used and casts.
-        origin: (B, S, 3) [m] the sensors.
-        offset: (B, 2) [m] of the measurement's origin in the window.
-        center: (B, 2) [cells] of the first cell's centre from the measurement's origin.
-        polar: ranges, azimuths and widening of the `PolarGrid`.
-        bins: of the `PolarGrid`.
-        cfg: resolution, and the fields of `RaycastConfig` in the order of `_Settings`.
-    """
+def cast_rays(state: MapState, m: Measurement, polar: PolarGrid, grid: GridConfig, cfg: RaycastConfig) -> MapState:
+    """Return the state after the rays of all sensors were cast, where `can_run` says so."""
     library = _library()
     assert library is not None
-    B, H, W = layers[0].shape
-    S, num_points = origin.shape[1], points[0].shape[1] // max(origin.shape[1], 1)
-    new = [layer.clone(memory_format=torch.contiguous_format) for layer in changed]
-    read = [value.contiguous() for value in layers]
-    inputs = [value.contiguous() for value in (*points, origin, offset, center)]
-    pointers = [ctypes.c_void_p(value.data_ptr()) for value in (*read, *new, *inputs)]
-    table = _polar(PolarGrid(polar[0], polar[1], bins, tuple(polar[2:])))[0]
-    settings = _Settings(H, W, *cfg, torch.get_num_threads())
-    call(library.clear_seen_through, *pointers, ctypes.byref(table), ctypes.byref(settings), B, S, num_points)
-    return new
+    (B, H, W), S = state.elevation.shape, m.origin.shape[1]
+    changed: dict[str, Any] = {
+        name: getattr(state, name).clone(memory_format=torch.contiguous_format) for name in _CHANGED
+    }
+    read = [getattr(state, name) for name in _READ]
+    seen = [m.points, m.variance, m.used, m.casts, m.origin, lattice_offset(state, m, grid), first_center(state, m)]
+    tensors = [value.contiguous() for value in (*read, *changed.values(), *seen)]
+    pointers = [ctypes.c_void_p(value.data_ptr()) for value in tensors]
+    thresholds = cfg.min_time, cfg.min_incidence, cfg.min_support, cfg.gate
+    settings = _Settings(H, W, grid.resolution, *thresholds, torch.get_num_threads())
+    table, sizes = _polar(polar)[0], (B, S, m.points.shape[1] // max(S, 1))
+    call(library.clear_seen_through, *pointers, ctypes.byref(table), ctypes.byref(settings), *sizes)
+    return state._replace(**changed)
 
 
 @functools.cache
@@ -113,23 +95,3 @@ def _polar(polar: PolarGrid) -> tuple[_Polar, list[Tensor]]:
     pointers = [value.data_ptr() for value in tensors]
     size = polar.ranges, polar.azimuths, len(polar.widen)
     return _Polar(*size, *pointers[:3], near_ranges, near_azimuths, *pointers[3:]), tensors
-
-
-def clear(
-    state: MapState, m: Measurement, offset: Tensor, center: Tensor, grid: GridConfig, cfg: RaycastConfig
-) -> MapState:
-    """Return the state after the clean-up."""
-    polar = PolarGrid.of(grid, cfg)
-    new = clear_seen_through(
-        [getattr(state, name) for name in _READ],
-        [getattr(state, name) for name in CHANGED],
-        [m.points, m.variance, m.used, m.casts],
-        m.origin,
-        offset,
-        center,
-        [polar.ranges, polar.azimuths, *polar.widen],
-        polar.bins,
-        [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.min_support, cfg.gate],
-    )
-    changed: dict[str, Any] = dict(zip(CHANGED, new, strict=True))
-    return state._replace(**changed)
