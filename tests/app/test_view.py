@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 
 import numpy as np
@@ -95,6 +96,22 @@ def test_bad_input_is_one_line(run, recording, shown, tmp_path, args, words):
     export.save_npz(tmp_path / "whole.npz", mapped(num_envs=1))
     code, _, err = run("view", *args)
     assert code == 2 and words in err and "Traceback" not in err and not shown
+
+
+def test_ctrl_c_ends_the_wait_of_a_paused_player(run, recording, port, monkeypatch):
+    from torchelev.viz.live import Player
+
+    waits = []
+
+    def wait(self, snapshot):
+        waits.append("begun")
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1)
+        waits.append("ended")
+
+    monkeypatch.setattr(Player, "show", wait)
+    code, out, err = run("view", recording, "--port", port, "--paused", "--size", 6)
+    assert (code, err, waits) == (0, "", ["begun"]) and "closed" in out
 
 
 @pytest.mark.slow(8)

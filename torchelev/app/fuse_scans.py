@@ -68,6 +68,7 @@ def fuse_all(
     scans: Scans,
     options: MapOptions,
     after: Callable[[MappingRun, Frame], None] = lambda run, frame: None,
+    between: Callable[[MappingRun, Frame], None] = lambda run, frame: None,
 ) -> BaseException | None:
     """Fuse all scans in order.
 
@@ -75,7 +76,8 @@ def fuse_all(
         run: the map and its counts.
         scans: the recording.
         options: where the base is, and whether the window follows it.
-        after: called after each scan.
+        after: called after each scan, as a part of it: Ctrl-C does not stop it.
+        between: called then; may wait, as Ctrl-C stops it.
 
     Returns:
         The exception that stopped the mapping early, so that the caller can save the map before raising it; else None.
@@ -91,6 +93,7 @@ def fuse_all(
             with defer_interrupts():
                 run.add(frame, None if options.fixed else frame.T_map_base)
                 after(run, frame)
+            between(run, frame)
     except (KeyboardInterrupt, Exception) as reason:
         return reason
     return None

@@ -62,7 +62,7 @@ def _view_recording(make_page: _MakePage, request: MapRequest, is_paused: bool) 
         emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
         page = make_page(request.recording.resolve().name, emap.layers)
         player, show = Player(page, len(scans), not is_paused), ShowScans()
-        stopped = fuse_all(MappingRun(emap), scans, options, lambda run, frame: show(player, run, frame))
+        stopped = fuse_all(MappingRun(emap), scans, options, between=lambda run, frame: show(player, run, frame))
         if stopped is not None and not isinstance(stopped, KeyboardInterrupt) and player.num_shown:
             click.echo(f"stopped after {player.num_shown} of {len(scans)} scans: {stopped}", err=True)
         elif stopped is not None:
