@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.completion import context, parameters, predict, refine, surroundings
 from torchelev.completion.parameters import Weights
-from torchelev.native.library import as_defines, call, load
+from torchelev.native.library import call, load
 
 _LARGEST = 2**15 - 2  # cells along a side, as steps are counted in 16 bits
 _FLOATS = {
@@ -33,7 +33,7 @@ _FLOATS = {
     "LONG_AGO": refine.LONG_AGO,
 }
 _DOUBLES = {"RADIUS_0": context.RADII[0], "RADIUS_1": context.RADII[1], "SMALLEST_STD": context.SMALLEST_STD}
-_CONSTANTS = as_defines(_FLOATS, _DOUBLES)
+_CONSTANTS = {name: f"{value!r}f" for name, value in _FLOATS.items()} | {k: repr(v) for k, v in _DOUBLES.items()}
 
 
 def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> tuple[Tensor, Tensor] | None:

@@ -9,17 +9,13 @@ constexpr int LANES = 16;
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparisons: -1 true, 0 false
 
-inline Lanes all(float value) { return Lanes{} + value; }  // of -0, 0
+inline Lanes all(float value) { return Lanes{} + value; }
 inline Lanes pick(Flags flags, Lanes yes, Lanes no) { return flags ? yes : no; }
 inline Lanes one_if(Flags flags) { return pick(flags, all(1), all(0)); }
 inline Lanes smaller(Lanes a, Lanes b) { return pick(a < b, a, b); }
 inline Lanes larger(Lanes a, Lanes b) { return pick(a > b, a, b); }
 inline Lanes clamp(Lanes a, float low, float high) { return smaller(larger(a, all(low)), all(high)); }
 inline Lanes absolute(Lanes a) { return (Lanes)((Flags)a & 0x7fffffff); }
-
-inline Lanes copy_sign(Lanes size, Lanes sign) {
-    return (Lanes)((Flags)absolute(size) | ((Flags)sign & INT32_MIN));
-}
 
 // A function of each number: a loop over memory, which compilers vectorise, where one over lanes stays a loop.
 template <class Function> inline Lanes of_each(Lanes a, Function function) {
@@ -32,10 +28,6 @@ template <class Function> inline Lanes of_each(Lanes a, Function function) {
 
 inline Lanes root(Lanes a) {
     return of_each(a, [](float value) { return __builtin_sqrtf(value); });
-}
-
-inline Lanes floor(Lanes a) {
-    return of_each(a, [](float value) { return __builtin_floorf(value); });
 }
 
 inline Lanes load(const float* values, int count = LANES) {

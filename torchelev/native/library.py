@@ -22,12 +22,7 @@ _FLAGS = "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -fPIC 
 _OFF = ("0", "off", "false", "no")
 
 
-def as_defines(floats: Mapping[str, float], doubles: Mapping[str, float]) -> dict[str, str]:
-    """Return constants of the types float and double as C++ spells them."""
-    return {name: f"{value!r}f" for name, value in floats.items()} | {n: repr(value) for n, value in doubles.items()}
-
-
-def load(source: str, defines: Mapping[str, str], *flags: str) -> ctypes.CDLL | None:
+def load(source: str, defines: Mapping[str, str]) -> ctypes.CDLL | None:
     """Return a library, which is built if it is not in the cache.
 
     The cache is the folder in the environment variable TORCHELEV_CACHE, else `torchelev` in the user's cache folder.
@@ -35,7 +30,6 @@ def load(source: str, defines: Mapping[str, str], *flags: str) -> ctypes.CDLL | 
     Args:
         source: file in this folder.
         defines: values of the constants that the source does not define.
-        flags: further ones of the compiler.
 
     Returns:
         The library; None without a compiler, or with TORCHELEV_NATIVE=0 in the environment. If the compiler fails, a
@@ -43,12 +37,12 @@ def load(source: str, defines: Mapping[str, str], *flags: str) -> ctypes.CDLL | 
     """
     if os.environ.get("TORCHELEV_NATIVE", "1").lower() in _OFF:
         return None
-    return _load(source, tuple(sorted(defines.items())), flags)
+    return _load(source, tuple(sorted(defines.items())))
 
 
 @functools.cache
-def _load(source: str, defines: tuple[tuple[str, str], ...], further: tuple[str, ...]) -> ctypes.CDLL | None:
-    flags = [*_FLAGS, *further, *(f"-D{name}={value}" for name, value in defines)]
+def _load(source: str, defines: tuple[tuple[str, str], ...]) -> ctypes.CDLL | None:
+    flags = [*_FLAGS, *(f"-D{name}={value}" for name, value in defines)]
     try:
         compiler = find_compiler()
         if compiler is None:

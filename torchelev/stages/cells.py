@@ -41,15 +41,10 @@ def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[T
     return cells.to(m.points.dtype) * grid.resolution
 
 
-def first_center(state: MapState, m: Measurement) -> Float[Tensor, "B 2"]:
-    """Return the centre of cell [0, 0], counted from the measurement's horizontal origin [cells]."""
-    return (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
-
-
 @stored
 def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[Tensor, Tensor]:
     """Return x (B, H, 1) and y (B, 1, W) of the cell centres [m], counted from the measurement's horizontal origin."""
-    cells = first_center(state, m)
+    cells = (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
     x = torch.arange(grid.height, device=cells.device) + cells[:, 0, None]
     y = torch.arange(grid.width, device=cells.device) + cells[:, 1, None]
     return (x * grid.resolution)[:, :, None], (y * grid.resolution)[:, None, :]

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from torchelev.stages.visibility.config import RaycastConfig
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
-NO_RAY = 1e4  # a slope above every ray's
 # A ray that leaves the window over no known ground is accepted if it ends at most CLEARANCE below the lowest ground
 # NEAR by, and taken for one that passes CLEARANCE above it: returns that are too long shall not bound below the truth.
 NEAR, CLEARANCE = 1.0, 0.05  # [m]
@@ -166,7 +165,8 @@ def horizon(
     by gathering from the map: the running minimum, from the sensor outwards, of the fall to each bin's ground.
     """
     step = 2 * grid.resolution
-    ranges, azimuths = near_size(PolarGrid.of(grid, cfg))
+    polar = PolarGrid.of(grid, cfg)
+    ranges, azimuths = 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
     rho = (torch.arange(ranges, device=rays.r.device, dtype=rays.r.dtype) + 0.5)[:, None] * step
     x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(directions(azimuths, rays.r)))
     slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
@@ -178,11 +178,6 @@ def horizon(
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
     return torch.where(k >= 0, limit, NO_FALL)
-
-
-def near_size(polar: PolarGrid) -> tuple[int, int]:
-    """Return how many ranges and azimuths the table of `horizon` has."""
-    return 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
 
 
 @stored  # or each bin of every environment would compute them anew

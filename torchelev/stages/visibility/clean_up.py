@@ -19,14 +19,16 @@ from torchelev.ops.masks import count
 from torchelev.ops.operators import polar_minimum
 from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
-from torchelev.stages.visibility import native
-from torchelev.stages.visibility.accepted_rays import NO_RAY, Rays, accepted_rays, height_margin, sensor_rays
+from torchelev.stages.visibility.accepted_rays import Rays, accepted_rays, height_margin, sensor_rays
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
+
+
+NO_RAY = 1e4  # a slope above every ray's
 
 
 def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
@@ -92,13 +94,10 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     if cfg is None:
         return state
     polar, known = PolarGrid.of(grid, cfg), state.validity
-    if native.can_run(state, m):
-        state = native.cast_rays(state, m, polar, grid, cfg)
-    else:
-        for s in range(m.origin.shape[1]):
-            rays = sensor_rays(m, s)
-            table = lowest_slopes(accepted_rays(state, m, rays, grid, cfg), polar, grid)
-            state = clear_and_bound(state, find_lowest_rays(state, m, rays.origin, table, polar, grid), grid, cfg)
+    for s in range(m.origin.shape[1]):
+        rays = sensor_rays(m, s)
+        table = lowest_slopes(accepted_rays(state, m, rays, grid, cfg), polar, grid)
+        state = clear_and_bound(state, find_lowest_rays(state, m, rays.origin, table, polar, grid), grid, cfg)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
 
 
