@@ -17,6 +17,7 @@ from typing import Any
 
 import benchmarks
 import training
+from benchmarks.gpu import report as gpu
 from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.quality.real import completed, merged
@@ -47,6 +48,7 @@ from training.quadruped import step_time
 from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
+GPU = "gpu-nvidia-h100-80gb-hbm3"
 SPEED = "speed-2-x-intel-r-xeon-r-processor-2-threads"
 _SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
 
@@ -169,6 +171,7 @@ TABLES = {
     "head": _made_by(head.table, "head", "rows"),
     "block": _made_by(block.table, "block", "profiles", folder=training.RESULTS),
     "self_filter": _self_filter,
+    "gpu": _made_by(gpu.table, GPU),
 }
 
 

@@ -6,10 +6,11 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from benchmarks.speed.completion import make_maps
 from tests.helpers import pose, random_poses, small_config, with_completion
 from tests.robot_body.bodies import random_body
 from tests.site.helpers import known_cells, robots
-from torchelev import BodyConfig, ElevationMap, HeightScan, MapImage, SensorConfig
+from torchelev import BodyConfig, CompletionNet, ElevationMap, HeightScan, MapImage, SensorConfig
 from torchelev.completion.surroundings import count_steps
 from torchelev.ops import operators
 from torchelev.site import SiteMap
@@ -18,7 +19,9 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CU
 OPERATORS = [
     operators._cell_sums,
     operators._padded,
-    operators.running_minimum,
+    operators._running_minimum,
+    operators.highest_per_cell,
+    operators._lowest_per_cell,
     operators._polar_minimum,
     count_steps,
 ]
@@ -199,3 +202,13 @@ def test_a_site_takes_maps_of_a_gpu_and_gives_back(device):
     newcomer = ElevationMap(small_config((20, 20)), 1, "cuda")
     newcomer.initialize_from(sites[1], pose((2.0, 2.0, 0.5)).cuda())
     assert newcomer.state.validity.any()
+
+
+@needs_gpu
+@pytest.mark.parametrize("maps, size", [(1, 250), (16, 64)])
+def test_completion_compiles(maps, size):
+    net = CompletionNet.from_pretrained().requires_grad_(False).cuda()
+    layers = [layer.cuda() for layer in make_maps(maps, size)]
+    expected, completed = (run(*layers, resolution=0.04) for run in (net, torch.compile(net)))
+    for one, other in zip(expected, completed, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=0)

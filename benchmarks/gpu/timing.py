@@ -11,25 +11,35 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.speed import meter
+from benchmarks.speed.completion import make_maps
 from benchmarks.speed.meter import fresh_compiler
 from benchmarks.speed.workload import BPEARL, Drive, full_config
+from torchelev import CompletionNet
+from torchelev.completion.complete import CompletionInput
 
 _SCAN_POINTS = 187  # of a height scan
+MAPS = {"250 x 250": (1, 250), "256 x 64 x 64": (256, 64), "4096 x 64 x 64": (4096, 64)}  # completed: maps, cells
 Figure = tuple[str, Callable[[], Any]]  # its name and the call that measures it
 
 
-def _captured(drive: Drive) -> Callable[[], None]:
-    """Return a drive whose update is one CUDA graph, captured by torch: one launch instead of hundreds."""
-    points, T = (value.clone() for value in drive.next_scan())
+def _graph(run: Callable[[], Any]) -> torch.cuda.CUDAGraph:
+    """Return a call as one CUDA graph, captured by torch: one launch instead of hundreds."""
     side_stream = torch.cuda.Stream()
     side_stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side_stream):  # compile and warm up outside the graph
         for _ in range(3):
-            drive.emap.update(points, T, T, drive.dt)
+            run()
     torch.cuda.current_stream().wait_stream(side_stream)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        drive.emap.update(points, T, T, drive.dt)
+        run()
+    return graph
+
+
+def _captured(drive: Drive) -> Callable[[], None]:
+    """Return a drive whose update is one CUDA graph."""
+    points, T = (value.clone() for value in drive.next_scan())
+    graph = _graph(lambda: drive.emap.update(points, T, T, drive.dt))
 
     def replay() -> None:
         scan, pose = drive.next_scan()
@@ -63,8 +73,9 @@ def _waiting(run: Callable[[], None]) -> Callable[[], None]:
     return run_and_wait
 
 
-def many_robots(device: str, robots: int, points: int, seconds: float) -> Iterator[Figure]:
-    """Time thousands of robots, and measure the traffic and bandwidth to compare the time with."""
+def many_robots(device: str, seconds: float) -> Iterator[Figure]:
+    """Time thousands of robots, on a CPU eight, and measure the traffic and bandwidth to compare the time with."""
+    robots, points = (8, 512) if device == "cpu" else (4096, 3072)
     fresh_compiler()
     cfg = full_config(64)
     drive = Drive(cfg, points, robots=robots, device=device, scans=2)
@@ -84,8 +95,29 @@ def many_robots(device: str, robots: int, points: int, seconds: float) -> Iterat
         yield "height scans", lambda: meter.milliseconds(lambda: emap.sample(xy), seconds)
         yield "height scans, compiled", lambda: meter.milliseconds(lambda: sample(emap.state, xy), seconds)
     if device != "cpu":
+        with torch.no_grad():
+            yield "height scans, captured", lambda: _time_captured(lambda: sample(emap.state, xy), seconds)
         yield "many robots, captured", lambda: meter.milliseconds(_captured(drive), seconds)
     yield "reset", lambda: meter.milliseconds(emap.reset, seconds)
+
+
+def completion(device: str, seconds: float) -> Iterator[Figure]:
+    """Time the completion of maps half of whose cells are unknown: eager, compiled, captured."""
+    sizes = {"4 x 64 x 64": (4, 64)} if device == "cpu" else MAPS
+    net = CompletionNet.from_pretrained().requires_grad_(False).to(device)
+    for name, size in sizes.items():
+        layers = CompletionInput(*(layer.to(device) for layer in make_maps(*size)))
+        fresh_compiler()
+        compiled = torch.compile(net)
+        for kind, complete in (("eager", net), ("compiled", compiled)):
+            run = partial(complete, *layers, resolution=0.04)
+            yield f"completion, {name}, {kind}", partial(meter.milliseconds, run, seconds)
+        if device != "cpu":
+            yield f"completion, {name}, captured", partial(_time_captured, run, seconds)
+
+
+def _time_captured(run: Callable[[], Any], seconds: float) -> dict[str, float]:
+    return meter.milliseconds(_graph(run).replay, seconds)
 
 
 def _slowest_kernels(drive: Drive) -> dict[str, float]:
@@ -97,5 +129,5 @@ def _slowest_kernels(drive: Drive) -> dict[str, float]:
     kind = DeviceType.CUDA if on_gpu else DeviceType.CPU  # an operator's entry repeats its kernels' time
     events = [event for event in record.key_averages() if event.device_type == kind]
     field = "self_device_time_total" if on_gpu else "self_cpu_time_total"
-    times: dict[str, float] = {event.key[:80]: getattr(event, field) for event in events}  # [us]
-    return {key: round(times[key] / 1e3, 4) for key in sorted(times, key=times.__getitem__, reverse=True)[:20]}
+    slowest = sorted(events, key=lambda event: getattr(event, field), reverse=True)[:20]  # [us]
+    return {f"{event.key[:60]} ... {event.key[-40:]}": round(getattr(event, field) / 1e3, 4) for event in slowest}

@@ -1,7 +1,8 @@
 """Operations that the compiler makes 5 to 30 times slower on a CPU: as custom operators they stay as they are.
 
 It would turn sums per cell into atomic additions, test at every read of a border whether it lies outside, and compute
-every term of a running minimum again for every reader.
+every term of a running minimum again for every reader. On a GPU, where each operation costs a launch, it may do the
+latter two.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.ops import scatter
 from torchelev.ops.transforms import with_gradient
+
+
+def _compiles_for_gpu(values: Tensor) -> bool:
+    return torch.compiler.is_compiling() and not values.is_cpu and not torch.is_grad_enabled()
 
 
 @torch.library.custom_op("torchelev::cell_sums", mutates_args=())
 def _cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor:
     """Sum values (K, B, M) by the slots `index` (B, M) in [0, size): -> (K, B, size). Slots never mix environments."""
-    # One row per column and environment: rows run in parallel, and each stays in the cache.
-    zeros = values.new_zeros(values.shape[0], values.shape[1], size)
-    return zeros.scatter_add_(2, index.expand(values.shape), values)
+    return scatter.add(index, values, size)
 
 
 @_cell_sums.register_fake
@@ -61,7 +65,14 @@ def _keep_radius(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.radius = inputs[1]
 
 
-padded = with_gradient(_padded, _keep_radius, _padded_backward)
+_padded_with_gradient = with_gradient(_padded, _keep_radius, _padded_backward)
+
+
+def padded(values: Tensor, radius: int, fill: float) -> Tensor:
+    """Put a rim of `radius` cells around (..., H, W)."""
+    if _compiles_for_gpu(values):
+        return F.pad(values, [radius] * 4, value=fill)
+    return _padded_with_gradient(values, radius, fill)
 
 
 def _scan_rows(rows: Sequence[Tensor]) -> None:
@@ -85,16 +96,41 @@ def _scan(table: Tensor, from_end: bool) -> None:
 
 
 @torch.library.custom_op("torchelev::running_minimum", mutates_args=())
-def running_minimum(table: Tensor) -> Tensor:
-    """Return the running minimum along dimension 1, a multiple of 8: over j <= k."""
+def _running_minimum(table: Tensor) -> Tensor:
     table = table.clone()
     _scan(table, from_end=False)
     return table
 
 
-@running_minimum.register_fake
+@_running_minimum.register_fake
 def _(table: Tensor) -> Tensor:
     return torch.empty_like(table)
+
+
+def running_minimum(table: Tensor) -> Tensor:
+    """Return the running minimum along dimension 1, a multiple of 8: over j <= k."""
+    return table.cummin(1).values if _compiles_for_gpu(table) else _running_minimum(table)
+
+
+@torch.library.custom_op("torchelev::highest_per_cell", mutates_args=())
+def highest_per_cell(index: Tensor, values: Tensor, size: int) -> Tensor:
+    """Return the highest of the values (B, M) in each slot `index` (B, M): -> (B, size), -inf where there is none."""
+    return scatter.highest(index, values, size, -torch.inf)
+
+
+@highest_per_cell.register_fake
+def _(index: Tensor, values: Tensor, size: int) -> Tensor:
+    return values.new_empty(values.shape[0], size)
+
+
+@torch.library.custom_op("torchelev::lowest_per_cell", mutates_args=())
+def _lowest_per_cell(index: Tensor, values: Tensor, size: int, blank: float) -> Tensor:
+    return scatter.lowest(index, values, size, blank)
+
+
+@_lowest_per_cell.register_fake
+def _(index: Tensor, values: Tensor, size: int, blank: float) -> Tensor:
+    return values.new_empty(values.shape[0], size)
 
 
 @torch.library.custom_op(
@@ -103,16 +139,8 @@ def _(table: Tensor) -> Tensor:
     schema="(Tensor index, Tensor values, SymInt azimuths, SymInt[] widen, SymInt ranges, float blank) -> Tensor",
 )
 def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
-    """Return the table (B, R, azimuths) of the lowest value at or beyond each range and near each azimuth.
-
-    `index` (B, N) is range * azimuths + azimuth of each value (B, N); range = `ranges` drops it. Every level w of
-    `widen` makes an entry of the first widen[w] ranges the minimum of twice as many azimuths, itself the first of
-    them. Row `ranges` and what follows it, R being a multiple of 8, are blank, for what lies out of reach.
-    """
     size = _table_rows(ranges)
-    table = values.new_full((index.shape[0], size * azimuths), blank)
-    table.scatter_reduce_(1, index, values, "amin")
-    table = table.unflatten(1, (size, azimuths))
+    table = scatter.lowest(index, values, size * azimuths, blank).unflatten(1, (size, azimuths))
     table[:, ranges] = blank
     _scan(table, from_end=True)
     _widen(table, widen)
@@ -155,4 +183,22 @@ def _polar_minimum_backward(ctx, grad: Tensor) -> tuple[None, Tensor, None, None
     return None, by_rank[:, :number].gather(1, rank.to(torch.int64)), None, None, None, None
 
 
-polar_minimum = with_gradient(_polar_minimum, _keep_rays, _polar_minimum_backward)
+_polar_minimum_with_gradient = with_gradient(_polar_minimum, _keep_rays, _polar_minimum_backward)
+
+
+def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
+    """Return the table (B, R, azimuths) of the lowest value at or beyond each range and near each azimuth.
+
+    `index` (B, N) is range * azimuths + azimuth of each value (B, N); range = `ranges` drops it. Every level w of
+    `widen` makes an entry of the first widen[w] ranges the minimum of twice as many azimuths, itself the first of
+    them. Row `ranges` and what follows it, R being a multiple of 8, are blank, for what lies out of reach.
+    """
+    if not _compiles_for_gpu(values):
+        return _polar_minimum_with_gradient(index, values, azimuths, widen, ranges, blank)
+    size = _table_rows(ranges)
+    table = _lowest_per_cell(index, values, size * azimuths, blank).unflatten(1, (size, azimuths))
+    row = torch.arange(size, device=values.device)[:, None]
+    table = torch.where(row == ranges, blank, table).flip(1).cummin(1).values.flip(1)
+    for level, rows in enumerate(widen):
+        table = torch.where(row < rows, torch.minimum(table, table.roll(-(2**level), 2)), table)
+    return table

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.indexing import SelectedCells, can_select, select_points
+from torchelev.ops.operators import cell_sums, highest_per_cell
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -46,18 +47,25 @@ class ContestedCells(SelectedCells):
         self.cells, self.owner, columns = select_points(self.selected, slot, columns)
         self.has_step, self.mean = self.of(has_step), self.of(mean)
         z, self.spread, self.weight, self.passed, *self.ray = columns
+        if not can_select(self.selected):  # without the other cells' points, which sums leave out if they are zero
+            self.weight = self.weight * self.at_points(self.selected.flatten())
         self.z = z - self.at_points(self.mean)  # [m] above the mean of the cell's points
         self.used = (self.weight > 0).to(z.dtype)
 
     def sum(self, values: Tensor) -> Tensor:
         """Sum the points' values (..., P) per cell: -> (..., K)."""
-        total = values.new_zeros(*values.shape[:-1], self.cells.shape[0])
-        return total.scatter_add_(-1, self.owner.expand(values.shape), values)
+        if values.is_cpu:
+            total = values.new_zeros(*values.shape[:-1], self.cells.shape[0])
+            return total.scatter_add_(-1, self.owner.expand(values.shape), values)
+        sums = cell_sums(self.owner[None], values.reshape(-1, 1, values.shape[-1]), self.cells.shape[0])
+        return sums.view(*values.shape[:-1], -1)
 
     def highest(self, values: Tensor) -> Tensor:
-        """Return the highest of the points' values (..., P) per cell: -> (..., K)."""
-        highest = values.new_full((*values.shape[:-1], self.cells.shape[0]), -torch.inf)
-        return highest.scatter_reduce_(-1, self.owner.expand(values.shape), values, "amax")
+        """Return the highest of the points' values (P,) per cell: -> (K,)."""
+        if values.is_cpu:
+            highest = values.new_full((self.cells.shape[0],), -torch.inf)
+            return highest.scatter_reduce_(-1, self.owner, values, "amax")
+        return highest_per_cell(self.owner[None], values[None], self.cells.shape[0])[0]
 
     def at_points(self, values: Tensor) -> Tensor:
         """Give each point its cell's value: (..., K) -> (..., P)."""

@@ -85,7 +85,7 @@ def level_reached(points: ContestedCells, reached: Tensor, number: int) -> Tenso
     for _ in range(number - 1):
         at = points.at_points(level)
         next_level = points.highest(torch.where(reached < at, reached, -torch.inf))
-        enough = points.sum((reached >= at).to(reached.dtype)) >= number
+        enough = points.sum(points.used * (reached >= at)) >= number
         level = torch.where(enough, level, next_level)
     return level
 

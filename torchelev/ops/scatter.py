@@ -1,0 +1,57 @@
+"""Sums and extremes of values by slot.
+
+On a GPU torch writes every value, also those that change nothing, and all that share a slot wait for each other. There
+`torchelev.ops.triton_scatter` does the same and leaves those out.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+
+import torch
+from torch import Tensor
+
+
+def add(index: Tensor, values: Tensor, size: int) -> Tensor:
+    """Sum values (K, B, M) by the slots `index` (B, M) in [0, size): -> (K, B, size)."""
+    # One row per column and environment: on a CPU rows run in parallel, and each stays in the cache.
+    sums = values.new_zeros(values.shape[0], values.shape[1], size)
+    if _takes_triton(values):
+        from torchelev.ops import triton_scatter
+
+        triton_scatter.add(sums, index.contiguous(), values.contiguous())
+        return sums
+    return sums.scatter_add_(2, index.expand(values.shape), values)
+
+
+def lowest(index: Tensor, values: Tensor, size: int, blank: float) -> Tensor:
+    """Return the lowest of the values (B, M) in each slot: -> (B, size), `blank` where none is lower."""
+    table = values.new_full((values.shape[0], size), blank)
+    return _keep(table, index, values, "amin")
+
+
+def highest(index: Tensor, values: Tensor, size: int, blank: float) -> Tensor:
+    """Return the highest of the values (B, M) in each slot: -> (B, size), `blank` where none is higher."""
+    table = values.new_full((values.shape[0], size), blank)
+    return _keep(table, index, values, "amax")
+
+
+def _keep(table: Tensor, index: Tensor, values: Tensor, which: str) -> Tensor:
+    if _takes_triton(values):
+        from torchelev.ops import triton_scatter
+
+        triton_scatter.keep(table, index.contiguous(), values.contiguous(), lowest=which == "amin")
+        return table
+    return table.scatter_reduce_(1, index, values, which)
+
+
+def _takes_triton(values: Tensor) -> bool:
+    """Tell whether Triton may do it: its sums differ from run to run in the last bit."""
+    is_float = values.is_cuda and values.dtype == torch.float32
+    return is_float and _has_triton() and not torch.are_deterministic_algorithms_enabled()
+
+
+@functools.cache
+def _has_triton() -> bool:
+    return importlib.util.find_spec("triton") is not None
