@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor
@@ -25,7 +27,6 @@ from torchelev.app.results import markdown_table, slug, write_json
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact.sensors import NonRepetitiveLidar
 from torchelev.sim.poses import pose
-from torchelev.sim.sensors import tracing
 from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor
 from torchelev.sim.terrains.generate import terrain_grid
@@ -64,37 +65,38 @@ def _legs(robots: int, count: int, device: str) -> Boxes | None:
     return Boxes(T_base_box.expand(robots, count, 4, 4), half_size.expand(robots, count, 3))
 
 
-def rounds(cast: Callable[[], Any]) -> list[tuple[int, int]]:
-    """Return, for each round of a cast, how many rays it searched and over how many cells along each axis."""
-    search, done = tracing.search, []
-
-    def counted(field: HeightField, rays: tracing.Rays, count: int) -> tuple[Tensor, Tensor]:
-        done.append((len(rays.ray), count))
-        return search(field, rays, count)
-
-    tracing.search = counted
-    try:
-        cast()
-    finally:
-        tracing.search = search
-    return done
-
-
 def measure(field: HeightField, seconds: float) -> list[dict[str, Any]]:
-    """Time all cases in turn."""
-    casts: dict[tuple[str, int, int], Callable[[], Tensor]] = {}
+    """Time all cases in turn, on a CPU in C++ and by tensors."""
+    casts: dict[tuple[str, int, int, str], Callable[[], Tensor]] = {}
     for name, robots, boxes in CASES:
         tiles, T = standing(field, robots)
         legs, step = _legs(robots, boxes, str(field.device)), torch.zeros_like(tiles)
-        casts[name, robots, boxes] = partial(SENSORS[name], field, tiles, T, legs=legs, step=step)
+        for code in ("C++", "tensors") if field.device.type == "cpu" else ("tensors",):
+            measured = partial(SENSORS[name], field, tiles, T, legs=legs, step=step)
+            casts[name, robots, boxes, code] = measured if code == "C++" else partial(_without_native, measured)
     times = meter.interleaved(casts, seconds)
     rows = []
-    for (name, robots, boxes), cast in casts.items():
-        time_of, rays = times[name, robots, boxes], cast().shape[:2].numel()
-        row = {"sensor": name, "robots": robots, "boxes": boxes, "rays": rays} | time_of
-        hits = float(cast()[..., 0].isfinite().float().mean())
-        rows.append(row | {"rays_per_second": 1e3 * rays / time_of["median"], "hits": hits, "rounds": rounds(cast)})
+    for case, cast in casts.items():
+        rays, hits = cast().shape[:2].numel(), float(cast()[..., 0].isfinite().float().mean())
+        row = dict(zip(("sensor", "robots", "boxes", "code"), case, strict=True)) | times[case]
+        rows.append(row | {"rays": rays, "rays_per_second": 1e3 * rays / times[case]["median"], "hits": hits})
     return rows
+
+
+def _without_native(cast: Callable[[], Tensor]) -> Tensor:
+    with mock.patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"}):
+        return cast()
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Tabulate the times [ms]."""
+    head = ["sensor", "robots", "boxes", "by", "median ms", "min ms", "M rays/s", "hits"]
+    lines = [
+        [r["sensor"], str(r["robots"]), str(r["boxes"]), r["code"], f"{r['median']:.1f}", f"{r['min']:.1f}",
+         f"{r['rays_per_second'] / 1e6:.1f}", f"{r['hits']:.0%}"]
+        for r in rows
+    ]  # fmt: skip
+    return markdown_table(head, lines)
 
 
 def main() -> None:
@@ -118,13 +120,7 @@ def main() -> None:
     tile = {"samples": list(field.heights.shape[1:]), "resolution": field.resolution, "bytes": held}
     result = {"tiles": field.num_tiles, "tile": tile, "seconds_to_build": built, "cases": rows}
     write_json(options.out or RESULTS / f"sensors{name}.json", result)
-    head = ["sensor", "robots", "boxes", "ms, median", "iqr", "M rays/s", "hits", "rounds"]
-    table = [
-        [r["sensor"], str(r["robots"]), str(r["boxes"]), f"{r['median']:.1f}", f"{r['iqr']:.1f}",
-         f"{r['rays_per_second'] / 1e6:.1f}", f"{r['hits']:.0%}", str(len(r["rounds"]))]
-        for r in rows
-    ]  # fmt: skip
-    print(markdown_table(head, table))
+    print(table(rows))
 
 
 if __name__ == "__main__":

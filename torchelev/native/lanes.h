@@ -11,6 +11,8 @@ typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparison
 
 inline Lanes all(float value) { return Lanes{} + value; }
 inline Lanes pick(Flags flags, Lanes yes, Lanes no) { return flags ? yes : no; }
+inline Flags pick_int(Flags flags, Flags yes, Flags no) { return flags ? yes : no; }
+inline Flags pick_int(Flags flags, int yes, Flags no) { return pick_int(flags, Flags{} + yes, no); }
 inline Lanes one_if(Flags flags) { return pick(flags, all(1), all(0)); }
 inline Lanes smaller(Lanes a, Lanes b) { return pick(a < b, a, b); }
 inline Lanes larger(Lanes a, Lanes b) { return pick(a > b, a, b); }

@@ -142,6 +142,16 @@ def test_path_of_a_gpu_has_static_shapes(monkeypatch):
         assert cast(field, *(mode.from_tensor(v) for v in inputs), reach, boxes).shape == (2, 5)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_boxes_equal_those_of_the_tensors(seed, monkeypatch):
+    torch.manual_seed(seed)
+    field, *inputs = on("cpu", B=3, M=300, K=5)
+    inputs[-1].half_size[:, 1] = 0.0
+    fast = cast(field, *inputs)
+    monkeypatch.setenv("TORCHELEV_NATIVE", "0")
+    same(fast, cast(field, *inputs))
+
+
 @needs_gpu
 def test_gpu_equals_cpu():
     torch.manual_seed(0)

@@ -113,20 +113,20 @@ def test_range_is_the_limit(path):
 @pytest.mark.slow(8)
 @pytest.mark.parametrize("terrain", TERRAINS)
 def test_equals_a_fine_march(terrain):
-    """All kinds of rays on one kind of terrain: 3,150 of them, and 22,050 over all terrains."""
+    """All kinds of rays on one kind of terrain: 3,150 of them, and 22,050 over all terrains, by C++ and by tensors."""
     rng, N, reach, touching = np.random.default_rng(TERRAINS.index(terrain)), 150, 1.5, 0
     for resolution in (0.02, 0.035, 0.05):
         field = difficult_terrain(terrain, rng, resolution)
         for kind in RAYS:
             tile, origins, d = difficult_rays(kind, rng, field, N)
             expected = march(field, tile, origins.astype(float), d.astype(float), reach)
-            got = cast(field, torch.from_numpy(tile), torch.from_numpy(origins), torch.from_numpy(d)[:, None], reach)
-            got = got[:, 0].double().numpy()
-            far = (np.minimum(got, expected) > reach - FINE) | (got == expected)
-            differ = np.flatnonzero(~far & ~np.isclose(got, expected, rtol=0, atol=0.005))
-            touching += len(differ)
-            assert all(only_touches(field, tile[n], origins[n], d[n], got[n], expected[n]) for n in differ), kind
-    assert touching <= 10  # of 3,150
+            rays = torch.from_numpy(tile), torch.from_numpy(origins), torch.from_numpy(d)[:, None], reach
+            for got in (cast(field, *rays)[:, 0].numpy(), by_tensors(field, *rays)[:, 0].numpy()):
+                far = (np.minimum(got, expected) > reach - FINE) | (got == expected)
+                differ = np.flatnonzero(~far & ~np.isclose(got, expected, rtol=0, atol=0.005))
+                touching += len(differ)
+                assert all(only_touches(field, tile[n], origins[n], d[n], got[n], expected[n]) for n in differ), kind
+    assert touching <= 20  # of 6,300
 
 
 def only_touches(field, tile, origin, d, got, expected):
@@ -150,6 +150,7 @@ def test_ray_that_is_next_to_a_border_by_rounding():
 
 
 def test_air_above_everything_takes_one_round(monkeypatch):
+    monkeypatch.setenv("TORCHELEV_NATIVE", "0")
     field, tiles, origin, _ = scene(3)
     counts, search = [], tracing.search
     monkeypatch.setattr(tracing, "search", lambda *args: (counts.append(1), search(*args))[1])
@@ -168,6 +169,7 @@ def test_march_finds_what_it_must():
 
 
 @pytest.mark.parametrize("terrain", TERRAINS)
+@pytest.mark.parametrize("path", ["selects rays", "keeps all rays"], indirect=True)
 def test_no_ray_is_left_over(terrain, path, monkeypatch):
     """After the last round each ray has met the ground or come to the end of its range, also the longest ones."""
     rng, last, seen = np.random.default_rng(9), {}, {}
@@ -199,13 +201,33 @@ def test_hits_lie_on_the_surface(seed):
     assert (over[t.isfinite()].abs() < 2e-4).all()  # the steepest face rises 0.8 m in 0.04 m
 
 
-@given(st.integers(0, 10_000))
-def test_paths_agree(seed):
-    field, tiles, origin, d = scene(seed, kind=RAYS[seed % len(RAYS)])
-    picked = cast(field, tiles, origin, d, 4.0)
+def by_tensors(*arguments, selects=True):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tracing, "can_select_rays", lambda device: False)
-        same(cast(field, tiles, origin, d, 4.0), picked)
+        patch.setenv("TORCHELEV_NATIVE", "0")
+        patch.setattr(tracing, "can_select_rays", lambda device: selects)
+        return cast(*arguments)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 2))
+def test_paths_agree(seed, threads):
+    field, tiles, origin, d = scene(seed, kind=RAYS[seed % len(RAYS)])
+    picked = by_tensors(field, tiles, origin, d, 4.0)
+    same(by_tensors(field, tiles, origin, d, 4.0, selects=False), picked)
+    torch.set_num_threads(threads)
+    same(cast(field, tiles, origin, d, 4.0), picked)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, 0.0])
+def test_directions_that_are_none_end_all_the_same(bad, path):
+    field, tiles, origin, d = scene(4, B=3)
+    expected = cast(field, tiles, origin, d, 4.0)
+    for k in range(3):
+        broken = d.clone()
+        broken[:, ::7, k] = bad
+        t = cast(field, tiles, origin, broken, 4.0)
+        assert not t.isnan().any() and (t >= 0).all()
+        others = torch.arange(d.shape[1]) % 7 > 0
+        same(t[:, others], expected[:, others])
 
 
 @given(st.integers(0, 10_000))
@@ -246,3 +268,4 @@ def test_far_more_rays_than_a_round_searches_at_once():
     t = cast(field, tiles, origin, d, 3.0)
     part = cast(field, tiles, origin, d[:, ::97], 3.0)
     same(t[:, ::97], part)
+    same(t[:, ::97], by_tensors(field, tiles, origin, d[:, ::97], 3.0))

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.inputs.checks import require_indices
 from torchelev.ops.storage import keep_freed_memory
+from torchelev.sim.sensors import native
 from torchelev.sim.sensors.tracing import HUGE, trace
 from torchelev.sim.terrains.heightfield import HeightField
 
@@ -82,11 +83,24 @@ def cast(
 def _cast_part(
     field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Tensor, max_range: float, boxes: Boxes | None
 ) -> Tensor:
-    nearest = trace(field, tile_ids, origin, directions, max_range)
-    if boxes is not None:
-        nearest = torch.minimum(nearest, _distance_to_boxes(boxes, origin, directions))
+    nearest = native.cast(field, tile_ids, origin, directions, max_range, _describe_boxes(boxes, origin))
+    if nearest is None:
+        nearest = trace(field, tile_ids, origin, directions, max_range)
+        if boxes is not None:
+            nearest = torch.minimum(nearest, _distance_to_boxes(boxes, origin, directions))
     hit = (nearest <= max_range) & origin.isfinite().all(-1, keepdim=True)
     return nearest.masked_fill(~hit, math.inf)
+
+
+def _describe_boxes(boxes: Boxes | None, origin: Float[Tensor, "B 3"]) -> Float[Tensor, "B K 15"]:
+    """Return each box's axes, the rays' origin in its frame [m] and half its sides [m], NaN if it is absent."""
+    if boxes is None:
+        return origin.new_empty(len(origin), 0, 15)
+    axes = boxes.T_map_box[..., :3, :3].mT
+    start = (axes * (origin[:, None] - boxes.T_map_box[..., :3, 3])[:, :, None]).sum(-1)
+    is_present = (boxes.half_size > 0).all(-1, keepdim=True)
+    half = torch.where(is_present, boxes.half_size, math.nan)
+    return torch.cat([value.to(origin.dtype) for value in (axes.flatten(2), start, half)], -1)
 
 
 def _check(field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Tensor, max_range: float) -> None:

@@ -1,0 +1,106 @@
+// Rays against a height field: tracing.py, sixteen at a time, each as far as it needs.
+#pragma once
+
+#include "../lanes.h"
+
+constexpr int TOP = 6;    // level of the bound of the whole tile; the blocks of level l have 2^l cells along a side
+constexpr int FIRST = 3;  // level that a ray begins at
+constexpr float TINY = 1e-9f, ENDLESS = 1e9f;
+
+inline Lanes whole(Lanes a) {
+    return of_each(a, [](float value) { return __builtin_floorf(value); });
+}
+inline Flags integers(Lanes a) { return __builtin_convertvector(a, Flags); }
+inline Lanes numbers(Flags a) { return __builtin_convertvector(a, Lanes); }
+inline Lanes power_of_two(Flags exponent) { return (Lanes)((exponent + 127) << 23); }
+
+// Return how many flags are set.
+inline int count_set(Flags flags) {
+    int32_t values[LANES], total = 0;
+    std::memcpy(values, &flags, sizeof flags);
+    for (int l = 0; l < LANES; l++) total -= values[l];
+    return total;
+}
+
+// A tile: HeightField, and its bounds.
+struct Field {
+    const float* heights;  // (rows + 1, columns + 1) samples, the rim included
+    const float* bounds;   // highest points of the blocks, level by level
+    int32_t offset[TOP + 1];  // where each level begins
+    int rows, columns;     // cells
+};
+
+// Sixteen rays: position in cells and metres as in `Rays`.
+struct Rays {
+    Lanes start[3];            // [cells, cells, m]
+    Lanes step[3];             // change per metre along the ray
+    Lanes sign[2], inverse[2];  // direction along x and y, and metres along the ray per cell
+    Lanes fastest, slowness;   // metres along the ray per cell of the faster of x and y, and per metre of descent
+    Lanes along;               // [m] up to which nothing is hit
+    Lanes cell[2];             // that the ray is in
+    Flags level;               // of the block to jump over; below 0: intersect the cell
+    Flags turns;               // taken so far
+
+    void set(int lane, const float* origin, const float* direction, float resolution) {
+        for (int k = 0; k < 3; k++) {
+            const float d = __builtin_isfinite(direction[k]) ? direction[k] : 0;
+            start[k][lane] = origin[k], step[k][lane] = k < 2 ? d / resolution : d;
+        }
+        for (int k = 0; k < 2; k++) {
+            sign[k][lane] = __builtin_copysignf(1, step[k][lane]);
+            const float speed = __builtin_fabsf(step[k][lane]);
+            inverse[k][lane] = 1 / (speed > TINY ? speed : TINY);
+            cell[k][lane] = __builtin_floorf(origin[k]);
+        }
+        fastest[lane] = inverse[0][lane] < inverse[1][lane] ? inverse[0][lane] : inverse[1][lane];
+        slowness[lane] = 1 / (-step[2][lane] > TINY ? -step[2][lane] : TINY);
+        along[lane] = 0, level[lane] = FIRST, turns[lane] = 0;
+    }
+
+    Lanes at(int k, Lanes distance) const { return start[k] + distance * step[k]; }
+};
+
+// Jump over the free space of a block, and go on to larger blocks; or, where the ray meets the block's height, to
+// smaller ones. See `skip` in tracing.py.
+inline void jump(const Field& field, Rays& rays, Flags jumping) {
+    const Flags level = jumping & rays.level, is_top = level == TOP;
+    const Lanes edge = power_of_two(level), inverse_edge = power_of_two(-level), ahead = rays.along + rays.fastest * edge;
+    const Flags last_row = pick_int(is_top, 0, (field.rows - 1) >> level);
+    const Flags last_column = pick_int(is_top, 0, (field.columns - 1) >> level);
+    const Lanes row = smaller(larger(rays.at(0, ahead) * inverse_edge, all(0)), numbers(last_row));
+    const Lanes column = smaller(larger(rays.at(1, ahead) * inverse_edge, all(0)), numbers(last_column));
+    const Flags place = gather_as<Flags>(field.offset, level) + integers(row) * (last_column + 1) + integers(column);
+    const Lanes free = (rays.at(2, rays.along) - gather(field.bounds, place)) * rays.slowness;
+    const Lanes reach = pick(is_top, all(ENDLESS), 2 * edge) * rays.fastest;
+    const Flags moves = jumping & (free >= 0.5f * rays.fastest), is_through = free >= reach;
+    rays.along = pick(moves, rays.along + smaller(free, reach), rays.along);
+    for (int k = 0; k < 2; k++) rays.cell[k] = pick(moves, whole(rays.at(k, rays.along)), rays.cell[k]);
+    const Flags next = pick_int(is_through, pick_int(is_top, TOP, level + 1), level - 1);
+    rays.level = pick_int(jumping, next, rays.level);
+}
+
+// Intersect the rays with the surface of their cells, and go on to the next ones. See `_intersect` in tracing.py.
+// Returns which hit; `along` is then that distance.
+inline Flags cross(const Field& field, Rays& rays, Flags crossing) {
+    const Lanes u = rays.at(0, rays.along) - rays.cell[0], v = rays.at(1, rays.along) - rays.cell[1];
+    const int width = field.columns + 1;
+    const Flags row = integers(clamp(rays.cell[0], 0, field.rows - 1));
+    const Flags first = row * width + integers(clamp(rays.cell[1], 0, field.columns - 1));
+    const Lanes a = gather(field.heights, first), b = gather(field.heights, first + width) - a;
+    const Lanes c = gather(field.heights, first + 1) - a, d = gather(field.heights, first + width + 1) - a - b - c;
+    const Lanes slope_x = b + d * v, over = rays.at(2, rays.along) - a - slope_x * u - c * v;
+    const Lanes sinking = slope_x * rays.step[0] + (c + d * u) * rays.step[1] - rays.step[2];
+    const Lanes bend = d * rays.step[0] * rays.step[1];
+    const Lanes ahead = 2 * over / (sinking + root(sinking * sinking + 4 * bend * over));
+    const Lanes leave_x = larger(rays.inverse[0] * (0.5f - rays.sign[0] * (u - 0.5f)), all(0));
+    const Lanes leave_y = larger(rays.inverse[1] * (0.5f - rays.sign[1] * (v - 0.5f)), all(0));
+    const Lanes leave = smaller(leave_x, leave_y);
+    const Flags is_below = over <= 0, hits = crossing & (is_below | ((ahead >= 0) & (ahead <= leave)));
+    const Flags through_x = leave_x <= leave_y, goes = crossing & ~hits;
+    rays.along = pick(hits, rays.along + pick(is_below, all(0), ahead), pick(goes, rays.along + leave, rays.along));
+    rays.cell[0] = pick(goes & through_x, rays.cell[0] + rays.sign[0], rays.cell[0]);
+    rays.cell[1] = pick(goes & ~through_x, rays.cell[1] + rays.sign[1], rays.cell[1]);
+    const Lanes above = over - leave * (sinking + bend * leave);
+    rays.level = pick_int(goes & (above * rays.slowness > 2 * rays.fastest), 0, rays.level);
+    return hits;
+}
