@@ -107,6 +107,8 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
 
 def forget(state: MapState, grid: GridConfig, env_ids: Tensor | None, mask: Tensor | None) -> None:
     """Make some environments of a state blank, in place: those of the ids or of the mask, or all."""
+    if mask is not None and mask.is_cpu and type(mask) is Tensor and not torch.compiler.is_compiling():
+        env_ids, mask = mask.nonzero()[:, 0], None  # mostly few: a mask would be read for every cell of all
     for name, value in (state._asdict() | state.statistics._asdict()).items():
         if name not in ("corner", "statistics"):
             _fill(value, BLANK.get(name, 0), env_ids, mask)

@@ -1,5 +1,6 @@
 """The C++ libraries: built once, kept, and done without where they cannot be built."""
 
+import ctypes
 import os
 import stat
 
@@ -125,3 +126,22 @@ def test_it_can_be_switched_off(monkeypatch, tmp_path):
     (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return 1; }')
     monkeypatch.setenv("TORCHELEV_NATIVE", "0")
     assert library.load("answer.cpp", {}) is None and not (tmp_path / "cache").exists()
+
+
+@needs_compiler
+@pytest.mark.parametrize("is_of_torch", [True, False])
+def test_threads_of_torch_and_its_own_do_all_the_work(is_of_torch, tmp_path):
+    program = tmp_path / "count.cpp"
+    program.write_text(
+        f'#include "{SOURCES / "threads.h"}"\n'
+        'extern "C" bool count(int* times, int number, int threads) {\n'
+        "  return succeeds([&] { for_each(number, threads, [&](int k) { times[k] += 1; }); });\n"
+        "}\n"
+    )
+    path = tmp_path / "count.so"
+    library._build(library.find_compiler(), library._FLAGS, program, path)
+    opened = library._open(path) if is_of_torch else ctypes.CDLL(str(path))
+    for number, threads in ((0, 2), (1, 2), (1000, 1), (1000, 2), (1000, 3)):
+        times = (ctypes.c_int * number)()
+        library.call(opened.count, times, number, threads)
+        assert list(times) == [1] * number

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import threading
 import time
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 
 from tests.helpers import mapped, scan
 from torchelev.ops import waiting
-from torchelev.ops.waiting import BUSY, FREE, SETTINGS, RunningThreads, SpareTeam, Waits
+from torchelev.ops.waiting import BUSY, FREE, SETTINGS, RunningThreads, SpareTeam, Waits, count_own_running
 
 
 class Team:
@@ -28,8 +29,8 @@ def _two_cores(monkeypatch):
     monkeypatch.setattr(waiting, "num_cores", lambda: 2)
 
 
-def made(count_running, clock=lambda: 0.0, sleep=lambda seconds: None):
-    return Waits(count_running, Team(), clock, sleep)
+def made(count_running, clock=lambda: 0.0, sleep=lambda seconds: None, count_own=lambda: 1):
+    return Waits(count_running, count_own, Team(), clock, sleep)
 
 
 def updated(waits, times, num_threads=2):
@@ -76,6 +77,12 @@ def test_threads_of_the_last_update_that_still_spin_are_no_other_process():
     running[0] = 3
     updated(waits, 1)
     assert waits.short
+
+
+def test_threads_of_this_process_that_spin_after_anything_else_are_no_other_process():
+    waits = made(lambda: 2, itertools.count(0.0, 1.0).__next__, count_own=lambda: 2)
+    updated(waits, 20)
+    assert not waits.short
 
 
 def test_how_long_threads_spin_is_learned():
@@ -139,6 +146,24 @@ def test_a_spare_team_is_there_until_it_ends_and_changes_no_number_of_threads():
     while new & set(os.listdir("/proc/self/task")) and time.monotonic() < end:
         time.sleep(0.01)
     assert not new & set(os.listdir("/proc/self/task")) and torch.get_num_threads() == 2
+
+
+def test_own_threads_that_run_are_counted():
+    leave = threading.Event()
+
+    def spin():
+        while not leave.is_set():
+            pass
+
+    sleeper, spinner = threading.Thread(target=leave.wait), threading.Thread(target=spin)
+    sleeper.start(), spinner.start()
+    try:
+        counts = [count_own_running() for _ in range(50)]
+    finally:
+        leave.set()
+        sleeper.join(), spinner.join()
+    # Of Python's threads one runs at a time, and the other waits for it, unless it hands over just then.
+    assert 1 <= max(counts) and max(counts) < len(os.listdir("/proc/self/task")) + 2
 
 
 def test_this_thread_is_running():

@@ -49,9 +49,9 @@ def _load(source: str, defines: tuple[tuple[str, str], ...]) -> ctypes.CDLL | No
             return None
         path = cache_folder() / f"{Path(source).stem}-{_key(compiler, flags)}.so"
         with contextlib.suppress(OSError):  # there is none, or a damaged one
-            return ctypes.CDLL(str(path))
+            return _open(path)
         _build(compiler, flags, _SOURCES / source, path)
-        return ctypes.CDLL(str(path))
+        return _open(path)
     except (OSError, RuntimeError, subprocess.SubprocessError) as error:  # RuntimeError: a user without a home
         reason = getattr(error, "stderr", None) or error
         warnings.warn(
@@ -61,6 +61,14 @@ def _load(source: str, defines: tuple[tuple[str, str], ...]) -> ctypes.CDLL | No
             stacklevel=2,
         )
         return None
+
+
+def _open(path: Path) -> ctypes.CDLL:
+    """Open a library, whose threads are those of torch's OpenMP where that is GNU's."""
+    library = ctypes.CDLL(str(path))
+    with contextlib.suppress(AttributeError):
+        library.use_team(ctypes.CDLL(None).GOMP_parallel)
+    return library
 
 
 def call(function: Any, *arguments: Any) -> None:

@@ -7,8 +7,28 @@
 #include <thread>
 #include <vector>
 
-// Call `work(k)` for each k below `count`, by so many threads, of which the caller is one, or fewer if there are no
-// more. What a call throws is thrown again at the end, once.
+// GOMP_parallel of the OpenMP that torch uses: call a function on each of so many threads. Threads of our own would share
+// the cores with torch's, which spin between its operations.
+typedef void (*Parallel)(void (*function)(void*), void* data, unsigned num_threads, unsigned flags);
+static Parallel team = nullptr;
+extern "C" void use_team(Parallel parallel) { team = parallel; }
+
+// Call `run()` on each of so many threads, of which the caller is one, or on fewer if there are no more.
+template <class Run> void on_threads(int num_threads, Run& run) {
+    if (team && num_threads > 1) {
+        team([](void* data) { (*static_cast<Run*>(data))(); }, &run, num_threads, 0);
+        return;
+    }
+    std::vector<std::thread> helpers;
+    try {
+        for (int k = 1; k < num_threads; k++) helpers.emplace_back([&run] { run(); });
+    } catch (const std::exception&) {
+    }
+    run();
+    for (std::thread& helper : helpers) helper.join();
+}
+
+// Call `work(k)` for each k below `count`. What a call throws is thrown again at the end, once.
 template <class Work> void for_each(int count, int num_threads, const Work& work) {
     std::atomic<int> next{0};
     std::mutex mutex;
@@ -22,13 +42,7 @@ template <class Work> void for_each(int count, int num_threads, const Work& work
             if (!failure) failure = std::current_exception();
         }
     };
-    std::vector<std::thread> helpers;
-    try {
-        for (int k = 1; k < num_threads && k < count; k++) helpers.emplace_back(run);
-    } catch (const std::exception&) {
-    }
-    run();
-    for (std::thread& helper : helpers) helper.join();
+    on_threads(num_threads < count ? num_threads : count, run);
     if (failure) std::rethrow_exception(failure);
 }
 

@@ -12,6 +12,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import torch
 
@@ -58,6 +59,7 @@ class Waits:
 
     Args:
         count_running: returns how many threads of all processes run or wait for a core, the caller included.
+        count_own: returns how many of these belong to this process; takes longer.
         team: makes waits short.
         clock: returns the time [s].
         sleep: sleeps for a time [s].
@@ -66,11 +68,13 @@ class Waits:
     def __init__(
         self,
         count_running: Callable[[], int],
+        count_own: Callable[[], int],
         team: SpareTeam,
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.count_running = count_running
+        self.count_own = count_own
         self.team = team
         self.clock = clock
         self.sleep = sleep
@@ -87,12 +91,12 @@ class Waits:
             if self.short:
                 self._lengthen_if_free(num_threads)
             else:
-                self._shorten_if_busy(num_threads, self._count_own(num_threads))
+                self._shorten_if_busy(num_threads, self._expect_own(num_threads))
         yield
         is_spinning = not self.short and self.count_running() >= num_threads
         self._spinning_from = self.clock() if is_spinning else float("-inf")
 
-    def _count_own(self, num_threads: int) -> int:
+    def _expect_own(self, num_threads: int) -> int:
         """Return how many threads of this process may be running before an update: those of the last one may spin."""
         since = self.clock() - self._spinning_from
         if self.count_running() == 1:
@@ -101,7 +105,10 @@ class Waits:
 
     def _shorten_if_busy(self, num_threads: int, own: int) -> None:
         for k in range(BUSY):
-            if self.count_running() - own + num_threads <= num_cores():
+            spare = num_cores() - num_threads
+            running = self.count_running()
+            # Threads of this process may also spin after an operation that was no update.
+            if running - own <= spare or running - self.count_own() <= spare:
                 return
             if k < BUSY - 1:
                 self.sleep(_PAUSE)
@@ -132,13 +139,26 @@ class RunningThreads:
         return int(os.pread(self._file, 64, 0).split()[3].partition(b"/")[0])
 
 
+def count_own_running() -> int:
+    """Count the threads of this process that run or wait for a core, as Linux tells it."""
+    return sum(map(_is_running, os.listdir("/proc/self/task")))
+
+
+def _is_running(thread: str) -> bool:
+    try:
+        stat = Path(f"/proc/self/task/{thread}/stat").read_bytes()
+    except OSError:  # it has ended
+        return False
+    return stat.rpartition(b")")[2].split()[0] == b"R"
+
+
 @functools.cache
 def process_waits() -> Waits | None:
     """Return what adapts the waits of this process, or None where the user has set them or the system is not Linux."""
     if any(name in os.environ for name in SETTINGS):
         return None
     try:
-        return Waits(RunningThreads(), SpareTeam())
+        return Waits(RunningThreads(), count_own_running, SpareTeam())
     except OSError:
         return None
 
