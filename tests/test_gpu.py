@@ -54,6 +54,7 @@ def test_host_reads_nothing_back(monkeypatch):
     with OneDevice():
         emap.update(cloud, T, T[:, 0], 0.1)
         emap.update(cloud, T, T[:, 0], torch.empty(5, device="meta"), variance=cloud[..., 0])
+        emap.update(cloud[:, :, :0], T, T[:, 0], 0.1)
         emap.sample(torch.empty(5, 7, 2, device="meta"), "upper_bound")
         emap.layer("normal_z")
         emap.initialize(torch.empty(5, 4, 3, device="meta"))

@@ -1,5 +1,8 @@
 """The completion in C++ against the same with tensors."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from hypothesis import given
@@ -83,3 +86,24 @@ def test_forward_mode_and_vmap_are_refused():
         torch.func.jvp(mean, (layers.elevation,), (torch.ones_like(layers.elevation),))
     with pytest.raises(NotImplementedError, match="vmap"):
         torch.func.vmap(mean)(layers.elevation[None])
+
+
+FORK = """
+import os
+import torch
+from torchelev import CompletionNet
+
+torch.set_num_threads(2)
+net, maps = CompletionNet().requires_grad_(False), torch.rand(2, 24, 24)
+torch.rand(2**22).exp(), net(maps, maps > 0.5, resolution=0.04)
+child = os.fork()
+if child == 0:
+    net(maps, maps > 0.5, resolution=0.04)
+    os._exit(0)
+assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+@pytest.mark.slow(6)
+def test_a_forked_process_does_not_wait_for_threads_that_it_lacks():
+    subprocess.run([sys.executable, "-c", FORK], check=True, timeout=120)

@@ -325,3 +325,16 @@ def test_half_precision_is_refused():
     half = CompletionInput(*(layer.half() if layer.is_floating_point() else layer for layer in layers))
     with pytest.raises(TypeError, match="weights: must be of float32 or float64, got torch.float16"):
         run(CompletionNet().half(), half)
+
+
+def test_gradients_have_gradients_also_by_functions():
+    net, layers = random_net(0), random_layers(0, 1)
+
+    def total(elevation):
+        return net(*layers._replace(elevation=elevation), resolution=0.05).mean.square().sum()
+
+    x = layers.elevation.clone().requires_grad_()
+    (first,) = torch.autograd.grad(total(x), x, create_graph=True)
+    (expected,) = torch.autograd.grad(first.square().sum(), x)
+    found = torch.func.grad(lambda y: torch.func.grad(total)(y).square().sum())(layers.elevation)
+    torch.testing.assert_close(found, expected)

@@ -150,20 +150,16 @@ def test_a_spare_team_is_there_until_it_ends_and_changes_no_number_of_threads():
 
 def test_own_threads_that_run_are_counted():
     leave = threading.Event()
-
-    def spin():
-        while not leave.is_set():
-            pass
-
-    sleeper, spinner = threading.Thread(target=leave.wait), threading.Thread(target=spin)
-    sleeper.start(), spinner.start()
+    sleepers = [threading.Thread(target=leave.wait) for _ in range(5)]
+    for sleeper in sleepers:
+        sleeper.start()
     try:
         counts = [count_own_running() for _ in range(50)]
     finally:
         leave.set()
-        sleeper.join(), spinner.join()
-    # Of Python's threads one runs at a time, and the other waits for it, unless it hands over just then.
-    assert 1 <= max(counts) and max(counts) < len(os.listdir("/proc/self/task")) + 2
+        for sleeper in sleepers:
+            sleeper.join()
+    assert min(counts) == 1  # this one; threads of torch may spin for a while
 
 
 def test_this_thread_is_running():

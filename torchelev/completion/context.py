@@ -73,7 +73,7 @@ def _keep_nothing(ctx: Any, inputs: tuple, output: Tensor) -> None:
 
 
 def _integral_backward(ctx: Any, grad: Tensor) -> Tensor:
-    return _integral(grad.flip(1, 2).contiguous()).flip(1, 2)
+    return integral(grad.flip(1, 2).contiguous()).flip(1, 2)
 
 
 integral = with_gradient(_integral, _keep_nothing, _integral_backward)

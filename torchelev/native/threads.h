@@ -13,15 +13,16 @@ typedef void (*Parallel)(void (*function)(void*), void* data, unsigned num_threa
 static Parallel team = nullptr;
 extern "C" void use_team(Parallel parallel) { team = parallel; }
 
-// Call `run()` on each of so many threads, of which the caller is one, or on fewer if there are no more.
-template <class Run> void on_threads(int num_threads, Run& run) {
-    if (team && num_threads > 1) {
+// Call `run()` on each of so many threads, of which the caller is one, or on fewer if there are no more, or no more than
+// `count` are of use.
+template <class Run> void on_threads(int count, int num_threads, Run& run) {
+    if (team && num_threads > 1 && count > 1) {  // all of the team, which would end those that are left out
         team([](void* data) { (*static_cast<Run*>(data))(); }, &run, num_threads, 0);
         return;
     }
     std::vector<std::thread> helpers;
     try {
-        for (int k = 1; k < num_threads; k++) helpers.emplace_back([&run] { run(); });
+        for (int k = 1; k < num_threads && k < count; k++) helpers.emplace_back([&run] { run(); });
     } catch (const std::exception&) {
     }
     run();
@@ -42,7 +43,7 @@ template <class Work> void for_each(int count, int num_threads, const Work& work
             if (!failure) failure = std::current_exception();
         }
     };
-    on_threads(num_threads < count ? num_threads : count, run);
+    on_threads(count, num_threads, run);
     if (failure) std::rethrow_exception(failure);
 }
 

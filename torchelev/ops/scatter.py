@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import warnings
 
 import torch
 from torch import Tensor
@@ -20,7 +21,8 @@ def add(index: Tensor, values: Tensor, size: int) -> Tensor:
     if _takes_triton(values):
         from torchelev.ops import triton_scatter
 
-        triton_scatter.add(sums, index.contiguous(), values.contiguous())
+        with torch.cuda.device(values.device):
+            triton_scatter.add(sums, index.contiguous(), values.contiguous())
         return sums
     return sums.scatter_add_(2, index.expand(values.shape), values)
 
@@ -41,7 +43,8 @@ def _keep(table: Tensor, index: Tensor, values: Tensor, which: str) -> Tensor:
     if _takes_triton(values):
         from torchelev.ops import triton_scatter
 
-        triton_scatter.keep(table, index.contiguous(), values.contiguous(), lowest=which == "amin")
+        with torch.cuda.device(values.device):
+            triton_scatter.keep(table, index.contiguous(), values.contiguous(), lowest=which == "amin")
         return table
     return table.scatter_reduce_(1, index, values, which)
 
@@ -49,9 +52,23 @@ def _keep(table: Tensor, index: Tensor, values: Tensor, which: str) -> Tensor:
 def _takes_triton(values: Tensor) -> bool:
     """Tell whether Triton may do it: its sums differ from run to run in the last bit."""
     is_float = values.is_cuda and values.dtype == torch.float32
-    return is_float and _has_triton() and not torch.are_deterministic_algorithms_enabled()
+    return is_float and not torch.are_deterministic_algorithms_enabled() and _triton_works(values.device)
 
 
 @functools.cache
-def _has_triton() -> bool:
-    return importlib.util.find_spec("triton") is not None
+def _triton_works(device: torch.device) -> bool:
+    """Tell whether Triton is there and can run on the device: it needs a C compiler, and not too old a GPU."""
+    if importlib.util.find_spec("triton") is None:
+        return False
+    one = torch.ones(1, 1, device=device)
+    try:
+        from torchelev.ops import triton_scatter
+
+        with torch.cuda.device(device):
+            triton_scatter.add(one[None], torch.zeros_like(one, dtype=torch.int64), one[None])
+    except Exception as error:  # of many kinds, by Triton, its compiler and the driver
+        warnings.warn(
+            f"Triton does not work here, and slower code does its work: {error}", RuntimeWarning, stacklevel=2
+        )
+        return False
+    return True

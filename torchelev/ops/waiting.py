@@ -12,7 +12,6 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import torch
 
@@ -146,10 +145,15 @@ def count_own_running() -> int:
 
 def _is_running(thread: str) -> bool:
     try:
-        stat = Path(f"/proc/self/task/{thread}/stat").read_bytes()
+        file = os.open(f"/proc/self/task/{thread}/stat", os.O_RDONLY | os.O_CLOEXEC)
     except OSError:  # it has ended
         return False
-    return stat.rpartition(b")")[2].split()[0] == b"R"
+    try:
+        return os.read(file, 512).rpartition(b")")[2].split()[0] == b"R"
+    except (OSError, IndexError):
+        return False
+    finally:
+        os.close(file)
 
 
 @functools.cache

@@ -152,6 +152,41 @@ def test_boxes_equal_those_of_the_tensors(seed, monkeypatch):
     same(fast, cast(field, *inputs))
 
 
+def test_rays_along_a_face_of_a_box_miss_it(path):
+    for axis, side in ((0, 0.5), (1, 0.25), (2, 0.1)):
+        origin, d = torch.tensor([2.0, 0.0, 1.0]), torch.zeros(3)
+        origin[axis] += side
+        origin[(axis + 1) % 3] -= 1.0
+        d[(axis + 1) % 3] = 1.0
+        assert one(flat(-9.0), tuple(origin.tolist()), d, 3.0, box((2.0, 0.0, 1.0), (0.5, 0.25, 0.1))).isinf().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_default_dtype_and_device_change_nothing(dtype):
+    field, *inputs = on("cpu")
+    expected = cast(field, *inputs)
+    torch.set_default_dtype(dtype)
+    try:
+        with torch.device("meta"):
+            assert torch.equal(cast(field, *inputs), expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_within_transforms():
+    field, *inputs = on("cpu")
+    total = cast(field, *inputs).nan_to_num(0.0, 0.0, 0.0).sum()
+    gradient = torch.func.grad(lambda x: cast(field, *inputs).nan_to_num(0.0, 0.0, 0.0).sum() * x)(torch.tensor(1.0))
+    torch.testing.assert_close(gradient, total)
+
+
+def test_far_beyond_the_rim(path):
+    field = flat()
+    for x in (1e5, 1e6, 1e8):
+        t = one(field, (x, 0.0, 1.0), [[0.6, 0.0, -0.8], [0.0, 0.0, -1.0], [0.0, 0.6, -0.8]], 5.0)
+        same(t, torch.tensor([1.25, 1.0, 1.25]))
+
+
 @needs_gpu
 def test_gpu_equals_cpu():
     torch.manual_seed(0)

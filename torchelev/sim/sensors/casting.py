@@ -83,7 +83,9 @@ def cast(
 def _cast_part(
     field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Tensor, max_range: float, boxes: Boxes | None
 ) -> Tensor:
-    nearest = native.cast(field, tile_ids, origin, directions, max_range, _describe_boxes(boxes, origin))
+    nearest = None
+    if origin.is_cpu:
+        nearest = native.cast(field, tile_ids, origin, directions, max_range, _describe_boxes(boxes, origin))
     if nearest is None:
         nearest = trace(field, tile_ids, origin, directions, max_range)
         if boxes is not None:

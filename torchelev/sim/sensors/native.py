@@ -7,8 +7,11 @@ import ctypes
 import torch
 from torch import Tensor
 
+from torchelev.inputs.checks import readable
 from torchelev.native.library import call, load
 from torchelev.sim.terrains.heightfield import HeightField
+
+_FARTHEST = 2.0**23  # [cells]
 
 
 def cast(
@@ -28,14 +31,14 @@ def cast(
             half their sides [m], NaN if there is no box.
     """
     tensors = (field.padded, tile_ids, origin, directions)
-    if not all(type(value) is Tensor and value.is_cpu for value in tensors) or len(field.bounds.highest) >= 2**31:
+    if not all(readable(value) for value in tensors) or len(field.bounds.highest) >= 2**31:
         return None
     library = load("casting/casting.cpp", {})
     if library is None:
         return None
-    rim, scale = torch.cat([field.middle, torch.zeros(1)]), torch.tensor([field.resolution, field.resolution, 1.0])
-    start = (origin / scale + rim).nan_to_num(0.0, 0.0, 0.0)
-    distance = torch.empty(directions.shape[:2])
+    start = torch.cat([origin[:, :2] / field.resolution + field.middle, origin[:, 2:]], 1).nan_to_num(0.0, 0.0, 0.0)
+    start[:, :2].clamp_(-_FARTHEST, _FARTHEST)  # the rim continues for ever, but float32 counts cells no farther
+    distance = directions.new_empty(directions.shape[:2])
     bounds = (field.bounds.highest, field.bounds.first, field.bounds.size)
     inputs = (field.padded, *bounds, tile_ids, start, directions, solids)
     arrays = [*(value.contiguous() for value in inputs), distance]

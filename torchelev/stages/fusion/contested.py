@@ -6,6 +6,7 @@ GPU goes through all. Nothing here has a gradient: a height is an estimate aroun
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -48,7 +49,7 @@ class ContestedCells(SelectedCells):
         self.has_step, self.mean = self.of(has_step), self.of(mean)
         z, self.spread, self.weight, self.passed, *self.ray = columns
         if not can_select(self.selected):  # without the other cells' points, which sums leave out if they are zero
-            self.weight = self.weight * self.at_points(self.selected.flatten())
+            self.weight = torch.where(self.at_points(self.selected.flatten()), self.weight, 0.0)
         self.z = z - self.at_points(self.mean)  # [m] above the mean of the cell's points
         self.used = (self.weight > 0).to(z.dtype)
 
@@ -57,7 +58,9 @@ class ContestedCells(SelectedCells):
         if values.is_cpu:
             total = values.new_zeros(*values.shape[:-1], self.cells.shape[0])
             return total.scatter_add_(-1, self.owner.expand(values.shape), values)
-        sums = cell_sums(self.owner[None], values.reshape(-1, 1, values.shape[-1]), self.cells.shape[0])
+        sums = cell_sums(
+            self.owner[None], values.reshape(math.prod(values.shape[:-1]), 1, values.shape[-1]), self.cells.shape[0]
+        )
         return sums.view(*values.shape[:-1], -1)
 
     def highest(self, values: Tensor) -> Tensor:
