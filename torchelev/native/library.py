@@ -68,7 +68,7 @@ def _open(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     with contextlib.suppress(AttributeError):
         library.use_team(ctypes.CDLL(None).GOMP_parallel)
-        # Where a process forks, the child lacks the team's threads, and would wait for them for ever.
+        # A forked child has none of the team's threads, and would wait for them forever.
         os.register_at_fork(after_in_child=functools.partial(library.use_team, None))
     return library
 

@@ -7,16 +7,16 @@
 #include <thread>
 #include <vector>
 
-// GOMP_parallel of the OpenMP that torch uses: call a function on each of so many threads. Threads of our own would share
-// the cores with torch's, which spin between its operations.
+// GOMP_parallel of torch's OpenMP, which calls a function on each thread of a team. Threads of our own would compete for
+// the cores with that team, whose threads spin between operations.
 typedef void (*Parallel)(void (*function)(void*), void* data, unsigned num_threads, unsigned flags);
 static Parallel team = nullptr;
 extern "C" void use_team(Parallel parallel) { team = parallel; }
 
-// Call `run()` on each of so many threads, of which the caller is one, or on fewer if there are no more, or no more than
-// `count` are of use.
+// Call `run()` on `num_threads` threads, the caller included. Without a team, on at most `count`, or as many as can
+// start.
 template <class Run> void on_threads(int count, int num_threads, Run& run) {
-    if (team && num_threads > 1 && count > 1) {  // all of the team, which would end those that are left out
+    if (team && num_threads > 1 && count > 1) {  // a smaller team would end the other threads
         team([](void* data) { (*static_cast<Run*>(data))(); }, &run, num_threads, 0);
         return;
     }

@@ -1,8 +1,8 @@
 """Operations that the compiler makes 5 to 30 times slower on a CPU: as custom operators they stay as they are.
 
 It would turn sums per cell into atomic additions, test at every read of a border whether it lies outside, and compute
-every term of a running minimum again for every reader. On a GPU, where each operation costs a launch, it may do the
-latter two.
+every term of a running minimum again for every reader. On a GPU, where each operation costs a launch, the
+compiler does the latter two.
 """
 
 from __future__ import annotations

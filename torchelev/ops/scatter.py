@@ -50,7 +50,7 @@ def _keep(table: Tensor, index: Tensor, values: Tensor, which: str) -> Tensor:
 
 
 def _takes_triton(values: Tensor) -> bool:
-    """Tell whether Triton may do it: its sums differ from run to run in the last bit."""
+    """Tell whether Triton computes it: not if runs must repeat, as its sums differ in the last bit."""
     is_float = values.is_cuda and values.dtype == torch.float32
     return is_float and not torch.are_deterministic_algorithms_enabled() and _triton_works(values.device)
 

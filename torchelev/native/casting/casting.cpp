@@ -16,8 +16,8 @@ constexpr int AT_A_TIME = 1024;  // rays that a thread takes
 // Trace rays from one origin; a lane takes the next ray as soon as its own has ended.
 void trace(const Field& field, const float* origin, const float* directions, int count, float resolution,
            float max_range, float* distance) {
-    // A unit vector's ray crosses two borders a cell, and tries a jump before each.
-    const int most = int(std::min(1e9f, 64 + 8 * max_range / resolution));
+    // Along a unit vector a ray crosses at most two borders per cell length, and may try to jump before each.
+    const int max_turns = int(std::min(1e9f, 64 + 8 * max_range / resolution));
     Rays rays{};
     Flags active{};
     int ray[LANES], next = 0;
@@ -25,11 +25,11 @@ void trace(const Field& field, const float* origin, const float* directions, int
         ray[l] = next, rays.set(l, origin, directions + 3 * next++, resolution), active[l] = -1;
     for (int left; (left = count_set(active)) > 0;) {
         const Flags jumping = active & (rays.level >= 0);
-        const bool jumps = 2 * count_set(jumping) > left;  // rather those of which there are more
+        const bool jumps = 2 * count_set(jumping) > left;  // a turn is one kind of work: what more of the rays need
         if (jumps) jump(field, rays, jumping);
         const Flags hits = jumps ? Flags{} : cross(field, rays, active & ~jumping);
         rays.turns -= jumps ? jumping : active & ~jumping;
-        const Flags ends = active & (hits | (rays.along > max_range) | (rays.turns > most));
+        const Flags ends = active & (hits | (rays.along > max_range) | (rays.turns > max_turns));
         if (!count_set(ends)) continue;
         for (int l = 0; l < LANES; l++) {
             if (!ends[l]) continue;
@@ -42,7 +42,8 @@ void trace(const Field& field, const float* origin, const float* directions, int
     }
 }
 
-void hide_behind(const Box* boxes, int num_boxes, const float* directions, int count, float* distance) {
+// Shorten distances to those of the nearest box.
+void stop_at_boxes(const Box* boxes, int num_boxes, const float* directions, int count, float* distance) {
     for (int first = 0; first < count; first += LANES) {
         const int lanes = std::min(LANES, count - first);
         Lanes direction[3]{}, nearest{};
@@ -74,7 +75,7 @@ extern "C" bool cast(const float* heights, const float* bounds, const int64_t* l
             for (int l = 0; l <= TOP; l++)
                 field.offset[l] = int32_t(levels[l] + tiles[b] * sizes[l] - tiles[b] * sizes[0]);
             trace(field, origins + 3 * b, directions + 3 * first, count, resolution, max_range, distance + first);
-            if (num_boxes) hide_behind(boxes + b * num_boxes, num_boxes, directions + 3 * first, count, distance + first);
+            if (num_boxes) stop_at_boxes(boxes + b * num_boxes, num_boxes, directions + 3 * first, count, distance + first);
         });
     });
 }

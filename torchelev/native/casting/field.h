@@ -7,7 +7,7 @@ constexpr int TOP = 6;    // level of the bound of the whole tile; the blocks of
 constexpr int FIRST = 3;  // level that a ray begins at
 constexpr float TINY = 1e-9f, ENDLESS = 1e9f;
 
-inline Lanes whole(Lanes a) {
+inline Lanes floor_of(Lanes a) {
     return of_each(a, [](float value) { return __builtin_floorf(value); });
 }
 inline Flags integers(Lanes a) { return __builtin_convertvector(a, Flags); }
@@ -74,7 +74,7 @@ inline void jump(const Field& field, Rays& rays, Flags jumping) {
     const Lanes reach = pick(is_top, all(ENDLESS), 2 * edge) * rays.fastest;
     const Flags moves = jumping & (free >= 0.5f * rays.fastest), is_through = free >= reach;
     rays.along = pick(moves, rays.along + smaller(free, reach), rays.along);
-    for (int k = 0; k < 2; k++) rays.cell[k] = pick(moves, whole(rays.at(k, rays.along)), rays.cell[k]);
+    for (int k = 0; k < 2; k++) rays.cell[k] = pick(moves, floor_of(rays.at(k, rays.along)), rays.cell[k]);
     const Flags next = pick_int(is_through, pick_int(is_top, TOP, level + 1), level - 1);
     rays.level = pick_int(jumping, next, rays.level);
 }

@@ -37,7 +37,7 @@ def cast(
     if library is None:
         return None
     start = torch.cat([origin[:, :2] / field.resolution + field.middle, origin[:, 2:]], 1).nan_to_num(0.0, 0.0, 0.0)
-    start[:, :2].clamp_(-_FARTHEST, _FARTHEST)  # the rim continues for ever, but float32 counts cells no farther
+    start[:, :2].clamp_(-_FARTHEST, _FARTHEST)  # float32 cannot count cells farther out, where the ground is level
     distance = directions.new_empty(directions.shape[:2])
     bounds = (field.bounds.highest, field.bounds.first, field.bounds.size)
     inputs = (field.padded, *bounds, tile_ids, start, directions, solids)
