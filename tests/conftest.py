@@ -8,8 +8,8 @@ import torch
 from hypothesis import HealthCheck, Phase, settings
 
 import envs.offscreen  # noqa: F401  (before any test imports MuJoCo)
-from torchelev.compiled_update import graphs_of
-from torchelev.ops import compiler
+from torchelev.compiled import compiler, kept_graphs
+from torchelev.compiled.update import graphs_of
 
 settings.register_profile(
     "torchelev",
@@ -44,10 +44,11 @@ def _one_thread():
 
 @pytest.fixture
 def compile_with(monkeypatch):
-    """Let emap.compile() use another backend of the compiler, with the guards of the real one."""
+    """Let emap.compile() use another backend of the compiler, with the guards of the real one, and keep no graph."""
 
     def use(backend):
         monkeypatch.setattr(compiler, "inductor", backend)
+        monkeypatch.setattr(kept_graphs, "can_keep", lambda _: False)
         graphs_of.cache_clear()
         torch._dynamo.reset()
 

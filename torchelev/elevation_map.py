@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchelev import pipeline
-from torchelev.compiled_update import compile_ahead, compiled_update
+from torchelev.compiled.update import compile_ahead, compiled_update
 from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose

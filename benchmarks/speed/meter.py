@@ -15,7 +15,8 @@ import torch
 import torch.utils.benchmark as bench
 from torch.profiler import ProfilerActivity, profile
 
-from torchelev import ElevationMapConfig, compiled_update
+from torchelev import ElevationMapConfig
+from torchelev.compiled.update import graphs_of
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.state import blank_state
 
@@ -26,7 +27,7 @@ Value = TypeVar("Value")
 def fresh_compiler() -> None:
     """Forget compiled updates: torch compiles the one for a second number of robots for any number."""
     torch._dynamo.reset()
-    compiled_update.graphs_of.cache_clear()
+    graphs_of.cache_clear()
 
 
 def progress(values: Iterable[Value], name: str) -> Iterator[Value]:

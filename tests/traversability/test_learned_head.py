@@ -10,7 +10,7 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, LearnedTraversabilityConfig, RobotConfig
-from torchelev.compiled_update import Graphs
+from torchelev.compiled.update import Graphs
 from torchelev.io.map_file import load_map, save_map
 from torchelev.pipeline import rate_surface
 from torchelev.state import blank_state

@@ -110,12 +110,12 @@ def _build(compiler: list[str], flags: list[str], source: Path, path: Path) -> N
 def _key(compiler: list[str], flags: list[str]) -> str:
     """Return a hash of all that the library depends on: sources, flags, compiler and processor."""
     version = subprocess.run([*compiler, "--version"], check=True, capture_output=True, timeout=60).stdout
-    parts = [version, " ".join(flags).encode(), _processor()]
+    parts = [version, " ".join(flags).encode(), describe_processor()]
     parts += [path.read_bytes() for path in sorted(_SOURCES.rglob("*")) if path.suffix in (".cpp", ".h")]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
 
 
-def _processor() -> bytes:
+def describe_processor() -> bytes:
     """Describe the processor, as -march=native makes code for this one."""
     try:
         lines = Path("/proc/cpuinfo").read_bytes().splitlines()

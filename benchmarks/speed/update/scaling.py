@@ -10,7 +10,7 @@ from torch._dynamo.utils import counters
 from benchmarks.speed import meter
 from benchmarks.speed.meter import progress
 from benchmarks.speed.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
-from torchelev.compiled_update import Graphs
+from torchelev.compiled.update import Graphs
 from torchelev.stages.visibility.polar_table import PolarGrid
 
 POINTS = [1000, 3000, 6276, 15000, 43074, 100000, 200000, 407040]

@@ -16,9 +16,9 @@ from benchmarks.speed import meter
 from benchmarks.speed.meter import progress
 from benchmarks.speed.workload import BPEARL, MANY_POINTS, Drive, full_config
 from torchelev import pipeline
-from torchelev.compiled_update import with_masks
+from torchelev.compiled import compiler
+from torchelev.compiled.update import with_masks
 from torchelev.inputs.chunks import CPU_CELLS
-from torchelev.ops import compiler
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages import age, compensate, measure, overlap, recenter
 from torchelev.stages.fusion import fuse

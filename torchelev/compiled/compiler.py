@@ -140,6 +140,27 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
     return [not guard.is_global and not any(name in guard.name for name in fixed) for guard in guards]
 
 
+def traced(function: Callable[..., Any], args: Sequence[Any]) -> bytes:
+    """Compile a function for arguments into bytes, which `torch.compiler.load_compiled_function` loads in a process."""
+    from torch._dynamo.aot_compile import AOTCompiledFunction
+    from torch._dynamo.callback import CallbackTrigger, callback_handler
+
+    graph = torch.compile(
+        function, fullgraph=True, backend=inductor, options={"guard_filter_fn": guards_on_kept_arguments}
+    )
+    with callback_handler.install_callbacks(CallbackTrigger.DYNAMO, "to keep"):
+        return AOTCompiledFunction.serialize(graph.aot_compile((tuple(args), {}))).serialized_data  # type: ignore[attr-defined]
+
+
+def guards_on_kept_arguments(guards: Sequence[Any]) -> list[bool]:
+    """Choose which guards are kept with a graph: of those on arguments, not those on classes, which cannot be kept."""
+    from torch._dynamo.guards import CheckFunctionManager
+
+    lost = (*CheckFunctionManager.UNSUPPORTED_SERIALIZATION_GUARD_TYPES, "CLASS_MATCH")
+    kept = guards_on_arguments(guards)
+    return [keep and guard.guard_type not in lost for keep, guard in zip(kept, guards, strict=True)]
+
+
 @contextlib.contextmanager
 def announced_compilation() -> Iterator[None]:
     """Say on stderr what is going on for minutes, and what it cost, if anything is compiled."""
@@ -165,11 +186,18 @@ def announced_compilation() -> Iterator[None]:
             print(end, file=sys.stderr, flush=True)
 
 
-def mark_dynamic(dim: int, *values: Tensor | None) -> None:
+def mark_dynamic(dim: int, values: Sequence[Tensor | None]) -> None:
     """Let the size along a dimension differ from call to call."""
     for value in values:
         if value is not None:
             torch._dynamo.maybe_mark_dynamic(value, dim)
+
+
+def remove_marks(values: Sequence[Tensor | None]) -> None:
+    """Undo `mark_dynamic`: a graph from disk refuses tensors with marks."""
+    for value in values:
+        for name in ("_dynamo_weak_dynamic_indices", "_has_dynamo_dim_marking"):
+            getattr(value, "__dict__", {}).pop(name, None)
 
 
 def packed(value: Tensor) -> Tensor:

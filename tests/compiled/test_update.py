@@ -10,7 +10,7 @@ from torch._dynamo.testing import CompileCounter
 import torchelev
 from tests.helpers import assert_close, differences, mapped, scan, small_config, small_map, snapshot
 from torchelev import ElevationMap, SensorConfig
-from torchelev.compiled_update import Graphs, graphs_of
+from torchelev.compiled.update import Graphs, graphs_of
 from torchelev.layers import LAYERS
 
 pytestmark = pytest.mark.compiles
@@ -125,7 +125,7 @@ def test_an_update_that_is_stopped_leaves_a_sound_map(compile_with, monkeypatch)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        name = "torchelev.compiled_update.graphs_of"
+        name = "torchelev.compiled.update.graphs_of"
         patch.setattr(name, lambda *key: graphs_of(*key)._replace(fuse_heights=stopped))
         with pytest.raises(KeyboardInterrupt):
             emap.update(cloud, T, T, 0.3)

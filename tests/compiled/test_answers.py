@@ -10,7 +10,7 @@ from tests.answers import PARTS, assert_recorded, config
 from tests.helpers import assert_close, differences, pose, scan
 from tests.inputs.test_update_inputs import assert_bad_poses_leave_one_robot_out
 from torchelev import ElevationMap
-from torchelev.compiled_update import Graphs
+from torchelev.compiled.update import Graphs
 from torchelev.inputs import checks
 from torchelev.stages.fusion import consensus
 from torchelev.stages.fusion.consensus import resolve_contested

@@ -10,7 +10,7 @@ from torch._inductor.codegen.cpp import CppScheduling
 from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
 from torch._inductor.utils import run_and_get_code
 
-from torchelev.ops.compiler import KERNEL_ARGUMENTS, announced_compilation, choose_bytes_as_integers, compiled
+from torchelev.compiled.compiler import KERNEL_ARGUMENTS, announced_compilation, choose_bytes_as_integers, compiled
 
 pytestmark = pytest.mark.compiles
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
+from torchelev.compiled.compiler import announced_compilation, packed
+from torchelev.compiled.elsewhere import run_elsewhere
+from torchelev.compiled.kept_graphs import KeptGraph
 from torchelev.config import ElevationMapConfig
-from torchelev.ops.compiler import announced_compilation, compiled, mark_dynamic, packed
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, update_in_place
 from torchelev.stages.age import age
@@ -32,13 +35,13 @@ def compiled_update(
         update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
     inputs = [None if value is None else packed(value) for value in (points, *others)]
-    mark_dynamic(2, inputs[0], inputs[4])  # points, and their variance
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     with announced_compilation():
         graphs = graphs_of(cfg, kinds, points.shape[1])
         stored = with_masks(stored, as_bytes)
+        if graphs.move_window.is_new(stored):
+            compile_side_by_side(graphs, stored, inputs, cfg, weights)
         m = graphs.move_window(stored, *inputs)
-        mark_dynamic(1, m.points, m.variance, m.used, m.casts, m.noise)
         graphs.fuse_heights(stored, m)
         graphs.apply_rays(stored, m, weights)
 
@@ -57,6 +60,39 @@ def compile_ahead(
             state = map_layers(lambda layer, n=size: layer[:n], scratch)
             first: list[Any] = [None if value is None else value[:size] for value in inputs]
             compiled_update(state, *first, cfg=cfg, weights=weights)
+
+
+def compile_side_by_side(
+    graphs: Graphs, stored: MapState, inputs: Sequence[Tensor | None], cfg: ElevationMapConfig, weights: Weights | None
+) -> None:
+    """Let other processes compile some of the graphs, the longest first, while this one compiles the others."""
+    processes = min(len(os.sched_getaffinity(0)), len(graphs)) if hasattr(os, "sched_getaffinity") else 1
+    blank = [None if value is None else torch.zeros_like(value) for value in inputs]
+    about = len(stored.elevation), stored.elevation.dtype, torch.get_num_threads()
+    for part in ("apply_rays", "fuse_heights")[: processes - 1]:
+        graph: KeptGraph = getattr(graphs, part)
+        if graph.is_missing(stored):
+            graph.helper = run_elsewhere(compile_part, part, blank, cfg, weights, *about)
+
+
+def compile_part(
+    part: str,
+    inputs: Sequence[Any],
+    cfg: ElevationMapConfig,
+    weights: Weights | None,
+    num_envs: int,
+    dtype: torch.dtype,
+    num_threads: int,
+) -> None:
+    """Compile one graph of an update into its file."""
+    torch.set_num_threads(num_threads)
+    kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
+    graph: KeptGraph = getattr(graphs_of(cfg, kinds, inputs[0].shape[1]), part)
+    with torch.inference_mode(False), torch.no_grad():
+        blank = blank_state(cfg.grid, num_envs, inputs[0].device, dtype)
+    with torch.inference_mode():
+        m = with_masks(measure(*inputs, cfg.grid, cfg.sensor, dtype), as_bytes)  # type: ignore[call-arg]
+        graph.prepare(with_masks(blank, as_bytes), m, *([weights] if part == "apply_rays" else []))
 
 
 # `pipeline.forward` in three parts, see `Graphs`.
@@ -90,9 +126,9 @@ class Graphs(NamedTuple):
     an update without its points or rays. Masks come and go as bytes, see `as_bytes`.
     """
 
-    move_window: Callable[..., Measurement]  #: measures, moves the window and ages it
-    fuse_heights: Callable[..., None]  #: compensates drift and fuses the points' heights
-    apply_rays: Callable[..., None]  #: clears cells, bounds unknown ones and rates the rest
+    move_window: KeptGraph  #: measures, moves the window and ages it
+    fuse_heights: KeptGraph  #: compensates drift and fuses the points' heights
+    apply_rays: KeptGraph  #: clears cells, bounds unknown ones and rates the rest
 
 
 @functools.cache
@@ -105,14 +141,24 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
         write_changes(stored, state, move_window(state, m, cfg))
         return with_masks(m, as_bytes)
 
-    def in_place(stages: Callable[..., MapState]) -> Callable[..., None]:
+    def in_place(stages: Callable[..., MapState]) -> KeptGraph:
         def run(stored: MapState, m: Measurement, *weights: Weights | None) -> None:
             state = with_masks(stored, as_mask)
             write_changes(stored, state, stages(state, with_masks(m, as_mask), cfg, *weights))
 
-        return compiled(run)
+        return KeptGraph(run, (stages.__name__, *settings), _measured)
 
-    return Graphs(compiled(first), in_place(fuse_heights), in_place(apply_rays))
+    settings = (cfg, kinds, sensors)
+    move = KeptGraph(first, (move_window.__name__, *settings), _sized_by_points)
+    return Graphs(move, in_place(fuse_heights), in_place(apply_rays))
+
+
+def _sized_by_points(_: MapState, points: Tensor, *others: Any) -> tuple[int, Sequence[Tensor | None]]:
+    return 2, (points, others[3])  # and their variance
+
+
+def _measured(_: MapState, m: Measurement, *__: Weights | None) -> tuple[int, Sequence[Tensor | None]]:
+    return 1, (m.points, m.variance, m.used, m.casts, m.noise)
 
 
 def write_changes(stored: MapState, old: MapState, new: MapState) -> None:
