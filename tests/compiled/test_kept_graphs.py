@@ -73,6 +73,18 @@ def test_two_numbers_of_environments_are_kept_and_others_share_one_graph(compile
 
 
 @pytest.mark.slow(10)
+def test_each_number_of_environments_is_a_constant_of_its_graph(compiled_anew):
+    """Also of the second one, which torch.compile would leave open."""
+    kept = graph()
+    for num_envs in (2, 4):
+        call(kept, pair(num_envs))
+        found = kept._kept[num_envs, torch.float32, torch.device("cpu")]
+        call(kept, pair(num_envs, 9))
+        assert found.guard_check(pair(num_envs, 9), torch.tensor(2.0))
+        assert not found.guard_check(pair(num_envs + 1, 9), torch.tensor(2.0))
+
+
+@pytest.mark.slow(10)
 def test_what_the_file_does_not_fit_is_compiled_by_the_process(compiled_anew):
     kept = graph()
     call(kept, pair())

@@ -145,9 +145,8 @@ def traced(function: Callable[..., Any], args: Sequence[Any]) -> bytes:
     from torch._dynamo.aot_compile import AOTCompiledFunction
     from torch._dynamo.callback import CallbackTrigger, callback_handler
 
-    graph = torch.compile(
-        function, fullgraph=True, backend=inductor, options={"guard_filter_fn": guards_on_kept_arguments}
-    )
+    options = {"guard_filter_fn": guards_on_kept_arguments}
+    graph = torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
     with callback_handler.install_callbacks(CallbackTrigger.DYNAMO, "to keep"):
         return AOTCompiledFunction.serialize(graph.aot_compile((tuple(args), {}))).serialized_data  # type: ignore[attr-defined]
 

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.ops import scatter
+from torchelev.ops import native, scatter
 from torchelev.ops.transforms import with_gradient
 
 
@@ -25,7 +25,8 @@ def _compiles_for_gpu(values: Tensor) -> bool:
 @torch.library.custom_op("torchelev::cell_sums", mutates_args=())
 def _cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor:
     """Sum values (K, B, M) by the slots `index` (B, M) in [0, size): -> (K, B, size). Slots never mix environments."""
-    return scatter.add(index, values, size)
+    sums = native.cell_sums(index, values, size)
+    return scatter.add(index, values, size) if sums is None else sums
 
 
 @_cell_sums.register_fake
@@ -97,9 +98,11 @@ def _scan(table: Tensor, from_end: bool) -> None:
 
 @torch.library.custom_op("torchelev::running_minimum", mutates_args=())
 def _running_minimum(table: Tensor) -> Tensor:
-    table = table.clone()
-    _scan(table, from_end=False)
-    return table
+    result = native.running_minimum(table)
+    if result is None:
+        result = table.clone()
+        _scan(result, from_end=False)
+    return result
 
 
 @_running_minimum.register_fake
@@ -139,11 +142,13 @@ def _(index: Tensor, values: Tensor, size: int, blank: float) -> Tensor:
     schema="(Tensor index, Tensor values, SymInt azimuths, SymInt[] widen, SymInt ranges, float blank) -> Tensor",
 )
 def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
-    size = _table_rows(ranges)
-    table = scatter.lowest(index, values, size * azimuths, blank).unflatten(1, (size, azimuths))
-    table[:, ranges] = blank
-    _scan(table, from_end=True)
-    _widen(table, widen)
+    rows = _table_rows(ranges)
+    table = native.polar_minimum(index, values, rows, azimuths, widen, ranges, blank)
+    if table is None:
+        table = scatter.lowest(index, values, rows * azimuths, blank).unflatten(1, (rows, azimuths))
+        table[:, ranges] = blank
+        _scan(table, from_end=True)
+        _widen(table, widen)
     return table
 
 

@@ -23,10 +23,17 @@ from training.completion.cells import FARTHEST, distances
 from training.completion.maps import YARD, YARD_CONFIG, TrueMap, WalkConfig, Walks, make_walks
 from training.options import jobs_option
 
-SPLITS = {  # with the resolutions [m] of their maps
-    "held_out": (0.02, 0.04, 0.08),
-    "unseen": (0.02, 0.04, 0.08),
-    "held_out_yards": (0.04, 0.08),
+class Split(NamedTuple):
+    """What is evaluated on one of the splits of `maps.SPLITS`."""
+
+    cfg: WalkConfig
+    resolutions: tuple[float, ...]  #: [m] of the maps
+
+
+SPLITS = {
+    "held_out": Split(WalkConfig(), (0.02, 0.04, 0.08)),
+    "unseen": Split(WalkConfig(), (0.02, 0.04, 0.08)),
+    "held_out_yards": Split(YARD_CONFIG, (0.04, 0.08)),
 }
 DISTANCES = (0.0, 0.1, 0.3, 1.0, FARTHEST)  # [m] limits of the groups of unknown cells
 _SEED = 0  # of the maps, the same for all weights
@@ -126,9 +133,9 @@ def evaluate(answers: dict[str, Answer], data: Path, num_walks: int, jobs: int) 
     """
     answers = answers | {name: fill(name) for name in FILLS}
     result: dict[str, Any] = {}
-    for split, resolutions in SPLITS.items():
+    for split, (cfg, resolutions) in SPLITS.items():
         for resolution in resolutions:
-            walks = Walks(data, split, _SEED, YARD_CONFIG if "yards" in split else WalkConfig(), resolution)
+            walks = Walks(data, split, _SEED, cfg, resolution)
             make_walks(walks, num_walks, jobs)
             bar = tqdm(range(num_walks), desc=f"{split} at {100 * resolution:g} cm", unit="walk")
             errors = all_errors(answers, [maps for index in bar for maps in walks.read(index)])

@@ -26,7 +26,7 @@ from training.options import jobs_option, runs_option
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
-WALKS, DRIVES, STEPS, EVALUATION_WALKS = 290, 130, 15000, 8
+WALKS, DRIVES, STEPS, EVALUATION_WALKS = 290, 130, 15000, 32
 UNETS = {"U-Net of equal size": 3}  # channels of the finest level
 UNET_STEPS = 4000
 
@@ -34,7 +34,6 @@ UNET_STEPS = 4000
 def _jobs(runs: Path) -> list[Job]:
     """Return a training for each seed."""
     fixed = {"--data": runs / "data", "--walks": WALKS, "--drives": DRIVES, "--steps": STEPS, "--jobs": 1}
-    fixed |= {"--evaluation-walks": EVALUATION_WALKS}
     return [Job("training.completion", {"--seed": seed, **fixed}, runs / f"seed-{seed}") for seed in SEEDS]
 
 
@@ -77,6 +76,7 @@ def main(runs: Path, jobs: int) -> None:
     answers |= {name: as_answer(fit_unet(runs, channels)) for name, channels in UNETS.items()}
     result = evaluate(answers, runs / "data", EVALUATION_WALKS, jobs)
     fixed = {"seeds": SEEDS, "walks": WALKS, "drives": DRIVES, "steps": STEPS, "unet_steps": UNET_STEPS}
+    fixed |= {"evaluation_walks": EVALUATION_WALKS}
     write_json(RESULTS / "completion.json", result | {"training": fixed})
     click.echo(table(result))
 

@@ -173,10 +173,11 @@ def test_the_u_net_stays_below_the_bound_and_learns():
 
 @pytest.mark.slow(20)
 def test_the_commands_train_evaluate_and_resume(tmp_path, monkeypatch):
-    for module in (training, evaluation):
-        monkeypatch.setattr(module, "WalkConfig", TINY)
-        monkeypatch.setattr(module, "YARD_CONFIG", TINY_YARD)
-    monkeypatch.setattr(evaluation, "SPLITS", dict.fromkeys(evaluation.SPLITS, (0.08,)))
+    monkeypatch.setattr(training, "WalkConfig", TINY)
+    monkeypatch.setattr(training, "YARD_CONFIG", TINY_YARD)
+    tiny = {name: TINY_YARD if "yards" in name else TINY() for name in evaluation.SPLITS}
+    splits = {name: evaluation.Split(cfg, (0.08,)) for name, cfg in tiny.items()}
+    monkeypatch.setattr(evaluation, "SPLITS", splits)
     out = tmp_path / "run"
     common = ("--out", out, "--walks", 2, "--drives", 1, "--evaluation-walks", 1, "--jobs", 1, "--steps", 2)
     done = invoke(training.main, *common)
