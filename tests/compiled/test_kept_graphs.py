@@ -6,6 +6,7 @@ import time
 
 import pytest
 import torch
+from torch._inductor import cpu_vec_isa
 
 from tests.helpers import small_config
 from torchelev import GridConfig
@@ -115,6 +116,20 @@ def test_a_folder_that_cannot_be_written_is_told_and_the_update_runs(compiled_an
     (tmp_path / "torchelev").write_text("a file, not a folder")
     with pytest.warns(RuntimeWarning, match="TORCHINDUCTOR_CACHE_DIR"):
         call(graph(), pair())
+
+
+@pytest.mark.slow(10)
+def test_a_kept_graph_needs_no_trials_of_the_processor(compiled_anew, monkeypatch):
+    """The compiler would try its instructions in other processes, for a second."""
+    call(graph(), pair())
+
+    def tried(*_):
+        raise AssertionError("tried")
+
+    monkeypatch.setattr(cpu_vec_isa.VecISA, "_VecISA__bool__impl", tried)
+    cpu_vec_isa.valid_vec_isa_list.cache_clear()
+    call(graph(), pair())
+    assert len(compiled_anew) == 1
 
 
 def test_only_settings_that_are_known_are_kept():

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from torchelev.ops.moving import moved
 from torchelev.ops.operators import cell_sums, padded, polar_minimum, running_minimum
 
-
 DTYPES = st.sampled_from([np.float32, np.float64])  # in C++, where there is a compiler, and by tensors
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
+import pickle
 import re
 import sys
 import time
@@ -141,14 +143,34 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
 
 
 def traced(function: Callable[..., Any], args: Sequence[Any]) -> bytes:
-    """Compile a function for arguments into bytes, which `torch.compiler.load_compiled_function` loads in a process."""
+    """Compile a function for arguments into bytes, which `load_traced` loads in any process."""
     from torch._dynamo.aot_compile import AOTCompiledFunction
     from torch._dynamo.callback import CallbackTrigger, callback_handler
+    from torch._inductor.cpu_vec_isa import valid_vec_isa_list
 
-    options = {"guard_filter_fn": guards_on_kept_arguments}
-    graph = torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
+    options: dict[str, Any] = {"guard_filter_fn": guards_on_kept_arguments}
+    # A code object of its own, or the compiler would leave open what differs from the function's graph before.
+    compiler: Any = torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
     with callback_handler.install_callbacks(CallbackTrigger.DYNAMO, "to keep"):
-        return AOTCompiledFunction.serialize(graph.aot_compile((tuple(args), {}))).serialized_data  # type: ignore[attr-defined]
+        graph = AOTCompiledFunction.serialize(compiler.aot_compile((tuple(args), {}))).serialized_data
+    return pickle.dumps(([str(isa) for isa in valid_vec_isa_list()], graph))
+
+
+def load_traced(data: bytes) -> Any:
+    """Return the function that `traced` compiled; it may raise anything if the bytes are damaged."""
+    instructions, graph = pickle.loads(data)
+    with known_instructions(instructions):
+        return torch.compiler.load_compiled_function(io.BytesIO(graph))
+
+
+def known_instructions(names: Sequence[str]) -> contextlib.AbstractContextManager[None]:
+    """Let the compiler take vector instructions as given, which it else tries out in new processes for a second."""
+    from torch._inductor import cpu_vec_isa
+
+    known = [isa for isa in cpu_vec_isa.supported_vec_isa_list if str(isa) in names]
+    if len(known) < len(names):  # of processors where it need not try
+        return contextlib.nullcontext()
+    return replaced(cpu_vec_isa, "valid_vec_isa_list", lambda _: lambda: known)
 
 
 def guards_on_kept_arguments(guards: Sequence[Any]) -> list[bool]:

@@ -18,12 +18,12 @@ from typing import Any
 
 import torch
 
-from torchelev.compiled.compiler import compiled, mark_dynamic, remove_marks, traced
+from torchelev.compiled.compiler import compiled, load_traced, mark_dynamic, remove_marks, traced
 from torchelev.native.library import describe_processor
 from torchelev.output_files import atomic_file
 
 NUM_KEPT = 2  # numbers of environments with a graph of their own: chunks have one size, but for the last
-_VARIABLES = ("TORCH", "OMP_", "CXX")  # beginnings of environment variables that may change what is compiled
+_VARIABLES = ("TORCH", "ATEN_", "OMP_", "CXX")  # beginnings of environment variables that may change what is compiled
 _STALE = 60  # [s] after which nobody writes an empty library any more
 _SOURCES = Path(__file__).parents[1]
 
@@ -113,8 +113,7 @@ class KeptGraph:
 def _load(path: Path) -> Any:
     """Return the graph in a file; None if there is none, or none of use."""
     try:
-        with path.open("rb") as file:
-            return torch.compiler.load_compiled_function(file)
+        return load_traced(path.read_bytes())
     except OSError:
         return None
     except Exception:  # a damaged file raises whatever its bytes say

@@ -23,6 +23,7 @@ from training.completion.cells import FARTHEST, distances
 from training.completion.maps import YARD, YARD_CONFIG, TrueMap, WalkConfig, Walks, make_walks
 from training.options import jobs_option
 
+
 class Split(NamedTuple):
     """What is evaluated on one of the splits of `maps.SPLITS`."""
 
