@@ -50,7 +50,7 @@ from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
 GPU = "gpu-nvidia-h100-80gb-hbm3"
-SPEED = "speed-2-x-intel-r-xeon-r-processor-2-threads"
+SPEED = "speed-2-x-amd-epyc-2-threads"
 _SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
 
 

@@ -1,6 +1,6 @@
 """Measure speed and scaling on this machine, and check the targets.
 
-    python -m benchmarks.speed.run                      # all sections, under ten minutes: JSON, plots, tables
+    python -m benchmarks.speed.run                      # all sections, a quarter of an hour: JSON, plots, tables
     python -m benchmarks.speed.run points robots        # only these sections; the others keep their results
     python -m benchmarks.speed.run --against old.json   # measure and report regressions
     python -m benchmarks.speed.run --compare new.json --against old.json    # compare two files, measure nothing

@@ -5,24 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch._dynamo.utils import counters
 
 from benchmarks.speed import meter
 from benchmarks.speed.meter import progress
 from benchmarks.speed.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
-from torchelev.compiled.update import Graphs
 from torchelev.stages.visibility.polar_table import PolarGrid
 
 POINTS = [1000, 3000, 6276, 15000, 43074, 100000, 200000, 407040]
 ROBOTS = [1, 4, 16, 64, 256, 1024, 4096]
 CELLS = [125, 250, 500, 1000]  # along each side
 RAYS = [1.2, 1.7, 2.4, 3.4, 4.8, 6.8, 19.2, 38.4]  # [m] horizontal length of the longest ray; the window ends at 5 m
+THREADS, MANY_ROBOTS = (1, 2), 256
 _STEEPNESS = 0.5  # slope of the long rays: above the exclusion ramp at any distance
 
 
 def points(seconds: float) -> dict[str, Any]:
     """Time one robot's update against the number of points: all stages, the paper's plain baseline, uncompiled."""
-    counters.clear()
     drives = {("full", n): Drive(full_config(), n) for n in POINTS}
     drives |= {("baseline", n): Drive(baseline_config(), n) for n in POINTS}
     drives |= {("eager", n): Drive(full_config(), n, compiled=False) for n in sorted(row[1] for row in SENSORS)}
@@ -36,11 +34,31 @@ def points(seconds: float) -> dict[str, Any]:
         row["gigabytes_per_second"] = moved / row["median"] / 1e6
         results[kind].append(row | {"largest_statistics": drive.seen})
     sizes, medians = [row["points"] for row in results["full"]], [row["median"] for row in results["full"]]
-    results["graphs"] = counters["stats"]["unique_graphs"] - len(Graphs._fields)  # without the baseline's
     results["exponent"] = meter.exponent(sizes, medians)
     first = sizes.index(BPEARL)
     results["exponent_from_43074"] = meter.exponent(sizes[first:], medians[first:])
     return results
+
+
+def threads(seconds: float) -> dict[str, Any]:
+    """Time updates of one robot and of many on one thread and on two, against the bytes that they must move."""
+    full, many = full_config(), full_config(64)
+    cases = {f"{n:,} points": (full, n, 1) for n in sorted(row[1] for row in SENSORS)}
+    cases[f"{MANY_ROBOTS} robots"] = (many, MANY_POINTS, MANY_ROBOTS)
+    before, rows = torch.get_num_threads(), []
+    for number in progress(THREADS, "threads"):
+        torch.set_num_threads(number)
+        meter.fresh_compiler()
+        drives = {name: Drive(cfg, n, robots=count) for name, (cfg, n, count) in cases.items()}
+        for drive in drives.values():
+            drive.watch(8)
+        bandwidth = meter.copy_bandwidth()
+        for name, time in meter.interleaved(drives, seconds).items():
+            cfg, n, count = cases[name]
+            share = count * meter.needed_traffic(cfg, n) / (time["median"] / 1e3) / bandwidth
+            rows.append({"case": name, "threads": number} | time | {"share_of_copy": share})
+    torch.set_num_threads(before)
+    return {"rows": rows}
 
 
 def robots(seconds: float) -> dict[str, Any]:

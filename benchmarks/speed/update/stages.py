@@ -60,7 +60,10 @@ def stages(seconds: float) -> dict[str, Any]:
     }
     update = Drive(cfg, BPEARL)
     update.warm_up()
-    return {"points": BPEARL, "stages": meter.interleaved(runs | {"the whole update": update}, seconds)}
+    times = meter.interleaved(runs | {"the whole update": update}, seconds)
+    moved = {name: _traffic(stage, *inputs[0]) for name, stage in all_stages.items()}
+    moved["the whole update"] = meter.needed_traffic(cfg, BPEARL)
+    return {"points": BPEARL, "stages": {name: time | {"bytes": moved[name]} for name, time in times.items()}}
 
 
 def parts(seconds: float) -> dict[str, Any]:
@@ -103,6 +106,23 @@ def _compiled_alone(stage: _Stage, inputs: list[tuple[MapState, Measurement]]) -
 
     run()
     return run
+
+
+def _traffic(stage: _Stage, state: MapState, m: Measurement) -> int:
+    """Return how many bytes a stage reads and writes, each value once, without what it stores in between."""
+    moved: list[int] = []
+
+    def add_up(graph: torch.fx.GraphModule, _: Any) -> Callable[..., Any]:
+        read = [node for node in graph.graph.find_nodes(op="placeholder") if node.users]
+        written = set(graph.graph.output_node().args[0]) - set(read)  # type: ignore[arg-type]
+        values = [node.meta.get("example_value") for node in (*read, *written)]
+        moved.append(sum(value.nbytes for value in values if isinstance(value, Tensor)))
+        return graph.forward
+
+    torch._dynamo.reset()
+    with torch.no_grad():
+        torch.compile(lambda state, m: stage(state, m), fullgraph=True, backend=add_up)(state, m)
+    return moved[0]
 
 
 def _mask_bytes(values: Any) -> Any:

@@ -16,12 +16,13 @@ from benchmarks.speed.meter import progress
 _IMPORT = "import time, torch; t = time.perf_counter(); import torchelev; print(time.perf_counter() - t)"
 _FIRST_UPDATE = """
 import time, torch
+from benchmarks.speed.meter import peak_megabytes
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 torch.set_num_threads({threads})
 drive = Drive(full_config(), BPEARL, scans=1)
 t = time.perf_counter()
 drive()
-print(time.perf_counter() - t)
+print(time.perf_counter() - t, peak_megabytes())
 """
 
 
@@ -32,9 +33,11 @@ def start(seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as cache:
         runs = [_run_python(first, TORCHINDUCTOR_CACHE_DIR=cache) for _ in progress(range(2), "start")]
     (cold, messages), (cached, _) = runs
-    result = {"import_seconds": statistics.median(imports), "first_update_seconds": float(cold)}
-    announced = messages.count("compiling the update")
-    return result | {"cached_first_update_seconds": float(cached), "announced": announced}
+    result: dict[str, Any] = {"import_seconds": statistics.median(imports)}
+    for name, numbers in (("", cold), ("cached_", cached)):
+        seconds_taken, megabytes = map(float, numbers.split())
+        result |= {f"{name}first_update_seconds": seconds_taken, f"{name}megabytes": megabytes}
+    return result | {"announced": messages.count("compiling the update")}
 
 
 def _run_python(code: str, **environment: str) -> tuple[str, str]:

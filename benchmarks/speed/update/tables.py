@@ -15,7 +15,8 @@ FLAT = 1.15  # largest growth of the time per robot beyond 256 robots
 _MEMORY = 1.5  # factor on the minimum memory of map, points and polar table
 _FRACTION = 0.15  # of an update's time: reset, recenter, sample
 GROWTH = {"points": 1.0, "cells": 1.1, "rays": 0.1}  # largest exponents, the last in absolute value
-IMPORT, FIRST_UPDATE = 0.3, 60  # [s]
+IMPORT, FIRST_UPDATE, LATER_UPDATE = 0.3, 60, 3  # [s]
+RESIDENT = 450  # [MB] of a process with a compiled map of one robot
 
 
 class Check(NamedTuple):
@@ -60,7 +61,6 @@ def _points(values: dict[str, Any]) -> Iterator[Check]:
         remark = f", {row['median'] / full[n]['median']:.1f} x compiled"
         yield Check(f"eager, {n:,} points", row["median"], _EAGER * TARGETS[n], "{:.1f} ms", remark)
     yield Check("growth with points", values["exponent_from_43074"], GROWTH["points"], "exponent {:.2f}")
-    yield Check("graphs compiled for 8 numbers of points (for one: 3)", values["graphs"], 3, "{:.0f}")
 
 
 def _robots(values: dict[str, Any]) -> Iterator[Check]:
@@ -90,6 +90,8 @@ def _parts(values: dict[str, Any]) -> Iterator[Check]:
 def _start(values: dict[str, Any]) -> Iterator[Check]:
     yield Check("import beyond torch", values["import_seconds"], IMPORT, "{:.2f} s")
     yield Check("first compiled update", values["first_update_seconds"], FIRST_UPDATE, "{:.0f} s")
+    yield Check("the same in later processes", values["cached_first_update_seconds"], LATER_UPDATE, "{:.1f} s")
+    yield Check("memory of such a process", values["cached_megabytes"], RESIDENT, "{:.0f} MB")
 
 
 def sensors(result: dict[str, Any]) -> str:
@@ -105,9 +107,29 @@ def sensors(result: dict[str, Any]) -> str:
 
 
 def stages(result: dict[str, Any]) -> str:
-    """Tabulate the time of each stage (paper, Table I)."""
-    rows = [[name, f"{t['median']:.2f}", f"{t['min']:.2f}"] for name, t in result["stages"]["stages"].items()]
-    return markdown_table([f"stage alone, {BPEARL:,} points", "median ms", "min ms"], rows)
+    """Tabulate the time of each stage (paper, Table I), and of a copy of as many bytes."""
+    rows, speed = [], result["copy_gigabytes_per_second"]
+    for name, t in result["stages"]["stages"].items():
+        copied = t["bytes"] / speed / 1e6
+        figures = f"{t['median']:.2f}", f"{t['min']:.2f}", f"{t['bytes'] / 1e6:.1f}", f"{copied:.2f}"
+        rows.append([name, *figures, f"{100 * copied / t['median']:.0f}"])
+    head = ["median ms", "min ms", "MB", "ms to copy them", "share [%]"]
+    return markdown_table([f"stage alone, {BPEARL:,} points", *head], rows)
+
+
+def threads(result: dict[str, Any]) -> str:
+    """Tabulate the times on one thread and on two."""
+    rows: list[list[str]] = []
+    by_case: dict[str, list[dict[str, Any]]] = {}
+    for row in result["threads"]["rows"]:
+        by_case.setdefault(row["case"], []).append(row)
+    for case, of_case in by_case.items():
+        for row in of_case:
+            times = [f"{row[key]:.1f}" for key in ("median", "p90", "p99", "min")]
+            faster = f"{of_case[0]['median'] / row['median']:.2f}"
+            rows.append([case, f"{row['threads']}", *times, faster, f"{100 * row['share_of_copy']:.0f}"])
+    head = ["", "threads", "p50 ms", "p90 ms", "p99 ms", "min ms", "times as fast as one", "share of a copy [%]"]
+    return markdown_table(head, rows)
 
 
 def robots(result: dict[str, Any]) -> str:
@@ -121,6 +143,6 @@ def robots(result: dict[str, Any]) -> str:
 
 def report(result: dict[str, Any]) -> str:
     """Return the tables of the sections that were measured."""
-    tables = {"points": sensors, "stages": stages, "robots": robots}
+    tables = {"points": sensors, "threads": threads, "stages": stages, "robots": robots}
     texts = [table(result) for section, table in tables.items() if section in result]
     return "\n\n".join([*texts, verdicts(result)])
