@@ -2,15 +2,20 @@
 
 import dataclasses
 import os
+import pickle
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from filelock import FileLock
 from torch._inductor import cpu_vec_isa
 
-from tests.helpers import small_config
-from torchelev import GridConfig
-from torchelev.compiled import kept_graphs
+from tests.helpers import scan, small_config, small_map
+from torchelev import Capsule, GridConfig, LearnedTraversabilityConfig, RobotBody, SensorConfig
+from torchelev.compiled import kept_graphs, update
 from torchelev.compiled.elsewhere import run_elsewhere
 from torchelev.compiled.kept_graphs import KeptGraph, describe, remove_unfinished
 
@@ -20,8 +25,8 @@ pytestmark = [
 ]
 
 
-def add_up(pair, factor):
-    return pair[0].sum(1) * factor
+def scaled(pair, factor):
+    return pair[0] * factor + 1
 
 
 @pytest.fixture
@@ -40,7 +45,7 @@ def compiled_anew(tmp_path, monkeypatch):
 
 
 def graph(settings=(1,)):
-    return KeptGraph(add_up, settings, lambda pair, _: (1, pair))
+    return KeptGraph(scaled, settings, lambda pair, _: (1, pair))
 
 
 def pair(num_envs=2, number=5, dtype=torch.float32):
@@ -48,7 +53,7 @@ def pair(num_envs=2, number=5, dtype=torch.float32):
 
 
 def call(kept, values, factor=2.0):
-    assert torch.equal(kept(values, torch.tensor(factor)), add_up(values, factor))
+    assert torch.equal(kept(values, torch.tensor(factor)), scaled(values, factor))
 
 
 @pytest.mark.slow(10)
@@ -79,7 +84,7 @@ def test_each_number_of_environments_is_a_constant_of_its_graph(compiled_anew):
     kept = graph()
     for num_envs in (2, 4):
         call(kept, pair(num_envs))
-        found = kept._kept[num_envs, torch.float32, torch.device("cpu")]
+        found = kept.prepare(pair(num_envs), torch.tensor(2.0))
         call(kept, pair(num_envs, 9))
         assert found.guard_check(pair(num_envs, 9), torch.tensor(2.0))
         assert not found.guard_check(pair(num_envs + 1, 9), torch.tensor(2.0))
@@ -112,10 +117,49 @@ def test_a_damaged_file_is_replaced(compiled_anew, tmp_path, damage):
 
 
 @pytest.mark.slow(10)
-def test_a_folder_that_cannot_be_written_is_told_and_the_update_runs(compiled_anew, tmp_path):
-    (tmp_path / "torchelev").write_text("a file, not a folder")
-    with pytest.warns(RuntimeWarning, match="TORCHINDUCTOR_CACHE_DIR"):
+@pytest.mark.parametrize("obstacle", ["folder", "caches", "compiler"])
+def test_what_cannot_be_kept_is_told_and_the_update_runs(compiled_anew, tmp_path, monkeypatch, obstacle):
+    if obstacle == "folder":
+        (tmp_path / "torchelev").write_text("a file, not a folder")
+    elif obstacle == "compiler":
+        monkeypatch.setattr(kept_graphs, "traced", lambda *_: 1 / 0)
+    disabled = torch._inductor.config.patch(force_disable_caches=obstacle == "caches")
+    with disabled, pytest.warns(RuntimeWarning, match="TORCHINDUCTOR_CACHE_DIR"):
         call(graph(), pair())
+
+
+@pytest.mark.slow(10)
+def test_every_mode_of_torch_has_its_own_file(compiled_anew):
+    call(graph(), pair())
+    usual = graph().path(pair(), torch.tensor(2.0))
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert graph().path(pair(), torch.tensor(2.0)) != usual
+        call(graph(), pair())
+    finally:
+        torch.use_deterministic_algorithms(False)
+    with torch.inference_mode():
+        assert graph().path(pair(), torch.tensor(2.0)) != usual
+    with torch._inductor.config.patch("cpp.min_chunk_size", 17):
+        assert graph().path(pair(), torch.tensor(2.0)) != usual
+    assert graph().path(pair(number=9), torch.tensor(2.0)) == usual
+    assert len({graph().path(*args) for args in ((pair(3), torch.ones(())), (pair(), torch.ones(2)))} - {usual}) == 2
+    assert len(compiled_anew) == 2
+
+
+@pytest.mark.slow(10)
+def test_the_first_size_does_not_decide(compiled_anew):
+    call(graph(), pair(number=3))
+    ((_, args, _),) = compiled_anew
+    assert args[0][0].shape == (2, kept_graphs.EXAMPLE // 2)
+
+
+@pytest.mark.slow(10)
+def test_threads_wait_for_each_other(compiled_anew):
+    kept = graph()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda number: call(kept, pair(number=number)), range(3, 11)))
+    assert len(compiled_anew) == 1
 
 
 @pytest.mark.slow(10)
@@ -143,8 +187,8 @@ def test_only_settings_that_are_known_are_kept():
     cfg = small_config()
     assert describe(cfg) == describe(small_config()) != describe(small_config(drift=None))
     assert describe((1, None, torch.float32, torch.device("cpu"))) is not None
-    assert describe(Foreign()) is describe(Own()) is describe(add_up) is describe((1, Own())) is None
-    assert graph(Own())._path((2, torch.float32, torch.device("cpu"))) is None
+    assert describe(Foreign()) is describe(Own()) is describe(scaled) is describe((1, Own())) is None
+    assert graph(Own()).path(pair(), torch.tensor(2.0)) is None
 
 
 def test_empty_libraries_of_killed_compilations_are_removed(tmp_path):
@@ -157,22 +201,74 @@ def test_empty_libraries_of_killed_compilations_are_removed(tmp_path):
     assert sorted(path.stem for path in tmp_path.rglob("*.so")) == ["new", "whole"]
 
 
-@pytest.mark.slow(10)
-def test_another_process_compiles_what_this_one_waits_for(compiled_anew, tmp_path):
+def write_later(seconds, path, data):
+    """Write a file while others wait for it."""
+    with FileLock(f"{path}.lock"):
+        Path(f"{path}.begun").touch()
+        time.sleep(seconds)
+        Path(path).write_bytes(data)
+
+
+@pytest.mark.slow(15)
+def test_a_process_waits_for_another_that_compiles_the_same(compiled_anew, tmp_path):
     call(graph(), pair())
     (path,) = tmp_path.glob("torchelev/*.graph")
     data = path.read_bytes()
     path.unlink()
-    kept = graph()
-    kept.helper = run_elsewhere(os.write, 1, b"")  # it writes nothing, and ends
-    call(kept, pair())
-    assert len(compiled_anew) == 2
-    path.unlink()
-    kept = graph()
-    kept.helper = run_elsewhere(type(path).write_bytes, path, data)
-    call(kept, pair())
-    assert len(compiled_anew) == 2
+    other = run_elsewhere(write_later, 1.0, str(path), data)
+    while not Path(f"{path}.begun").exists():
+        assert other.poll() is None
+        time.sleep(0.01)
+    call(graph(), pair())
+    assert other.wait() == 0 and len(compiled_anew) == 1
 
 
-def test_what_cannot_be_sent_runs_nowhere():
+def test_what_cannot_be_sent_runs_nowhere(monkeypatch):
     assert run_elsewhere(lambda: None) is None
+    monkeypatch.setattr("sys.executable", "/opt/robot/bin/program")
+    assert run_elsewhere(os.getpid) is None
+
+
+LEG = RobotBody(capsules=(Capsule(link="leg", start=(0.0, 0.0, 0.0), end=(0.0, 0.0, -0.1), radius=0.02),))
+KINDS = {
+    "base": {},
+    "no base": {},
+    "variance": {},
+    "covariance": {},
+    "links": {"sensor": SensorConfig(body=LEG)},
+    "head": {"traversability": LearnedTraversabilityConfig()},
+}
+
+
+@pytest.mark.parametrize("sensors", [1, 2])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_another_process_compiles_the_graphs_that_an_update_looks_for(tmp_path, monkeypatch, kind, dtype, sensors):
+    """It makes up a measurement, whose tensors must be like the real one's."""
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(update, "run_elsewhere", lambda function, *order: orders.append(order))
+    orders, paths = [], []
+
+    def uncompiled(kept, args):
+        paths.append(kept.path(*args))
+        return SimpleNamespace(guard_check=lambda *_: True, fn=kept._function)
+
+    monkeypatch.setattr(KeptGraph, "_find", uncompiled)
+    update.graphs_of.cache_clear()
+    emap = small_map(2, dtype=dtype, **KINDS[kind])
+    emap.compile()
+    cloud, T = scan(0, 2, 60)
+    clouds, poses = cloud[:, None].repeat(1, sensors, 1, 1), T[:, None].repeat(1, sensors, 1, 1)
+    given = {"variance": clouds[..., 0].abs() + 0.01} if kind == "variance" else {}
+    given |= {"T_base_links": T[:, None]} if kind == "links" else {}
+    given |= {"pose_covariance": torch.eye(6).repeat(2, sensors, 1, 1)} if kind == "covariance" else {}
+    emap.update(clouds, poses, None if kind == "no base" else T, 0.3, **given)
+    assert len(paths) == 3 == len(set(paths)) and emap.validity.any()
+    update.graphs_of.cache_clear()
+    wanted = {"fuse_heights": paths[1], "apply_rays": paths[2]}
+    assert orders, "on one core alone there is no other process"
+    for part, path in wanted.items():
+        order = pickle.loads(pickle.dumps(orders[0][1:]))
+        update.compile_part(part, *order)
+        assert paths[-1] == path
+    update.graphs_of.cache_clear()

@@ -108,6 +108,7 @@ POINTS[3] = (POINTS[3] > 0.5).to(torch.uint8)
     [
         ("padded", (TABLE, 1, 2.0)),
         ("running_minimum", (TABLE,)),
+        ("running_minimum", (TABLE.mT.contiguous().mT,)),
         ("polar_minimum", (torch.tensor([[0, 11]]), torch.ones(1, 2), 4, [3, 1], 8, 9.0)),
         ("cell_sums", (torch.tensor([[0, 1], [1, 1]]), torch.ones(3, 2, 2), 2)),
         ("moved", ([TABLE, TABLE > 0.5], torch.tensor([[1, 0], [0, -2]]), [1.0, 0.0])),

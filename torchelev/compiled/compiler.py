@@ -142,17 +142,21 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
     return [not guard.is_global and not any(name in guard.name for name in fixed) for guard in guards]
 
 
-def traced(function: Callable[..., Any], args: Sequence[Any]) -> bytes:
-    """Compile a function for arguments into bytes, which `load_traced` loads in any process."""
+def traced(
+    function: Callable[..., Any], args: Sequence[Any], dynamic: Callable[..., tuple[int, Sequence[Tensor | None]]]
+) -> bytes:
+    """Compile a function for arguments into bytes, which `load_traced` loads in any process.
+
+    `dynamic` returns, of the arguments, the dimension whose size may differ from call to call, and who has it.
+    """
     from torch._dynamo.aot_compile import AOTCompiledFunction
-    from torch._dynamo.callback import CallbackTrigger, callback_handler
     from torch._inductor.cpu_vec_isa import valid_vec_isa_list
 
     options: dict[str, Any] = {"guard_filter_fn": guards_on_kept_arguments}
-    # A code object of its own, or the compiler would leave open what differs from the function's graph before.
+    # A code object of its own, or sizes that differ from those compiled before would become dynamic.
     compiler: Any = torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
-    with callback_handler.install_callbacks(CallbackTrigger.DYNAMO, "to keep"):
-        graph = AOTCompiledFunction.serialize(compiler.aot_compile((tuple(args), {}))).serialized_data
+    mark_dynamic(*dynamic(*args))
+    graph = AOTCompiledFunction.serialize(compiler.aot_compile((tuple(args), {}))).serialized_data
     return pickle.dumps(([str(isa) for isa in valid_vec_isa_list()], graph))
 
 
@@ -174,7 +178,10 @@ def known_instructions(names: Sequence[str]) -> contextlib.AbstractContextManage
 
 
 def guards_on_kept_arguments(guards: Sequence[Any]) -> list[bool]:
-    """Choose which guards are kept with a graph: of those on arguments, not those on classes, which cannot be kept."""
+    """Choose which guards are kept with a graph: of those on arguments and torch's modes, what can be written.
+
+    Left out are those on classes and identities: arguments are always tuples of the same classes.
+    """
     from torch._dynamo.guards import CheckFunctionManager
 
     lost = (*CheckFunctionManager.UNSUPPORTED_SERIALIZATION_GUARD_TYPES, "CLASS_MATCH")
@@ -205,6 +212,13 @@ def announced_compilation() -> Iterator[None]:
             callback_handler.remove_start_callback(announce)
         if starts:
             print(end, file=sys.stderr, flush=True)
+
+
+def announced_start() -> contextlib.AbstractContextManager[Any]:
+    """Let `announced_compilation` say that something is compiled, which `aot_compile` does not tell it."""
+    from torch._dynamo.callback import CallbackTrigger, callback_handler
+
+    return callback_handler.install_callbacks(CallbackTrigger.DYNAMO, "to keep")
 
 
 def mark_dynamic(dim: int, values: Sequence[Tensor | None]) -> None:

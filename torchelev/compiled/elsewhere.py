@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import pickle
 import subprocess
 import sys
@@ -11,25 +10,33 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-_RUN = "import pickle, sys; function, arguments = pickle.load(sys.stdin.buffer); function(*arguments)"
-_PACKAGES = Path(__file__).parents[2]  # where torchelev lies
+_RUN = """
+import pickle, sys
+sys.path[:] = pickle.load(sys.stdin.buffer)
+function, arguments = pickle.load(sys.stdin.buffer)
+function(*arguments)
+"""
 
 
 def run_elsewhere(function: Callable[..., Any], *arguments: Any) -> subprocess.Popen[bytes] | None:
-    """Start a module's function in a new process, which says nothing and returns nothing.
+    """Start a module's function in a new Python process, which says nothing and returns nothing.
+
+    Args:
+        function: of a module that can be imported.
+        arguments: a few kilobytes, or the process must have read them before this returns.
 
     Returns:
-        The process; None if the arguments cannot be sent, or no process be started.
+        The process; None if the arguments cannot be sent, or no Python process can be started.
     """
-    path = os.pathsep.join([str(_PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])
+    if not Path(sys.executable or "").name.startswith("python"):  # in a program that embeds Python it is that program
+        return None
     try:
-        order = pickle.dumps((function, arguments))
+        order = pickle.dumps(sys.path) + pickle.dumps((function, arguments))
         process = subprocess.Popen(
             [sys.executable, "-c", _RUN],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": path},
         )
     except (OSError, pickle.PicklingError, AttributeError, TypeError):  # the latter two: what has no name, or no copy
         return None

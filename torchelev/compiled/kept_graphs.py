@@ -7,23 +7,23 @@ import dataclasses
 import functools
 import hashlib
 import os
-import pickle
 import platform
-import subprocess
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from torchelev.compiled.compiler import compiled, load_traced, mark_dynamic, remove_marks, traced
+from torchelev.compiled.compiler import announced_start, compiled, load_traced, mark_dynamic, remove_marks, traced
 from torchelev.native.library import describe_processor
 from torchelev.output_files import atomic_file
 
 NUM_KEPT = 2  # numbers of environments with a graph of their own: chunks have one size, but for the last
-_VARIABLES = ("TORCH", "ATEN_", "OMP_", "CXX")  # beginnings of environment variables that may change what is compiled
+EXAMPLE = 2**16  # size of dimensions that vary, over all environments: enough to be worth several threads
+_VARIABLES = ("TORCHINDUCTOR", "TORCHDYNAMO", "ATEN_CPU", "CXX")  # beginnings of those that change what is compiled
 _STALE = 60  # [s] after which nobody writes an empty library any more
 _SOURCES = Path(__file__).parents[1]
 
@@ -31,12 +31,12 @@ _SOURCES = Path(__file__).parents[1]
 class KeptGraph:
     """A function as one compiled graph, which later processes find in the compiler's cache folder.
 
-    Each of the first NUM_KEPT numbers of environments has a graph of its own. What else differs between two calls, such
-    as the number of threads, goes to `torch.compile`.
+    Each of the first NUM_KEPT numbers of environments has a graph of its own. Other arguments go to `torch.compile`,
+    and so does everything where no graph can be kept.
 
     Args:
         function: takes a NamedTuple of tensors first, whose first size is the number of environments.
-        settings: all that the graph depends on besides torchelev's code and what its guards check.
+        settings: all that the graph depends on besides its arguments and torchelev's code.
         dynamic: returns, of the arguments, the dimension whose size may differ from call to call, and who has it.
     """
 
@@ -45,87 +45,119 @@ class KeptGraph:
         self._settings = describe(settings)
         self._usual = compiled(function)
         self._kept: dict[tuple[Any, ...], Any] = {}
-        self.helper: subprocess.Popen[bytes] | None = None  #: a process that writes the file
 
     def __call__(self, *args: Any) -> Any:
         """Call the function."""
+        if torch.compiler.is_compiling():  # a graph of the caller's own takes it in
+            return self._function(*args)
         graph = self.prepare(*args)
         if graph is not None and graph.guard_check(*args):
             return graph.fn(*args)
-        mark_dynamic(*self._dynamic(*args))
-        return self._usual(*args)
-
-    def prepare(self, *args: Any) -> Any:
-        """Return the graph from the file, which is compiled if it is not there; None if it cannot be kept."""
-        kind = _kind(args)
-        if self.is_new(*args):
-            path = self._path(kind)
-            self._kept[kind] = None if path is None else self._find(path, args)
-        return self._kept.get(kind)
-
-    def is_new(self, *args: Any) -> bool:
-        """Tell whether this process has not looked for the graph yet."""
-        return _kind(args) not in self._kept and len(self._kept) < NUM_KEPT
-
-    def is_missing(self, *args: Any) -> bool:
-        """Tell whether the graph can be kept, but is not yet."""
-        path = self._path(_kind(args))
-        return path is not None and not path.exists()
-
-    def _path(self, kind: tuple[Any, ...]) -> Path | None:
-        """Return the file for a kind of arguments; None if there can be none."""
-        if self._settings is None or not can_keep(kind[-1]):
-            return None
-        return _folder() / f"{_hash(self._settings, str(kind), _surroundings())}.graph"
-
-    def _find(self, path: Path, args: Sequence[Any]) -> Any:
-        graph = _load(path)
-        if graph is None and self.helper is not None:
-            self.helper.wait()
-            graph = _load(path)
-        if graph is None and self._write(path, args):
-            graph = _load(path)
-        return graph
-
-    def _write(self, path: Path, args: Sequence[Any]) -> bool:
-        """Compile the graph into a file; return whether it could be kept."""
         dim, values = self._dynamic(*args)
         mark_dynamic(dim, values)
         try:
-            remove_unfinished(path.parents[1])
-            data = traced(self._function, args)
+            return self._usual(*args)
+        finally:
+            remove_marks(values)
+
+    def prepare(self, *args: Any) -> Any:
+        """Return the graph for arguments, from its file or compiled into it; None if it cannot be kept."""
+        kind = _kind(args)
+        if kind not in self._kept and len(self._kept) < NUM_KEPT:
+            with _one_thread_at_a_time():
+                if kind not in self._kept:
+                    self._kept[kind] = self._find(args)
+        return self._kept.get(kind)
+
+    def is_missing(self, *args: Any) -> bool:
+        """Tell whether the graph for arguments could be kept, but is neither loaded nor on disk."""
+        if _kind(args) in self._kept or len(self._kept) >= NUM_KEPT:
+            return False
+        path = self.path(*args)
+        return path is not None and not path.exists()
+
+    def path(self, *args: Any) -> Path | None:
+        """Return the file for arguments; None if there can be none."""
+        if self._settings is None or not can_keep(args[0][0].device):
+            return None
+        dim, values = self._dynamic(*args)
+        of_tensors = [_describe_tensor(v, dim if any(v is w for w in values) else None) for v in _tensors(args)]
+        return _folder() / f"{_hash(self._settings, str(of_tensors), _surroundings())}.graph"
+
+    def _find(self, args: Sequence[Any]) -> Any:
+        path = self.path(*args)
+        if path is None:
+            return None
+        graph = _load(path)
+        if graph is not None:
+            return graph
+        try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_file(path) as file:
-                file.write(data)
-        except (OSError, pickle.PicklingError, torch._dynamo.exc.PackageError) as error:
+            with announced_start(), _one_process_at_a_time(path):
+                graph = _load(path)
+                if graph is None:
+                    remove_unfinished(path.parents[1])
+                    data = traced(self._function, self._examples(args), self._dynamic)
+                    graph = load_traced(data)
+                    with atomic_file(path) as file:
+                        file.write(data)
+        except Exception as error:  # of the folder, or of a compiler whose interface is young
             warnings.warn(
-                f"{path}: cannot be written, so each process will compile the update anew: {error}. Set "
-                "TORCHINDUCTOR_CACHE_DIR to a folder that can be written.",
+                f"{path}: cannot be written, so each process compiles the update anew: {error!r}. If that is about the "
+                "folder, set TORCHINDUCTOR_CACHE_DIR to one that can be written.",
                 RuntimeWarning,
                 stacklevel=2,
             )
-            return False
-        finally:
-            remove_marks(values)
-        return True
+        return graph
+
+    def _examples(self, args: Sequence[Any]) -> tuple[Any, ...]:
+        """Return the arguments with a usual size where it may vary, so that the first call's does not decide."""
+        dim, values = self._dynamic(*args)
+        size = max(2, EXAMPLE // max(1, len(args[0][0])))
+
+        def resized(value: Any) -> Any:
+            if isinstance(value, tuple):
+                parts = [resized(part) for part in value]
+                return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+            if not any(value is other for other in values) or value is None:
+                return value
+            return value.new_zeros(*value.shape[:dim], size, *value.shape[dim + 1 :])
+
+        return tuple(resized(value) for value in args)
 
 
 def _load(path: Path) -> Any:
-    """Return the graph in a file; None if there is none, or none of use."""
+    """Return the graph in a file; None if there is none of use."""
     try:
-        return load_traced(path.read_bytes())
+        data = path.read_bytes()
     except OSError:
         return None
+    try:
+        return load_traced(data)
     except Exception:  # a damaged file raises whatever its bytes say
-        with contextlib.suppress(OSError):
-            path.unlink()
         return None
 
 
 def _kind(args: Sequence[Any]) -> tuple[Any, ...]:
-    """Return what tells the graphs of one function apart: number of environments, dtype and device."""
-    first = args[0][0]
-    return len(first), first.dtype, first.device
+    """Return what tells the graphs of a process apart: number of environments and dtypes."""
+    first = args[0]
+    return (len(first[0]), *(value.dtype for value in first if isinstance(value, Tensor)))
+
+
+def _tensors(value: Any) -> Iterator[Any]:
+    """Yield the tensors in nested tuples, and None where an argument is not given."""
+    if isinstance(value, tuple):
+        for part in value:
+            yield from _tensors(part)
+    else:
+        yield value
+
+
+def _describe_tensor(value: Tensor | None, dynamic: int | None) -> Any:
+    if value is None:
+        return None
+    shape = [None if dim == dynamic else size for dim, size in enumerate(value.shape)]
+    return shape, str(value.dtype), str(value.device), value.is_contiguous(), value.is_inference()
 
 
 def can_keep(device: torch.device) -> bool:
@@ -138,7 +170,7 @@ def describe(value: Any) -> str | None:
 
     Objects of foreign classes have code that torchelev does not know.
     """
-    if value is None or isinstance(value, (bool, int, float, str, torch.dtype, torch.device)):
+    if value is None or isinstance(value, (bool, int, float, str, Path, torch.dtype, torch.device)):
         return repr(value)
     if dataclasses.is_dataclass(value) and type(value).__module__.startswith("torchelev."):
         parts: Iterable[Any] = (getattr(value, field.name) for field in dataclasses.fields(value))
@@ -154,10 +186,23 @@ def describe(value: Any) -> str | None:
 
 def remove_unfinished(folder: Path) -> None:
     """Remove the empty libraries that a killed compilation left: every later start would fail on them."""
-    for path in folder.rglob("*.so"):
-        found = path.stat()
-        if found.st_size == 0 and time.time() - found.st_mtime > _STALE:
-            path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # another process may remove them, too
+        for path in folder.rglob("*.so"):
+            found = path.stat()
+            if found.st_size == 0 and time.time() - found.st_mtime > _STALE:
+                path.unlink(missing_ok=True)
+
+
+def _one_thread_at_a_time() -> contextlib.AbstractContextManager[Any]:
+    from torch._dynamo.convert_frame import compile_lock  # which `torch.compile` holds while it compiles
+
+    return compile_lock
+
+
+def _one_process_at_a_time(path: Path) -> contextlib.AbstractContextManager[Any]:
+    from torch.utils._filelock import FileLock
+
+    return FileLock(f"{path}.lock")
 
 
 def _folder() -> Path:
@@ -168,9 +213,14 @@ def _folder() -> Path:
 
 def _surroundings() -> str:
     """Describe what else a graph depends on: this process."""
+    from torch._C._dynamo.guards import GlobalStateGuard
+    from torch._inductor import config
+
     variables = sorted(item for item in os.environ.items() if item[0].startswith(_VARIABLES))
     variables = [item for item in variables if item[0] != "TORCHINDUCTOR_CACHE_DIR"]
-    return f"{_installation()} {torch.get_num_threads()} {variables}"
+    state: Any = GlobalStateGuard()
+    modes: Any = state.__getstate__()
+    return f"{_installation()} {modes!r} {torch.get_default_device()} {config.get_hash()!r} {variables}"
 
 
 @functools.cache

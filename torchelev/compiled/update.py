@@ -39,8 +39,8 @@ def compiled_update(
     with announced_compilation():
         graphs = graphs_of(cfg, kinds, points.shape[1])
         stored = with_masks(stored, as_bytes)
-        if graphs.move_window.is_new(stored):
-            compile_side_by_side(graphs, stored, inputs, cfg, weights)
+        if graphs.move_window.is_missing(stored, *inputs):
+            compile_side_by_side(len(stored.elevation), stored.elevation.dtype, inputs, cfg, weights)
         m = graphs.move_window(stored, *inputs)
         graphs.fuse_heights(stored, m)
         graphs.apply_rays(stored, m, weights)
@@ -63,29 +63,34 @@ def compile_ahead(
 
 
 def compile_side_by_side(
-    graphs: Graphs, stored: MapState, inputs: Sequence[Tensor | None], cfg: ElevationMapConfig, weights: Weights | None
+    num_envs: int,
+    dtype: torch.dtype,
+    inputs: Sequence[Tensor | None],
+    cfg: ElevationMapConfig,
+    weights: Weights | None,
 ) -> None:
-    """Let other processes compile some of the graphs, the longest first, while this one compiles the others."""
-    processes = min(len(os.sched_getaffinity(0)), len(graphs)) if hasattr(os, "sched_getaffinity") else 1
-    blank = [None if value is None else torch.zeros_like(value) for value in inputs]
-    about = len(stored.elevation), stored.elevation.dtype, torch.get_num_threads()
+    """Let other processes compile some of the graphs, the longest first, while this one compiles the others.
+
+    Whoever comes first to a graph compiles it, and the other waits for it.
+    """
+    processes = min(len(os.sched_getaffinity(0)), len(Graphs._fields)) if hasattr(os, "sched_getaffinity") else 1
+    shapes = [None if value is None else value.to("meta") for value in inputs]
     for part in ("apply_rays", "fuse_heights")[: processes - 1]:
-        graph: KeptGraph = getattr(graphs, part)
-        if graph.is_missing(stored):
-            graph.helper = run_elsewhere(compile_part, part, blank, cfg, weights, *about)
+        run_elsewhere(compile_part, part, num_envs, dtype, shapes, cfg, weights, torch.get_num_threads())
 
 
 def compile_part(
     part: str,
-    inputs: Sequence[Any],
-    cfg: ElevationMapConfig,
-    weights: Weights | None,
     num_envs: int,
     dtype: torch.dtype,
+    shapes: Sequence[Tensor | None],
+    cfg: ElevationMapConfig,
+    weights: Weights | None,
     num_threads: int,
 ) -> None:
-    """Compile one graph of an update into its file."""
+    """Compile one graph of an update into its file, for inputs of these shapes and dtypes."""
     torch.set_num_threads(num_threads)
+    inputs: list[Any] = [None if value is None else torch.zeros_like(value, device="cpu") for value in shapes]
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     graph: KeptGraph = getattr(graphs_of(cfg, kinds, inputs[0].shape[1]), part)
     with torch.inference_mode(False), torch.no_grad():

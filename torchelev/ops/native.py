@@ -1,4 +1,4 @@
-"""Operators in C++ (`torchelev/native/tables`): the same as those of `torchelev.ops.operators`, bit for bit."""
+"""Operators in C++ (`torchelev/native/tables`): the same numbers as `torchelev.ops.operators`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchelev.native.library import load
 
 def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor | None:
     """Return the sums (K, B, size) of values (K, B, M) by slots (B, M); None where C++ cannot compute them."""
-    library = _library(values)
+    library = _library(values, index)
     if library is None:
         return None
     sums = values.new_empty(*values.shape[:2], size)
@@ -37,7 +37,7 @@ def polar_minimum(
     index: Tensor, values: Tensor, rows: int, azimuths: int, widen: Sequence[int], ranges: int, blank: float
 ) -> Tensor | None:
     """Return the table (B, rows, azimuths) of `operators.polar_minimum`; None where C++ cannot compute it."""
-    library = _library(values)
+    library = _library(values, index)
     if library is None:
         return None
     table = values.new_empty(len(values), rows, azimuths)
@@ -47,16 +47,27 @@ def polar_minimum(
     return table
 
 
-def _library(values: Tensor) -> ctypes.CDLL | None:
+def _library(values: Tensor, index: Tensor | None = None) -> ctypes.CDLL | None:
+    """Return the functions for values (..., M) and indices (B, M); None where they cannot take them."""
     is_plain = values.dtype == torch.float32 and values.device.type == "cpu" and values.numel() > 0
+    if index is not None:
+        is_plain &= index.dtype == torch.int64 and index.device == values.device and index.shape == values.shape[-2:]
     return load("tables/tables.cpp", {}) if is_plain else None
 
 
 def _call(function: Any, tensors: Sequence[Tensor], *arguments: Any) -> None:
-    """Call a function with the addresses of tensors. Raises IndexError if it returns False."""
-    function.restype = ctypes.c_bool
+    """Call a function with the addresses of tensors.
+
+    Raises:
+        IndexError: it returned 1: an index is outside.
+        MemoryError: it returned 2.
+    """
+    function.restype = ctypes.c_int
     arrays = [tensor.contiguous() for tensor in tensors]
     addresses = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
     whole = [ctypes.c_int64(value) if isinstance(value, int) else value for value in arguments]
-    if not function(*addresses, *whole, torch.get_num_threads()):
+    failure = function(*addresses, *whole, torch.get_num_threads())
+    if failure == 1:
         raise IndexError(f"{function.__name__}: an index is out of range")
+    if failure:
+        raise MemoryError(f"{function.__name__} ran out of memory: give it fewer or smaller maps at a time")

@@ -100,14 +100,14 @@ def _scan(table: Tensor, from_end: bool) -> None:
 def _running_minimum(table: Tensor) -> Tensor:
     result = native.running_minimum(table)
     if result is None:
-        result = table.clone()
+        result = table.clone(memory_format=torch.contiguous_format)
         _scan(result, from_end=False)
     return result
 
 
 @_running_minimum.register_fake
 def _(table: Tensor) -> Tensor:
-    return torch.empty_like(table)
+    return torch.empty_like(table, memory_format=torch.contiguous_format)
 
 
 def running_minimum(table: Tensor) -> Tensor:

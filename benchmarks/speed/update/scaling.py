@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -42,23 +43,27 @@ def points(seconds: float) -> dict[str, Any]:
 
 def threads(seconds: float) -> dict[str, Any]:
     """Time updates of one robot and of many on one thread and on two, against the bytes that they must move."""
+    before = torch.get_num_threads()
+    try:
+        return {"rows": [row for number in progress(THREADS, "threads") for row in _on_threads(number, seconds)]}
+    finally:
+        torch.set_num_threads(before)
+
+
+def _on_threads(number: int, seconds: float) -> Iterator[dict[str, Any]]:
     full, many = full_config(), full_config(64)
     cases = {f"{n:,} points": (full, n, 1) for n in sorted(row[1] for row in SENSORS)}
     cases[f"{MANY_ROBOTS} robots"] = (many, MANY_POINTS, MANY_ROBOTS)
-    before, rows = torch.get_num_threads(), []
-    for number in progress(THREADS, "threads"):
-        torch.set_num_threads(number)
-        meter.fresh_compiler()
-        drives = {name: Drive(cfg, n, robots=count) for name, (cfg, n, count) in cases.items()}
-        for drive in drives.values():
-            drive.watch(8)
-        bandwidth = meter.copy_bandwidth()
-        for name, time in meter.interleaved(drives, seconds).items():
-            cfg, n, count = cases[name]
-            share = count * meter.needed_traffic(cfg, n) / (time["median"] / 1e3) / bandwidth
-            rows.append({"case": name, "threads": number} | time | {"share_of_copy": share})
-    torch.set_num_threads(before)
-    return {"rows": rows}
+    torch.set_num_threads(number)
+    meter.fresh_compiler()
+    drives = {name: Drive(cfg, n, robots=count) for name, (cfg, n, count) in cases.items()}
+    for drive in drives.values():
+        drive.watch(8)
+    bandwidth = meter.copy_bandwidth()
+    for name, time in meter.interleaved(drives, seconds).items():
+        cfg, n, count = cases[name]
+        share = count * meter.needed_traffic(cfg, n) / (time["median"] / 1e3) / bandwidth
+        yield {"case": name, "threads": number} | time | {"share_of_copy": share}
 
 
 def robots(seconds: float) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <stdexcept>
 #include <vector>
 
 #include "../threads.h"
@@ -13,6 +14,23 @@ constexpr int64_t COLUMNS = 1024;  // of a table that one thread scans: their ro
 
 // The lower value; NaN if one of them is.
 inline float lower(float a, float b) { return a < b || a != a ? a : b; }
+
+inline int64_t checked(int64_t index, int64_t size) {
+    if (uint64_t(index) >= uint64_t(size)) throw std::out_of_range("index");
+    return index;
+}
+
+// Do the work; return 0, or 1 if an index was out of range, or 2 without memory. No exception may reach C.
+template <class Work> int code_of(const Work& work) {
+    try {
+        work();
+        return 0;
+    } catch (const std::out_of_range&) {
+        return 1;
+    } catch (...) {
+        return 2;
+    }
+}
 
 // Turn each row into the minimum of itself and the one before it.
 void scan(float* table, int64_t first, int64_t last, int64_t step, int64_t width, int64_t begin, int64_t end) {
@@ -36,15 +54,14 @@ struct Polar {
     int64_t levels;
     float blank;
 
-    bool fill(const int64_t* index, const float* values, float* table) const {
+    void fill(const int64_t* index, const float* values, float* table) const {
         const int64_t size = rows * azimuths;
         std::fill(table, table + size, blank);
         for (int64_t i = 0; i < number; i++) {
-            if (uint64_t(index[i]) >= uint64_t(size)) return false;
-            table[index[i]] = lower(table[index[i]], values[i]);
+            const int64_t slot = checked(index[i], size);
+            table[slot] = lower(table[slot], values[i]);
         }
         std::fill(table + ranges * azimuths, table + (ranges + 1) * azimuths, blank);
-        return true;
     }
 
     void scan_columns(float* table, int64_t begin, int64_t end) const {
@@ -54,79 +71,60 @@ struct Polar {
     void widen_rows(float* table, int64_t begin, int64_t end) const {
         std::vector<float> start(azimuths);
         for (int64_t r = begin; r < end; r++)
-            for (int64_t w = 0; w < levels && r < widen[w]; w++)
-                widen_row(table + r * azimuths, azimuths, (int64_t(1) << w) % azimuths, start.data());
+            for (int64_t w = 0; w < levels; w++)
+                if (r < widen[w]) widen_row(table + r * azimuths, azimuths, (int64_t(1) << w) % azimuths, start.data());
     }
 };
 
 }  // namespace
 
 // Sum values (rows, number) by index (num_index, number), which row r takes from r % num_index, into sums (rows, size).
-// False if an index is outside.
-extern "C" bool add_by_slot(const int64_t* index, const float* values, float* sums, int64_t rows, int64_t num_index,
-                            int64_t number, int64_t size, int num_threads) {
-    std::atomic<bool> is_inside{true};
-    for_each(rows, num_threads, [&](int r) {
+extern "C" int add_by_slot(const int64_t* index, const float* values, float* sums, int64_t rows, int64_t num_index,
+                           int64_t number, int64_t size, int num_threads) {
+    auto add = [&](int64_t r) {
         const int64_t* slot = index + (r % num_index) * number;
         const float* value = values + r * number;
         float* sum = sums + r * size;
         std::fill(sum, sum + size, 0.0f);
-        for (int64_t i = 0; i < number; i++) {
-            if (uint64_t(slot[i]) >= uint64_t(size)) {
-                is_inside = false;
-                return;
-            }
-            sum[slot[i]] += value[i];
-        }
-    });
-    return is_inside;
+        for (int64_t i = 0; i < number; i++) sum[checked(slot[i], size)] += value[i];
+    };
+    return code_of([&] { for_each(rows, num_threads, add); });
 }
 
 // The running minimum of tables (B, rows, width) along their rows.
-extern "C" bool running_minimum(const float* tables, float* result, int64_t B, int64_t rows, int64_t width,
-                                int num_threads) {
+extern "C" int running_minimum(const float* tables, float* results, int64_t B, int64_t rows, int64_t width,
+                               int num_threads) {
     const int64_t blocks = (width + COLUMNS - 1) / COLUMNS;
-    for_each(B * blocks, num_threads, [&](int k) {
+    auto scan_block = [&](int64_t k) {
         const int64_t first = (k / blocks) * rows * width, begin = (k % blocks) * COLUMNS;
         const int64_t end = std::min(width, begin + COLUMNS);
         for (int64_t r = 0; r < rows; r++) {
             const float* row = tables + first + r * width;
-            std::copy(row + begin, row + end, result + first + r * width + begin);
+            std::copy(row + begin, row + end, results + first + r * width + begin);
         }
-        scan(result + first, 1, rows, 1, width, begin, end);
-    });
-    return true;
+        scan(results + first, 1, rows, 1, width, begin, end);
+    };
+    return code_of([&] { for_each(B * blocks, num_threads, scan_block); });
 }
 
-// The table of the lowest rays: `polar_minimum`. False if an index is outside.
-extern "C" bool polar_minimum(const int64_t* index, const float* values, float* tables, int64_t B, int64_t number,
-                              int64_t rows, int64_t azimuths, int64_t ranges, const int64_t* widen, int64_t levels,
-                              float blank, int num_threads) {
+// The table of the lowest rays: `polar_minimum`.
+extern "C" int polar_minimum(const int64_t* index, const float* values, float* tables, int64_t B, int64_t number,
+                             int64_t rows, int64_t azimuths, int64_t ranges, const int64_t* widen, int64_t levels,
+                             float blank, int num_threads) {
     const Polar polar{rows, azimuths, ranges, number, widen, levels, blank};
-    std::atomic<bool> is_inside{true};
-    auto fill = [&](int64_t b) {
-        const bool done = polar.fill(index + b * number, values + b * number, tables + b * rows * azimuths);
-        if (!done) is_inside = false;
-        return done;
-    };
-    if (B >= num_threads) {
-        for_each(B, num_threads, [&](int b) {
-            float* table = tables + b * rows * azimuths;
-            if (!fill(b)) return;
-            polar.scan_columns(table, 0, azimuths);
-            polar.widen_rows(table, 0, rows);
-        });
-        return is_inside;
-    }
-    const int64_t blocks = 4 * num_threads;
-    for (int64_t b = 0; b < B && fill(b); b++) {
+    // One thread for each table, or several for one after the other, each with some of the columns, then of the rows.
+    const int64_t parts = B >= num_threads ? 1 : 4 * num_threads;
+    auto make = [&](int64_t b, auto each) {
         float* table = tables + b * rows * azimuths;
-        for_each(blocks, num_threads, [&](int k) {
-            polar.scan_columns(table, k * azimuths / blocks, (k + 1) * azimuths / blocks);
-        });
-        for_each(blocks, num_threads, [&](int k) {
-            polar.widen_rows(table, k * rows / blocks, (k + 1) * rows / blocks);
-        });
-    }
-    return is_inside;
+        polar.fill(index + b * number, values + b * number, table);
+        each([&](int64_t k) { polar.scan_columns(table, k * azimuths / parts, (k + 1) * azimuths / parts); });
+        each([&](int64_t k) { polar.widen_rows(table, k * rows / parts, (k + 1) * rows / parts); });
+    };
+    return code_of([&] {
+        if (parts == 1) {
+            for_each(B, num_threads, [&](int64_t b) { make(b, [](auto work) { work(0); }); });
+            return;
+        }
+        for (int64_t b = 0; b < B; b++) make(b, [&](auto work) { for_each(parts, num_threads, work); });
+    });
 }
