@@ -10,6 +10,7 @@ from tests.answers import PARTS, assert_recorded, config
 from tests.helpers import assert_close, differences, pose, scan
 from tests.inputs.test_update_inputs import assert_bad_poses_leave_one_robot_out
 from torchelev import ElevationMap
+from torchelev.compiled.kept_graphs import can_keep
 from torchelev.compiled.update import Graphs
 from torchelev.inputs import checks
 from torchelev.stages.fusion import consensus
@@ -52,7 +53,8 @@ def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
     before = graphs()
     for emap in maps.values():
         emap.update(cloud, T, T, 0.3)
-    assert graphs() - before in (0, len(Graphs._fields))
+    # Kept graphs are compiled by another way, and nothing goes past them.
+    assert graphs() - before in ((0,) if can_keep(torch.device("cpu")) else (0, len(Graphs._fields)))
     before = graphs()
     losses = {name: (torch.ones(1, requires_grad=True) * emap.elevation).sum() for name, emap in maps.items()}
     for k, number in enumerate((300, 290, 5000, 200, 6000, 100)):

@@ -155,6 +155,18 @@ def test_the_first_size_does_not_decide(compiled_anew):
 
 
 @pytest.mark.slow(10)
+@pytest.mark.parametrize("is_inference", [True, False])
+def test_arguments_keep_their_order_in_memory(compiled_anew, is_inference):
+    kept = graph()
+    with torch.inference_mode(is_inference):
+        for number in (5, 8, 70):
+            values = (torch.arange(6.0 * number).view(2, 3, number).transpose(1, 2),)
+            call(kept, values)
+            assert kept.prepare(values, torch.tensor(2.0)).guard_check(values, torch.tensor(2.0))
+    assert len(compiled_anew) == 1
+
+
+@pytest.mark.slow(10)
 def test_threads_wait_for_each_other(compiled_anew):
     kept = graph()
     with ThreadPoolExecutor(4) as pool:

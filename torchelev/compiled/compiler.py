@@ -198,7 +198,7 @@ def announced_compilation() -> Iterator[None]:
 
     def announce(*_: Any) -> None:
         if not starts:
-            print("torchelev: compiling the update, for one to three minutes ...", end=" ", file=sys.stderr, flush=True)
+            print("torchelev: compiling the update, for about a minute ...", end=" ", file=sys.stderr, flush=True)
         starts.append(time.perf_counter())
 
     callback_handler.register_start_callback(announce)

@@ -119,11 +119,28 @@ class KeptGraph:
             if isinstance(value, tuple):
                 parts = [resized(part) for part in value]
                 return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-            if not any(value is other for other in values) or value is None:
-                return value
-            return value.new_zeros(*value.shape[:dim], size, *value.shape[dim + 1 :])
+            is_dynamic = value is not None and any(value is other for other in values)
+            return _resized(value, dim, size) if is_dynamic else value
 
         return tuple(resized(value) for value in args)
+
+
+def _resized(value: Tensor, dim: int, size: int) -> Tensor:
+    """Return zeros of another size along a dimension, laid out in memory in the same order."""
+    shape, unit = _layout(value, dim)
+    shape[dim], strides = size, [stride * (size if spans else 1) for stride, spans in unit]
+    with torch.inference_mode(value.is_inference()):
+        return torch.empty_strided(shape, strides, dtype=value.dtype, device=value.device).zero_()
+
+
+def _layout(value: Tensor, dim: int | None) -> tuple[list[int], list[tuple[int, bool]]]:
+    """Return the shape, 0 along a dimension, and the strides: in units of its size those that span it."""
+    shape, strides = list(value.shape), value.stride()
+    if dim is None:
+        return shape, [(stride, False) for stride in strides]
+    extent, shape[dim] = strides[dim] * shape[dim], 0
+    spans = [k != dim and stride >= extent for k, stride in enumerate(strides)]
+    return shape, [(s // value.shape[dim] if far else s, far) for s, far in zip(strides, spans, strict=True)]
 
 
 def _load(path: Path) -> Any:
@@ -156,8 +173,7 @@ def _tensors(value: Any) -> Iterator[Any]:
 def _describe_tensor(value: Tensor | None, dynamic: int | None) -> Any:
     if value is None:
         return None
-    shape = [None if dim == dynamic else size for dim, size in enumerate(value.shape)]
-    return shape, str(value.dtype), str(value.device), value.is_contiguous(), value.is_inference()
+    return _layout(value, dynamic), str(value.dtype), str(value.device), value.is_inference()
 
 
 def can_keep(device: torch.device) -> bool:
