@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import pickle
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,7 +19,7 @@ from tests.helpers import scan, small_config, small_map
 from torchelev import Capsule, GridConfig, LearnedTraversabilityConfig, RobotBody, SensorConfig
 from torchelev.compiled import kept_graphs, update
 from torchelev.compiled.elsewhere import run_elsewhere
-from torchelev.compiled.kept_graphs import KeptGraph, describe, remove_unfinished
+from torchelev.compiled.kept_graphs import Dynamic, KeptGraph, describe, remove_unfinished
 
 pytestmark = [
     pytest.mark.compiles,
@@ -45,7 +47,7 @@ def compiled_anew(tmp_path, monkeypatch):
 
 
 def graph(settings=(1,)):
-    return KeptGraph(scaled, settings, lambda pair, _: (1, pair))
+    return KeptGraph(scaled, settings, lambda pair, _: Dynamic(1, pair))
 
 
 def pair(num_envs=2, number=5, dtype=torch.float32):
@@ -94,15 +96,39 @@ def test_each_number_of_environments_is_a_constant_of_its_graph(compiled_anew):
 def test_what_the_file_does_not_fit_is_compiled_by_the_process(compiled_anew):
     kept = graph()
     call(kept, pair())
-    call(kept, (pair(4)[0].view(2, 10)[:, ::2],))  # other strides
+    apart = (pair(4)[0].view(2, 10)[:, ::2],)  # of other strides
+    assert not kept.prepare(apart, torch.tensor(2.0)).guard_check(apart, torch.tensor(2.0))
+    call(kept, apart)
+    assert len(compiled_anew) == 1
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(threads + 1)
         call(kept, pair())
-        call(graph(), pair())
     finally:
         torch.set_num_threads(threads)
     assert len(compiled_anew) == 2, "another number of threads has a file of its own"
+
+
+PATH = """
+import torch
+from tests.compiled.test_kept_graphs import graph, pair
+torch.set_num_threads(1)
+print(graph().path(pair(), torch.tensor(2.0)))
+"""
+
+
+@pytest.mark.slow(10)
+def test_the_file_depends_neither_on_the_folder_nor_on_the_cores(tmp_path):
+    first = sorted(os.sched_getaffinity(0))[0]
+    places = (tmp_path, lambda: None), (Path.cwd(), lambda: os.sched_setaffinity(0, {first}))
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd()), "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", PATH], cwd=cwd, preexec_fn=bind, env=environment, capture_output=True, check=True
+        ).stdout
+        for cwd, bind in places
+    ]
+    assert found[0] == found[1] and b".graph" in found[0]
 
 
 @pytest.mark.slow(10)
@@ -150,7 +176,7 @@ def test_every_mode_of_torch_has_its_own_file(compiled_anew):
 @pytest.mark.slow(10)
 def test_the_first_size_does_not_decide(compiled_anew):
     call(graph(), pair(number=3))
-    ((_, args, _),) = compiled_anew
+    ((_, args),) = compiled_anew
     assert args[0][0].shape == (2, kept_graphs.EXAMPLE // 2)
 
 
@@ -252,7 +278,7 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("sensors", [1, 2])
+@pytest.mark.parametrize("sensors", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", KINDS)
 def test_another_process_compiles_the_graphs_that_an_update_looks_for(tmp_path, monkeypatch, kind, dtype, sensors):
@@ -263,6 +289,7 @@ def test_another_process_compiles_the_graphs_that_an_update_looks_for(tmp_path, 
 
     def uncompiled(kept, args):
         paths.append(kept.path(*args))
+        kept._function(*kept._examples(args))  # which a trace would run
         return SimpleNamespace(guard_check=lambda *_: True, fn=kept._function)
 
     monkeypatch.setattr(KeptGraph, "_find", uncompiled)

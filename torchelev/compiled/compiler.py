@@ -142,20 +142,14 @@ def guards_on_arguments(guards: Sequence[Any]) -> list[bool]:
     return [not guard.is_global and not any(name in guard.name for name in fixed) for guard in guards]
 
 
-def traced(
-    function: Callable[..., Any], args: Sequence[Any], dynamic: Callable[..., tuple[int, Sequence[Tensor | None]]]
-) -> bytes:
-    """Compile a function for arguments into bytes, which `load_traced` loads in any process.
-
-    `dynamic` returns, of the arguments, the dimension whose size may differ from call to call, and who has it.
-    """
+def traced(function: Callable[..., Any], args: Sequence[Any]) -> bytes:
+    """Compile a function for arguments into bytes, which `load_traced` loads in any process."""
     from torch._dynamo.aot_compile import AOTCompiledFunction
     from torch._inductor.cpu_vec_isa import valid_vec_isa_list
 
     options: dict[str, Any] = {"guard_filter_fn": guards_on_kept_arguments}
     # A code object of its own, or sizes that differ from those compiled before would become dynamic.
     compiler: Any = torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
-    mark_dynamic(*dynamic(*args))
     graph = AOTCompiledFunction.serialize(compiler.aot_compile((tuple(args), {}))).serialized_data
     return pickle.dumps(([str(isa) for isa in valid_vec_isa_list()], graph))
 

@@ -16,10 +16,11 @@ sys.path[:] = pickle.load(sys.stdin.buffer)
 function, arguments = pickle.load(sys.stdin.buffer)
 function(*arguments)
 """
+_started: list[subprocess.Popen[bytes]] = []
 
 
 def run_elsewhere(function: Callable[..., Any], *arguments: Any) -> subprocess.Popen[bytes] | None:
-    """Start a module's function in a new Python process, which says nothing and returns nothing.
+    """Start a module's function in a new Python process; its output is discarded.
 
     Args:
         function: of a module that can be imported.
@@ -40,6 +41,8 @@ def run_elsewhere(function: Callable[..., Any], *arguments: Any) -> subprocess.P
         )
     except (OSError, pickle.PicklingError, AttributeError, TypeError):  # the latter two: what has no name, or no copy
         return None
+    _started[:] = [other for other in _started if other.poll() is None]  # which also ends those that are done
+    _started.append(process)
     assert process.stdin is not None
     with contextlib.suppress(BrokenPipeError), process.stdin as pipe:
         pipe.write(order)

@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,8 +24,17 @@ from torchelev.output_files import atomic_file
 NUM_KEPT = 2  # numbers of environments with a graph of their own: chunks have one size, but for the last
 EXAMPLE = 2**16  # size of dimensions that vary, over all environments: enough to be worth several threads
 _VARIABLES = ("TORCHINDUCTOR", "TORCHDYNAMO", "ATEN_CPU", "CXX")  # beginnings of those that change what is compiled
-_STALE = 60  # [s] after which nobody writes an empty library any more
+_STALE = 60  # [s] age beyond which an empty library counts as abandoned
+_TIMEOUT = 600  # [s] to wait for another process that compiles the same
 _SOURCES = Path(__file__).parents[1]
+
+
+class Dynamic(NamedTuple):
+    """Arguments that may differ in size from call to call."""
+
+    dim: int  #: whose size it is
+    values: Sequence[Tensor | None]  #: who has it
+    multiple: int = 1  #: the size is a multiple of this
 
 
 class KeptGraph:
@@ -37,10 +46,10 @@ class KeptGraph:
     Args:
         function: takes a NamedTuple of tensors first, whose first size is the number of environments.
         settings: all that the graph depends on besides its arguments and torchelev's code.
-        dynamic: returns, of the arguments, the dimension whose size may differ from call to call, and who has it.
+        dynamic: returns, of the arguments, what may differ in size from call to call.
     """
 
-    def __init__(self, function: Callable[..., Any], settings: Any, dynamic: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], settings: Any, dynamic: Callable[..., Dynamic]) -> None:
         self._function, self._dynamic = function, dynamic
         self._settings = describe(settings)
         self._usual = compiled(function)
@@ -53,36 +62,40 @@ class KeptGraph:
         graph = self.prepare(*args)
         if graph is not None and graph.guard_check(*args):
             return graph.fn(*args)
-        dim, values = self._dynamic(*args)
-        mark_dynamic(dim, values)
+        dynamic = self._dynamic(*args)
+        mark_dynamic(dynamic.dim, dynamic.values)
         try:
             return self._usual(*args)
         finally:
-            remove_marks(values)
+            remove_marks(dynamic.values)
 
     def prepare(self, *args: Any) -> Any:
         """Return the graph for arguments, from its file or compiled into it; None if it cannot be kept."""
         kind = _kind(args)
-        if kind not in self._kept and len(self._kept) < NUM_KEPT:
+        if self._is_new(kind):
             with _one_thread_at_a_time():
-                if kind not in self._kept:
+                if self._is_new(kind):
                     self._kept[kind] = self._find(args)
         return self._kept.get(kind)
 
     def is_missing(self, *args: Any) -> bool:
         """Tell whether the graph for arguments could be kept, but is neither loaded nor on disk."""
-        if _kind(args) in self._kept or len(self._kept) >= NUM_KEPT:
-            return False
-        path = self.path(*args)
+        path = self.path(*args) if self._is_new(_kind(args)) else None
         return path is not None and not path.exists()
+
+    def _is_new(self, kind: tuple[Any, ...]) -> bool:
+        return kind not in self._kept and len(self._kept) < NUM_KEPT
 
     def path(self, *args: Any) -> Path | None:
         """Return the file for arguments; None if there can be none."""
         if self._settings is None or not can_keep(args[0][0].device):
             return None
-        dim, values = self._dynamic(*args)
+        dim, values, _ = self._dynamic(*args)
         of_tensors = [_describe_tensor(v, dim if any(v is w for w in values) else None) for v in _tensors(args)]
-        return _folder() / f"{_hash(self._settings, str(of_tensors), _surroundings())}.graph"
+        try:
+            return _folder() / f"{_hash(self._settings, str(of_tensors), surroundings())}.graph"
+        except OSError:  # the folder cannot be made
+            return None
 
     def _find(self, args: Sequence[Any]) -> Any:
         path = self.path(*args)
@@ -97,14 +110,17 @@ class KeptGraph:
                 graph = _load(path)
                 if graph is None:
                     remove_unfinished(path.parents[1])
-                    data = traced(self._function, self._examples(args), self._dynamic)
+                    examples = self._examples(args)
+                    dynamic = self._dynamic(*examples)
+                    mark_dynamic(dynamic.dim, dynamic.values)
+                    data = traced(self._function, examples)
                     graph = load_traced(data)
                     with atomic_file(path) as file:
                         file.write(data)
         except Exception as error:  # of the folder, or of a compiler whose interface is young
             warnings.warn(
-                f"{path}: cannot be written, so each process compiles the update anew: {error!r}. If that is about the "
-                "folder, set TORCHINDUCTOR_CACHE_DIR to one that can be written.",
+                f"the compiled update could not be stored in {path}; each process will compile it again. Cause: "
+                f"{error!r}. If the folder is not writable, set TORCHINDUCTOR_CACHE_DIR",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -112,8 +128,8 @@ class KeptGraph:
 
     def _examples(self, args: Sequence[Any]) -> tuple[Any, ...]:
         """Return the arguments with a usual size where it may vary, so that the first call's does not decide."""
-        dim, values = self._dynamic(*args)
-        size = max(2, EXAMPLE // max(1, len(args[0][0])))
+        dim, values, multiple = self._dynamic(*args)
+        size = multiple * max(2, EXAMPLE // (multiple * max(1, len(args[0][0]))))
 
         def resized(value: Any) -> Any:
             if isinstance(value, tuple):
@@ -156,9 +172,9 @@ def _load(path: Path) -> Any:
 
 
 def _kind(args: Sequence[Any]) -> tuple[Any, ...]:
-    """Return what tells the graphs of a process apart: number of environments and dtypes."""
+    """Return what tells the graphs of a process apart: number of environments, threads and dtypes."""
     first = args[0]
-    return (len(first[0]), *(value.dtype for value in first if isinstance(value, Tensor)))
+    return (len(first[0]), torch.get_num_threads(), *(value.dtype for value in first if isinstance(value, Tensor)))
 
 
 def _tensors(value: Any) -> Iterator[Any]:
@@ -177,8 +193,8 @@ def _describe_tensor(value: Tensor | None, dynamic: int | None) -> Any:
 
 
 def can_keep(device: torch.device) -> bool:
-    """Tell whether this torch can write and load graphs for a device."""
-    return device.type == "cpu" and torch.__version__ >= "2.13"
+    """Tell whether this torch can store compiled graphs for a device, as far as that was tested."""
+    return device.type == "cpu" and torch.__version__ >= "2.13" and torch.__version__ < "2.14"
 
 
 def describe(value: Any) -> str | None:
@@ -202,8 +218,8 @@ def describe(value: Any) -> str | None:
 
 def remove_unfinished(folder: Path) -> None:
     """Remove the empty libraries that a killed compilation left: every later start would fail on them."""
-    with contextlib.suppress(OSError):  # another process may remove them, too
-        for path in folder.rglob("*.so"):
+    for path in folder.rglob("*.so"):
+        with contextlib.suppress(OSError):  # another process may remove it, too
             found = path.stat()
             if found.st_size == 0 and time.time() - found.st_mtime > _STALE:
                 path.unlink(missing_ok=True)
@@ -218,7 +234,7 @@ def _one_thread_at_a_time() -> contextlib.AbstractContextManager[Any]:
 def _one_process_at_a_time(path: Path) -> contextlib.AbstractContextManager[Any]:
     from torch.utils._filelock import FileLock
 
-    return FileLock(f"{path}.lock")
+    return FileLock(f"{path}.lock", timeout=_TIMEOUT)
 
 
 def _folder() -> Path:
@@ -227,7 +243,7 @@ def _folder() -> Path:
     return Path(cache_dir()) / "torchelev"
 
 
-def _surroundings() -> str:
+def surroundings() -> str:
     """Describe what else a graph depends on: this process."""
     from torch._C._dynamo.guards import GlobalStateGuard
     from torch._inductor import config
@@ -235,8 +251,8 @@ def _surroundings() -> str:
     variables = sorted(item for item in os.environ.items() if item[0].startswith(_VARIABLES))
     variables = [item for item in variables if item[0] != "TORCHINDUCTOR_CACHE_DIR"]
     state: Any = GlobalStateGuard()
-    modes: Any = state.__getstate__()
-    return f"{_installation()} {modes!r} {torch.get_default_device()} {config.get_hash()!r} {variables}"
+    options = sorted(config.save_config_portable(ignore_private_configs=False).items())  # as torch's own cache has them
+    return f"{_installation()} {state.__getstate__()!r} {torch.get_default_device()} {options} {variables}"
 
 
 @functools.cache

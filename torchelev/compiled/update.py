@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchelev.compiled.compiler import announced_compilation, packed
 from torchelev.compiled.elsewhere import run_elsewhere
-from torchelev.compiled.kept_graphs import KeptGraph
+from torchelev.compiled.kept_graphs import Dynamic, KeptGraph, surroundings
 from torchelev.config import ElevationMapConfig
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, update_in_place
@@ -76,7 +76,9 @@ def compile_side_by_side(
     processes = min(len(os.sched_getaffinity(0)), len(Graphs._fields)) if hasattr(os, "sched_getaffinity") else 1
     shapes = [None if value is None else value.to("meta") for value in inputs]
     for part in ("apply_rays", "fuse_heights")[: processes - 1]:
-        run_elsewhere(compile_part, part, num_envs, dtype, shapes, cfg, weights, torch.get_num_threads())
+        run_elsewhere(
+            compile_part, part, num_envs, dtype, shapes, cfg, weights, torch.get_num_threads(), surroundings()
+        )
 
 
 def compile_part(
@@ -87,8 +89,9 @@ def compile_part(
     cfg: ElevationMapConfig,
     weights: Weights | None,
     num_threads: int,
+    wanted: str,
 ) -> None:
-    """Compile one graph of an update into its file, for inputs of these shapes and dtypes."""
+    """Compile one graph of an update into its file, for inputs of these shapes and dtypes, if `surroundings` agree."""
     torch.set_num_threads(num_threads)
     inputs: list[Any] = [None if value is None else torch.zeros_like(value, device="cpu") for value in shapes]
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
@@ -96,6 +99,8 @@ def compile_part(
     with torch.inference_mode(False), torch.no_grad():
         blank = blank_state(cfg.grid, num_envs, inputs[0].device, dtype)
     with torch.inference_mode():
+        if surroundings() != wanted:  # the other process has set modes that this one does not know
+            return
         m = with_masks(measure(*inputs, cfg.grid, cfg.sensor, dtype), as_bytes)  # type: ignore[call-arg]
         graph.prepare(with_masks(blank, as_bytes), m, *([weights] if part == "apply_rays" else []))
 
@@ -151,19 +156,18 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
             state = with_masks(stored, as_mask)
             write_changes(stored, state, stages(state, with_masks(m, as_mask), cfg, *weights))
 
-        return KeptGraph(run, (stages.__name__, *settings), _measured)
+        return KeptGraph(run, (stages.__name__, *settings), measured)
+
+    def measured(_: MapState, m: Measurement, *__: Weights | None) -> Dynamic:
+        return Dynamic(1, (m.points, m.variance, m.used, m.casts, m.noise), multiple=sensors)
 
     settings = (cfg, kinds, sensors)
     move = KeptGraph(first, (move_window.__name__, *settings), _sized_by_points)
     return Graphs(move, in_place(fuse_heights), in_place(apply_rays))
 
 
-def _sized_by_points(_: MapState, points: Tensor, *others: Any) -> tuple[int, Sequence[Tensor | None]]:
-    return 2, (points, others[3])  # and their variance
-
-
-def _measured(_: MapState, m: Measurement, *__: Weights | None) -> tuple[int, Sequence[Tensor | None]]:
-    return 1, (m.points, m.variance, m.used, m.casts, m.noise)
+def _sized_by_points(_: MapState, points: Tensor, *others: Any) -> Dynamic:
+    return Dynamic(2, (points, others[3]))  # and their variance
 
 
 def write_changes(stored: MapState, old: MapState, new: MapState) -> None:
