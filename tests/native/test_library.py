@@ -109,9 +109,9 @@ def test_what_is_thrown_on_a_thread_is_no_crash(tmp_path):
         """
         #include "threads.h"
         #include <new>
-        extern "C" bool throwing(int count, int threads, int failing) {
+        extern "C" int throwing(int count, int threads, int failing) {
             auto work = [&](int k) { if (k == failing) throw std::bad_alloc(); };
-            return succeeds([&] { for_each(count, threads, work); });
+            return code_of([&] { for_each(count, threads, work); });
         }
         """
     )
@@ -134,8 +134,8 @@ def test_threads_of_torch_and_its_own_do_all_the_work(is_of_torch, tmp_path):
     program = tmp_path / "count.cpp"
     program.write_text(
         f'#include "{SOURCES / "threads.h"}"\n'
-        'extern "C" bool count(int* times, int number, int threads) {\n'
-        "  return succeeds([&] { for_each(number, threads, [&](int k) { times[k] += 1; }); });\n"
+        'extern "C" int count(int* times, int number, int threads) {\n'
+        "  return code_of([&] { for_each(number, threads, [&](int k) { times[k] += 1; }); });\n"
         "}\n"
     )
     path = tmp_path / "count.so"

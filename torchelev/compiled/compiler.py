@@ -118,18 +118,21 @@ def own_code(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function with a code object of its own.
 
     The compiler finds its graphs by code object and guards. Functions that differ by what they enclose alone, which no
-    guard looks at here, would be given each other's graphs; and of one code object it keeps no more than eight.
+    guard looks at here, would be given each other's graphs; of one code object it keeps no more than eight, and lets
+    sizes vary that differ from those before.
     """
     assert isinstance(function, FunctionType)
     code = function.__code__.replace(co_name=f"{function.__name__}_{next(_number)}")
     return FunctionType(code, function.__globals__, code.co_name, function.__defaults__, function.__closure__)
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled(
+    function: Callable[..., Any], choose_guards: Callable[[Sequence[Any]], list[bool]] | None = None
+) -> Callable[..., Any]:
     """Return the function as one compiled graph; call what it returns under `announced_compilation`."""
     options: dict[str, Any] = {}
     if hasattr(torch.compiler, "skip_guard_on_globals_unsafe"):
-        options["guard_filter_fn"] = guards_on_arguments
+        options["guard_filter_fn"] = choose_guards or guards_on_arguments
     return torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
 
 
@@ -147,9 +150,7 @@ def traced(function: Callable[..., Any], args: Sequence[Any]) -> bytes:
     from torch._dynamo.aot_compile import AOTCompiledFunction
     from torch._inductor.cpu_vec_isa import valid_vec_isa_list
 
-    options: dict[str, Any] = {"guard_filter_fn": guards_on_kept_arguments}
-    # A code object of its own, or sizes that differ from those compiled before would become dynamic.
-    compiler: Any = torch.compile(own_code(function), fullgraph=True, backend=inductor, options=options)
+    compiler: Any = compiled(function, guards_on_kept_arguments)
     graph = AOTCompiledFunction.serialize(compiler.aot_compile((tuple(args), {}))).serialized_data
     return pickle.dumps(([str(isa) for isa in valid_vec_isa_list()], graph))
 

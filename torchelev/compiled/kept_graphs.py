@@ -10,18 +10,19 @@ import os
 import platform
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map
 
 from torchelev.compiled.compiler import announced_start, compiled, load_traced, mark_dynamic, remove_marks, traced
 from torchelev.native.library import describe_processor
 from torchelev.output_files import atomic_file
 
-NUM_KEPT = 2  # numbers of environments with a graph of their own: chunks have one size, but for the last
+NUM_KEPT = 2  # kinds of arguments with a graph of their own: chunks have one size, but for the last
 EXAMPLE = 2**16  # size of dimensions that vary, over all environments: enough to be worth several threads
 _VARIABLES = ("TORCHINDUCTOR", "TORCHDYNAMO", "ATEN_CPU", "CXX")  # beginnings of those that change what is compiled
 _STALE = 60  # [s] age beyond which an empty library counts as abandoned
@@ -40,8 +41,8 @@ class Dynamic(NamedTuple):
 class KeptGraph:
     """A function as one compiled graph, which later processes find in the compiler's cache folder.
 
-    Each of the first NUM_KEPT numbers of environments has a graph of its own. Other arguments go to `torch.compile`,
-    and so does everything where no graph can be kept.
+    Each of the first NUM_KEPT kinds of arguments, mostly numbers of environments, has a graph of its own. Others go to
+    `torch.compile`, and so does everything where no graph can be kept.
 
     Args:
         function: takes a NamedTuple of tensors first, whose first size is the number of environments.
@@ -91,7 +92,7 @@ class KeptGraph:
         if self._settings is None or not can_keep(args[0][0].device):
             return None
         dim, values, _ = self._dynamic(*args)
-        of_tensors = [_describe_tensor(v, dim if any(v is w for w in values) else None) for v in _tensors(args)]
+        of_tensors = [_describe_tensor(v, dim if any(v is w for w in values) else None) for v in tree_leaves(args)]
         try:
             return _folder() / f"{_hash(self._settings, str(of_tensors), surroundings())}.graph"
         except OSError:  # the folder cannot be made
@@ -131,14 +132,12 @@ class KeptGraph:
         dim, values, multiple = self._dynamic(*args)
         size = multiple * max(2, EXAMPLE // (multiple * max(1, len(args[0][0]))))
 
-        def resized(value: Any) -> Any:
-            if isinstance(value, tuple):
-                parts = [resized(part) for part in value]
-                return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-            is_dynamic = value is not None and any(value is other for other in values)
-            return _resized(value, dim, size) if is_dynamic else value
+        def resized(value: Tensor | None) -> Tensor | None:
+            if value is None or not any(value is other for other in values):
+                return value
+            return _resized(value, dim, size)
 
-        return tuple(resized(value) for value in args)
+        return tree_map(resized, tuple(args))
 
 
 def _resized(value: Tensor, dim: int, size: int) -> Tensor:
@@ -175,15 +174,6 @@ def _kind(args: Sequence[Any]) -> tuple[Any, ...]:
     """Return what tells the graphs of a process apart: number of environments, threads and dtypes."""
     first = args[0]
     return (len(first[0]), torch.get_num_threads(), *(value.dtype for value in first if isinstance(value, Tensor)))
-
-
-def _tensors(value: Any) -> Iterator[Any]:
-    """Yield the tensors in nested tuples, and None where an argument is not given."""
-    if isinstance(value, tuple):
-        for part in value:
-            yield from _tensors(part)
-    else:
-        yield value
 
 
 def _describe_tensor(value: Tensor | None, dynamic: int | None) -> Any:

@@ -1,4 +1,4 @@
-"""The update as three compiled graphs: how they are kept and found again."""
+"""The update as three compiled graphs."""
 
 from __future__ import annotations
 
@@ -75,10 +75,9 @@ def compile_side_by_side(
     """
     processes = min(len(os.sched_getaffinity(0)), len(Graphs._fields)) if hasattr(os, "sched_getaffinity") else 1
     shapes = [None if value is None else value.to("meta") for value in inputs]
+    order = num_envs, dtype, shapes, cfg, weights, torch.get_num_threads(), surroundings()
     for part in ("apply_rays", "fuse_heights")[: processes - 1]:
-        run_elsewhere(
-            compile_part, part, num_envs, dtype, shapes, cfg, weights, torch.get_num_threads(), surroundings()
-        )
+        run_elsewhere(compile_part, part, *order)
 
 
 def compile_part(

@@ -74,9 +74,17 @@ def _open(path: Path) -> ctypes.CDLL:
 
 
 def call(function: Any, *arguments: Any) -> None:
-    """Call a library's function, which returns False where it ran out of memory. Raises MemoryError then."""
-    function.restype = ctypes.c_bool
-    if not function(*arguments):
+    """Call a library's function.
+
+    Raises:
+        IndexError: it returned 1: an index is out of range.
+        MemoryError: it returned 2.
+    """
+    function.restype = ctypes.c_int
+    failure = function(*arguments)
+    if failure == 1:
+        raise IndexError(f"{function.__name__}: an index is out of range")
+    if failure:
         raise MemoryError(f"{function.__name__} ran out of memory: give it fewer or smaller maps at a time")
 
 

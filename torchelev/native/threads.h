@@ -4,6 +4,7 @@
 #include <atomic>
 #include <exception>
 #include <mutex>
+#include <stdexcept>
 #include <thread>
 #include <vector>
 
@@ -47,12 +48,14 @@ template <class Work> void for_each(int count, int num_threads, const Work& work
     if (failure) std::rethrow_exception(failure);
 }
 
-// Tell whether `work()` ended without an exception, which must not reach C.
-template <class Work> bool succeeds(const Work& work) {
+// Do the work; return 0, or 1 if an index was out of range, or 2 without memory. No exception may reach C.
+template <class Work> int code_of(const Work& work) {
     try {
         work();
-        return true;
+        return 0;
+    } catch (const std::out_of_range&) {
+        return 1;
     } catch (...) {
-        return false;
+        return 2;
     }
 }

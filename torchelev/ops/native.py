@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchelev.native.library import load
+from torchelev.native.library import call, load
 
 
 def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor | None:
@@ -56,18 +56,8 @@ def _library(values: Tensor, index: Tensor | None = None) -> ctypes.CDLL | None:
 
 
 def _call(function: Any, tensors: Sequence[Tensor], *arguments: Any) -> None:
-    """Call a function with the addresses of tensors.
-
-    Raises:
-        IndexError: it returned 1: an index is outside.
-        MemoryError: it returned 2.
-    """
-    function.restype = ctypes.c_int
+    """Call a function with the addresses of tensors."""
     arrays = [tensor.contiguous() for tensor in tensors]
     addresses = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
     whole = [ctypes.c_int64(value) if isinstance(value, int) else value for value in arguments]
-    failure = function(*addresses, *whole, torch.get_num_threads())
-    if failure == 1:
-        raise IndexError(f"{function.__name__}: an index is out of range")
-    if failure:
-        raise MemoryError(f"{function.__name__} ran out of memory: give it fewer or smaller maps at a time")
+    call(function, *addresses, *whole, torch.get_num_threads())

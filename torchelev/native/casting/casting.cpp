@@ -58,13 +58,13 @@ void stop_at_boxes(const Box* boxes, int num_boxes, const float* directions, int
 
 // Distances (B, M) of rays from origins (B, 3) [cells, cells, m], counted from the rim of the tiles, along directions
 // (B, M, 3). `heights` are (K, rows + 1, columns + 1), `bounds` and `sizes` those of `Bounds`, tile by tile within each
-// level. False without memory.
-extern "C" bool cast(const float* heights, const float* bounds, const int64_t* levels, const int64_t* sizes,
-                     const int64_t* tiles, const float* origins, const float* directions, const Box* boxes,
-                     float* distance, int rows, int columns, int B, int M, int num_boxes, float resolution,
-                     float max_range, int num_threads) {
+// level. Returns what `code_of` does.
+extern "C" int cast(const float* heights, const float* bounds, const int64_t* levels, const int64_t* sizes,
+                    const int64_t* tiles, const float* origins, const float* directions, const Box* boxes,
+                    float* distance, int rows, int columns, int B, int M, int num_boxes, float resolution,
+                    float max_range, int num_threads) {
     const int parts = (M + AT_A_TIME - 1) / AT_A_TIME;
-    return succeeds([&] {
+    return code_of([&] {
         std::vector<int> order(B);  // robots on the same tile one after the other, while it is in the caches
         std::iota(order.begin(), order.end(), 0);
         std::sort(order.begin(), order.end(), [&](int a, int b) { return tiles[a] < tiles[b]; });

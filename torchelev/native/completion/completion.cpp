@@ -30,17 +30,17 @@ void complete_row(const Weights& weights, const Map& map, int i) {
 
 }  // namespace
 
-// Layers of (B, H, W) and parameters as in complete.py; H and W are below 32767. False without memory.
-extern "C" bool complete(const float* weights, const float* elevation, const bool* known, const float* variance,
-                         const float* upper_bound, const bool* bounded, const float* age, float* mean, float* std,
-                         int B, int H, int W, double resolution, int num_threads) {
+// Layers of (B, H, W) and parameters as in complete.py; H and W are below 32767. Returns what `code_of` does.
+extern "C" int complete(const float* weights, const float* elevation, const bool* known, const float* variance,
+                        const float* upper_bound, const bool* bounded, const float* age, float* mean, float* std,
+                        int B, int H, int W, double resolution, int num_threads) {
     const Weights parameters(weights);
     auto make_map = [&](int b) {
         const size_t first = size_t(b) * H * W;
         return Map({elevation + first, variance + first, upper_bound + first, age + first, known + first,
                     bounded + first, mean + first, std + first}, H, W, resolution);
     };
-    return succeeds([&] {
+    return code_of([&] {
         if (B >= num_threads) {
             for_each(B, num_threads, [&](int b) {
                 Map map = make_map(b);

@@ -20,18 +20,6 @@ inline int64_t checked(int64_t index, int64_t size) {
     return index;
 }
 
-// Do the work; return 0, or 1 if an index was out of range, or 2 without memory. No exception may reach C.
-template <class Work> int code_of(const Work& work) {
-    try {
-        work();
-        return 0;
-    } catch (const std::out_of_range&) {
-        return 1;
-    } catch (...) {
-        return 2;
-    }
-}
-
 // Turn each row into the minimum of itself and the one before it.
 void scan(float* table, int64_t first, int64_t last, int64_t step, int64_t width, int64_t begin, int64_t end) {
     for (int64_t r = first; r != last; r += step) {
