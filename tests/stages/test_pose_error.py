@@ -14,7 +14,7 @@ from tests.test_properties import LIVELY, recording
 from torchelev import DriftConfig, FusionConfig, SensorConfig
 from torchelev.layers import LAYERS
 from torchelev.stages.cells import cells_of
-from torchelev.stages.fusion.points import gather_points
+from torchelev.stages.fusion.points import HitPoints, gather_points
 from torchelev.stages.pose_error import relative_variance
 
 SEEDS = st.integers(0, 10_000)
@@ -209,6 +209,8 @@ def test_the_gate_of_points_is_that_of_their_whole_variance():
     covariance = covariances(np.random.default_rng(0), 1)
     m = emap.measure(flat(0.0, 4, side=0.1), pose((0, 0, 1)), None, 0.1, pose_covariance=covariance)
     cfg, grid, state = FusionConfig(), emap.cfg.grid, emap.state
-    scan = gather_points(m, cells_of(state, m, grid), relative_variance(state, m), grid, cfg)
+    assert m.noise is not None
+    shared, cells = relative_variance(state, m), cells_of(state, m, grid)
+    scan = gather_points(HitPoints(m.points, m.noise, shared, m.origin, cells), grid, cfg)
     torch.testing.assert_close(scan.spread, m.variance + (cfg.relief * grid.resolution) ** 2)
     torch.testing.assert_close(scan.weight, 1 / m.noise)

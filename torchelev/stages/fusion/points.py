@@ -11,10 +11,31 @@ from torchelev.grid import GridConfig
 from torchelev.stages.cells import PointCells
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.contested import ratio
-from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, UInt8
+
+
+class HitPoints(NamedTuple):
+    """The points of a scan of S sensors, M = S * N, and the cell of each."""
+
+    points: Float[Tensor, "B M 3"]  #: [m]
+    noise: Float[Tensor, "B M"]  #: [m^2] variance of each height, without what the pose adds
+    shared: Float[Tensor, "B M"] | None  #: [m^2] variance that the pose adds
+    origin: Float[Tensor, "B S 3"]  #: [m] the sensors
+    cells: PointCells
+
+
+class CellLayers(NamedTuple):
+    """What the update reads and writes of cells, flat; see `MapState`."""
+
+    elevation: Tensor
+    variance: Tensor
+    support: Tensor
+    challenger: Tensor
+    challenger_support: Tensor
+    validity: Tensor
+    time: Tensor
 
 
 class ScanPoints(NamedTuple):
@@ -56,15 +77,12 @@ class Prior(NamedTuple):
     challenger_support: UInt8[Tensor, "B C"]  #: points that do so, less points that do not
 
 
-def gather_points(
-    m: Measurement, cells: PointCells, shared: Tensor | None, grid: GridConfig, cfg: FusionConfig
-) -> ScanPoints:
+def gather_points(hits: HitPoints, grid: GridConfig, cfg: FusionConfig) -> ScanPoints:
     """Find what the update needs of each point, and whether its ray passed over the cell's centre."""
-    xy, z, used = m.points[..., :2], m.points[..., 2], cells.inside
+    points, noise, shared, origin, cells = hits
+    xy, z, used = points[..., :2], points[..., 2], cells.inside
     from_center = xy - (torch.floor(xy / grid.resolution) + 0.5) * grid.resolution
-    sensors = m.origin.shape[1]
-    ray = (xy.unflatten(1, (sensors, -1)) - m.origin[:, :, None, :2]).flatten(1, 2)
-    noise = m.variance if m.noise is None else m.noise
+    ray = (xy.unflatten(1, (origin.shape[1], -1)) - origin[:, :, None, :2]).flatten(1, 2)
     spread = noise + (cfg.relief * grid.resolution) ** 2
     return ScanPoints(
         z=z,
@@ -88,15 +106,15 @@ def passed_center(from_center: Tensor, ray: Tensor) -> Tensor:
     return along > across.abs()
 
 
-def gather_prior(state: MapState) -> Prior:
-    """Flatten what the update reads of the map."""
+def gather_prior(layers: CellLayers) -> Prior:
+    """Return what the update reads of the map."""
     return Prior(
-        elevation=state.elevation.flatten(1),
-        variance=state.variance.flatten(1),
-        known=state.validity.flatten(1),
-        support=state.support.flatten(1),
-        challenger=state.challenger.detach().flatten(1),
-        challenger_support=state.challenger_support.flatten(1),
+        elevation=layers.elevation,
+        variance=layers.variance,
+        known=layers.validity,
+        support=layers.support,
+        challenger=layers.challenger.detach(),
+        challenger_support=layers.challenger_support,
     )
 
 

@@ -1,0 +1,91 @@
+"""The update in C++: the same as by tensors."""
+
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.helpers import random_poses, random_state, small_map
+from tests.stages.fusion.test_fuse import CELLS, EDGES, FUSED, steps_and_outliers
+from torchelev import EdgeConfig, FusionConfig
+from torchelev.stages.fusion import fuse as stage
+from torchelev.stages.fusion.native import can_update_hit, config_of, numbers
+from torchelev.state import map_layers
+
+CONFIGS = [FusionConfig(), FusionConfig(edges=None), FusionConfig(scan_variance_floor=1e-3, max_support=3.0)]
+CONFIGS += [FusionConfig(edges=edges) for edges in EDGES[1:]]
+
+
+def random_scan(seed, num_envs, sensors, num_points, with_covariance):
+    """A state and a measurement in float32."""
+    rng = np.random.default_rng(seed)
+    emap = small_map(num_envs, CELLS)
+    state = random_state(rng, emap.cfg.grid, num_envs)
+    state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
+    state = state._replace(elevation=torch.where(state.validity, 0.1 * state.elevation, 0.0))
+    T = torch.stack([random_poses(rng, sensors, reach=1.0) for _ in range(num_envs)])
+    in_map = [[steps_and_outliers(rng, num_points) for _ in range(sensors)] for _ in range(num_envs)]
+    cloud = (torch.from_numpy(np.array(in_map)) - T[:, :, None, :3, 3]) @ T[:, :, :3, :3]
+    cloud[torch.from_numpy(rng.random(cloud.shape[:3]) < 0.1)] = torch.nan
+    covariance = 1e-4 * torch.eye(6).expand(num_envs, sensors, 6, 6) if with_covariance else None
+    return state, emap.measure(cloud.float(), T, None, 0.1, pose_covariance=covariance), emap.cfg.grid
+
+
+def assert_same(state, m, grid, cfg, has_rays):
+    with torch.no_grad():
+        got = stage.fuse(state, m, grid, cfg, has_rays)
+        with patch.object(stage, "can_update_hit", lambda state: False):
+            expected = stage.fuse(state, m, grid, cfg, has_rays)
+    for name in (*FUSED, "validity"):
+        torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-5, rtol=1e-4, msg=name)
+    assert torch.equal(torch.stack(got.statistics[:8]), torch.stack(expected.statistics[:8]))
+
+
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 3),
+    st.integers(1, 2),
+    st.sampled_from([1, 30, 200, 500]),
+    st.sampled_from(CONFIGS),
+    st.booleans(),
+    st.booleans(),
+    st.integers(1, 2),
+)
+def test_agrees_with_tensors(seed, num_envs, sensors, num_points, cfg, has_rays, with_covariance, threads):
+    torch.set_num_threads(threads)
+    state, m, grid = random_scan(seed, num_envs, sensors, num_points, with_covariance)
+    assert_same(state, m, grid, cfg, has_rays)
+
+
+def test_without_points():
+    state, m, grid = random_scan(0, 2, 1, 0, False)
+    assert_same(state, m, grid, FusionConfig(), True)
+
+
+def test_without_a_compiler(monkeypatch):
+    """Compiled code calls the operator all the same."""
+    state, m, grid = random_scan(0, 2, 2, 300, True)
+    monkeypatch.setenv("TORCHELEV_NATIVE", "0")
+    with patch.object(stage, "can_update_hit", lambda state: True):
+        with torch.no_grad():
+            got = stage.fuse(state, m, grid, FusionConfig(), True)
+    assert not can_update_hit(state)
+    with torch.no_grad():
+        expected = stage.fuse(state, m, grid, FusionConfig(), True)
+    for name in (*FUSED, "validity"):
+        torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-6, rtol=0, msg=name)
+
+
+def test_gradients_and_float64_go_by_tensors():
+    state, _, _ = random_scan(0, 1, 1, 3, False)
+    assert not can_update_hit(state)
+    with torch.no_grad():
+        assert not can_update_hit(state._replace(elevation=state.elevation.double()))
+
+
+@pytest.mark.parametrize("cfg", [*CONFIGS, FusionConfig(gate=float("inf"), edges=EdgeConfig(min_points=9))])
+def test_settings_survive_as_numbers(cfg):
+    assert config_of(numbers(cfg)) == cfg

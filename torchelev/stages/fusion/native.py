@@ -1,0 +1,150 @@
+"""The update of the cells that points fall into, in C++ (`torchelev/native/fusion`)."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import astuple, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig
+from torchelev.native.library import call, load
+from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.stages.cells import PointCells
+from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
+from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
+from torchelev.stages.fusion.points import CellLayers, HitPoints
+from torchelev.stages.fusion.update import Update, update_all
+from torchelev.state import MapState
+
+_SOURCE = "fusion/fusion.cpp"
+
+
+class _Settings(ctypes.Structure):
+    """`Settings` of points.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_float) for name in ("resolution", "relief", "gate", "max_gate_std", "floor")),
+        *((name, ctypes.c_float) for name in ("outlier_variance", "max_support", "max_variance")),
+        *((name, ctypes.c_int32) for name in ("min_above", "max_above_per_scan", "min_challengers")),
+        *((name, ctypes.c_int32) for name in ("has_rays", "has_edges", "min_points", "min_extreme", "refinements")),
+        *((name, ctypes.c_float) for name in ("min_share", "min_passed", "margin", "min_settled")),
+    )
+
+
+def can_update_hit(state: MapState) -> bool:
+    """Tell whether `update_hit` takes the state: float32 on a CPU, without a gradient."""
+    layer = state.elevation
+    if torch.is_grad_enabled() or layer.dtype != torch.float32 or layer.device.type != "cpu":
+        return False
+    return torch.compiler.is_compiling() or (type(layer) is Tensor and load(_SOURCE, {}) is not None)
+
+
+def update_hit(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:
+    """Update the cells that points fall into; arguments are those of `update_all`."""
+    layers = [as_bytes(layer) if layer.dtype == torch.bool else layer for layer in before]
+    hits = (*points[:-1], as_bytes(points.cells.inside), points.cells.slot)
+    cells, *new, num_used, num_ignored = _update_hit(*hits, layers, grid.resolution, grid.width, has_rays, numbers(cfg))
+    pairs = zip(new, before, strict=True)
+    values = [as_mask(value) if layer.dtype == torch.bool else value for value, layer in pairs]
+    return Update(CellLayers(*(value[None] for value in values)), cells, num_used, num_ignored)
+
+
+def numbers(cfg: FusionConfig) -> list[float]:
+    """Return the settings as numbers, as operators take them; those of the edges last."""
+    *values, edges = (getattr(cfg, field.name) for field in fields(cfg))
+    return [float(value) for value in (*values, *(() if edges is None else astuple(edges)))]
+
+
+def config_of(settings: Sequence[float]) -> FusionConfig:
+    """Return the settings that `numbers` made numbers of."""
+    *own, _ = fields(FusionConfig)
+    of_edges = fields(EdgeConfig) if len(settings) > len(own) else ()
+    pairs = zip((*own, *of_edges), settings, strict=True)
+    values = [int(value) if isinstance(field.default, int) else value for field, value in pairs]
+    edges: dict[str, Any] = {field.name: value for field, value in zip(of_edges, values[len(own) :], strict=True)}
+    named: dict[str, Any] = {field.name: value for field, value in zip(own, values, strict=False)}
+    return FusionConfig(**named, edges=EdgeConfig(**edges) if edges else None)
+
+
+@torch.library.custom_op(
+    "torchelev::update_hit_cells",
+    mutates_args=(),
+    schema="(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, Tensor[] layers, "
+    "float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
+)
+def _update_hit(
+    points: Tensor,
+    noise: Tensor,
+    shared: Tensor | None,
+    origin: Tensor,
+    inside: Tensor,
+    slot: Tensor,
+    layers: list[Tensor],
+    resolution: float,
+    width: int,
+    has_rays: bool,
+    settings: list[float],
+) -> list[Tensor]:
+    """Return the T cells, their layers (T,) with masks as bytes, and the points used and ignored (B,)."""
+    library, cfg = load(_SOURCE, {}), config_of(settings)
+    (B, M), C = slot.shape, layers[0].shape[1]
+    if library is None:
+        hits = HitPoints(points, noise, shared, origin, PointCells(slot, as_mask(inside), C))
+        return _update_all(hits, layers, resolution, width, cfg, has_rays)
+    ints = [torch.empty(size, dtype=torch.int64) for size in (B * M, B, B, 1)]
+    new = [torch.empty(B * M, dtype=layer.dtype) for layer in layers]
+    cells, num_used, num_ignored, count = ints
+    tensors = [points, noise, shared, origin, inside, slot, *layers, cells, *new, num_used, num_ignored, count]
+    arrays = [None if tensor is None else tensor.contiguous() for tensor in tensors]
+    addresses = [ctypes.c_void_p(None if array is None else array.data_ptr()) for array in arrays]
+    sizes = [ctypes.c_int64(size) for size in (B, M, origin.shape[1], C // width, width)]
+    own = _c_settings(cfg, resolution, has_rays)
+    call(library.fuse_points, *addresses, *sizes, ctypes.byref(own), torch.get_num_threads())
+    T = int(count)
+    return [cells[:T], *(layer[:T] for layer in new), num_used, num_ignored]
+
+
+@_update_hit.register_fake
+def _(
+    points: Tensor,
+    noise: Tensor,
+    shared: Tensor | None,
+    origin: Tensor,
+    inside: Tensor,
+    slot: Tensor,
+    layers: list[Tensor],
+    resolution: float,
+    width: int,
+    has_rays: bool,
+    settings: list[float],
+) -> list[Tensor]:
+    T, B = torch.library.get_ctx().new_dynamic_size(), slot.shape[0]
+    return [slot.new_empty(T), *(layer.new_empty(T) for layer in layers), slot.new_empty(B), slot.new_empty(B)]
+
+
+def _update_all(
+    points: HitPoints, layers: list[Tensor], resolution: float, width: int, cfg: FusionConfig, has_rays: bool
+) -> list[Tensor]:
+    """Do the same by tensors, without a compiler."""
+    C = points.cells.num_cells
+    grid = GridConfig(resolution=resolution, length_x=C // width * resolution, length_y=width * resolution)
+    before = CellLayers(*layers)
+    before = before._replace(validity=as_mask(before.validity))
+    new = update_all(points, before, grid, cfg, has_rays)
+    values = [as_bytes(value) if value.dtype == torch.bool else value for value in new.layers]
+    cells = torch.arange(len(points.cells.slot) * C)
+    return [cells, *(value.reshape(-1) for value in values), new.num_used, new.num_ignored]
+
+
+def _c_settings(cfg: FusionConfig, resolution: float, has_rays: bool) -> _Settings:
+    edges = cfg.edges or EdgeConfig(margin=0.0, min_settled=0.0)
+    names = [field[0] for field in _Settings._fields_]
+    of_edges = {name: getattr(edges, name) for name in names if hasattr(edges, name)}
+    own = {name: getattr(cfg, name) for name in names if hasattr(cfg, name)}
+    given = {"resolution": resolution, "relief": cfg.relief * resolution, "floor": cfg.scan_variance_floor}
+    flags = {"min_challengers": MIN_CHALLENGERS, "has_rays": has_rays, "has_edges": cfg.edges is not None}
+    return _Settings(**(own | of_edges | given | flags))
