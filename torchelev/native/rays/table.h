@@ -22,13 +22,6 @@ struct Polar {
     float bins;
     const int64_t* widen;
     int levels;
-
-    // Of how many azimuths, as a power of two, an entry of a row is the minimum.
-    int level_at(int row) const {
-        int level = 0;
-        while (level < levels && row < widen[level]) level++;
-        return level;
-    }
 };
 
 // Return the numbers from place SHIFT on, of two vectors one after the other.
@@ -57,125 +50,117 @@ inline Lanes widened(Lanes a, Lanes next, int level) {
     return a;
 }
 
-// Its rows are ranges. Those near the sensor, which look at more than LANES azimuths, are stored whole; the others in
-// blocks of LANES azimuths, each as far as its rays and those of the next block reach, and a blank row after that.
+// Its rows are ranges. Each block of LANES azimuths has rows as far as its rays and those of the next block reach, and a
+// blank row after that. Rows near the sensor, whose entries look at more azimuths than a block and the next one have, are
+// stored once more, whole.
 class Table {
-    static constexpr int NEAR_LEVEL = 4;  // 2^4 azimuths: those of a block and of the next one
+    static constexpr int NEAR_LEVEL = 4;  // 2^4 azimuths: from any of a block to the last but one of the next
     const Polar& polar;
-    float blank;
-    std::vector<float> entries;
+    std::vector<float> blocks, whole;
+    std::vector<int32_t> rows, first;  // of each block: rows that rays reach, and where its row 0 is
+    int near;                          // rows that are stored whole
 
   public:
-    int near = 0, far = 0;             // rows that are stored whole, rows that any ray reaches
-    std::vector<int32_t> rows, place;  // of each block: rows that rays reach, and where row 0 would be
-
-    Table(const Polar& polar, float blank) : polar(polar), blank(blank) {}
-
-    float at(int row, int azimuth) const {
-        if (row < near) return entries[row * polar.azimuths + azimuth];
-        const unsigned block = unsigned(azimuth) / LANES, lane = unsigned(azimuth) % LANES;
-        return entries[place[block] + std::min(row, rows[block]) * LANES + lane];
-    }
+    int far = 0;  // rows that any ray reaches
 
     // `each(count, work)` calls work(k) for each k below `count`.
-    template <class Each> void build(const Rays& rays, int parts, const Each& each) {
+    template <class Each> Table(const Polar& polar, const Rays& rays, int parts, const Each& each) : polar(polar) {
         measure(rays);
         place_blocks();
         fill(rays);
-        const int blocks = int(rows.size());
-        std::vector<std::vector<float>> next;  // unchanged copies of the blocks that follow each part
-        for (int k = 1; k <= parts; k++) next.push_back(copy_of(int64_t(k) * blocks / parts));
+        const int count = int(rows.size());
+        auto begin = [&](int part) { return int(int64_t(part) * count / parts); };
+        std::vector<std::vector<float>> next;  // the blocks that follow each part, unchanged
+        for (int k = 1; k <= parts; k++) next.push_back(copy_of(begin(k)));
         each(parts, [&](int k) {
-            const int begin = int(int64_t(k) * blocks / parts), end = int(int64_t(k + 1) * blocks / parts);
-            for (int b = begin; b < end; b++) {
-                const bool is_last = b + 1 == end;
-                const int rows_of_next = b + 1 < blocks ? rows[b + 1] : 0;
-                scan_block(b, is_last ? next[k].data() : entries.data() + place[b + 1] + near * LANES, rows_of_next);
-            }
+            for (int b = begin(k); b < begin(k + 1); b++)
+                scan_block(b, b + 1 == begin(k + 1) ? next[k].data() : blocks.data() + first[b + 1]);
         });
-        for (int r = near - 2; r >= 0; r--) {
-            float *row = entries.data() + int64_t(r) * polar.azimuths, *farther = row + polar.azimuths;
-            for (int a = 0; a < polar.azimuths; a++) row[a] = std::min(row[a], farther[a]);
-        }
-        each(near, [&](int r) { widen_row(r); });
+        each(near, [&](int row) { widen_row(row); });
+    }
+
+    float at(int row, int azimuth) const {
+        if (row < near) return whole[row * polar.azimuths + azimuth];
+        const unsigned block = unsigned(azimuth) / LANES, lane = unsigned(azimuth) % LANES;
+        return blocks[first[block] + std::min(row, rows[block]) * LANES + lane];
     }
 
   private:
+    bool has(int range) const { return uint32_t(range) < uint32_t(polar.ranges); }
+
     void measure(const Rays& rays) {
         const int azimuths = polar.azimuths;
         rows.assign((azimuths + 2 * LANES - 2) / LANES, 0);  // LANES - 1 azimuths follow that repeat the first ones
         for (int64_t i = 0; i < rays.number; i++) {
-            const int range = rays.range[i], a = rays.azimuth[i];
-            if (uint32_t(range) >= uint32_t(polar.ranges)) continue;
+            const int a = rays.azimuth[i];
             if (uint32_t(a) >= uint32_t(azimuths)) throw std::out_of_range("azimuth");
-            rows[a / LANES] = std::max(rows[a / LANES], range + 1);
+            rows[a / LANES] = std::max(rows[a / LANES], has(rays.range[i]) ? rays.range[i] + 1 : 0);
         }
+        for (int a = azimuths; a < azimuths + LANES - 1; a++)
+            rows[a / LANES] = std::max(rows[a / LANES], rows[(a - azimuths) / LANES]);
         far = *std::max_element(rows.begin(), rows.end());
-        for (int a = 0; a < LANES - 1; a++)
-            rows[(azimuths + a) / LANES] = std::max(rows[(azimuths + a) / LANES], rows[a / LANES]);
         near = polar.levels > NEAR_LEVEL ? std::min(far, int(polar.widen[NEAR_LEVEL])) : 0;
     }
 
     void place_blocks() {
-        const int blocks = int(rows.size());
-        place.resize(blocks);
-        int64_t size = int64_t(near) * polar.azimuths;
-        for (int b = 0; b < blocks; b++) {
-            rows[b] = std::max({near, rows[b], b + 1 < blocks ? rows[b + 1] : 0});
-            place[b] = int32_t(size - near * LANES);
-            size += (rows[b] - near + 1) * LANES;
+        first.resize(rows.size());
+        int32_t size = 0;
+        for (size_t b = 0; b < rows.size(); b++) {
+            if (b + 1 < rows.size()) rows[b] = std::max(rows[b], rows[b + 1]);
+            first[b] = size;
+            size += (rows[b] + 1) * LANES;
         }
-        entries.assign(size, blank);
+        blocks.assign(size + 1, NO_RAY);  // one more for the rays that are dropped
+        whole.assign(size_t(near) * polar.azimuths, NO_RAY);
     }
-
-    void lower(int64_t slot, float value) { entries[slot] = std::min(entries[slot], value); }
 
     void fill(const Rays& rays) {
+        float *entries = blocks.data(), *dropped = entries + blocks.size() - 1;
+        auto lower = [&](unsigned a, int range, float slope) {
+            float* entry = has(range) ? entries + first[a / LANES] + range * LANES + a % LANES : dropped;
+            *entry = std::min(*entry, slope);
+        };
         for (int64_t i = 0; i < rays.number; i++) {
-            const int range = rays.range[i], a = rays.azimuth[i], again = a + polar.azimuths;
-            if (uint32_t(range) >= uint32_t(polar.ranges)) continue;
-            if (range < near) {
-                lower(int64_t(range) * polar.azimuths + a, rays.slope[i]);
-                continue;
-            }
-            lower(place[a / LANES] + range * LANES + a % LANES, rays.slope[i]);
-            if (a < LANES - 1) lower(place[again / LANES] + range * LANES + again % LANES, rays.slope[i]);
+            const int a = rays.azimuth[i];
+            lower(a, rays.range[i], rays.slope[i]);
+            if (a < LANES - 1) lower(a + polar.azimuths, rays.range[i], rays.slope[i]);
         }
     }
 
-    std::vector<float> copy_of(int64_t block) const {
-        if (block >= int64_t(rows.size())) return {};
-        const float* first = entries.data() + place[block] + near * LANES;
-        return {first, first + (rows[block] - near) * LANES};
+    std::vector<float> copy_of(size_t block) const {
+        if (block >= rows.size()) return {};
+        const float* begin = blocks.data() + first[block];
+        return {begin, begin + rows[block] * LANES};
     }
 
     // Turn a block into its running minimum from far to near, and widen it by the next one, which is unchanged as yet.
-    void scan_block(int b, const float* next, int rows_of_next) {
-        Lanes lowest = all(blank), beside = all(blank);
-        float* block = entries.data() + place[b];
-        int level = polar.level_at(rows[b]);
-        for (int r = rows[b] - 1; r >= near; r--) {
+    void scan_block(int b, const float* next) {
+        const int rows_of_next = b + 1 < int(rows.size()) ? rows[b + 1] : 0;
+        const int last = std::min(LANES, polar.azimuths - b * LANES);
+        Lanes lowest = all(NO_RAY), beside = all(NO_RAY);
+        float* block = blocks.data() + first[b];
+        int level = 0;
+        for (int r = rows[b] - 1; r >= 0; r--) {
             while (level < polar.levels && r < polar.widen[level]) level++;
             lowest = smaller(lowest, load(block + r * LANES));
-            if (r < rows_of_next) beside = smaller(beside, load(next + (r - near) * LANES));
-            store(block + r * LANES, widened(lowest, beside, level));
+            if (r < rows_of_next) beside = smaller(beside, load(next + r * LANES));
+            if (r >= near)
+                store(block + r * LANES, widened(lowest, beside, level));
+            else if (last > 0)
+                store(whole.data() + r * polar.azimuths + b * LANES, lowest, last);
         }
-        if (near == 0) return;
-        float* nearer = entries.data() + int64_t(near - 1) * polar.azimuths + b * LANES;
-        const int count = std::min(LANES, polar.azimuths - b * LANES);
-        for (int l = 0; l < count; l++) nearer[l] = std::min(nearer[l], float(lowest[l]));
     }
 
-    // Make each entry of a row the minimum of itself and the 2^level - 1 that follow it, all around.
-    void widen_row(int r) {
-        const int width = polar.azimuths, level = polar.level_at(r);
-        float* row = entries.data() + int64_t(r) * width;
+    // Make each entry of a row that is stored whole the minimum of itself and the 2^level - 1 that follow it, all around.
+    void widen_row(int row) {
+        const int width = polar.azimuths;
+        float* entry = whole.data() + row * width;
         std::vector<float> start(width);
-        for (int w = 0; w < level; w++) {
+        for (int w = 0; w < polar.levels && row < polar.widen[w]; w++) {
             const int shift = (1 << w) % width;
-            std::copy(row, row + shift, start.begin());
-            for (int a = 0; a < width - shift; a++) row[a] = std::min(row[a], row[a + shift]);
-            for (int a = width - shift; a < width; a++) row[a] = std::min(row[a], start[a - (width - shift)]);
+            std::copy(entry, entry + shift, start.begin());
+            for (int a = 0; a < width - shift; a++) entry[a] = std::min(entry[a], entry[a + shift]);
+            for (int a = width - shift; a < width; a++) entry[a] = std::min(entry[a], start[a - (width - shift)]);
         }
     }
 };

@@ -14,7 +14,6 @@ from torchelev.ops.indexing import tabulate
 if TYPE_CHECKING:
     from torchelev.stages.visibility.config import RaycastConfig
 
-NO_RAY = 1e4  # a slope above every ray's
 BREADTH = math.sqrt(2)  # [cells] any ray over a cell passes within half its diagonal beside the cell's centre
 
 
