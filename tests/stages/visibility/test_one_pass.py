@@ -64,13 +64,15 @@ def test_both_agree(seed, num_envs, cells, num_rays, reach, place, threads, cfg)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("cells, num_rays", [((300, 400), 900), ((64, 48), 20_000)])
+@pytest.mark.parametrize("cells, num_rays", [((500, 600), 900), ((64, 48), 20_000)])
 def test_both_agree_on_large_maps_and_many_rays(cells, num_rays, threads):
-    """And the rays do all that they may."""
+    """And the rays do all that they may. Ten times, as threads may share the work otherwise."""
     torch.set_num_threads(threads)
     state, *inputs = rays_over(cells, np.random.default_rng(0), 1, num_rays)
-    expected, after = apply_rays(state, *inputs), apply_in_one_pass(state, *inputs)
-    agree(expected, after)
+    expected = apply_rays(state, *inputs)
+    for _ in range(10):
+        after = apply_in_one_pass(state, *inputs)
+        agree(expected, after)
     assert (state.validity & ~after.validity).any() and after.validity.any()
     assert (after.validity & (after.challenger_support < state.challenger_support)).any()
     assert (state.bounded & after.bounded & (after.upper_bound < state.upper_bound)).any()

@@ -71,7 +71,8 @@ inline Lanes lowest_slope(const Table& table, const Polar& polar, Lanes k, Lanes
 
 // Copy bytes; zero where the mask has a value.
 template <bool VALUE>
-inline void clear_where(const uint8_t* __restrict mask, const uint8_t* __restrict from, uint8_t* __restrict to, int count) {
+inline void clear_where(const uint8_t* __restrict mask, const uint8_t* __restrict from, uint8_t* __restrict to,
+                        int count) {
     for (int j = 0; j < count; j++) to[j] = from[j] & ((mask[j] == VALUE) - 1);
 }
 

@@ -5,13 +5,13 @@
 #pragma GCC optimize("fp-contract=off")
 #endif
 
-#include "../threads.h"
 #include "cells.h"
 
-constexpr int AT_A_TIME = 2048;  // cells that a thread takes
+constexpr int64_t AT_A_TIME = 2048;  // cells that a thread takes
+constexpr int64_t LARGE = 1000000;  // entries of a table that is worth several threads
 
-// What rays (B, N) of one sensor make of maps (B, H, W); masks are bytes. `x` (B, H) and `y` (B, W) are the cells' places
-// as seen from the sensors, and `z` (B) the sensors' heights [m]. The last four layers are the results.
+// What rays (B, N) of one sensor make of maps (B, H, W); masks are bytes. `x` (B, H) and `y` (B, W) are the cells'
+// places as seen from the sensors, and `z` (B) the sensors' heights [m]. The last four layers are the results.
 extern "C" int apply_rays(const int32_t* range, const int32_t* azimuth, const float* slope, const float* x,
                           const float* y, const float* z, const float* elevation, const float* variance,
                           const float* time, const float* gradient_x, const float* gradient_y, const float* challenger,
@@ -25,24 +25,20 @@ extern "C" int apply_rays(const int32_t* range, const int32_t* azimuth, const fl
     const Layers layers{elevation,  variance,    time,     gradient_x, gradient_y,
                         challenger, upper_bound, validity, bounded,    challenger_support};
     const Changed changed{new_validity, new_bounded, new_upper_bound, new_challenger_support};
-    const int64_t at_a_time = std::max<int64_t>(1, AT_A_TIME / W);
-    // `each(count, work)` calls work(k) for each k below `count`.
-    auto update = [&](int64_t b, int parts, auto each) {
-        const Table table(polar, {range + b * N, azimuth + b * N, slope + b * N, N}, parts, each);
-        each(int((H + at_a_time - 1) / at_a_time), [&](int k) {
+    const int64_t at_a_time = std::max(int64_t(1), AT_A_TIME / W);
+    auto update = [&](int64_t b, int threads) {
+        const int builders = ranges * azimuths < LARGE ? 1 : threads;
+        const Table table(polar, {range + b * N, azimuth + b * N, slope + b * N, N}, builders);
+        for_each(int((H + at_a_time - 1) / at_a_time), threads, [&](int k) {
             for (int64_t i = b * H + k * at_a_time; i < b * H + std::min(H, (k + 1) * at_a_time); i++)
                 Row{table, polar, settings, layers, changed, i * W, x[i], z[b], y + b * W, int(W)}.apply();
         });
     };
-    auto in_turn = [](int count, auto work) {
-        for (int k = 0; k < count; k++) work(k);
-    };
-    auto side_by_side = [&](int count, auto work) { for_each(count, num_threads, work); };
     return code_of([&] {
         // A thread for each map, or all of them for one map after the other.
-        if (num_threads == 1 || B >= 4 * num_threads)
-            for_each(int(B), num_threads, [&](int b) { update(b, 1, in_turn); });
+        if (B >= 4 * num_threads)
+            for_each(int(B), num_threads, [&](int b) { update(b, 1); });
         else
-            for (int64_t b = 0; b < B; b++) update(b, 4 * num_threads, side_by_side);
+            for (int64_t b = 0; b < B; b++) update(b, num_threads);
     });
 }

@@ -1,5 +1,5 @@
-// The lowest ray at or beyond each range and near each azimuth: `polar_minimum` in ops/operators.py, without the entries
-// that no ray reaches.
+// The lowest ray at or beyond each range and near each azimuth: `polar_minimum` in ops/operators.py, without the
+// entries that no ray reaches.
 #pragma once
 
 #include <algorithm>
@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "../lanes.h"
+#include "../threads.h"
 
 // Of rays from one sensor.
 struct Rays {
@@ -50,9 +51,9 @@ inline Lanes widened(Lanes a, Lanes next, int level) {
     return a;
 }
 
-// Its rows are ranges. Each block of LANES azimuths has rows as far as its rays and those of the next block reach, and a
-// blank row after that. Rows near the sensor, whose entries look at more azimuths than a block and the next one have, are
-// stored once more, whole.
+// Its rows are ranges. Each block of LANES azimuths has rows as far as its rays and those of the next block reach, and
+// a blank row after that. Rows near the sensor, whose entries look at more azimuths than a block and the next one have,
+// are stored whole.
 class Table {
     static constexpr int NEAR_LEVEL = 4;  // 2^4 azimuths: from any of a block to the last but one of the next
     const Polar& polar;
@@ -63,20 +64,20 @@ class Table {
   public:
     int far = 0;  // rows that any ray reaches
 
-    // `each(count, work)` calls work(k) for each k below `count`.
-    template <class Each> Table(const Polar& polar, const Rays& rays, int parts, const Each& each) : polar(polar) {
+    Table(const Polar& polar, const Rays& rays, int num_threads) : polar(polar) {
         measure(rays);
         place_blocks();
         fill(rays);
-        const int count = int(rows.size());
+        const int count = int(rows.size()), parts = num_threads == 1 ? 1 : 4 * num_threads;
         auto begin = [&](int part) { return int(int64_t(part) * count / parts); };
         std::vector<std::vector<float>> next;  // the blocks that follow each part, unchanged
         for (int k = 1; k <= parts; k++) next.push_back(copy_of(begin(k)));
-        each(parts, [&](int k) {
+        for_each(parts, num_threads, [&](int turn) {
+            const int k = parts - 1 - turn;  // from the last one on, or tests on one core would not miss the copies
             for (int b = begin(k); b < begin(k + 1); b++)
                 scan_block(b, b + 1 == begin(k + 1) ? next[k].data() : blocks.data() + first[b + 1]);
         });
-        each(near, [&](int row) { widen_row(row); });
+        for_each(near, num_threads, [&](int row) { widen_row(row); });
     }
 
     float at(int row, int azimuth) const {
@@ -151,7 +152,7 @@ class Table {
         }
     }
 
-    // Make each entry of a row that is stored whole the minimum of itself and the 2^level - 1 that follow it, all around.
+    // Make each entry of a whole row the minimum of itself and the 2^level - 1 that follow it, all around.
     void widen_row(int row) {
         const int width = polar.azimuths;
         float* entry = whole.data() + row * width;
