@@ -32,6 +32,20 @@ inline Lanes root(Lanes a) {
     return of_each(a, [](float value) { return __builtin_sqrtf(value); });
 }
 
+inline Lanes floor_of(Lanes a) {
+    return of_each(a, [](float value) { return __builtin_floorf(value); });
+}
+inline Flags integers(Lanes a) { return __builtin_convertvector(a, Flags); }
+inline Lanes numbers(Flags a) { return __builtin_convertvector(a, Lanes); }
+
+// Return how many flags are set.
+inline int count_set(Flags flags) {
+    int32_t values[LANES], total = 0;
+    std::memcpy(values, &flags, sizeof flags);
+    for (int l = 0; l < LANES; l++) total -= values[l];
+    return total;
+}
+
 inline Lanes load(const float* values, int count = LANES) {
     Lanes lanes{};
     std::memcpy(&lanes, values, sizeof(float) * count);

@@ -7,20 +7,7 @@ constexpr int TOP = 6;    // level of the bound of the whole tile; the blocks of
 constexpr int FIRST = 3;  // level that a ray begins at
 constexpr float TINY = 1e-9f, ENDLESS = 1e9f;
 
-inline Lanes floor_of(Lanes a) {
-    return of_each(a, [](float value) { return __builtin_floorf(value); });
-}
-inline Flags integers(Lanes a) { return __builtin_convertvector(a, Flags); }
-inline Lanes numbers(Flags a) { return __builtin_convertvector(a, Lanes); }
 inline Lanes power_of_two(Flags exponent) { return (Lanes)((exponent + 127) << 23); }
-
-// Return how many flags are set.
-inline int count_set(Flags flags) {
-    int32_t values[LANES], total = 0;
-    std::memcpy(values, &flags, sizeof flags);
-    for (int l = 0; l < LANES; l++) total -= values[l];
-    return total;
-}
 
 // A tile: HeightField, and its bounds.
 struct Field {

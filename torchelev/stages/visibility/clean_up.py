@@ -1,85 +1,33 @@
-"""Rays: what lies below a ray that reached farther is gone, and what no ray saw lies below the lowest ray.
-
-All rays of a sensor share their origin, so a ray over a cell is known by azimuth and slope. Instead of marching along
-each ray, a polar table holds for each (range, azimuth) the lowest slope of the rays that reached farther; each cell
-looks its own entry up. Cost: points + table + cells, whatever the length of the rays.
-"""
+"""Rays: what lies below a ray that reached farther is gone, and what no ray saw lies below the lowest ray."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.indexing import read
 from torchelev.ops.masks import count
-from torchelev.ops.operators import polar_minimum
 from torchelev.ops.storage import stored
-from torchelev.stages.cells import center_offsets
-from torchelev.stages.visibility.accepted_rays import Rays, accepted_rays, height_margin, sensor_rays
+from torchelev.stages.visibility.accepted_rays import accepted_rays, height_margin, sensor_rays
 from torchelev.stages.visibility.config import RaycastConfig
-from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
+from torchelev.stages.visibility.lowest_rays import (
+    RayBins,
+    RayOverCell,
+    View,
+    bins_of,
+    find_lowest_rays,
+    lowest_slopes,
+    view_from,
+)
+from torchelev.stages.visibility.one_pass import has_one_pass, in_one_pass
+from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-
-
-NO_RAY = 1e4  # a slope above every ray's
-
-
-def lowest_slopes(rays: Rays, polar: PolarGrid, grid: GridConfig) -> Float[Tensor, "B R P"]:
-    """Return, for each range bin and azimuth, the lowest slope of the rays that reach at least a cell farther.
-
-    At short range, where a cell covers several azimuth bins, an entry is the minimum of about half as many.
-    """
-    # Less its noise, or every other ray to the face of a step would seem to pass through the step's edge.
-    last = torch.floor((rays.r - rays.noise) / grid.resolution).clamp(max=polar.ranges + 1) - 2
-    a = torch.floor(rays.azimuth * polar.azimuths).clamp(max=polar.azimuths - 1)
-    index = flat(torch.where(rays.casts & (last >= 0), last, polar.ranges), a, polar.azimuths)
-    return polar_minimum(index.to(torch.int64), rays.slope, polar.azimuths, list(polar.widen), polar.ranges, NO_RAY)
-
-
-class RayOverCell(NamedTuple):
-    """The lowest ray of one sensor over each cell."""
-
-    found: Bool[Tensor, "B H W"]  #: a ray passes over the cell
-    height: Float[Tensor, "B H W"]  #: [m] over the cell's centre
-    fall: Float[Tensor, "B H W"]  #: [m] how far it falls over a cell's length, or rises
-    incidence: Float[Tensor, "B H W"]  #: |r . n|
-
-
-def find_lowest_rays(
-    state: MapState, m: Measurement, origin: Tensor, table: Tensor, polar: PolarGrid, grid: GridConfig
-) -> RayOverCell:
-    """Gather the lowest ray over each cell, or less than a cell beside it."""
-    x, y = center_offsets(state, m, grid)
-    x, y, z_s = x - origin[:, 0, None, None], y - origin[:, 1, None, None], origin[:, 2, None, None]
-    rho = (x.square() + y.square()).clamp(min=1e-12).sqrt()
-    k = torch.floor(rho / grid.resolution).clamp(max=polar.ranges)
-    lowest = lowest_slope(table, k, azimuth_fraction(x, y) * polar.azimuths, polar)
-    found = lowest < NO_RAY
-    slope = lowest * found
-    gx, gy = state.gradient_x, state.gradient_y
-    along = (slope - (gx * x + gy * y) / rho).abs()
-    incidence = along / ((1 + slope.square()) * (1 + gx.square() + gy.square())).sqrt()
-    return RayOverCell(found, z_s + slope * rho, slope.abs() * grid.resolution, incidence)
-
-
-@stored
-def lowest_slope(table: Tensor, k: Tensor, azimuth: Tensor, polar: PolarGrid) -> Float[Tensor, "B H W"]:
-    """Return the lowest slope in all azimuth bins that cells at range k cover; `azimuth` counts bins."""
-    # Two entries, the first and the last, hold the minimum of all.
-    width, entry = polar.covered(k)
-    a = torch.floor(azimuth - 0.5 * width)
-    further = (torch.floor(azimuth + 0.5 * width) - a + 1 - entry).clamp(min=0)
-    a = torch.where(a < 0, a + polar.azimuths, a).clamp(max=polar.azimuths - 1)
-    b = a + further
-    b = torch.where(b < polar.azimuths, b, b - polar.azimuths)
-    return torch.minimum(*(read(table, flat(k, place, polar.azimuths)) for place in (a, b)))
+    from jaxtyping import Bool
 
 
 def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None) -> MapState:
@@ -96,9 +44,21 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     polar, known = PolarGrid.of(grid, cfg), state.validity
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
-        table = lowest_slopes(accepted_rays(state, m, rays, grid, cfg), polar, grid)
-        state = clear_and_bound(state, find_lowest_rays(state, m, rays.origin, table, polar, grid), grid, cfg)
+        bins = bins_of(accepted_rays(state, m, rays, grid, cfg), polar, grid)
+        apply = apply_in_one_pass if has_one_pass(state) else apply_rays
+        state = apply(state, bins, view_from(state, m, rays.origin, grid), polar, grid, cfg)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
+
+
+def apply_rays(
+    state: MapState, rays: RayBins, view: View, polar: PolarGrid, grid: GridConfig, cfg: RaycastConfig
+) -> MapState:
+    """Apply the lowest of one sensor's rays over each cell."""
+    table = lowest_slopes(rays, polar)
+    return clear_and_bound(state, find_lowest_rays(state, view, table, polar, grid), grid, cfg)
+
+
+apply_in_one_pass = in_one_pass(apply_rays)
 
 
 @stored

@@ -1,0 +1,44 @@
+// What the rays of one sensor say of the cells below them: stages/visibility/clean_up.py.
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that cells and rays fall into the same bins
+#else
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#include "cells.h"
+
+constexpr int64_t AT_A_TIME = 2048;  // cells that a thread takes
+constexpr int64_t LARGE = 1000000;  // entries of a table that is worth several threads
+
+// What rays (B, N) of one sensor make of maps (B, H, W); masks are bytes. `x` (B, H) and `y` (B, W) are the cells'
+// places as seen from the sensors, and `z` (B) the sensors' heights [m]. The last four layers are the results.
+extern "C" int apply_rays(const int32_t* range, const int32_t* azimuth, const float* slope, const float* x,
+                          const float* y, const float* z, const float* elevation, const float* variance,
+                          const float* time, const float* gradient_x, const float* gradient_y, const float* challenger,
+                          const float* upper_bound, const uint8_t* validity, const uint8_t* bounded,
+                          const uint8_t* challenger_support, uint8_t* new_validity, uint8_t* new_bounded,
+                          float* new_upper_bound, uint8_t* new_challenger_support, int64_t B, int64_t N, int64_t H,
+                          int64_t W, int64_t ranges, int64_t azimuths, int64_t levels, const int64_t* widen, float bins,
+                          float resolution, float min_time, float min_incidence, float gate, int num_threads) {
+    const Polar polar{int(ranges), int(azimuths), bins, widen, int(levels)};
+    const Settings settings{resolution, min_time, min_incidence, gate};
+    const Layers layers{elevation,  variance,    time,     gradient_x, gradient_y,
+                        challenger, upper_bound, validity, bounded,    challenger_support};
+    const Changed changed{new_validity, new_bounded, new_upper_bound, new_challenger_support};
+    const int64_t at_a_time = std::max(int64_t(1), AT_A_TIME / W);
+    auto update = [&](int64_t b, int threads) {
+        const int builders = ranges * azimuths < LARGE ? 1 : threads;
+        const Table table(polar, {range + b * N, azimuth + b * N, slope + b * N, N}, builders);
+        for_each(int((H + at_a_time - 1) / at_a_time), threads, [&](int k) {
+            for (int64_t i = b * H + k * at_a_time; i < b * H + std::min(H, (k + 1) * at_a_time); i++)
+                Row{table, polar, settings, layers, changed, i * W, x[i], z[b], y + b * W, int(W)}.apply();
+        });
+    };
+    return code_of([&] {
+        // A thread for each map, or all of them for one map after the other.
+        if (B >= 4 * num_threads)
+            for_each(int(B), num_threads, [&](int b) { update(b, 1); });
+        else
+            for (int64_t b = 0; b < B; b++) update(b, num_threads);
+    });
+}

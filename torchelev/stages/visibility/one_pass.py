@@ -1,0 +1,116 @@
+"""Rays over cells in one pass of C++ (`torchelev/native/rays`): the same as `apply_rays`, several times as fast."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig
+from torchelev.native.library import call, load
+from torchelev.ops.masks import NOWHERE
+from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.ops.transforms import is_transforming
+from torchelev.stages.visibility.config import RaycastConfig
+from torchelev.stages.visibility.lowest_rays import NO_RAY, RayBins, View
+from torchelev.stages.visibility.polar_table import PolarGrid
+from torchelev.state import MASKS, MapState
+
+CHANGED = ("validity", "bounded", "upper_bound", "challenger_support")
+_HEIGHTS = ("elevation", "variance", "time", "gradient_x", "gradient_y", "challenger", "upper_bound")
+READ = (*_HEIGHTS, "validity", "bounded", "challenger_support")  # in the order of C++, like CHANGED
+_CONSTANTS = {"NO_RAY": f"{NO_RAY!r}f", "NOWHERE": f"{NOWHERE!r}f"}
+_LARGEST = 2**30  # entries of a table, as they are counted in 32 bits
+
+Apply = Callable[[MapState, RayBins, View, PolarGrid, GridConfig, RaycastConfig], MapState]
+
+
+def has_one_pass(state: MapState) -> bool:
+    """Tell whether what `in_one_pass` returns may run: it computes float32 on a CPU, and has no gradient."""
+    heights = state.elevation
+    is_plain = heights.is_cpu and heights.dtype == torch.float32
+    return is_plain and not torch.is_grad_enabled() and not is_transforming()
+
+
+def in_one_pass(twin: Apply) -> Apply:
+    """Return a function that does what its twin does, and calls it where C++ cannot be built."""
+
+    @torch.library.custom_op("torchelev::apply_rays", mutates_args=())
+    def operator(
+        rays: list[Tensor],
+        view: list[Tensor],
+        layers: list[Tensor],
+        ranges: int,
+        azimuths: int,
+        bins: float,
+        widen: list[int],
+        settings: list[float],
+    ) -> list[Tensor]:
+        polar = PolarGrid(ranges, azimuths, bins, tuple(widen))
+        changed = _native(rays, view, layers, polar, settings)
+        if changed is None:
+            state, grid, cfg = _described(layers, *settings)
+            changed = _layers(twin(state, RayBins(*rays), View(*view), polar, grid, cfg), CHANGED)
+        return changed
+
+    @operator.register_fake
+    def _(rays: list[Tensor], view: list[Tensor], layers: list[Tensor], *_: object) -> list[Tensor]:
+        return _new(layers)
+
+    def apply(
+        state: MapState, rays: RayBins, view: View, polar: PolarGrid, grid: GridConfig, cfg: RaycastConfig
+    ) -> MapState:
+        sizes = polar.ranges, polar.azimuths, polar.bins, list(polar.widen)
+        settings = [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.gate]
+        changed = operator(list(rays), list(view), _layers(state, READ), *sizes, settings)
+        return state._replace(**_named(CHANGED, changed))  # type: ignore[arg-type]
+
+    return apply
+
+
+def _layers(state: MapState, names: tuple[str, ...]) -> list[Tensor]:
+    """Return layers of the state, masks as bytes."""
+    return [as_bytes(getattr(state, name)) if name in MASKS else getattr(state, name) for name in names]
+
+
+def _named(names: tuple[str, ...], layers: list[Tensor]) -> dict[str, Tensor]:
+    """Return layers by name, masks of bytes."""
+    return {name: as_mask(layer) if name in MASKS else layer for name, layer in zip(names, layers, strict=True)}
+
+
+def _new(layers: list[Tensor]) -> list[Tensor]:
+    """Return memory for the changed layers."""
+    old = (layers[READ.index(name)] for name in CHANGED)
+    return [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in old]
+
+
+def _described(
+    layers: list[Tensor], resolution: float, min_time: float, min_incidence: float, gate: float
+) -> tuple[MapState, GridConfig, RaycastConfig]:
+    """Return what the operator was called for, as far as its twin asks."""
+    state = MapState(**(dict.fromkeys(MapState._fields) | _named(READ, layers)))  # type: ignore[arg-type]
+    length_x, length_y = (size * resolution for size in layers[0].shape[1:])
+    grid = GridConfig(resolution=resolution, length_x=length_x, length_y=length_y)
+    return state, grid, RaycastConfig(min_time=min_time, min_incidence=min_incidence, gate=gate)
+
+
+def _native(
+    rays: list[Tensor], view: list[Tensor], layers: list[Tensor], polar: PolarGrid, settings: list[float]
+) -> list[Tensor] | None:
+    """Return the changed layers; None where C++ cannot compute them."""
+    if layers[0].numel() == 0 or polar.ranges * polar.azimuths > _LARGEST:
+        return None
+    library = load("rays/rays.cpp", _CONSTANTS)
+    if library is None:
+        return None
+    inputs = [value.contiguous() for value in (*rays, *view, *layers)]
+    changed = _new(layers)
+    pointers = [ctypes.c_void_p(tensor.data_ptr()) for tensor in (*inputs, *changed)]
+    sizes = (*rays[0].shape, *layers[0].shape[1:], polar.ranges, polar.azimuths, len(polar.widen))
+    widen = (ctypes.c_int64 * len(polar.widen))(*polar.widen)
+    numbers = [ctypes.c_float(value) for value in (polar.bins, *settings)]
+    whole = [ctypes.c_int64(size) for size in sizes]
+    call(library.apply_rays, *pointers, *whole, widen, *numbers, torch.get_num_threads())
+    return changed
