@@ -1,0 +1,173 @@
+// Normals and the analytic head's rating of maps: traversability/surface.py.
+
+#include "../threads.h"
+#include "planes.h"
+
+namespace {
+
+constexpr int ROWS = 64, COLUMNS = 256;  // of a tile
+
+// The numbers of `surface.py`.
+struct Settings {
+    float resolution;     // [m]
+    float min_spread[2];  // [cells^2] of the normals' windows and of the head's
+    float critical_slope, critical_step, critical_roughness;
+};
+
+// Layers of a map (H, W), from some cell on.
+struct Layers {
+    float *gradient_x, *gradient_y;
+    uint8_t* has_normal;
+    float* traversability;
+    uint8_t* rated;
+
+    Layers from(size_t cell) const {
+        const bool has_head = traversability;
+        return {gradient_x + cell, gradient_y + cell, has_normal + cell,
+                has_head ? traversability + cell : nullptr, has_head ? rated + cell : nullptr};
+    }
+};
+
+void put(float* layer, Lanes values, int count) {
+    count == LANES ? store(layer, values) : store(layer, values, count);
+}
+
+void put(uint8_t* layer, Flags flags, int count) {
+    const Bytes bytes = bytes_of(flags);
+    count == LANES ? std::memcpy(layer, &bytes, LANES) : std::memcpy(layer, &bytes, count);
+}
+
+// What a thread keeps from one tile to the next, as fresh memory takes longer than the work.
+struct Scratch {
+    Tile tile;
+    Lines lines[2];
+};
+
+// Normals and ratings of tiles, row by row.
+class Rater {
+public:
+    Rater(const Settings& settings, int radius, int cells, Scratch& scratch)
+        : settings_(settings), radius_(radius), cells_(cells), tile_(scratch.tile), lines_(scratch.lines) {}
+
+    void rate(const float* elevation, const uint8_t* validity, int H, int W, const Extent& extent, const Layers& layers) {
+        const int rim = std::max(radius_, cells_);
+        const bool is_known = tile_.read(elevation, validity, H, W, extent, rim);
+        lines_[0].resize(radius_, extent.columns, rim), lines_[1].resize(cells_, extent.columns, rim);
+        for (int row = 0; row < extent.rows; row++) {
+            const Layers out = layers.from(size_t(extent.first_row + row) * W + extent.first_column);
+            if (!is_known)
+                clear(out, 0, extent.columns);
+            else if (cells_)
+                rate_row<true>(row, extent.columns, out);
+            else
+                rate_row<false>(row, extent.columns, out);
+        }
+    }
+
+private:
+    const Settings& settings_;
+    int radius_, cells_;  // of the normals' windows, and of the head's; 0 without it
+    Tile& tile_;
+    Lines* lines_;
+
+    static void clear(const Layers& out, int begin, int end) {
+        const int count = end - begin;
+        std::fill_n(out.gradient_x + begin, count, 0.0f), std::fill_n(out.gradient_y + begin, count, 0.0f);
+        std::fill_n(out.has_normal + begin, count, uint8_t(0));
+        if (!out.traversability) return;
+        std::fill_n(out.traversability + begin, count, 0.0f), std::fill_n(out.rated + begin, count, uint8_t(0));
+    }
+
+    bool is_known(int row, int column) const { return any(load(tile_.known(row, column)) > 0); }
+
+    // Rate the runs of known cells, which are all that has a normal or a rating.
+    template <bool HAS_HEAD> void rate_row(int row, int columns, const Layers& out) {
+        for (int begin = 0, end; begin < columns; begin = end) {
+            const bool known = is_known(row, begin);
+            for (end = begin + LANES; end < columns && is_known(row, end) == known;) end += LANES;
+            end = std::min(end, columns);
+            known ? rate_run<HAS_HEAD>(row, begin, end, out) : clear(out, begin, end);
+        }
+    }
+
+    template <bool HAS_HEAD> void rate_run(int row, int begin, int end, const Layers& out) {
+        Lines& normals = lines_[0];
+        Lines& head = lines_[HAS_HEAD && cells_ != radius_];
+        Lines& inner = HAS_HEAD && cells_ < radius_ ? head : normals;
+        sum_rows<HAS_HEAD>(tile_, row, begin, end, inner, &inner == &head ? normals : head);
+        with_radius(radius_, [&](auto radius) {
+            for_planes<radius>(normals, row, begin, end, settings_.min_spread[0], [&](auto&&... at) {
+                put_normals(out, at...);
+                if (HAS_HEAD && &head == &normals) put_ratings<radius>(out, head, at...);
+            });
+        });
+        if (!HAS_HEAD || &head == &normals) return;
+        with_radius(cells_, [&](auto radius) {
+            for_planes<radius>(head, row, begin, end, settings_.min_spread[1],
+                               [&](auto&&... at) { put_ratings<radius>(out, head, at...); });
+        });
+    }
+
+    // Call `use` with the planes of the cells begin to end of a row, and with where they are known.
+    template <int RADIUS, class Use>
+    void for_planes(const Lines& lines, int row, int begin, int end, float min_spread, const Use& use) const {
+        for (int column = begin; column < end; column += LANES) {
+            const Flags known = load(tile_.known(row, column)) > 0;
+            use(column, std::min(LANES, end - column), known, Planes::of<RADIUS>(lines, column, min_spread));
+        }
+    }
+
+    void put_normals(const Layers& out, int column, int count, Flags known, const Planes& planes) const {
+        const float per_cell = 1 / settings_.resolution;
+        const Flags has_normal = known & planes.spans;
+        put(out.gradient_x + column, pick(has_normal, planes.gradient_u * per_cell, all(0)), count);
+        put(out.gradient_y + column, pick(has_normal, planes.gradient_v * per_cell, all(0)), count);
+        put(out.has_normal + column, has_normal, count);
+    }
+
+    template <int RADIUS>
+    void put_ratings(const Layers& out, const Lines& lines, int column, int count, Flags known, const Planes& planes) const {
+        const Flags rated = known & planes.spans;
+        put(out.traversability + column, pick(rated, rating<RADIUS>(planes, lines, column), all(0)), count);
+        put(out.rated + column, rated, count);
+    }
+
+    // `traversability` in heads.py
+    template <int RADIUS>
+    [[gnu::always_inline]] Lanes rating(const Planes& planes, const Lines& lines, int column) const {
+        const float per_cell = 1 / settings_.resolution;
+        const Lanes x = planes.gradient_u * per_cell, y = planes.gradient_v * per_cell;
+        const Lanes slope = arctan(root(larger(x * x + y * y, all(1e-12f))));
+        const Lanes explained = float(2 * cells_) * (absolute(planes.gradient_u) + absolute(planes.gradient_v));
+        const Lanes highest = largest_along<RADIUS>(lines, Lines::HIGHEST, column);
+        const Lanes range = highest + largest_along<RADIUS>(lines, Lines::MINUS_LOWEST, column);
+        const Lanes step = larger(range - explained, all(0));
+        const Lanes roughness = root(larger(planes.residual, all(1e-12f)));
+        const Lanes worst = larger(slope * (1 / settings_.critical_slope), step * (1 / settings_.critical_step));
+        return larger(1 - larger(worst, roughness * (1 / settings_.critical_roughness)), all(0));
+    }
+};
+
+int parts(int length, int size) { return (length + size - 1) / size; }
+
+}  // namespace
+
+// Layers of (B, H, W) as in surface.py; without the head, `cells` is 0, and so are `traversability` and `rated`.
+// Returns what `code_of` does.
+extern "C" int rate_surface(const float* elevation, const uint8_t* validity, float* gradient_x, float* gradient_y,
+                            uint8_t* has_normal, float* traversability, uint8_t* rated, int64_t B, int64_t H, int64_t W,
+                            int64_t radius, int64_t cells, const float* settings, int num_threads) {
+    Settings numbers;
+    std::memcpy(&numbers, settings, sizeof numbers);
+    const Layers layers{gradient_x, gradient_y, has_normal, traversability, rated};
+    const int bands = parts(H, ROWS), strips = parts(W, COLUMNS);
+    auto rate = [&](int task) {
+        thread_local Scratch scratch;
+        const size_t first = size_t(task / (bands * strips)) * H * W;
+        const int band = task / strips % bands, strip = task % strips;
+        const int row = band * H / bands, column = strip * W / strips;
+        const Extent extent{row, int((band + 1) * H / bands) - row, column, int((strip + 1) * W / strips) - column};
+        Rater(numbers, radius, cells, scratch).rate(elevation + first, validity + first, H, W, extent, layers.from(first));
+    };
+    return code_of([&] { for_each(B * bands * strips, num_threads, rate); });
+}
