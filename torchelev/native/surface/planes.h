@@ -8,19 +8,19 @@ struct Places {
     Lanes weight;  // 1 / number of cells
     Lanes u, v, uu, uv, vv;
 
-    template <int RADIUS> [[gnu::always_inline]] static Places of(const Lines& lines, int column) {
-        const int r = RADIUS ? RADIUS : lines.radius;
+    template <int RADIUS> [[gnu::always_inline]] static Places of(const Window<RADIUS>& window, int column) {
+        const int r = window.radius();
         const float full = float((2 * r + 1) * (2 * r + 1)), variance = float(r * (r + 1)) / 3;
-        const Lanes n = sum_along<RADIUS>(lines, Lines::N, column);
+        Lanes n{};
+        window.each([&](int k) { n += window.at(k, Lines::N, column); });
         const Lanes weight = 1 / larger(n, all(1));
         if (!any(n != full)) return {weight, all(0), all(0), all(variance), all(0), all(variance)};
         Lanes n_u{}, n_v{}, n_uu{}, n_uv{}, n_vv{};
-#pragma GCC unroll 8
-        for (int k = -r; k <= r; k++) {
-            const Lanes known = load(lines.at(Lines::N, column + k)), known_u = load(lines.at(Lines::U_N, column + k));
-            n_u += known_u, n_uv += float(k) * known_u, n_uu += load(lines.at(Lines::UU_N, column + k));
-            n_v += float(k) * known, n_vv += float(k * k) * known;
-        }
+        window.each([&](int k) {
+            const Lanes known = window.at(k, Lines::N, column), known_v = window.at(k, Lines::V_N, column);
+            n_v += known_v, n_uv += float(k) * known_v, n_vv += window.at(k, Lines::VV_N, column);
+            n_u += float(k) * known, n_uu += float(k * k) * known;
+        });
         const Lanes u = n_u * weight, v = n_v * weight;
         return {weight, u, v, n_uu * weight - u * u, n_uv * weight - u * v, n_vv * weight - v * v};
     }
@@ -39,16 +39,14 @@ struct Planes {
     Lanes residual;                // [m^2]
 
     template <int RADIUS>
-    [[gnu::always_inline]] static Planes of(const Lines& lines, int column, float min_spread) {
-        const int r = RADIUS ? RADIUS : lines.radius;
-        const Places at = Places::of<RADIUS>(lines, column);
+    [[gnu::always_inline]] static Planes of(const Window<RADIUS>& window, int column, float min_spread) {
+        const Places at = Places::of(window, column);
         Lanes s_z{}, s_uz{}, s_vz{}, s_zz{};
-#pragma GCC unroll 8
-        for (int k = -r; k <= r; k++) {
-            const Lanes height = load(lines.at(Lines::Z, column + k));
-            s_z += height, s_vz += float(k) * height;
-            s_uz += load(lines.at(Lines::U_Z, column + k)), s_zz += load(lines.at(Lines::ZZ, column + k));
-        }
+        window.each([&](int k) {
+            const Lanes height = window.at(k, Lines::Z, column);
+            s_z += height, s_uz += float(k) * height;
+            s_vz += window.at(k, Lines::V_Z, column), s_zz += window.at(k, Lines::ZZ, column);
+        });
         const Lanes z = s_z * at.weight, uz = s_uz * at.weight - at.u * z, vz = s_vz * at.weight - at.v * z;
         const Lanes det = at.uu * at.vv - at.uv * at.uv, trace = at.uu + at.vv;
         const Flags is_regular = det > MIN_DET;  // `solve_gradient`

@@ -5,7 +5,7 @@
 
 namespace {
 
-constexpr int ROWS = 64, COLUMNS = 256;  // of a tile
+constexpr int ROWS = 64, COLUMNS = 128;  // of a tile: the sums of its last rows stay in the nearest cache
 
 // The numbers of `surface.py`.
 struct Settings {
@@ -39,7 +39,7 @@ void put(uint8_t* layer, Flags flags, int count) {
 
 // What a thread keeps from one tile to the next, as fresh memory takes longer than the work.
 struct Scratch {
-    Tile tile;
+    Row row;
     Lines lines[2];
 };
 
@@ -47,28 +47,29 @@ struct Scratch {
 class Rater {
 public:
     Rater(const Settings& settings, int radius, int cells, Scratch& scratch)
-        : settings_(settings), radius_(radius), cells_(cells), tile_(scratch.tile), lines_(scratch.lines) {}
+        : settings_(settings), cells_(cells), rim_(std::max(radius, cells)), row_(scratch.row),
+          normals_(scratch.lines[0]), head_(scratch.lines[cells != 0 && cells != radius]) {
+        normals_.radius = radius, head_.radius = cells ? cells : radius;
+    }
 
-    void rate(const float* elevation, const uint8_t* validity, int H, int W, const Extent& extent, const Layers& layers) {
-        const int rim = std::max(radius_, cells_);
-        const bool is_known = tile_.read(elevation, validity, H, W, extent, rim);
-        lines_[0].resize(radius_, extent.columns, rim), lines_[1].resize(cells_, extent.columns, rim);
-        for (int row = 0; row < extent.rows; row++) {
-            const Layers out = layers.from(size_t(extent.first_row + row) * W + extent.first_column);
-            if (!is_known)
-                clear(out, 0, extent.columns);
-            else if (cells_)
-                rate_row<true>(row, extent.columns, out);
-            else
-                rate_row<false>(row, extent.columns, out);
-        }
+    void rate(const Map& map, const Extent& extent, const Layers& layers) {
+        const bool is_known = row_.choose(map, extent, rim_);
+        for (Lines* lines : {&normals_, &head_}) lines->resize(lines->radius, extent.columns, 2 * rim_ + 1);
+        if (is_known)
+            cells_ ? rate_rows<true>(map, extent, layers) : rate_rows<false>(map, extent, layers);
+        else
+            for (int row = 0; row < extent.rows; row++) clear(row_of(layers, map, extent, row), 0, extent.columns);
     }
 
 private:
     const Settings& settings_;
-    int radius_, cells_;  // of the normals' windows, and of the head's; 0 without it
-    Tile& tile_;
-    Lines* lines_;
+    int cells_, rim_;
+    Row& row_;
+    Lines &normals_, &head_;  // the same if their windows are, or without a head
+
+    static Layers row_of(const Layers& layers, const Map& map, const Extent& extent, int row) {
+        return layers.from(size_t(extent.first_row + row) * map.W + extent.first_column);
+    }
 
     static void clear(const Layers& out, int begin, int end) {
         const int count = end - begin;
@@ -78,7 +79,21 @@ private:
         std::fill_n(out.traversability + begin, count, 0.0f), std::fill_n(out.rated + begin, count, uint8_t(0));
     }
 
-    bool is_known(int row, int column) const { return any(load(tile_.known(row, column)) > 0); }
+    template <bool HAS_HEAD> void rate_rows(const Map& map, const Extent& extent, const Layers& layers) {
+        for (int row = -rim_; row < extent.rows + rim_; row++) {
+            row_.read(row);
+            if (head_.radius > normals_.radius)
+                sum_along<false, HAS_HEAD>(row_, row, extent.columns, normals_, head_);
+            else
+                sum_along<HAS_HEAD, false>(row_, row, extent.columns, head_, normals_);
+            const int middle = row - rim_;  // of the windows that this row completes
+            if (middle >= 0) rate_row<HAS_HEAD>(middle, extent.columns, row_of(layers, map, extent, middle));
+        }
+    }
+
+    bool is_known(int row, int column) const {
+        return any(load(normals_.row(row) + normals_.at(Lines::KNOWN, column)) > 0);
+    }
 
     // Rate the runs of known cells, which are all that has a normal or a rating.
     template <bool HAS_HEAD> void rate_row(int row, int columns, const Layers& out) {
@@ -91,33 +106,32 @@ private:
     }
 
     template <bool HAS_HEAD> void rate_run(int row, int begin, int end, const Layers& out) {
-        Lines& normals = lines_[0];
-        Lines& head = lines_[HAS_HEAD && cells_ != radius_];
-        Lines& inner = HAS_HEAD && cells_ < radius_ ? head : normals;
-        sum_rows<HAS_HEAD>(tile_, row, begin, end, inner, &inner == &head ? normals : head);
-        with_radius(radius_, [&](auto radius) {
-            for_planes<radius>(normals, row, begin, end, settings_.min_spread[0], [&](auto&&... at) {
+        const bool is_shared = HAS_HEAD && &head_ == &normals_;
+        with_radius(normals_.radius, [&](auto radius) {
+            const Window<radius> window(normals_, row);
+            for_planes(window, begin, end, settings_.min_spread[0], [&](auto&&... at) {
                 put_normals(out, at...);
-                if (HAS_HEAD && &head == &normals) put_ratings<radius>(out, head, at...);
+                if (is_shared) put_ratings(out, window, at...);
             });
         });
-        if (!HAS_HEAD || &head == &normals) return;
-        with_radius(cells_, [&](auto radius) {
-            for_planes<radius>(head, row, begin, end, settings_.min_spread[1],
-                               [&](auto&&... at) { put_ratings<radius>(out, head, at...); });
+        if (!HAS_HEAD || is_shared) return;
+        with_radius(head_.radius, [&](auto radius) {
+            const Window<radius> window(head_, row);
+            for_planes(window, begin, end, settings_.min_spread[1],
+                       [&](auto&&... at) { put_ratings(out, window, at...); });
         });
     }
 
     // Call `use` with the planes of the cells begin to end of a row, and with where they are known.
     template <int RADIUS, class Use>
-    void for_planes(const Lines& lines, int row, int begin, int end, float min_spread, const Use& use) const {
+    static void for_planes(const Window<RADIUS>& window, int begin, int end, float min_spread, const Use& use) {
         for (int column = begin; column < end; column += LANES) {
-            const Flags known = load(tile_.known(row, column)) > 0;
-            use(column, std::min(LANES, end - column), known, Planes::of<RADIUS>(lines, column, min_spread));
+            const Flags known = window.at(0, Lines::KNOWN, column) > 0;
+            use(column, std::min(LANES, end - column), known, Planes::of(window, column, min_spread));
         }
     }
 
-    void put_normals(const Layers& out, int column, int count, Flags known, const Planes& planes) const {
+    [[gnu::always_inline]] void put_normals(const Layers& out, int column, int count, Flags known, const Planes& planes) const {
         const float per_cell = 1 / settings_.resolution;
         const Flags has_normal = known & planes.spans;
         put(out.gradient_x + column, pick(has_normal, planes.gradient_u * per_cell, all(0)), count);
@@ -126,21 +140,21 @@ private:
     }
 
     template <int RADIUS>
-    void put_ratings(const Layers& out, const Lines& lines, int column, int count, Flags known, const Planes& planes) const {
+    [[gnu::always_inline]] void put_ratings(const Layers& out, const Window<RADIUS>& window, int column, int count, Flags known,
+                     const Planes& planes) const {
         const Flags rated = known & planes.spans;
-        put(out.traversability + column, pick(rated, rating<RADIUS>(planes, lines, column), all(0)), count);
+        const Lanes highest = window.largest(Lines::HIGHEST, column);
+        const Lanes range = highest + window.largest(Lines::MINUS_LOWEST, column);
+        put(out.traversability + column, pick(rated, rating(planes, range), all(0)), count);
         put(out.rated + column, rated, count);
     }
 
-    // `traversability` in heads.py
-    template <int RADIUS>
-    [[gnu::always_inline]] Lanes rating(const Planes& planes, const Lines& lines, int column) const {
+    // `traversability` in heads.py, given the height range of the windows [m].
+    [[gnu::always_inline]] Lanes rating(const Planes& planes, Lanes range) const {
         const float per_cell = 1 / settings_.resolution;
         const Lanes x = planes.gradient_u * per_cell, y = planes.gradient_v * per_cell;
         const Lanes slope = arctan(root(larger(x * x + y * y, all(1e-12f))));
         const Lanes explained = float(2 * cells_) * (absolute(planes.gradient_u) + absolute(planes.gradient_v));
-        const Lanes highest = largest_along<RADIUS>(lines, Lines::HIGHEST, column);
-        const Lanes range = highest + largest_along<RADIUS>(lines, Lines::MINUS_LOWEST, column);
         const Lanes step = larger(range - explained, all(0));
         const Lanes roughness = root(larger(planes.residual, all(1e-12f)));
         const Lanes worst = larger(slope * (1 / settings_.critical_slope), step * (1 / settings_.critical_step));
@@ -167,7 +181,8 @@ extern "C" int rate_surface(const float* elevation, const uint8_t* validity, flo
         const int band = task / strips % bands, strip = task % strips;
         const int row = band * H / bands, column = strip * W / strips;
         const Extent extent{row, int((band + 1) * H / bands) - row, column, int((strip + 1) * W / strips) - column};
-        Rater(numbers, radius, cells, scratch).rate(elevation + first, validity + first, H, W, extent, layers.from(first));
+        const Map map{elevation + first, validity + first, int(H), int(W)};
+        Rater(numbers, radius, cells, scratch).rate(map, extent, layers.from(first));
     };
     return code_of([&] { for_each(B * bands * strips, num_threads, rate); });
 }

@@ -1,18 +1,18 @@
-// Sums over the windows around the cells of a row: first over the rows above and below, then along the row.
+// Sums over the windows around the cells of a row: first along each row, then over the rows above and below.
 #pragma once
 
-#include "tile.h"
+#include "rows.h"
 
-// Sums over the cells above and below; u counts rows from the middle one.
+// Sums over the cells to the left and right; v counts columns from the middle one.
 struct Sums {
-    Lanes n{}, u_n{}, uu_n{};  // of known cells
-    Lanes z{}, u_z{}, zz{};    // of their heights [m]
+    Lanes n{}, v_n{}, vv_n{};  // of known cells
+    Lanes z{}, v_z{}, zz{};    // of their heights [m]
     Lanes highest = all(-NOWHERE), minus_lowest = all(-NOWHERE);  // of them [m]
 
-    template <bool HAS_RANGE> void add(const Tile& tile, int row, int column, int u) {
-        const Lanes known = load(tile.known(row + u, column)), height = load(tile.height(row + u, column));
-        n += known, u_n += float(u) * known, uu_n += float(u * u) * known;
-        z += height, u_z += float(u) * height, zz += height * height;
+    template <bool HAS_RANGE> void add(const Row& row, int column, int v) {
+        const Lanes known = load(row.known(column + v)), height = load(row.height(column + v));
+        n += known, v_n += float(v) * known, vv_n += float(v * v) * known;
+        z += height, v_z += float(v) * height, zz += height * height;
         if constexpr (HAS_RANGE) {
             const Lanes sunk = NOWHERE * known - NOWHERE;  // where nothing is known
             highest = larger(highest, sunk + height), minus_lowest = larger(minus_lowest, sunk - height);
@@ -20,52 +20,94 @@ struct Sums {
     }
 };
 
-// `Sums` of a row of a tile, for windows of one radius.
+// `Sums` of the last rows, for windows of one radius.
 class Lines {
 public:
-    enum Name { N, U_N, UU_N, Z, U_Z, ZZ, HIGHEST, MINUS_LOWEST, COUNT };
+    enum Name { N, V_N, VV_N, Z, V_Z, ZZ, HIGHEST, MINUS_LOWEST, KNOWN, COUNT };
     int radius = 0;
 
-    // Make room for `columns` cells, and `rim` more on both sides.
-    void resize(int radius, int columns, int rim) {
-        this->radius = radius, rim_ = rim, width_ = whole_lanes(columns) + whole_lanes(2 * rim) + LANES;
-        values_.resize(size_t(COUNT) * width_);
+    // Make room for rows of `columns` cells, `kept` rows of them.
+    void resize(int radius, int columns, int kept) {
+        this->radius = radius, width_ = whole_lanes(columns), kept_ = kept;
+        values_.resize(size_t(COUNT) * width_ * kept);
     }
 
-    const float* at(Name name, int column) const { return &values_[size_t(name) * width_ + column + rim_]; }
+    // A row's sums; the first row is at least -kept.
+    const float* row(int row) const { return values_.data() + size_t(COUNT) * width_ * ((row + kept_) % kept_); }
+    float* row(int row) { return const_cast<float*>(const_cast<const Lines*>(this)->row(row)); }
 
-    template <bool HAS_RANGE> void put(int column, const Sums& sums) {
-        put(N, column, sums.n), put(U_N, column, sums.u_n), put(UU_N, column, sums.uu_n);
-        put(Z, column, sums.z), put(U_Z, column, sums.u_z), put(ZZ, column, sums.zz);
-        if constexpr (HAS_RANGE) put(HIGHEST, column, sums.highest), put(MINUS_LOWEST, column, sums.minus_lowest);
+    int at(Name name, int column) const { return name * width_ + column; }
+
+    template <bool HAS_RANGE> void put(float* row, int column, const Sums& sums) const {
+        put(row, N, column, sums.n), put(row, V_N, column, sums.v_n), put(row, VV_N, column, sums.vv_n);
+        put(row, Z, column, sums.z), put(row, V_Z, column, sums.v_z), put(row, ZZ, column, sums.zz);
+        if constexpr (!HAS_RANGE) return;
+        put(row, HIGHEST, column, sums.highest), put(row, MINUS_LOWEST, column, sums.minus_lowest);
     }
+
+    void put(float* row, Name name, int column, Lanes values) const { store(row + at(name, column), values); }
 
 private:
-    std::vector<float> values_;
-    int width_ = 0, rim_ = 0;
-
-    void put(Name name, int column, Lanes values) { store(&values_[size_t(name) * width_ + column + rim_], values); }
+    Buffer values_;
+    int width_ = 0, kept_ = 0;
 };
 
-// Sum the rows around the cells begin to end of a row, and those beside them; the windows of `inner` are part of those
-// of `outer`.
-template <bool HAS_RANGE>
-inline void sum_rows(const Tile& tile, int row, int begin, int end, Lines& inner, Lines& outer) {
-    for (int column = begin - outer.radius; column < end + outer.radius; column += LANES) {
+// Sum along a row around each of its cells; the windows of `inner` are part of those of `outer`.
+template <bool HAS_INNER_RANGE, bool HAS_OUTER_RANGE>
+inline void sum_along(const Row& row, int number, int columns, Lines& inner, Lines& outer) {
+    constexpr bool HAS_RANGE = HAS_INNER_RANGE || HAS_OUTER_RANGE;
+    float *inner_row = inner.row(number), *outer_row = outer.row(number);
+    for (int column = 0; column < columns; column += LANES) {
         Sums sums;
         auto add = [&](int first, int last) {
-            for (int u = first; u <= last; u++)
-                sums.add<HAS_RANGE>(tile, row, column, -u), sums.add<HAS_RANGE>(tile, row, column, u);
+            for (int v = first; v <= last; v++)
+                sums.add<HAS_RANGE>(row, column, -v), sums.add<HAS_RANGE>(row, column, v);
         };
-        sums.add<HAS_RANGE>(tile, row, column, 0), add(1, inner.radius);
-        inner.put<HAS_RANGE>(column, sums);
+        sums.add<HAS_RANGE>(row, column, 0), add(1, inner.radius);
+        inner.put(inner_row, Lines::KNOWN, column, load(row.known(column)));
+        inner.put<HAS_INNER_RANGE>(inner_row, column, sums);
         if (&outer == &inner) continue;
         add(inner.radius + 1, outer.radius);
-        outer.put<HAS_RANGE>(column, sums);
+        outer.put(outer_row, Lines::KNOWN, column, load(row.known(column)));
+        outer.put<HAS_OUTER_RANGE>(outer_row, column, sums);
     }
 }
 
-// Call `work` with a radius: as a constant where it is small, so that compilers unroll its loops, else with 0.
+// The rows of `Lines` around one of them. RADIUS is theirs, or 0 where compilers shall not unroll loops.
+template <int RADIUS> class Window {
+public:
+    Window(const Lines& lines, int row) : lines_(lines) {
+        if (!RADIUS) rows_.resize(2 * lines.radius + 1);
+        for (int u = -radius(); u <= radius(); u++) rows()[u] = lines.row(row + u);
+    }
+
+    int radius() const { return RADIUS ? RADIUS : lines_.radius; }
+
+    Lanes at(int u, Lines::Name name, int column) const { return load(rows()[u] + lines_.at(name, column)); }
+
+    // Call `work` with each u, which counts rows from the middle one.
+    template <class Work> [[gnu::always_inline]] void each(const Work& work) const {
+        const int r = radius();
+#pragma GCC unroll 8
+        for (int u = -r; u <= r; u++) work(u);
+    }
+
+    [[gnu::always_inline]] Lanes largest(Lines::Name name, int column) const {
+        Lanes largest = at(0, name, column);
+        each([&](int u) { largest = larger(largest, at(u, name, column)); });
+        return largest;
+    }
+
+private:
+    const Lines& lines_;
+    const float* few_[2 * RADIUS + 1];
+    std::vector<const float*> rows_;
+
+    const float** rows() { return (RADIUS ? few_ : rows_.data()) + radius(); }
+    const float* const* rows() const { return (RADIUS ? few_ : rows_.data()) + radius(); }
+};
+
+// Call `work` with a radius, as a constant: 0 unless it is small.
 template <class Work> inline void with_radius(int radius, const Work& work) {
     switch (radius) {
     case 1: return work(std::integral_constant<int, 1>());
@@ -73,20 +115,4 @@ template <class Work> inline void with_radius(int radius, const Work& work) {
     case 3: return work(std::integral_constant<int, 3>());
     default: return work(std::integral_constant<int, 0>());
     }
-}
-
-template <int RADIUS> [[gnu::always_inline]] inline Lanes sum_along(const Lines& lines, Lines::Name name, int column) {
-    const int r = RADIUS ? RADIUS : lines.radius;
-    Lanes sum{};
-#pragma GCC unroll 8
-    for (int v = -r; v <= r; v++) sum += load(lines.at(name, column + v));
-    return sum;
-}
-
-template <int RADIUS> [[gnu::always_inline]] inline Lanes largest_along(const Lines& lines, Lines::Name name, int column) {
-    const int r = RADIUS ? RADIUS : lines.radius;
-    Lanes largest = load(lines.at(name, column));
-#pragma GCC unroll 8
-    for (int v = -r; v <= r; v++) largest = larger(largest, load(lines.at(name, column + v)));
-    return largest;
 }
