@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 MIN_DET = 1e-4  # [cells^4] of the covariance of places that spread in two directions
 MIN_TRACE = 1e-2  # [cells^2] of the covariance of places that spread in one
 
+
 @dataclass(frozen=True, kw_only=True)
 class SurfaceConfig:
     """How far the plane of a normal reaches."""

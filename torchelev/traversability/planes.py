@@ -22,7 +22,9 @@ from torchelev.traversability.heads import Critical, PlaneRating, Traversability
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-_CONSTANTS = {name: f"{value!r}f" for name, value in dict(MIN_DET=MIN_DET, MIN_TRACE=MIN_TRACE, NOWHERE=NOWHERE).items()}
+_CONSTANTS = {
+    name: f"{value!r}f" for name, value in dict(MIN_DET=MIN_DET, MIN_TRACE=MIN_TRACE, NOWHERE=NOWHERE).items()
+}
 _NAMES = (*Normals._fields, *PlaneRating._fields)
 
 
@@ -32,23 +34,24 @@ def rate_planes(
     grid: GridConfig,
     surface: SurfaceConfig,
     head: TraversabilityConfig | None,
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     """Return the layers (B, H, W) of `Normals` and, given the analytic head, those of `PlaneRating`, by name."""
     cells, critical = (0, []) if head is None else (head.cells(grid), list(head.critical))
-    settings = surface.radius, cells, grid.resolution, critical
-    layers = _in_one_pass(elevation, validity, *settings) if _suits(elevation) else _layers(elevation, validity, *settings)
+    compute = _in_one_pass if _suits(elevation) else _layers
+    layers = compute(elevation, validity, surface.radius, cells, grid.resolution, critical)
     return dict(zip(_NAMES, layers, strict=False))
 
 
 def _suits(elevation: Tensor) -> bool:
-    """Tell whether C++ can take a layer; it computes no gradient."""
-    is_plain = elevation.is_cpu and elevation.dtype == torch.float32
-    return is_plain and not torch.is_grad_enabled() and not is_transforming()
+    """Tell whether C++ can take a layer, whose gradient it does not compute."""
+    wants_gradient = torch.is_grad_enabled() and (torch.compiler.is_compiling() or elevation.requires_grad)
+    return elevation.is_cpu and elevation.dtype == torch.float32 and not wants_gradient and not is_transforming()
 
 
 def _layers(
     elevation: Tensor, validity: Tensor, radius: int, cells: int, resolution: float, critical: list[float]
 ) -> list[Tensor]:
+    """Return the layers by the equations; without a head, `cells` is 0."""
     ground = known_ground(elevation, validity, max(radius, cells))
     layers: list[Tensor] = [*normals(ground, validity, radius, resolution)]
     if cells:
@@ -57,6 +60,7 @@ def _layers(
 
 
 def _in_one_pass(elevation: Tensor, validity: Tensor, *settings: Any) -> list[Tensor]:
+    """Return what `_layers` does, by C++."""
     layers = _rate_planes(elevation, as_bytes(validity), *settings)
     return [as_mask(layer) if layer.dtype == torch.uint8 else layer for layer in layers]
 
