@@ -37,7 +37,8 @@ void put(uint8_t* layer, Flags flags, int count) {
     count == LANES ? std::memcpy(layer, &bytes, LANES) : std::memcpy(layer, &bytes, count);
 }
 
-// What a thread keeps from one tile to the next, as fresh memory takes longer than the work.
+// What is kept of a tile's last rows. Not from call to call: it would lie between larger blocks of an update's memory,
+// which could not become one again.
 struct Scratch {
     Row row;
     Lines lines[2];
@@ -176,7 +177,7 @@ extern "C" int rate_surface(const float* elevation, const uint8_t* validity, flo
     const Layers layers{gradient_x, gradient_y, has_normal, traversability, rated};
     const int bands = parts(H, ROWS), strips = parts(W, COLUMNS);
     auto rate = [&](int task) {
-        thread_local Scratch scratch;
+        Scratch scratch;
         const size_t first = size_t(task / (bands * strips)) * H * W;
         const int band = task / strips % bands, strip = task % strips;
         const int row = band * H / bands, column = strip * W / strips;
