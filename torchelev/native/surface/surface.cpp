@@ -37,8 +37,7 @@ void put(uint8_t* layer, Flags flags, int count) {
     count == LANES ? std::memcpy(layer, &bytes, LANES) : std::memcpy(layer, &bytes, count);
 }
 
-// What is kept of a tile's last rows. Not from call to call: it would lie between larger blocks of an update's memory,
-// which could not become one again.
+// What is kept of a tile's last rows.
 struct Scratch {
     Row row;
     Lines lines[2];
