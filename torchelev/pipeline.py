@@ -13,10 +13,10 @@ from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.measure import measure
 from torchelev.stages.overlap import clear_other_floors
 from torchelev.stages.recenter import recenter
-from torchelev.stages.surface import known_ground, normals
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MapState, Measurement, map_layers, tally
-from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all, traversability
+from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all
+from torchelev.traversability.planes import rate_planes
 from torchelev.traversability.weight_file import Weights
 
 
@@ -36,13 +36,12 @@ def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: W
 def rate_surface(state: MapState, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
     """Compute normals and traversability from the elevation."""
     head = cfg.traversability
-    rim = max(cfg.surface.radius, head.cells(cfg.grid) if isinstance(head, TraversabilityConfig) else 0)
-    ground = known_ground(state.elevation, state.validity, rim)
-    state = normals(state, ground, cfg.grid, cfg.surface)
+    analytic = head if isinstance(head, TraversabilityConfig) else None
+    state = state._replace(**rate_planes(state.elevation, state.validity, cfg.grid, cfg.surface, analytic))
     if head is None:
         return rate_all(state)
     if isinstance(head, TraversabilityConfig):
-        return traversability(state, ground, cfg.grid, head)
+        return state
     assert weights is not None
     rating = learned_rating(state, cfg.grid, head, weights)
     return state._replace(traversability=rating.traversability, rated=state.validity)

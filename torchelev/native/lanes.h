@@ -1,11 +1,19 @@
-// Sixteen numbers at a time, and the functions of them that compilers do not vectorise alike.
+// As many numbers at a time as fit the processor's vectors, and the functions of them that compilers do not vectorise
+// alike.
 #pragma once
 
 #include <cstdint>
 #include <cstring>
+#include <initializer_list>
 #include <type_traits>
 
+#if defined(__AVX512F__)
 constexpr int LANES = 16;
+#elif defined(__AVX__)
+constexpr int LANES = 8;  // of longer vectors compilers choose and compare one number after the other
+#else
+constexpr int LANES = 4;
+#endif
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparisons: -1 true, 0 false
 
@@ -90,6 +98,18 @@ inline Lanes exp(Lanes x) {
         y = y * x + c;
     y = y * x * x + x + 1;
     return (Lanes)((Flags)y + (__builtin_convertvector(n, Flags) << 23));
+}
+
+// Arc tangent of numbers that are not negative, by the polynomial of Cephes' atanf: 1 unit in the last place.
+inline Lanes arctan(Lanes x) {
+    const Flags is_large = x > 2.414213562f, is_middle = x > 0.4142135624f;
+    const Lanes above = pick(is_large, all(-1), pick(is_middle, x - 1, x));
+    const Lanes below = pick(is_large, x, pick(is_middle, x + 1, all(1)));
+    const Lanes start = pick(is_large, all(1.5707963268f), pick(is_middle, all(0.7853981634f), all(0)));
+    const Lanes y = above / below, z = y * y;
+    Lanes p = all(8.05374449538e-2f);
+    for (float c : {-1.38776856032e-1f, 1.99777106478e-1f, -3.33329491539e-1f}) p = p * z + c;
+    return start + (p * z * y + y);
 }
 
 inline Lanes tanh(Lanes x) { return 1 - 2 / (exp(2 * x) + 1); }

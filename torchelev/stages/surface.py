@@ -9,14 +9,15 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.grid import GridConfig
 from torchelev.ops.operators import padded
 from torchelev.ops.storage import stored
 from torchelev.ops.windows import window_moments
-from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
+
+MIN_DET = 1e-4  # [cells^4] of the covariance of places that spread in two directions
+MIN_TRACE = 1e-2  # [cells^2] of the covariance of places that spread in one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,7 @@ def fit_plane(ground: Ground, radius: int, resolution: float) -> Plane:
 
 
 def solve_gradient(
-    uu: Tensor, uv: Tensor, vv: Tensor, uz: Tensor, vz: Tensor, min_det: float = 1e-4, min_trace: float = 1e-2
+    uu: Tensor, uv: Tensor, vv: Tensor, uz: Tensor, vz: Tensor, min_det: float = MIN_DET, min_trace: float = MIN_TRACE
 ) -> tuple[Tensor, Tensor]:
     """Solve [uu uv; uv vv] (g_u, g_v) = (uz, vz), given the covariances of cells' places and heights.
 
@@ -116,13 +117,16 @@ def min_spread(radius: int) -> float:
     return max(0.25, 0.4**2 * radius * (radius + 1) / 3) - rounding
 
 
-def normals(state: MapState, ground: Ground, grid: GridConfig, cfg: SurfaceConfig) -> MapState:
-    """Store the gradient of every known cell whose neighbours span a plane (paper, Sec. II-A).
+class Normals(NamedTuple):
+    """The unit normal n = (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2) of each cell is made when it is read."""
 
-    The unit normal n = (-g_x, -g_y, 1) / sqrt(1 + g_x^2 + g_y^2) is made when it is read.
-    """
-    plane = fit_plane(ground, cfg.radius, grid.resolution)
-    has_normal = state.validity & plane.spans
-    return state._replace(
-        gradient_x=plane.gradient_x * has_normal, gradient_y=plane.gradient_y * has_normal, has_normal=has_normal
-    )
+    gradient_x: Float[Tensor, "B H W"]  #: dz/dx
+    gradient_y: Float[Tensor, "B H W"]  #: dz/dy
+    has_normal: Bool[Tensor, "B H W"]  #: known cells whose neighbours span a plane; elsewhere the gradient is 0
+
+
+def normals(ground: Ground, validity: Bool[Tensor, "B H W"], radius: int, resolution: float) -> Normals:
+    """Return the gradient of every known cell whose neighbours span a plane (paper, Sec. II-A)."""
+    plane = fit_plane(ground, radius, resolution)
+    has_normal = validity & plane.spans
+    return Normals(plane.gradient_x * has_normal, plane.gradient_y * has_normal, has_normal)

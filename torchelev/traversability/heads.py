@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,6 +22,9 @@ from torchelev.state import MapState
 from torchelev.traversability.net import Rating, TraversabilityNet
 from torchelev.traversability.rate import rate
 from torchelev.traversability.weight_file import Weights
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 __all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "TraversabilityConfig", "TraversabilityNet"]
 
@@ -46,6 +49,19 @@ class TraversabilityConfig:
     def cells(self, grid: GridConfig) -> int:
         """Return the window's radius in cells."""
         return max(1, round(self.radius / grid.resolution))
+
+    @property
+    def critical(self) -> Critical:
+        """The critical values."""
+        return Critical(self.critical_slope, self.critical_step, self.critical_roughness)
+
+
+class Critical(NamedTuple):
+    """Critical values of the analytic head."""
+
+    slope: float  #: [rad]
+    step: float  #: [m]
+    roughness: float  #: [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,19 +119,27 @@ def rate_all(state: MapState) -> MapState:
     return state._replace(traversability=torch.ones_like(state.traversability), rated=torch.zeros_like(state.rated))
 
 
-def traversability(state: MapState, ground: Ground, grid: GridConfig, cfg: TraversabilityConfig) -> MapState:
+class PlaneRating(NamedTuple):
+    """What the analytic head tells."""
+
+    traversability: Float[Tensor, "B H W"]  #: in [0, 1]
+    rated: Bool[Tensor, "B H W"]  #: known cells whose window spans a plane; elsewhere traversability is 0
+
+
+def traversability(
+    ground: Ground, validity: Bool[Tensor, "B H W"], radius: int, resolution: float, critical: Critical
+) -> PlaneRating:
     """Rate every known cell whose window spans a plane, by the worst of slope, step and roughness.
 
     t = 1 - max(slope / critical, step / critical, roughness / critical), not below 0. The step is the height range of
     the window less what its own plane explains.
     """
-    radius = cfg.cells(grid)
-    plane = fit_plane(ground, radius, grid.resolution)
+    plane = fit_plane(ground, radius, resolution)
     slope = torch.atan((plane.gradient_x.square() + plane.gradient_y.square()).clamp(min=1e-12).sqrt())
-    explained = 2 * radius * grid.resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())
+    explained = 2 * radius * resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())
     step = (height_range(ground, radius) - explained).clamp(min=0)
     roughness = plane.residual.clamp(min=1e-12).sqrt()
-    worst = torch.maximum(slope / cfg.critical_slope, step / cfg.critical_step)
-    worst = torch.maximum(worst, roughness / cfg.critical_roughness)
-    rated = state.validity & plane.spans
-    return state._replace(traversability=(1 - worst).clamp(min=0) * rated, rated=rated)
+    worst = torch.maximum(slope / critical.slope, step / critical.step)
+    worst = torch.maximum(worst, roughness / critical.roughness)
+    rated = validity & plane.spans
+    return PlaneRating((1 - worst).clamp(min=0) * rated, rated)
