@@ -8,6 +8,14 @@
 
 namespace {
 
+constexpr int64_t CELLS_PER_POINT = 4;  // up to which several threads sort the points: each counts in all cells
+constexpr int64_t PARTS_PER_THREAD = 4;
+
+inline int64_t checked(int64_t slot, int64_t num_cells) {
+    if (uint64_t(slot) >= uint64_t(num_cells)) throw std::out_of_range("slot");
+    return slot;
+}
+
 // The scan of B environments with M points each, of S sensors.
 struct Scan {
     const float *points, *noise, *shared, *origins;  // (B, M, 3) [m], (B, M) [m^2] or null, (B, S, 3) [m]
@@ -16,16 +24,24 @@ struct Scan {
     int64_t number, sensors;                         // M, S
 };
 
-// Points of cells [first, last) of one environment, those of a cell one after the other.
-struct Band {
-    int64_t environment, first, last;
-    std::vector<int64_t> cells, starts;  // slots; where their points start
-    std::vector<Consensus> consensus;
+// The points of one environment, those of a cell one after the other.
+struct Sorted {
+    std::vector<int64_t> cells, starts;  // slots that are hit; where their points start
     std::unique_ptr<Point[]> sorted;
-    int64_t num_used = 0, num_ignored = 0;  // points
+    std::vector<Consensus> consensus;  // of each cell
 
     Points points(int64_t k) const {
         return {&sorted[starts[k]], &sorted[starts[k + 1]], float(starts[k + 1] - starts[k])};
+    }
+};
+
+// Calls `work(part, first, last)` for parts of 0 to `size`, which may run side by side.
+struct Parts {
+    int64_t number;
+    int num_threads;
+
+    template <class Work> void operator()(int64_t size, const Work& work) const {
+        for_each(number, num_threads, [&](int64_t k) { work(k, size * k / number, size * (k + 1) / number); });
     }
 };
 
@@ -43,56 +59,40 @@ inline Point make_point(const float* xyz, const float* origin, float noise, floa
     return {xyz[2], noise + square(s.relief) + shared, 1.0f / noise, shared, ray_x, ray_y, passed};
 }
 
-// Sort a band's points by cell.
-void sort_points(Band& band, const Scan& scan, const Settings& s) {
-    const int64_t offset = band.environment * scan.number;
-    const int64_t* slots = scan.slots + offset;
-    const uint8_t* used = scan.used + offset;
-    const uint64_t size = band.last - band.first;
-    auto each = [&](int64_t first, int64_t last, const auto& work) {
-        for (int64_t i = first; i < last; i++) {
-            const uint64_t place = slots[i] - band.first;
-            if (used[i] && place < size) work(i, place);
-        }
-    };
-    std::vector<int32_t> next(size, 0);  // number of a cell's points, and then where its next one goes
-    each(0, scan.number, [&](int64_t, uint64_t place) { next[place]++; });
-    int32_t total = 0;
-    for (uint64_t place = 0; place < size; place++) {
-        const int32_t number = next[place];
-        if (number == 0) continue;
-        band.cells.push_back(band.first + place), band.starts.push_back(total);
-        next[place] = total;
-        total += number;
-    }
-    band.starts.push_back(total);
-    band.sorted.reset(new Point[total]);
+// Sort the points of environment b by cell: count, add up, and put each where its turn is. `parts` are of its points.
+void sort_points(Sorted& result, int64_t b, const Scan& scan, int64_t num_cells, const Parts& parts,
+                 const Settings& s) {
     const int64_t per_sensor = scan.number / scan.sensors;
-    for (int64_t k = 0; k < scan.sensors; k++) {
-        const float* origin = scan.origins + 3 * (band.environment * scan.sensors + k);
-        each(k * per_sensor, (k + 1) * per_sensor, [&](int64_t i, uint64_t place) {
-            const float* xyz = scan.points + 3 * (offset + i);
-            const float noise = scan.noise[offset + i], shared = scan.shared ? scan.shared[offset + i] : 0.0f;
-            band.sorted[next[place]++] = make_point(xyz, origin, noise, shared, s);
-        });
+    const uint8_t* used = scan.used + b * scan.number;
+    const int64_t* slots = scan.slots + b * scan.number;
+    std::vector<int32_t> counts(parts.number * num_cells, 0);
+    parts(scan.number, [&](int64_t part, int64_t first, int64_t last) {
+        int32_t* count = &counts[part * num_cells];
+        for (int64_t i = first; i < last; i++) count[checked(slots[i], num_cells)] += used[i];
+    });
+    int64_t total = 0;
+    for (int64_t slot = 0; slot < num_cells; slot++) {
+        const int64_t start = total;
+        for (int64_t k = 0; k < parts.number; k++) {  // turn numbers into where the first point of the part goes
+            int32_t& count = counts[k * num_cells + slot];
+            const int32_t number = count;
+            count = int32_t(total);
+            total += number;
+        }
+        if (total > start) result.cells.push_back(slot), result.starts.push_back(start);
     }
-}
-
-// Divide the cells of one environment into bands of whole rows, with about as many points each.
-void add_bands(std::vector<Band>& bands, int64_t environment, int64_t count, const Scan& scan, int64_t rows,
-               int64_t columns) {
-    std::vector<int64_t> points(rows, 0);
-    const int64_t* slots = scan.slots + environment * scan.number;
-    for (int64_t i = 0; count > 1 && i < scan.number; i++) points[slots[i] / columns]++;
-    int64_t first = 0, passed = 0;
-    for (int64_t row = 0; row < rows; row++) {
-        passed += points[row];
-        const bool is_full = count > 1 && passed > 0 && passed * count >= scan.number;
-        if (row + 1 < rows && !is_full) continue;
-        Band& band = bands.emplace_back();
-        band.environment = environment, band.first = first * columns, band.last = (row + 1) * columns;
-        first = row + 1, passed = 0;
-    }
+    result.starts.push_back(total);
+    result.sorted.reset(new Point[total]);
+    parts(scan.number, [&](int64_t part, int64_t first, int64_t last) {
+        int32_t* next = &counts[part * num_cells];
+        for (int64_t i = first; i < last; i++) {
+            if (!used[i]) continue;
+            const int64_t k = b * scan.number + i;
+            const float* origin = scan.origins + 3 * (b * scan.sensors + (scan.sensors > 1 ? i / per_sensor : 0));
+            const float shared = scan.shared ? scan.shared[k] : 0.0f;
+            result.sorted[next[slots[i]]++] = make_point(scan.points + 3 * k, origin, scan.noise[k], shared, s);
+        }
+    });
 }
 
 // What the cells that are hit hold after the update, (T,) each, and what became of the points, (B,) each.
@@ -110,11 +110,13 @@ struct Results {
     }
 };
 
-// The maps of B environments, and the scan's means.
+// The maps of B environments, and their scan.
 struct Maps {
     Map map;
     int64_t rows, columns;
-    float* in_scan;
+    Scan scan;
+    float* in_scan;  // [m] the scan's mean in each cell
+    const Settings& s;
 
     Map of(int64_t b) const {
         const int64_t k = b * rows * columns;
@@ -122,34 +124,55 @@ struct Maps {
                 map.time + k,      map.known + k,    map.challenger_support + k};
     }
 
-    // Sort a band's points, and write their means for other bands to see.
-    void prepare(Band& band, const Scan& scan, const Settings& s) const {
-        float* means = in_scan + band.environment * rows * columns;
-        std::fill(means + band.first, means + band.last, NO_HEIGHT);
-        sort_points(band, scan, s);
-        for (size_t k = 0; k < band.cells.size(); k++) {
-            band.consensus.push_back(find_consensus(band.points(k), of(band.environment), band.cells[k], s));
-            means[band.cells[k]] = band.consensus[k].mean;
-        }
+    // Sort the points of environment b, and compare each cell's with its elevation.
+    void prepare(int64_t b, Sorted& sorted, int num_threads) const {
+        const int64_t num_cells = rows * columns;
+        float* means = in_scan + b * num_cells;
+        const int64_t parts = num_cells <= CELLS_PER_POINT * scan.number ? num_threads : 1;
+        sort_points(sorted, b, scan, num_cells, {parts, num_threads}, s);
+        const Parts all{num_threads > 1 ? PARTS_PER_THREAD * num_threads : 1, num_threads};
+        all(num_cells, [&](int64_t, int64_t first, int64_t last) { std::fill(means + first, means + last, NO_HEIGHT); });
+        sorted.consensus.resize(sorted.cells.size());
+        all(sorted.cells.size(), [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t k = first; k < last; k++) {
+                sorted.consensus[k] = find_consensus(sorted.points(k), of(b), sorted.cells[k], s);
+                means[sorted.cells[k]] = sorted.consensus[k].mean;
+            }
+        });
     }
 
-    // Update a band's cells, the first of which is result `first`; leave the numbers of points in the band.
-    void update(Band& band, int64_t first, const Results& results, const Settings& s) const {
-        const Map own = of(band.environment);
-        const int64_t offset = band.environment * rows * columns;
+    // Update the cells of environment b, the first of which is result `start`.
+    void update(int64_t b, const Sorted& sorted, int64_t start, const Results& results, int num_threads) const {
+        const Map own = of(b);
+        const int64_t offset = b * rows * columns;
         const Around around{rows, columns, own.elevation, in_scan + offset, own.known};
-        for (size_t k = 0; k < band.cells.size(); k++) {
-            const int64_t slot = band.cells[k];
-            const Cell cell = update_cell(band.points(k), own, slot, band.consensus[k], around, s);
-            results.set(first + k, offset + slot, cell);
-            band.num_used += cell.used, band.num_ignored += cell.ignored;
-        }
+        const Parts parts{num_threads > 1 ? PARTS_PER_THREAD * num_threads : 1, num_threads};
+        parts(sorted.cells.size(), [&](int64_t, int64_t first, int64_t last) {
+            int64_t used = 0, ignored = 0;
+            for (int64_t k = first; k < last; k++) {
+                const int64_t slot = sorted.cells[k];
+                const Cell cell = update_cell(sorted.points(k), own, slot, sorted.consensus[k], around, s);
+                results.set(start + k, offset + slot, cell);
+                used += cell.used, ignored += cell.ignored;
+            }
+            __atomic_fetch_add(&results.used[b], used, __ATOMIC_RELAXED);
+            __atomic_fetch_add(&results.ignored[b], ignored, __ATOMIC_RELAXED);
+        });
     }
 };
 
+// Call `work(b, threads)` for each environment: one thread for each, or all for one after the other.
+template <class Work> void for_environments(int64_t B, int num_threads, const Work& work) {
+    if (B >= num_threads) {
+        for_each(B, num_threads, [&](int64_t b) { work(b, 1); });
+        return;
+    }
+    for (int64_t b = 0; b < B; b++) work(b, num_threads);
+}
+
 }  // namespace
 
-// Update the cells that points fall into; write T, their number.
+// Update the cells that points fall into; write their number.
 extern "C" int fuse_points(const float* points, const float* noise, const float* shared, const float* origins,
                            const uint8_t* used, const int64_t* slots, const float* elevation, const float* variance,
                            const float* support, const float* challenger, const uint8_t* challenger_support,
@@ -159,24 +182,20 @@ extern "C" int fuse_points(const float* points, const float* noise, const float*
                            int64_t B, int64_t M, int64_t S, int64_t rows, int64_t columns, const Settings* settings,
                            int num_threads) {
     const Scan scan{points, noise, shared, origins, used, slots, M, S};
+    const Map map{elevation, variance, support, challenger, time, known, challenger_support};
     const Results results{cells, elevations, variances,          supports, challengers,
                           times, challenger_supports, knowns, num_used, num_ignored};
     return code_of([&] {
-        for (int64_t i = 0; i < B * M; i++)
-            if (uint64_t(slots[i]) >= uint64_t(rows * columns)) throw std::out_of_range("slot");
         const std::unique_ptr<float[]> in_scan(new float[B * rows * columns]);
-        const Map map{elevation, variance, support, challenger, time, known, challenger_support};
-        const Maps maps{map, rows, columns, in_scan.get()};
-        std::vector<Band> bands;
-        for (int64_t b = 0; b < B; b++) add_bands(bands, b, B >= num_threads ? 1 : 2 * num_threads, scan, rows, columns);
-        for_each(bands.size(), num_threads, [&](int64_t k) { maps.prepare(bands[k], scan, *settings); });
-        std::vector<int64_t> firsts{0};
-        for (const Band& band : bands) firsts.push_back(firsts.back() + band.cells.size());
-        for_each(bands.size(), num_threads,
-                 [&](int64_t k) { maps.update(bands[k], firsts[k], results, *settings); });
+        const Maps maps{map, rows, columns, scan, in_scan.get(), *settings};
+        std::vector<Sorted> sorted(B);
+        for_environments(B, num_threads, [&](int64_t b, int threads) { maps.prepare(b, sorted[b], threads); });
+        std::vector<int64_t> starts{0};
+        for (const Sorted& each : sorted) starts.push_back(starts.back() + each.cells.size());
         std::fill(num_used, num_used + B, 0), std::fill(num_ignored, num_ignored + B, 0);
-        for (const Band& band : bands)
-            num_used[band.environment] += band.num_used, num_ignored[band.environment] += band.num_ignored;
-        *count = firsts.back();
+        for_environments(B, num_threads, [&](int64_t b, int threads) {
+            maps.update(b, sorted[b], starts[b], results, threads);
+        });
+        *count = starts.back();
     });
 }
