@@ -21,7 +21,7 @@ from torchelev.stages.compensate import compensate
 from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.measure import measure
 from torchelev.stages.overlap import clear_other_floors
-from torchelev.stages.recenter import recenter
+from torchelev.stages.recenter import follow_in_place, recenter
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.traversability.weight_file import Weights
@@ -107,11 +107,9 @@ def compile_part(
 # `pipeline.forward` in three parts, see `Graphs`.
 
 
-def move_window(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
-    """Move the window with the robot, and let time pass."""
-    state = reset_statistics(state, m)
-    state = recenter(state, m, cfg.grid)
-    return age(state, m, cfg.aging)
+def let_time_pass(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+    """Start an update of a window that has moved: forget the last one's statistics, and age the cells."""
+    return age(reset_statistics(state, m), m, cfg.aging)
 
 
 def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
@@ -146,8 +144,13 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
 
     def first(stored: MapState, points: Tensor, *others: Any) -> Measurement:
         m = measure(points, *others, cfg.grid, cfg.sensor, stored.elevation.dtype)  # type: ignore[call-arg]
-        state = with_masks(stored, as_mask)
-        write_changes(stored, state, move_window(state, m, cfg))
+        moved = follow_in_place(stored, m, cfg.grid) if stored.elevation.is_cpu else None
+        old = with_masks(stored, as_mask)
+        if moved is None:
+            state = recenter(old, m, cfg.grid)
+        else:
+            state = old._replace(corner=moved.corner, base_height=moved.base_height)
+        write_changes(stored, old, let_time_pass(state, m, cfg))
         return with_masks(m, as_bytes)
 
     def in_place(stages: Callable[..., MapState]) -> KeptGraph:
@@ -161,7 +164,7 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
         return Dynamic(1, (m.points, m.variance, m.used, m.casts, m.noise), multiple=sensors)
 
     settings = (cfg, kinds, sensors)
-    move = KeptGraph(first, (move_window.__name__, *settings), _sized_by_points)
+    move = KeptGraph(first, ("move_window", *settings), _sized_by_points)
     return Graphs(move, in_place(fuse_heights), in_place(apply_rays))
 
 

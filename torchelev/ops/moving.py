@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.ops import native
 from torchelev.ops.indexing import read
 from torchelev.ops.storage import realize_all
 
@@ -34,6 +35,27 @@ def move_layers(layers: dict[str, Tensor], shift: Int[Tensor, "B 2"], blank: dic
     copies = eager and shift.shape[0] <= HOST_ENVIRONMENTS and shift.device.type == "cpu"
     *values, bits = moved(values, shift, blanks) if copies else _gathered(values, shift, blanks)
     return dict(zip((*names, *masks), (*values, *_from_bits(bits, len(masks))), strict=True))
+
+
+@torch.library.custom_op(
+    "torchelev::move_in_place",
+    mutates_args=("layers",),
+    schema="(Tensor(a!)[] layers, Tensor shift, float[] blanks) -> ()",
+)
+def move_in_place(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> None:
+    """Shift contiguous layers (B, H, W) on a CPU by whole cells (B, 2), each environment by its own; those of 0 stay.
+
+    Layers of bytes get 0 in entering cells, whatever their blank.
+    """
+    if native.move_layers(layers, shift, blanks):
+        return
+    for layer, value in zip(layers, moved(layers, shift, blanks), strict=True):
+        layer.copy_(value)
+
+
+@move_in_place.register_fake
+def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> None:
+    return None
 
 
 def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:

@@ -47,6 +47,25 @@ def polar_minimum(
     return table
 
 
+def move_layers(layers: Sequence[Tensor], shift: Tensor, blanks: Sequence[float]) -> bool:
+    """Do what `moving.move_in_place` does; return False where C++ cannot."""
+    is_plain = all(layer.device.type == "cpu" and layer.is_contiguous() for layer in layers)
+    library = load("moving/moving.cpp", {}) if is_plain else None
+    if library is None:
+        return False
+    number = len(layers)
+    arrays = (
+        (ctypes.c_void_p * number)(*(layer.data_ptr() for layer in layers)),
+        (ctypes.c_int64 * number)(*(layer.element_size() for layer in layers)),
+        (ctypes.c_double * number)(*blanks),
+    )
+    sizes = [ctypes.c_int64(size) for size in layers[0].shape]
+    shifts = shift.contiguous()
+    address, count = ctypes.c_void_p(shifts.data_ptr()), ctypes.c_int64(number)
+    call(library.move_layers, *arrays, count, address, *sizes, torch.get_num_threads())
+    return True
+
+
 def _library(values: Tensor, index: Tensor | None = None) -> ctypes.CDLL | None:
     """Return the functions for values (..., M) and indices (B, M); None where they cannot take them."""
     is_plain = values.dtype == torch.float32 and values.device.type == "cpu" and values.numel() > 0

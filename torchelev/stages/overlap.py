@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
-from torchelev.state import MapState, Measurement, tally
+from torchelev.state import LAYERS, MapState, Measurement, tally
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -52,21 +53,42 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     The robot's height is its base's, z_b, or that of a low base on the same ground: min(z_b, z_g + base_height), with
     z_g from `ground_below`. So a tall robot keeps its ground. Cells hit by this scan may differ by height * (1 + d /
     radius) at distance d: a slope is no other floor. What lies below the base is no upper floor. Skipped without a base
-    pose or `cfg`. A cell's upper bound goes too when it belongs to another floor.
+    pose or `cfg`. A cell's upper bound goes too when it belongs to another floor. The window is centred on the base.
     """
     if m.base is None or cfg is None:
         return state
+    rows, columns = (middle(size, cfg.radius / grid.resolution) for size in (grid.height, grid.width))
+    part = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in LAYERS})
     x, y = center_offsets(state, m, grid)
-    x, y = x - m.base[:, 0, None, None], y - m.base[:, 1, None, None]
+    x, y = x[:, rows] - m.base[:, 0, None, None], y[:, :, columns] - m.base[:, 1, None, None]
     distance = (x.square() + y.square()).sqrt()
     near = distance <= cfg.radius
     base = m.base[:, 2, None, None]
-    height, hit = (state.elevation - base).detach(), state.validity & (state.time == 0)
-    floor = own_floor(ground_below(height, state.validity & near, hit & near, distance, cfg), cfg)
+    height, hit = (part.elevation - base).detach(), part.validity & (part.time == 0)
+    floor = own_floor(ground_below(height, part.validity & near, hit & near, distance, cfg), cfg)
     slope = torch.where(hit, distance * (cfg.height / cfg.radius), 0.0)
-    other = near & state.validity & is_outside(height, floor, slope)
-    other_bound = near & state.bounded & is_outside((state.upper_bound - base).detach(), floor, 0.0)
-    return tally(clear(state, other, other_bound), cleared_other_floors=count(other))
+    other = near & part.validity & is_outside(height, floor, slope)
+    other_bound = near & part.bounded & is_outside((part.upper_bound - base).detach(), floor, 0.0)
+    cleared = clear(part, other, other_bound)
+    return tally(put_back(state, cleared, rows, columns), cleared_other_floors=count(other))
+
+
+def middle(size: int, radius: float) -> slice:
+    """Return which of so many cells along a side may lie within a radius [cells] of the window's centre."""
+    half = math.ceil(min(radius, size)) + 1
+    return slice(max(0, size // 2 - half), min(size, (size + 1) // 2 + half))
+
+
+def put_back(state: MapState, part: MapState, rows: slice, columns: slice) -> MapState:
+    """Return the state with what `clear` changes in some of its cells."""
+    layers: dict[str, Any] = {}
+    for name in ("validity", "bounded", "challenger_support"):
+        layer, new = getattr(state, name), getattr(part, name)
+        if new.shape != layer.shape:
+            strip = layer[:, rows].slice_scatter(new, 2, columns.start, columns.stop)
+            new = layer.slice_scatter(strip, 1, rows.start, rows.stop)
+        layers[name] = new
+    return state._replace(**layers)
 
 
 @stored

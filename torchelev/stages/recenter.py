@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.moving import move_layers
+from torchelev.ops.moving import move_in_place, move_layers
 from torchelev.ops.storage import stored
 from torchelev.state import BLANK, LAYERS, MapState, Measurement
 
@@ -32,6 +32,17 @@ def follow(state: MapState, base: Float[Tensor, "B 3"], anchor: Int[Tensor, "B 2
     layers: dict[str, Any] = move_layers({name: getattr(state, name) for name in LAYERS}, shift, BLANK)
     base_height = torch.where(moves, base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **layers)
+
+
+def follow_in_place(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
+    """Do what `recenter` does to layers on a CPU, in their own memory; return the state of these layers."""
+    if m.base is None:
+        return state
+    moves = torch.isfinite(m.base).all(1)
+    corner, shift = move_corner(state, m.base, m.anchor, moves, grid)
+    move_in_place([getattr(state, name) for name in LAYERS], shift, [BLANK.get(name, 0.0) for name in LAYERS])
+    base_height = torch.where(moves, m.base[:, 2], state.base_height)
+    return state._replace(corner=corner, base_height=base_height)
 
 
 @stored
