@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
 from torchelev.compiled.compiler import announced_start, compiled, load_traced, mark_dynamic, remove_marks, traced
-from torchelev.native.library import describe_processor
+from torchelev.native.library import describe_processor, is_native
 from torchelev.output_files import atomic_file
 
 NUM_KEPT = 2  # kinds of arguments with a graph of their own: chunks have one size, but for the last
@@ -242,7 +242,8 @@ def surroundings() -> str:
     variables = [item for item in variables if item[0] != "TORCHINDUCTOR_CACHE_DIR"]
     state: Any = GlobalStateGuard()
     options = sorted(config.save_config_portable(ignore_private_configs=False).items())  # as torch's own cache has them
-    return f"{_installation()} {state.__getstate__()!r} {torch.get_default_device()} {options} {variables}"
+    code = f"{_installation()} {is_native()}"
+    return f"{code} {state.__getstate__()!r} {torch.get_default_device()} {options} {variables}"
 
 
 @functools.cache

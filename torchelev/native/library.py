@@ -40,6 +40,15 @@ def load(source: str, defines: Mapping[str, str]) -> ctypes.CDLL | None:
     return _load(source, tuple(sorted(defines.items())))
 
 
+def is_native() -> bool:
+    """Tell whether C++ is used: libraries can be built or are there, and TORCHELEV_NATIVE does not forbid it."""
+    return load("tables/tables.cpp", {}) is not None
+
+
+# As `torch.compiler.assume_constant_result` does, which would load the compiler: code that is compiled asks only once.
+is_native._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
 @functools.cache
 def _load(source: str, defines: tuple[tuple[str, str], ...]) -> ctypes.CDLL | None:
     flags = [*_FLAGS, *(f"-D{name}={value}" for name, value in defines)]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.native.library import call, load
+from torchelev.native.library import call, is_native, load
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.ops.transforms import is_transforming
@@ -45,7 +45,8 @@ def rate_planes(
 def _suits(elevation: Tensor) -> bool:
     """Tell whether C++ can take a layer, whose gradient it does not compute."""
     wants_gradient = torch.is_grad_enabled() and (torch.compiler.is_compiling() or elevation.requires_grad)
-    return elevation.is_cpu and elevation.dtype == torch.float32 and not wants_gradient and not is_transforming()
+    is_plain = elevation.is_cpu and elevation.dtype == torch.float32
+    return is_plain and not wants_gradient and not is_transforming() and is_native()
 
 
 def _layers(

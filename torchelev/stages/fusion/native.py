@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.native.library import call, load
+from torchelev.native.library import call, is_native, load
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.cells import PointCells
 from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
@@ -40,7 +40,7 @@ def can_update_hit(state: MapState) -> bool:
     layer = state.elevation
     if torch.is_grad_enabled() or layer.dtype != torch.float32 or layer.device.type != "cpu":
         return False
-    return torch.compiler.is_compiling() or (type(layer) is Tensor and load(_SOURCE, {}) is not None)
+    return (torch.compiler.is_compiling() or type(layer) is Tensor) and is_native()
 
 
 def update_hit(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:

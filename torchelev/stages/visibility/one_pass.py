@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.native.library import call, load
+from torchelev.native.library import call, is_native, load
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.ops.transforms import is_transforming
@@ -31,7 +31,7 @@ def has_one_pass(state: MapState) -> bool:
     """Tell whether what `in_one_pass` returns may run: it computes float32 on a CPU, and has no gradient."""
     heights = state.elevation
     is_plain = heights.is_cpu and heights.dtype == torch.float32
-    return is_plain and not torch.is_grad_enabled() and not is_transforming()
+    return is_plain and not torch.is_grad_enabled() and not is_transforming() and is_native()
 
 
 def in_one_pass(twin: Apply) -> Apply:
