@@ -23,19 +23,19 @@ class HitPoints(NamedTuple):
     noise: Float[Tensor, "B M"]  #: [m^2] variance of each height, without what the pose adds
     shared: Float[Tensor, "B M"] | None  #: [m^2] variance that the pose adds
     origin: Float[Tensor, "B S 3"]  #: [m] the sensors
-    cells: PointCells
+    cells: PointCells  #: the cell of each point
 
 
 class CellLayers(NamedTuple):
-    """What the update reads and writes of cells, flat; see `MapState`."""
+    """What the update reads and writes of cells, (B, C) each, or (1, T) of those that are hit; see `MapState`."""
 
-    elevation: Tensor
-    variance: Tensor
-    support: Tensor
-    challenger: Tensor
-    challenger_support: Tensor
-    validity: Tensor
-    time: Tensor
+    elevation: Tensor  #: [m]
+    variance: Tensor  #: [m^2]
+    support: Tensor  #: points that agree, less points that disagree
+    challenger: Tensor  #: [m] lowest height that contradicts the elevation from above
+    challenger_support: Tensor  #: points that do so, less points that do not
+    validity: Tensor  #: the elevation is known
+    time: Tensor  #: [s] since the last hit
 
 
 class ScanPoints(NamedTuple):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class Update(NamedTuple):
     """What some cells hold after the scan, (1, T) each, or all, (B, C) each; and the points, per environment."""
 
-    layers: CellLayers
+    layers: CellLayers  #: new values
     cells: Int[Tensor, "T"] | None  #: numbers of the cells, across environments; None: all
     num_used: Int[Tensor, "B"]  #: points that a cell took
     num_ignored: Int[Tensor, "B"]  #: points on the wrong side of a step

@@ -31,7 +31,7 @@ class RayBins(NamedTuple):
     """Where the rays of one sensor lie in the polar table."""
 
     range: Int[Tensor, "B N"]  #: last one that a ray reaches at least a cell before its end; PolarGrid.ranges: none
-    azimuth: Int[Tensor, "B N"]
+    azimuth: Int[Tensor, "B N"]  #: azimuth bin
     slope: Float[Tensor, "B N"]  #: dz / dr
 
 
