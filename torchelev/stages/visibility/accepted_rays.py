@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -13,11 +12,11 @@ from torch import Tensor
 from torchelev.grid import GridConfig, locate
 from torchelev.ops.indexing import read
 from torchelev.ops.masks import NOWHERE
-from torchelev.ops.operators import running_minimum
 from torchelev.ops.storage import stored
 from torchelev.ops.windows import neighbours
 from torchelev.stages.cells import lattice_offset
-from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
+from torchelev.stages.visibility.horizon import horizon
+from torchelev.stages.visibility.rays import Rays, height_margin
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
@@ -25,33 +24,9 @@ if TYPE_CHECKING:
 
     from torchelev.stages.visibility.config import RaycastConfig
 
-NO_FALL = 1e4  # a fall -dz/dr that no ray has
 # A ray that leaves the window over no known ground is accepted if it ends at most CLEARANCE below the lowest ground
 # NEAR by, and taken for one that passes CLEARANCE above it: returns that are too long shall not bound below the truth.
 NEAR, CLEARANCE = 1.0, 0.05  # [m]
-
-
-class Rays(NamedTuple):
-    """The rays of one sensor."""
-
-    origin: Float[Tensor, "B 3"]  #: [m] counted from the measurement's horizontal origin
-    xy: Float[Tensor, "B N 2"]  #: [m] from the sensor to the hit
-    r: Float[Tensor, "B N"]  #: [m] horizontal length
-    slope: Float[Tensor, "B N"]  #: dz / dr
-    azimuth: Float[Tensor, "B N"]  #: in turns
-    noise: Float[Tensor, "B N"]  #: [m] standard deviation of its end
-    casts: Bool[Tensor, "B N"]  #: clears and bounds cells
-    overhang: Bool[Tensor, "B N"]  #: the point lies above the exclusion ramp
-
-
-def sensor_rays(m: Measurement, s: int) -> Rays:
-    """Return the rays of sensor s."""
-    sensors = m.origin.shape[1]
-    ray = m.points.unflatten(1, (sensors, -1))[:, s] - m.origin[:, s, None]
-    x, y, z = ray.unbind(-1)
-    r = (x.square() + y.square()).clamp(min=1e-12).sqrt()
-    casts, used, variance = (values.unflatten(1, (sensors, -1))[:, s] for values in (m.casts, m.used, m.variance))
-    return Rays(m.origin[:, s], ray[..., :2], r, z / r, azimuth_fraction(x, y), variance.sqrt(), casts, casts & ~used)
 
 
 def accepted_rays(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Rays:
@@ -148,40 +123,3 @@ def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bo
     _, above, _, left, right, _, below, _ = neighbours(state.elevation + NOWHERE * ~enough, NOWHERE)
     unlike = functools.reduce(torch.minimum, [(h - state.elevation).abs() for h in (above, left, right, below)])
     return enough | (state.validity & (unlike <= resolution))
-
-
-def height_margin(state: MapState, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B H W"]:
-    """Return how far below a cell's elevation a ray must pass to contradict it [m]; half a cell allows for relief."""
-    # An infinite gate must leave finite heights.
-    return (cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()).clamp(max=NOWHERE)
-
-
-def horizon(
-    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
-) -> Float[Tensor, "B N"]:
-    """Return the steepest fall -dz/dr that a ray may have before it passes below ground hit within `min_time`.
-
-    Rays that pass below it contradict it, and are wrong returns. Kept in a polar table of half the resolution, filled
-    by gathering from the map: the running minimum, from the sensor outwards, of the fall to each bin's ground.
-    """
-    step = 2 * grid.resolution
-    polar = PolarGrid.of(grid, cfg)
-    ranges, azimuths = 8 * (polar.ranges // 16 + 1), polar.azimuths // 2
-    rho = (torch.arange(ranges, device=rays.r.device, dtype=rays.r.dtype) + 0.5)[:, None] * step
-    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(directions(azimuths, rays.r)))
-    slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
-    recent = state.validity & (state.time <= cfg.min_time)
-    below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
-    fall = torch.where(inside, read(below_sensor, slot), NO_FALL * step) / rho
-    steepest = running_minimum(fall.detach())  # compared with, and so without a gradient
-    k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
-    a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
-    limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
-    return torch.where(k >= 0, limit, NO_FALL)
-
-
-@stored  # or each bin of every environment would compute them anew
-def directions(number: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cosines and sines of so many azimuths (number,), evenly spaced."""
-    angle = (torch.arange(number, device=like.device, dtype=like.dtype) + 0.5) * (2 * math.pi / number)
-    return angle.cos(), angle.sin()

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
-from torchelev.stages.visibility.accepted_rays import accepted_rays, height_margin, sensor_rays
+from torchelev.stages.visibility.accepted_rays import accepted_rays
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import (
     RayBins,
@@ -24,6 +24,7 @@ from torchelev.stages.visibility.lowest_rays import (
 )
 from torchelev.stages.visibility.one_pass import has_one_pass, in_one_pass
 from torchelev.stages.visibility.polar_table import PolarGrid
+from torchelev.stages.visibility.rays import height_margin, sensor_rays
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from torchelev.ops.indexing import read
 from torchelev.ops.operators import polar_minimum
 from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
-from torchelev.stages.visibility.accepted_rays import Rays
 from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
+from torchelev.stages.visibility.rays import Rays
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:

@@ -1,0 +1,158 @@
+"""The steepest fall that rays may have before they pass below recently hit ground."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig, locate
+from torchelev.native.library import call, load
+from torchelev.ops.indexing import read
+from torchelev.ops.masks import NOWHERE
+from torchelev.ops.operators import running_minimum
+from torchelev.ops.storage import as_bytes, as_mask, stored
+from torchelev.stages.cells import lattice_offset
+from torchelev.stages.visibility.config import RaycastConfig
+from torchelev.stages.visibility.one_pass import has_one_pass
+from torchelev.stages.visibility.polar_table import PolarGrid, flat
+from torchelev.stages.visibility.rays import Rays, height_margin
+from torchelev.state import MapState, Measurement
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+NO_FALL = 1e4  # a fall -dz/dr that no ray has
+_CONSTANTS = {"NO_FALL": f"{NO_FALL!r}f", "NOWHERE": f"{NOWHERE!r}f"}
+_LARGEST = 2**30  # bins of a table, as they are counted in 32 bits
+
+
+class SeenRays(NamedTuple):
+    """Rays, and where their sensors are."""
+
+    r: Float[Tensor, "B N"]  #: [m] horizontal length
+    azimuth: Float[Tensor, "B N"]  #: in turns
+    origin: Float[Tensor, "B 3"]  #: [m] of the sensor, counted from the measurement's horizontal origin
+    offset: Float[Tensor, "B 2"]  #: [m] of that origin in the window
+
+
+class Directions(NamedTuple):
+    """Azimuths, evenly spaced."""
+
+    cosines: Float[Tensor, "A"]
+    sines: Float[Tensor, "A"]
+
+
+def horizon(
+    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
+) -> Float[Tensor, "B N"]:
+    """Return the steepest fall -dz/dr that a ray may have before it passes below ground hit within `min_time`.
+
+    Rays that pass below it contradict it, and are wrong returns. It is the minimum, from the sensor to two bins before
+    the ray's end, of the fall to each bin's ground; bins are two cells long, and as wide.
+
+    Args:
+        state: the maps.
+        m: the scan.
+        rays: of one sensor.
+        lowest: heights (B, H, W) [m] below which a ray contradicts a cell.
+        grid: the window.
+        cfg: the rules.
+    """
+    polar = PolarGrid.of(grid, cfg)
+    ranges, ways = 8 * (polar.ranges // 16 + 1), directions(polar.azimuths // 2, rays.r)
+    seen = SeenRays(rays.r, rays.azimuth, rays.origin, lattice_offset(state, m, grid))
+    if not has_one_pass(state):
+        return limits_by_tensors(state, seen, lowest, ways, ranges, grid, cfg)
+    layers = [state.elevation, state.variance, state.time, as_bytes(state.validity)]
+    return _horizon(list(seen), layers, list(ways), ranges, [grid.resolution, cfg.gate, cfg.min_time])
+
+
+@stored  # or each bin of every environment would compute them anew
+def directions(number: int, like: Tensor) -> Directions:
+    """Return the directions of so many azimuths."""
+    angle = (torch.arange(number, device=like.device, dtype=like.dtype) + 0.5) * (2 * math.pi / number)
+    return Directions(angle.cos(), angle.sin())
+
+
+def limits_by_tensors(
+    state: MapState,
+    rays: SeenRays,
+    lowest: Tensor,
+    ways: Directions,
+    ranges: int,
+    grid: GridConfig,
+    cfg: RaycastConfig,
+) -> Float[Tensor, "B N"]:
+    """Return each ray's limit, from a polar table over the whole window that is filled by gathering from the map."""
+    step, azimuths = 2 * grid.resolution, len(ways.cosines)
+    rho = (torch.arange(ranges, device=rays.r.device, dtype=rays.r.dtype) + 0.5)[:, None] * step
+    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(ways))
+    slot, inside = locate(x, y, rays.offset, grid)
+    recent = state.validity & (state.time <= cfg.min_time)
+    below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
+    fall = torch.where(inside, read(below_sensor, slot), NO_FALL * step) / rho
+    steepest = running_minimum(fall.detach())  # compared with, and so without a gradient
+    k = (torch.floor(rays.r / step) - 1).clamp(max=ranges - 1)
+    a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
+    limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
+    return torch.where(k >= 0, limit, NO_FALL)
+
+
+@torch.library.custom_op("torchelev::horizon", mutates_args=())
+def _horizon(
+    rays: list[Tensor], layers: list[Tensor], ways: list[Tensor], ranges: int, settings: list[float]
+) -> Tensor:
+    """Return what `limits_by_tensors` does, from C++ that marches along each azimuth as far as its rays reach."""
+    limits = _native(rays, layers, ways, ranges, *settings)
+    if limits is None:
+        state, grid, cfg = _described(layers, *settings)
+        lowest = state.elevation - height_margin(state, grid, cfg)
+        limits = limits_by_tensors(state, SeenRays(*rays), lowest, Directions(*ways), ranges, grid, cfg)
+    return limits
+
+
+@_horizon.register_fake
+def _(rays: list[Tensor], *_: object) -> Tensor:
+    return torch.empty_like(rays[0], memory_format=torch.contiguous_format)
+
+
+def _described(
+    layers: list[Tensor], resolution: float, gate: float, min_time: float
+) -> tuple[MapState, GridConfig, RaycastConfig]:
+    """Return what the operator was called for, as far as its twin asks."""
+    elevation, variance, time, validity = layers
+    known = {"elevation": elevation, "variance": variance, "time": time, "validity": as_mask(validity)}
+    state = MapState(**(dict.fromkeys(MapState._fields) | known))  # type: ignore[arg-type]
+    length_x, length_y = (size * resolution for size in elevation.shape[1:])
+    grid = GridConfig(resolution=resolution, length_x=length_x, length_y=length_y)
+    return state, grid, RaycastConfig(gate=gate, min_time=min_time)
+
+
+def _native(
+    rays: list[Tensor],
+    layers: list[Tensor],
+    ways: list[Tensor],
+    ranges: int,
+    resolution: float,
+    gate: float,
+    min_time: float,
+) -> Tensor | None:
+    """Return the limits; None where C++ cannot compute them."""
+    azimuths = len(ways[0])
+    if layers[0].numel() == 0 or ranges * azimuths > _LARGEST:
+        return None
+    library = load("rays/horizon.cpp", _CONSTANTS)
+    if library is None:
+        return None
+    inputs = [value.contiguous() for value in (*rays, *layers, *ways)]
+    limits = torch.empty(rays[0].shape)
+    pointers = [ctypes.c_void_p(tensor.data_ptr()) for tensor in (*inputs, limits)]
+    whole = [ctypes.c_int64(size) for size in (*rays[0].shape, *layers[0].shape[1:], ranges, azimuths)]
+    step = 2 * resolution
+    numbers = (resolution, step, (0.5 * resolution) ** 2, NO_FALL * step, gate, min_time)
+    call(library.horizon, *pointers, *whole, *map(ctypes.c_float, numbers), torch.get_num_threads())
+    return limits
