@@ -14,7 +14,7 @@ from torchelev import GridConfig, RaycastConfig, SensorConfig
 from torchelev.stages.visibility.accepted_rays import accepted_rays, has_credible_end
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.stages.visibility.polar_table import BREADTH, PolarGrid, azimuth_fraction
-from torchelev.stages.visibility.rays import height_margin, sensor_rays
+from torchelev.stages.visibility.rays import sensor_rays
 from torchelev.state import LAYERS
 
 CELLS, RESOLUTION = (40, 30), 0.1
@@ -366,8 +366,8 @@ def test_where_rays_end_agrees_with_the_reference(place):
     hits[::2, :2] = origin[:2] + rng.uniform(1, 6, (3000, 1)) * (hits[::2, :2] - origin[:2])
     m = emap.measure(seen_from(T, hits), T, None, 0.1)
     m = m._replace(used=m.used & torch.from_numpy(rng.random((1, 6000)) < 0.8))
-    rays, lowest = sensor_rays(m, 0), state.elevation - height_margin(state, emap.cfg.grid, EVERY)
-    well, slope = (values[0].numpy() for values in has_credible_end(state, m, rays, lowest, emap.cfg.grid, EVERY))
+    rays = sensor_rays(m, 0)
+    well, slope = (values[0].numpy() for values in has_credible_end(state, m, rays, emap.cfg.grid, EVERY))
     layers = {n: getattr(state, n)[0].numpy() for n in LAYERS}
     corner, rule = state.corner[0].tolist(), dict(min_support=EVERY.min_support, gate=EVERY.gate)
     slopes = [reference.believed_slope(origin, hit, layers, corner, RESOLUTION, **rule) for hit in hits]

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <utility>
 
 #include "../lanes.h"
 #include "../threads.h"
@@ -43,16 +44,13 @@ class Ground {
         const Lanes j = floor_of((y + rho * sine) / settings.resolution) + first_j;
         const Lanes near_i = clamp(i, 0, last_i), near_j = clamp(j, 0, last_j);
         const Flags inside = (i == near_i) & (j == near_j);
-        if (!count_set(inside)) return settings.beyond / rho;
-        const Lanes depth = below_sensor(integers(near_i) * width + integers(near_j));
-        return pick(inside, depth, all(settings.beyond)) / rho;
+        return pick(inside, below_sensor(integers(near_i) * width + integers(near_j)), all(settings.beyond)) / rho;
     }
 
   private:
     // Return how far below the sensor the cells' lowest ground lies [m], NO_FALL where it was not hit recently.
     Lanes below_sensor(Flags slot) const {
         const Flags recent = (gather(layers.validity, slot) > 0) & (gather(layers.time, slot) <= settings.min_time);
-        if (!count_set(recent)) return all(NO_FALL);
         const Lanes deviation = root(gather(layers.variance, slot) + settings.relief);
         const Lanes margin = smaller(settings.gate * deviation, all(NOWHERE));
         return pick(recent, z - (gather(layers.elevation, slot) - margin), all(NO_FALL));
@@ -64,13 +62,34 @@ struct Azimuth {
     float cosine, sine;
 };
 
+constexpr float NONE = std::numeric_limits<float>::infinity();
+
+// Return the numbers SHIFT places later.
+template <int SHIFT, int... I> inline Lanes later(Lanes a, std::integer_sequence<int, I...>) {
+#ifdef __clang__
+    return __builtin_shufflevector(all(NONE), a, (LANES - SHIFT + I)...);
+#else
+    return __builtin_shuffle(all(NONE), a, Flags{(LANES - SHIFT + I)...});
+#endif
+}
+
+// Return the minimum of each number and those before it.
+template <int SHIFT = 1> inline Lanes running_minimum(Lanes a) {
+    if constexpr (SHIFT < LANES)
+        return running_minimum<2 * SHIFT>(smaller(a, later<SHIFT>(a, std::make_integer_sequence<int, LANES>())));
+    else
+        return a;
+}
+
 // Write the running minimum of the falls to so many bins; room is for whole vectors.
 inline void march(const Azimuth& azimuth, int number, float* steepest) {
     Flags index;
     for (int l = 0; l < LANES; l++) index[l] = l;
-    float lowest = std::numeric_limits<float>::infinity();
+    Lanes lowest = all(NONE);
     for (int k = 0; k < number; k += LANES) {
-        store(steepest + k, azimuth.ground.falls(numbers(index + k), azimuth.cosine, azimuth.sine));
-        for (int l = k; l < k + LANES; l++) steepest[l] = lowest = std::min(lowest, steepest[l]);
+        const Lanes falls = azimuth.ground.falls(numbers(index + k), azimuth.cosine, azimuth.sine);
+        lowest = smaller(running_minimum(falls), lowest);
+        store(steepest + k, lowest);
+        lowest = all(lowest[LANES - 1]);
     }
 }

@@ -41,7 +41,7 @@ struct Bins {
   private:
     void find(Lanes r, Lanes turn, int32_t* range, int32_t* azimuth) const {
         const Flags k = integers(clamp(floor_of(r / step) - 1, -1, float(ranges - 1)));
-        const Flags a = integers(smaller(floor_of(turn * float(azimuths)), all(float(azimuths - 1))));
+        const Flags a = integers(clamp(floor_of(turn * float(azimuths)), 0, float(azimuths - 1)));
         std::memcpy(range, &k, sizeof k), std::memcpy(azimuth, &a, sizeof a);
     }
 };
@@ -89,11 +89,14 @@ class Horizon {
 
     void measure() {
         const int64_t azimuths = bins.azimuths;
+        if (rays.number > azimuths * bins.ranges) {  // rays are more work than bins
+            number.assign(azimuths, int32_t(bins.ranges));
+            return;
+        }
         std::vector<int32_t> farthest(parts() * azimuths, 0);
         in_parts([&](int64_t part, int64_t begin, int64_t end) {
             int32_t* own = &farthest[part * azimuths];
             bins.each(rays, begin, end, [&](int64_t, int k, int a) {
-                if (uint32_t(a) >= uint32_t(azimuths)) throw std::out_of_range("azimuth");
                 own[a] = std::max(own[a], k + 1);
             });
         });

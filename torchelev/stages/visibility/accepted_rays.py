@@ -34,14 +34,13 @@ def accepted_rays(state: MapState, m: Measurement, rays: Rays, grid: GridConfig,
 
     Accepted rays end credibly (`has_credible_end`) and do not pass below recently hit ground (`horizon`).
     """
-    lowest = state.elevation - height_margin(state, grid, cfg)
-    above = horizon(state, m, rays, lowest, grid, cfg) + rays.slope >= 0
-    well, slope = has_credible_end(state, m, rays, lowest, grid, cfg)
+    above = horizon(state, m, rays, grid, cfg) + rays.slope >= 0
+    well, slope = has_credible_end(state, m, rays, grid, cfg)
     return rays._replace(casts=rays.casts & well & above, slope=slope)
 
 
 def has_credible_end(
-    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
+    state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig
 ) -> tuple[Bool[Tensor, "B N"], Float[Tensor, "B N"]]:
     """Tell which rays end, or leave the window, in a well supported cell and not below it; and return their slopes.
 
@@ -52,7 +51,8 @@ def has_credible_end(
     """
     end = find_ends(state, m, rays, grid)
     ground = supported_ground(state, cfg, grid.resolution)
-    floor, known = (read(layer, end.slot) for layer in (lowest, ground))
+    elevation, variance, known = (read(layer, end.slot) for layer in (state.elevation, state.variance, ground))
+    floor = elevation - height_margin(variance, grid, cfg)
     near = ground_at_borders(ground, grid).gather(1, end.border)
     z = rays.origin[:, None, 2]
     height, deepest = z + end.reach * rays.slope, z + rays.r * rays.slope.clamp(max=0)

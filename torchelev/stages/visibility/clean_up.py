@@ -101,4 +101,4 @@ def passes_far_below(state: MapState, depth: Tensor, grid: GridConfig, cfg: Rayc
     cell, and what its plane rises from the centre to the border.
     """
     rise = (state.gradient_x.square() + state.gradient_y.square()).sqrt() * (0.5 * grid.resolution)
-    return depth > height_margin(state, grid, cfg) + rise
+    return depth > height_margin(state.variance, grid, cfg) + rise

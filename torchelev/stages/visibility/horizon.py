@@ -46,9 +46,7 @@ class Directions(NamedTuple):
     sines: Float[Tensor, "A"]
 
 
-def horizon(
-    state: MapState, m: Measurement, rays: Rays, lowest: Tensor, grid: GridConfig, cfg: RaycastConfig
-) -> Float[Tensor, "B N"]:
+def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B N"]:
     """Return the steepest fall -dz/dr that a ray may have before it passes below ground hit within `min_time`.
 
     Rays that pass below it contradict it, and are wrong returns. It is the minimum, from the sensor to two bins before
@@ -58,7 +56,6 @@ def horizon(
         state: the maps.
         m: the scan.
         rays: of one sensor.
-        lowest: heights (B, H, W) [m] below which a ray contradicts a cell.
         grid: the window.
         cfg: the rules.
     """
@@ -66,7 +63,7 @@ def horizon(
     ranges, ways = 8 * (polar.ranges // 16 + 1), directions(polar.azimuths // 2, rays.r)
     seen = SeenRays(rays.r, rays.azimuth, rays.origin, lattice_offset(state, m, grid))
     if not has_one_pass(state):
-        return limits_by_tensors(state, seen, lowest, ways, ranges, grid, cfg)
+        return limits_by_tensors(state, seen, ways, ranges, grid, cfg)
     layers = [state.elevation, state.variance, state.time, as_bytes(state.validity)]
     return _horizon(list(seen), layers, list(ways), ranges, [grid.resolution, cfg.gate, cfg.min_time])
 
@@ -81,7 +78,6 @@ def directions(number: int, like: Tensor) -> Directions:
 def limits_by_tensors(
     state: MapState,
     rays: SeenRays,
-    lowest: Tensor,
     ways: Directions,
     ranges: int,
     grid: GridConfig,
@@ -92,6 +88,7 @@ def limits_by_tensors(
     rho = (torch.arange(ranges, device=rays.r.device, dtype=rays.r.dtype) + 0.5)[:, None] * step
     x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(ways))
     slot, inside = locate(x, y, rays.offset, grid)
+    lowest = state.elevation - height_margin(state.variance, grid, cfg)
     recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)
     fall = torch.where(inside, read(below_sensor, slot), NO_FALL * step) / rho
@@ -110,8 +107,7 @@ def _horizon(
     limits = _native(rays, layers, ways, ranges, *settings)
     if limits is None:
         state, grid, cfg = _described(layers, *settings)
-        lowest = state.elevation - height_margin(state, grid, cfg)
-        limits = limits_by_tensors(state, SeenRays(*rays), lowest, Directions(*ways), ranges, grid, cfg)
+        limits = limits_by_tensors(state, SeenRays(*rays), Directions(*ways), ranges, grid, cfg)
     return limits
 
 

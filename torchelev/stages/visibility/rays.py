@@ -10,7 +10,7 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.polar_table import azimuth_fraction
-from torchelev.state import MapState, Measurement
+from torchelev.state import Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -39,7 +39,7 @@ def sensor_rays(m: Measurement, s: int) -> Rays:
     return Rays(m.origin[:, s], ray[..., :2], r, z / r, azimuth_fraction(x, y), variance.sqrt(), casts, casts & ~used)
 
 
-def height_margin(state: MapState, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B H W"]:
-    """Return how far below a cell's elevation a ray must pass to contradict it [m]; half a cell allows for relief."""
+def height_margin(variance: Float[Tensor, "..."], grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "..."]:
+    """Return how far below cells' elevations a ray must pass to contradict them [m]; half a cell allows for relief."""
     # An infinite gate must leave finite heights.
-    return (cfg.gate * (state.variance + (0.5 * grid.resolution) ** 2).sqrt()).clamp(max=NOWHERE)
+    return (cfg.gate * (variance + (0.5 * grid.resolution) ** 2).sqrt()).clamp(max=NOWHERE)
