@@ -104,6 +104,13 @@ def test_update_is_measure_forward_store(with_base):
     assert_close(with_gradient, b.state, 1e-5, skip=["traversability"])  # the root of a rounding error, on a few cells
 
 
+def test_forward_refuses_a_measurement_of_another_dtype():
+    emap, (cloud, T) = mapped(), scan(7)
+    m = small_map(2, dtype=torch.float64).measure(cloud, T, T, 0.2)
+    with pytest.raises(TypeError, match="measurement.*dtype, torch.float32.*float64"):
+        emap(emap.state, m)
+
+
 def test_update_neither_changes_nor_keeps_its_arguments():
     emap = small_map(2)
     cloud, T = scan(0)

@@ -186,9 +186,12 @@ class ElevationMap(ReadableMap):
 
         Raises:
             NotImplementedError: under `torch.func.jvp` and `torch.func.vmap`.
-            TypeError: if the state is of half precision.
+            TypeError: if the state is of half precision, or the measurement of another dtype than the state.
         """
-        require_full_precision(state.elevation.dtype)
+        dtype, other = state.elevation.dtype, measurement.points.dtype
+        require_full_precision(dtype)
+        hint = "measure with a map of that dtype"
+        require(other == dtype, "measurement", f"must be of the state's dtype, {dtype}", other, hint, TypeError)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
         before, state = state, forget_completed(state) if self._writes_back else state
         new = pipeline.forward(state, measurement, self.cfg, self._weights)

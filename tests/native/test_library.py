@@ -2,7 +2,9 @@
 
 import ctypes
 import os
+import platform
 import stat
+import subprocess
 
 import pytest
 
@@ -145,3 +147,17 @@ def test_threads_of_torch_and_its_own_do_all_the_work(is_of_torch, tmp_path):
         times = (ctypes.c_int * number)()
         library.call(opened.count, times, number, threads)
         assert list(times) == [1] * number
+
+
+@needs_compiler
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="names vectors of x86-64")
+@pytest.mark.parametrize("narrow", ["-mno-avx512f", "-mno-avx512f -mno-avx"])
+def test_every_library_builds_for_narrower_vectors(narrow):
+    """As of other processors; those that work on vectors say so by their own tests."""
+    for source in sorted(SOURCES.rglob("*.cpp")):
+        if source.parent.name == "completion":  # whose sizes are given at build time
+            continue
+        defines = [f"-D{name}=1e4f" for name in ("NO_RAY", "NOWHERE", "NO_FALL", "MIN_DET", "MIN_TRACE")]
+        command = [*library.find_compiler(), *library._FLAGS, *narrow.split(), *defines, "-fsyntax-only", str(source)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, f"{source.name}: {done.stderr[:2000]}"

@@ -49,7 +49,8 @@ def polar_minimum(
 
 def move_layers(layers: Sequence[Tensor], shift: Tensor, blanks: Sequence[float]) -> bool:
     """Do what `moving.move_in_place` does; return False where C++ cannot."""
-    is_plain = all(layer.device.type == "cpu" and layer.is_contiguous() for layer in layers)
+    dtypes = (torch.float32, torch.float64, torch.bool, torch.uint8)
+    is_plain = all(layer.is_cpu and layer.is_contiguous() and layer.dtype in dtypes for layer in layers)
     library = load("moving/moving.cpp", {}) if is_plain else None
     if library is None:
         return False

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "../lanes.h"
@@ -25,16 +26,17 @@ struct Polar {
     int levels;
 };
 
+template <int SHIFT, size_t... I> inline Lanes shifted(Lanes a, Lanes next, std::index_sequence<I...>) {
+#ifdef __clang__
+    return __builtin_shufflevector(a, next, int(SHIFT + I)...);
+#else
+    return __builtin_shuffle(a, next, Flags{int(SHIFT + I)...});
+#endif
+}
+
 // Return the numbers from place SHIFT on, of two vectors one after the other.
 template <int SHIFT> inline Lanes shifted(Lanes a, Lanes next) {
-    constexpr int S = SHIFT;
-#ifdef __clang__
-    return __builtin_shufflevector(a, next, S, S + 1, S + 2, S + 3, S + 4, S + 5, S + 6, S + 7, S + 8, S + 9, S + 10,
-                                   S + 11, S + 12, S + 13, S + 14, S + 15);
-#else
-    return __builtin_shuffle(a, next, Flags{S, S + 1, S + 2, S + 3, S + 4, S + 5, S + 6, S + 7, S + 8, S + 9, S + 10,
-                                            S + 11, S + 12, S + 13, S + 14, S + 15});
-#endif
+    return shifted<SHIFT>(a, next, std::make_index_sequence<LANES>());
 }
 
 template <int SHIFT> inline void widen_once(Lanes& a, Lanes& next) {
@@ -46,8 +48,10 @@ template <int SHIFT> inline void widen_once(Lanes& a, Lanes& next) {
 inline Lanes widened(Lanes a, Lanes next, int level) {
     if (level > 0) widen_once<1>(a, next);
     if (level > 1) widen_once<2>(a, next);
-    if (level > 2) widen_once<4>(a, next);
-    if (level > 3) widen_once<8>(a, next);
+    if constexpr (LANES > 4)
+        if (level > 2) widen_once<4>(a, next);
+    if constexpr (LANES > 8)
+        if (level > 3) widen_once<8>(a, next);
     return a;
 }
 
@@ -55,7 +59,8 @@ inline Lanes widened(Lanes a, Lanes next, int level) {
 // a blank row after that. Rows near the sensor, whose entries look at more azimuths than a block and the next one have,
 // are stored whole.
 class Table {
-    static constexpr int NEAR_LEVEL = 4;  // 2^4 azimuths: from any of a block to the last but one of the next
+    // 2^4 azimuths of 16 lanes: from any of a block to the last but one of the next
+    static constexpr int NEAR_LEVEL = LANES == 16 ? 4 : LANES == 8 ? 3 : 2;
     const Polar& polar;
     std::vector<float> blocks, whole;
     std::vector<int32_t> rows, first;  // of each block: rows that rays reach, and where its row 0 is

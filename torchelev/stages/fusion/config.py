@@ -25,6 +25,7 @@ class EdgeConfig:
     def __post_init__(self) -> None:
         for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
             require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
+        require(self.margin >= 0, "fusion.edges.margin", "must not be negative", self.margin, "give 0.25")
         require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
 
     def has_step(self, number: Tensor, far: Tensor) -> Tensor:

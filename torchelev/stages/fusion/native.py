@@ -147,4 +147,7 @@ def _c_settings(cfg: FusionConfig, resolution: float, has_rays: bool) -> _Settin
     own = {name: getattr(cfg, name) for name in names if hasattr(cfg, name)}
     given = {"resolution": resolution, "relief": cfg.relief * resolution, "floor": cfg.scan_variance_floor}
     flags = {"min_challengers": MIN_CHALLENGERS, "has_rays": has_rays, "has_edges": cfg.edges is not None}
-    return _Settings(**(own | of_edges | given | flags))
+    values = own | of_edges | given | flags
+    return _Settings(
+        **{name: min(value, 2**31 - 1) if isinstance(value, int) else value for name, value in values.items()}
+    )
