@@ -147,7 +147,6 @@ def _c_settings(cfg: FusionConfig, resolution: float, has_rays: bool) -> _Settin
     own = {name: getattr(cfg, name) for name in names if hasattr(cfg, name)}
     given = {"resolution": resolution, "relief": cfg.relief * resolution, "floor": cfg.scan_variance_floor}
     flags = {"min_challengers": MIN_CHALLENGERS, "has_rays": has_rays, "has_edges": cfg.edges is not None}
-    values = own | of_edges | given | flags
-    return _Settings(
-        **{name: min(value, 2**31 - 1) if isinstance(value, int) else value for name, value in values.items()}
-    )
+    values = (own | of_edges | given | flags).items()
+    # C's integers have 32 bits.
+    return _Settings(**{name: min(v, 2**31 - 1) if isinstance(v, int) else v for name, v in values})

@@ -42,8 +42,8 @@ class SeenRays(NamedTuple):
 class Directions(NamedTuple):
     """Azimuths, evenly spaced."""
 
-    cosines: Float[Tensor, "A"]
-    sines: Float[Tensor, "A"]
+    cosines: Float[Tensor, "A"]  #: of each azimuth
+    sines: Float[Tensor, "A"]  #: of each azimuth
 
 
 def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B N"]:
