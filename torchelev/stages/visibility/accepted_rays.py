@@ -51,8 +51,8 @@ def has_credible_end(
     """
     end = find_ends(state, m, rays, grid)
     ground = supported_ground(state, cfg, grid.resolution)
-    elevation, variance, known = (read(layer, end.slot) for layer in (state.elevation, state.variance, ground))
-    floor = elevation - height_margin(variance, grid, cfg)
+    lowest = state.elevation - height_margin(state.variance, grid, cfg)
+    floor, known = (read(layer, end.slot) for layer in (lowest, ground))
     near = ground_at_borders(ground, grid).gather(1, end.border)
     z = rays.origin[:, None, 2]
     height, deepest = z + end.reach * rays.slope, z + rays.r * rays.slope.clamp(max=0)
