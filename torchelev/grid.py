@@ -5,6 +5,7 @@ Cell k of an axis spans k * resolution to (k + 1) * resolution in the map frame,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -44,6 +45,12 @@ class GridConfig:
     def num_cells(self) -> int:
         """H * W, number of cells."""
         return self.height * self.width
+
+
+def grid_of(size: Sequence[int], resolution: float) -> GridConfig:
+    """Return the grid of so many cells along x and y."""
+    height, width = size
+    return GridConfig(resolution=resolution, length_x=height * resolution, length_y=width * resolution)
 
 
 def locate(x: Tensor, y: Tensor, offset: Float[Tensor, "B 2"], grid: GridConfig) -> tuple[Tensor, Tensor]:

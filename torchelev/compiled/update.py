@@ -22,7 +22,7 @@ from torchelev.stages.compensate import compensate
 from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.measure import measure
 from torchelev.stages.overlap import clear_other_floors
-from torchelev.stages.recenter import follow_in_place, recenter
+from torchelev.stages.recenter import recenter
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.traversability.weight_file import Weights
@@ -145,12 +145,13 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
 
     def first(stored: MapState, points: Tensor, *others: Any) -> Measurement:
         m = measure(points, *others, cfg.grid, cfg.sensor, stored.elevation.dtype)  # type: ignore[call-arg]
-        moved = follow_in_place(stored, m, cfg.grid) if stored.elevation.is_cpu and is_native() else None
+        in_place = stored.elevation.is_cpu and is_native()
+        moved = recenter(stored, m, cfg.grid, in_place=True) if in_place else stored
         old = with_masks(stored, as_mask)
-        if moved is None:
-            state = recenter(old, m, cfg.grid)
-        else:
+        if in_place:
             state = old._replace(corner=moved.corner, base_height=moved.base_height)
+        else:
+            state = recenter(old, m, cfg.grid)
         write_changes(stored, old, let_time_pass(state, m, cfg))
         return with_masks(m, as_bytes)
 

@@ -16,6 +16,7 @@ constexpr int LANES = 4;
 #endif
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparisons: -1 true, 0 false
+typedef uint8_t Bytes __attribute__((vector_size(LANES)));
 
 inline Lanes all(float value) { return Lanes{} + value; }
 inline Lanes pick(Flags flags, Lanes yes, Lanes no) { return flags ? yes : no; }
@@ -52,6 +53,25 @@ inline int count_set(Flags flags) {
     std::memcpy(values, &flags, sizeof flags);
     for (int l = 0; l < LANES; l++) total -= values[l];
     return total;
+}
+
+inline bool any(Flags flags) {
+    uint64_t words[2]{};
+    const Bytes bytes = __builtin_convertvector(flags & 1, Bytes);
+    std::memcpy(words, &bytes, sizeof bytes);
+    return words[0] | words[1];
+}
+
+// Numbers of bytes, and bytes of numbers. A count that is known to the compiler takes one step.
+template <class Count> inline Flags load_bytes(const uint8_t* values, Count count) {
+    Bytes bytes{};
+    std::memcpy(&bytes, values, count);
+    return __builtin_convertvector(bytes, Flags);
+}
+
+template <class Count> inline void store_bytes(uint8_t* values, Flags numbers, Count count) {
+    const Bytes bytes = __builtin_convertvector(numbers, Bytes);
+    std::memcpy(values, &bytes, count);
 }
 
 inline Lanes load(const float* values, int count = LANES) {

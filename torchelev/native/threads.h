@@ -2,6 +2,7 @@
 #pragma once
 
 #include <atomic>
+#include <cstdint>
 #include <exception>
 #include <mutex>
 #include <stdexcept>
@@ -46,6 +47,30 @@ template <class Work> void for_each(int count, int num_threads, const Work& work
     };
     on_threads(count, num_threads, run);
     if (failure) std::rethrow_exception(failure);
+}
+
+// Calls `work(part, first, last)` for parts of 0 to `size`, which may run side by side.
+struct Parts {
+    int64_t number;
+    int num_threads;
+
+    template <class Work> void operator()(int64_t size, const Work& work) const {
+        for_each(int(number), num_threads, [&](int64_t k) { work(k, size * k / number, size * (k + 1) / number); });
+    }
+};
+
+// Call `work(b, threads)` for each environment: a thread for each where there are `per_thread` of them for every thread,
+// else all threads for one after the other.
+template <class Work> void for_environments(int64_t B, int num_threads, const Work& work, int per_thread = 1) {
+    if (B >= per_thread * num_threads)
+        for_each(int(B), num_threads, [&](int64_t b) { work(b, 1); });
+    else
+        for (int64_t b = 0; b < B; b++) work(b, num_threads);
+}
+
+inline int64_t checked(int64_t index, int64_t size) {
+    if (uint64_t(index) >= uint64_t(size)) throw std::out_of_range("index");
+    return index;
 }
 
 // Do the work; return 0, or 1 if an index was out of range, or 2 without memory. No exception may reach C.

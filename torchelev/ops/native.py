@@ -1,4 +1,4 @@
-"""Operators in C++ (`torchelev/native/tables`): the same numbers as `torchelev.ops.operators`."""
+"""Operators in C++ (`torchelev/native/tables`): the same as `torchelev.ops.operators`; and the way to call others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchelev.native.library import call, load
+from torchelev.native.library import call, is_native, load
+from torchelev.ops.transforms import is_transforming
+
+
+def computes(layer: Tensor) -> bool:
+    """Tell whether C++ may compute what has no gradient of a layer: it is float32 on a CPU, and no transform runs."""
+    return layer.is_cpu and layer.dtype == torch.float32 and not is_transforming() and is_native()
 
 
 def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor | None:
@@ -19,7 +25,7 @@ def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor | None:
         return None
     sums = values.new_empty(*values.shape[:2], size)
     rows = values.shape[0] * values.shape[1]
-    _call(library.add_by_slot, [index, values, sums], rows, *index.shape, size)
+    run(library.add_by_slot, [index, values, sums], rows, *index.shape, size)
     return sums
 
 
@@ -29,7 +35,7 @@ def running_minimum(table: Tensor) -> Tensor | None:
     if library is None:
         return None
     result = torch.empty_like(table, memory_format=torch.contiguous_format)
-    _call(library.running_minimum, [table, result], *table.shape)
+    run(library.running_minimum, [table, result], *table.shape)
     return result
 
 
@@ -43,7 +49,7 @@ def polar_minimum(
     table = values.new_empty(len(values), rows, azimuths)
     levels = (ctypes.c_int64 * len(widen))(*widen)
     sizes = (*values.shape, rows, azimuths, ranges)
-    _call(library.polar_minimum, [index, values, table], *sizes, levels, len(widen), ctypes.c_float(blank))
+    run(library.polar_minimum, [index, values, table], *sizes, levels, len(widen), blank)
     return table
 
 
@@ -60,10 +66,7 @@ def move_layers(layers: Sequence[Tensor], shift: Tensor, blanks: Sequence[float]
         (ctypes.c_int64 * number)(*(layer.element_size() for layer in layers)),
         (ctypes.c_double * number)(*blanks),
     )
-    sizes = [ctypes.c_int64(size) for size in layers[0].shape]
-    shifts = shift.contiguous()
-    address, count = ctypes.c_void_p(shifts.data_ptr()), ctypes.c_int64(number)
-    call(library.move_layers, *arrays, count, address, *sizes, torch.get_num_threads())
+    run(library.move_layers, [shift], *arrays, number, *layers[0].shape)
     return True
 
 
@@ -75,9 +78,20 @@ def _library(values: Tensor, index: Tensor | None = None) -> ctypes.CDLL | None:
     return load("tables/tables.cpp", {}) if is_plain else None
 
 
-def _call(function: Any, tensors: Sequence[Tensor], *arguments: Any) -> None:
-    """Call a function with the addresses of tensors."""
-    arrays = [tensor.contiguous() for tensor in tensors]
-    addresses = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
-    whole = [ctypes.c_int64(value) if isinstance(value, int) else value for value in arguments]
-    call(function, *addresses, *whole, torch.get_num_threads())
+def run(function: Any, tensors: Sequence[Tensor | None], *arguments: Any) -> None:
+    """Call a library's function, which waits for torch's number of threads last.
+
+    Args:
+        function: of a library.
+        tensors: whose addresses it gets; those that it writes must be contiguous. None: a null pointer.
+        arguments: an int becomes int64, a float float32.
+    """
+    arrays = [None if tensor is None else tensor.contiguous() for tensor in tensors]
+    addresses = [ctypes.c_void_p(None if array is None else array.data_ptr()) for array in arrays]
+    call(function, *addresses, *map(_number, arguments), torch.get_num_threads())
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, int):
+        return ctypes.c_int64(value)
+    return ctypes.c_float(value) if isinstance(value, float) else value

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require, whole_cells
-from torchelev.grid import GridConfig
+from torchelev.grid import grid_of
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
 from torchelev.site.export import Place, choose_area, export
@@ -131,8 +131,7 @@ class ReadableSite:
     def _copy(self, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str]) -> SavedMap:
         """Copy an area whose first cell has these numbers on the lattice."""
         area = read_area(self._tiles, corner, size, names, self._clock)
-        length_x, length_y = (cells * self.resolution for cells in size)
-        grid = GridConfig(resolution=self.resolution, length_x=length_x, length_y=length_y)
+        grid = grid_of(size, self.resolution)
         middle = [(c + n / 2) * self.resolution for c, n in zip(corner, size, strict=True)]
         arrays = {name: value.numpy() for name, value in area.items()}
         config = ElevationMapConfig(grid=grid).to_dict()

@@ -16,33 +16,32 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
-def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
+def recenter(state: MapState, m: Measurement, grid: GridConfig, in_place: bool = False) -> MapState:
     """Move the window by whole cells so that it follows the robot (paper, Sec. II: a robot-centric map).
 
     World-fixed cells keep their value to the bit, entering cells are blank. Environments move independently.
-    Without a base pose the window stays.
+    Without a base pose the window stays. `in_place`: the layers, on a CPU, move in their own memory.
     """
-    return state if m.base is None else follow(state, m.base, m.anchor, grid)
+    return state if m.base is None else follow(state, m.base, m.anchor, grid, in_place)
 
 
-def follow(state: MapState, base: Float[Tensor, "B 3"], anchor: Int[Tensor, "B 2"], grid: GridConfig) -> MapState:
+def follow(
+    state: MapState,
+    base: Float[Tensor, "B 3"],
+    anchor: Int[Tensor, "B 2"],
+    grid: GridConfig,
+    in_place: bool = False,
+) -> MapState:
     """Move the windows by whole cells to `base` [m], whose x, y count from cell `anchor`; not where it is NaN."""
     moves = torch.isfinite(base).all(1)
     corner, shift = move_corner(state, base, anchor, moves, grid)
-    layers: dict[str, Any] = move_layers({name: getattr(state, name) for name in LAYERS}, shift, BLANK)
+    layers: dict[str, Any] = {name: getattr(state, name) for name in LAYERS}
+    if in_place:
+        move_in_place(list(layers.values()), shift, [BLANK.get(name, 0.0) for name in layers])
+    else:
+        layers = move_layers(layers, shift, BLANK)
     base_height = torch.where(moves, base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **layers)
-
-
-def follow_in_place(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
-    """Do what `recenter` does to layers on a CPU, in their own memory; return the state of these layers."""
-    if m.base is None:
-        return state
-    moves = torch.isfinite(m.base).all(1)
-    corner, shift = move_corner(state, m.base, m.anchor, moves, grid)
-    move_in_place([getattr(state, name) for name in LAYERS], shift, [BLANK.get(name, 0.0) for name in LAYERS])
-    base_height = torch.where(moves, m.base[:, 2], state.base_height)
-    return state._replace(corner=corner, base_height=base_height)
 
 
 @stored

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.native.library import call, is_native, load
+from torchelev.native.library import load
 from torchelev.ops.masks import NOWHERE
+from torchelev.ops.native import computes, run
 from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.ops.transforms import is_transforming
 from torchelev.stages.surface import MIN_DET, MIN_TRACE, Normals, SurfaceConfig, known_ground, min_spread, normals
 from torchelev.traversability.heads import Critical, PlaneRating, TraversabilityConfig, traversability
 
@@ -45,8 +45,7 @@ def rate_planes(
 def _suits(elevation: Tensor) -> bool:
     """Tell whether C++ can take a layer, whose gradient it does not compute."""
     wants_gradient = torch.is_grad_enabled() and (torch.compiler.is_compiling() or elevation.requires_grad)
-    is_plain = elevation.is_cpu and elevation.dtype == torch.float32
-    return is_plain and not wants_gradient and not is_transforming() and is_native()
+    return computes(elevation) and not wants_gradient
 
 
 def _layers(
@@ -80,12 +79,9 @@ def _rate_planes(
         layers = _layers(elevation, as_mask(known), radius, cells, resolution, critical)
         return [as_bytes(layer) if layer.dtype == torch.bool else layer for layer in layers]
     layers = _empty_layers(elevation, cells)
-    inputs = [elevation.contiguous(), known.contiguous()]
-    addresses = [ctypes.c_void_p(tensor.data_ptr()) for tensor in (*inputs, *layers)]
-    addresses += [ctypes.c_void_p()] * (2 + len(_NAMES) - len(addresses))
-    sizes = [ctypes.c_int64(size) for size in (*elevation.shape, radius, cells)]
+    tensors = [elevation, known, *layers, *[None] * (len(_NAMES) - len(layers))]
     numbers = resolution, min_spread(radius), min_spread(cells), *(critical or 3 * [1.0])
-    call(library.rate_surface, *addresses, *sizes, (ctypes.c_float * 6)(*numbers), torch.get_num_threads())
+    run(library.rate_surface, tensors, *elevation.shape, radius, cells, (ctypes.c_float * 6)(*numbers))
     return layers
 
 

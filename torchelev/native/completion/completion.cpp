@@ -40,19 +40,10 @@ extern "C" int complete(const float* weights, const float* elevation, const bool
         return Map({elevation + first, variance + first, upper_bound + first, age + first, known + first,
                     bounded + first, mean + first, std + first}, H, W, resolution);
     };
-    return code_of([&] {
-        if (B >= num_threads) {
-            for_each(B, num_threads, [&](int b) {
-                Map map = make_map(b);
-                map.count_steps(), map.sum_layers();
-                for (int i = 0; i < H; i++) complete_row(parameters, map, i);
-            });
-            return;
-        }
-        for (int b = 0; b < B; b++) {
-            Map map = make_map(b);
-            for_each(2, num_threads, [&](int part) { part ? map.count_steps() : map.sum_layers(); });
-            for_each(H, num_threads, [&](int i) { complete_row(parameters, map, i); });
-        }
-    });
+    auto fill = [&](int64_t b, int threads) {
+        Map map = make_map(int(b));
+        for_each(2, threads, [&](int part) { part ? map.count_steps() : map.sum_layers(); });
+        for_each(H, threads, [&](int i) { complete_row(parameters, map, i); });
+    };
+    return code_of([&] { for_environments(B, num_threads, fill); });
 }

@@ -11,11 +11,6 @@ namespace {
 constexpr int64_t CELLS_PER_POINT = 4;  // up to which several threads sort the points: each counts in all cells
 constexpr int64_t PARTS_PER_THREAD = 4;
 
-inline int64_t checked(int64_t slot, int64_t num_cells) {
-    if (uint64_t(slot) >= uint64_t(num_cells)) throw std::out_of_range("slot");
-    return slot;
-}
-
 // The scan of B environments with M points each, of S sensors.
 struct Scan {
     const float *points, *noise, *shared, *origins;  // (B, M, 3) [m], (B, M) [m^2] or null, (B, S, 3) [m]
@@ -32,16 +27,6 @@ struct Sorted {
 
     Points points(int64_t k) const {
         return {&sorted[starts[k]], &sorted[starts[k + 1]], float(starts[k + 1] - starts[k])};
-    }
-};
-
-// Calls `work(part, first, last)` for parts of 0 to `size`, which may run side by side.
-struct Parts {
-    int64_t number;
-    int num_threads;
-
-    template <class Work> void operator()(int64_t size, const Work& work) const {
-        for_each(number, num_threads, [&](int64_t k) { work(k, size * k / number, size * (k + 1) / number); });
     }
 };
 
@@ -160,15 +145,6 @@ struct Maps {
         });
     }
 };
-
-// Call `work(b, threads)` for each environment: one thread for each, or all for one after the other.
-template <class Work> void for_environments(int64_t B, int num_threads, const Work& work) {
-    if (B >= num_threads) {
-        for_each(B, num_threads, [&](int64_t b) { work(b, 1); });
-        return;
-    }
-    for (int64_t b = 0; b < B; b++) work(b, num_threads);
-}
 
 }  // namespace
 

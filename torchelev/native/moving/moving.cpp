@@ -32,8 +32,8 @@ void move(uint8_t* layer, int64_t H, int64_t W, int64_t size, int64_t di, int64_
 }  // namespace
 
 // Move `count` layers (B, H, W) with cells of sizes[k] bytes by shifts (B, 2), each environment by its own.
-extern "C" int move_layers(uint8_t* const* layers, const int64_t* sizes, const double* blanks, int64_t count,
-                           const int64_t* shifts, int64_t B, int64_t H, int64_t W, int num_threads) {
+extern "C" int move_layers(const int64_t* shifts, uint8_t* const* layers, const int64_t* sizes, const double* blanks,
+                           int64_t count, int64_t B, int64_t H, int64_t W, int num_threads) {
     auto move_one = [&](int64_t k) {
         const int64_t b = k / count, l = k % count, di = shifts[2 * b], dj = shifts[2 * b + 1];
         if (di != 0 || dj != 0) move(layers[l] + b * H * W * sizes[l], H, W, sizes[l], di, dj, blanks[l]);

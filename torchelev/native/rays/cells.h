@@ -3,19 +3,6 @@
 
 #include "table.h"
 
-typedef uint8_t Bytes __attribute__((vector_size(LANES)));
-
-template <class Count> inline Flags load_bytes(const uint8_t* values, Count count) {
-    Bytes bytes{};
-    std::memcpy(&bytes, values, count);
-    return __builtin_convertvector(bytes, Flags);
-}
-
-template <class Count> inline void store_bytes(uint8_t* values, Flags numbers, Count count) {
-    const Bytes bytes = __builtin_convertvector(numbers, Bytes);
-    std::memcpy(values, &bytes, count);
-}
-
 // [m], [s], RaycastConfig
 struct Settings {
     float resolution, min_time, min_incidence, gate;
@@ -123,11 +110,11 @@ struct Row {
         const Lanes azimuth = azimuth_fraction(xs, ys) * float(polar.azimuths);
         const Lanes slope = lowest_slope(table, polar, k, azimuth, nearest);
         const Flags found = slope < NO_RAY;
-        if (!count_set(found)) return;
+        if (!any(found)) return;
         const int64_t n = first + j;
         const Lanes height = z + slope * rho;
         Flags known = load_bytes(old.validity + n, count) > 0;
-        if (count_set(found & known)) {
+        if (any(found & known)) {
             known &= ~gone(n, count, found & known, ys, rho, slope, height);
             store_bytes(changed.validity + n, -known, count);
         }
@@ -140,7 +127,7 @@ struct Row {
     Flags gone(int64_t n, Count count, Flags cells, Lanes ys, Lanes rho, Lanes slope, Lanes height) const {
         const Lanes depth = load(old.elevation + n, count) - height, variance = load(old.variance + n, count);
         const Flags may = cells & (depth > root(variance)) & (load(old.time + n, count) > settings.min_time);
-        if (!count_set(may)) return may;
+        if (!any(may)) return may;
         const Lanes gx = load(old.gradient_x + n, count), gy = load(old.gradient_y + n, count);
         const Lanes along = absolute(slope - (gx * x + gy * ys) / rho);
         const Lanes incidence = along / root((1 + slope * slope) * (1 + gx * gx + gy * gy));
@@ -156,7 +143,7 @@ struct Row {
     template <class Count>
     void refute_challengers(int64_t n, Count count, Flags found, Flags known, Lanes slope, Lanes height) const {
         const Flags support = load_bytes(old.challenger_support + n, count);
-        if (!count_set(support > 0)) return;
+        if (!any(support > 0)) return;
         const Lanes fall = absolute(slope) * settings.resolution;
         const Flags passes_below = found & (height < load(old.challenger + n, count) + 0.70710678f * fall);
         store_bytes(changed.challenger_support + n, ~passes_below & known & support, count);

@@ -70,7 +70,7 @@ class Horizon {
     }
 
     void look_up(float* limits) const {
-        in_parts([&](int64_t, int64_t begin, int64_t end) {
+        parts()(rays.number, [&](int64_t, int64_t begin, int64_t end) {
             bins.each(rays, begin, end, [&](int64_t i, int k, int a) {
                 limits[i] = k < 0 ? NO_FALL : steepest[first[a] + k];
             });
@@ -78,13 +78,8 @@ class Horizon {
     }
 
   private:
-    int64_t parts() const {
-        return std::max(int64_t(1), std::min(int64_t(num_threads), rays.number / RAYS_AT_A_TIME));
-    }
-
-    template <class Work> void in_parts(const Work& work) const {
-        const int64_t count = parts(), size = rays.number;
-        for_each(int(count), num_threads, [&](int64_t k) { work(k, size * k / count, size * (k + 1) / count); });
+    Parts parts() const {
+        return {std::clamp(rays.number / RAYS_AT_A_TIME, int64_t(1), int64_t(num_threads)), num_threads};
     }
 
     void measure() {
@@ -93,8 +88,8 @@ class Horizon {
             number.assign(azimuths, int32_t(bins.ranges));
             return;
         }
-        std::vector<int32_t> farthest(parts() * azimuths, 0);
-        in_parts([&](int64_t part, int64_t begin, int64_t end) {
+        std::vector<int32_t> farthest(parts().number * azimuths, 0);
+        parts()(rays.number, [&](int64_t part, int64_t begin, int64_t end) {
             int32_t* own = &farthest[part * azimuths];
             bins.each(rays, begin, end, [&](int64_t, int k, int a) {
                 own[a] = std::max(own[a], k + 1);
@@ -133,11 +128,5 @@ extern "C" int horizon(const float* r, const float* azimuth, const float* origin
         const Rays rays{r + b * N, azimuth + b * N, N};
         Horizon(bins, rays, ground, cosines, sines, threads).look_up(limits + b * N);
     };
-    return code_of([&] {
-        // A thread for each map, or all of them for one map after the other.
-        if (B >= num_threads)
-            for_each(int(B), num_threads, [&](int b) { look(b, 1); });
-        else
-            for (int64_t b = 0; b < B; b++) look(b, num_threads);
-    });
+    return code_of([&] { for_environments(B, num_threads, look); });
 }

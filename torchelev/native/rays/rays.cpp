@@ -9,6 +9,7 @@
 
 constexpr int64_t AT_A_TIME = 2048;  // cells that a thread takes
 constexpr int64_t LARGE = 1000000;  // entries of a table that is worth several threads
+constexpr int MAPS_PER_THREAD = 4;  // from which on each thread takes whole maps
 
 // What rays (B, N) of one sensor make of maps (B, H, W); masks are bytes. `x` (B, H) and `y` (B, W) are the cells'
 // places as seen from the sensors, and `z` (B) the sensors' heights [m]. The last four layers are the results.
@@ -34,11 +35,5 @@ extern "C" int apply_rays(const int32_t* range, const int32_t* azimuth, const fl
                 Row{table, polar, settings, layers, changed, i * W, x[i], z[b], y + b * W, int(W)}.apply();
         });
     };
-    return code_of([&] {
-        // A thread for each map, or all of them for one map after the other.
-        if (B >= 4 * num_threads)
-            for_each(int(B), num_threads, [&](int b) { update(b, 1); });
-        else
-            for (int64_t b = 0; b < B; b++) update(b, num_threads);
-    });
+    return code_of([&] { for_environments(B, num_threads, update, MAPS_PER_THREAD); });
 }

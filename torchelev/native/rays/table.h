@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "../lanes.h"
+#include "../minima.h"
 #include "../threads.h"
 
 // Of rays from one sensor.
@@ -82,7 +83,7 @@ class Table {
             for (int b = begin(k); b < begin(k + 1); b++)
                 scan_block(b, b + 1 == begin(k + 1) ? next[k].data() : blocks.data() + first[b + 1]);
         });
-        for_each(near, num_threads, [&](int row) { widen_row(row); });
+        for_each(near, num_threads, [&](int row) { widen_whole(row); });
     }
 
     float at(int row, int azimuth) const {
@@ -158,15 +159,10 @@ class Table {
     }
 
     // Make each entry of a whole row the minimum of itself and the 2^level - 1 that follow it, all around.
-    void widen_row(int row) {
+    void widen_whole(int row) {
         const int width = polar.azimuths;
-        float* entry = whole.data() + row * width;
         std::vector<float> start(width);
-        for (int w = 0; w < polar.levels && row < polar.widen[w]; w++) {
-            const int shift = (1 << w) % width;
-            std::copy(entry, entry + shift, start.begin());
-            for (int a = 0; a < width - shift; a++) entry[a] = std::min(entry[a], entry[a + shift]);
-            for (int a = width - shift; a < width; a++) entry[a] = std::min(entry[a], start[a - (width - shift)]);
-        }
+        for (int w = 0; w < polar.levels && row < polar.widen[w]; w++)
+            widen_row(whole.data() + row * width, width, (1 << w) % width, start.data());
     }
 };

@@ -8,23 +8,6 @@
 
 #include "../lanes.h"
 
-typedef uint8_t Bytes __attribute__((vector_size(LANES)));
-
-inline Bytes bytes_of(Flags flags) { return __builtin_convertvector(flags & 1, Bytes); }
-
-inline Flags flags_of(const uint8_t* mask) {
-    Bytes bytes;
-    std::memcpy(&bytes, mask, sizeof bytes);
-    return __builtin_convertvector(bytes, Flags) > 0;
-}
-
-inline bool any(Flags flags) {
-    uint64_t words[2]{};
-    const Bytes bytes = bytes_of(flags);
-    std::memcpy(words, &bytes, sizeof bytes);
-    return words[0] | words[1];
-}
-
 inline int whole_lanes(int count) { return (count + LANES - 1) / LANES * LANES; }
 
 // Numbers that begin where vectors are read fastest.
@@ -75,7 +58,7 @@ public:
         float *known = known_.data() + offset_, *height = height_.data() + offset_;
         int k = begin_;
         for (; k + LANES <= end_; k += LANES) {
-            const Flags is_known = flags_of(validity + k);
+            const Flags is_known = load_bytes(validity + k, LANES) > 0;
             store(known + k, one_if(is_known)), store(height + k, pick(is_known, load(elevation + k) - mean_, all(0)));
         }
         for (; k < end_; k++) known[k] = validity[k] ? 1 : 0, height[k] = validity[k] ? elevation[k] - mean_ : 0;
@@ -110,7 +93,7 @@ private:
             const uint8_t* validity = map_.validity + cell(row);
             int k = begin_;
             for (; k + LANES <= end_; k += LANES) {
-                const Flags is_known = flags_of(validity + k);
+                const Flags is_known = load_bytes(validity + k, LANES) > 0;
                 if (!any(is_known)) continue;
                 number += one_if(is_known), sum += pick(is_known, load(elevation + k), all(0));
             }

@@ -1,4 +1,4 @@
-// Normals and the analytic head's rating of maps: traversability/surface.py.
+// Normals and the analytic head's rating of maps: traversability/planes.py.
 
 #include "../threads.h"
 #include "planes.h"
@@ -7,7 +7,7 @@ namespace {
 
 constexpr int ROWS = 64, COLUMNS = 128;  // of a tile: the sums of its last rows stay in the nearest cache
 
-// The numbers of `surface.py`.
+// What `_rate_planes` gives.
 struct Settings {
     float resolution;     // [m]
     float min_spread[2];  // [cells^2] of the normals' windows and of the head's
@@ -33,8 +33,7 @@ void put(float* layer, Lanes values, int count) {
 }
 
 void put(uint8_t* layer, Flags flags, int count) {
-    const Bytes bytes = bytes_of(flags);
-    count == LANES ? std::memcpy(layer, &bytes, LANES) : std::memcpy(layer, &bytes, count);
+    count == LANES ? store_bytes(layer, flags & 1, LANES) : store_bytes(layer, flags & 1, count);
 }
 
 // What is kept of a tile's last rows.
@@ -166,7 +165,7 @@ int parts(int length, int size) { return (length + size - 1) / size; }
 
 }  // namespace
 
-// Layers of (B, H, W) as in surface.py; without the head, `cells` is 0, and so are `traversability` and `rated`.
+// Layers of (B, H, W) as in planes.py; without the head, `cells` is 0, and so are `traversability` and `rated`.
 // Returns what `code_of` does.
 extern "C" int rate_surface(const float* elevation, const uint8_t* validity, float* gradient_x, float* gradient_y,
                             uint8_t* has_normal, float* traversability, uint8_t* rated, int64_t B, int64_t H, int64_t W,

@@ -3,22 +3,14 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <stdexcept>
 #include <vector>
 
+#include "../minima.h"
 #include "../threads.h"
 
 namespace {
 
 constexpr int64_t COLUMNS = 1024;  // of a table that one thread scans: their rows stay in its cache
-
-// The lower value; NaN if one of them is.
-inline float lower(float a, float b) { return a < b || a != a ? a : b; }
-
-inline int64_t checked(int64_t index, int64_t size) {
-    if (uint64_t(index) >= uint64_t(size)) throw std::out_of_range("index");
-    return index;
-}
 
 // Turn each row into the minimum of itself and the one before it.
 void scan(float* table, int64_t first, int64_t last, int64_t step, int64_t width, int64_t begin, int64_t end) {
@@ -27,13 +19,6 @@ void scan(float* table, int64_t first, int64_t last, int64_t step, int64_t width
         float* row = table + r * width;
         for (int64_t a = begin; a < end; a++) row[a] = lower(before[a], row[a]);
     }
-}
-
-// Make each entry of a row the minimum of itself and the one `shift` on, all around; `start` has room for `shift`.
-void widen_row(float* row, int64_t width, int64_t shift, float* start) {
-    std::copy(row, row + shift, start);
-    for (int64_t a = 0; a < width - shift; a++) row[a] = lower(row[a], row[a + shift]);
-    for (int64_t a = width - shift; a < width; a++) row[a] = lower(row[a], start[a - (width - shift)]);
 }
 
 struct Polar {
@@ -100,19 +85,12 @@ extern "C" int polar_minimum(const int64_t* index, const float* values, float* t
                              int64_t rows, int64_t azimuths, int64_t ranges, const int64_t* widen, int64_t levels,
                              float blank, int num_threads) {
     const Polar polar{rows, azimuths, ranges, number, widen, levels, blank};
-    // One thread for each table, or several for one after the other, each with some of the columns, then of the rows.
-    const int64_t parts = B >= num_threads ? 1 : 4 * num_threads;
-    auto make = [&](int64_t b, auto each) {
+    auto make = [&](int64_t b, int threads) {
         float* table = tables + b * rows * azimuths;
         polar.fill(index + b * number, values + b * number, table);
-        each([&](int64_t k) { polar.scan_columns(table, k * azimuths / parts, (k + 1) * azimuths / parts); });
-        each([&](int64_t k) { polar.widen_rows(table, k * rows / parts, (k + 1) * rows / parts); });
+        const Parts parts{threads == 1 ? 1 : 4 * threads, threads};
+        parts(azimuths, [&](int64_t, int64_t begin, int64_t end) { polar.scan_columns(table, begin, end); });
+        parts(rows, [&](int64_t, int64_t begin, int64_t end) { polar.widen_rows(table, begin, end); });
     };
-    return code_of([&] {
-        if (parts == 1) {
-            for_each(B, num_threads, [&](int64_t b) { make(b, [](auto work) { work(0); }); });
-            return;
-        }
-        for (int64_t b = 0; b < B; b++) make(b, [&](auto work) { for_each(parts, num_threads, work); });
-    });
+    return code_of([&] { for_environments(B, num_threads, make); });
 }

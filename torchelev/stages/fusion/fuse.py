@@ -34,7 +34,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
     Each cell counts the points that agree with it, less those that do not (majority vote of Boyer and Moore), so that
     the height on which most points agree wins, even if an outlier came first. A scan that disagrees raises the
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
-    above the cell agree with each other (`challenge`): a new obstacle appears soon, even on ground seen for long.
+    above the cell agree with each other (`challenge`): a new obstacle appears soon, even on settled ground.
     """
     cells = cells_of(state, m, grid)
     noise = m.variance if m.noise is None else m.noise

@@ -10,8 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchelev.grid import GridConfig
-from torchelev.native.library import call, is_native, load
+from torchelev.grid import GridConfig, grid_of
+from torchelev.native.library import load
+from torchelev.ops.indexing import can_select
+from torchelev.ops.native import computes, run
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.cells import PointCells
 from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
@@ -37,10 +39,7 @@ class _Settings(ctypes.Structure):
 
 def can_update_hit(state: MapState) -> bool:
     """Tell whether `update_hit` takes the state: float32 on a CPU, without a gradient."""
-    layer = state.elevation
-    if torch.is_grad_enabled() or layer.dtype != torch.float32 or layer.device.type != "cpu":
-        return False
-    return (torch.compiler.is_compiling() or type(layer) is Tensor) and is_native()
+    return computes(state.elevation) and can_select(state.elevation) and not torch.is_grad_enabled()
 
 
 def update_hit(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:
@@ -99,29 +98,15 @@ def _update_hit(
     new = [torch.empty(B * M, dtype=layer.dtype) for layer in layers]
     cells, num_used, num_ignored, count = ints
     tensors = [points, noise, shared, origin, inside, slot, *layers, cells, *new, num_used, num_ignored, count]
-    arrays = [None if tensor is None else tensor.contiguous() for tensor in tensors]
-    addresses = [ctypes.c_void_p(None if array is None else array.data_ptr()) for array in arrays]
-    sizes = [ctypes.c_int64(size) for size in (B, M, origin.shape[1], C // width, width)]
     own = _c_settings(cfg, resolution, has_rays)
-    call(library.fuse_points, *addresses, *sizes, ctypes.byref(own), torch.get_num_threads())
+    run(library.fuse_points, tensors, B, M, origin.shape[1], C // width, width, ctypes.byref(own))
     T = int(count)
     return [cells[:T], *(layer[:T] for layer in new), num_used, num_ignored]
 
 
 @_update_hit.register_fake
-def _(
-    points: Tensor,
-    noise: Tensor,
-    shared: Tensor | None,
-    origin: Tensor,
-    inside: Tensor,
-    slot: Tensor,
-    layers: list[Tensor],
-    resolution: float,
-    width: int,
-    has_rays: bool,
-    settings: list[float],
-) -> list[Tensor]:
+def _(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
+    _, _, slot, layers, *_ = others
     T, B = torch.library.get_ctx().new_dynamic_size(), slot.shape[0]
     return [slot.new_empty(T), *(layer.new_empty(T) for layer in layers), slot.new_empty(B), slot.new_empty(B)]
 
@@ -131,10 +116,9 @@ def _update_all(
 ) -> list[Tensor]:
     """Do the same by tensors, without a compiler."""
     C = points.cells.num_cells
-    grid = GridConfig(resolution=resolution, length_x=C // width * resolution, length_y=width * resolution)
     before = CellLayers(*layers)
     before = before._replace(validity=as_mask(before.validity))
-    new = update_all(points, before, grid, cfg, has_rays)
+    new = update_all(points, before, grid_of((C // width, width), resolution), cfg, has_rays)
     values = [as_bytes(value) if value.dtype == torch.bool else value for value in new.layers]
     cells = torch.arange(len(points.cells.slot) * C)
     return [cells, *(value.reshape(-1) for value in values), new.num_used, new.num_ignored]

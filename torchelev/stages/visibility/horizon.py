@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.grid import GridConfig, locate
-from torchelev.native.library import call, load
+from torchelev.grid import GridConfig, grid_of, locate
+from torchelev.native.library import load
 from torchelev.ops.indexing import read
 from torchelev.ops.masks import NOWHERE
+from torchelev.ops.native import run
 from torchelev.ops.operators import running_minimum
 from torchelev.ops.storage import as_bytes, as_mask, stored
 from torchelev.stages.cells import lattice_offset
@@ -20,7 +20,7 @@ from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.one_pass import has_one_pass
 from torchelev.stages.visibility.polar_table import PolarGrid, flat
 from torchelev.stages.visibility.rays import Rays, height_margin
-from torchelev.state import MapState, Measurement
+from torchelev.state import MapState, Measurement, partial_state
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -123,11 +123,8 @@ def _described(
 ) -> tuple[MapState, GridConfig, RaycastConfig]:
     """Return what the operator was called for, as far as its twin asks."""
     elevation, variance, time, validity = layers
-    known = {"elevation": elevation, "variance": variance, "time": time, "validity": as_mask(validity)}
-    state = MapState(**(dict.fromkeys(MapState._fields) | known))  # type: ignore[arg-type]
-    length_x, length_y = (size * resolution for size in elevation.shape[1:])
-    grid = GridConfig(resolution=resolution, length_x=length_x, length_y=length_y)
-    return state, grid, RaycastConfig(gate=gate, min_time=min_time)
+    state = partial_state(elevation=elevation, variance=variance, time=time, validity=as_mask(validity))
+    return state, grid_of(elevation.shape[1:], resolution), RaycastConfig(gate=gate, min_time=min_time)
 
 
 def _native(
@@ -146,11 +143,9 @@ def _native(
     library = load("rays/horizon.cpp", _CONSTANTS)
     if library is None:
         return None
-    inputs = [value.contiguous() for value in (*rays, *layers, *ways)]
     limits = torch.empty(rays[0].shape)
-    pointers = [ctypes.c_void_p(tensor.data_ptr()) for tensor in (*inputs, limits)]
-    whole = [ctypes.c_int64(size) for size in (*rays[0].shape, *layers[0].shape[1:], ranges, azimuths)]
+    sizes = (*rays[0].shape, *layers[0].shape[1:], ranges, azimuths)
     step = 2 * resolution
-    numbers = (resolution, step, (0.5 * resolution) ** 2, NO_FALL * step, gate, min_time)
-    call(library.horizon, *pointers, *whole, *map(ctypes.c_float, numbers), torch.get_num_threads())
+    numbers = map(float, (resolution, step, (0.5 * resolution) ** 2, NO_FALL * step, gate, min_time))
+    run(library.horizon, [*rays, *layers, *ways, limits], *sizes, *numbers)
     return limits

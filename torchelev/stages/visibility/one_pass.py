@@ -8,15 +8,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchelev.grid import GridConfig
-from torchelev.native.library import call, is_native, load
+from torchelev.grid import GridConfig, grid_of
+from torchelev.native.library import load
 from torchelev.ops.masks import NOWHERE
+from torchelev.ops.native import computes, run
 from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.ops.transforms import is_transforming
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import NO_RAY, RayBins, View
 from torchelev.stages.visibility.polar_table import PolarGrid
-from torchelev.state import MASKS, MapState
+from torchelev.state import MASKS, MapState, partial_state
 
 CHANGED = ("validity", "bounded", "upper_bound", "challenger_support")
 _HEIGHTS = ("elevation", "variance", "time", "gradient_x", "gradient_y", "challenger", "upper_bound")
@@ -29,9 +29,7 @@ Apply = Callable[[MapState, RayBins, View, PolarGrid, GridConfig, RaycastConfig]
 
 def has_one_pass(state: MapState) -> bool:
     """Tell whether what `in_one_pass` returns may run: it computes float32 on a CPU, and has no gradient."""
-    heights = state.elevation
-    is_plain = heights.is_cpu and heights.dtype == torch.float32
-    return is_plain and not torch.is_grad_enabled() and not is_transforming() and is_native()
+    return computes(state.elevation) and not torch.is_grad_enabled()
 
 
 def in_one_pass(twin: Apply) -> Apply:
@@ -90,10 +88,8 @@ def _described(
     layers: list[Tensor], resolution: float, min_time: float, min_incidence: float, gate: float
 ) -> tuple[MapState, GridConfig, RaycastConfig]:
     """Return what the operator was called for, as far as its twin asks."""
-    state = MapState(**(dict.fromkeys(MapState._fields) | _named(READ, layers)))  # type: ignore[arg-type]
-    length_x, length_y = (size * resolution for size in layers[0].shape[1:])
-    grid = GridConfig(resolution=resolution, length_x=length_x, length_y=length_y)
-    return state, grid, RaycastConfig(min_time=min_time, min_incidence=min_incidence, gate=gate)
+    cfg = RaycastConfig(min_time=min_time, min_incidence=min_incidence, gate=gate)
+    return partial_state(**_named(READ, layers)), grid_of(layers[0].shape[1:], resolution), cfg
 
 
 def _native(
@@ -105,12 +101,8 @@ def _native(
     library = load("rays/rays.cpp", _CONSTANTS)
     if library is None:
         return None
-    inputs = [value.contiguous() for value in (*rays, *view, *layers)]
     changed = _new(layers)
-    pointers = [ctypes.c_void_p(tensor.data_ptr()) for tensor in (*inputs, *changed)]
     sizes = (*rays[0].shape, *layers[0].shape[1:], polar.ranges, polar.azimuths, len(polar.widen))
     widen = (ctypes.c_int64 * len(polar.widen))(*polar.widen)
-    numbers = [ctypes.c_float(value) for value in (polar.bins, *settings)]
-    whole = [ctypes.c_int64(size) for size in sizes]
-    call(library.apply_rays, *pointers, *whole, widen, *numbers, torch.get_num_threads())
+    run(library.apply_rays, [*rays, *view, *layers, *changed], *sizes, widen, polar.bins, *map(float, settings))
     return changed
