@@ -53,10 +53,10 @@ def _layers(
 ) -> list[Tensor]:
     """Return the layers by the equations; without a head, `cells` is 0."""
     ground = known_ground(elevation, validity, max(radius, cells))
-    layers: list[Tensor] = [*normals(ground, validity, radius, resolution)]
-    if cells:
-        layers += traversability(ground, validity, cells, resolution, Critical(*critical))
-    return layers
+    planes = normals(ground, validity, radius, resolution)
+    if cells == 0:
+        return [*planes]
+    return [*planes, *traversability(ground, validity, cells, resolution, Critical(*critical))]
 
 
 def _in_one_pass(elevation: Tensor, validity: Tensor, *settings: Any) -> list[Tensor]:

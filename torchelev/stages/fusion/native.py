@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import astuple, fields
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -55,7 +55,8 @@ def update_hit(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: Fus
 def numbers(cfg: FusionConfig) -> list[float]:
     """Return the settings as numbers, as operators take them; those of the edges last."""
     *values, edges = (getattr(cfg, field.name) for field in fields(cfg))
-    return [float(value) for value in (*values, *(() if edges is None else astuple(edges)))]
+    of_edges = [] if edges is None else [getattr(edges, field.name) for field in fields(edges)]
+    return [float(value) for value in (*values, *of_edges)]
 
 
 def config_of(settings: Sequence[float]) -> FusionConfig:
