@@ -35,9 +35,14 @@ def load(source: str, defines: Mapping[str, str]) -> ctypes.CDLL | None:
         The library; None without a compiler, or with TORCHELEV_NATIVE=0 in the environment. If the compiler fails, a
         warning says so.
     """
-    if os.environ.get("TORCHELEV_NATIVE", "1").lower() in _OFF:
+    if is_switched_off():
         return None
     return _load(source, tuple(sorted(defines.items())))
+
+
+def is_switched_off() -> bool:
+    """Tell whether TORCHELEV_NATIVE in the environment forbids to build anything."""
+    return os.environ.get("TORCHELEV_NATIVE", "1").lower() in _OFF
 
 
 def is_native() -> bool:

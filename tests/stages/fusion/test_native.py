@@ -1,4 +1,4 @@
-"""The update in C++: the same as by tensors."""
+"""The update in C++ and by CUDA kernels: the same as by tensors."""
 
 from unittest.mock import patch
 
@@ -9,12 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import random_poses, random_state, small_map
+from tests.native.emulated_gpu import launch
 from tests.stages.fusion.test_fuse import CELLS, EDGES, FUSED, steps_and_outliers
 from torchelev import EdgeConfig, FusionConfig
+from torchelev.native import kernels
+from torchelev.native.library import find_compiler
 from torchelev.stages.fusion import fuse as stage
 from torchelev.stages.fusion.native import can_update_hit, config_of, numbers
 from torchelev.state import map_layers
 
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 CONFIGS = [FusionConfig(), FusionConfig(edges=None), FusionConfig(scan_variance_floor=1e-3, max_support=3.0)]
 CONFIGS += [FusionConfig(edges=edges) for edges in EDGES[1:]]
 
@@ -34,11 +38,18 @@ def random_scan(seed, num_envs, sensors, num_points, with_covariance):
     return state, emap.measure(cloud.float(), T, None, 0.1, pose_covariance=covariance), emap.cfg.grid
 
 
-def assert_same(state, m, grid, cfg, has_rays):
-    with torch.no_grad():
-        got = stage.fuse(state, m, grid, cfg, has_rays)
-        with patch.object(stage, "can_update_hit", lambda state: False):
-            expected = stage.fuse(state, m, grid, cfg, has_rays)
+def fused(by, *scan):
+    with (
+        torch.no_grad(),
+        patch.object(stage, "can_update_hit", lambda _: by == "C++"),
+        patch.object(stage, "can_update_on_gpu", lambda *_: by == "kernels"),
+        patch.object(kernels, "launch", launch),
+    ):
+        return stage.fuse(*scan)
+
+
+def assert_same(by, *scan):
+    got, expected = fused(by, *scan), fused("tensors", *scan)
     for name in (*FUSED, "validity"):
         torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-5, rtol=1e-4, msg=name)
     assert torch.equal(torch.stack(got.statistics[:8]), torch.stack(expected.statistics[:8]))
@@ -57,24 +68,36 @@ def assert_same(state, m, grid, cfg, has_rays):
 def test_agrees_with_tensors(seed, num_envs, sensors, num_points, cfg, has_rays, with_covariance, threads):
     torch.set_num_threads(threads)
     state, m, grid = random_scan(seed, num_envs, sensors, num_points, with_covariance)
-    assert_same(state, m, grid, cfg, has_rays)
+    assert_same("C++", state, m, grid, cfg, has_rays)
 
 
-def test_without_points():
+@needs_compiler
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 3),
+    st.integers(1, 2),
+    st.sampled_from([1, 30, 200, 500]),
+    st.sampled_from(CONFIGS),
+    st.booleans(),
+    st.booleans(),
+)
+def test_kernels_agree_with_tensors(seed, num_envs, sensors, num_points, cfg, has_rays, with_covariance):
+    state, m, grid = random_scan(seed, num_envs, sensors, num_points, with_covariance)
+    assert_same("kernels", state, m, grid, cfg, has_rays)
+
+
+@pytest.mark.parametrize("by", ["C++", "kernels"])
+def test_without_points(by):
     state, m, grid = random_scan(0, 2, 1, 0, False)
-    assert_same(state, m, grid, FusionConfig(), True)
+    assert_same(by, state, m, grid, FusionConfig(), True)
 
 
 def test_without_a_compiler(monkeypatch):
     """Compiled code calls the operator all the same."""
     state, m, grid = random_scan(0, 2, 2, 300, True)
     monkeypatch.setenv("TORCHELEV_NATIVE", "0")
-    with patch.object(stage, "can_update_hit", lambda state: True):
-        with torch.no_grad():
-            got = stage.fuse(state, m, grid, FusionConfig(), True)
     assert not can_update_hit(state)
-    with torch.no_grad():
-        expected = stage.fuse(state, m, grid, FusionConfig(), True)
+    got, expected = (fused(by, state, m, grid, FusionConfig(), True) for by in ("C++", "tensors"))
     for name in (*FUSED, "validity"):
         torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-6, rtol=0, msg=name)
 

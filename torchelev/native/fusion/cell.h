@@ -3,10 +3,17 @@
 
 #include "points.h"
 
-// What a map holds of its cells before the scan.
+// What maps hold of their cells before the scan.
 struct Map {
-    const float *elevation, *variance, *support, *challenger, *time;
-    const uint8_t *known, *challenger_support;
+    const float *elevation, *variance, *support, *challenger;
+    const uint8_t *challenger_support, *known;
+    const float* time;
+
+    // What a map holds whose first cell is number k.
+    Map from(int64_t k) const {
+        return {elevation + k,          variance + k, support + k, challenger + k,
+                challenger_support + k, known + k,    time + k};
+    }
 };
 
 // What a cell holds after it.

@@ -30,20 +30,6 @@ struct Sorted {
     }
 };
 
-// Whether a ray passed over the middle of its cell before it hit: `passed_center`.
-inline bool passed_center(float x, float y, float ray_x, float ray_y, float resolution) {
-    const float from_x = x - (std::floor(x / resolution) + 0.5f) * resolution;
-    const float from_y = y - (std::floor(y / resolution) + 0.5f) * resolution;
-    return from_x * ray_x + from_y * ray_y > std::fabs(from_x * ray_y - from_y * ray_x);
-}
-
-// A point as the update needs it.
-inline Point make_point(const float* xyz, const float* origin, float noise, float shared, const Settings& s) {
-    const float ray_x = xyz[0] - origin[0], ray_y = xyz[1] - origin[1];
-    const bool passed = passed_center(xyz[0], xyz[1], ray_x, ray_y, s.resolution);
-    return {xyz[2], noise + square(s.relief) + shared, 1.0f / noise, shared, ray_x, ray_y, passed};
-}
-
 // Sort the points of environment b by cell: count, add up, and put each where its turn is. `parts` are of its points.
 void sort_points(Sorted& result, int64_t b, const Scan& scan, int64_t num_cells, const Parts& parts,
                  const Settings& s) {
@@ -103,11 +89,7 @@ struct Maps {
     float* in_scan;  // [m] the scan's mean in each cell
     const Settings& s;
 
-    Map of(int64_t b) const {
-        const int64_t k = b * rows * columns;
-        return {map.elevation + k, map.variance + k, map.support + k,           map.challenger + k,
-                map.time + k,      map.known + k,    map.challenger_support + k};
-    }
+    Map of(int64_t b) const { return map.from(b * rows * columns); }
 
     // Sort the points of environment b, and compare each cell's with its elevation.
     void prepare(int64_t b, Sorted& sorted, int num_threads) const {
@@ -158,7 +140,7 @@ extern "C" int fuse_points(const float* points, const float* noise, const float*
                            int64_t B, int64_t M, int64_t S, int64_t rows, int64_t columns, const Settings* settings,
                            int num_threads) {
     const Scan scan{points, noise, shared, origins, used, slots, M, S};
-    const Map map{elevation, variance, support, challenger, time, known, challenger_support};
+    const Map map{elevation, variance, support, challenger, challenger_support, known, time};
     const Results results{cells, elevations, variances,          supports, challengers,
                           times, challenger_supports, knowns, num_used, num_ignored};
     return code_of([&] {

@@ -9,6 +9,9 @@
 constexpr float NO_HEIGHT = -1e30f;  // [m] below all heights
 constexpr float TINY = std::numeric_limits<float>::min();
 
+inline float ratio(float numerator, float denominator) { return numerator / std::max(denominator, TINY); }
+inline float square(float value) { return value * value; }
+
 // Settings of the update, as stages/fusion/native.py fills them in.
 struct Settings {
     float resolution, relief;  // [m]
@@ -23,6 +26,20 @@ struct Point {
     bool passed;
 };
 
+// Whether a ray passed over the middle of its cell before it hit: `passed_center`.
+inline bool passed_center(float x, float y, float ray_x, float ray_y, float resolution) {
+    const float from_x = x - (std::floor(x / resolution) + 0.5f) * resolution;
+    const float from_y = y - (std::floor(y / resolution) + 0.5f) * resolution;
+    return from_x * ray_x + from_y * ray_y > std::fabs(from_x * ray_y - from_y * ray_x);
+}
+
+// A point as the update needs it.
+inline Point make_point(const float* xyz, const float* origin, float noise, float shared, const Settings& s) {
+    const float ray_x = xyz[0] - origin[0], ray_y = xyz[1] - origin[1];
+    const bool passed = passed_center(xyz[0], xyz[1], ray_x, ray_y, s.resolution);
+    return {xyz[2], noise + square(s.relief) + shared, 1.0f / noise, shared, ray_x, ray_y, passed};
+}
+
 // Points that lie one after the other.
 struct Points {
     const Point *first, *last;
@@ -32,8 +49,12 @@ struct Points {
     const Point* end() const { return last; }
 };
 
-inline float ratio(float numerator, float denominator) { return numerator / std::max(denominator, TINY); }
-inline float square(float value) { return value * value; }
+// The mean of the points, weighted [m].
+inline float mean_height(const Points& p) {
+    float weight = 0, moment = 0;
+    for (const Point& point : p) weight += point.weight, moment += point.weight * point.z;
+    return ratio(moment, weight);
+}
 
 // The mean of z - height, points far from zero reduced in weight.
 inline float reduced_mean(const Points& p, float height) {

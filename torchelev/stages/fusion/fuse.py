@@ -12,6 +12,7 @@ from torchelev.ops.masks import count
 from torchelev.stages.cells import cells_of
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.native import can_update_hit, update_hit
+from torchelev.stages.fusion.on_gpu import can_update_on_gpu, update_on_gpu
 from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update, update_all
 from torchelev.stages.pose_error import relative_variance
@@ -40,7 +41,7 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
     noise = m.variance if m.noise is None else m.noise
     points = HitPoints(m.points, noise, relative_variance(state, m), m.origin, cells)
     before = CellLayers(*(getattr(state, name).flatten(1) for name in CellLayers._fields))
-    run = update_hit if can_update_hit(state) else update_all
+    run = update_hit if can_update_hit(state) else update_on_gpu if can_update_on_gpu(state, m.points) else update_all
     new = run(points, before, grid, cfg, has_rays)
     return tally(
         write_back(state, new, cfg),

@@ -99,7 +99,7 @@ def _update_hit(
     new = [torch.empty(B * M, dtype=layer.dtype) for layer in layers]
     cells, num_used, num_ignored, count = ints
     tensors = [points, noise, shared, origin, inside, slot, *layers, cells, *new, num_used, num_ignored, count]
-    own = _c_settings(cfg, resolution, has_rays)
+    own = c_settings(cfg, resolution, has_rays)
     run(library.fuse_points, tensors, B, M, origin.shape[1], C // width, width, ctypes.byref(own))
     T = int(count)
     return [cells[:T], *(layer[:T] for layer in new), num_used, num_ignored]
@@ -125,7 +125,8 @@ def _update_all(
     return [cells, *(value.reshape(-1) for value in values), new.num_used, new.num_ignored]
 
 
-def _c_settings(cfg: FusionConfig, resolution: float, has_rays: bool) -> _Settings:
+def c_settings(cfg: FusionConfig, resolution: float, has_rays: bool) -> ctypes.Structure:
+    """Return the settings as the C++ of points.h takes them."""
     edges = cfg.edges or EdgeConfig(margin=0.0, min_settled=0.0)
     names = [field[0] for field in _Settings._fields_]
     of_edges = {name: getattr(edges, name) for name in names if hasattr(edges, name)}

@@ -1,0 +1,158 @@
+"""CUDA kernels: compiled when first used, for the GPU at hand, by NVRTC, which comes with torch."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchelev.native.library import is_switched_off
+
+_SOURCES = Path(__file__).parent
+_STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: gpu/standard.h is all of them
+_THREADS = 128  # of a block
+
+
+def can_launch() -> bool:
+    """Tell whether kernels run on the current GPU; False with TORCHELEV_NATIVE=0 in the environment.
+
+    If they do not, though torch's own do, a warning says so.
+    """
+    if is_switched_off() or not torch.cuda.is_available() or torch.version.cuda is None:
+        return False
+    return _can_launch(torch.cuda.current_device())
+
+
+# As `torch.compiler.assume_constant_result` does, which would load the compiler: code that is compiled asks only once.
+can_launch._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
+def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) -> None:
+    """Run a kernel on the current stream, with `number` threads for each of some rows.
+
+    Args:
+        source: file in this folder.
+        kernel: of that file.
+        rows: of work.
+        number: threads of a row; the last block of each has more.
+        arguments: a tensor or None becomes its address, an int an int64; a structure stays as it is.
+    """
+    if rows * number == 0:
+        return
+    values = [_argument(value) for value in arguments]
+    addresses = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+    _bind_context()
+    blocks = rows * -(-number // _THREADS)
+    stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
+    function = _function(source, kernel, torch.cuda.current_device())
+    _check(_driver().cuLaunchKernel(function, blocks, 1, 1, _THREADS, 1, 1, 0, stream, addresses, None), kernel)
+
+
+def addresses_of(tensors: Sequence[Tensor]) -> ctypes.Structure:
+    """Return the addresses of tensors as a structure, which a kernel takes by value."""
+    fields = [(f"p{k}", ctypes.c_void_p) for k in range(len(tensors))]
+    return type("Addresses", (ctypes.Structure,), {"_fields_": fields})(*(tensor.data_ptr() for tensor in tensors))
+
+
+def _argument(value: Any) -> Any:
+    if value is None or isinstance(value, Tensor):
+        return ctypes.c_void_p(None if value is None else value.data_ptr())
+    return ctypes.c_int64(value) if isinstance(value, int) else value
+
+
+@functools.cache
+def _can_launch(device: int) -> bool:
+    try:
+        one = torch.ones(1, device=device)
+        launch("gpu/trial.cu", "double_it", 1, 1, one)
+        return one.item() == 2
+    except (AttributeError, OSError, RuntimeError) as error:  # AttributeError: a library lacks a function
+        warnings.warn(
+            f"CUDA kernels cannot be built here, and slower code does their work: {error}. "
+            "TORCHELEV_NATIVE=0 builds nothing.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return False
+
+
+def _bind_context() -> None:
+    """Give a thread that has not used the GPU yet its context."""
+    context = ctypes.c_void_p()
+    _check(_driver().cuCtxGetCurrent(ctypes.byref(context)), "cuCtxGetCurrent")
+    if not context.value:
+        torch.zeros(1, device="cuda")
+
+
+@functools.cache
+def _driver() -> ctypes.CDLL:
+    return ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+
+
+def _check(result: int, what: str) -> None:
+    if result != 0:
+        text = ctypes.c_char_p()
+        _driver().cuGetErrorString(result, ctypes.byref(text))
+        raise RuntimeError(f"{what}: {(text.value or b'unknown error').decode()}")
+
+
+@functools.cache
+def _function(source: str, kernel: str, device: int) -> ctypes.c_void_p:
+    function = ctypes.c_void_p()
+    module = _module(source, device)
+    _check(_driver().cuModuleGetFunction(ctypes.byref(function), module, kernel.encode()), kernel)
+    return function
+
+
+@functools.cache
+def _module(source: str, device: int) -> ctypes.c_void_p:
+    """Compile a source for a GPU, which must be the current one, and load it there."""
+    module = ctypes.c_void_p()
+    major, minor = torch.cuda.get_device_capability(device)
+    _check(_driver().cuModuleLoadData(ctypes.byref(module), compiled(source, f"sm_{major}{minor}")), source)
+    return module
+
+
+def compiled(source: str, architecture: str) -> bytes:
+    """Return a source's machine code for GPUs of an architecture; raise RuntimeError if there is none."""
+    nvrtc, program = _nvrtc(), ctypes.c_void_p()
+    path = _SOURCES / source
+    headers = {p.name: p.read_bytes() for folder in (path.parent, _SOURCES / "gpu") for p in folder.glob("*.h")}
+    headers |= dict.fromkeys(_STANDARD, b'#include "standard.h"\n')
+    texts, names = _strings(headers.values()), _strings(name.encode() for name in headers)
+    text = path.read_bytes()
+    failed = nvrtc.nvrtcCreateProgram(ctypes.byref(program), text, path.name.encode(), len(headers), texts, names)
+    options = [f"--gpu-architecture={architecture}", "--std=c++17", "--device-as-default-execution-space"]
+    failed = failed or nvrtc.nvrtcCompileProgram(program, len(options), _strings(o.encode() for o in options))
+    log = _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
+    code = _read(nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN, program)
+    nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+    if failed:
+        raise RuntimeError(f"NVRTC did not compile {source}: {log.decode(errors='replace').strip()}")
+    return code
+
+
+def _nvrtc() -> ctypes.CDLL:
+    """Return NVRTC, which torch brings along, through the library of torch that is linked to it."""
+    name = "caffe2_nvrtc.dll" if os.name == "nt" else "libcaffe2_nvrtc.so"
+    return ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / name))
+
+
+def _strings(values: Any) -> Any:
+    values = list(values)
+    return (ctypes.c_char_p * len(values))(*values)
+
+
+def _read(get_size: Any, get: Any, program: ctypes.c_void_p) -> bytes:
+    size = ctypes.c_size_t(0)
+    get_size(program, ctypes.byref(size))
+    data = ctypes.create_string_buffer(max(size.value, 1))
+    get(program, data)
+    return data.raw[: size.value]

@@ -1,0 +1,82 @@
+"""The update of all cells by CUDA kernels (`torchelev/native/fusion/fusion.cu`), for float32 without a gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig
+from torchelev.native import kernels
+from torchelev.ops.transforms import is_transforming
+from torchelev.stages.fusion.config import FusionConfig
+from torchelev.stages.fusion.native import c_settings, config_of, numbers
+from torchelev.stages.fusion.points import CellLayers, HitPoints
+from torchelev.stages.fusion.update import Update
+from torchelev.state import MapState
+
+_SOURCE = "fusion/fusion.cu"
+_POINT_BYTES = 28  # of `Point` in points.h
+
+
+def can_update_on_gpu(state: MapState, points: Tensor) -> bool:
+    """Tell whether `update_on_gpu` takes the state and its scan; not if runs must repeat: it sums in any order."""
+    layer = state.elevation
+    is_plain = layer.is_cuda and layer.dtype == torch.float32 and not torch.is_grad_enabled() and not is_transforming()
+    repeats = torch.are_deterministic_algorithms_enabled()
+    return is_plain and not repeats and points[..., 0].numel() < 2**31 and kernels.can_launch()
+
+
+def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:
+    """Update all cells; arguments are those of `update_all`."""
+    hits = (*points[:-1], points.cells.inside, points.cells.slot)
+    *new, used, ignored = _update(*hits, list(before), grid.resolution, grid.width, has_rays, numbers(cfg))
+    return Update(CellLayers(*new), None, used, ignored)
+
+
+@torch.library.custom_op(
+    "torchelev::update_cells_on_gpu",
+    mutates_args=(),
+    schema="(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, Tensor[] layers, "
+    "float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
+)
+def _update(
+    points: Tensor,
+    noise: Tensor,
+    shared: Tensor | None,
+    origin: Tensor,
+    inside: Tensor,
+    slot: Tensor,
+    layers: list[Tensor],
+    resolution: float,
+    width: int,
+    has_rays: bool,
+    settings: list[float],
+) -> list[Tensor]:
+    """Return all layers (B, C), and the points used and ignored (B,)."""
+    (B, M), C = slot.shape, layers[0].shape[1]
+    own, layers = c_settings(config_of(settings), resolution, has_rays), [layer.contiguous() for layer in layers]
+    points, noise, origin, inside, slot = (value.contiguous() for value in (points, noise, origin, inside, slot))
+    shared = None if shared is None else shared.contiguous()
+    with torch.cuda.device_of(points):
+        counts = slot.new_zeros(B, C, dtype=torch.int32)
+        numbers_in_cell, in_scan = torch.empty_like(slot, dtype=torch.int32), torch.empty_like(layers[0])
+        kernels.launch(_SOURCE, "count_points", B, M, inside, slot, counts, numbers_in_cell, M, C)
+        ends = counts.flatten().cumsum(0, dtype=torch.int32)
+        gathered = torch.empty(B * M * _POINT_BYTES, dtype=torch.uint8, device=points.device)
+        cells = kernels.addresses_of([gathered, ends, counts])
+        scan = points, noise, shared, origin, inside, slot, numbers_in_cell
+        kernels.launch(_SOURCE, "sort_points", B, M, *scan, cells, gathered, M, origin.shape[1], C, own)
+        kernels.launch(_SOURCE, "average_points", B, C, cells, in_scan, C)
+        new = [torch.empty_like(layer) for layer in layers]
+        tallies = [slot.new_zeros(B), slot.new_zeros(B)]
+        before, after = kernels.addresses_of(layers), kernels.addresses_of([*new, *tallies])
+        kernels.launch(_SOURCE, "update_cells", B, C, cells, in_scan, before, after, C // width, width, own)
+    return [*new, *tallies]
+
+
+@_update.register_fake
+def _(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
+    _, _, slot, layers, *_ = others
+    return [*(torch.empty_like(layer) for layer in layers), slot.new_empty(len(slot)), slot.new_empty(len(slot))]
