@@ -1,11 +1,17 @@
 """Sums per cell, borders, running minima and polar tables: operators of their own."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.native.emulated_gpu import launch
+from torchelev.native import kernels
+from torchelev.native.library import find_compiler
+from torchelev.ops import operators
 from torchelev.ops.moving import moved
 from torchelev.ops.operators import cell_sums, padded, polar_minimum, running_minimum
 
@@ -38,6 +44,18 @@ def test_polar_minimum(seed, num_envs, num_values, dtype, threads):
                 expected[b, k, a] = min(expected[b, k, a], values[b, n])
     table = polar_minimum(torch.from_numpy(index), torch.from_numpy(values), azimuths, [4, 2], ranges, blank)
     np.testing.assert_array_equal(table, expected)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
+@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(0, 40), st.sampled_from([[], [4, 2], [9, 5, 3, 1]]))
+def test_polar_minimum_by_a_kernel(seed, num_envs, num_values, widen):
+    generator = torch.Generator().manual_seed(seed)
+    index = torch.randint(10 * 26, (num_envs, num_values), generator=generator)
+    values = torch.randn(num_envs, num_values, generator=generator)
+    expected = polar_minimum(index, values, 26, widen, 9, 9.0)
+    on_gpu = patch.multiple(operators, _compiles_for_gpu=lambda _: True)
+    with on_gpu, patch.multiple(kernels, can_launch=lambda: True, launch=launch):
+        assert torch.equal(polar_minimum(index, values, 26, widen, 9, 9.0), expected)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 3), st.integers(0, 20), DTYPES)
