@@ -19,7 +19,6 @@ from torchelev.native import kernels
 from torchelev.ops import native, scatter
 from torchelev.ops.transforms import with_gradient
 
-
 _LEVELS = 16  # of a polar table that a kernel widens
 
 

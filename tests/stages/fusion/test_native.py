@@ -15,6 +15,7 @@ from torchelev import EdgeConfig, FusionConfig
 from torchelev.native import kernels
 from torchelev.native.library import find_compiler
 from torchelev.stages.fusion import fuse as stage
+from torchelev.stages.fusion import on_gpu
 from torchelev.stages.fusion.native import can_update_hit, config_of, numbers
 from torchelev.state import map_layers
 
@@ -44,6 +45,7 @@ def fused(by, *scan):
         patch.object(stage, "can_update_hit", lambda _: by == "C++"),
         patch.object(stage, "can_update_on_gpu", lambda *_: by == "kernels"),
         patch.object(kernels, "launch", launch),
+        patch.object(on_gpu, "_THREADS", 256),
     ):
         return stage.fuse(*scan)
 

@@ -43,6 +43,7 @@ inline Consensus find_consensus(const Points& p, const Map& map, int64_t slot, c
         agreeing += agrees(point, map.elevation[slot], gate_at, s);
         weight += point.weight, moment += point.weight * point.z, shared += point.weight * point.shared;
     }
+    p.add_up(agreeing, weight, moment, shared);
     const float number = p.number;
     const bool trusted = map.known[slot] && 2 * agreeing >= number;
     const float variance = std::max(1.0f / std::max(weight, 1e-12f), s.floor) + ratio(shared, weight);
@@ -101,6 +102,7 @@ inline Measured measure(const Points& p, const Map& map, int64_t slot, const Con
         if (!agrees(point, side.height, gate, s)) continue;
         information += point.weight, moment += point.weight * above, shared += point.weight * point.shared, kept++;
     }
+    p.add_up(information, moment, shared, kept, ignored, agreeing);
     const float height = side.height + ratio(moment, information), votes = kept + ignored;
     const bool is_lower_part =
         side.side > 0 && height < map.elevation[slot] && map.support[slot] >= s.min_settled;

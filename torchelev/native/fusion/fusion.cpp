@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "../threads.h"
+#include "serial.h"
 #include "cell.h"
 
 namespace {

@@ -2,17 +2,21 @@
 //
 // B environments with M points each, of S sensors, and with C cells each.
 
+#include "shared.h"
+
 #include "cell.h"
 #include "threads.h"
 
+constexpr int FEW = 8;  // points of a cell up to which one thread takes it, as few cells have more
+
 // The points of all environments, those of a cell one after the other.
 struct Sorted {
-    const Point* points;       // of all cells
+    const Point* points;           // of all cells
     const int32_t *ends, *counts;  // (B, C) where a cell's points end, and how many they are
 
-    Points of(int64_t cell) const {
+    Points of(int64_t cell, int threads) const {
         const Point* end = points + ends[cell];
-        return {end - counts[cell], end, float(counts[cell])};
+        return {end - counts[cell], end, float(counts[cell]), threads};
     }
 };
 
@@ -32,7 +36,7 @@ extern "C" __global__ void sort_points(const float* points, const float* noise, 
     const Place at = place(M);
     const int64_t k = at.row * M + at.k;
     if (at.k >= M || !used[k]) return;
-    const int64_t cell = at.row * C + slots[k], sensor = at.row * S + at.k * S / M;
+    const int64_t cell = at.row * C + slots[k], sensor = at.row * S + int32_t(at.k) / int32_t(M / S);
     const int32_t start = sorted.ends[cell] - sorted.counts[cell];
     result[start + numbers[k]] =
         make_point(points + 3 * k, origins + 3 * sensor, noise[k], shared ? shared[k] : 0.0f, s);
@@ -43,7 +47,7 @@ extern "C" __global__ void average_points(Sorted sorted, float* in_scan, int64_t
     const Place at = place(C);
     if (at.k >= C) return;
     const int64_t cell = at.row * C + at.k;
-    in_scan[cell] = sorted.counts[cell] ? mean_height(sorted.of(cell)) : NO_HEIGHT;
+    in_scan[cell] = sorted.counts[cell] ? mean_height(sorted.of(cell, 1)) : NO_HEIGHT;
 }
 
 // What all cells hold after the update, (B, C) each, and what became of the points, (B,) each.
@@ -70,26 +74,58 @@ inline Cell untouched(const Map& map, int64_t slot, const Settings& s) {
     return cell;
 }
 
-// Update all cells.
-extern "C" __global__ void update_cells(Sorted sorted, const float* in_scan, Map map, Results results, int64_t rows,
-                                        int64_t columns, Settings s) {
-    const int64_t C = rows * columns;
-    const Place at = place(C);
+// Maps before the update, and the scan.
+struct Scan {
+    Sorted sorted;
+    const float* in_scan;  // (B, C) [m]
+    Map map;
+    int64_t rows, columns;
+
+    Cell update(int64_t row, int64_t slot, const Points& points, const Settings& s) const {
+        const int64_t first = row * rows * columns;
+        const Map own = map.from(first);
+        const Around around{rows, columns, own.elevation, in_scan + first, own.known};
+        return update_cell(points, own, slot, find_consensus(points, own, slot, s), around, s);
+    }
+};
+
+// The cells with more points than a thread takes.
+struct Heavy {
+    int32_t *cells, *number;
+};
+
+// Update all cells but the heavy ones, and list those.
+extern "C" __global__ void update_cells(Sorted sorted, const float* in_scan, Map map, Results results, Heavy heavy,
+                                        int64_t rows, int64_t columns, Settings s) {
+    const Place at = place(rows * columns);
+    const Scan scan{sorted, in_scan, map, rows, columns};
     int32_t used = 0, ignored = 0;
-    if (at.k < C) {
-        const int64_t cell = at.row * C + at.k;
-        const Map own = map.from(at.row * C);
-        Cell after;
-        if (sorted.counts[cell]) {
-            const Points points = sorted.of(cell);
-            const Around around{rows, columns, own.elevation, in_scan + at.row * C, own.known};
-            after = update_cell(points, own, at.k, find_consensus(points, own, at.k, s), around, s);
+    if (at.k < rows * columns) {
+        const int64_t cell = at.row * rows * columns + at.k;
+        const int32_t count = sorted.counts[cell];
+        if (count > FEW) {
+            heavy.cells[atomicAdd(heavy.number, 1)] = int32_t(cell);
         } else {
-            after = untouched(own, at.k, s);
+            const Cell after = count ? scan.update(at.row, at.k, sorted.of(cell, 1), s) : untouched(map, cell, s);
+            results.set(cell, after);
+            used = int32_t(after.used), ignored = int32_t(after.ignored);
         }
-        results.set(cell, after);
-        used = int32_t(after.used), ignored = int32_t(after.ignored);
     }
     add_of_warp(results.used + at.row, used);
     add_of_warp(results.ignored + at.row, ignored);
+}
+
+// Update the heavy cells, a warp for each.
+extern "C" __global__ void update_heavy_cells(Sorted sorted, const float* in_scan, Map map, Results results,
+                                              Heavy heavy, int64_t rows, int64_t columns, Settings s, int64_t threads) {
+    const Scan scan{sorted, in_scan, map, rows, columns};
+    const int32_t C = int32_t(rows * columns), number = *heavy.number, step = int32_t(threads / warpSize);
+    for (int32_t k = int32_t(place(threads).k) / warpSize; k < number; k += step) {
+        const int32_t cell = heavy.cells[k], row = cell / C;
+        const Cell after = scan.update(row, cell % C, sorted.of(cell, warpSize), s);
+        if (threadIdx.x % warpSize) continue;
+        results.set(cell, after);
+        atomicAdd(reinterpret_cast<unsigned long long*>(results.used + row), after.used);
+        atomicAdd(reinterpret_cast<unsigned long long*>(results.ignored + row), after.ignored);
+    }
 }

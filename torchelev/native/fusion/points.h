@@ -1,58 +1,12 @@
-// The points of one cell, and the heights that they agree on: stages/fusion/{consensus,edges}.py.
+// The heights that the points of one cell agree on: stages/fusion/{consensus,edges}.py. `Points` come from serial.h or
+// shared.h.
 #pragma once
-
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <limits>
-
-constexpr float NO_HEIGHT = -1e30f;  // [m] below all heights
-constexpr float TINY = std::numeric_limits<float>::min();
-
-inline float ratio(float numerator, float denominator) { return numerator / std::max(denominator, TINY); }
-inline float square(float value) { return value * value; }
-
-// Settings of the update, as stages/fusion/native.py fills them in.
-struct Settings {
-    float resolution, relief;  // [m]
-    float gate, max_gate_std, floor, outlier_variance, max_support, max_variance;
-    int32_t min_above, max_above_per_scan, min_challengers, has_rays, has_edges;
-    int32_t min_points, min_extreme, refinements;
-    float min_share, min_passed, margin, min_settled;
-};
-
-struct Point {
-    float z, spread, weight, shared, ray_x, ray_y;  // see `ScanPoints`
-    bool passed;
-};
-
-// Whether a ray passed over the middle of its cell before it hit: `passed_center`.
-inline bool passed_center(float x, float y, float ray_x, float ray_y, float resolution) {
-    const float from_x = x - (std::floor(x / resolution) + 0.5f) * resolution;
-    const float from_y = y - (std::floor(y / resolution) + 0.5f) * resolution;
-    return from_x * ray_x + from_y * ray_y > std::fabs(from_x * ray_y - from_y * ray_x);
-}
-
-// A point as the update needs it.
-inline Point make_point(const float* xyz, const float* origin, float noise, float shared, const Settings& s) {
-    const float ray_x = xyz[0] - origin[0], ray_y = xyz[1] - origin[1];
-    const bool passed = passed_center(xyz[0], xyz[1], ray_x, ray_y, s.resolution);
-    return {xyz[2], noise + square(s.relief) + shared, 1.0f / noise, shared, ray_x, ray_y, passed};
-}
-
-// Points that lie one after the other.
-struct Points {
-    const Point *first, *last;
-    float number;
-
-    const Point* begin() const { return first; }
-    const Point* end() const { return last; }
-};
 
 // The mean of the points, weighted [m].
 inline float mean_height(const Points& p) {
     float weight = 0, moment = 0;
     for (const Point& point : p) weight += point.weight, moment += point.weight * point.z;
+    p.add_up(weight, moment);
     return ratio(moment, weight);
 }
 
@@ -64,6 +18,7 @@ inline float reduced_mean(const Points& p, float height) {
         const float reduced = point.weight / square(1.0f + square(residual) / point.spread);
         moment += reduced * residual, total += reduced;
     }
+    p.add_up(moment, total);
     return ratio(moment, total);
 }
 
@@ -86,14 +41,17 @@ inline float level_reached(const Heights& heights, int number) {
     auto reached = [&](const Point& point) { return heights.z(point) + std::sqrt(point.spread); };
     float level = NONE;
     for (const Point& point : heights.p) level = std::max(level, reached(point));
+    level = heights.p.highest(level);
     for (int round = 1; round < number; round++) {
         float next = NONE;
-        int64_t at_level = 0;
+        int32_t at_level = 0;
         for (const Point& point : heights.p) {
             const float own = reached(point);
             at_level += own >= level;
             if (own < level) next = std::max(next, own);
         }
+        heights.p.add_up(at_level);
+        next = heights.p.highest(next);
         if (at_level < number) level = next;
     }
     return level;
@@ -110,6 +68,7 @@ inline float top_of_step(const Heights& heights, int rounds, const Settings& s) 
             if (z + s.margin * std::sqrt(point.spread) < height) continue;
             moment += point.weight * z, total += point.weight;
         }
+        heights.p.add_up(moment, total);
         const float mean = moment / total;  // NaN where no point lies past the height, which compares as false
         if (highest >= mean) height = mean;
     }
@@ -152,6 +111,7 @@ inline Side side_of_step(const Points& p, float mean, int64_t slot, const Around
         low += is_low, passed += is_low && point.passed;
         x += point.ray_x, y += point.ray_y;
     }
+    p.add_up(low, passed, x, y);
     const float middle = mean + 0.5f * top, top_height = mean + top - s.relief;
     bool elsewhere = false;
     around.each(slot, [&](int64_t other, int di, int dj) {
@@ -172,6 +132,7 @@ inline Side resolve(const Points& p, float mean, bool is_step, int64_t slot, con
     const float settled = robust_mean(p, mean);
     float far = 0;
     for (const Point& point : p) far += square(point.z - mean - settled) > square(s.gate) * point.spread;
+    p.add_up(far);
     Side side{0, settled};
     if (is_step || has_step(p.number, far, s)) side = side_of_step(p, mean, slot, around, s);
     return {side.side, mean + side.height};

@@ -6,12 +6,13 @@ struct Place {
 };
 
 inline Place place(int64_t number) {
-    const int64_t blocks = (number + blockDim.x - 1) / blockDim.x;
-    return {blockIdx.x / blocks, blockIdx.x % blocks * blockDim.x + threadIdx.x};
+    const unsigned blocks = unsigned((number + blockDim.x - 1) / blockDim.x);  // divisions of 64 bits are slow
+    const unsigned block = unsigned(blockIdx.x);
+    return {block / blocks, int64_t(block % blocks) * blockDim.x + threadIdx.x};
 }
 
 // Add the values of a warp's threads, all of which must call this, to one number.
 inline void add_of_warp(int64_t* total, int32_t value) {
-    for (int step = warpSize / 2; step > 0; step /= 2) value += __shfl_down_sync(0xffffffff, value, step);
+    for (int step = warpSize / 2; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffff, value, step);
     if (threadIdx.x % warpSize == 0 && value) atomicAdd(reinterpret_cast<unsigned long long*>(total), value);
 }

@@ -17,7 +17,9 @@ from torchelev.stages.fusion.update import Update
 from torchelev.state import MapState
 
 _SOURCE = "fusion/fusion.cu"
-_POINT_BYTES = 28  # of `Point` in points.h
+_POINT_BYTES = 32  # of `Point` in point.h
+_FEW = 8  # points of a cell up to which one thread takes it
+_THREADS = 2**16  # that share the other cells
 
 
 def can_update_on_gpu(state: MapState, points: Tensor) -> bool:
@@ -25,7 +27,12 @@ def can_update_on_gpu(state: MapState, points: Tensor) -> bool:
     layer = state.elevation
     is_plain = layer.is_cuda and layer.dtype == torch.float32 and not torch.is_grad_enabled() and not is_transforming()
     repeats = torch.are_deterministic_algorithms_enabled()
-    return is_plain and not repeats and points[..., 0].numel() < 2**31 and kernels.can_launch()
+    return is_plain and not repeats and _fits(state, points) and kernels.can_launch()
+
+
+def _fits(state: MapState, points: Tensor) -> bool:
+    """Tell whether 32 bits count the points and the cells."""
+    return max(points[..., 0].numel(), state.elevation.numel()) < 2**31
 
 
 def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:
@@ -71,8 +78,11 @@ def _update(
         kernels.launch(_SOURCE, "average_points", B, C, cells, in_scan, C)
         new = [torch.empty_like(layer) for layer in layers]
         tallies = [slot.new_zeros(B), slot.new_zeros(B)]
-        before, after = kernels.addresses_of(layers), kernels.addresses_of([*new, *tallies])
-        kernels.launch(_SOURCE, "update_cells", B, C, cells, in_scan, before, after, C // width, width, own)
+        heavy = slot.new_empty(B * M // _FEW, dtype=torch.int32), slot.new_zeros(1, dtype=torch.int32)
+        maps = [kernels.addresses_of(values) for values in (layers, [*new, *tallies], heavy)]
+        update = cells, in_scan, *maps, C // width, width, own
+        kernels.launch(_SOURCE, "update_cells", B, C, *update)
+        kernels.launch(_SOURCE, "update_heavy_cells", 1, _THREADS, *update, _THREADS)
     return [*new, *tallies]
 
 
