@@ -130,6 +130,21 @@ def test_gpu_gives_the_same_map(compiled):
 
 
 @needs_gpu
+def test_gpu_gives_the_same_map_where_cells_hold_many_points():
+    """A warp shares their points."""
+    on_cpu, on_gpu = (ElevationMap(small_config((20, 20), 0.05), 3, device) for device in ("cpu", "cuda"))
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        cloud = torch.rand(3, 20_000, 3, generator=generator) - torch.tensor([0.5, 0.5, 1.0])
+        cloud[..., 2] = -0.9 + 0.3 * (cloud[..., 0] > 0.13) + 0.01 * torch.randn(3, 20_000, generator=generator)
+        for emap in (on_cpu, on_gpu):
+            T = pose((0.0, 0.0, 1.0), num_envs=3).to(emap.device)
+            emap.update(cloud.to(emap.device), T, T, 0.1)
+    assert torch.equal(on_gpu.validity.cpu(), on_cpu.validity)
+    assert (on_gpu.elevation.cpu() - on_cpu.elevation).abs().quantile(0.99) < 1e-4
+
+
+@needs_gpu
 def test_gpu_repeats_to_the_bit_when_told_to():
     torch.use_deterministic_algorithms(True)
     try:

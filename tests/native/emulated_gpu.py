@@ -14,7 +14,11 @@ GPU = """
 #define __global__
 struct { int64_t x; } blockIdx, threadIdx, blockDim;
 constexpr int warpSize = 1;
-template <class T, class U> T atomicAdd(T* number, U value) { const T before = *number; *number += value; return before; }
+template <class T, class U> T atomicAdd(T* number, U value) {
+    const T before = *number;
+    *number += value;
+    return before;
+}
 template <class T> T __shfl_xor_sync(unsigned, T value, int) { return value; }
 extern "C" void take_place(int64_t block, int64_t thread, int64_t size) {
     blockIdx.x = block, threadIdx.x = thread, blockDim.x = size;

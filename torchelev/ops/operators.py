@@ -7,7 +7,6 @@ compiler does the latter two.
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 from collections.abc import Sequence
 
@@ -15,11 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.native import kernels
-from torchelev.ops import native, scatter
+from torchelev.ops import native, on_gpu, scatter
 from torchelev.ops.transforms import with_gradient
-
-_LEVELS = 16  # of a polar table that a kernel widens
 
 
 def _compiles_for_gpu(values: Tensor) -> bool:
@@ -148,7 +144,10 @@ def _(index: Tensor, values: Tensor, size: int, blank: float) -> Tensor:
 def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
     rows = _table_rows(ranges)
     table = native.polar_minimum(index, values, rows, azimuths, widen, ranges, blank)
-    if table is None:
+    if on_gpu.scans(values, widen):
+        table = scatter.lowest(index, values, rows * azimuths, blank).unflatten(1, (rows, azimuths))
+        on_gpu.scan_and_widen(table, widen, ranges, blank)
+    elif table is None:
         table = scatter.lowest(index, values, rows * azimuths, blank).unflatten(1, (rows, azimuths))
         table[:, ranges] = blank
         _scan(table, from_end=True)
@@ -162,26 +161,6 @@ def _widen(table: Tensor, widen: list[int]) -> None:
         for level, rows in enumerate(widen):
             near = half[:, :rows]
             torch.minimum(near, near.roll(-(2**level), 2), out=near)
-
-
-@torch.library.custom_op("torchelev::widened", mutates_args=())
-def _widened(table: Tensor, widen: Sequence[int]) -> Tensor:
-    """Do what `_widen` does, by one kernel, not in place."""
-    new = torch.empty_like(table, memory_format=torch.contiguous_format)
-    levels = (ctypes.c_int64 * _LEVELS)(*widen)
-    with torch.cuda.device_of(table):
-        (B, R, P) = table.shape
-        kernels.launch("tables/tables.cu", "widen", B, R * P, table.contiguous(), new, R, P, _Levels(levels))
-    return new
-
-
-class _Levels(ctypes.Structure):
-    _fields_ = (("rows", ctypes.c_int64 * _LEVELS),)
-
-
-@_widened.register_fake
-def _(table: Tensor, widen: Sequence[int]) -> Tensor:
-    return torch.empty_like(table, memory_format=torch.contiguous_format)
 
 
 def _table_rows(ranges: int) -> int:
@@ -222,14 +201,12 @@ def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int]
     `widen` makes an entry of the first widen[w] ranges the minimum of twice as many azimuths, itself the first of
     them. Row `ranges` and what follows it, R being a multiple of 8, are blank, for what lies out of reach.
     """
-    if not _compiles_for_gpu(values):
+    if not _compiles_for_gpu(values) or on_gpu.scans(values, widen):
         return _polar_minimum_with_gradient(index, values, azimuths, widen, ranges, blank)
     size = _table_rows(ranges)
     table = _lowest_per_cell(index, values, size * azimuths, blank).unflatten(1, (size, azimuths))
     row = torch.arange(size, device=values.device)[:, None]
     table = torch.where(row == ranges, blank, table).flip(1).cummin(1).values.flip(1)
-    if table.dtype == torch.float32 and len(widen) <= _LEVELS and kernels.can_launch():
-        return _widened(table, widen)
     for level, rows in enumerate(widen):
         table = torch.where(row < rows, torch.minimum(table, table.roll(-(2**level), 2)), table)
     return table

@@ -20,7 +20,11 @@ from torchelev.stages.fusion.native import can_update_hit, config_of, numbers
 from torchelev.state import map_layers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
-CONFIGS = [FusionConfig(), FusionConfig(edges=None), FusionConfig(scan_variance_floor=1e-3, max_support=3.0)]
+CONFIGS = [
+    FusionConfig(),
+    FusionConfig(edges=None),
+    FusionConfig(scan_variance_floor=1e-3, max_support=3.0, max_variance=0.005),
+]
 CONFIGS += [FusionConfig(edges=edges) for edges in EDGES[1:]]
 
 

@@ -1,8 +1,26 @@
-// Polar tables on a GPU, a thread for each entry: `polar_minimum` in ops/operators.py.
+// Polar tables on a GPU: `polar_minimum` in ops/operators.py.
 
 #include <cstdint>
 
 #include "threads.h"
+
+inline float lower(float a, float b) { return a < b || a != a ? a : b; }
+
+// Write the running minimum of tables (B, R, P) from row `ranges` - 1 to the first, a thread for each column; the rows
+// from `ranges` on are blank.
+extern "C" __global__ void scan_back(const float* __restrict__ table, float* __restrict__ scanned, int64_t R, int64_t P,
+                                     int64_t ranges, float blank) {
+    const Place at = place(P);
+    if (at.k >= P) return;
+    const int64_t first = at.row * R * P + at.k;
+    for (int64_t row = ranges; row < R; row++) scanned[first + row * P] = blank;
+    float lowest = blank;
+#pragma unroll 16
+    for (int32_t row = int32_t(ranges) - 1; row >= 0; row--) {
+        lowest = lower(table[first + row * P], lowest);
+        scanned[first + row * P] = lowest;
+    }
+}
 
 constexpr int LEVELS = 16;
 
@@ -10,7 +28,8 @@ struct Levels {
     int64_t rows[LEVELS];  // below which a level widens an entry; 0 after the last level
 };
 
-// Make each entry of tables (B, R, P) the minimum of itself and those that follow it all around: 1, 3, 7, ... of them.
+// Make each entry of tables (B, R, P) the minimum of itself and those that follow it all around: 1, 3, 7, ... of them. A thread
+// for each entry.
 extern "C" __global__ void widen(const float* table, float* widened, int64_t R, int64_t P, Levels levels) {
     const Place at = place(R * P);
     if (at.k >= R * P) return;
@@ -20,8 +39,7 @@ extern "C" __global__ void widen(const float* table, float* widened, int64_t R, 
     const float* entries = table + at.row * R * P + int64_t(row) * P;
     float lowest = entries[first];
     for (int32_t k = first, left = span; left > 0; left--) {
-        const float other = entries[k];
-        if (other < lowest || other != other) lowest = other;
+        lowest = lower(entries[k], lowest);
         k = k + 1 < width ? k + 1 : 0;
     }
     widened[at.row * R * P + at.k] = lowest;
