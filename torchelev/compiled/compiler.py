@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -155,11 +155,39 @@ def traced(function: Callable[..., Any], args: Sequence[Any]) -> bytes:
     return pickle.dumps(([str(isa) for isa in valid_vec_isa_list()], graph))
 
 
-def load_traced(data: bytes) -> Any:
+class LoadedGraph(NamedTuple):
+    """A function compiled for arguments of one kind."""
+
+    guard_check: Callable[..., bool]  #: tells whether arguments are of that kind
+    fn: Callable[..., Any]  #: the function; call it only with such arguments
+
+
+def load_traced(data: bytes) -> LoadedGraph:
     """Return the function that `traced` compiled; it may raise anything if the bytes are damaged."""
     instructions, graph = pickle.loads(data)
     with known_instructions(instructions):
-        return torch.compiler.load_compiled_function(io.BytesIO(graph))
+        loaded: Any = torch.compiler.load_compiled_function(io.BytesIO(graph))
+    return LoadedGraph(_guard_of(loaded), loaded.fn)
+
+
+def _guard_of(graph: Any) -> Callable[..., bool]:
+    """Return what tests arguments as a loaded graph's own `guard_check` does, which takes three times as long."""
+    artifacts = graph._artifacts
+    environment = artifacts.runtime_env
+    cells = [cell.cell_contents for cell in environment.closure or ()]
+    outer = dict(zip(environment.bytecode.co_freevars, cells, strict=True))
+    kinds = artifacts.signature.parameters
+    names = [name for name, kind in kinds.items() if kind.kind != kind.VAR_POSITIONAL]
+    others = [name for name, kind in kinds.items() if kind.kind == kind.VAR_POSITIONAL]
+    test = artifacts.guard_manager.root.check
+
+    def passes(*args: Any) -> bool:
+        values = {**outer, **dict(zip(names, args, strict=False))}
+        for name in others:
+            values[name] = args[len(names) :]
+        return test(values)
+
+    return passes
 
 
 def known_instructions(names: Sequence[str]) -> contextlib.AbstractContextManager[None]:
@@ -234,10 +262,10 @@ def packed(value: Tensor) -> Tensor:
     """Return the values as a tensor of its own, with the strides of a new one; they are copied only if they must be.
 
     A slice, an expansion, or what was made in inference mode would get other graphs, and so would views of other bases.
+    Call it outside of inference mode, and without gradients.
     """
-    with torch.inference_mode(False), torch.no_grad():
-        value = value.contiguous().reshape(-1).view(value.shape)  # constants expanded in full would else stay so
-        if value.is_inference():
-            return value.clone()
-        place = value.untyped_storage(), value.storage_offset(), value.shape, value.stride()
-        return value.new_empty(0).set_(*place)
+    value = value.contiguous().reshape(-1).view(value.shape)  # constants expanded in full would else stay so
+    if value.is_inference():
+        return value.clone()
+    place = value.untyped_storage(), value.storage_offset(), value.shape, value.stride()
+    return value.new_empty(0).set_(*place)

@@ -35,7 +35,8 @@ def compiled_update(
     if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
         update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
-    inputs = [None if value is None else packed(value) for value in (points, *others)]
+    with torch.inference_mode(False), torch.no_grad():
+        inputs = [None if value is None else packed(value) for value in (points, *others)]
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)
     with announced_compilation():
         graphs = graphs_of(cfg, kinds, points.shape[1])

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.inputs import checks
 from torchelev.ops.transforms import require_reverse_mode
 
@@ -149,14 +149,19 @@ def require_full_precision(dtype: torch.dtype) -> None:
 def _check_points(points: object, num_envs: int, device: torch.device) -> Float[Tensor, "B S N 3"]:
     value = checks.check_tensor("points", points, device, checks.FLOATS)
     fits = value.ndim in (3, 4) and value.shape[0] == num_envs and value.shape[-1] == 3
+    if not fits:
+        raise _wrong_shape(value, num_envs, device)
+    value = value if value.ndim == 4 else value[:, None]
+    require(value.shape[1] > 0, "points", "must have at least one sensor", value.shape, "give S >= 1")
+    return value
+
+
+def _wrong_shape(value: Tensor, num_envs: int, device: torch.device) -> ValueError:
     rule = f"expected (B, N, 3) or (B, S, N, 3) with B = {num_envs} on {device}"
     hint = "give one cloud per environment, padded with NaN"
     if value.ndim in (3, 4) and value.shape[-1] != 3:
         hint = "transpose the last two dimensions" if value.shape[-2] == 3 else "keep x, y and z alone: points[..., :3]"
-    require(fits, "points", rule, f"{tuple(value.shape)} on {value.device}", hint)
-    value = value if value.ndim == 4 else value[:, None]
-    require(value.shape[1] > 0, "points", "must have at least one sensor", tuple(value.shape), "give S >= 1")
-    return value
+    return ValueError(message("points", rule, f"{tuple(value.shape)} on {value.device}", hint))
 
 
 def _check_dt(
@@ -176,15 +181,15 @@ def _check_dt(
 
 def _check_dt_tensor(dt: Tensor, num_envs: int, device: torch.device, check_values: bool) -> Tensor:
     value = checks.check_tensor("dt", dt, device, checks.FLOATS)
-    fits = tuple(value.shape) in ((), (num_envs,))
-    require(fits, "dt", f"expected a number or ({num_envs},)", tuple(value.shape), "give one dt per environment")
+    if value.shape not in ((), (num_envs,)):
+        rule = f"expected a number or ({num_envs},)"
+        require(False, "dt", rule, tuple(value.shape), "give one dt per environment")
     if checks.readable(value, check_values):
-        seconds = np.atleast_1d(value.detach().double().cpu().numpy())
-        bad = ~((seconds >= 0) & (seconds < math.inf))
-        actual = f"{seconds[bad][0]:g}{checks.name_environments(bad)}" if bad.any() else ""
-        require(
-            not bad.any(), "dt", "must be finite and not negative", actual, "give the seconds since the last update"
-        )
+        good = (value >= 0) & (value < math.inf)
+        if not good.all():
+            bad = np.atleast_1d(~good.cpu().numpy())
+            actual = f"{value[~good].flatten()[0]:g}{checks.name_environments(bad)}"
+            require(False, "dt", "must be finite and not negative", actual, "give the seconds since the last update")
     return value
 
 

@@ -122,6 +122,7 @@ class Waits:
             self.short = False
 
 
+@functools.cache  # asking the system takes as long as all else that is done here
 def num_cores() -> int:
     """Return the number of the machine's cores."""
     return os.cpu_count() or 1

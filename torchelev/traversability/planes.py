@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.native.library import load
+from torchelev.ops.define import operator
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.native import computes, run
 from torchelev.ops.storage import as_bytes, as_mask
@@ -65,10 +66,16 @@ def _in_one_pass(elevation: Tensor, validity: Tensor, *settings: Any) -> list[Te
     return [as_mask(layer) if layer.dtype == torch.uint8 else layer for layer in layers]
 
 
-@torch.library.custom_op(
-    "torchelev::rate_planes",
-    mutates_args=(),
-    schema="(Tensor elevation, Tensor known, int radius, int cells, float resolution, float[] critical) -> Tensor[]",
+def _fake(
+    elevation: Tensor, known: Tensor, radius: int, cells: int, resolution: float, critical: list[float]
+) -> list[Tensor]:
+    return _empty_layers(elevation, cells)
+
+
+@operator(
+    "rate_planes(Tensor elevation, Tensor known, int radius, int cells, float resolution, float[] critical) "
+    "-> Tensor[]",
+    _fake,
 )
 def _rate_planes(
     elevation: Tensor, known: Tensor, radius: int, cells: int, resolution: float, critical: list[float]
@@ -83,13 +90,6 @@ def _rate_planes(
     numbers = resolution, min_spread(radius), min_spread(cells), *(critical or 3 * [1.0])
     run(library.rate_surface, tensors, *elevation.shape, radius, cells, (ctypes.c_float * 6)(*numbers))
     return layers
-
-
-@_rate_planes.register_fake
-def _(
-    elevation: Tensor, known: Tensor, radius: int, cells: int, resolution: float, critical: list[float]
-) -> list[Tensor]:
-    return _empty_layers(elevation, cells)
 
 
 def _empty_layers(elevation: Tensor, cells: int) -> list[Tensor]:

@@ -117,4 +117,4 @@ def test_gradients_and_float64_go_by_tensors():
 
 @pytest.mark.parametrize("cfg", [*CONFIGS, FusionConfig(gate=float("inf"), edges=EdgeConfig(min_points=9))])
 def test_settings_survive_as_numbers(cfg):
-    assert config_of(numbers(cfg)) == cfg
+    assert config_of(tuple(numbers(cfg))) == cfg

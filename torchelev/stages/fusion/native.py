@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+import functools
 from dataclasses import fields
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig, grid_of
 from torchelev.native.library import load
+from torchelev.ops.define import operator
 from torchelev.ops.indexing import can_select
 from torchelev.ops.native import computes, run
 from torchelev.ops.storage import as_bytes, as_mask
@@ -59,7 +60,8 @@ def numbers(cfg: FusionConfig) -> list[float]:
     return [float(value) for value in (*values, *of_edges)]
 
 
-def config_of(settings: Sequence[float]) -> FusionConfig:
+@functools.cache  # as it is asked for in every update
+def config_of(settings: tuple[float, ...]) -> FusionConfig:
     """Return the settings that `numbers` made numbers of."""
     *own, _ = fields(FusionConfig)
     of_edges = fields(EdgeConfig) if len(settings) > len(own) else ()
@@ -70,11 +72,16 @@ def config_of(settings: Sequence[float]) -> FusionConfig:
     return FusionConfig(**named, edges=EdgeConfig(**edges) if edges else None)
 
 
-@torch.library.custom_op(
-    "torchelev::update_hit_cells",
-    mutates_args=(),
-    schema="(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, Tensor[] layers, "
-    "float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
+def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
+    _, _, slot, layers, *_ = others
+    T, B = torch.library.get_ctx().new_dynamic_size(), slot.shape[0]
+    return [slot.new_empty(T), *(layer.new_empty(T) for layer in layers), slot.new_empty(B), slot.new_empty(B)]
+
+
+@operator(
+    "update_hit_cells(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, "
+    "Tensor[] layers, float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
+    _fake,
 )
 def _update_hit(
     points: Tensor,
@@ -90,7 +97,7 @@ def _update_hit(
     settings: list[float],
 ) -> list[Tensor]:
     """Return the T cells, their layers (T,) with masks as bytes, and the points used and ignored (B,)."""
-    library, cfg = load(_SOURCE, {}), config_of(settings)
+    library, cfg = load(_SOURCE, {}), config_of(tuple(settings))
     (B, M), C = slot.shape, layers[0].shape[1]
     if library is None:
         hits = HitPoints(points, noise, shared, origin, PointCells(slot, as_mask(inside), C))
@@ -103,13 +110,6 @@ def _update_hit(
     run(library.fuse_points, tensors, B, M, origin.shape[1], C // width, width, ctypes.byref(own))
     T = int(count)
     return [cells[:T], *(layer[:T] for layer in new), num_used, num_ignored]
-
-
-@_update_hit.register_fake
-def _(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
-    _, _, slot, layers, *_ = others
-    T, B = torch.library.get_ctx().new_dynamic_size(), slot.shape[0]
-    return [slot.new_empty(T), *(layer.new_empty(T) for layer in layers), slot.new_empty(B), slot.new_empty(B)]
 
 
 def _update_all(
@@ -125,6 +125,7 @@ def _update_all(
     return [cells, *(value.reshape(-1) for value in values), new.num_used, new.num_ignored]
 
 
+@functools.cache
 def c_settings(cfg: FusionConfig, resolution: float, has_rays: bool) -> ctypes.Structure:
     """Return the settings as the C++ of points.h takes them."""
     edges = cfg.edges or EdgeConfig(margin=0.0, min_settled=0.0)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.native import kernels
+from torchelev.ops.define import operator
 from torchelev.ops.transforms import is_transforming
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.native import c_settings, config_of, numbers
@@ -42,11 +43,15 @@ def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: 
     return Update(CellLayers(*new), None, used, ignored)
 
 
-@torch.library.custom_op(
-    "torchelev::update_cells_on_gpu",
-    mutates_args=(),
-    schema="(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, Tensor[] layers, "
-    "float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
+def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
+    _, _, slot, layers, *_ = others
+    return [*(torch.empty_like(layer) for layer in layers), slot.new_empty(len(slot)), slot.new_empty(len(slot))]
+
+
+@operator(
+    "update_cells_on_gpu(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, "
+    "Tensor[] layers, float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
+    _fake,
 )
 def _update(
     points: Tensor,
@@ -63,7 +68,7 @@ def _update(
 ) -> list[Tensor]:
     """Return all layers (B, C), and the points used and ignored (B,)."""
     (B, M), C = slot.shape, layers[0].shape[1]
-    own, layers = c_settings(config_of(settings), resolution, has_rays), [layer.contiguous() for layer in layers]
+    own, layers = c_settings(config_of(tuple(settings)), resolution, has_rays), [layer.contiguous() for layer in layers]
     points, noise, origin, inside, slot = (value.contiguous() for value in (points, noise, origin, inside, slot))
     shared = None if shared is None else shared.contiguous()
     with torch.cuda.device_of(points):
@@ -84,9 +89,3 @@ def _update(
         kernels.launch(_SOURCE, "update_cells", B, C, *update)
         kernels.launch(_SOURCE, "update_heavy_cells", 1, _THREADS, *update, _THREADS)
     return [*new, *tallies]
-
-
-@_update.register_fake
-def _(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
-    _, _, slot, layers, *_ = others
-    return [*(torch.empty_like(layer) for layer in layers), slot.new_empty(len(slot)), slot.new_empty(len(slot))]

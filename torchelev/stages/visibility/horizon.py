@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig, grid_of, locate
 from torchelev.native.library import load
+from torchelev.ops.define import operator
 from torchelev.ops.indexing import read
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.native import run
@@ -101,7 +102,11 @@ def limits_by_tensors(
     return torch.where(k >= 0, limit, NO_FALL)
 
 
-@torch.library.custom_op("torchelev::horizon", mutates_args=())
+def _fake(rays: list[Tensor], *_: object) -> Tensor:
+    return torch.empty_like(rays[0], memory_format=torch.contiguous_format)
+
+
+@operator("horizon(Tensor[] rays, Tensor[] layers, Tensor[] ways, int ranges, float[] settings) -> Tensor", _fake)
 def _horizon(
     rays: list[Tensor], layers: list[Tensor], ways: list[Tensor], ranges: int, settings: list[float]
 ) -> Tensor:
@@ -111,11 +116,6 @@ def _horizon(
         state, grid, cfg = _described(layers, *settings)
         limits = limits_by_tensors(state, SeenRays(*rays), Directions(*ways), ranges, grid, cfg)
     return limits
-
-
-@_horizon.register_fake
-def _(rays: list[Tensor], *_: object) -> Tensor:
-    return torch.empty_like(rays[0], memory_format=torch.contiguous_format)
 
 
 def _described(

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig, grid_of
 from torchelev.native.library import load
+from torchelev.ops.define import operator
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.native import computes, run
 from torchelev.ops.storage import as_bytes, as_mask
@@ -35,8 +36,12 @@ def has_one_pass(state: MapState) -> bool:
 def in_one_pass(twin: Apply) -> Apply:
     """Return a function that does what its twin does, and calls it where C++ cannot be built."""
 
-    @torch.library.custom_op("torchelev::apply_rays", mutates_args=())
-    def operator(
+    @operator(
+        "apply_rays(Tensor[] rays, Tensor[] view, Tensor[] layers, int ranges, int azimuths, float bins, int[] widen, "
+        "float[] settings) -> Tensor[]",
+        _fake,
+    )
+    def apply_to_layers(
         rays: list[Tensor],
         view: list[Tensor],
         layers: list[Tensor],
@@ -53,16 +58,12 @@ def in_one_pass(twin: Apply) -> Apply:
             changed = _layers(twin(state, RayBins(*rays), View(*view), polar, grid, cfg), CHANGED)
         return changed
 
-    @operator.register_fake
-    def _(rays: list[Tensor], view: list[Tensor], layers: list[Tensor], *_: object) -> list[Tensor]:
-        return _new(layers)
-
     def apply(
         state: MapState, rays: RayBins, view: View, polar: PolarGrid, grid: GridConfig, cfg: RaycastConfig
     ) -> MapState:
         sizes = polar.ranges, polar.azimuths, polar.bins, list(polar.widen)
         settings = [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.gate]
-        changed = operator(list(rays), list(view), _layers(state, READ), *sizes, settings)
+        changed = apply_to_layers(list(rays), list(view), _layers(state, READ), *sizes, settings)
         return state._replace(**_named(CHANGED, changed))  # type: ignore[arg-type]
 
     return apply
@@ -82,6 +83,10 @@ def _new(layers: list[Tensor]) -> list[Tensor]:
     """Return memory for the changed layers."""
     old = (layers[READ.index(name)] for name in CHANGED)
     return [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in old]
+
+
+def _fake(rays: list[Tensor], view: list[Tensor], layers: list[Tensor], *_: object) -> list[Tensor]:
+    return _new(layers)
 
 
 def _described(
