@@ -7,7 +7,7 @@ wait for the device. They are made for CPU tensors, and elsewhere only if the ca
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -80,23 +80,32 @@ def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.de
     value = check_tensor(name, pose, device, _POSE_DTYPES)
     if value.shape != shape:
         require(False, name, f"expected {shape} on {device}", tuple(value.shape), "give one 4 x 4 matrix for each")
-    if readable(value, always) and not _are_few_and_rigid(value):
+    if readable(value, always) and not _are_rigid(value):
         _require_rigid(name, value)
     return value
 
 
-def _are_few_and_rigid(pose: Tensor) -> bool:
-    """Tell whether matrices pass `_require_rigid`, without its messages: for few of them in a tenth of its time."""
-    return pose.numel() <= 16 * _FEW and all(map(_is_rigid, pose.detach().reshape(-1, 16).tolist()))
+def _are_rigid(pose: Tensor) -> bool:
+    """Tell whether matrices pass `_require_rigid`, whose messages take several times as long."""
+    matrices = pose.detach().cpu().reshape(-1, 16)
+    if len(matrices) <= _FEW:  # Python's numbers are faster than NumPy's
+        return all(map(_is_rigid, matrices.tolist()))
+    return bool(np.all(_is_rigid(matrices.double().T.contiguous().numpy())))
 
 
-def _is_rigid(matrix: list[float]) -> bool:
+def _is_rigid(matrix: Any) -> Any:
+    """Tell whether a matrix of 16 numbers is rigid, or which are, of arrays of such numbers."""
     a, b, c, x, d, e, f, y, g, h, i, z, *last = matrix
-    lengths = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
-    products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-    is_rotation = all(abs(v - 1) < 1e-3 for v in lengths) and all(abs(v) < 1e-3 for v in products)
-    is_right_handed = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
-    return is_rotation and is_right_handed and last == [0, 0, 0, 1] and max(abs(x), abs(y), abs(z)) <= FARTHEST
+    good = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
+    for length in (a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i):
+        good &= abs(length - 1) < 1e-3
+    for product in (a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i):
+        good &= abs(product) < 1e-3
+    for value, exact in zip(last, (0, 0, 0, 1), strict=True):
+        good &= value == exact
+    for coordinate in (x, y, z):
+        good &= abs(coordinate) <= FARTHEST
+    return good
 
 
 def _require_rigid(name: str, pose: Tensor) -> None:
