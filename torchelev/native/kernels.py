@@ -18,6 +18,7 @@ from torchelev.native.library import is_switched_off
 _SOURCES = Path(__file__).parent
 _STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: gpu/standard.h is all of them
 _THREADS = 128  # of a block
+_KNOWN: dict[int, bool] = {}  # devices, and whether kernels run there
 
 
 def can_launch() -> bool:
@@ -27,7 +28,12 @@ def can_launch() -> bool:
     """
     if is_switched_off() or not torch.cuda.is_available() or torch.version.cuda is None:
         return False
-    return _can_launch(torch.cuda.current_device())
+    device = torch.cuda.current_device()
+    if device not in _KNOWN:
+        if torch.cuda.is_current_stream_capturing():  # in which nothing can be tried
+            return False
+        _KNOWN[device] = _try(device)
+    return _KNOWN[device]
 
 
 # As `torch.compiler.assume_constant_result` does, which would load the compiler: code that is compiled asks only once.
@@ -57,8 +63,13 @@ def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) ->
 
 def addresses_of(tensors: Sequence[Tensor]) -> ctypes.Structure:
     """Return the addresses of tensors as a structure, which a kernel takes by value."""
-    fields = [(f"p{k}", ctypes.c_void_p) for k in range(len(tensors))]
-    return type("Addresses", (ctypes.Structure,), {"_fields_": fields})(*(tensor.data_ptr() for tensor in tensors))
+    return _pointers(len(tensors))(*(tensor.data_ptr() for tensor in tensors))
+
+
+@functools.cache
+def _pointers(number: int) -> type[ctypes.Structure]:
+    fields = [(f"p{k}", ctypes.c_void_p) for k in range(number)]
+    return type("Addresses", (ctypes.Structure,), {"_fields_": fields})
 
 
 def _argument(value: Any) -> Any:
@@ -67,9 +78,11 @@ def _argument(value: Any) -> Any:
     return ctypes.c_int64(value) if isinstance(value, int) else value
 
 
-@functools.cache
-def _can_launch(device: int) -> bool:
+def _try(device: int) -> bool:
+    """Run a kernel on the current device, and load all others."""
     try:
+        for path in _SOURCES.rglob("*.cu"):  # while a graph is captured, none could be loaded
+            _module(path.relative_to(_SOURCES).as_posix(), device)
         one = torch.ones(1, device=device)
         launch("gpu/trial.cu", "double_it", 1, 1, one)
         return one.item() == 2

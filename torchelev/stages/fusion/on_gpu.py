@@ -45,7 +45,8 @@ def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: 
 
 def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
     _, _, slot, layers, *_ = others
-    return [*(torch.empty_like(layer) for layer in layers), slot.new_empty(len(slot)), slot.new_empty(len(slot))]
+    new = [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in layers]
+    return [*new, slot.new_empty(len(slot)), slot.new_empty(len(slot))]
 
 
 @operator(
