@@ -397,3 +397,14 @@ def test_what_is_no_number_of_environments_is_refused(number):
         ElevationMap(small_config(), num_envs=number)
     with pytest.raises(ValueError, match="chunk: must be a positive int, got .*or None"):
         ElevationMap(small_config(), chunk=number)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("num_envs", [2, 20])
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_numbers_in_a_pose_that_are_not_finite_are_refused_without_warnings(num_envs, bad):
+    emap = small_map(num_envs)
+    T = pose(num_envs=num_envs)
+    T[-1, 0, 1] = bad
+    with pytest.raises(ValueError, match=f"T_map_sensor: must be finite.*in environment {num_envs - 1}"):
+        emap.update(torch.zeros(num_envs, 5, 3), T, None, 0.1)

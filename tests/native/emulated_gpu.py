@@ -1,4 +1,7 @@
-"""CUDA kernels on a CPU, thread after thread: each source is compiled as C++, with a GPU's names defined."""
+"""CUDA kernels on a CPU, thread after thread: each source is compiled as C++, with a GPU's names defined.
+
+A warp has one thread here: `tests/test_gpu.py` tests what threads share.
+"""
 
 import ctypes
 import functools
@@ -28,21 +31,21 @@ extern "C" void take_place(int64_t block, int64_t thread, int64_t size) {
 
 @functools.cache
 def library(source):
-    folder = Path(tempfile.mkdtemp())
-    (folder / "gpu.h").write_text(GPU)
     path = kernels._SOURCES / source
-    includes = ["-include", str(folder / "gpu.h"), f"-I{path.parent}", f"-I{kernels._SOURCES / 'gpu'}"]
     flags = ["-std=c++17", "-O1", "-fPIC", "-shared", "-fsanitize=undefined", "-fno-sanitize-recover"]
-    built = folder / "kernels.so"
-    subprocess.run([*find_compiler(), *flags, *includes, "-x", "c++", str(path), "-o", str(built)], check=True)
-    return ctypes.CDLL(str(built))
+    with tempfile.TemporaryDirectory() as name:
+        header, built = Path(name) / "gpu.h", Path(name) / "kernels.so"
+        header.write_text(GPU)
+        includes = ["-include", str(header), f"-I{path.parent}", f"-I{kernels._SOURCES / 'gpu'}"]
+        subprocess.run([*find_compiler(), *flags, *includes, "-x", "c++", str(path), "-o", str(built)], check=True)
+        return ctypes.CDLL(str(built))
 
 
 def launch(source, kernel, rows, number, *arguments):
     """Do what `kernels.launch` does, on tensors of the CPU."""
     emulated = library(source)
     values = [kernels._argument(value) for value in arguments]
-    for block in range(rows * -(-number // kernels._THREADS)):
-        for thread in range(kernels._THREADS):
-            emulated.take_place(block, thread, kernels._THREADS)
+    for block in range(rows * -(-number // kernels._BLOCK)):
+        for thread in range(kernels._BLOCK):
+            emulated.take_place(block, thread, kernels._BLOCK)
             getattr(emulated, kernel)(*values)

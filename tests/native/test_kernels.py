@@ -1,5 +1,6 @@
 """CUDA kernels are used where they run, and tensors elsewhere. What the kernels compute: beside the stages' tests."""
 
+import contextlib
 import warnings
 from unittest.mock import patch
 
@@ -13,37 +14,37 @@ from torchelev.native import kernels
 def gpu(monkeypatch):
     """A GPU as far as `can_launch` asks; what it knows of GPUs is forgotten."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
     monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(kernels, "_KNOWN", {})
+    monkeypatch.setattr(kernels, "_CAN_LAUNCH", {})
     monkeypatch.delenv("TORCHELEV_NATIVE", raising=False)
     return monkeypatch
 
 
 def test_without_a_gpu():
     with patch.object(torch.cuda, "is_available", lambda: False):
-        assert not kernels.can_launch()
+        assert not kernels.can_launch(0)
 
 
 def test_each_gpu_is_tried_once(gpu):
     tried = []
     gpu.setattr(kernels, "_try", lambda device: not tried.append(device))
-    assert kernels.can_launch() and kernels.can_launch()
-    assert tried == [0]
+    assert kernels.can_launch(0) and kernels.can_launch(1) and kernels.can_launch(0)
+    assert tried == [0, 1]
 
 
 def test_nothing_is_tried_while_a_graph_is_captured(gpu):
     gpu.setattr(kernels, "_try", lambda device: True)
     with patch.object(torch.cuda, "is_current_stream_capturing", lambda: True):
-        assert not kernels.can_launch()
-    assert kernels.can_launch()
+        assert not kernels.can_launch(0)
+    assert kernels.can_launch(0)
 
 
 def test_they_can_be_switched_off(gpu):
     gpu.setattr(kernels, "_try", lambda device: True)
     gpu.setenv("TORCHELEV_NATIVE", "0")
-    assert not kernels.can_launch()
+    assert not kernels.can_launch(0)
 
 
 def test_a_gpu_for_which_nothing_compiles_is_told(gpu):
@@ -51,12 +52,14 @@ def test_a_gpu_for_which_nothing_compiles_is_told(gpu):
         raise RuntimeError("no such architecture")
 
     gpu.setattr(kernels, "_module", fail)
-    with pytest.warns(RuntimeWarning, match="cannot be built here.*no such architecture.*TORCHELEV_NATIVE=0"):
-        assert not kernels.can_launch()
+    kernels._function.cache_clear()
+    with pytest.warns(RuntimeWarning, match="do not work here.*no such architecture.*TORCHELEV_NATIVE=0"):
+        assert not kernels.can_launch(0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not kernels.can_launch()
+        assert not kernels.can_launch(0)
 
 
-def test_all_sources_are_found():
-    assert {path.name for path in kernels._SOURCES.rglob("*.cu")} == {"fusion.cu", "tables.cu", "trial.cu"}
+def test_compiled_code_asks():
+    compiled = torch.compile(lambda x: x + kernels.can_launch(max(0, x.get_device())), fullgraph=True, backend="eager")
+    assert compiled(torch.zeros(1)) == kernels.can_launch(0)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.native.emulated_gpu import launch
 from torchelev.native import kernels
 from torchelev.native.library import find_compiler
-from torchelev.ops import on_gpu
+from torchelev.ops import native, on_gpu
 from torchelev.ops.moving import moved
 from torchelev.ops.operators import cell_sums, padded, polar_minimum, running_minimum
 
@@ -53,7 +53,11 @@ def test_polar_minimum_by_a_kernel(seed, num_envs, num_values, widen):
     index = torch.randint(10 * 26, (num_envs, num_values), generator=generator)
     values = torch.randn(num_envs, num_values, generator=generator)
     expected = polar_minimum(index, values, 26, widen, 9, 9.0)
-    with patch.object(on_gpu, "scans", lambda *_: True), patch.object(kernels, "launch", launch):
+    by_kernel = (
+        patch.object(native, "polar_minimum", lambda *_: None),
+        patch.object(on_gpu, "can_scan", lambda *_: True),
+    )
+    with by_kernel[0], by_kernel[1], patch.object(kernels, "launch", launch):
         assert torch.equal(polar_minimum(index, values, 26, widen, 9, 9.0), expected)
 
 

@@ -171,23 +171,23 @@ def load_traced(data: bytes) -> LoadedGraph:
 
 
 def _guard_of(graph: Any) -> Callable[..., bool]:
-    """Return what tests arguments as a loaded graph's own `guard_check` does, which takes three times as long."""
+    """Return a test of a graph's arguments. It does what the graph's `guard_check` does, in a third of the time."""
     artifacts = graph._artifacts
     environment = artifacts.runtime_env
     cells = [cell.cell_contents for cell in environment.closure or ()]
     outer = dict(zip(environment.bytecode.co_freevars, cells, strict=True))
-    kinds = artifacts.signature.parameters
-    names = [name for name, kind in kinds.items() if kind.kind != kind.VAR_POSITIONAL]
-    others = [name for name, kind in kinds.items() if kind.kind == kind.VAR_POSITIONAL]
-    test = artifacts.guard_manager.root.check
+    parameters = artifacts.signature.parameters.values()
+    named = [p.name for p in parameters if p.kind != p.VAR_POSITIONAL]
+    rest = next((p.name for p in parameters if p.kind == p.VAR_POSITIONAL), None)
+    check: Callable[[dict[str, Any]], bool] = artifacts.guard_manager.root.check
 
-    def passes(*args: Any) -> bool:
-        values = {**outer, **dict(zip(names, args, strict=False))}
-        for name in others:
-            values[name] = args[len(names) :]
-        return test(values)
+    def accepts(*args: Any) -> bool:
+        values = {**outer, **dict(zip(named, args, strict=False))}
+        if rest is not None:
+            values[rest] = args[len(named) :]
+        return check(values)
 
-    return passes
+    return accepts
 
 
 def known_instructions(names: Sequence[str]) -> contextlib.AbstractContextManager[None]:

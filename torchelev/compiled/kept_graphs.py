@@ -18,7 +18,15 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
-from torchelev.compiled.compiler import announced_start, compiled, load_traced, mark_dynamic, remove_marks, traced
+from torchelev.compiled.compiler import (
+    LoadedGraph,
+    announced_start,
+    compiled,
+    load_traced,
+    mark_dynamic,
+    remove_marks,
+    traced,
+)
 from torchelev.native.library import describe_processor, is_native
 from torchelev.output_files import atomic_file
 
@@ -54,7 +62,7 @@ class KeptGraph:
         self._function, self._dynamic = function, dynamic
         self._settings = describe(settings)
         self._usual = compiled(function)
-        self._kept: dict[tuple[Any, ...], Any] = {}
+        self._kept: dict[tuple[Any, ...], LoadedGraph | None] = {}
 
     def __call__(self, *args: Any) -> Any:
         """Call the function."""
@@ -70,7 +78,7 @@ class KeptGraph:
         finally:
             remove_marks(dynamic.values)
 
-    def prepare(self, *args: Any) -> Any:
+    def prepare(self, *args: Any) -> LoadedGraph | None:
         """Return the graph for arguments, from its file or compiled into it; None if it cannot be kept."""
         kind = _kind(args)
         if self._is_new(kind):
@@ -98,7 +106,7 @@ class KeptGraph:
         except OSError:  # the folder cannot be made
             return None
 
-    def _find(self, args: Sequence[Any]) -> Any:
+    def _find(self, args: Sequence[Any]) -> LoadedGraph | None:
         path = self.path(*args)
         if path is None:
             return None
@@ -158,7 +166,7 @@ def _layout(value: Tensor, dim: int | None) -> tuple[list[int], list[tuple[int, 
     return shape, [(s // value.shape[dim] if far else s, far) for s, far in zip(strides, spans, strict=True)]
 
 
-def _load(path: Path) -> Any:
+def _load(path: Path) -> LoadedGraph | None:
     """Return the graph in a file; None if there is none of use."""
     try:
         data = path.read_bytes()

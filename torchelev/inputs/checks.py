@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.ops.transforms import is_transforming
 
 FARTHEST = 1e9  # [m] limit of coordinates; beyond it float64 misses cells
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-_FEW = 8  # poses
+_FEW = 8  # poses, up to which Python's numbers are faster than NumPy's
 _POSE_DTYPES = (torch.float32, torch.float64)
 Config = TypeVar("Config")
 
@@ -79,22 +79,24 @@ def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.de
     """Return rigid transforms (..., 4, 4) of this shape."""
     value = check_tensor(name, pose, device, _POSE_DTYPES)
     if value.shape != shape:
-        require(False, name, f"expected {shape} on {device}", tuple(value.shape), "give one 4 x 4 matrix for each")
+        hint = "give one 4 x 4 matrix for each"
+        raise ValueError(message(name, f"expected {shape} on {device}", tuple(value.shape), hint))
     if readable(value, always) and not _are_rigid(value):
         _require_rigid(name, value)
     return value
 
 
 def _are_rigid(pose: Tensor) -> bool:
-    """Tell whether matrices pass `_require_rigid`, whose messages take several times as long."""
+    """Tell quickly whether all matrices are rigid; where this says no, `_require_rigid` decides and words the error."""
     matrices = pose.detach().cpu().reshape(-1, 16)
-    if len(matrices) <= _FEW:  # Python's numbers are faster than NumPy's
+    if len(matrices) <= _FEW:
         return all(map(_is_rigid, matrices.tolist()))
-    return bool(np.all(_is_rigid(matrices.double().T.contiguous().numpy())))
+    with np.errstate(all="ignore"):  # of what is not finite
+        return bool(np.all(_is_rigid(matrices.double().T.contiguous().numpy())))
 
 
 def _is_rigid(matrix: Any) -> Any:
-    """Tell whether a matrix of 16 numbers is rigid, or which are, of arrays of such numbers."""
+    """Return whether a matrix, its 16 entries row by row, is rigid. Entries may be arrays: one matrix per element."""
     a, b, c, x, d, e, f, y, g, h, i, z, *last = matrix
     good = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
     for length in (a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i):
@@ -116,7 +118,7 @@ def _require_rigid(name: str, pose: Tensor) -> None:
 
     def refuse(bad: np.ndarray, rule: str, actual: Callable[[], str], hint: str) -> None:
         if bad.any():
-            require(False, name, rule, actual() + name_environments(bad), hint)
+            raise ValueError(message(name, rule, actual() + name_environments(bad), hint))
 
     hint = "where the pose is unknown, give any rigid one, and NaN points if they should be ignored"
     refuse(~np.isfinite(matrix), "must be finite", lambda: "NaN or inf", hint)

@@ -152,7 +152,7 @@ def _check_points(points: object, num_envs: int, device: torch.device) -> Float[
     if not fits:
         raise _wrong_shape(value, num_envs, device)
     value = value if value.ndim == 4 else value[:, None]
-    require(value.shape[1] > 0, "points", "must have at least one sensor", value.shape, "give S >= 1")
+    require(value.shape[1] > 0, "points", "must have at least one sensor", tuple(value.shape), "give S >= 1")
     return value
 
 
@@ -183,13 +183,14 @@ def _check_dt_tensor(dt: Tensor, num_envs: int, device: torch.device, check_valu
     value = checks.check_tensor("dt", dt, device, checks.FLOATS)
     if value.shape not in ((), (num_envs,)):
         rule = f"expected a number or ({num_envs},)"
-        require(False, "dt", rule, tuple(value.shape), "give one dt per environment")
+        raise ValueError(message("dt", rule, tuple(value.shape), "give one dt per environment"))
     if checks.readable(value, check_values):
         good = (value >= 0) & (value < math.inf)
         if not good.all():
             bad = np.atleast_1d(~good.cpu().numpy())
             actual = f"{value[~good].flatten()[0]:g}{checks.name_environments(bad)}"
-            require(False, "dt", "must be finite and not negative", actual, "give the seconds since the last update")
+            hint = "give the seconds since the last update"
+            raise ValueError(message("dt", "must be finite and not negative", actual, hint))
     return value
 
 

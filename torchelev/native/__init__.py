@@ -1,4 +1,4 @@
-"""C++ for CPUs, where tensors are far slower: built on demand, and never required.
+"""C++ for CPUs and CUDA kernels for GPUs, where tensors are far slower: built on demand, and never required.
 
-Each function has a twin in torch that computes the same, and that runs where there is no compiler.
+Each has a twin in torch that computes the same, and that runs where nothing can be built.
 """

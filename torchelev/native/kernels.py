@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,23 +18,23 @@ from torchelev.native.library import is_switched_off
 
 _SOURCES = Path(__file__).parent
 _STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: gpu/standard.h is all of them
-_THREADS = 128  # of a block
-_KNOWN: dict[int, bool] = {}  # devices, and whether kernels run there
+_BLOCK = 128  # threads
+_CAN_LAUNCH: dict[int, bool] = {}  # by device
 
 
-def can_launch() -> bool:
-    """Tell whether kernels run on the current GPU; False with TORCHELEV_NATIVE=0 in the environment.
+def can_launch(device: int) -> bool:
+    """Tell whether kernels run on a GPU, given its number; False with TORCHELEV_NATIVE=0 in the environment.
 
     If they do not, though torch's own do, a warning says so.
     """
     if is_switched_off() or not torch.cuda.is_available() or torch.version.cuda is None:
         return False
-    device = torch.cuda.current_device()
-    if device not in _KNOWN:
-        if torch.cuda.is_current_stream_capturing():  # in which nothing can be tried
-            return False
-        _KNOWN[device] = _try(device)
-    return _KNOWN[device]
+    if device not in _CAN_LAUNCH:
+        with torch.cuda.device(device):
+            if torch.cuda.is_current_stream_capturing():  # in which nothing can be tried
+                return False
+            _CAN_LAUNCH[device] = _try(device)
+    return _CAN_LAUNCH[device]
 
 
 # As `torch.compiler.assume_constant_result` does, which would load the compiler: code that is compiled asks only once.
@@ -41,24 +42,27 @@ can_launch._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) -> None:
-    """Run a kernel on the current stream, with `number` threads for each of some rows.
+    """Run a kernel on the current stream, with at least `number` threads for each of `rows` rows.
 
     Args:
         source: file in this folder.
-        kernel: of that file.
-        rows: of work.
-        number: threads of a row; the last block of each has more.
-        arguments: a tensor or None becomes its address, an int an int64; a structure stays as it is.
+        kernel: function in that file.
+        rows: number of rows.
+        number: threads per row, rounded up to whole blocks.
+        arguments: tensors and None are passed as addresses, ints as int64, ctypes values as they are.
+
+    Raises:
+        RuntimeError: if the source does not compile, or the driver refuses.
     """
     if rows * number == 0:
         return
     values = [_argument(value) for value in arguments]
     addresses = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
     _bind_context()
-    blocks = rows * -(-number // _THREADS)
+    blocks = rows * -(-number // _BLOCK)
     stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
     function = _function(source, kernel, torch.cuda.current_device())
-    _check(_driver().cuLaunchKernel(function, blocks, 1, 1, _THREADS, 1, 1, 0, stream, addresses, None), kernel)
+    _check(_driver().cuLaunchKernel(function, blocks, 1, 1, _BLOCK, 1, 1, 0, stream, addresses, None), kernel)
 
 
 def addresses_of(tensors: Sequence[Tensor]) -> ctypes.Structure:
@@ -82,18 +86,20 @@ def _try(device: int) -> bool:
     """Run a kernel on the current device, and load all others."""
     try:
         for path in _SOURCES.rglob("*.cu"):  # while a graph is captured, none could be loaded
-            _module(path.relative_to(_SOURCES).as_posix(), device)
-        one = torch.ones(1, device=device)
+            for kernel in re.findall(r"__global__ void (\w+)", path.read_text(encoding="utf-8")):
+                _function(path.relative_to(_SOURCES).as_posix(), kernel, device)
+        one = torch.ones(1, device=device, dtype=torch.float32)
         launch("gpu/trial.cu", "double_it", 1, 1, one)
-        return one.item() == 2
+        if one.item() != 2:
+            raise RuntimeError("a kernel computed something else")
     except (AttributeError, OSError, RuntimeError) as error:  # AttributeError: a library lacks a function
         warnings.warn(
-            f"CUDA kernels cannot be built here, and slower code does their work: {error}. "
-            "TORCHELEV_NATIVE=0 builds nothing.",
+            f"CUDA kernels do not work here, and slower code does their work: {error}. TORCHELEV_NATIVE=0 builds none.",
             RuntimeWarning,
             stacklevel=3,
         )
         return False
+    return True
 
 
 def _bind_context() -> None:
@@ -129,11 +135,11 @@ def _module(source: str, device: int) -> ctypes.c_void_p:
     """Compile a source for a GPU, which must be the current one, and load it there."""
     module = ctypes.c_void_p()
     major, minor = torch.cuda.get_device_capability(device)
-    _check(_driver().cuModuleLoadData(ctypes.byref(module), compiled(source, f"sm_{major}{minor}")), source)
+    _check(_driver().cuModuleLoadData(ctypes.byref(module), compile_source(source, f"sm_{major}{minor}")), source)
     return module
 
 
-def compiled(source: str, architecture: str) -> bytes:
+def compile_source(source: str, architecture: str) -> bytes:
     """Return a source's machine code for GPUs of an architecture; raise RuntimeError if there is none."""
     nvrtc, program = _nvrtc(), ctypes.c_void_p()
     path = _SOURCES / source

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchelev.native.library import call, is_native, load
 from torchelev.ops.transforms import is_transforming
 
-_SIZES = {torch.float32: 4, torch.float64: 8, torch.bool: 1, torch.uint8: 1}  # bytes
+_MOVABLE = torch.float32, torch.float64, torch.bool, torch.uint8
 
 
 def computes(layer: Tensor) -> bool:
@@ -57,14 +57,14 @@ def polar_minimum(
 
 def move_layers(layers: Sequence[Tensor], shift: Tensor, blanks: Sequence[float]) -> bool:
     """Do what `moving.move_in_place` does; return False where C++ cannot."""
-    is_plain = all(layer.is_cpu and layer.is_contiguous() and layer.dtype in _SIZES for layer in layers)
+    is_plain = all(layer.is_cpu and layer.is_contiguous() and layer.dtype in _MOVABLE for layer in layers)
     library = load("moving/moving.cpp", {}) if is_plain else None
     if library is None:
         return False
     number = len(layers)
     arrays = (
         (ctypes.c_void_p * number)(*(layer.data_ptr() for layer in layers)),
-        (ctypes.c_int64 * number)(*(_SIZES[layer.dtype] for layer in layers)),
+        (ctypes.c_int64 * number)(*(layer.element_size() for layer in layers)),
         (ctypes.c_double * number)(*blanks),
     )
     run(library.move_layers, [shift], *arrays, number, *layers[0].shape)

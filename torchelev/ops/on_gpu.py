@@ -20,10 +20,10 @@ class _Levels(ctypes.Structure):
     _fields_ = (("rows", ctypes.c_int64 * _LEVELS),)
 
 
-def scans(values: Tensor, widen: Sequence[int]) -> bool:
+def can_scan(values: Tensor, widen: Sequence[int]) -> bool:
     """Tell whether `scan_and_widen` takes tables of such values."""
     is_plain = values.is_cuda and values.dtype == torch.float32 and len(widen) <= _LEVELS
-    return is_plain and kernels.can_launch()
+    return is_plain and kernels.can_launch(values.get_device())
 
 
 def scan_and_widen(table: Tensor, widen: Sequence[int], ranges: int, blank: float) -> None:

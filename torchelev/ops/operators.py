@@ -2,7 +2,7 @@
 
 It would turn sums per cell into atomic additions, test at every read of a border whether it lies outside, and compute
 every term of a running minimum again for every reader. On a GPU, where each operation costs a launch, the
-compiler does the latter two.
+compiler does borders and running minima, and CUDA kernels (`on_gpu`) do the polar tables.
 """
 
 from __future__ import annotations
@@ -144,14 +144,15 @@ def _(index: Tensor, values: Tensor, size: int, blank: float) -> Tensor:
 def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int], ranges: int, blank: float) -> Tensor:
     rows = _table_rows(ranges)
     table = native.polar_minimum(index, values, rows, azimuths, widen, ranges, blank)
-    if on_gpu.scans(values, widen):
-        table = scatter.lowest(index, values, rows * azimuths, blank).unflatten(1, (rows, azimuths))
+    if table is not None:
+        return table
+    table = scatter.lowest(index, values, rows * azimuths, blank).unflatten(1, (rows, azimuths))
+    if on_gpu.can_scan(values, widen):
         on_gpu.scan_and_widen(table, widen, ranges, blank)
-    elif table is None:
-        table = scatter.lowest(index, values, rows * azimuths, blank).unflatten(1, (rows, azimuths))
-        table[:, ranges] = blank
-        _scan(table, from_end=True)
-        _widen(table, widen)
+        return table
+    table[:, ranges] = blank
+    _scan(table, from_end=True)
+    _widen(table, widen)
     return table
 
 
@@ -201,7 +202,7 @@ def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int]
     `widen` makes an entry of the first widen[w] ranges the minimum of twice as many azimuths, itself the first of
     them. Row `ranges` and what follows it, R being a multiple of 8, are blank, for what lies out of reach.
     """
-    if not _compiles_for_gpu(values) or on_gpu.scans(values, widen):
+    if not _compiles_for_gpu(values) or on_gpu.can_scan(values, widen):
         return _polar_minimum_with_gradient(index, values, azimuths, widen, ranges, blank)
     size = _table_rows(ranges)
     table = _lowest_per_cell(index, values, size * azimuths, blank).unflatten(1, (size, azimuths))

@@ -49,7 +49,7 @@ def fused(by, *scan):
         patch.object(stage, "can_update_hit", lambda _: by == "C++"),
         patch.object(stage, "can_update_on_gpu", lambda *_: by == "kernels"),
         patch.object(kernels, "launch", launch),
-        patch.object(on_gpu, "_THREADS", 256),
+        patch.object(on_gpu, "_HEAVY_THREADS", 256),
     ):
         return stage.fuse(*scan)
 
@@ -92,7 +92,24 @@ def test_kernels_agree_with_tensors(seed, num_envs, sensors, num_points, cfg, ha
     assert_same("kernels", state, m, grid, cfg, has_rays)
 
 
-@pytest.mark.parametrize("by", ["C++", "kernels"])
+def test_graphs_of_kernels_serve_any_number_of_maps():
+    graphs = []
+
+    def backend(graph, inputs):
+        graphs.append(graph)
+        return graph.forward
+
+    torch._dynamo.reset()
+    compiled = torch.compile(stage.fuse, backend=backend, fullgraph=True)
+    with patch.object(stage, "can_update_hit", lambda _: False), patch.object(kernels, "launch", lambda *_: None):
+        with patch.object(stage, "can_update_on_gpu", lambda *_: True), torch.no_grad():
+            for num_envs in range(2, 7):
+                state, m, grid = random_scan(0, num_envs, 1, 30, False)
+                compiled(state, m, grid, FusionConfig(), True)
+    assert len(graphs) <= 2
+
+
+@pytest.mark.parametrize("by", ["C++", pytest.param("kernels", marks=needs_compiler)])
 def test_without_points(by):
     state, m, grid = random_scan(0, 2, 1, 0, False)
     assert_same(by, state, m, grid, FusionConfig(), True)
@@ -101,8 +118,10 @@ def test_without_points(by):
 def test_without_a_compiler(monkeypatch):
     """Compiled code calls the operator all the same."""
     state, m, grid = random_scan(0, 2, 2, 300, True)
-    monkeypatch.setenv("TORCHELEV_NATIVE", "0")
-    assert not can_update_hit(state)
+    with torch.no_grad():
+        assert can_update_hit(state) == (find_compiler() is not None)
+        monkeypatch.setenv("TORCHELEV_NATIVE", "0")
+        assert not can_update_hit(state)
     got, expected = (fused(by, state, m, grid, FusionConfig(), True) for by in ("C++", "tensors"))
     for name in (*FUSED, "validity"):
         torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-6, rtol=0, msg=name)

@@ -1,7 +1,7 @@
 // The update of one cell: stages/fusion/{consensus,challenge,cell_measurement,vote,fuse}.py.
 #pragma once
 
-#include "points.h"
+#include "consensus.h"
 
 // What maps hold of their cells before the scan.
 struct Map {

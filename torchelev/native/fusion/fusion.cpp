@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "../threads.h"
-#include "serial.h"
+#include "points_of_thread.h"
 #include "cell.h"
 
 namespace {

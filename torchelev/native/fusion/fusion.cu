@@ -2,7 +2,7 @@
 //
 // B environments with M points each, of S sensors, and with C cells each.
 
-#include "shared.h"
+#include "points_of_warp.h"
 
 #include "cell.h"
 #include "threads.h"

@@ -28,8 +28,8 @@ struct Levels {
     int64_t rows[LEVELS];  // below which a level widens an entry; 0 after the last level
 };
 
-// Make each entry of tables (B, R, P) the minimum of itself and those that follow it all around: 1, 3, 7, ... of them. A thread
-// for each entry.
+// Make each entry of tables (B, R, P) the minimum of itself and the 1, 3, 7, ... entries that follow it around the row.
+// A thread for each entry.
 extern "C" __global__ void widen(const float* table, float* widened, int64_t R, int64_t P, Levels levels) {
     const Place at = place(R * P);
     if (at.k >= R * P) return;

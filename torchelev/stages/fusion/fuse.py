@@ -41,7 +41,11 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
     noise = m.variance if m.noise is None else m.noise
     points = HitPoints(m.points, noise, relative_variance(state, m), m.origin, cells)
     before = CellLayers(*(getattr(state, name).flatten(1) for name in CellLayers._fields))
-    run = update_hit if can_update_hit(state) else update_on_gpu if can_update_on_gpu(state, m.points) else update_all
+    run = update_all
+    if can_update_hit(state):
+        run = update_hit
+    elif can_update_on_gpu(state, m.points):
+        run = update_on_gpu
     new = run(points, before, grid, cfg, has_rays)
     return tally(
         write_back(state, new, cfg),

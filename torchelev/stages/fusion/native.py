@@ -27,7 +27,7 @@ _SOURCE = "fusion/fusion.cpp"
 
 
 class _Settings(ctypes.Structure):
-    """`Settings` of points.h."""
+    """`Settings` of point.h."""
 
     _fields_ = (
         *((name, ctypes.c_float) for name in ("resolution", "relief", "gate", "max_gate_std", "floor")),
@@ -60,7 +60,7 @@ def numbers(cfg: FusionConfig) -> list[float]:
     return [float(value) for value in (*values, *of_edges)]
 
 
-@functools.cache  # as it is asked for in every update
+@functools.lru_cache(maxsize=64)  # as it is asked for in every update
 def config_of(settings: tuple[float, ...]) -> FusionConfig:
     """Return the settings that `numbers` made numbers of."""
     *own, _ = fields(FusionConfig)
@@ -125,9 +125,9 @@ def _update_all(
     return [cells, *(value.reshape(-1) for value in values), new.num_used, new.num_ignored]
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def c_settings(cfg: FusionConfig, resolution: float, has_rays: bool) -> ctypes.Structure:
-    """Return the settings as the C++ of points.h takes them."""
+    """Return the settings as point.h defines them."""
     edges = cfg.edges or EdgeConfig(margin=0.0, min_settled=0.0)
     names = [field[0] for field in _Settings._fields_]
     of_edges = {name: getattr(edges, name) for name in names if hasattr(edges, name)}

@@ -19,21 +19,24 @@ from torchelev.state import MapState
 
 _SOURCE = "fusion/fusion.cu"
 _POINT_BYTES = 32  # of `Point` in point.h
-_FEW = 8  # points of a cell up to which one thread takes it
-_THREADS = 2**16  # that share the other cells
+_FEW = 8  # as in fusion.cu: points of a cell up to which one thread takes it
+_HEAVY_THREADS = 2**16  # that share the other cells
 
 
 def can_update_on_gpu(state: MapState, points: Tensor) -> bool:
-    """Tell whether `update_on_gpu` takes the state and its scan; not if runs must repeat: it sums in any order."""
+    """Tell whether `update_on_gpu` takes the state and its points: float32 on a GPU, without a gradient.
+
+    It adds up in any order, so it is not used where results must repeat.
+    """
     layer = state.elevation
     is_plain = layer.is_cuda and layer.dtype == torch.float32 and not torch.is_grad_enabled() and not is_transforming()
-    repeats = torch.are_deterministic_algorithms_enabled()
-    return is_plain and not repeats and _fits(state, points) and kernels.can_launch()
-
-
-def _fits(state: MapState, points: Tensor) -> bool:
-    """Tell whether 32 bits count the points and the cells."""
-    return max(points[..., 0].numel(), state.elevation.numel()) < 2**31
+    fits_in_32_bits = max(points.numel() // 3, layer.numel()) < 2**31
+    return (
+        is_plain
+        and fits_in_32_bits
+        and not torch.are_deterministic_algorithms_enabled()
+        and kernels.can_launch(layer.get_device())
+    )
 
 
 def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:
@@ -46,7 +49,7 @@ def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: 
 def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
     _, _, slot, layers, *_ = others
     new = [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in layers]
-    return [*new, slot.new_empty(len(slot)), slot.new_empty(len(slot))]
+    return [*new, slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])]
 
 
 @operator(
@@ -88,5 +91,5 @@ def _update(
         maps = [kernels.addresses_of(values) for values in (layers, [*new, *tallies], heavy)]
         update = cells, in_scan, *maps, C // width, width, own
         kernels.launch(_SOURCE, "update_cells", B, C, *update)
-        kernels.launch(_SOURCE, "update_heavy_cells", 1, _THREADS, *update, _THREADS)
+        kernels.launch(_SOURCE, "update_heavy_cells", 1, _HEAVY_THREADS, *update, _HEAVY_THREADS)
     return [*new, *tallies]

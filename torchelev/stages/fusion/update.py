@@ -1,4 +1,4 @@
-"""The update of every cell by tensors; `native.py` does the same in C++, for the cells that points fall into."""
+"""The update of every cell by tensors. `native.py` (C++) and `on_gpu.py` (CUDA kernels) compute the same."""
 
 from __future__ import annotations
 

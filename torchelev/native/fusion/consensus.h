@@ -1,5 +1,5 @@
-// The heights that the points of one cell agree on: stages/fusion/{consensus,edges}.py. `Points` come from serial.h or
-// shared.h.
+// The height that the points of a cell agree on: stages/fusion/{consensus,edges}.py. Include points_of_thread.h or
+// points_of_warp.h first.
 #pragma once
 
 // The mean of the points, weighted [m].
