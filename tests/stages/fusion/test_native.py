@@ -20,6 +20,7 @@ from torchelev.stages.fusion.native import can_update_hit, config_of, numbers
 from torchelev.state import map_layers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
+WAYS = ["C++", pytest.param("kernels", marks=needs_compiler)]
 CONFIGS = [
     FusionConfig(),
     FusionConfig(edges=None),
@@ -61,6 +62,7 @@ def assert_same(by, *scan):
     assert torch.equal(torch.stack(got.statistics[:8]), torch.stack(expected.statistics[:8]))
 
 
+@pytest.mark.parametrize("by", WAYS)
 @given(
     st.integers(0, 10_000),
     st.integers(1, 3),
@@ -71,25 +73,10 @@ def assert_same(by, *scan):
     st.booleans(),
     st.integers(1, 2),
 )
-def test_agrees_with_tensors(seed, num_envs, sensors, num_points, cfg, has_rays, with_covariance, threads):
+def test_agrees_with_tensors(by, seed, num_envs, sensors, num_points, cfg, has_rays, with_covariance, threads):
     torch.set_num_threads(threads)
     state, m, grid = random_scan(seed, num_envs, sensors, num_points, with_covariance)
-    assert_same("C++", state, m, grid, cfg, has_rays)
-
-
-@needs_compiler
-@given(
-    st.integers(0, 10_000),
-    st.integers(1, 3),
-    st.integers(1, 2),
-    st.sampled_from([1, 30, 200, 500]),
-    st.sampled_from(CONFIGS),
-    st.booleans(),
-    st.booleans(),
-)
-def test_kernels_agree_with_tensors(seed, num_envs, sensors, num_points, cfg, has_rays, with_covariance):
-    state, m, grid = random_scan(seed, num_envs, sensors, num_points, with_covariance)
-    assert_same("kernels", state, m, grid, cfg, has_rays)
+    assert_same(by, state, m, grid, cfg, has_rays)
 
 
 def test_graphs_of_kernels_serve_any_number_of_maps():
@@ -109,7 +96,7 @@ def test_graphs_of_kernels_serve_any_number_of_maps():
     assert len(graphs) <= 2
 
 
-@pytest.mark.parametrize("by", ["C++", pytest.param("kernels", marks=needs_compiler)])
+@pytest.mark.parametrize("by", WAYS)
 def test_without_points(by):
     state, m, grid = random_scan(0, 2, 1, 0, False)
     assert_same(by, state, m, grid, FusionConfig(), True)

@@ -32,8 +32,8 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
 
         h <- h + K (z_s - h),    sigma_m^2 <- K R,    K = sigma_m^2 / (sigma_m^2 + R).
 
-    Each cell counts the points that agree with it, less those that do not (majority vote of Boyer and Moore), so that
-    the height on which most points agree wins, even if an outlier came first. A scan that disagrees raises the
+    Each cell counts the points that agree with it, less those that do not (majority vote of Boyer and Moore). The
+    height that most points support wins, even if the first point was an outlier. A scan that disagrees raises the
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
     above the cell agree with each other (`challenge`): a new obstacle appears soon, even on settled ground.
     """

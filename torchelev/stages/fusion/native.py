@@ -23,6 +23,10 @@ from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update, update_all
 from torchelev.state import MapState
 
+ARGUMENTS = (  # of the operators in C++ and on a GPU
+    "Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, Tensor[] layers, "
+    "float resolution, int width, bool has_rays, float[] settings"
+)
 _SOURCE = "fusion/fusion.cpp"
 
 
@@ -78,11 +82,7 @@ def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) ->
     return [slot.new_empty(T), *(layer.new_empty(T) for layer in layers), slot.new_empty(B), slot.new_empty(B)]
 
 
-@operator(
-    "update_hit_cells(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, "
-    "Tensor[] layers, float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
-    _fake,
-)
+@operator(f"update_hit_cells({ARGUMENTS}) -> Tensor[]", _fake)
 def _update_hit(
     points: Tensor,
     noise: Tensor,

@@ -12,7 +12,7 @@ from torchelev.native import kernels
 from torchelev.ops.define import operator
 from torchelev.ops.transforms import is_transforming
 from torchelev.stages.fusion.config import FusionConfig
-from torchelev.stages.fusion.native import c_settings, config_of, numbers
+from torchelev.stages.fusion.native import ARGUMENTS, c_settings, config_of, numbers
 from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update
 from torchelev.state import MapState
@@ -52,11 +52,7 @@ def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) ->
     return [*new, slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])]
 
 
-@operator(
-    "update_cells_on_gpu(Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, "
-    "Tensor[] layers, float resolution, int width, bool has_rays, float[] settings) -> Tensor[]",
-    _fake,
-)
+@operator(f"update_cells_on_gpu({ARGUMENTS}) -> Tensor[]", _fake)
 def _update(
     points: Tensor,
     noise: Tensor,
