@@ -850,6 +850,15 @@ def view_candidates(view, other, reference):
     return [height, line, *slopes]
 
 
+def square_features(elevation, known, bounded, i, j, height, resolution):
+    """The mean heights of the squares around a cell, and what the network sees of the squares, from a height on."""
+    squares = [square_around(elevation, known, bounded, i, j, radius, resolution) for radius in (0.4, 1.2)]
+    share, bound_share, step, mean, std, skewness = zip(*squares, strict=True)
+    relative = [0.0 if m is None else squash(m - height) for m in mean]
+    steps, stds = [squash(s, 0.01) for s in step], [squash(s) for s in std]
+    return mean, [*share, *bound_share, *steps, *relative, *stds, *skewness]
+
+
 def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     """The mean and standard deviation [m] of the ground at an unknown cell; w holds the weights by name."""
     views = [view_from(elevation, known, i, j, direction, resolution) for direction in DIRECTIONS]
@@ -871,11 +880,8 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     cell = [squash(high - low), squash(low)]
     cell += [0.0, 0.0, 0.0] if bound is None else [1.0, squash(bound - low), squash(bound)]
     cell += [math.log1p(nearest / 0.1), math.log(resolution / 0.04), len(found) / 8]
-    squares = [square_around(elevation, known, bounded, i, j, radius, resolution) for radius in (0.4, 1.2)]
-    share, bound_share, step, mean, std, skewness = zip(*squares, strict=True)
-    cell += [*share, *bound_share, *(squash(s, 0.01) for s in step)]
-    cell += [0.0 if m is None else squash(m - reference) for m in mean]
-    cell += [*(squash(s) for s in std), *skewness]
+    mean, squares = square_features(elevation, known, bounded, i, j, reference, resolution)
+    cell += squares
     cell = relu("cell_inner", relu("cell", [*np.mean(channels, 0), *np.max(channels, 0), *cell]))
 
     told = w["to_view"] @ cell + w["to_view_bias"][:, 0]
@@ -899,7 +905,7 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     return reference + answer, math.exp((1 - fade) * log_std + fade * w["prior"][0])
 
 
-def refine_cell(w, elevation, known, variance, age, i, j, resolution):
+def refine_cell(w, elevation, known, variance, bounded, age, i, j, resolution):
     """The mean and standard deviation [m] of the ground at a measured cell."""
     height, bends, tilts = elevation[i, j], [], []
     for di, dj in ((1, 1), (1, 0), (1, -1), (0, 1)):
@@ -912,6 +918,7 @@ def refine_cell(w, elevation, known, variance, age, i, j, resolution):
     sigma = math.sqrt(max(variance[i, j], 1e-6))
     features = [math.log(sigma), abs(bend) / (abs(bend) + sigma), squash(rough, 0.01), squash(tilt), len(bends) / 4]
     features += [math.log1p(min(max(age[i, j], 0.0), 60.0)), math.log(resolution / 0.04)]
+    features += square_features(elevation, known, bounded, i, j, height, resolution)[1]
     channels = np.maximum(w["measured"] @ np.array(features) + w["measured_bias"][:, 0], 0)
     gain, factor = w["measured_answer"] @ channels + w["measured_answer_bias"][:, 0]
     mean = height + 2 * sigma * math.tanh(bend / (1 + math.exp(-gain)) / (2 * sigma))

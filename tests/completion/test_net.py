@@ -61,10 +61,11 @@ def test_every_cell_follows_the_slow_equations(known, resolution):
     w = {name: value.numpy() for name, value in net.state_dict().items()}
     elevation, valid, variance, bound, bounded, age = (layer[0].numpy() for layer in layers)
     for i, j in np.ndindex(*valid.shape):
+        hidden = bounded & ~valid
         if valid[i, j]:
-            expected = reference.refine_cell(w, elevation, valid, variance, age, i, j, resolution)
+            expected = reference.refine_cell(w, elevation, valid, variance, hidden, age, i, j, resolution)
         else:
-            expected = reference.complete_cell(w, elevation, valid, bound, bounded & ~valid, i, j, resolution)
+            expected = reference.complete_cell(w, elevation, valid, bound, hidden, i, j, resolution)
         actual = float(answer.mean[0, i, j]), float(answer.std[0, i, j])
         assert actual == pytest.approx(expected, abs=1e-9), (i, j, valid[i, j])
 

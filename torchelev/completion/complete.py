@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchelev.completion import native
-from torchelev.completion.context import describe, sum_layers
+from torchelev.completion.context import Context, describe, sum_layers
 from torchelev.completion.parameters import Weights
 from torchelev.completion.predict import Seen, predict
-from torchelev.completion.refine import refine
+from torchelev.completion.refine import look_close, refine
 from torchelev.completion.surroundings import UNKNOWN, count_steps, look_around
 from torchelev.ops.parallel import map_in_order
 
@@ -52,20 +52,26 @@ def complete(weights: Weights, layers: CompletionInput, resolution: float) -> Co
     """
     if _may_choose_cells(weights, layers):
         return Completion(*complete_on_cpu(list(weights), list(layers), resolution))
-    known = layers.validity
-    unseen, (mean, std) = _prepare(weights, layers, resolution)
+    known, cells = layers.validity, Cells(layers, resolution)
     places = torch.arange(known.numel(), device=known.device).split(_AT_A_TIME_ON_GPU)
-    parts = [predict(weights, unseen.read(place)) for place in places]
-    predicted = [torch.cat(values).view_as(mean) for values in zip(*parts, strict=True)]
-    return Completion(*(torch.where(known, old, new) for old, new in zip((mean, std), predicted, strict=True)))
+    parts = [_answer_all(weights, cells, place) for place in places]
+    return Completion(*(torch.cat(values).view_as(known) for values in zip(*parts, strict=True)))
+
+
+def _answer_all(weights: Weights, cells: Cells, place: Tensor) -> list[Tensor]:
+    """Return mean and standard deviation of cells, each computed both as measured and as unknown."""
+    context, known = cells.describe(place), cells.known.flatten().index_select(0, place)
+    measured, unknown = cells.measured.choose(place), cells.read_unknown(place, context)
+    answers = zip(refine(weights, measured, context), predict(weights, unknown), strict=True)
+    return [torch.where(known, old, new) for old, new in answers]
 
 
 @torch.library.custom_op("torchelev::complete_on_cpu", mutates_args=())
 def complete_on_cpu(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[Tensor, Tensor]:
-    """Return the same without gradients: in C++ where that can be built, else by tensors of the unknown cells alone."""
+    """Return the same without gradients: in C++ where that can be built, else by tensors."""
     fields, named = Weights(*weights), CompletionInput(*layers)
     fast = native.complete(fields, layers, resolution)
-    return _fill_unknown(fields, *_prepare(fields, named, resolution)) if fast is None else fast
+    return _answer_each(fields, Cells(named, resolution)) if fast is None else fast
 
 
 @complete_on_cpu.register_fake
@@ -75,45 +81,48 @@ def _(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[T
 
 
 @torch.no_grad()
-def _fill_unknown(weights: Weights, unseen: Unseen, refined: Completion) -> Completion:
-    """Predict the unknown cells alone, in place, on all cores."""
-    places = (~unseen.known).flatten().nonzero()[:, 0].split(_AT_A_TIME)
-    parts = map_in_order(lambda place: predict(weights, unseen.read(place)), places)
-    for place, values in zip(places, parts, strict=True):
-        for layer, value in zip(refined, values, strict=True):
-            layer.view(-1).index_copy_(0, place, value)
-    return refined
+def _answer_each(weights: Weights, cells: Cells) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation of all cells, each computed as what it is, on all cores."""
+
+    def measured(place: Tensor) -> tuple[Tensor, Tensor]:
+        return refine(weights, cells.measured.choose(place), cells.describe(place))
+
+    def unknown(place: Tensor) -> tuple[Tensor, Tensor]:
+        return predict(weights, cells.read_unknown(place, cells.describe(place)))
+
+    layers = torch.empty_like(cells.ground), torch.empty_like(cells.ground)
+    for answer, chosen in ((measured, cells.known), (unknown, ~cells.known)):
+        places = chosen.flatten().nonzero()[:, 0].split(_AT_A_TIME)
+        for place, values in zip(places, map_in_order(answer, places), strict=True):
+            for layer, value in zip(layers, values, strict=True):
+                layer.view(-1).index_copy_(0, place, value)
+    return layers
 
 
-def _prepare(weights: Weights, layers: CompletionInput, resolution: float) -> tuple[Unseen, Completion]:
-    """Return what predicts the unknown cells, and the measured cells refined."""
-    known, bounded = layers.validity, layers.bounded & ~layers.validity
-    of_cells = torch.full_like(layers.elevation, resolution)
-    mean, std = refine(weights, layers.elevation, known, layers.variance, layers.age, of_cells)
-    unseen = Unseen(layers.elevation, known, layers.upper_bound, bounded, resolution)
-    return unseen, Completion(mean.contiguous(), std.contiguous())
+class Cells:
+    """Reads what the answers at the cells of maps depend on; cells are numbered in the flat maps."""
 
-
-class Unseen:
-    """Predicts unknown cells of maps, whose surroundings it prepares."""
-
-    def __init__(
-        self, elevation: Tensor, known: Tensor, upper_bound: Tensor, bounded: Tensor, resolution: float
-    ) -> None:
+    def __init__(self, layers: CompletionInput, resolution: float) -> None:
+        elevation, known, variance, upper_bound, bounded, age = layers
+        bounded = bounded & ~known
         self.known, self.resolution = known, resolution
-        self.ground = torch.where(known, elevation, UNKNOWN)
+        self.ground = torch.where(known, elevation, UNKNOWN).contiguous()
         self.steps = count_steps(known)
         total = torch.where(known, elevation, 0.0).double().sum((1, 2))
         self.level = total / known.sum((1, 2)).clamp(min=1)  # [m] where no direction holds known ground
         self.sums = sum_layers(elevation, known, bounded, self.level)
         self.bound, self.bounded = upper_bound.flatten(), bounded.flatten()
+        self.measured = look_close(elevation, known, variance, age, resolution)
 
-    def read(self, place: Int[Tensor, "n"]) -> Seen:
-        """Return what the prediction at cells, numbered in the flat maps, depends on."""
+    def describe(self, place: Int[Tensor, "n"]) -> Context:
+        """Return the squares around cells."""
+        return describe(self.sums, self.level, place, self.resolution)
+
+    def read_unknown(self, place: Int[Tensor, "n"], context: Context) -> Seen:
+        """Return what the prediction at unknown cells depends on."""
         around = look_around(self.ground, self.steps, place, self.resolution)
         bound, bounded = (values.index_select(0, place) for values in (self.bound, self.bounded))
         level = self.level.to(bound.dtype).index_select(0, place // self.known[0].numel())
-        context = describe(self.sums, self.level, place, self.resolution)
         return Seen(around, context, bound, bounded, level, torch.full_like(bound, self.resolution))
 
 

@@ -21,7 +21,7 @@ _FLOATS = {
     "NEAR_STEP": predict.STEP,
     "FARTHEST": predict.FARTHEST,
     "STEEPEST": predict.STEEPEST,
-    "SMALL_STEP": predict.SMALL_STEP,
+    "SMALL_STEP": parameters.SMALL_STEP,
     "MARGIN": predict.MARGIN,
     "NO_SPREAD": predict.NO_SPREAD,
     "FADE": predict.FADE,

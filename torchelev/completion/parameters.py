@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.completion.context import NUM_CONTEXT, RADII
+from torchelev.completion.context import NUM_CONTEXT, RADII, Context
 from torchelev.completion.surroundings import REACHES
 
 if TYPE_CHECKING:
@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 NUM_VIEW = 8 + 2 * len(REACHES)  # features of a direction
 NUM_CELL = 8 + NUM_CONTEXT  # of a cell
 NUM_CANDIDATES = 2 + len(REACHES)  # heights that each direction proposes
-NUM_MEASURED = 7  # features of a measured cell
+NUM_MEASURED = 7 + NUM_CONTEXT  # of a measured cell
 USUAL = 0.04  # [m] resolution that the network's input is relative to
 SQUASH = 0.05  # [m] heights count about logarithmically beyond it
+SMALL_STEP = 0.01  # [m] steps count about logarithmically beyond it
 _SMALL = 1e-6
 
 
@@ -88,3 +89,9 @@ def squash(height: Tensor, scale: float = SQUASH) -> Tensor:
     """Return sign(h) log(1 + |h| / scale): linear below the scale [m], logarithmic above it."""
     ratio = (height.abs() / scale).clamp(min=_SMALL)  # whose logarithm has a slope at 0, which a sign would not have
     return height / scale * (torch.log1p(ratio) / ratio)
+
+
+def describe_context(context: Context, squares: Float[Tensor, "R n"]) -> Float[Tensor, "F n"]:
+    """Return the features of squares, whose mean heights `squares` [m] count from the cell's height."""
+    known, bounded, steps, _, stds, skewness = (values.to(squares.dtype) for values in context)
+    return torch.cat([known, bounded, squash(steps, SMALL_STEP), squash(squares), squash(stds), skewness])

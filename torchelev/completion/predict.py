@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.completion.context import Context
-from torchelev.completion.parameters import USUAL, Weights, affine, hidden, squash
+from torchelev.completion.parameters import USUAL, Weights, affine, describe_context, hidden, squash
 from torchelev.completion.surroundings import Surroundings
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ NOWHERE = 1e6  # [m]
 STEP = 0.1  # [m] distances count about logarithmically beyond it
 FARTHEST = 10.0  # [m] distances beyond it make no difference
 STEEPEST = 1.5  # slope to which ground is continued
-SMALL_STEP = 0.01  # [m] steps count about logarithmically beyond it
 MARGIN = 0.02  # [m] by which an answer may leave the range of the heights around
 NO_SPREAD = 0.01  # [m] of candidates that agree
 FADE = 2.0  # [m] from measurements, where prior and prediction count the same
@@ -133,9 +132,7 @@ def _describe_cell(seen: Seen, heights: _Heights) -> Float[Tensor, "F n"]:
         (seen.resolution / USUAL).log(),
         seen.around.is_known.mean(0),
     ]
-    known, bounded, steps, _, stds, skewness = (values.to(bound.dtype) for values in seen.context)
-    squares = [known, bounded, squash(steps, SMALL_STEP), squash(heights.squares), squash(stds), skewness]
-    return torch.cat([torch.stack(cell), *squares])
+    return torch.cat([torch.stack(cell), describe_context(seen.context, heights.squares)])
 
 
 def _vote(

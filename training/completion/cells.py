@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from torchelev.completion.complete import CompletionInput, Unseen
+from torchelev.completion.complete import Cells, CompletionInput
+from torchelev.completion.context import Context
 from torchelev.completion.predict import Seen
+from torchelev.completion.refine import Measured
 from torchelev.completion.surroundings import UNKNOWN, count_steps, look_around
 from torchelev.errors import require
 from torchelev.filters import Filter
@@ -37,12 +39,12 @@ class UnknownCells(NamedTuple):
 
 
 class MeasuredCells(NamedTuple):
-    """m measured cells, each in the middle of a map of 3 x 3 cells."""
+    """n measured cells."""
 
-    layers: CompletionInput  #: (m, 3, 3) each
-    truth: Float[Tensor, "m"]  #: [m]
-    weight: Float[Tensor, "m"]  #: [1/m] of an error
-    resolution: Float[Tensor, "m"]  #: [m]
+    seen: Measured
+    context: Context
+    truth: Float[Tensor, "n"]  #: [m]
+    weight: Float[Tensor, "n"]  #: [1/m] of an error
 
 
 def remove_cells(layers: CompletionInput, kept: Bool[Tensor, "B H W"]) -> CompletionInput:
@@ -83,7 +85,7 @@ def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells
     Errors weigh by the inverse of the mean error of the nearest known heights in the same map, so that each map counts
     the same, however deep its holes.
     """
-    drawn, unseen, known = [], _unseen(maps), maps.layers.validity
+    drawn, cells, known = [], Cells(maps.layers, maps.resolution), maps.layers.validity
     filled, _ = Filter("inpaint_nearest")((maps.layers.elevation, known), resolution=maps.resolution)
     distance = distances(maps)
     counts = maps.is_inside & ~known & (distance < FARTHEST)
@@ -94,7 +96,7 @@ def draw_unknown(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells
         chosen = place[_draw(1 / (distance.flatten()[place] + _NEAR), NUM_UNKNOWN, generator)]
         truth = maps.truth.flatten()[chosen]
         error = (filled.flatten()[chosen] - truth).abs().mean() + MIN_ERROR
-        drawn.append(UnknownCells(unseen.read(chosen), truth, torch.full_like(truth, 1 / float(error))))
+        drawn.append(UnknownCells(_look(cells, chosen), truth, torch.full_like(truth, 1 / float(error))))
     return drawn
 
 
@@ -104,32 +106,28 @@ def draw_evenly(maps: TrueMap, generator: torch.Generator) -> list[UnknownCells]
     counts &= torch.rand(counts.shape, generator=generator) < _SHARE
     chosen = counts.flatten().nonzero()[:, 0]
     truth = maps.truth.flatten()[chosen]
-    return [UnknownCells(_unseen(maps).read(chosen), truth, torch.ones_like(truth))] if len(chosen) else []
+    if not len(chosen):
+        return []
+    seen = _look(Cells(maps.layers, maps.resolution), chosen)
+    return [UnknownCells(seen, truth, torch.ones_like(truth))]
 
 
-def _unseen(maps: TrueMap) -> Unseen:
-    layers = maps.layers
-    bounded = layers.bounded & ~layers.validity
-    return Unseen(layers.elevation, layers.validity, layers.upper_bound, bounded, maps.resolution)
+def _look(cells: Cells, chosen: Int[Tensor, "n"]) -> Seen:
+    return cells.read_unknown(chosen, cells.describe(chosen))
 
 
 def draw_measured(maps: TrueMap, generator: torch.Generator) -> list[MeasuredCells]:
     """Draw measured cells of each map. Errors weigh by the inverse of the mean error of the map's own elevation."""
-    layers, drawn = maps.layers, []
-    inner = maps.is_inside.clone()
-    inner[:, [0, -1]] = inner[:, :, [0, -1]] = False
-    for b in range(len(inner)):
-        i, j = (inner[b] & layers.validity[b]).nonzero().unbind(1)
-        if not len(i):
+    cells, drawn = Cells(maps.layers, maps.resolution), []
+    counts, error = maps.is_inside & maps.layers.validity, maps.layers.elevation - maps.truth
+    for b in range(len(counts)):
+        place = b * counts[0].numel() + counts[b].flatten().nonzero()[:, 0]
+        if not len(place):
             continue
-        chosen = _draw(torch.ones(len(i)), NUM_MEASURED, generator)
-        i, j = i[chosen], j[chosen]
-        around = torch.arange(-1, 2)
-        patches = [layer[b][i[:, None, None] + around[:, None], j[:, None, None] + around] for layer in layers]
-        truth = maps.truth[b][i, j]
-        error = (layers.elevation[b][i, j] - truth).abs().mean() + MIN_ERROR
-        weight = torch.full_like(truth, 1 / float(error))
-        drawn.append(MeasuredCells(CompletionInput(*patches), truth, weight, torch.full_like(truth, maps.resolution)))
+        chosen = place[_draw(torch.ones(len(place)), NUM_MEASURED, generator)]
+        truth = maps.truth.flatten()[chosen]
+        weight = torch.full_like(truth, 1 / float(error.flatten()[chosen].abs().mean() + MIN_ERROR))
+        drawn.append(MeasuredCells(cells.measured.choose(chosen), cells.describe(chosen), truth, weight))
     return drawn
 
 
@@ -137,26 +135,22 @@ def _draw(weights: Tensor, number: int, generator: torch.Generator) -> Tensor:
     return torch.multinomial(weights, min(number, len(weights)), generator=generator)
 
 
-Cells = TypeVar("Cells", UnknownCells, MeasuredCells)
+Drawn = TypeVar("Drawn", UnknownCells, MeasuredCells)
 
 
-def concatenate(parts: Sequence[Cells]) -> Cells:
+def concatenate(parts: Sequence[Drawn]) -> Drawn:
     """Concatenate cells. Raises ValueError without any."""
     require(len(parts) > 0, "walks", "must hold cells to train on", "none", "give more of them")
-    return _map(lambda dim, *values: torch.cat(values, dim), _cell_dim(parts[0]), *parts)
+    return _map(lambda *values: torch.cat(values, -1), *parts)
 
 
-def choose(cells: Cells, chosen: Int[Tensor, "k"]) -> Cells:
+def choose(cells: Drawn, chosen: Int[Tensor, "k"]) -> Drawn:
     """Return some of the cells, by number."""
-    return _map(lambda dim, value: value.index_select(dim, chosen), _cell_dim(cells), cells)
+    return _map(lambda value: value.index_select(-1, chosen), cells)
 
 
-def _cell_dim(cells: UnknownCells | MeasuredCells) -> int:
-    return -1 if isinstance(cells, UnknownCells) else 0
-
-
-def _map(function: Callable[..., Tensor], dim: int, *values: Any) -> Any:
+def _map(function: Callable[..., Tensor], *values: Any) -> Any:
     """Apply a function to the tensors of nested tuples of the same kind."""
     if isinstance(values[0], Tensor):
-        return function(dim, *values)
-    return type(values[0])(*(_map(function, dim, *column) for column in zip(*values, strict=True)))
+        return function(*values)
+    return type(values[0])(*(_map(function, *column) for column in zip(*values, strict=True)))

@@ -26,22 +26,24 @@ from training.options import jobs_option, runs_option
 
 # Fixed before the first run.
 SEEDS = (0, 1, 2)
-WALKS, DRIVES, STEPS, EVALUATION_WALKS = 290, 130, 15000, 32
+WALKS, DRIVES, COLLAGES, STEPS, EVALUATION_WALKS = 290, 130, 150, 15000, 32
 UNETS = {"U-Net of equal size": 3}  # channels of the finest level
 UNET_STEPS = 4000
 
 
 def _jobs(runs: Path) -> list[Job]:
     """Return a training for each seed."""
-    fixed = {"--data": runs / "data", "--walks": WALKS, "--drives": DRIVES, "--steps": STEPS, "--jobs": 1}
+    fixed = {"--data": runs / "data", "--walks": WALKS, "--drives": DRIVES, "--collages": COLLAGES}
+    fixed |= {"--steps": STEPS, "--evaluation-walks": 1, "--jobs": 1}  # the evaluation of all is below
     return [Job("training.completion", {"--seed": seed, **fixed}, runs / f"seed-{seed}") for seed in SEEDS]
 
 
 def _walks(runs: Path) -> list[tuple[Walks, int]]:
-    """Return the walks and drives of the trainings, and their numbers."""
+    """Return the walks, drives and collages of the trainings, and their numbers."""
     return [
         (Walks(runs / "data", "train", 0, WalkConfig()), WALKS),
         (Walks(runs / "data", "yards", 0, YARD_CONFIG), DRIVES),
+        (Walks(runs / "data", "collages", 0, WalkConfig()), COLLAGES),
     ]
 
 
@@ -75,7 +77,14 @@ def main(runs: Path, jobs: int) -> None:
     answers = {COMPLETED if seed == SEEDS[0] else f"seed {seed}": learned(net) for seed, net in nets.items()}
     answers |= {name: as_answer(fit_unet(runs, channels)) for name, channels in UNETS.items()}
     result = evaluate(answers, runs / "data", EVALUATION_WALKS, jobs)
-    fixed = {"seeds": SEEDS, "walks": WALKS, "drives": DRIVES, "steps": STEPS, "unet_steps": UNET_STEPS}
+    fixed = {
+        "seeds": SEEDS,
+        "walks": WALKS,
+        "drives": DRIVES,
+        "collages": COLLAGES,
+        "steps": STEPS,
+        "unet_steps": UNET_STEPS,
+    }
     fixed |= {"evaluation_walks": EVALUATION_WALKS}
     write_json(RESULTS / "completion.json", result | {"training": fixed})
     click.echo(table(result))

@@ -25,7 +25,7 @@ from torchelev.weight_files import RESOLUTIONS
 from training.completion.yards import drive_and_look
 from training.fit import save_atomically
 from training.traversability.maps.mapping import DataConfig, Look, blank_map, tile_cell_centers, walk_and_look
-from training.traversability.maps.terrain import KINDS, LOOK_INTERVAL, UNSEEN_KINDS, draw_robot, make_tiles
+from training.traversability.maps.terrain import COLLAGE, KINDS, LOOK_INTERVAL, UNSEEN_KINDS, draw_robot, make_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -33,7 +33,14 @@ if TYPE_CHECKING:
 VERSION = 1  # of the maps; increase it when their computation changes, so that old files are refused
 YARD = "yard"
 _YARD_RESOLUTIONS = (0.04, 0.1)  # [m]
-SPLITS = {"train": KINDS, "held_out": KINDS, "unseen": UNSEEN_KINDS, "yards": (YARD,), "held_out_yards": (YARD,)}
+SPLITS = {
+    "train": KINDS,
+    "held_out": KINDS,
+    "unseen": UNSEEN_KINDS,
+    "yards": (YARD,),
+    "held_out_yards": (YARD,),
+    "collages": (COLLAGE,),
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,6 +36,7 @@ _WALKS_SEED = 0
 )
 @click.option("--walks", type=_POSITIVE, default=290, show_default=True, help="Training walks of four robots.")
 @click.option("--drives", type=_POSITIVE, default=130, show_default=True, help="Training drives of four vehicles.")
+@click.option("--collages", type=_POSITIVE, default=150, show_default=True, help="Training walks over collages.")
 @click.option(
     "--steps", type=_POSITIVE, default=15000, show_default=True, help="Steps in total, including those before --resume."
 )
@@ -52,6 +53,7 @@ def main(
     seed: int,
     walks: int,
     drives: int,
+    collages: int,
     steps: int,
     evaluation_walks: int,
     out: Path,
@@ -61,9 +63,9 @@ def main(
 ) -> None:
     """Train the completion network.
 
-    Lets simulated robots walk over random ground, and vehicles drive through yards, and map it; fits the network to the
-    true ground below unknown and measured cells, calibrates its standard deviations and evaluates it on held-out
-    ground.
+    Lets simulated robots walk over random ground of known kinds and over collages of random shapes, and vehicles drive
+    through yards, and map it; fits the network to the true ground below unknown and measured cells, calibrates its
+    standard deviations and evaluates it on held-out ground.
 
     Writes TensorBoard logs, checkpoint.pt, weights.pt (for `CompletionNet.from_pretrained`) and result.json to OUT. The
     walks are kept for the next training.
@@ -73,6 +75,7 @@ def main(
     with command_errors():
         sets = [(Walks(data, "train", _WALKS_SEED, WalkConfig()), walks)]
         sets += [(Walks(data, "yards", _WALKS_SEED, YARD_CONFIG), drives)]
+        sets += [(Walks(data, "collages", _WALKS_SEED, WalkConfig()), collages)]
         cells = training_cells(sets, jobs, seed)
         trainer = Trainer(*cells, FitConfig(steps=steps, seed=seed))
         if resume:

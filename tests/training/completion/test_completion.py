@@ -59,8 +59,9 @@ def test_cells_come_with_their_truth_and_maps_count_the_same():
         assert float(cells.truth.min()) == float(cells.truth.max()) == pytest.approx(truth)
         assert float(cells.weight[0] * (truth + 0.005)) == pytest.approx(1.0)
     measured = draw_measured(maps, generator)[0]
-    assert measured.layers.elevation.shape[1:] == (3, 3) and bool(measured.layers.validity[:, 1, 1].all())
-    assert float(measured.truth.abs().max()) == 0.0
+    assert float(measured.seen.height.abs().max()) == float(measured.truth.abs().max()) == 0.0
+    assert float(measured.seen.sigma.min()) == float(measured.seen.sigma.max()) == pytest.approx(0.01)
+    assert measured.context.known[1].unique().tolist() == pytest.approx([6 * 12 / 31**2]), "of 1.2 m to all sides"
 
 
 @pytest.mark.slow(4)

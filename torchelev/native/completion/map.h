@@ -13,7 +13,7 @@ constexpr int ROWS[] = {1, -1, 0, 0, 1, -1, 1, -1}, COLUMNS[] = {0, 0, 1, -1, 1,
 constexpr float REACHES[] = {REACH_0, REACH_1};
 constexpr double RADII[] = {RADIUS_0, RADIUS_1};
 constexpr int16_t NONE = 32767;  // steps; maps are smaller
-constexpr int NUM_SUMS = 8;      // the last one fills a cache line
+constexpr int NUM_SUMS = 7;
 
 struct Layers {
     const float *elevation, *variance, *upper_bound, *age;
@@ -28,7 +28,7 @@ struct Map {
     double level = 0;            // [m] mean height
     std::vector<float> ground;   // (H + 2, stride) [m], UNKNOWN where it does not count
     std::vector<int16_t> steps;  // (8, H, W)
-    std::vector<double> sums;    // (H + 1, W + 1, 8), over all cells before a corner
+    std::vector<double> sums;    // (7, H + 1, W + 1), over all cells before a corner
 
     Map(const Layers& layers, int H, int W, double resolution)
         : layers(layers), H(H), W(W), stride(W + 2 + LANES), resolution(resolution) {
@@ -69,12 +69,16 @@ struct Map {
             }
     }
 
+    const double* sums_of(int layer, int i) const { return &sums[(size_t(layer) * (H + 1) + i) * (W + 1)]; }
+
     void sum_layers() {
-        sums.assign(size_t(H + 1) * (W + 1) * NUM_SUMS, 0.0);
+        sums.assign(size_t(NUM_SUMS) * (H + 1) * (W + 1), 0.0);
         for (int i = 0; i < H; i++) {
             double row[NUM_SUMS] = {};
-            const double* above = &sums[size_t(i) * (W + 1) * NUM_SUMS];
-            double* below = &sums[size_t(i + 1) * (W + 1) * NUM_SUMS];
+            const double* above[NUM_SUMS];
+            double* below[NUM_SUMS];
+            for (int k = 0; k < NUM_SUMS; k++)
+                above[k] = sums_of(k, i) + 1, below[k] = const_cast<double*>(sums_of(k, i + 1)) + 1;
             for (int j = 0; j < W; j++) {
                 const float* here = &ground[index(i, j)];
                 if (*here < UNKNOWN) {
@@ -84,8 +88,7 @@ struct Map {
                     row[0] += 1, row[4] += z, row[5] += z * z, row[6] += z * z * z;
                 } else
                     row[1] += layers.bounded[i * W + j];
-                above += NUM_SUMS, below += NUM_SUMS;
-                for (int k = 0; k < NUM_SUMS; k++) below[k] = above[k] + row[k];
+                for (int k = 0; k < NUM_SUMS; k++) below[k][j] = above[k][j] + row[k];
             }
         }
     }
@@ -129,44 +132,51 @@ inline void look_around(const Map& map, const Cells& cells, Surroundings& around
     }
 }
 
-// The squares around cells; `mean` is relative to the map's level [m].
+// The squares around the cells of a row, as the network sees them; mean heights count from the map's level [m].
 struct Context {
-    Lanes known[NUM_RADII], bounded[NUM_RADII], step[NUM_RADII], std[NUM_RADII], skewness[NUM_RADII];
-    double mean[NUM_RADII][LANES];
+    std::vector<float> known[NUM_RADII], bounded[NUM_RADII], step[NUM_RADII], std[NUM_RADII], skewness[NUM_RADII];
+    std::vector<double> mean[NUM_RADII];
 };
 
-inline void describe(const Map& map, const Cells& cells, Context& context) {
-    typedef double Sums __attribute__((vector_size(8 * NUM_SUMS)));
+inline Context describe(const Map& map, int i) {
+    const int W = map.W, padded = (W + LANES - 1) / LANES * LANES;
+    Context context;
+    std::vector<double> squares(size_t(NUM_SUMS) * W);
     for (int r = 0; r < NUM_RADII; r++) {
         const int half = std::max(1, int(std::nearbyint(RADII[r] / map.resolution)));
-        const double area = double(2 * half + 1) * (2 * half + 1);
-        double sums[NUM_SUMS][LANES];
-        for (int l = 0; l < LANES; l++) {
-            const int top = std::max(cells.row[l] - half, 0), bottom = std::min(cells.row[l] + half + 1, map.H);
-            const int left = std::max(cells.column[l] - half, 0);
-            const int right = std::min(cells.column[l] + half + 1, map.W);
-            auto corner = [&](int i, int j) {
-                Sums values;
-                std::memcpy(&values, &map.sums[(size_t(i) * (map.W + 1) + j) * NUM_SUMS], sizeof values);
-                return values;
-            };
-            const Sums square = corner(bottom, right) - corner(bottom, left) - corner(top, right) + corner(top, left);
-            for (int k = 0; k < NUM_SUMS; k++) sums[k][l] = square[k];
+        const int top = std::max(i - half, 0), bottom = std::min(i + half + 1, map.H);
+        std::vector<double> band(W + 2 * half + 1);  // over its rows and all columns before; the map's sides are repeated
+        for (int k = 0; k < NUM_SUMS; k++) {
+            const double *above = map.sums_of(k, top), *below = map.sums_of(k, bottom);
+            for (int j = 0; j <= W; j++) band[half + j] = below[j] - above[j];
+            std::fill(band.end() - half, band.end(), band[half + W]);
+            for (int j = 0; j < W; j++) squares[k * W + j] = band[j + 2 * half + 1] - band[j];
         }
-        const double per_area = 1 / area;
-        Lanes variance, third, pairs;
-        for (int l = 0; l < LANES; l++) {
-            const double per_cell = 1 / std::max(sums[0][l], 1.0), mean = sums[4][l] * per_cell;
-            const double spread = sums[5][l] * per_cell - mean * mean;
-            variance[l] = float(std::max(spread, 0.0));
-            third[l] = float(sums[6][l] * per_cell - 3 * mean * std::max(spread, 0.0) - mean * mean * mean);
-            context.known[r][l] = float(sums[0][l] * per_area), context.bounded[r][l] = float(sums[1][l] * per_area);
-            context.step[r][l] = float(sums[3][l]), pairs[l] = float(std::max(sums[2][l], 1.0));
-            context.mean[r][l] = mean;
+        for (auto* values : {&context.known[r], &context.bounded[r], &context.step[r], &context.std[r],
+                             &context.skewness[r]})
+            values->assign(padded, 0.0f);
+        context.mean[r].assign(padded, 0.0);
+        const double* sums = squares.data();
+        float *known = context.known[r].data(), *bounded = context.bounded[r].data(), *step = context.step[r].data();
+        float *std = context.std[r].data(), *skewness = context.skewness[r].data();
+        double* means = context.mean[r].data();
+        const double per_area = 1 / (double(2 * half + 1) * (2 * half + 1));
+        for (int j = 0; j < W; j++) {
+            const double count = sums[j], pairs = sums[2 * W + j];
+            const double per_cell = 1 / (count > 1 ? count : 1), mean = sums[4 * W + j] * per_cell;
+            const double square = sums[5 * W + j] * per_cell - mean * mean, variance = square > 0 ? square : 0;
+            const double third = sums[6 * W + j] * per_cell - 3 * mean * variance - mean * mean * mean;
+            const float spread = __builtin_sqrtf(float(variance) + float(SMALLEST_STD * SMALLEST_STD));
+            known[j] = float(count * per_area), bounded[j] = float(sums[W + j] * per_area);
+            step[j] = float(sums[3 * W + j] / (pairs > 1 ? pairs : 1));
+            std[j] = spread - float(SMALLEST_STD);
+            skewness[j] = float(third) / (spread * spread * spread);
+            means[j] = mean;
         }
-        const Lanes spread = root(variance + float(SMALLEST_STD) * float(SMALLEST_STD));
-        context.step[r] /= pairs;
-        context.std[r] = spread - float(SMALLEST_STD);
-        context.skewness[r] = third / (spread * spread * spread);
+        for (int j = 0; j < padded; j += LANES) {
+            store(step + j, squash(load(step + j), SMALL_STEP));
+            store(std + j, squash(load(std + j), SQUASH));
+        }
     }
+    return context;
 }

@@ -7,11 +7,9 @@ struct Answer {
     Lanes mean, std;  // [m]
 };
 
-inline Answer predict(const Weights& weights, const Map& map, const Cells& cells) {
+inline Answer predict(const Weights& weights, const Map& map, const Context& context, const Cells& cells) {
     Surroundings around;
     look_around(map, cells, around);
-    Context context;
-    describe(map, cells, context);
     Lanes upper_bound, is_bounded;
     for (int l = 0; l < LANES; l++) {
         const int place = cells.row[l] * map.W + cells.column[l];
@@ -44,11 +42,12 @@ inline Answer predict(const Weights& weights, const Map& map, const Cells& cells
     }
     high = pick(has_any > 0, high, all(0));
     const Lanes bound = (upper_bound - lowest - mean) * is_bounded;
-    Lanes squares[NUM_RADII], has_square[NUM_RADII];
+    Lanes squares[NUM_RADII], has_square[NUM_RADII], known_around[NUM_RADII];
     for (int r = 0; r < NUM_RADII; r++) {
-        has_square[r] = one_if(context.known[r] > 0);
+        known_around[r] = gather(context.known[r].data(), cells.column);
+        has_square[r] = one_if(known_around[r] > 0);
         for (int l = 0; l < LANES; l++)
-            squares[r][l] = float(map.level + context.mean[r][l] - double(lowest[l]) - double(mean[l]));
+            squares[r][l] = float(map.level + context.mean[r][cells.column[l]] - double(lowest[l]) - double(mean[l]));
         squares[r] *= has_square[r];
     }
 
@@ -92,8 +91,9 @@ inline Answer predict(const Weights& weights, const Map& map, const Cells& cells
                         log(usual), num_known * (1.0f / NUM_DIRECTIONS)})
         *cell++ = value;
     for (int r = 0; r < NUM_RADII; r++) {
-        const Lanes values[] = {context.known[r],           context.bounded[r], squash(context.step[r], SMALL_STEP),
-                                squash(squares[r], SQUASH), squash(context.std[r], SQUASH), context.skewness[r]};
+        auto read = [&](const std::vector<float>& of_row) { return gather(of_row.data(), cells.column); };
+        const Lanes values[] = {known_around[r],            read(context.bounded[r]), read(context.step[r]),
+                                squash(squares[r], SQUASH), read(context.std[r]),     read(context.skewness[r])};
         for (int k = 0; k < 6; k++) cell[k * NUM_RADII + r] = values[k];
     }
     Lanes outer[CELLS], inner[CELLS], told[VIEWS], of_cell[NUM_CANDIDATES];

@@ -4,7 +4,8 @@
 #include "map.h"
 
 // Refine a row of cells; unknown ones become finite.
-inline void refine(const Weights& weights, const Map& map, int i) {
+inline void refine(const Weights& weights, const Map& map, const Context& context, int i) {
+    const Lanes usual = log(all(float(map.resolution) / USUAL));
     for (int j = 0; j < map.W; j += LANES) {
         const int count = std::min(LANES, map.W - j), place = i * map.W + j;
         const float* here = &map.ground[map.index(i, j)];
@@ -25,10 +26,17 @@ inline void refine(const Weights& weights, const Map& map, int i) {
         const Lanes variance = pick(known, load(map.layers.variance + place, count), all(0));
         const Lanes age = pick(known, load(map.layers.age + place, count), all(0));
         const Lanes sigma = root(larger(variance, all(MIN_STD * MIN_STD)));
-        const Lanes features[NUM_MEASURED] = {log(sigma), absolute(bend) / (absolute(bend) + sigma),
-                                              squash(rough, 0.01f), squash(tilt, SQUASH), pairs * 0.25f,
-                                              log(1 + clamp(age, 0, LONG_AGO)),
-                                              log(all(float(map.resolution) / USUAL))};
+        Lanes features[NUM_MEASURED] = {log(sigma), absolute(bend) / (absolute(bend) + sigma),
+                                        squash(rough, SMALL_STEP), squash(tilt, SQUASH), pairs * 0.25f,
+                                        log(1 + clamp(age, 0, LONG_AGO)), usual};
+        for (int r = 0; r < NUM_RADII; r++) {
+            Lanes square;
+            for (int l = 0; l < LANES; l++) square[l] = float(map.level + context.mean[r][j + l] - double(height[l]));
+            square *= one_if(load(&context.known[r][j]) > 0);
+            const Lanes values[] = {load(&context.known[r][j]), load(&context.bounded[r][j]), load(&context.step[r][j]),
+                                    squash(square, SQUASH), load(&context.std[r][j]), load(&context.skewness[r][j])};
+            for (int k = 0; k < 6; k++) features[NUM_CLOSE + k * NUM_RADII + r] = values[k];
+        }
         Lanes channels[MEASURED], answer[2];
         affine<MEASURED, NUM_MEASURED>(weights.measured, weights.measured_bias, features, channels);
         relu<MEASURED>(channels);

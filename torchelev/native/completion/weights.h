@@ -7,7 +7,7 @@
 
 constexpr int NUM_DIRECTIONS = 8, NUM_REACHES = 2, NUM_RADII = 2;
 constexpr int NUM_VIEW = 8 + 2 * NUM_REACHES, NUM_CELL = 8 + 6 * NUM_RADII, NUM_CANDIDATES = 2 + NUM_REACHES;
-constexpr int NUM_POOLED = 2 * VIEWS + NUM_CELL, NUM_MEASURED = 7;
+constexpr int NUM_POOLED = 2 * VIEWS + NUM_CELL, NUM_CLOSE = 7, NUM_MEASURED = NUM_CLOSE + 6 * NUM_RADII;
 
 struct Weights {
     const float *view, *view_bias, *view_inner, *view_inner_bias, *cell, *cell_bias, *cell_inner, *cell_inner_bias;
