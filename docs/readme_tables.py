@@ -45,7 +45,7 @@ from training.completion import edges
 from training.completion import evaluate as filling
 from training.nav import encoder_experiment, experiment, fill_experiment
 from training.quadruped import experiment as legs
-from training.quadruped import step_time
+from training.quadruped import fills, step_time
 from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
@@ -159,6 +159,7 @@ TABLES = {
     "legs": _made_by(legs.table, "quadruped", folder=training.RESULTS),
     "legs_stairs": _made_by(legs.stairs_table, "quadruped", folder=training.RESULTS),
     "legs_walk": _made_by(legs.walk_table, "quadruped", folder=training.RESULTS),
+    "legs_fills": _made_by(fills.table, "quadruped_fills", folder=training.RESULTS),
     "legs_step_time": _made_by(step_time.table, "quadruped-step-time", folder=training.RESULTS),
     "encoder_success": _made_by(encoder_experiment.table, "encoders", folder=training.RESULTS),
     "fill": _made_by(fill_experiment.table, "fill", folder=training.RESULTS),

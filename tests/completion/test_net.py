@@ -54,9 +54,9 @@ def test_steps_lead_to_the_next_known_cell():
 
 
 @pytest.mark.parametrize("known", [0.0, 0.02, 0.15, 0.7])
-@pytest.mark.parametrize("resolution", [0.02, 0.08])
-def test_every_cell_follows_the_slow_equations(known, resolution):
-    net, layers = random_net(), random_layers(3, 1, known=known)
+@pytest.mark.parametrize(("resolution", "size"), [(0.02, (14, 11)), (0.08, (14, 11)), (0.1, (3, 40)), (0.1, (40, 3))])
+def test_every_cell_follows_the_slow_equations(known, resolution, size):
+    net, layers = random_net(), random_layers(3, 1, *size, known=known)
     answer = run(net, layers, resolution)
     w = {name: value.numpy() for name, value in net.state_dict().items()}
     elevation, valid, variance, bound, bounded, age = (layer[0].numpy() for layer in layers)

@@ -11,7 +11,7 @@ from torchelev.completion import native
 from torchelev.completion.context import Context, describe, sum_layers
 from torchelev.completion.parameters import Weights
 from torchelev.completion.predict import Seen, predict
-from torchelev.completion.refine import look_close, refine
+from torchelev.completion.refine import read_measured, refine
 from torchelev.completion.surroundings import UNKNOWN, count_steps, look_around
 from torchelev.ops.parallel import map_in_order
 
@@ -112,7 +112,7 @@ class Cells:
         self.level = total / known.sum((1, 2)).clamp(min=1)  # [m] where no direction holds known ground
         self.sums = sum_layers(elevation, known, bounded, self.level)
         self.bound, self.bounded = upper_bound.flatten(), bounded.flatten()
-        self.measured = look_close(elevation, known, variance, age, resolution)
+        self.measured = read_measured(elevation, known, variance, age, resolution)
 
     def describe(self, place: Int[Tensor, "n"]) -> Context:
         """Return the squares around cells."""

@@ -33,14 +33,14 @@ class Measured(NamedTuple):
         return Measured(*(value.index_select(-1, place) for value in self))
 
 
-def look_close(
+def read_measured(
     elevation: Float[Tensor, "B H W"],
     known: Bool[Tensor, "B H W"],
     variance: Float[Tensor, "B H W"],
     age: Float[Tensor, "B H W"],
     resolution: float,
 ) -> Measured:
-    """Return all cells of the maps, B * H * W of them."""
+    """Return all cells of the maps, n = B * H * W of them."""
     height = torch.where(known, elevation, 0.0)
     around, has = neighbours(height, 0.0), neighbours(known.to(height.dtype), 0.0)
     pairs = [has[a] * has[b] * known for a, b in _PAIRS]
@@ -66,7 +66,7 @@ def refine(weights: Weights, cells: Measured, context: Context) -> tuple[Float[T
         mean = h + 2 sigma tanh(g u / (2 sigma)),
 
     which stays within two standard deviations sigma of the map, a millimetre at least. The squares around a cell tell
-    how far to trust it: where there are many gaps, a pose that is off by a few centimetres makes ground of a gap.
+    how far to trust it: where there are many gaps, a pose that is off by a few centimetres puts ground into a gap.
     """
     height, sigma, bend, features = cells
     squares = ((context.mean - height) * (context.known > 0)).to(height.dtype)

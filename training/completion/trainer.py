@@ -17,7 +17,7 @@ from training.completion.cells import Drawn, MeasuredCells, UnknownCells, choose
 from training.fit import Fit
 
 # Share of the training's cells that are to lie within two standard deviations. Of a normal distribution 95 % would; the
-# rest is for ground of other kinds, of which the network knows less than it can know.
+# rest is for ground of other kinds, on which the network is overconfident.
 COVERAGE = 0.97
 _MIN_DEVIATION = 1e-3  # [m]
 _LARGEST_SQUARE = 100.0  # of a weighted error

@@ -49,8 +49,7 @@ def evaluate(
         was commanded, None where none was; and `episodes`. Kinds are called by what the robot meets.
     """
     task = Quadruped(cfg, episodes, device, perception, seed, compiled)
-    levels = (torch.arange(episodes, device=task.device) // len(cfg.terrain.kinds)) % cfg.terrain.num_levels
-    task.place_at(levels)
+    task.place_at(even_levels(task))
     level, kind = task.level.clone(), task.kind.clone()
     endings = torch.zeros(len(ENDINGS), episodes, dtype=torch.bool, device=task.device)
     walked, asked = torch.zeros(2, episodes, device=task.device)
@@ -73,6 +72,12 @@ def evaluate(
     by_kind = {name: _summarize(endings, walked, asked, chosen) for name, chosen in kinds.items()}
     everything = _summarize(endings, walked, asked, torch.ones_like(kind, dtype=torch.bool))
     return {"all": everything, "by_kind": by_kind, "by_level": by_level, "episodes": episodes}
+
+
+def even_levels(task: Quadruped) -> Tensor:
+    """Return levels (B,) such that kinds and levels are spread evenly."""
+    terrain = task.cfg.terrain
+    return (torch.arange(task.num_envs, device=task.device) // len(terrain.kinds)) % terrain.num_levels
 
 
 def _summarize(endings: Tensor, walked: Tensor, asked: Tensor, chosen: Tensor) -> dict[str, float | None]:

@@ -104,8 +104,8 @@ def test_thinned_maps_bound_what_they_lost_and_bounds_stay_true():
     assert 0 < int(kept.sum()) < 8 and float(rise.min()) == 0.0 < float(rise.max()) <= 3.0
 
 
-def test_the_standard_deviation_is_fitted_to_hold_95_percent():
-    """Of the errors of any distribution, half the 95 % quantile minimises the loss; no gradient reaches the mean."""
+def test_the_standard_deviation_is_fitted_to_hold_the_coverage():
+    """Of the errors of any distribution, half the quantile COVERAGE minimises the loss; no gradient reaches the mean."""
     error = torch.randn(20_000, generator=torch.Generator().manual_seed(0)) ** 3
     stds = torch.linspace(0.2, 6.0, 200)
     loss = torch.stack([losses(error, std.expand_as(error), torch.ones_like(error))[1] for std in stds])

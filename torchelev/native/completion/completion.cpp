@@ -8,13 +8,13 @@ namespace {
 
 // Complete a row: all cells as measured ones, then the unknown ones.
 void complete_row(const Weights& weights, const Map& map, int i) {
-    const Context context = describe(map, i);
-    refine(weights, map, context, i);
+    const Squares of_row = describe(map, i);
+    refine(weights, map, of_row, i);
     Cells cells;
     int count = 0;
     auto flush = [&] {
         for (int l = count; l < LANES; l++) cells.row[l] = i, cells.column[l] = cells.column[0];
-        const Answer answer = predict(weights, map, context, cells);
+        const Answer answer = predict(weights, map, of_row, cells);
         for (int l = 0; l < count; l++) {
             map.layers.mean[i * map.W + cells.column[l]] = answer.mean[l];
             map.layers.std[i * map.W + cells.column[l]] = answer.std[l];

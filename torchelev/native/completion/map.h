@@ -69,7 +69,7 @@ struct Map {
             }
     }
 
-    const double* sums_of(int layer, int i) const { return &sums[(size_t(layer) * (H + 1) + i) * (W + 1)]; }
+    size_t row_of_sums(int layer, int i) const { return (size_t(layer) * (H + 1) + i) * (W + 1); }
 
     void sum_layers() {
         sums.assign(size_t(NUM_SUMS) * (H + 1) * (W + 1), 0.0);
@@ -78,7 +78,7 @@ struct Map {
             const double* above[NUM_SUMS];
             double* below[NUM_SUMS];
             for (int k = 0; k < NUM_SUMS; k++)
-                above[k] = sums_of(k, i) + 1, below[k] = const_cast<double*>(sums_of(k, i + 1)) + 1;
+                above[k] = &sums[row_of_sums(k, i) + 1], below[k] = &sums[row_of_sums(k, i + 1) + 1];
             for (int j = 0; j < W; j++) {
                 const float* here = &ground[index(i, j)];
                 if (*here < UNKNOWN) {
@@ -133,34 +133,35 @@ inline void look_around(const Map& map, const Cells& cells, Surroundings& around
 }
 
 // The squares around the cells of a row, as the network sees them; mean heights count from the map's level [m].
-struct Context {
+struct Squares {
     std::vector<float> known[NUM_RADII], bounded[NUM_RADII], step[NUM_RADII], std[NUM_RADII], skewness[NUM_RADII];
     std::vector<double> mean[NUM_RADII];
 };
 
-inline Context describe(const Map& map, int i) {
+inline Squares describe(const Map& map, int i) {
     const int W = map.W, padded = (W + LANES - 1) / LANES * LANES;
-    Context context;
+    Squares of_row;
     std::vector<double> squares(size_t(NUM_SUMS) * W);
     for (int r = 0; r < NUM_RADII; r++) {
         const int half = std::max(1, int(std::nearbyint(RADII[r] / map.resolution)));
         const int top = std::max(i - half, 0), bottom = std::min(i + half + 1, map.H);
         std::vector<double> band(W + 2 * half + 1);  // over its rows and all columns before; the map's sides are repeated
         for (int k = 0; k < NUM_SUMS; k++) {
-            const double *above = map.sums_of(k, top), *below = map.sums_of(k, bottom);
+            const double *above = &map.sums[map.row_of_sums(k, top)], *below = &map.sums[map.row_of_sums(k, bottom)];
             for (int j = 0; j <= W; j++) band[half + j] = below[j] - above[j];
             std::fill(band.end() - half, band.end(), band[half + W]);
             for (int j = 0; j < W; j++) squares[k * W + j] = band[j + 2 * half + 1] - band[j];
         }
-        for (auto* values : {&context.known[r], &context.bounded[r], &context.step[r], &context.std[r],
-                             &context.skewness[r]})
+        for (auto* values : {&of_row.known[r], &of_row.bounded[r], &of_row.step[r], &of_row.std[r],
+                             &of_row.skewness[r]})
             values->assign(padded, 0.0f);
-        context.mean[r].assign(padded, 0.0);
+        of_row.mean[r].assign(padded, 0.0);
         const double* sums = squares.data();
-        float *known = context.known[r].data(), *bounded = context.bounded[r].data(), *step = context.step[r].data();
-        float *std = context.std[r].data(), *skewness = context.skewness[r].data();
-        double* means = context.mean[r].data();
+        float *known = of_row.known[r].data(), *bounded = of_row.bounded[r].data(), *step = of_row.step[r].data();
+        float *std = of_row.std[r].data(), *skewness = of_row.skewness[r].data();
+        double* means = of_row.mean[r].data();
         const double per_area = 1 / (double(2 * half + 1) * (2 * half + 1));
+#pragma GCC ivdep
         for (int j = 0; j < W; j++) {
             const double count = sums[j], pairs = sums[2 * W + j];
             const double per_cell = 1 / (count > 1 ? count : 1), mean = sums[4 * W + j] * per_cell;
@@ -178,5 +179,15 @@ inline Context describe(const Map& map, int i) {
             store(std + j, squash(load(std + j), SQUASH));
         }
     }
-    return context;
+    return of_row;
+}
+
+// Write the features of squares whose mean heights are `means` [m]; `read` takes values of cells from those of the row.
+template <class Read>
+inline void write_features(const Squares& of_row, const Lanes* means, const Read& read, Lanes* features) {
+    for (int r = 0; r < NUM_RADII; r++) {
+        const Lanes values[] = {read(of_row.known[r]),      read(of_row.bounded[r]), read(of_row.step[r]),
+                                squash(means[r], SQUASH), read(of_row.std[r]),     read(of_row.skewness[r])};
+        for (int k = 0; k < 6; k++) features[k * NUM_RADII + r] = values[k];
+    }
 }

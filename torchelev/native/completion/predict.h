@@ -7,7 +7,7 @@ struct Answer {
     Lanes mean, std;  // [m]
 };
 
-inline Answer predict(const Weights& weights, const Map& map, const Context& context, const Cells& cells) {
+inline Answer predict(const Weights& weights, const Map& map, const Squares& of_row, const Cells& cells) {
     Surroundings around;
     look_around(map, cells, around);
     Lanes upper_bound, is_bounded;
@@ -42,12 +42,12 @@ inline Answer predict(const Weights& weights, const Map& map, const Context& con
     }
     high = pick(has_any > 0, high, all(0));
     const Lanes bound = (upper_bound - lowest - mean) * is_bounded;
-    Lanes squares[NUM_RADII], has_square[NUM_RADII], known_around[NUM_RADII];
+    auto read = [&](const std::vector<float>& values) { return gather(values.data(), cells.column); };
+    Lanes squares[NUM_RADII], has_square[NUM_RADII];
     for (int r = 0; r < NUM_RADII; r++) {
-        known_around[r] = gather(context.known[r].data(), cells.column);
-        has_square[r] = one_if(known_around[r] > 0);
+        has_square[r] = one_if(read(of_row.known[r]) > 0);
         for (int l = 0; l < LANES; l++)
-            squares[r][l] = float(map.level + context.mean[r][cells.column[l]] - double(lowest[l]) - double(mean[l]));
+            squares[r][l] = float(map.level + of_row.mean[r][cells.column[l]] - double(lowest[l]) - double(mean[l]));
         squares[r] *= has_square[r];
     }
 
@@ -90,12 +90,7 @@ inline Answer predict(const Weights& weights, const Map& map, const Context& con
                         squash(bound - low, SQUASH) * is_bounded, squash(bound, SQUASH), log(1 + nearest * (1 / NEAR_STEP)),
                         log(usual), num_known * (1.0f / NUM_DIRECTIONS)})
         *cell++ = value;
-    for (int r = 0; r < NUM_RADII; r++) {
-        auto read = [&](const std::vector<float>& of_row) { return gather(of_row.data(), cells.column); };
-        const Lanes values[] = {known_around[r],            read(context.bounded[r]), read(context.step[r]),
-                                squash(squares[r], SQUASH), read(context.std[r]),     read(context.skewness[r])};
-        for (int k = 0; k < 6; k++) cell[k * NUM_RADII + r] = values[k];
-    }
+    write_features(of_row, squares, read, cell);
     Lanes outer[CELLS], inner[CELLS], told[VIEWS], of_cell[NUM_CANDIDATES];
     affine<CELLS, NUM_POOLED>(weights.cell, weights.cell_bias, pooled, outer);
     relu<CELLS>(outer);

@@ -3,14 +3,15 @@
 
 #include "map.h"
 
-// Refine a row of cells; unknown ones become finite.
-inline void refine(const Weights& weights, const Map& map, const Context& context, int i) {
+// Refine the measured cells of a row; others become arbitrary.
+inline void refine(const Weights& weights, const Map& map, const Squares& of_row, int i) {
     const Lanes usual = log(all(float(map.resolution) / USUAL));
     for (int j = 0; j < map.W; j += LANES) {
         const int count = std::min(LANES, map.W - j), place = i * map.W + j;
         const float* here = &map.ground[map.index(i, j)];
         const Lanes center = load(here);
         const Flags known = center < UNKNOWN;
+        if (!any(known)) continue;
         const Lanes height = pick(known, center, all(0));
         Lanes pairs{}, bend{}, rough{}, tilt{};
         auto add = [&](int to) {
@@ -29,14 +30,13 @@ inline void refine(const Weights& weights, const Map& map, const Context& contex
         Lanes features[NUM_MEASURED] = {log(sigma), absolute(bend) / (absolute(bend) + sigma),
                                         squash(rough, SMALL_STEP), squash(tilt, SQUASH), pairs * 0.25f,
                                         log(1 + clamp(age, 0, LONG_AGO)), usual};
+        auto read = [&](const std::vector<float>& values) { return load(&values[j]); };
+        Lanes squares[NUM_RADII];
         for (int r = 0; r < NUM_RADII; r++) {
-            Lanes square;
-            for (int l = 0; l < LANES; l++) square[l] = float(map.level + context.mean[r][j + l] - double(height[l]));
-            square *= one_if(load(&context.known[r][j]) > 0);
-            const Lanes values[] = {load(&context.known[r][j]), load(&context.bounded[r][j]), load(&context.step[r][j]),
-                                    squash(square, SQUASH), load(&context.std[r][j]), load(&context.skewness[r][j])};
-            for (int k = 0; k < 6; k++) features[NUM_CLOSE + k * NUM_RADII + r] = values[k];
+            for (int l = 0; l < LANES; l++) squares[r][l] = float(map.level + of_row.mean[r][j + l] - double(height[l]));
+            squares[r] *= one_if(read(of_row.known[r]) > 0);
         }
+        write_features(of_row, squares, read, features + NUM_CLOSE);
         Lanes channels[MEASURED], answer[2];
         affine<MEASURED, NUM_MEASURED>(weights.measured, weights.measured_bias, features, channels);
         relu<MEASURED>(channels);

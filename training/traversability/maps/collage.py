@@ -30,9 +30,9 @@ def make_collage(axis: Tensor, rng: np.random.Generator) -> Tensor:
     largest, step = _log_uniform(rng, *_LARGEST), _log_uniform(rng, *_STEPS)
     signs = {"up and down": [-1, 1], "down": [-1], "up": [1]}[str(rng.choice(list(_SIGNS), p=list(_SIGNS.values())))]
     ground = torch.zeros(len(axis), len(axis), dtype=axis.dtype)
-    uncovered = _log_uniform(rng, *_LAYERS) * (2 * half) ** 2
+    area_left = _log_uniform(rng, *_LAYERS) * (2 * half) ** 2
     for _ in range(_MOST):
-        length = _log_uniform(rng, min(_SMALLEST, largest), largest)
+        length = _log_uniform(rng, min(_SMALLEST, largest), largest)  # half of it
         center, turn = rng.uniform(-half, half, 2), rng.uniform(-math.pi, math.pi)
         corners = ((center + sign * 1.5 * length + half) / spacing for sign in (-1, 1))
         first, last = (corner.clip(0, len(axis)).astype(int) for corner in corners)
@@ -45,8 +45,8 @@ def make_collage(axis: Tensor, rng: np.random.Generator) -> Tensor:
         below = ground[window]
         base = below if rng.random() < _STACKED else torch.zeros_like(below)
         ground[window] = torch.where(inside, base + height + tilt * u, below)
-        uncovered -= float(inside.sum()) * spacing**2
-        if uncovered < 0:
+        area_left -= float(inside.sum()) * spacing**2
+        if area_left < 0:
             break
     return ground
 
