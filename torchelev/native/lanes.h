@@ -95,6 +95,14 @@ template <class Result, class Value> inline Result gather_as(const Value* values
 inline Lanes gather(const float* values, Flags index) { return gather_as<Lanes>(values, index); }
 inline Flags gather(const int16_t* values, Flags index) { return gather_as<Flags>(values, index); }
 
+// Values that lie side by side, as `gather` returns them.
+template <class Value> auto load_as(const Value* values) {
+    typedef Value Values __attribute__((vector_size(sizeof(Value) * LANES)));
+    Values found;
+    std::memcpy(&found, values, sizeof found);
+    return __builtin_convertvector(found, decltype(gather(values, Flags{})));
+}
+
 // Natural logarithm of positive normal numbers, by the polynomial of Cephes' logf: 1 unit in the last place.
 inline Lanes log(Lanes x) {
     const Flags exponent = ((Flags)x - 0x3f3504f3) >> 23;  // such that the mantissa is in sqrt(1/2) to sqrt(2)

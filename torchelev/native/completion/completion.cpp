@@ -14,6 +14,7 @@ void complete_row(const Weights& weights, const Map& map, int i) {
     int count = 0;
     auto flush = [&] {
         for (int l = count; l < LANES; l++) cells.row[l] = i, cells.column[l] = cells.column[0];
+        cells.adjacent = cells.column[LANES - 1] - cells.column[0] == LANES - 1;
         const Answer answer = predict(weights, map, of_row, cells);
         for (int l = 0; l < count; l++) {
             map.layers.mean[i * map.W + cells.column[l]] = answer.mean[l];

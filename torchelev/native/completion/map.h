@@ -97,6 +97,12 @@ struct Map {
 // LANES cells of a map.
 struct Cells {
     Flags row, column;
+    bool adjacent;  // one row's cells side by side: what they read lies in memory so, too
+
+    // Values of the cells from those of all cells of the row, or of the map.
+    template <class Value> auto read(const Value* values, Flags place) const {
+        return adjacent ? load_as<Value>(values + place[0]) : gather(values, place);
+    }
 };
 
 // The known ground in eight directions.
@@ -118,7 +124,7 @@ inline void look_around(const Map& map, const Cells& cells, Surroundings& around
             const Flags index = k <= room ? here + k * stride : Flags{};
             return gather(map.ground.data(), index);
         };
-        const Flags steps = gather(&map.steps[size_t(d) * map.H * map.W], place);
+        const Flags steps = cells.read(&map.steps[size_t(d) * map.H * map.W], place);
         const Lanes height = read(steps), run = __builtin_convertvector(steps, Lanes) * length;
         const Flags is_known = height < UNKNOWN;
         around.known[d] = one_if(is_known), around.height[d] = pick(is_known, height, all(0));

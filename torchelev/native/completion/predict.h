@@ -42,7 +42,7 @@ inline Answer predict(const Weights& weights, const Map& map, const Squares& of_
     }
     high = pick(has_any > 0, high, all(0));
     const Lanes bound = (upper_bound - lowest - mean) * is_bounded;
-    auto read = [&](const std::vector<float>& values) { return gather(values.data(), cells.column); };
+    auto read = [&](const std::vector<float>& values) { return cells.read(values.data(), cells.column); };
     Lanes squares[NUM_RADII], has_square[NUM_RADII];
     for (int r = 0; r < NUM_RADII; r++) {
         has_square[r] = one_if(read(of_row.known[r]) > 0);
