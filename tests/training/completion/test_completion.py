@@ -105,7 +105,7 @@ def test_thinned_maps_bound_what_they_lost_and_bounds_stay_true():
 
 
 def test_the_standard_deviation_is_fitted_to_hold_the_coverage():
-    """Of the errors of any distribution, half the quantile COVERAGE minimises the loss; no gradient reaches the mean."""
+    """Of the errors of any distribution, half the COVERAGE quantile has the least loss; the mean gets no gradient."""
     error = torch.randn(20_000, generator=torch.Generator().manual_seed(0)) ** 3
     stds = torch.linspace(0.2, 6.0, 200)
     loss = torch.stack([losses(error, std.expand_as(error), torch.ones_like(error))[1] for std in stds])
