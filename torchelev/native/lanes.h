@@ -94,6 +94,7 @@ template <class Result, class Value> inline Result gather_as(const Value* values
 
 inline Lanes gather(const float* values, Flags index) { return gather_as<Lanes>(values, index); }
 inline Flags gather(const int16_t* values, Flags index) { return gather_as<Flags>(values, index); }
+inline Flags gather(const uint8_t* values, Flags index) { return gather_as<Flags>(values, index); }
 
 // Values that lie side by side, as `gather` returns them.
 template <class Value> auto load_as(const Value* values) {
@@ -149,21 +150,34 @@ inline Lanes squash(Lanes x, float scale) {
     return pick(x < 0, -y, y);
 }
 
-// y = w x + b for a matrix (OUT, IN), row by row; without b: y += w x.
-template <int OUT, int IN, int AT_A_TIME = OUT % 8 == 0 ? 8 : OUT % 4 == 0 ? 4 : OUT % 2 == 0 ? 2 : 1>
-inline void affine(const float* w, const float* b, const Lanes* x, Lanes* y) {
-    for (int first = 0; first < OUT; first += AT_A_TIME) {
-        Lanes sums[AT_A_TIME];
+// y = w x + b for a matrix (OUT, IN), row by row, and COLUMNS columns of x; without b: y += w x.
+template <int OUT, int IN, int COLUMNS, bool IS_HIDDEN = false>
+inline void affine(const float* w, const float* b, const Lanes (*x)[COLUMNS], Lanes (*y)[COLUMNS]) {
+    constexpr int ACROSS = COLUMNS % 2 == 0 ? 2 : 1;  // the sums of a tile stay in registers
+    constexpr int DOWN = OUT % 8 == 0 && ACROSS == 1 ? 8 : OUT % 4 == 0 ? 4 : OUT % 2 == 0 ? 2 : 1;
+    for (int row = 0; row < OUT; row += DOWN)
+        for (int column = 0; column < COLUMNS; column += ACROSS) {
+            Lanes sums[DOWN][ACROSS];
 #pragma GCC unroll 8
-        for (int k = 0; k < AT_A_TIME; k++) sums[k] = b ? all(b[first + k]) : y[first + k];
-        for (int in = 0; in < IN; in++)
+            for (int k = 0; k < DOWN; k++)
+#pragma GCC unroll 2
+                for (int c = 0; c < ACROSS; c++) sums[k][c] = b ? all(b[row + k]) : y[row + k][column + c];
+#pragma GCC unroll 2
+            for (int in = 0; in < IN; in++)
 #pragma GCC unroll 8
-            for (int k = 0; k < AT_A_TIME; k++) sums[k] += w[(first + k) * IN + in] * x[in];
+                for (int k = 0; k < DOWN; k++)
+#pragma GCC unroll 2
+                    for (int c = 0; c < ACROSS; c++) sums[k][c] += w[(row + k) * IN + in] * x[in][column + c];
 #pragma GCC unroll 8
-        for (int k = 0; k < AT_A_TIME; k++) y[first + k] = sums[k];
-    }
+            for (int k = 0; k < DOWN; k++)
+#pragma GCC unroll 2
+                for (int c = 0; c < ACROSS; c++)
+                    y[row + k][column + c] = IS_HIDDEN ? larger(sums[k][c], all(0)) : sums[k][c];
+        }
 }
 
-template <int SIZE> inline void relu(Lanes* values) {
-    for (int k = 0; k < SIZE; k++) values[k] = larger(values[k], all(0));
+// y = max(w x + b, 0)
+template <int OUT, int IN, int COLUMNS>
+inline void hidden(const float* w, const float* b, const Lanes (*x)[COLUMNS], Lanes (*y)[COLUMNS]) {
+    affine<OUT, IN, COLUMNS, true>(w, b, x, y);
 }

@@ -31,14 +31,16 @@ template <class Run> void on_threads(int count, int num_threads, Run& run) {
     for (std::thread& helper : helpers) helper.join();
 }
 
-// Call `work(k)` for each k below `count`. What a call throws is thrown again at the end, once.
-template <class Work> void for_each(int count, int num_threads, const Work& work) {
+// Call `work(k, own)` for each k below `count`, where `own` is what `make()` returned to its thread. What a call throws
+// is thrown again at the end, once.
+template <class Make, class Work> void for_each(int count, int num_threads, const Make& make, const Work& work) {
     std::atomic<int> next{0};
     std::mutex mutex;
     std::exception_ptr failure;
     auto run = [&] {
         try {
-            for (int k; (k = next++) < count;) work(k);
+            auto own = make();
+            for (int k; (k = next++) < count;) work(k, own);
         } catch (...) {
             next = count;
             const std::lock_guard<std::mutex> lock(mutex);
@@ -47,6 +49,10 @@ template <class Work> void for_each(int count, int num_threads, const Work& work
     };
     on_threads(count, num_threads, run);
     if (failure) std::rethrow_exception(failure);
+}
+
+template <class Work> void for_each(int count, int num_threads, const Work& work) {
+    for_each(count, num_threads, [] { return 0; }, [&](int k, int) { work(k); });
 }
 
 // Calls `work(part, first, last)` for parts of 0 to `size`, which may run side by side.
@@ -59,13 +65,21 @@ struct Parts {
     }
 };
 
-// Call `work(b, threads)` for each environment: a thread for each where there are `per_thread` of them for every thread,
-// else all threads for one after the other.
+// Call `work(b, threads, own)` for each environment, where `own` is as in `for_each`: a thread for each where there are
+// `per_thread` of them for every thread, else all threads for one after the other.
+template <class Make, class Work>
+void for_environments(int64_t B, int num_threads, const Make& make, const Work& work, int per_thread = 1) {
+    if (B >= per_thread * num_threads) {
+        for_each(int(B), num_threads, make, [&](int64_t b, auto& own) { work(b, 1, own); });
+    } else {
+        auto own = make();
+        for (int64_t b = 0; b < B; b++) work(b, num_threads, own);
+    }
+}
+
 template <class Work> void for_environments(int64_t B, int num_threads, const Work& work, int per_thread = 1) {
-    if (B >= per_thread * num_threads)
-        for_each(int(B), num_threads, [&](int64_t b) { work(b, 1); });
-    else
-        for (int64_t b = 0; b < B; b++) work(b, num_threads);
+    auto call = [&](int64_t b, int threads, int) { work(b, threads); };
+    for_environments(B, num_threads, [] { return 0; }, call, per_thread);
 }
 
 inline int64_t checked(int64_t index, int64_t size) {

@@ -1,4 +1,4 @@
-// One map, and what the prediction at all its cells shares: surroundings.py and context.py.
+// One map, and what lies around its cells: surroundings.py, and the sums of context.py.
 #pragma once
 
 #include <algorithm>
@@ -17,62 +17,76 @@ constexpr int NUM_SUMS = 7;
 
 struct Layers {
     const float *elevation, *variance, *upper_bound, *age;
-    const bool *known, *bounded;
+    const uint8_t *known, *bounded;  // 0 or 1
     float *mean, *std;
 };
 
+// Reads one map after the other, into the same memory.
 struct Map {
-    const Layers layers;
     const int H, W, stride;  // of the ground, which has a rim of one cell
     const double resolution;
-    double level = 0;            // [m] mean height
+    Layers layers;
+    double level;                // [m] mean height
+    float level_rest;            // [m] what a float of it lacks
     std::vector<float> ground;   // (H + 2, stride) [m], UNKNOWN where it does not count
     std::vector<int16_t> steps;  // (8, H, W)
     std::vector<double> sums;    // (7, H + 1, W + 1), over all cells before a corner
 
-    Map(const Layers& layers, int H, int W, double resolution)
-        : layers(layers), H(H), W(W), stride(W + 2 + LANES), resolution(resolution) {
-        ground.assign(size_t(H + 2) * stride, UNKNOWN);
+    Map(int H, int W, double resolution)
+        : H(H), W(W), stride(W + 2 + LANES), resolution(resolution), ground(size_t(H + 2) * stride, UNKNOWN),
+          steps(size_t(NUM_DIRECTIONS) * H * W, NONE), sums(size_t(NUM_SUMS) * (H + 1) * (W + 1)) {}
+
+    void read(const Layers& its_layers) {
+        layers = its_layers;
         double total = 0;
         int64_t count = 0;
         for (int i = 0; i < H; i++)
-            for (int j = 0; j < W; j++)
-                if (layers.known[i * W + j]) {
-                    const float height = layers.elevation[i * W + j];
-                    ground[index(i, j)] = height;
-                    total += height, count++;
-                }
+            for (int j = 0; j < W; j++) {
+                const bool is_known = layers.known[i * W + j];
+                const float height = is_known ? layers.elevation[i * W + j] : 0;
+                ground[index(i, j)] = is_known ? height : UNKNOWN;
+                total += height, count += is_known;
+            }
         level = total / double(std::max<int64_t>(count, 1));
+        level_rest = float(level - double(float(level)));
     }
+
+    // How far the level is above heights [m].
+    Lanes above(Lanes height) const { return (all(float(level)) - height) + level_rest; }
 
     int index(int i, int j) const { return (i + 1) * stride + j + 1; }
 
     // The steps to the next known cell: one where the neighbour is known, else one more than the neighbour's.
     void count_steps() {
-        steps.assign(size_t(NUM_DIRECTIONS) * H * W, NONE);
         for (int d = 0; d < NUM_DIRECTIONS; d++)
             for (int k = 0; k < H; k++) {
                 const int i = ROWS[d] > 0 ? H - 1 - k : k, next = i + ROWS[d];
                 if (next < 0 || next >= H) continue;
                 int16_t* row = &steps[(size_t(d) * H + i) * W];
-                const int16_t* ahead = &steps[(size_t(d) * H + next) * W] + COLUMNS[d];
-                const bool* is_known = layers.known + next * W + COLUMNS[d];
-                const int first = std::max(0, -COLUMNS[d]), last = W - std::max(0, COLUMNS[d]);
-                auto step = [&](int j) {
-                    const int16_t more = std::min<int16_t>(ahead[j], NONE - 1) + 1;
-                    row[j] = is_known[j] ? 1 : more;
-                };
-                if (COLUMNS[d] > 0 && ROWS[d] == 0)
-                    for (int j = last; j-- > first;) step(j);
-                else
-                    for (int j = first; j < last; j++) step(j);
+                const uint8_t* is_known = layers.known + next * W;
+                if (ROWS[d] == 0) {
+                    int last = -NONE;  // in the order of n; without a branch, which would often be guessed wrong
+                    for (int n = 0; n < W; n++) {
+                        const int j = COLUMNS[d] < 0 ? n : W - 1 - n;
+                        row[j] = int16_t(std::min(n - last, int(NONE)));
+                        last = std::max(last, is_known[j] * (n + NONE) - NONE);
+                    }
+                } else {
+                    const int16_t* ahead = &steps[(size_t(d) * H + next) * W] + COLUMNS[d];
+                    const int first = std::max(0, -COLUMNS[d]), last = W - std::max(0, COLUMNS[d]);
+                    is_known += COLUMNS[d];
+#pragma GCC ivdep
+                    for (int j = first; j < last; j++) {
+                        const int16_t fewer = ahead[j] < NONE - 1 ? ahead[j] : int16_t(NONE - 1);
+                        row[j] = (fewer & int16_t(int16_t(is_known[j]) - 1)) + 1;
+                    }
+                }
             }
     }
 
     size_t row_of_sums(int layer, int i) const { return (size_t(layer) * (H + 1) + i) * (W + 1); }
 
     void sum_layers() {
-        sums.assign(size_t(NUM_SUMS) * (H + 1) * (W + 1), 0.0);
         for (int i = 0; i < H; i++) {
             double row[NUM_SUMS] = {};
             const double* above[NUM_SUMS];
@@ -99,7 +113,7 @@ struct Cells {
     Flags row, column;
     bool adjacent;  // one row's cells side by side: what they read lies in memory so, too
 
-    // Values of the cells from those of all cells of the row, or of the map.
+    // Values of the cells from those of all cells of some rows, or of the map.
     template <class Value> auto read(const Value* values, Flags place) const {
         return adjacent ? load_as<Value>(values + place[0]) : gather(values, place);
     }
@@ -135,65 +149,5 @@ inline void look_around(const Map& map, const Cells& cells, Surroundings& around
             around.has_slope[r][d] = one_if(far < UNKNOWN);
             around.slope[r][d] = pick(far < UNKNOWN, (height - far) * (1 / (more * length)), all(0));
         }
-    }
-}
-
-// The squares around the cells of a row, as the network sees them; mean heights count from the map's level [m].
-struct Squares {
-    std::vector<float> known[NUM_RADII], bounded[NUM_RADII], step[NUM_RADII], std[NUM_RADII], skewness[NUM_RADII];
-    std::vector<double> mean[NUM_RADII];
-};
-
-inline Squares describe(const Map& map, int i) {
-    const int W = map.W, padded = (W + LANES - 1) / LANES * LANES;
-    Squares of_row;
-    std::vector<double> squares(size_t(NUM_SUMS) * W);
-    for (int r = 0; r < NUM_RADII; r++) {
-        const int half = std::max(1, int(std::nearbyint(RADII[r] / map.resolution)));
-        const int top = std::max(i - half, 0), bottom = std::min(i + half + 1, map.H);
-        std::vector<double> band(W + 2 * half + 1);  // over its rows and all columns before; the map's sides are repeated
-        for (int k = 0; k < NUM_SUMS; k++) {
-            const double *above = &map.sums[map.row_of_sums(k, top)], *below = &map.sums[map.row_of_sums(k, bottom)];
-            for (int j = 0; j <= W; j++) band[half + j] = below[j] - above[j];
-            std::fill(band.end() - half, band.end(), band[half + W]);
-            for (int j = 0; j < W; j++) squares[k * W + j] = band[j + 2 * half + 1] - band[j];
-        }
-        for (auto* values : {&of_row.known[r], &of_row.bounded[r], &of_row.step[r], &of_row.std[r],
-                             &of_row.skewness[r]})
-            values->assign(padded, 0.0f);
-        of_row.mean[r].assign(padded, 0.0);
-        const double* sums = squares.data();
-        float *known = of_row.known[r].data(), *bounded = of_row.bounded[r].data(), *step = of_row.step[r].data();
-        float *std = of_row.std[r].data(), *skewness = of_row.skewness[r].data();
-        double* means = of_row.mean[r].data();
-        const double per_area = 1 / (double(2 * half + 1) * (2 * half + 1));
-#pragma GCC ivdep
-        for (int j = 0; j < W; j++) {
-            const double count = sums[j], pairs = sums[2 * W + j];
-            const double per_cell = 1 / (count > 1 ? count : 1), mean = sums[4 * W + j] * per_cell;
-            const double square = sums[5 * W + j] * per_cell - mean * mean, variance = square > 0 ? square : 0;
-            const double third = sums[6 * W + j] * per_cell - 3 * mean * variance - mean * mean * mean;
-            const float spread = __builtin_sqrtf(float(variance) + float(SMALLEST_STD * SMALLEST_STD));
-            known[j] = float(count * per_area), bounded[j] = float(sums[W + j] * per_area);
-            step[j] = float(sums[3 * W + j] / (pairs > 1 ? pairs : 1));
-            std[j] = spread - float(SMALLEST_STD);
-            skewness[j] = float(third) / (spread * spread * spread);
-            means[j] = mean;
-        }
-        for (int j = 0; j < padded; j += LANES) {
-            store(step + j, squash(load(step + j), SMALL_STEP));
-            store(std + j, squash(load(std + j), SQUASH));
-        }
-    }
-    return of_row;
-}
-
-// Write the features of squares whose mean heights are `means` [m]; `read` takes values of cells from those of the row.
-template <class Read>
-inline void write_features(const Squares& of_row, const Lanes* means, const Read& read, Lanes* features) {
-    for (int r = 0; r < NUM_RADII; r++) {
-        const Lanes values[] = {read(of_row.known[r]),      read(of_row.bounded[r]), read(of_row.step[r]),
-                                squash(means[r], SQUASH), read(of_row.std[r]),     read(of_row.skewness[r])};
-        for (int k = 0; k < 6; k++) features[k * NUM_RADII + r] = values[k];
     }
 }

@@ -1,21 +1,57 @@
 // The ground at unknown cells: predict.py.
 #pragma once
 
-#include "map.h"
+#include "squares.h"
+
+constexpr int GROUPS = 2;  // of cells at a time: one alone would leave the processor waiting for results
+constexpr int NUM_COLUMNS = GROUPS * NUM_DIRECTIONS;
 
 struct Answer {
     Lanes mean, std;  // [m]
 };
 
-inline Answer predict(const Weights& weights, const Map& map, const Squares& of_row, const Cells& cells) {
+// What the answer at LANES cells is made of. Heights [m] count from the mean of those around each cell.
+struct Scene {
     Surroundings around;
-    look_around(map, cells, around);
-    Lanes upper_bound, is_bounded;
-    for (int l = 0; l < LANES; l++) {
-        const int place = cells.row[l] * map.W + cells.column[l];
-        is_bounded[l] = map.layers.bounded[place];
-        upper_bound[l] = is_bounded[l] ? map.layers.upper_bound[place] : 0;
+    Lanes has_any, is_bounded, reach, nearest;
+    Lanes base, low, high, bound;  // `base`, that mean itself, is absolute
+    Lanes candidates[NUM_CANDIDATES][NUM_DIRECTIONS], exists[NUM_CANDIDATES][NUM_DIRECTIONS];
+    Lanes squares[NUM_RADII], has_square[NUM_RADII];
+};
+
+// Write the features of each direction into columns from `first` on, and the heights that it proposes.
+inline void view(Scene& scene, const Lanes* near, const Lanes* distance, const Lanes* height,
+                 Lanes (*features)[NUM_COLUMNS], int first) {
+    const Surroundings& around = scene.around;
+    Lanes across;
+    for (int d = 0; d < NUM_DIRECTIONS; d++) {
+        const int o = d ^ 1;
+        const Lanes known = around.known[d], both = known * around.known[o];
+        if (d < o) across = both / larger(distance[d] + distance[o], all(1e-6f));
+        const Lanes share = distance[o] * across;
+        const Lanes step = (height[o] - height[d]) * both;
+        scene.candidates[0][d] = height[d], scene.exists[0][d] = known;
+        scene.candidates[1][d] = height[d] + (1 - share) * step, scene.exists[1][d] = both;
+        const Lanes values[] = {known, near[d], log(1 + distance[d] * (1 / NEAR_STEP)), squash(height[d], SQUASH),
+                                squash(height[d] - scene.low, SQUASH) * known, both, share, squash(step, SQUASH)};
+        for (int k = 0; k < 8; k++) features[k][first + d] = values[k];
+        for (int r = 0; r < NUM_REACHES; r++) {
+            const Lanes slope = clamp(around.slope[r][d], -STEEPEST, STEEPEST);
+            scene.candidates[2 + r][d] = height[d] + slope * distance[d];
+            scene.exists[2 + r][d] = around.has_slope[r][d];
+            features[8 + r][first + d] = around.has_slope[r][d], features[8 + NUM_REACHES + r][first + d] = slope;
+        }
     }
+}
+
+// Fill the scene of group g, and write the features of its directions and of its cells.
+inline void look(const Map& map, const Squares& of_rows, const Cells& cells, int g, Scene& scene,
+                 Lanes (*views)[NUM_COLUMNS], Lanes (*features)[GROUPS]) {
+    Surroundings& around = scene.around;
+    look_around(map, cells, around);
+    const Flags in_map = cells.row * map.W + cells.column, has_bound = gather(map.layers.bounded, in_map) > 0;
+    const Lanes upper_bound = pick(has_bound, gather(map.layers.upper_bound, in_map), all(0));
+    scene.is_bounded = one_if(has_bound);
 
     // Heights from the mean of those around each cell, in which nearer ones count more.
     Lanes has_any{}, lowest = all(NOWHERE), reach = all(NOWHERE);
@@ -41,104 +77,96 @@ inline Answer predict(const Weights& weights, const Map& map, const Squares& of_
         high = larger(high, pick(around.known[d] > 0, height[d], all(-NOWHERE)));
     }
     high = pick(has_any > 0, high, all(0));
-    const Lanes bound = (upper_bound - lowest - mean) * is_bounded;
-    auto read = [&](const std::vector<float>& values) { return cells.read(values.data(), cells.column); };
-    Lanes squares[NUM_RADII], has_square[NUM_RADII];
+    scene.has_any = has_any, scene.reach = reach, scene.nearest = nearest;
+    scene.base = lowest + mean, scene.low = low, scene.high = high;
+    scene.bound = (upper_bound - lowest - mean) * scene.is_bounded;
+    const Flags place = of_rows.index(cells.row, cells.column);
+    auto read = [&](const std::vector<float>& values) { return cells.read(values.data(), place); };
     for (int r = 0; r < NUM_RADII; r++) {
-        has_square[r] = one_if(read(of_row.known[r]) > 0);
-        for (int l = 0; l < LANES; l++)
-            squares[r][l] = float(map.level + of_row.mean[r][cells.column[l]] - double(lowest[l]) - double(mean[l]));
-        squares[r] *= has_square[r];
+        scene.has_square[r] = one_if(read(of_rows.known[r]) > 0);
+        scene.squares[r] = (read(of_rows.mean[r]) + map.above(lowest) - mean) * scene.has_square[r];
     }
+    view(scene, near, distance, height, views, g * NUM_DIRECTIONS);
 
-    // What each direction proposes and what the network makes of it.
-    Lanes candidates[NUM_CANDIDATES][NUM_DIRECTIONS], exists[NUM_CANDIDATES][NUM_DIRECTIONS];
-    Lanes views[NUM_DIRECTIONS][VIEWS], pooled[NUM_POOLED], across;
-    for (int d = 0; d < NUM_DIRECTIONS; d++) {
-        const int o = d ^ 1;
-        const Lanes known = around.known[d], both = known * around.known[o];
-        if (d < o) across = both / larger(distance[d] + distance[o], all(1e-6f));
-        const Lanes share = distance[o] * across;
-        const Lanes step = (height[o] - height[d]) * both;
-        candidates[0][d] = height[d], exists[0][d] = known;
-        candidates[1][d] = height[d] + (1 - share) * step, exists[1][d] = both;
-        Lanes features[NUM_VIEW] = {known, near[d], log(1 + distance[d] * (1 / NEAR_STEP)), squash(height[d], SQUASH),
-                                    squash(height[d] - low, SQUASH) * known, both, share, squash(step, SQUASH)};
-        for (int r = 0; r < NUM_REACHES; r++) {
-            const Lanes slope = clamp(around.slope[r][d], -STEEPEST, STEEPEST);
-            candidates[2 + r][d] = height[d] + slope * distance[d], exists[2 + r][d] = around.has_slope[r][d];
-            features[8 + r] = around.has_slope[r][d], features[8 + NUM_REACHES + r] = slope;
-        }
-        Lanes channels[VIEWS];
-        affine<VIEWS, NUM_VIEW>(weights.view, weights.view_bias, features, channels);
-        relu<VIEWS>(channels);
-        affine<VIEWS, VIEWS>(weights.view_inner, weights.view_inner_bias, channels, views[d]);
-        relu<VIEWS>(views[d]);
-        for (int k = 0; k < VIEWS; k++) {
-            pooled[k] = d ? pooled[k] + views[d][k] : views[d][k];
-            pooled[VIEWS + k] = d ? larger(pooled[VIEWS + k], views[d][k]) : views[d][k];
-        }
-    }
-    for (int k = 0; k < VIEWS; k++) pooled[k] *= 1.0f / NUM_DIRECTIONS;
-
-    // What it knows of the cell.
     Lanes num_known{};
     for (const Lanes& known : around.known) num_known += known;
-    Lanes* cell = pooled + 2 * VIEWS;
-    const Lanes usual = all(float(map.resolution) / USUAL);
+    const Lanes usual = all(float(map.resolution) / USUAL), bound = scene.bound, is_bounded = scene.is_bounded;
     for (Lanes value : {squash(high - low, SQUASH), squash(low, SQUASH), is_bounded,
-                        squash(bound - low, SQUASH) * is_bounded, squash(bound, SQUASH), log(1 + nearest * (1 / NEAR_STEP)),
-                        log(usual), num_known * (1.0f / NUM_DIRECTIONS)})
-        *cell++ = value;
-    write_features(of_row, squares, read, cell);
-    Lanes outer[CELLS], inner[CELLS], told[VIEWS], of_cell[NUM_CANDIDATES];
-    affine<CELLS, NUM_POOLED>(weights.cell, weights.cell_bias, pooled, outer);
-    relu<CELLS>(outer);
-    affine<CELLS, CELLS>(weights.cell_inner, weights.cell_inner_bias, outer, inner);
-    relu<CELLS>(inner);
-    affine<VIEWS, CELLS>(weights.to_view, weights.to_view_bias, inner, told);
-    affine<NUM_CANDIDATES, CELLS>(weights.vote_cell, weights.vote_bias, inner, of_cell);
+                        squash(bound - low, SQUASH) * is_bounded, squash(bound, SQUASH),
+                        log(1 + nearest * (1 / NEAR_STEP)), log(usual), num_known * (1.0f / NUM_DIRECTIONS)})
+        (*features++)[g] = value;
+    write_features(of_rows, scene.squares, read, features, g);
+}
 
-    // The votes.
-    Lanes votes[NUM_CANDIDATES][NUM_DIRECTIONS], of_squares[NUM_RADII], most = all(NO_VOTE);
-    for (int d = 0; d < NUM_DIRECTIONS; d++) {
-        Lanes channels[VIEWS], voted[NUM_CANDIDATES];
-        for (int k = 0; k < VIEWS; k++) channels[k] = larger(views[d][k] + told[k], all(0));
-        for (int v = 0; v < NUM_CANDIDATES; v++) voted[v] = of_cell[v];
-        affine<NUM_CANDIDATES, VIEWS>(weights.vote, nullptr, channels, voted);
-        for (int v = 0; v < NUM_CANDIDATES; v++) {
-            votes[v][d] = pick(exists[v][d] > 0, voted[v], all(NO_VOTE));
+// The mean of the candidates, each counting by its vote, and the spread around it; `correction` and `factor` on them.
+inline Answer answer(const Weights& weights, const Scene& scene, Lanes (*votes)[NUM_DIRECTIONS], Lanes* of_squares,
+                     Lanes correction, Lanes factor) {
+    Lanes most = all(NO_VOTE), voters{}, answer{}, spread{};
+    for (int v = 0; v < NUM_CANDIDATES; v++)
+        for (int d = 0; d < NUM_DIRECTIONS; d++) {
+            votes[v][d] = pick(scene.exists[v][d] > 0, votes[v][d], all(NO_VOTE));
             most = larger(most, votes[v][d]);
         }
-    }
-    affine<NUM_RADII, CELLS>(weights.vote_square, weights.vote_square_bias, inner, of_squares);
     for (int r = 0; r < NUM_RADII; r++) {
-        of_squares[r] = pick(has_square[r] > 0, of_squares[r], all(NO_VOTE));
+        of_squares[r] = pick(scene.has_square[r] > 0, of_squares[r], all(NO_VOTE));
         most = larger(most, of_squares[r]);
     }
-    Lanes voters{}, answer{}, spread{};
     auto count = [&](Lanes vote, Lanes candidate) {
         const Lanes share = exp(vote - most);
         voters += share, answer += share * candidate;
         return share;
     };
     for (int v = 0; v < NUM_CANDIDATES; v++)
-        for (int d = 0; d < NUM_DIRECTIONS; d++) votes[v][d] = count(votes[v][d], candidates[v][d]);
-    for (int r = 0; r < NUM_RADII; r++) of_squares[r] = count(of_squares[r], squares[r]);
+        for (int d = 0; d < NUM_DIRECTIONS; d++) votes[v][d] = count(votes[v][d], scene.candidates[v][d]);
+    for (int r = 0; r < NUM_RADII; r++) of_squares[r] = count(of_squares[r], scene.squares[r]);
     const Lanes per_voter = 1 / voters;
     answer *= per_voter;
     auto deviate = [&](Lanes share, Lanes candidate) { spread += share * (candidate - answer) * (candidate - answer); };
     for (int v = 0; v < NUM_CANDIDATES; v++)
-        for (int d = 0; d < NUM_DIRECTIONS; d++) deviate(votes[v][d], candidates[v][d]);
-    for (int r = 0; r < NUM_RADII; r++) deviate(of_squares[r], squares[r]);
+        for (int d = 0; d < NUM_DIRECTIONS; d++) deviate(votes[v][d], scene.candidates[v][d]);
+    for (int r = 0; r < NUM_RADII; r++) deviate(of_squares[r], scene.squares[r]);
     spread = spread * per_voter + NO_SPREAD * NO_SPREAD;
 
-    Lanes last[2];  // correction and factor on the spread
-    affine<2, CELLS>(weights.answer, weights.answer_bias, inner, last);
-    answer = pick(has_any > 0, answer + tanh(last[0]) * (high - low + MARGIN), all(0));
-    answer = pick(is_bounded > 0, smaller(answer, bound), answer);
-    const Lanes log_std = 0.5f * log(spread) + clamp(last[1], -LARGEST_LOG, LARGEST_LOG) + weights.calibration[0];
-    const Lanes fade = reach * reach / (reach * reach + FADE * FADE);
+    answer = pick(scene.has_any > 0, answer + tanh(correction) * (scene.high - scene.low + MARGIN), all(0));
+    answer = pick(scene.is_bounded > 0, smaller(answer, scene.bound), answer);
+    const Lanes log_std = 0.5f * log(spread) + clamp(factor, -LARGEST_LOG, LARGEST_LOG) + weights.calibration[0];
+    const Lanes fade = scene.reach * scene.reach / (scene.reach * scene.reach + FADE * FADE);
     const Lanes log_faded = (1 - fade) * log_std + fade * weights.prior[0];
-    return {lowest + mean + answer, exp(pick(has_any > 0, log_faded, all(weights.prior[0])))};
+    return {scene.base + answer, exp(pick(scene.has_any > 0, log_faded, all(weights.prior[0])))};
+}
+
+// The answers at some groups of cells.
+inline void predict(const Weights& weights, const Map& map, const Squares& of_rows, const Cells* cells,
+                    Answer* answers) {
+    Scene scenes[GROUPS];
+    Lanes features[NUM_VIEW][NUM_COLUMNS], channels[VIEWS][NUM_COLUMNS], views[VIEWS][NUM_COLUMNS];
+    Lanes pooled[NUM_POOLED][GROUPS], outer[CELLS][GROUPS], inner[CELLS][GROUPS], told[NUM_TOLD][GROUPS];
+    for (int g = 0; g < GROUPS; g++) look(map, of_rows, cells[g], g, scenes[g], features, pooled + 2 * VIEWS);
+    hidden<VIEWS, NUM_VIEW>(weights.view, weights.view_bias, features, channels);
+    hidden<VIEWS, VIEWS>(weights.view_inner, weights.view_inner_bias, channels, views);
+    for (int k = 0; k < VIEWS; k++)
+        for (int g = 0; g < GROUPS; g++) {
+            const Lanes* of_cell = views[k] + g * NUM_DIRECTIONS;
+            Lanes sum = of_cell[0], most = of_cell[0];
+            for (int d = 1; d < NUM_DIRECTIONS; d++) sum += of_cell[d], most = larger(most, of_cell[d]);
+            pooled[k][g] = sum * (1.0f / NUM_DIRECTIONS), pooled[VIEWS + k][g] = most;
+        }
+    hidden<CELLS, NUM_POOLED>(weights.cell, weights.cell_bias, pooled, outer);
+    hidden<CELLS, CELLS>(weights.cell_inner, weights.cell_inner_bias, outer, inner);
+    affine<NUM_TOLD, CELLS>(weights.told, weights.told_bias, inner, told);
+    Lanes votes[NUM_CANDIDATES][NUM_COLUMNS];
+    for (int g = 0; g < GROUPS; g++)
+        for (int c = g * NUM_DIRECTIONS; c < (g + 1) * NUM_DIRECTIONS; c++) {
+            for (int k = 0; k < VIEWS; k++) channels[k][c] = larger(views[k][c] + told[k][g], all(0));
+            for (int v = 0; v < NUM_CANDIDATES; v++) votes[v][c] = told[VIEWS + v][g];
+        }
+    affine<NUM_CANDIDATES, VIEWS>(weights.vote, nullptr, channels, votes);
+    for (int g = 0; g < GROUPS; g++) {
+        Lanes of_group[NUM_CANDIDATES][NUM_DIRECTIONS], of_squares[NUM_RADII];
+        for (int v = 0; v < NUM_CANDIDATES; v++)
+            for (int d = 0; d < NUM_DIRECTIONS; d++) of_group[v][d] = votes[v][g * NUM_DIRECTIONS + d];
+        for (int r = 0; r < NUM_RADII; r++) of_squares[r] = told[VIEWS + NUM_CANDIDATES + r][g];
+        const int last = VIEWS + NUM_CANDIDATES + NUM_RADII;
+        answers[g] = answer(weights, scenes[g], of_group, of_squares, told[last][g], told[last + 1][g]);
+    }
 }

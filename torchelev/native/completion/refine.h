@@ -1,10 +1,10 @@
 // The ground at measured cells: refine.py.
 #pragma once
 
-#include "map.h"
+#include "squares.h"
 
 // Refine the measured cells of a row; others become arbitrary.
-inline void refine(const Weights& weights, const Map& map, const Squares& of_row, int i) {
+inline void refine(const Weights& weights, const Map& map, const Squares& of_rows, int i) {
     const Lanes usual = log(all(float(map.resolution) / USUAL));
     for (int j = 0; j < map.W; j += LANES) {
         const int count = std::min(LANES, map.W - j), place = i * map.W + j;
@@ -27,23 +27,20 @@ inline void refine(const Weights& weights, const Map& map, const Squares& of_row
         const Lanes variance = pick(known, load(map.layers.variance + place, count), all(0));
         const Lanes age = pick(known, load(map.layers.age + place, count), all(0));
         const Lanes sigma = root(larger(variance, all(MIN_STD * MIN_STD)));
-        Lanes features[NUM_MEASURED] = {log(sigma), absolute(bend) / (absolute(bend) + sigma),
-                                        squash(rough, SMALL_STEP), squash(tilt, SQUASH), pairs * 0.25f,
-                                        log(1 + clamp(age, 0, LONG_AGO)), usual};
-        auto read = [&](const std::vector<float>& values) { return load(&values[j]); };
+        Lanes features[NUM_MEASURED][1] = {{log(sigma)}, {absolute(bend) / (absolute(bend) + sigma)},
+                                           {squash(rough, SMALL_STEP)}, {squash(tilt, SQUASH)}, {pairs * 0.25f},
+                                           {log(1 + clamp(age, 0, LONG_AGO))}, {usual}};
+        auto read = [&](const std::vector<float>& values) { return load(&values[of_rows.index(i, j)]); };
         Lanes squares[NUM_RADII];
-        for (int r = 0; r < NUM_RADII; r++) {
-            for (int l = 0; l < LANES; l++) squares[r][l] = float(map.level + of_row.mean[r][j + l] - double(height[l]));
-            squares[r] *= one_if(read(of_row.known[r]) > 0);
-        }
-        write_features(of_row, squares, read, features + NUM_CLOSE);
-        Lanes channels[MEASURED], answer[2];
-        affine<MEASURED, NUM_MEASURED>(weights.measured, weights.measured_bias, features, channels);
-        relu<MEASURED>(channels);
+        for (int r = 0; r < NUM_RADII; r++)
+            squares[r] = (read(of_rows.mean[r]) + map.above(height)) * one_if(read(of_rows.known[r]) > 0);
+        write_features(of_rows, squares, read, features + NUM_CLOSE, 0);
+        Lanes channels[MEASURED][1], answer[2][1];
+        hidden<MEASURED, NUM_MEASURED>(weights.measured, weights.measured_bias, features, channels);
         affine<2, MEASURED>(weights.measured_answer, weights.measured_answer_bias, channels, answer);
         const Lanes twice = 2 * sigma;
-        const Lanes extra = exp(2 * clamp(answer[1], -10, 2));
-        store(map.layers.mean + place, height + twice * tanh(sigmoid(answer[0]) * bend / twice), count);
+        const Lanes extra = exp(2 * clamp(answer[1][0], -10, 2));
+        store(map.layers.mean + place, height + twice * tanh(sigmoid(answer[0][0]) * bend / twice), count);
         store(map.layers.std + place, root(sigma * sigma + extra) * std::exp(weights.calibration[1]), count);
     }
 }

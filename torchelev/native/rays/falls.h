@@ -18,8 +18,6 @@ struct Layers {
     const uint8_t* validity;
 };
 
-inline Flags gather(const uint8_t* values, Flags index) { return gather_as<Flags>(values, index); }
-
 // The map of one environment, as its sensor sees it.
 class Ground {
     const Settings& settings;
