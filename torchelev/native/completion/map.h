@@ -30,7 +30,7 @@ struct Map {
     float level_rest;            // [m] what a float of it lacks
     std::vector<float> ground;   // (H + 2, stride) [m], UNKNOWN where it does not count
     std::vector<int16_t> steps;  // (8, H, W)
-    std::vector<double> sums;    // (7, H + 1, W + 1), over all cells before a corner
+    std::vector<double> sums;    // (H + 1, 7, W + 1), over all cells before a corner
 
     Map(int H, int W, double resolution)
         : H(H), W(W), stride(W + 2 + LANES), resolution(resolution), ground(size_t(H + 2) * stride, UNKNOWN),
@@ -84,7 +84,7 @@ struct Map {
             }
     }
 
-    size_t row_of_sums(int layer, int i) const { return (size_t(layer) * (H + 1) + i) * (W + 1); }
+    size_t row_of_sums(int layer, int i) const { return (size_t(i) * NUM_SUMS + layer) * (W + 1); }
 
     void sum_layers() {
         for (int i = 0; i < H; i++) {

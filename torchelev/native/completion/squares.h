@@ -8,7 +8,7 @@ struct Squares {
     int first, width;  // row; length of a row in these arrays, whose last numbers may lie beyond the map
     std::vector<float> known[NUM_RADII], bounded[NUM_RADII], step[NUM_RADII], std[NUM_RADII], skewness[NUM_RADII];
     std::vector<float> mean[NUM_RADII];
-    std::vector<double> band, sums;
+    std::vector<double> sums;
 
     template <class Numbers> Numbers index(Numbers i, Numbers j) const { return (i - first) * width + j; }
 
@@ -26,12 +26,14 @@ struct Squares {
     void describe_row(const Map& map, int i, int r, int at) {
         const int W = map.W, half = std::max(1, int(std::nearbyint(RADII[r] / map.resolution)));
         const int top = std::max(i - half, 0), bottom = std::min(i + half + 1, map.H);
-        band.assign(W + 2 * half + 1, 0);  // over its rows and all columns before; the map's sides are repeated
+        const int inside = std::max(W - half, 0);  // columns before it have a whole square to the right
         for (int k = 0; k < NUM_SUMS; k++) {
             const double *above = &map.sums[map.row_of_sums(k, top)], *below = &map.sums[map.row_of_sums(k, bottom)];
-            for (int j = 0; j <= W; j++) band[half + j] = below[j] - above[j];
-            std::fill(band.end() - half, band.end(), band[half + W]);
-            for (int j = 0; j < W; j++) sums[k * W + j] = band[j + 2 * half + 1] - band[j];
+            double* sum = &sums[k * W];
+            const double whole = below[W] - above[W];
+            for (int j = 0; j < inside; j++) sum[j] = below[j + half + 1] - above[j + half + 1];
+            for (int j = inside; j < W; j++) sum[j] = whole;
+            for (int j = half + 1; j < W; j++) sum[j] -= below[j - half] - above[j - half];
         }
         summarise(r, at, W, 1 / (double(2 * half + 1) * (2 * half + 1)));
         for (int j = at; j < at + width; j += LANES) {
