@@ -30,13 +30,15 @@ def by_tensors(net, layers, resolution):
     known=st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]),
     resolution=st.sampled_from([0.02, 0.05, 0.1]),
     threads=st.integers(1, 2),
+    altitude=st.sampled_from([0.0, 2.0**14]),
 )
-def test_every_cell_equals_that_of_the_tensors(seed, num_envs, H, W, known, resolution, threads):
+def test_every_cell_equals_that_of_the_tensors(seed, num_envs, H, W, known, resolution, threads, altitude):
     net, layers = random_net(seed, torch.float32), random_layers(seed, num_envs, H, W, known, torch.float32)
+    layers = layers._replace(elevation=layers.elevation + altitude, upper_bound=layers.upper_bound + altitude)
     expected = by_tensors(net, layers, resolution)
     torch.set_num_threads(threads)
     mean, std = native.complete(net.weights, layers, resolution)
-    torch.testing.assert_close(mean, expected.mean, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(mean, expected.mean, rtol=0, atol=1e-5 + 2 * altitude * torch.finfo(torch.float32).eps)
     torch.testing.assert_close(std, expected.std, rtol=1e-4, atol=0.0)
 
 
