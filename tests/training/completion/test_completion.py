@@ -180,7 +180,8 @@ def test_the_commands_train_evaluate_and_resume(tmp_path, monkeypatch):
     splits = {name: evaluation.Split(cfg, (0.08,)) for name, cfg in tiny.items()}
     monkeypatch.setattr(evaluation, "SPLITS", splits)
     out = tmp_path / "run"
-    common = ("--out", out, "--walks", 2, "--drives", 1, "--evaluation-walks", 1, "--jobs", 1, "--steps", 2)
+    drawn = ("--walks", 2, "--drives", 1, "--collages", 1, "--evaluation-walks", 1)
+    common = ("--out", out, *drawn, "--jobs", 1, "--steps", 2)
     done = invoke(training.main, *common)
     assert done.exit_code == 0 and "| held_out | 0.08 | unknown |" in done.output
     result = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
