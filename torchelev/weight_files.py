@@ -51,18 +51,20 @@ class WeightFormat(NamedTuple):
     def _read(self, path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         hint, where, train = f"write it with {self.save}", str(path), f"train weights: {self.train}"
         require(path.exists(), where, "must be a file of weights", "no file", train, FileNotFoundError)
+        require(not path.is_dir(), where, "must be a file of weights", "a folder", hint)
         try:
             found = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # the type depends on which byte is damaged
-            raise ValueError(message(where, "must be a file of weights", type(error).__name__, hint)) from error
+            refused = f"a file that torch.load refuses ({type(error).__name__})"
+            raise ValueError(message(where, "must be a file of weights", refused, hint)) from error
         actual = found.get("version") if isinstance(found, dict) else None
-        require(isinstance(actual, int), where, "must be a file of weights", "something else", hint)
+        require(isinstance(actual, int), where, "must be a file of weights", "a file of something else", hint)
         rule = f"must be of version {self.version}"
         require(actual == self.version, where, rule, actual, "train with this torchelev")
         config, state = found.get("config"), found.get("state_dict")
         fits = isinstance(config, dict) and isinstance(state, dict) and self.is_config(config)
         fits = fits and all(isinstance(value, Tensor) for value in state.values())
-        require(fits, where, "must be a file of weights", "other parts or types", hint)
+        require(fits, where, "must be a file of weights", "those of another network", hint)
         return config, state
 
 

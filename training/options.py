@@ -11,7 +11,7 @@ import click
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 jobs_option = click.option(
-    "--jobs", default=2, show_default=True, help="Number of parallel trainings, each on one core."
+    "--jobs", default=2, show_default=True, help="Number of parallel processes, each on one core."
 )
 paper_weights_option = click.option(
     "--paper-weights",

@@ -81,9 +81,9 @@ def main(
         if resume:
             trainer.resume(checkpoint)
         trainer.run(out)
-    net = trainer.net.eval()
-    net.save(out / "weights.pt")
-    result = evaluate({COMPLETED: learned(net)}, data, evaluation_walks, jobs)
+        net = trainer.net.eval()
+        net.save(out / "weights.pt")
+        result = evaluate({COMPLETED: learned(net)}, data, evaluation_walks, jobs)
     write_result(out / "result.json", {"training": trainer.settings, **result})
     click.echo(table(result))
     click.echo(f"Wrote weights.pt and result.json to {out}.")
