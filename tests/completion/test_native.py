@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.completion.test_net import apply, random_layers, random_net
@@ -31,9 +31,11 @@ def by_tensors(net, layers, resolution):
     resolution=st.sampled_from([0.02, 0.05, 0.1]),
     threads=st.integers(1, 2),
     altitude=st.sampled_from([0.0, 2.0**14]),
+    channels=st.sampled_from([(5, 7, 4), (8, 24, 8)]),
 )
-def test_every_cell_equals_that_of_the_tensors(seed, num_envs, H, W, known, resolution, threads, altitude):
-    net, layers = random_net(seed, torch.float32), random_layers(seed, num_envs, H, W, known, torch.float32)
+@example(0, 1, 40, 12, 0.5, 0.05, 1, 0.0, (5, 7, 4))  # cells of different rows whose columns are consecutive
+def test_every_cell_equals_that_of_the_tensors(seed, num_envs, H, W, known, resolution, threads, altitude, channels):
+    net, layers = random_net(seed, torch.float32, channels), random_layers(seed, num_envs, H, W, known, torch.float32)
     layers = layers._replace(elevation=layers.elevation + altitude, upper_bound=layers.upper_bound + altitude)
     expected = by_tensors(net, layers, resolution)
     torch.set_num_threads(threads)

@@ -15,10 +15,10 @@ from torchelev.weight_files import write_weights
 RESOLUTION = 0.08
 
 
-def random_net(seed=0, dtype=torch.float64):
+def random_net(seed=0, dtype=torch.float64, channels=(5, 7, 4)):
     """A network whose weights are all drawn at random, biases included."""
     torch.manual_seed(seed)
-    net = CompletionNet(view_channels=5, cell_channels=7, measured_channels=4)
+    net = CompletionNet(*channels)
     for value in net.parameters():
         torch.nn.init.normal_(value, std=0.4)
     return net.to(dtype).requires_grad_(False)

@@ -12,7 +12,6 @@
 constexpr int ROWS[] = {1, -1, 0, 0, 1, -1, 1, -1}, COLUMNS[] = {0, 0, 1, -1, 1, -1, -1, 1};
 constexpr float REACHES[] = {REACH_0, REACH_1};
 constexpr double RADII[] = {RADIUS_0, RADIUS_1};
-constexpr int16_t NONE = 32767;  // steps; maps are smaller
 constexpr int NUM_SUMS = 7;
 
 struct Layers {
@@ -34,7 +33,7 @@ struct Map {
 
     Map(int H, int W, double resolution)
         : H(H), W(W), stride(W + 2 + LANES), resolution(resolution), ground(size_t(H + 2) * stride, UNKNOWN),
-          steps(size_t(NUM_DIRECTIONS) * H * W, NONE), sums(size_t(NUM_SUMS) * (H + 1) * (W + 1)) {}
+          steps(size_t(NUM_DIRECTIONS) * H * W, 1), sums(size_t(NUM_SUMS) * (H + 1) * (W + 1)) {}
 
     void read(const Layers& its_layers) {
         layers = its_layers;
@@ -56,7 +55,8 @@ struct Map {
 
     int index(int i, int j) const { return (i + 1) * stride + j + 1; }
 
-    // The steps to the next known cell: one where the neighbour is known, else one more than the neighbour's.
+    // The steps to the next known cell, or off the map: one where the neighbour is known, else one more than its steps.
+    // Without branches, which would often be guessed wrong.
     void count_steps() {
         for (int d = 0; d < NUM_DIRECTIONS; d++)
             for (int k = 0; k < H; k++) {
@@ -65,21 +65,18 @@ struct Map {
                 int16_t* row = &steps[(size_t(d) * H + i) * W];
                 const uint8_t* is_known = layers.known + next * W;
                 if (ROWS[d] == 0) {
-                    int last = -NONE;  // in the order of n; without a branch, which would often be guessed wrong
+                    int last = -1;  // in the order of n
                     for (int n = 0; n < W; n++) {
                         const int j = COLUMNS[d] < 0 ? n : W - 1 - n;
-                        row[j] = int16_t(std::min(n - last, int(NONE)));
-                        last = std::max(last, is_known[j] * (n + NONE) - NONE);
+                        row[j] = int16_t(n - last);
+                        last = std::max(last, is_known[j] * (n + 1) - 1);
                     }
                 } else {
                     const int16_t* ahead = &steps[(size_t(d) * H + next) * W] + COLUMNS[d];
                     const int first = std::max(0, -COLUMNS[d]), last = W - std::max(0, COLUMNS[d]);
                     is_known += COLUMNS[d];
 #pragma GCC ivdep
-                    for (int j = first; j < last; j++) {
-                        const int16_t fewer = ahead[j] < NONE - 1 ? ahead[j] : int16_t(NONE - 1);
-                        row[j] = (fewer & int16_t(int16_t(is_known[j]) - 1)) + 1;
-                    }
+                    for (int j = first; j < last; j++) row[j] = int16_t(ahead[j] * (1 - is_known[j]) + 1);
                 }
             }
     }

@@ -32,8 +32,7 @@ inline void refine(const Weights& weights, const Map& map, const Squares& of_row
                                            {log(1 + clamp(age, 0, LONG_AGO))}, {usual}};
         auto read = [&](const std::vector<float>& values) { return load(&values[of_rows.index(i, j)]); };
         Lanes squares[NUM_RADII];
-        for (int r = 0; r < NUM_RADII; r++)
-            squares[r] = (read(of_rows.mean[r]) + map.above(height)) * one_if(read(of_rows.known[r]) > 0);
+        for (int r = 0; r < NUM_RADII; r++) squares[r] = read(of_rows.mean[r]) + map.above(height);
         write_features(of_rows, squares, read, features + NUM_CLOSE, 0);
         Lanes channels[MEASURED][1], answer[2][1];
         hidden<MEASURED, NUM_MEASURED>(weights.measured, weights.measured_bias, features, channels);

@@ -6,8 +6,8 @@
 // The squares around the cells of some rows, as the network sees them; mean heights count from the map's level [m].
 struct Squares {
     int first, width;  // row; length of a row in these arrays, whose last numbers may lie beyond the map
-    std::vector<float> known[NUM_RADII], bounded[NUM_RADII], step[NUM_RADII], std[NUM_RADII], skewness[NUM_RADII];
-    std::vector<float> mean[NUM_RADII];
+    std::vector<float> known[NUM_RADII], bounded[NUM_RADII], step[NUM_RADII], mean[NUM_RADII], std[NUM_RADII],
+        skewness[NUM_RADII];
     std::vector<double> sums;
 
     template <class Numbers> Numbers index(Numbers i, Numbers j) const { return (i - first) * width + j; }
