@@ -2,9 +2,8 @@
 
 #include <cstdint>
 
+#include "lower.h"
 #include "threads.h"
-
-inline float lower(float a, float b) { return a < b || a != a ? a : b; }
 
 // Write the running minimum of tables (B, R, P) from row `ranges` - 1 to the first, a thread for each column; the rows
 // from `ranges` on are blank.
