@@ -1,6 +1,7 @@
 """The comparison of fills: its trainings, its deployment, its table and its figure."""
 
 import dataclasses
+import functools
 import json
 
 import pytest
@@ -55,6 +56,7 @@ def test_trains_two_iterations_with_each_fill_and_deploys(tmp_path, monkeypatch)
     for module in (nav, experiment):
         monkeypatch.setattr(module, "task_config", small_task)
     monkeypatch.setattr(experiment, "evaluate", lambda *args, **_: nav.evaluate(*args[:3], episodes=4))
+    monkeypatch.setattr(experiment, "unknown_error", functools.partial(experiment.unknown_error, num_envs=4))
     for job in experiment._jobs(tmp_path, 1):
         options = {**job.arguments, "--iterations": 2, "--num-envs": 4, "--episodes": 4, "--out": job.folder}
         arguments = [str(part) for option in options.items() for part in option]
