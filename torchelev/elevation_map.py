@@ -86,6 +86,7 @@ class ElevationMap(ReadableMap):
         with torch.inference_mode(False):
             #: (B,) how often each environment was reset: what it told a site before does not count as its own
             self.register_buffer("num_resets", self.corner.new_zeros(self.num_envs), persistent=False)
+        self._num_bytes = sum(buffer.nbytes for buffer in self.buffers())
 
     # Updating -------------------------------------------------------------------------------------------------------
 
@@ -133,7 +134,7 @@ class ElevationMap(ReadableMap):
         self._history.add(inputs)
         self._derived.clear()
         if self.device.type == "cpu":
-            keep_freed_memory()
+            keep_freed_memory(self._num_bytes)
         weights = None if self._weights is None else self._weights.detached()
         run = compiled_update if self._compiled else update_in_place
         run = functools.partial(run, cfg=self._update_cfg, weights=weights)
