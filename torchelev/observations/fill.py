@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -11,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer, sample_layers
 from torchelev.observations.ground import continue_ground
@@ -47,8 +46,11 @@ def require_fill(name: str, fill: object, names: Sequence[str], clip: float | No
     """Refuse a fill that is neither one of `names` nor a number; inf needs a clip."""
     is_number = isinstance(fill, int | float) and not isinstance(fill, bool)
     is_name = isinstance(fill, str) and fill in names
-    hint = f"use {next(iter(difflib.get_close_matches(str(fill), names, 1)), 'ground')}"
-    require(is_number or is_name, name, f"must be a number or one of {', '.join(names)}", repr(fill), hint)
+    if not (is_number or is_name):
+        from difflib import get_close_matches  # which only this error needs
+
+        hint = f"use {next(iter(get_close_matches(str(fill), names, 1)), 'ground')}"
+        raise ValueError(message(name, f"must be a number or one of {', '.join(names)}", repr(fill), hint))
     if isinstance(fill, int | float):
         is_bounded = math.isfinite(fill) or (clip is not None and not math.isnan(fill))
         require(is_bounded, name, "must be finite without a clip", fill, "give metres, or clip")

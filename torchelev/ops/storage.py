@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 _TRIM_THRESHOLD = -1  # M_TRIM_THRESHOLD of glibc's malloc.h
-_kept_sizes = [0]
+_kept_sizes = [2**26]  # [bytes], in the order in which they were asked for
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
@@ -120,7 +120,7 @@ def keep_freed_memory(size: int = 0) -> None:
     which takes a quarter of the time.
     """
     torch.empty(2**25 - 2**16, dtype=torch.uint8, device="cpu")
-    if size > max(2**26, *_kept_sizes):
+    if size > max(_kept_sizes):
         _kept_sizes.append(size)
         with contextlib.suppress(AttributeError, OSError, TypeError):  # another allocator, or Windows
             ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, min(size, 2**31 - 1))

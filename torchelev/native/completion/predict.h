@@ -98,17 +98,19 @@ inline void look(const Map& map, const Squares& of_rows, const Cells& cells, int
     write_features(of_rows, scene.squares, read, features, g);
 }
 
-// The mean of the candidates, each counting by its vote, and the spread around it; `correction` and `factor` on them.
-inline Answer answer(const Weights& weights, const Scene& scene, Lanes (*votes)[NUM_DIRECTIONS], Lanes* of_squares,
-                     Lanes correction, Lanes factor) {
+// The answer at group g: the mean of the candidates, each counting by its vote, and the spread around it. `of_cell`
+// holds the votes for the squares, a correction of the mean and a factor on the spread.
+inline Answer answer(const Weights& weights, const Scene& scene, int g, const Lanes (*of_views)[NUM_COLUMNS],
+                     const Lanes (*of_cell)[GROUPS]) {
+    Lanes votes[NUM_CANDIDATES][NUM_DIRECTIONS], of_squares[NUM_RADII];
     Lanes most = all(NO_VOTE), voters{}, answer{}, spread{};
     for (int v = 0; v < NUM_CANDIDATES; v++)
         for (int d = 0; d < NUM_DIRECTIONS; d++) {
-            votes[v][d] = pick(scene.exists[v][d] > 0, votes[v][d], all(NO_VOTE));
+            votes[v][d] = pick(scene.exists[v][d] > 0, of_views[v][g * NUM_DIRECTIONS + d], all(NO_VOTE));
             most = larger(most, votes[v][d]);
         }
     for (int r = 0; r < NUM_RADII; r++) {
-        of_squares[r] = pick(scene.has_square[r] > 0, of_squares[r], all(NO_VOTE));
+        of_squares[r] = pick(scene.has_square[r] > 0, of_cell[r][g], all(NO_VOTE));
         most = larger(most, of_squares[r]);
     }
     auto count = [&](Lanes vote, Lanes candidate) {
@@ -127,6 +129,7 @@ inline Answer answer(const Weights& weights, const Scene& scene, Lanes (*votes)[
     for (int r = 0; r < NUM_RADII; r++) deviate(of_squares[r], scene.squares[r]);
     spread = spread * per_voter + NO_SPREAD * NO_SPREAD;
 
+    const Lanes correction = of_cell[NUM_RADII][g], factor = of_cell[NUM_RADII + 1][g];
     answer = pick(scene.has_any > 0, answer + tanh(correction) * (scene.high - scene.low + MARGIN), all(0));
     answer = pick(scene.is_bounded > 0, smaller(answer, scene.bound), answer);
     const Lanes log_std = 0.5f * log(spread) + clamp(factor, -LARGEST_LOG, LARGEST_LOG) + weights.calibration[0];
@@ -161,12 +164,6 @@ inline void predict(const Weights& weights, const Map& map, const Squares& of_ro
             for (int v = 0; v < NUM_CANDIDATES; v++) votes[v][c] = told[VIEWS + v][g];
         }
     affine<NUM_CANDIDATES, VIEWS>(weights.vote, nullptr, channels, votes);
-    for (int g = 0; g < GROUPS; g++) {
-        Lanes of_group[NUM_CANDIDATES][NUM_DIRECTIONS], of_squares[NUM_RADII];
-        for (int v = 0; v < NUM_CANDIDATES; v++)
-            for (int d = 0; d < NUM_DIRECTIONS; d++) of_group[v][d] = votes[v][g * NUM_DIRECTIONS + d];
-        for (int r = 0; r < NUM_RADII; r++) of_squares[r] = told[VIEWS + NUM_CANDIDATES + r][g];
-        const int last = VIEWS + NUM_CANDIDATES + NUM_RADII;
-        answers[g] = answer(weights, scenes[g], of_group, of_squares, told[last][g], told[last + 1][g]);
-    }
+    for (int g = 0; g < GROUPS; g++)
+        answers[g] = answer(weights, scenes[g], g, votes, told + VIEWS + NUM_CANDIDATES);
 }
