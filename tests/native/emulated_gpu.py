@@ -3,18 +3,24 @@
 A warp has one thread here: `tests/test_gpu.py` tests what threads share.
 """
 
+import contextlib
 import ctypes
 import functools
 import subprocess
 import tempfile
 from pathlib import Path
+from unittest.mock import patch
 
 from torchelev.native import kernels
 from torchelev.native.library import find_compiler
 
 GPU = """
 #include <cstdint>
+#include <cstring>
 #define __global__
+#define __shared__
+#define __syncthreads()
+int32_t memory[1 << 16];
 struct { int64_t x; } blockIdx, threadIdx, blockDim;
 constexpr int warpSize = 1;
 template <class T, class U> T atomicAdd(T* number, U value) {
@@ -22,6 +28,14 @@ template <class T, class U> T atomicAdd(T* number, U value) {
     *number += value;
     return before;
 }
+inline void atomicMin(int32_t* number, int32_t value) { *number = value < *number ? value : *number; }
+template <class T, class U> T bits_of(U value) {
+    T bits;
+    std::memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+inline int32_t __float_as_int(float value) { return bits_of<int32_t>(value); }
+inline float __int_as_float(int32_t value) { return bits_of<float>(value); }
 template <class T> T __shfl_xor_sync(unsigned, T value, int) { return value; }
 extern "C" void take_place(int64_t block, int64_t thread, int64_t size) {
     blockIdx.x = block, threadIdx.x = thread, blockDim.x = size;
@@ -41,6 +55,16 @@ def library(source):
         return ctypes.CDLL(str(built))
 
 
+def launch_blocks(source, kernel, blocks, memory, *arguments):
+    """Do what `kernels.launch_blocks` does, on tensors of the CPU, with one thread for each block."""
+    emulated = library(source)
+    assert memory <= 4 * 2**16
+    values = [kernels._argument(value) for value in arguments]
+    for block in range(blocks):
+        emulated.take_place(block, 0, 1)
+        getattr(emulated, kernel)(*values)
+
+
 def launch(source, kernel, rows, number, *arguments):
     """Do what `kernels.launch` does, on tensors of the CPU."""
     emulated = library(source)
@@ -49,3 +73,14 @@ def launch(source, kernel, rows, number, *arguments):
         for thread in range(kernels._BLOCK):
             emulated.take_place(block, thread, kernels._BLOCK)
             getattr(emulated, kernel)(*values)
+
+
+@contextlib.contextmanager
+def emulated_kernels(in_blocks):
+    """Emulate kernels; `in_blocks`: those whose blocks share memory, where there is a choice."""
+    with (
+        patch.object(kernels, "launch", launch),
+        patch.object(kernels, "launch_blocks", launch_blocks),
+        patch.object(kernels, "suits_blocks", lambda *_: in_blocks),
+    ):
+        yield

@@ -8,8 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.native.emulated_gpu import launch
-from torchelev.native import kernels
+from tests.native.emulated_gpu import emulated_kernels
 from torchelev.native.library import find_compiler
 from torchelev.ops import native, on_gpu
 from torchelev.ops.moving import moved
@@ -47,17 +46,23 @@ def test_polar_minimum(seed, num_envs, num_values, dtype, threads):
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
-@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(0, 40), st.sampled_from([[], [4, 2], [9, 5, 3, 1]]))
-def test_polar_minimum_by_a_kernel(seed, num_envs, num_values, widen):
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 3),
+    st.integers(0, 40),
+    st.sampled_from([[], [4, 2], [9, 5, 3, 1]]),
+    st.booleans(),
+)
+def test_polar_minimum_by_kernels(seed, num_envs, num_values, widen, in_blocks):
     generator = torch.Generator().manual_seed(seed)
     index = torch.randint(10 * 26, (num_envs, num_values), generator=generator)
     values = torch.randn(num_envs, num_values, generator=generator)
     expected = polar_minimum(index, values, 26, widen, 9, 9.0)
-    by_kernel = (
+    by_tensors, by_kernels = (
         patch.object(native, "polar_minimum", lambda *_: None),
-        patch.object(on_gpu, "can_scan", lambda *_: True),
+        patch.object(on_gpu, "can_tabulate", lambda *_: True),
     )
-    with by_kernel[0], by_kernel[1], patch.object(kernels, "launch", launch):
+    with by_tensors, by_kernels, emulated_kernels(in_blocks):
         assert torch.equal(polar_minimum(index, values, 26, widen, 9, 9.0), expected)
 
 

@@ -29,6 +29,9 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
         # What is read so often, or takes so many operations, is stored unasked. The usual limits, which other devices
         # keep, are so low that all sums over a window are stored.
         options |= {"realize_reads_threshold": 20, "realize_opcount_threshold": 120}
+    elif hasattr(config, "combo_kernels"):
+        # Kernels that need nothing of each other become one: half of them are shorter than a launch.
+        options["combo_kernels"] = True
     if hasattr(config.cpp, "enable_tiling_heuristics"):
         # The compiler gives up vectorisation on many gathers, which pays off in the loops over points.
         options["cpp.enable_tiling_heuristics"] = False

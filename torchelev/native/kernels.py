@@ -18,7 +18,9 @@ from torchelev.native.library import is_switched_off
 
 _SOURCES = Path(__file__).parent
 _STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: gpu/standard.h is all of them
-_BLOCK = 128  # threads
+_BLOCK, LARGE_BLOCK = 128, 512  # threads; of those that share memory
+_UNASKED_MEMORY = 48 * 2**10  # [bytes] that a block may have unasked
+_MEMORY_ATTRIBUTE = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
 _CAN_LAUNCH: dict[int, bool] = {}  # by device
 
 
@@ -54,20 +56,49 @@ def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) ->
     Raises:
         RuntimeError: if the source does not compile, or the driver refuses.
     """
-    if rows * number == 0:
+    _launch(source, kernel, rows * -(-number // _BLOCK), _BLOCK, 0, arguments)
+
+
+def launch_blocks(source: str, kernel: str, blocks: int, memory: int, *arguments: Any) -> None:
+    """Run a kernel on the current stream, in blocks whose threads share memory.
+
+    Args:
+        source: file in this folder.
+        kernel: function in that file.
+        blocks: number of blocks.
+        memory: how much memory the threads of a block share [bytes].
+        arguments: as for `launch`.
+
+    Raises:
+        RuntimeError: if the source does not compile, or the driver refuses.
+    """
+    _launch(source, kernel, blocks, LARGE_BLOCK, memory, arguments)
+
+
+def suits_blocks(device: int, blocks: int, memory: int) -> bool:
+    """Tell whether a GPU has that much memory for each block, and at least half of it would be busy."""
+    properties = torch.cuda.get_device_properties(device)
+    most = getattr(properties, "shared_memory_per_block_optin", _UNASKED_MEMORY)  # of torch's newer versions
+    return memory <= most and 2 * blocks >= properties.multi_processor_count
+
+
+def _launch(source: str, kernel: str, blocks: int, threads: int, memory: int, arguments: Sequence[Any]) -> None:
+    if blocks == 0:
         return
     values = [_argument(value) for value in arguments]
     addresses = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
     _bind_context()
-    blocks = rows * -(-number // _BLOCK)
     stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
     function = _function(source, kernel, torch.cuda.current_device())
-    _check(_driver().cuLaunchKernel(function, blocks, 1, 1, _BLOCK, 1, 1, 0, stream, addresses, None), kernel)
+    if memory > _UNASKED_MEMORY:
+        _check(_driver().cuFuncSetAttribute(function, _MEMORY_ATTRIBUTE, memory), kernel)
+    sizes = (blocks, 1, 1, threads, 1, 1, memory)
+    _check(_driver().cuLaunchKernel(function, *sizes, stream, addresses, None), kernel)
 
 
-def addresses_of(tensors: Sequence[Tensor]) -> ctypes.Structure:
+def addresses_of(tensors: Sequence[Tensor | None]) -> ctypes.Structure:
     """Return the addresses of tensors as a structure, which a kernel takes by value."""
-    return _pointers(len(tensors))(*(tensor.data_ptr() for tensor in tensors))
+    return _pointers(len(tensors))(*(None if tensor is None else tensor.data_ptr() for tensor in tensors))
 
 
 @functools.cache

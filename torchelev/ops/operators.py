@@ -146,10 +146,9 @@ def _polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int
     table = native.polar_minimum(index, values, rows, azimuths, widen, ranges, blank)
     if table is not None:
         return table
+    if on_gpu.can_tabulate(values, widen):
+        return on_gpu.polar_minimum(index, values, rows, azimuths, widen, ranges, blank)
     table = scatter.lowest(index, values, rows * azimuths, blank).unflatten(1, (rows, azimuths))
-    if on_gpu.can_scan(values, widen):
-        on_gpu.scan_and_widen(table, widen, ranges, blank)
-        return table
     table[:, ranges] = blank
     _scan(table, from_end=True)
     _widen(table, widen)
@@ -202,7 +201,7 @@ def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int]
     `widen` makes an entry of the first widen[w] ranges the minimum of twice as many azimuths, itself the first of
     them. Row `ranges` and what follows it, R being a multiple of 8, are blank, for what lies out of reach.
     """
-    if not _compiles_for_gpu(values) or on_gpu.can_scan(values, widen):
+    if not _compiles_for_gpu(values) or on_gpu.can_tabulate(values, widen):
         return _polar_minimum_with_gradient(index, values, azimuths, widen, ranges, blank)
     size = _table_rows(ranges)
     table = _lowest_per_cell(index, values, size * azimuths, blank).unflatten(1, (size, azimuths))

@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import random_poses, random_state, small_map
-from tests.native.emulated_gpu import launch
+from tests.native.emulated_gpu import emulated_kernels
 from tests.stages.fusion.test_fuse import CELLS, EDGES, FUSED, steps_and_outliers
 from torchelev import EdgeConfig, FusionConfig
-from torchelev.native import kernels
 from torchelev.native.library import find_compiler
 from torchelev.stages.fusion import fuse as stage
 from torchelev.stages.fusion import on_gpu
@@ -20,7 +19,7 @@ from torchelev.stages.fusion.native import can_update_hit, config_of, numbers
 from torchelev.state import map_layers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
-WAYS = ["C++", pytest.param("kernels", marks=needs_compiler)]
+WAYS = ["C++", *(pytest.param(way, marks=needs_compiler) for way in ("kernels", "kernels in blocks"))]
 CONFIGS = [
     FusionConfig(),
     FusionConfig(edges=None),
@@ -48,8 +47,8 @@ def fused(by, *scan):
     with (
         torch.no_grad(),
         patch.object(stage, "can_update_hit", lambda _: by == "C++"),
-        patch.object(stage, "can_update_on_gpu", lambda *_: by == "kernels"),
-        patch.object(kernels, "launch", launch),
+        patch.object(stage, "can_update_on_gpu", lambda *_: by.startswith("kernels")),
+        emulated_kernels(in_blocks=by.endswith("blocks")),
         patch.object(on_gpu, "_HEAVY_THREADS", 256),
     ):
         return stage.fuse(*scan)
@@ -88,7 +87,7 @@ def test_graphs_of_kernels_serve_any_number_of_maps():
 
     torch._dynamo.reset()
     compiled = torch.compile(stage.fuse, backend=backend, fullgraph=True)
-    with patch.object(stage, "can_update_hit", lambda _: False), patch.object(kernels, "launch", lambda *_: None):
+    with patch.object(stage, "can_update_hit", lambda _: False), emulated_kernels(True):
         with patch.object(stage, "can_update_on_gpu", lambda *_: True), torch.no_grad():
             for num_envs in range(2, 7):
                 state, m, grid = random_scan(0, num_envs, 1, 30, False)

@@ -83,7 +83,7 @@ struct Around {
 
     // Call `look(slot, di, dj)` for each of the eight neighbours that lie on the map.
     template <class Look> void each(int64_t slot, const Look& look) const {
-        const int64_t i = slot / columns, j = slot % columns;
+        const int32_t i = int32_t(slot) / int32_t(columns), j = int32_t(slot) % int32_t(columns);  // fast on a GPU
         for (int di = -1; di <= 1; di++)
             for (int dj = -1; dj <= 1; dj++) {
                 const bool exists = i + di >= 0 && i + di < rows && j + dj >= 0 && j + dj < columns;

@@ -20,26 +20,37 @@ struct Sorted {
     }
 };
 
+// The scan: points (B, 3, M), and what else they need to be made a `Point`.
+struct Hits {
+    const float *points, *noise, *shared, *origins;
+    const uint8_t* used;
+    const int64_t* slots;
+
+    // Point k of a row that has M of them, of S sensors.
+    Point get(int64_t row, int32_t k, int32_t M, int32_t S, const Settings& s) const {
+        const float* x = points + 3 * row * M + k;
+        const float xyz[3] = {x[0], x[M], x[2 * M]};
+        const int64_t hit = row * M + k, sensor = row * S + k / (M / S);
+        return make_point(xyz, origins + 3 * sensor, noise[hit], shared ? shared[hit] : 0.0f, s);
+    }
+};
+
 // Count the points of each cell, and number them.
-extern "C" __global__ void count_points(const uint8_t* used, const int64_t* slots, int32_t* counts, int32_t* numbers,
-                                        int64_t M, int64_t C) {
+extern "C" __global__ void count_points(Hits hits, int32_t* counts, int32_t* numbers, int64_t M, int64_t C) {
     const Place at = place(M);
     const int64_t k = at.row * M + at.k;
-    if (at.k < M && used[k]) numbers[k] = atomicAdd(&counts[at.row * C + slots[k]], 1);
+    if (at.k < M && hits.used[k]) numbers[k] = atomicAdd(&counts[at.row * C + hits.slots[k]], 1);
 }
 
 // Put each point beside those of its cell.
-extern "C" __global__ void sort_points(const float* points, const float* noise, const float* shared,
-                                       const float* origins, const uint8_t* used, const int64_t* slots,
-                                       const int32_t* numbers, Sorted sorted, Point* result, int64_t M, int64_t S,
-                                       int64_t C, Settings s) {
+extern "C" __global__ void sort_points(Hits hits, const int32_t* numbers, Sorted sorted, Point* result, int64_t M,
+                                       int64_t S, int64_t C, Settings s) {
     const Place at = place(M);
     const int64_t k = at.row * M + at.k;
-    if (at.k >= M || !used[k]) return;
-    const int64_t cell = at.row * C + slots[k], sensor = at.row * S + int32_t(at.k) / int32_t(M / S);
+    if (at.k >= M || !hits.used[k]) return;
+    const int64_t cell = at.row * C + hits.slots[k];
     const int32_t start = sorted.ends[cell] - sorted.counts[cell];
-    result[start + numbers[k]] =
-        make_point(points + 3 * k, origins + 3 * sensor, noise[k], shared ? shared[k] : 0.0f, s);
+    result[start + numbers[k]] = hits.get(at.row, int32_t(at.k), int32_t(M), int32_t(S), s);
 }
 
 // Average the points of each cell: (B, C) [m], NO_HEIGHT without points.
@@ -48,6 +59,36 @@ extern "C" __global__ void average_points(Sorted sorted, float* in_scan, int64_t
     if (at.k >= C) return;
     const int64_t cell = at.row * C + at.k;
     in_scan[cell] = sorted.counts[cell] ? mean_height(sorted.of(cell, 1)) : NO_HEIGHT;
+}
+
+// Count, sort and average the points of maps whose counts fit into a block's own memory. A block for each map.
+extern "C" __global__ void sort_in_block(Hits hits, int32_t* counts, int32_t* ends, Point* result, float* in_scan,
+                                         int64_t M, int64_t S, int64_t C, Settings s) {
+    const int64_t row = blockIdx.x, hit = row * M, cell = row * C;
+    const int32_t first = threadIdx.x, step = blockDim.x, share = (int32_t(C) + step - 1) / step;
+    const int32_t own = std::min(first * share, int32_t(C)), own_end = std::min(own + share, int32_t(C));
+    int32_t *next = block_memory(), *sums = next + C;  // (C,) where a cell's next point goes; (step,)
+    for (int32_t k = first; k < C; k += step) next[k] = 0;
+    __syncthreads();
+    for (int32_t k = first; k < M; k += step)
+        if (hits.used[hit + k]) atomicAdd(&next[hits.slots[hit + k]], 1);
+    __syncthreads();
+    int32_t before = 0;
+    for (int32_t k = own; k < own_end; k++) before += next[k];
+    before = sum_before(before, sums);
+    for (int32_t k = own; k < own_end; k++) {
+        const int32_t count = next[k];
+        next[k] = before, before += count;
+        counts[cell + k] = count, ends[cell + k] = int32_t(hit) + before;
+    }
+    __syncthreads();
+    for (int32_t k = first; k < M; k += step)
+        if (hits.used[hit + k])
+            result[hit + atomicAdd(&next[hits.slots[hit + k]], 1)] = hits.get(row, k, int32_t(M), int32_t(S), s);
+    __syncthreads();
+    const Sorted sorted{result, ends, counts};
+    for (int32_t k = first; k < C; k += step)
+        in_scan[cell + k] = counts[cell + k] ? mean_height(sorted.of(cell + k, 1)) : NO_HEIGHT;
 }
 
 // What all cells hold after the update, (B, C) each, and what became of the points, (B,) each.

@@ -22,13 +22,16 @@ struct Settings {
 };
 
 #ifdef __CUDACC__
-struct alignas(16) Point {  // which is read and written by 16 bytes
+struct alignas(16) Point {
+    float z, spread, weight, shared, ray_x, ray_y;  // see `ScanPoints`
+    int32_t passed, filler;  // of 32 bytes that a GPU writes whole: it reads what it writes in part
+};
 #else
 struct Point {
-#endif
     float z, spread, weight, shared, ray_x, ray_y;  // see `ScanPoints`
     bool passed;
 };
+#endif
 
 // Whether a ray passed over the middle of its cell before it hit: `passed_center`.
 inline bool passed_center(float x, float y, float ray_x, float ray_y, float resolution) {

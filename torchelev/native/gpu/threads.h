@@ -6,7 +6,7 @@ struct Place {
 };
 
 inline Place place(int64_t number) {
-    const unsigned blocks = unsigned((number + blockDim.x - 1) / blockDim.x);  // divisions of 64 bits are slow
+    const unsigned blocks = (unsigned(number) + blockDim.x - 1) / blockDim.x;  // divisions of 64 bits are slow
     const unsigned block = unsigned(blockIdx.x);
     return {block / blocks, int64_t(block % blocks) * blockDim.x + threadIdx.x};
 }
@@ -15,4 +15,23 @@ inline Place place(int64_t number) {
 inline void add_of_warp(int64_t* total, int32_t value) {
     for (int step = warpSize / 2; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffff, value, step);
     if (threadIdx.x % warpSize == 0 && value) atomicAdd(reinterpret_cast<unsigned long long*>(total), value);
+}
+
+// Memory that the threads of a block share: as much as the launch asks for.
+inline int32_t* block_memory() {
+    extern __shared__ int32_t memory[];
+    return memory;
+}
+
+// The sum of what a block's threads before this one bring; all must call it, with memory for a number of each.
+inline int32_t sum_before(int32_t value, int32_t* sums) {
+    const int32_t own = threadIdx.x;
+    sums[own] = value;
+    for (int32_t step = 1; step < blockDim.x; step *= 2) {
+        __syncthreads();
+        const int32_t other = own >= step ? sums[own - step] : 0;
+        __syncthreads();
+        sums[own] += other;
+    }
+    return sums[own] - value;
 }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import ctypes
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,18 +70,13 @@ def _update(
     """Return all layers (B, C), and the points used and ignored (B,)."""
     (B, M), C = slot.shape, layers[0].shape[1]
     own, layers = c_settings(config_of(tuple(settings)), resolution, has_rays), [layer.contiguous() for layer in layers]
-    points, noise, origin, inside, slot = (value.contiguous() for value in (points, noise, origin, inside, slot))
+    points, noise, origin, inside, slot = (
+        value.contiguous() for value in (points.transpose(1, 2), noise, origin, inside, slot)
+    )
     shared = None if shared is None else shared.contiguous()
     with torch.cuda.device_of(points):
-        counts = slot.new_zeros(B, C, dtype=torch.int32)
-        numbers_in_cell, in_scan = torch.empty_like(slot, dtype=torch.int32), torch.empty_like(layers[0])
-        kernels.launch(_SOURCE, "count_points", B, M, inside, slot, counts, numbers_in_cell, M, C)
-        ends = counts.flatten().cumsum(0, dtype=torch.int32)
-        gathered = torch.empty(B * M * _POINT_BYTES, dtype=torch.uint8, device=points.device)
-        cells = kernels.addresses_of([gathered, ends, counts])
-        scan = points, noise, shared, origin, inside, slot, numbers_in_cell
-        kernels.launch(_SOURCE, "sort_points", B, M, *scan, cells, gathered, M, origin.shape[1], C, own)
-        kernels.launch(_SOURCE, "average_points", B, C, cells, in_scan, C)
+        hits = kernels.addresses_of([points, noise, shared, origin, inside, slot])
+        cells, in_scan, *kept = _sort(hits, slot, layers[0], origin.shape[1], own)
         new = [torch.empty_like(layer) for layer in layers]
         tallies = [slot.new_zeros(B), slot.new_zeros(B)]
         heavy = slot.new_empty(B * M // _FEW, dtype=torch.int32), slot.new_zeros(1, dtype=torch.int32)
@@ -89,3 +85,31 @@ def _update(
         kernels.launch(_SOURCE, "update_cells", B, C, *update)
         kernels.launch(_SOURCE, "update_heavy_cells", 1, _HEAVY_THREADS, *update, _HEAVY_THREADS)
     return [*new, *tallies]
+
+
+class _Sorted(NamedTuple):
+    """The points of each cell, one after the other."""
+
+    cells: ctypes.Structure  #: `Sorted` of fusion.cu
+    in_scan: Tensor  #: (B, C) [m] their mean height
+    memory: tuple[Tensor, ...]  #: that `cells` points to
+
+
+def _sort(hits: ctypes.Structure, slot: Tensor, like: Tensor, sensors: int, settings: ctypes.Structure) -> _Sorted:
+    """Bring the points of each cell together."""
+    (B, M), C = slot.shape, like.shape[1]
+    gathered = slot.new_empty(B * M * _POINT_BYTES, dtype=torch.uint8)
+    in_scan = torch.empty_like(like)
+    memory = 4 * (C + kernels.LARGE_BLOCK)
+    if kernels.suits_blocks(like.get_device(), B, memory):
+        counts, ends = (slot.new_empty(B, C, dtype=torch.int32) for _ in range(2))
+        scan = hits, counts, ends, gathered, in_scan
+        kernels.launch_blocks(_SOURCE, "sort_in_block", B, memory, *scan, M, sensors, C, settings)
+        return _Sorted(kernels.addresses_of([gathered, ends, counts]), in_scan, (gathered, ends, counts))
+    counts, numbers_in_cell = slot.new_zeros(B, C, dtype=torch.int32), torch.empty_like(slot, dtype=torch.int32)
+    kernels.launch(_SOURCE, "count_points", B, M, hits, counts, numbers_in_cell, M, C)
+    ends = counts.flatten().cumsum(0, dtype=torch.int32)
+    cells = kernels.addresses_of([gathered, ends, counts])
+    kernels.launch(_SOURCE, "sort_points", B, M, hits, numbers_in_cell, cells, gathered, M, sensors, C, settings)
+    kernels.launch(_SOURCE, "average_points", B, C, cells, in_scan, C)
+    return _Sorted(cells, in_scan, (gathered, ends, counts))
