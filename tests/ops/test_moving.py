@@ -4,15 +4,11 @@ import os
 from unittest.mock import patch
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
-from tests.native.emulated_gpu import emulated_kernels
-from torchelev.native.library import find_compiler
-from torchelev.ops import on_gpu
 from torchelev.ops.moving import move_in_place
 
 SHIFTS = st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=3)
@@ -31,21 +27,6 @@ def test_move_in_place_agrees_with_the_reference(seed, shifts, H, W, with_native
     before, blanks = [layer.numpy().copy() for layer in layers], [1.0, -2.0, 0.0]
     with patch.dict(os.environ, {} if with_native else {"TORCHELEV_NATIVE": "0"}):
         move_in_place(layers, torch.tensor(shifts), blanks)
-    for layer, old, blank in zip(layers, before, blanks, strict=True):
-        for b, shift in enumerate(shifts):
-            np.testing.assert_array_equal(layer[b], reference.recenter(old[b], (0, 0), shift, blank))
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
-@given(st.integers(0, 10_000), SHIFTS, st.integers(1, 5), st.integers(1, 5))
-def test_kernels_move_in_place(seed, shifts, H, W):
-    rng = np.random.default_rng(seed)
-    numbers = rng.normal(size=(4, len(shifts), H, W))
-    layers = [torch.tensor(values, dtype=torch.float32) for values in numbers]
-    layers[1], layers[3] = layers[1] > 0, (layers[3] > 0).byte()
-    before, blanks = [layer.numpy().copy() for layer in layers], [1.0, 0.0, -2.0, 0.0]
-    with emulated_kernels(True), patch.object(on_gpu, "can_move", lambda _: True):
-        assert on_gpu.move_layers(layers, torch.tensor(shifts), blanks)
     for layer, old, blank in zip(layers, before, blanks, strict=True):
         for b, shift in enumerate(shifts):
             np.testing.assert_array_equal(layer[b], reference.recenter(old[b], (0, 0), shift, blank))

@@ -79,16 +79,18 @@ extern "C" __global__ void sort_in_block(Hits hits, int32_t* counts, int32_t* en
     for (int32_t k = own; k < own_end; k++) {
         const int32_t count = next[k];
         next[k] = before, before += count;
-        counts[cell + k] = count, ends[cell + k] = int32_t(hit) + before;
     }
     __syncthreads();
     for (int32_t k = first; k < M; k += step)
         if (hits.used[hit + k])
             result[hit + atomicAdd(&next[hits.slots[hit + k]], 1)] = hits.get(row, k, int32_t(M), int32_t(S), s);
     __syncthreads();
-    const Sorted sorted{result, ends, counts};
-    for (int32_t k = first; k < C; k += step)
-        in_scan[cell + k] = counts[cell + k] ? mean_height(sorted.of(cell + k, 1)) : NO_HEIGHT;
+    for (int32_t k = first; k < C; k += step) {  // `next` is now where each cell's points end
+        const int32_t begin = k ? next[k - 1] : 0, end = next[k];
+        const Points points{result + hit + begin, result + hit + end, float(end - begin), 1};
+        counts[cell + k] = end - begin, ends[cell + k] = int32_t(hit) + end;
+        in_scan[cell + k] = begin < end ? mean_height(points) : NO_HEIGHT;
+    }
 }
 
 // What all cells hold after the update, (B, C) each, and what became of the points, (B,) each.

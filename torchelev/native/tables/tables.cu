@@ -1,11 +1,13 @@
 // Polar tables on a GPU: `polar_minimum` in ops/operators.py.
 
+#include <algorithm>
 #include <cstdint>
 
 #include "lower.h"
 #include "threads.h"
 
 constexpr int LEVELS = 16;
+constexpr int TEAM = 128;  // threads that widen a row of a block's table
 
 struct Levels {
     int64_t rows[LEVELS];  // below which a level widens an entry; 0 after the last level
@@ -80,12 +82,11 @@ extern "C" __global__ void lowest_slopes(const int64_t* index, const float* valu
             lowest[place] = lower(lowest[place], lowest[place + width]);
     __syncthreads();
     float* own = table + blockIdx.x * R * P;
-    const int32_t parts = (width + warpSize - 1) / warpSize;  // of a row, a warp's each
-    for (int32_t n = first / warpSize; n < R * parts; n += step / warpSize) {
-        const int32_t row = n / parts, k = n % parts * warpSize + first % warpSize;
-        if (k >= width) continue;
+    const int32_t team = std::min(TEAM, step);
+    for (int32_t row = first / team; row < R; row += step / team) {
         const int32_t* entries = lowest + row * width;
-        own[row * width + k] =
-            row < ranges ? __int_as_float(ordered(lowest_of(entries, k, width, levels.span(row)))) : blank;
+        const int32_t span = levels.span(row);
+        for (int32_t k = first % team; k < width; k += team)
+            own[row * width + k] = row < ranges ? __int_as_float(ordered(lowest_of(entries, k, width, span))) : blank;
     }
 }
