@@ -16,7 +16,7 @@ from torchelev.stages.body import BodyConfig
 from torchelev.stages.compensate import DriftConfig
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.measure import ExclusionConfig, SensorConfig
-from torchelev.stages.overlap import OverlapConfig
+from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.stages.surface import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.state import MapState, Measurement, Statistics

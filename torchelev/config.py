@@ -16,7 +16,7 @@ from torchelev.stages.age import AgingConfig
 from torchelev.stages.compensate import DriftConfig
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.measure import SensorConfig
-from torchelev.stages.overlap import OverlapConfig
+from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.stages.surface import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig

@@ -1,6 +1,8 @@
 """Other floors near the robot."""
 
+import os
 from dataclasses import asdict
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,8 +13,10 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import nans, pose, random_state, seen_from, small_map
 from torchelev import OverlapConfig
-from torchelev.stages.overlap import clear_other_floors
+from torchelev.stages.overlap import clear as stage
+from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
+from torchelev.state import map_layers
 
 
 @given(
@@ -40,6 +44,36 @@ def test_agrees_with_the_reference(seed, radius, height, base_height, max_base_h
         np.testing.assert_array_equal(after.validity[b], validity)
         np.testing.assert_array_equal(after.bounded[b], bounded)
         assert after.statistics.cleared_other_floors[b] == cleared
+
+
+@pytest.mark.parametrize("with_native", [True, False])
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 3),
+    st.tuples(st.integers(1, 23), st.integers(1, 23)),
+    st.floats(0.1, 1.5),
+    st.floats(0.05, 0.8),
+    st.integers(1, 2),
+)
+def test_one_pass_agrees_with_tensors(with_native, seed, num_envs, cells, radius, height, threads):
+    torch.set_num_threads(threads)
+    rng = np.random.default_rng(seed)
+    emap = small_map(num_envs, cells)
+    T = torch.cat([pose((*rng.uniform(-2, 2, 2), rng.uniform(-0.3, 1.5))) for _ in range(num_envs)])
+    m = emap.measure(nans(num_envs), T, T, 0.1)
+    corner = recenter(emap.state, m, emap.cfg.grid).corner
+    state = random_state(rng, emap.cfg.grid, num_envs, known=rng.choice([0.1, 0.6, 1.0]))._replace(corner=corner)
+    state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
+    state = state._replace(time=state.time * torch.from_numpy(rng.random(state.time.shape) < rng.choice([0.5, 1.0])))
+    cfg = OverlapConfig(radius=radius, height=height, base_height=0.2, max_base_height=rng.uniform(0.2, 0.8))
+    with torch.no_grad(), patch.dict(os.environ, {} if with_native else {"TORCHELEV_NATIVE": "0"}):
+        with patch.object(stage, "has_one_pass", lambda _: True):
+            got = clear_other_floors(state, m, emap.cfg.grid, cfg)
+        with patch.object(stage, "has_one_pass", lambda _: False):
+            expected = clear_other_floors(state, m, emap.cfg.grid, cfg)
+    for name in ("validity", "bounded", "challenger_support"):
+        assert torch.equal(getattr(got, name), getattr(expected, name)), name
+    assert torch.equal(got.statistics.cleared_other_floors, expected.statistics.cleared_other_floors)
 
 
 def upstairs_map():

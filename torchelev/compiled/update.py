@@ -21,7 +21,7 @@ from torchelev.stages.age import age
 from torchelev.stages.compensate import compensate
 from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.measure import measure
-from torchelev.stages.overlap import clear_other_floors
+from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
 from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers

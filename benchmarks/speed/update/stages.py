@@ -20,8 +20,9 @@ from torchelev.compiled import compiler
 from torchelev.compiled.update import with_masks
 from torchelev.inputs.chunks import CPU_CELLS
 from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.stages import age, compensate, measure, overlap, recenter
+from torchelev.stages import age, compensate, measure, recenter
 from torchelev.stages.fusion import fuse
+from torchelev.stages.overlap import clear
 from torchelev.stages.visibility import clean_up
 from torchelev.state import MapState, Measurement, map_layers
 
@@ -51,7 +52,7 @@ def stages(seconds: float) -> dict[str, Any]:
         "drift compensation": lambda state, m: compensate.compensate(state, m, grid, cfg.drift, cfg.drift_gate),
         "height update": lambda state, m: fuse.fuse(state, m, grid, cfg.fusion, has_rays=True),
         "ray casting": lambda state, m: clean_up.clear_seen_through(state, m, grid, cfg.raycast),
-        "overlap clearance": lambda state, m: overlap.clear_other_floors(state, m, grid, cfg.overlap),
+        "overlap clearance": lambda state, m: clear.clear_other_floors(state, m, grid, cfg.overlap),
         "normals and traversability": lambda state, m: pipeline.rate_surface(state, cfg),
     }
     inputs = [(drive.emap.state, transform())]

@@ -3,41 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
-from torchelev.state import LAYERS, MapState, Measurement, tally
+from torchelev.stages.overlap.config import OverlapConfig
+from torchelev.stages.overlap.one_pass import READ, STANCE, Around, Cleared, has_one_pass, in_one_pass
+from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-STANCE = 0.5  # [m] half the size of the ground that a robot stands on
-
-
-@dataclass(frozen=True, kw_only=True)
-class OverlapConfig:
-    """What is near, what is another floor, and how high robots are."""
-
-    radius: float = 3.0  #: [m] horizontal distance from the base
-    height: float = 1.5  #: [m] difference from the robot's height
-    base_height: float = 0.6  #: [m] the robot's height is its base's, but no higher than this above its ground
-    max_base_height: float = 2.5  #: [m] ground farther below the base is not what the robot stands on
-
-    def __post_init__(self) -> None:
-        require(self.radius > 0, "overlap.radius", "must be positive", self.radius, "give metres, or overlap=None")
-        require(self.height > 0, "overlap.height", "must be positive", self.height, "give metres, or overlap=None")
-        low, high = self.base_height, self.max_base_height
-        require(low >= 0, "overlap.base_height", "must not be negative", low, "give metres; a legged robot's is 0.5")
-        rule, hint = "must be at least overlap.base_height", "give the highest base of your robots [m]"
-        require(high >= low, "overlap.max_base_height", rule, high, hint)
 
 
 class Floor(NamedTuple):
@@ -57,20 +37,43 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     """
     if m.base is None or cfg is None:
         return state
-    rows, columns = (middle(size, cfg.radius / grid.resolution) for size in (grid.height, grid.width))
-    part = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in LAYERS})
     x, y = center_offsets(state, m, grid)
-    x, y = x[:, rows] - m.base[:, 0, None, None], y[:, :, columns] - m.base[:, 1, None, None]
-    distance = (x.square() + y.square()).sqrt()
+    base = m.base[..., None, None]
+    around = Around(x - base[:, 0], y - base[:, 1], base[:, 2], near_part(grid, cfg))
+    left = (clear_in_one_pass if has_one_pass(state) else clear_by_tensors)(state, around, cfg)
+    support = left.challenger_support
+    state = state._replace(validity=left.validity, bounded=left.bounded, challenger_support=support)
+    return tally(state, cleared_other_floors=left.number)
+
+
+def near_part(grid: GridConfig, cfg: OverlapConfig) -> tuple[int, int, int, int]:
+    """Return the first and last but one row, and column, that may lie within the radius."""
+    rows, columns = (middle(size, cfg.radius / grid.resolution) for size in (grid.height, grid.width))
+    return rows.start, rows.stop, columns.start, columns.stop
+
+
+def clear_by_tensors(state: MapState, around: Around, cfg: OverlapConfig) -> Cleared:
+    """Return what is left of the cells, and how many were cleared."""
+    x, y, base, part = around
+    rows, columns = slice(*part[:2]), slice(*part[2:])
+    cells = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in READ})
+    distance = (x[:, rows].square() + y[:, :, columns].square()).sqrt()
     near = distance <= cfg.radius
-    base = m.base[:, 2, None, None]
-    height, hit = (part.elevation - base).detach(), part.validity & (part.time == 0)
-    floor = own_floor(ground_below(height, part.validity & near, hit & near, distance, cfg), cfg)
+    height, hit = (cells.elevation - base).detach(), cells.validity & (cells.time == 0)
+    floor = own_floor(ground_below(height, cells.validity & near, hit & near, distance, cfg), cfg)
     slope = torch.where(hit, distance * (cfg.height / cfg.radius), 0.0)
-    other = near & part.validity & is_outside(height, floor, slope)
-    other_bound = near & part.bounded & is_outside((part.upper_bound - base).detach(), floor, 0.0)
-    cleared = clear(part, other, other_bound)
-    return tally(put_back(state, cleared, rows, columns), cleared_other_floors=count(other))
+    other = near & cells.validity & is_outside(height, floor, slope)
+    other_bound = near & cells.bounded & is_outside((cells.upper_bound - base).detach(), floor, 0.0)
+    left = clear(cells, other, other_bound)
+    return Cleared(
+        validity=put_back(state.validity, left.validity, rows, columns),
+        bounded=put_back(state.bounded, left.bounded, rows, columns),
+        challenger_support=put_back(state.challenger_support, left.challenger_support, rows, columns),
+        number=count(other),
+    )
+
+
+clear_in_one_pass = in_one_pass(clear_by_tensors)
 
 
 def middle(size: int, radius: float) -> slice:
@@ -79,16 +82,12 @@ def middle(size: int, radius: float) -> slice:
     return slice(max(0, size // 2 - half), min(size, (size + 1) // 2 + half))
 
 
-def put_back(state: MapState, part: MapState, rows: slice, columns: slice) -> MapState:
-    """Return the state with what `clear` changes in some of its cells."""
-    layers: dict[str, Any] = {}
-    for name in ("validity", "bounded", "challenger_support"):
-        layer, new = getattr(state, name), getattr(part, name)
-        if new.shape != layer.shape:
-            strip = layer[:, rows].slice_scatter(new, 2, columns.start, columns.stop)
-            new = layer.slice_scatter(strip, 1, rows.start, rows.stop)
-        layers[name] = new
-    return state._replace(**layers)
+def put_back(layer: Tensor, part: Tensor, rows: slice, columns: slice) -> Tensor:
+    """Return a layer with some of its cells replaced."""
+    if part.shape == layer.shape:
+        return part
+    strip = layer[:, rows].slice_scatter(part, 2, columns.start, columns.stop)
+    return layer.slice_scatter(strip, 1, rows.start, rows.stop)
 
 
 @stored

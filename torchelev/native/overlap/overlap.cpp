@@ -1,0 +1,160 @@
+// Cells of other floors than the robot's: stages/overlap/clear.py.
+
+#include <algorithm>
+#include <cstdint>
+#include <limits>
+
+#include "../lanes.h"
+#include "../threads.h"
+
+namespace {
+
+constexpr float STANCE_SQUARE = STANCE * STANCE;
+
+// `OverlapConfig`, and which rows and columns may lie within the radius.
+struct Settings {
+    float radius, height, base_height, max_base_height;
+    int32_t first_row, end_row, first_column, end_column;
+};
+
+// Maps (B, H, W); masks are bytes. The last three are the results.
+struct Layers {
+    const float *elevation, *upper_bound, *time;
+    const uint8_t *validity, *bounded, *challenger_support;
+    uint8_t *new_validity, *new_bounded, *new_challenger_support;
+};
+
+// One map: its cells' places as seen from the base, and the base's height [m].
+struct Map {
+    const Layers& layers;
+    const Settings& s;
+    int64_t first;  // place of its first cell
+    int64_t columns;
+    const float *x, *y;
+    float z;
+
+    // Call `look(place, count, distance, near)` for vectors of cells some of which are near; `count` of them exist.
+    template <class Look> void each(const Look& look) const {
+        for (int64_t i = s.first_row; i < s.end_row; i++)
+            for (int64_t j = s.first_column; j < s.end_column; j += LANES) {
+                const int64_t place = first + i * columns + j;
+                const int count = int(std::min<int64_t>(LANES, s.end_column - j));
+                if (count == LANES)
+                    look_at(look, place, std::integral_constant<int, LANES>(), x[i], load(y + j));
+                else
+                    look_at(look, place, count, x[i], load(y + j, count));
+            }
+    }
+
+    template <class Count> Flags known(int64_t place, Count count) const {
+        return load_bytes(layers.validity + place, count) > 0;
+    }
+    template <class Count> Flags hit(int64_t place, Count count) const {
+        return load(layers.time + place, count) == 0;
+    }
+    template <class Count> Lanes height(int64_t place, Count count) const {
+        return load(layers.elevation + place, count) - z;
+    }
+
+  private:
+    template <class Look, class Count>
+    void look_at(const Look& look, int64_t place, Count count, float x, Lanes y) const {
+        const Lanes distance = root(x * x + y * y);
+        const Flags near = distance <= s.radius;
+        if (any(near)) look(place, count, distance, near);
+    }
+};
+
+// A weighted mean of heights.
+struct Mean {
+    Lanes weights{}, moments{};
+
+    void add(Flags cells, Lanes weight, Lanes height) {
+        weights += pick(cells, weight, all(0)), moments += pick(cells, weight * height, all(0));
+    }
+    float weight() const { return sum(weights); }
+    float value() const { return sum(moments) / std::max(weight(), 1e-12f); }
+
+  private:
+    static float sum(Lanes values) {
+        float total = 0;
+        for (int l = 0; l < LANES; l++) total += values[l];
+        return total;
+    }
+};
+
+// The height of the ground on which the robot stands [m], from the base's: `ground_below`.
+float ground_below(const Map& map) {
+    Mean of_all, of_known, of_hit;
+    map.each([&](int64_t place, auto count, Lanes distance, Flags near) {
+        const Lanes height = map.height(place, count), square = distance * distance + STANCE_SQUARE;
+        const Flags below = near & map.known(place, count) & (height <= 0);
+        if (!any(below)) return;
+        const Lanes weight = 1 / (square * square);
+        of_all.add(below, weight, height);
+        of_known.add(below & (height >= -map.s.max_base_height), weight, height);
+        of_hit.add(below & map.hit(place, count), weight, height);
+    });
+    const bool is_most = of_known.weight() > 0.5f * of_all.weight();
+    const bool is_level = of_hit.weight() == 0 || of_hit.value() <= of_known.value() + 0.5f * map.s.height;
+    return is_most && is_level ? of_known.value() : of_hit.value();
+}
+
+// The heights that belong to the robot's floor [m], from the base's: `own_floor`.
+struct Floor {
+    float lower, upper;
+
+    Floor(float ground, const Settings& s) {
+        const bool flies = ground < -s.max_base_height;
+        const float robot = flies ? 0.0f : std::min(ground + s.base_height, 0.0f);
+        lower = flies ? -std::numeric_limits<float>::infinity() : robot - s.height;
+        upper = std::max(robot + s.height, 0.0f);
+    }
+    Flags is_outside(Lanes height, Lanes allowance) const {
+        return (height < lower - allowance) | (height > upper + allowance);
+    }
+};
+
+// Clear the cells and bounds of other floors, and return the number of cells.
+int64_t clear(const Map& map, const Floor& floor) {
+    const Layers& l = map.layers;
+    const float slope = map.s.height / map.s.radius;
+    int64_t number = 0;
+    map.each([&](int64_t place, auto count, Lanes distance, Flags near) {
+        const Flags known = map.known(place, count), bounded = load_bytes(l.bounded + place, count) > 0;
+        const Lanes allowance = pick(known & map.hit(place, count), distance * slope, all(0));
+        const Flags other = near & known & floor.is_outside(map.height(place, count), allowance);
+        const Lanes bound = load(l.upper_bound + place, count) - map.z;
+        const Flags other_bound = other | (near & bounded & floor.is_outside(bound, all(0)));
+        if (!any(other_bound)) return;
+        const Flags support = load_bytes(l.challenger_support + place, count);
+        store_bytes(l.new_validity + place, -(known & ~other), count);
+        store_bytes(l.new_bounded + place, -(bounded & ~other_bound), count);
+        store_bytes(l.new_challenger_support + place, support & ~other, count);
+        number += count_set(other);
+    });
+    return number;
+}
+
+}  // namespace
+
+// What is left of maps (B, H, W) without other floors than their robots'. `x` (B, H) and `y` (B, W) are the cells'
+// places as seen from the bases, `z` (B) the bases' heights [m]; `numbers` (B) of the cells cleared.
+extern "C" int clear_other_floors(const float* x, const float* y, const float* z, const float* elevation,
+                                  const float* upper_bound, const float* time, const uint8_t* validity,
+                                  const uint8_t* bounded, const uint8_t* challenger_support, uint8_t* new_validity,
+                                  uint8_t* new_bounded, uint8_t* new_challenger_support, int64_t* numbers, int64_t B,
+                                  int64_t H, int64_t W, const Settings* settings, int num_threads) {
+    const Layers layers{elevation, upper_bound,        time,         validity,   bounded,
+                        challenger_support, new_validity, new_bounded, new_challenger_support};
+    const int64_t cells = H * W;
+    auto work = [&](int64_t b) {
+        const int64_t first = b * cells;
+        std::memcpy(new_validity + first, validity + first, cells);
+        std::memcpy(new_bounded + first, bounded + first, cells);
+        std::memcpy(new_challenger_support + first, challenger_support + first, cells);
+        const Map map{layers, *settings, first, W, x + b * H, y + b * W, z[b]};
+        numbers[b] = clear(map, Floor(ground_below(map), *settings));
+    };
+    return code_of([&] { for_each(int(B), num_threads, work); });
+}

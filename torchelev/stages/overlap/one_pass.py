@@ -1,0 +1,98 @@
+"""Other floors cleared in one pass of C++ (`torchelev/native/overlap`): the same as `clear_by_tensors`."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.native.library import load
+from torchelev.ops.define import operator
+from torchelev.ops.native import computes, run
+from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.stages.overlap.config import OverlapConfig
+from torchelev.state import MASKS, MapState, partial_state
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int, UInt8
+
+STANCE = 0.5  # [m] half the size of the ground that a robot stands on
+READ = ("elevation", "upper_bound", "time", "validity", "bounded", "challenger_support")  # in the order of C++
+_NUMBERS = ("radius", "height", "base_height", "max_base_height")  # of the config, in the order of C++
+_LIBRARY = "overlap/overlap.cpp", {"STANCE": f"{STANCE!r}f"}
+
+
+class Around(NamedTuple):
+    """Where the cells lie, as seen from the robots' bases."""
+
+    x: Float[Tensor, "B H 1"]  #: [m] from the base to the cells' centres
+    y: Float[Tensor, "B 1 W"]  #: [m] from the base to the cells' centres
+    base: Float[Tensor, "B 1 1"]  #: [m] height of the base
+    part: tuple[int, int, int, int]  #: first and last but one row, and column, that may lie within the radius
+
+
+class Cleared(NamedTuple):
+    """What is left of the cells."""
+
+    validity: Bool[Tensor, "B H W"]  #: see `MapState`
+    bounded: Bool[Tensor, "B H W"]  #: see `MapState`
+    challenger_support: UInt8[Tensor, "B H W"]  #: see `MapState`
+    number: Int[Tensor, "B"]  #: of cells whose heights were cleared
+
+
+Clear = Callable[[MapState, Around, OverlapConfig], Cleared]
+
+
+class _Settings(ctypes.Structure):
+    """`Settings` of overlap.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_float) for name in _NUMBERS),
+        *((name, ctypes.c_int32) for name in ("first_row", "end_row", "first_column", "end_column")),
+    )
+
+
+def has_one_pass(state: MapState) -> bool:
+    """Tell whether what `in_one_pass` returns may run: it computes float32 on a CPU, and has no gradient."""
+    return computes(state.elevation) and not torch.is_grad_enabled()
+
+
+def in_one_pass(twin: Clear) -> Clear:
+    """Return a function that does what its twin does, and calls it where C++ cannot be built."""
+
+    @operator(
+        "clear_other_floors(Tensor x, Tensor y, Tensor base, int[] part, Tensor[] layers, float[] settings) "
+        "-> Tensor[]",
+        _fake,
+    )
+    def clear_layers(
+        x: Tensor, y: Tensor, base: Tensor, part: list[int], layers: list[Tensor], settings: list[float]
+    ) -> list[Tensor]:
+        library = load(*_LIBRARY)
+        if library is None or layers[0].numel() == 0:
+            masks = {name: as_mask(layer) for name, layer in zip(READ, layers, strict=True) if name in MASKS}
+            state = partial_state(**(dict(zip(READ, layers, strict=True)) | masks))
+            cfg = OverlapConfig(**dict(zip(_NUMBERS, settings, strict=True)))
+            left = twin(state, Around(x, y, base, (part[0], part[1], part[2], part[3])), cfg)
+            return [as_bytes(left.validity), as_bytes(left.bounded), left.challenger_support, left.number]
+        cleared = _fake(x, y, base, part, layers)
+        own = _Settings(*settings, *part)
+        run(library.clear_other_floors, [x, y, base, *layers, *cleared], *layers[0].shape, ctypes.byref(own))
+        return cleared
+
+    def clear(state: MapState, around: Around, cfg: OverlapConfig) -> Cleared:
+        layers = [as_bytes(getattr(state, name)) if name in MASKS else getattr(state, name) for name in READ]
+        x, y, base, part = around
+        settings = [float(getattr(cfg, name)) for name in _NUMBERS]
+        validity, bounded, support, number = clear_layers(x, y, base, list(part), layers, settings)
+        return Cleared(as_mask(validity), as_mask(bounded), support, number)
+
+    return clear
+
+
+def _fake(x: Tensor, y: Tensor, base: Tensor, part: list[int], layers: list[Tensor], *_: object) -> list[Tensor]:
+    new = [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in layers[3:]]
+    return [*new, x.new_empty(x.shape[0], dtype=torch.int64)]
