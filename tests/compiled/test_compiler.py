@@ -10,7 +10,15 @@ from torch._inductor.codegen.cpp import CppScheduling
 from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
 from torch._inductor.utils import run_and_get_code
 
-from torchelev.compiled.compiler import KERNEL_ARGUMENTS, announced_compilation, choose_bytes_as_integers, compiled
+from torchelev.compiled.compiler import (
+    KERNEL_ARGUMENTS,
+    announced_compilation,
+    choose_bytes_as_integers,
+    compiled,
+    pass_bytes_on,
+)
+from torchelev.ops.moving import move_in_place
+from torchelev.ops.storage import as_bytes, as_mask
 
 pytestmark = pytest.mark.compiles
 
@@ -69,3 +77,28 @@ def test_bytes_are_chosen_as_integers_in_graphs_that_the_cache_accepts():
     nodes = [node for node in graphs[0].graph.nodes if node.op.startswith("call")]
     assert all(n.meta["example_value"].dtype == torch.int32 for n in nodes if n.target is torch.where)
     assert all("example_value" in node.meta for node in nodes)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_bytes_are_passed_on_unless_they_change_meanwhile(moves):
+    graphs = []
+
+    def keep(graph, _):
+        pass_bytes_on(graph)
+        graphs.append(graph)
+        return graph.forward
+
+    def copy(stored, other, shift):
+        mask = as_mask(stored)
+        if moves:
+            move_in_place([stored], shift, [0.0])
+        other.copy_(as_bytes(mask))
+        stored.copy_(as_bytes(~mask))
+        return as_bytes(mask & (other > 0))
+
+    torch._dynamo.reset()
+    stored, other = torch.tensor([[[1, 0, 0, 1]]]).byte(), torch.zeros(1, 1, 4).byte()
+    result = torch.compile(copy, backend=keep)(stored, other, torch.tensor([[0, 1]]))
+    assert other.tolist() == [[[1, 0, 0, 1]]] and stored.tolist() == [[[0, 1, 1, 0]]] and torch.equal(result, other)
+    (target, source) = next(n.args for n in graphs[0].graph.nodes if n.target == "copy_")
+    assert (source.op == "placeholder") == (not moves)

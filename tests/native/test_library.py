@@ -157,7 +157,7 @@ def test_every_library_builds_for_narrower_vectors(narrow):
     for source in sorted(SOURCES.rglob("*.cpp")):
         if source.parent.name == "completion":  # whose sizes are given at build time
             continue
-        defines = [f"-D{name}=1e4f" for name in ("NO_RAY", "NOWHERE", "NO_FALL", "MIN_DET", "MIN_TRACE")]
+        defines = [f"-D{name}=1e4f" for name in ("NO_RAY", "NOWHERE", "NO_FALL", "MIN_DET", "MIN_TRACE", "STANCE")]
         command = [*library.find_compiler(), *library._FLAGS, *narrow.split(), *defines, "-fsyntax-only", str(source)]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, f"{source.name}: {done.stderr[:2000]}"

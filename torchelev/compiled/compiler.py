@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import operator
 import pickle
 import re
 import sys
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 KERNEL_ARGUMENTS = 16  # measured: 12 to 24 do as well
-PATCHES = 1  # version of the patches of the compiler below, which its cache does not see: raise it with each change
+PATCHES = 2  # version of the patches of the compiler below, which its cache does not see: raise it with each change
 
 
 def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., Any]:
@@ -39,6 +40,7 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
     # shapes and addresses of all that in every update takes time.
     options |= {name: False for name in ("size_asserts", "alignment_asserts") if hasattr(config, name)}
     choose_bytes_as_integers(graph)
+    pass_bytes_on(graph)
     cache = torch.compiler.config
     tag = cache.patch(cache_key_tag=f"{cache.cache_key_tag}torchelev {PATCHES}")  # type: ignore[attr-defined]
     with short_kernels(), fast_mask_loads(), tag:
@@ -59,6 +61,40 @@ def choose_bytes_as_integers(graph: torch.fx.GraphModule) -> None:
             node.replace_all_uses_with(_converted(chosen, torch.uint8))
         graph.graph.erase_node(node)
     graph.recompile()
+
+
+def pass_bytes_on(graph: torch.fx.GraphModule) -> None:
+    """Let bytes that become a mask, and bytes again, stay as they are: operators take and return masks as bytes."""
+    places = {node: place for place, node in enumerate(graph.graph.nodes)}
+    for node in graph.graph.find_nodes(op="call_method", target="to"):
+        source = _bytes_of_mask(node)
+        if source is None:
+            continue
+        last = max((places[user] for user in node.users), default=0)
+        if not any(_writes(user, source) and places[user] < last for user in source.users):
+            node.replace_all_uses_with(source)
+    graph.recompile()
+
+
+def _writes(node: torch.fx.Node, value: torch.fx.Node) -> bool:
+    """Tell whether a node may write into a value that it is given."""
+    if node.op == "call_method":
+        return str(node.target).endswith("_") and node.args[0] is value
+    schema = getattr(node.target, "_schema", None)
+    return schema is not None and bool(schema.is_mutable)
+
+
+def _bytes_of_mask(node: torch.fx.Node) -> torch.fx.Node | None:
+    """Return the bytes that `as_bytes` makes again, if `node` is its last step and a mask of `as_mask` is its input."""
+    steps: list[Any] = [node]
+    for target, value in (("to", torch.uint8), ("to", torch.int32), (operator.gt, 0), ("to", torch.int32)):
+        step = steps[-1]
+        if not isinstance(step, torch.fx.Node) or step.target != target or step.args[1:] != (value,):
+            return None
+        steps.append(step.args[0])
+    source = steps[-1]
+    is_bytes = isinstance(source, torch.fx.Node) and source.meta["example_value"].dtype == torch.uint8
+    return source if is_bytes else None
 
 
 def _converted(node: torch.fx.Node, dtype: torch.dtype) -> torch.fx.Node:
