@@ -12,8 +12,17 @@ from tests.robot_body.bodies import random_body
 from tests.site.helpers import known_cells, robots
 from torchelev import BodyConfig, CompletionNet, ElevationMap, HeightScan, MapImage, SensorConfig
 from torchelev.completion.surroundings import count_steps
+from torchelev.native import kernels
 from torchelev.ops import operators
 from torchelev.site import SiteMap
+
+in_blocks = pytest.mark.parametrize("in_blocks", [False, True])  # by kernels whose blocks share memory
+
+
+@pytest.fixture
+def _kernels(monkeypatch, in_blocks):
+    monkeypatch.setattr(kernels, "suits_blocks", lambda *_: in_blocks)
+
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 OPERATORS = [
@@ -117,9 +126,11 @@ def drive(emap, updates=4, seed=0):
 
 
 @needs_gpu
-@pytest.mark.parametrize("compiled", [False, True])
-def test_gpu_gives_the_same_map(compiled):
-    on_cpu, on_gpu = (ElevationMap(small_config((40, 40), 0.05), 3, device) for device in ("cpu", "cuda"))
+@in_blocks
+@pytest.mark.usefixtures("_kernels")
+@pytest.mark.parametrize("compiled, cells", [(False, 40), (False, 115), (True, 40)])  # 115: more than 48 kB in a block
+def test_gpu_gives_the_same_map(compiled, cells):
+    on_cpu, on_gpu = (ElevationMap(small_config((cells, cells), 0.05), 3, device) for device in ("cpu", "cuda"))
     if compiled:
         on_gpu.compile()
     drive(on_cpu), drive(on_gpu)
@@ -130,6 +141,8 @@ def test_gpu_gives_the_same_map(compiled):
 
 
 @needs_gpu
+@in_blocks
+@pytest.mark.usefixtures("_kernels")
 def test_gpu_gives_the_same_map_where_cells_hold_many_points():
     """A warp shares their points."""
     on_cpu, on_gpu = (ElevationMap(small_config((20, 20), 0.05), 3, device) for device in ("cpu", "cuda"))

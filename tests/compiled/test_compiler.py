@@ -79,26 +79,77 @@ def test_bytes_are_chosen_as_integers_in_graphs_that_the_cache_accepts():
     assert all("example_value" in node.meta for node in nodes)
 
 
-@pytest.mark.parametrize("moves", [False, True])
-def test_bytes_are_passed_on_unless_they_change_meanwhile(moves):
-    graphs = []
+def rewritten(function, *arguments):
+    """What a function's graph returns and makes of its arguments, before the pass and after; and the graph after it."""
+    graphs, results = [], []
+    for change in (lambda graph: None, pass_bytes_on):
 
-    def keep(graph, _):
-        pass_bytes_on(graph)
-        graphs.append(graph)
-        return graph.forward
+        def keep(graph, _, change=change):
+            change(graph)
+            graphs.append(graph)
+            return graph.forward
 
-    def copy(stored, other, shift):
+        torch._dynamo.reset()
+        values = [value.clone() for value in arguments]
+        results.append([torch.compile(function, backend=keep)(*values), *values])
+    return results, graphs[1]
+
+
+STORED, OTHER = torch.tensor([[[1, 0, 0, 1]]]).byte(), torch.zeros(1, 1, 4).byte()
+
+
+def test_bytes_are_passed_on():
+    def copy(stored, other):
         mask = as_mask(stored)
-        if moves:
-            move_in_place([stored], shift, [0.0])
         other.copy_(as_bytes(mask))
         stored.copy_(as_bytes(~mask))
         return as_bytes(mask & (other > 0))
 
-    torch._dynamo.reset()
-    stored, other = torch.tensor([[[1, 0, 0, 1]]]).byte(), torch.zeros(1, 1, 4).byte()
-    result = torch.compile(copy, backend=keep)(stored, other, torch.tensor([[0, 1]]))
-    assert other.tolist() == [[[1, 0, 0, 1]]] and stored.tolist() == [[[0, 1, 1, 0]]] and torch.equal(result, other)
-    (target, source) = next(n.args for n in graphs[0].graph.nodes if n.target == "copy_")
-    assert (source.op == "placeholder") == (not moves)
+    (usual, got), graph = rewritten(copy, STORED, OTHER)
+    assert all(map(torch.equal, got, usual))
+    assert next(n for n in graph.graph.nodes if n.target == "copy_").args[1].op == "placeholder"
+
+
+def _then(change):
+    def copy(stored, other):
+        mask = as_mask(stored)
+        change(stored)
+        other.copy_(as_bytes(mask))
+        return other + 1
+
+    return copy
+
+
+def _change_result(stored, other):
+    result = as_bytes(as_mask(stored))
+    result.zero_()
+    return result + 1
+
+
+def _set(stored):
+    stored[..., :1] = 0
+
+
+def _add(stored):
+    stored += 1
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        _then(lambda stored: move_in_place([stored], torch.tensor([[0, 1]]), [0.0])),
+        _then(lambda stored: stored.copy_(stored + 1)),
+        _then(lambda stored: stored.view(-1).zero_()),
+        _then(lambda stored: torch.bitwise_xor(stored, stored, out=stored)),
+        _then(_set),
+        _then(_add),
+        _change_result,
+        lambda stored, other: as_bytes(as_mask(stored)),  # which must be no argument
+        lambda stored, other: as_bytes((stored + 4).to(torch.int32) > 0) + 1,  # a count
+        lambda stored, other: as_bytes(as_mask(stored.float() * 0.5)) + 1,
+    ],
+)
+def test_bytes_are_not_passed_on_where_they_change_or_are_no_mask(function):
+    (usual, got), graph = rewritten(function, STORED, OTHER)
+    assert all(map(torch.equal, got, usual))
+    assert all(got[0] is not argument for argument in got[1:])

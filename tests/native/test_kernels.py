@@ -2,6 +2,7 @@
 
 import contextlib
 import warnings
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import pytest
@@ -58,6 +59,17 @@ def test_a_gpu_for_which_nothing_compiles_is_told(gpu):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not kernels.can_launch(0)
+
+
+@pytest.mark.parametrize(
+    "blocks, memory, suits", [(66, 1000, True), (65, 1000, False), (500, 200_000, True), (500, 240_000, False)]
+)
+def test_blocks_suit_a_gpu_with_enough_memory_whose_half_they_keep_busy(monkeypatch, blocks, memory, suits):
+    properties = SimpleNamespace(multi_processor_count=132, shared_memory_per_block_optin=232_448)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: properties)
+    assert kernels.suits_blocks(0, blocks, memory) == suits
+    del properties.shared_memory_per_block_optin
+    assert kernels.suits_blocks(0, blocks, memory) == (suits and memory <= 48 * 1024)
 
 
 def test_compiled_code_asks():

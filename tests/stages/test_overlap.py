@@ -46,11 +46,17 @@ def test_agrees_with_the_reference(seed, radius, height, base_height, max_base_h
         assert after.statistics.cleared_other_floors[b] == cleared
 
 
+def by(one_pass, *arguments):
+    """Clear in one pass of C++, or by tensors."""
+    with torch.no_grad(), patch.object(stage, "has_one_pass", lambda _: one_pass):
+        return clear_other_floors(*arguments)
+
+
 @pytest.mark.parametrize("with_native", [True, False])
 @given(
     st.integers(0, 10_000),
     st.integers(1, 3),
-    st.tuples(st.integers(1, 23), st.integers(1, 23)),
+    st.tuples(st.integers(1, 40), st.integers(1, 40)),
     st.floats(0.1, 1.5),
     st.floats(0.05, 0.8),
     st.integers(1, 2),
@@ -61,19 +67,32 @@ def test_one_pass_agrees_with_tensors(with_native, seed, num_envs, cells, radius
     emap = small_map(num_envs, cells)
     T = torch.cat([pose((*rng.uniform(-2, 2, 2), rng.uniform(-0.3, 1.5))) for _ in range(num_envs)])
     m = emap.measure(nans(num_envs), T, T, 0.1)
+    if rng.random() < 0.2:
+        m = m._replace(base=torch.where(torch.arange(num_envs)[:, None] == 0, torch.nan, m.base))
     corner = recenter(emap.state, m, emap.cfg.grid).corner
-    state = random_state(rng, emap.cfg.grid, num_envs, known=rng.choice([0.1, 0.6, 1.0]))._replace(corner=corner)
+    state = random_state(rng, emap.cfg.grid, num_envs, known=rng.choice([0.0, 0.1, 0.6, 1.0]))._replace(corner=corner)
     state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
     state = state._replace(time=state.time * torch.from_numpy(rng.random(state.time.shape) < rng.choice([0.5, 1.0])))
     cfg = OverlapConfig(radius=radius, height=height, base_height=0.2, max_base_height=rng.uniform(0.2, 0.8))
-    with torch.no_grad(), patch.dict(os.environ, {} if with_native else {"TORCHELEV_NATIVE": "0"}):
-        with patch.object(stage, "has_one_pass", lambda _: True):
-            got = clear_other_floors(state, m, emap.cfg.grid, cfg)
-        with patch.object(stage, "has_one_pass", lambda _: False):
-            expected = clear_other_floors(state, m, emap.cfg.grid, cfg)
+    with patch.dict(os.environ, {} if with_native else {"TORCHELEV_NATIVE": "0"}):
+        got, expected = (by(one_pass, state, m, emap.cfg.grid, cfg) for one_pass in (True, False))
     for name in ("validity", "bounded", "challenger_support"):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
     assert torch.equal(got.statistics.cleared_other_floors, expected.statistics.cleared_other_floors)
+
+
+@pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.05, 0.05), (0.25, 0.15)])
+@pytest.mark.parametrize("radius", [1.5, 3.0])
+def test_one_pass_takes_the_same_cells_for_near(x, y, radius):
+    """Cells on the circle itself, around a base at a corner or on the centre of a cell."""
+    emap = small_map(1, (100, 100))
+    T = pose((x, y, 9.0))
+    m, cfg = emap.measure(nans(1), T, T, 0.1), OverlapConfig(radius=radius, max_base_height=20.0)
+    corner = recenter(emap.state, m, emap.cfg.grid).corner
+    known = torch.ones_like(emap.validity)
+    state = emap.state._replace(corner=corner, validity=known, elevation=6.0 * (torch.rand(known.shape) > 0.5))
+    left = [by(one_pass, state, m, emap.cfg.grid, cfg).validity for one_pass in (True, False)]
+    assert torch.equal(*left) and not left[0].all()
 
 
 def upstairs_map():

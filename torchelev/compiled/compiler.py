@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
-import operator
 import pickle
 import re
 import sys
@@ -30,8 +29,8 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
         # What is read so often, or takes so many operations, is stored unasked. The usual limits, which other devices
         # keep, are so low that all sums over a window are stored.
         options |= {"realize_reads_threshold": 20, "realize_opcount_threshold": 120}
-    elif hasattr(config, "combo_kernels"):
-        # Kernels that need nothing of each other become one: half of them are shorter than a launch.
+    elif torch.__version__ >= "2.11" and any(value.is_cuda for value in inputs if isinstance(value, Tensor)):
+        # Kernels that need nothing of each other become one: half of them are shorter than a launch. Tried with 2.11.
         options["combo_kernels"] = True
     if hasattr(config.cpp, "enable_tiling_heuristics"):
         # The compiler gives up vectorisation on many gathers, which pays off in the loops over points.
@@ -64,37 +63,42 @@ def choose_bytes_as_integers(graph: torch.fx.GraphModule) -> None:
 
 
 def pass_bytes_on(graph: torch.fx.GraphModule) -> None:
-    """Let bytes that become a mask, and bytes again, stay as they are: operators take and return masks as bytes."""
+    """Let bytes that `as_mask` made a mask of, and `as_bytes` bytes again, stay as they are.
+
+    Operators take and return masks as bytes. The bytes must not change before they are used for the last time, and what
+    is returned must be no argument.
+    """
     places = {node: place for place, node in enumerate(graph.graph.nodes)}
     for node in graph.graph.find_nodes(op="call_method", target="to"):
         source = _bytes_of_mask(node)
         if source is None:
             continue
         last = max((places[user] for user in node.users), default=0)
-        if not any(_writes(user, source) and places[user] < last for user in source.users):
+        before = [user for user in source.users if places[user] < last]
+        if all(_reads(user, source) for user in before) and all(_reads(user, node) for user in node.users):
             node.replace_all_uses_with(source)
     graph.recompile()
 
 
-def _writes(node: torch.fx.Node, value: torch.fx.Node) -> bool:
-    """Tell whether a node may write into a value that it is given."""
-    if node.op == "call_method":
-        return str(node.target).endswith("_") and node.args[0] is value
-    schema = getattr(node.target, "_schema", None)
-    return schema is not None and bool(schema.is_mutable)
+def _reads(user: torch.fx.Node, value: torch.fx.Node) -> bool:
+    """Tell whether a node certainly does nothing with a value but read it: no writing, and no view of it."""
+    if user.op == "call_method":
+        return user.target == "to" or (user.target == "copy_" and user.args[0] is not value)
+    schema = getattr(user.target, "_schema", None)  # of operators; functions such as `setitem` have none
+    return schema is not None and not schema.is_mutable and all(r.alias_info is None for r in schema.returns)
 
 
 def _bytes_of_mask(node: torch.fx.Node) -> torch.fx.Node | None:
     """Return the bytes that `as_bytes` makes again, if `node` is its last step and a mask of `as_mask` is its input."""
     steps: list[Any] = [node]
-    for target, value in (("to", torch.uint8), ("to", torch.int32), (operator.gt, 0), ("to", torch.int32)):
+    for target, value in (("to", torch.uint8), ("to", torch.int32), ("gt", 0), ("to", torch.int32)):
         step = steps[-1]
         if not isinstance(step, torch.fx.Node) or step.target != target or step.args[1:] != (value,):
             return None
         steps.append(step.args[0])
     source = steps[-1]
-    is_bytes = isinstance(source, torch.fx.Node) and source.meta["example_value"].dtype == torch.uint8
-    return source if is_bytes else None
+    example = source.meta.get("example_value") if isinstance(source, torch.fx.Node) else None
+    return source if example is not None and example.dtype == torch.uint8 else None
 
 
 def _converted(node: torch.fx.Node, dtype: torch.dtype) -> torch.fx.Node:

@@ -77,9 +77,14 @@ def launch_blocks(source: str, kernel: str, blocks: int, memory: int, *arguments
 
 def suits_blocks(device: int, blocks: int, memory: int) -> bool:
     """Tell whether a GPU has that much memory for each block, and at least half of it would be busy."""
+    processors = torch.cuda.get_device_properties(device).multi_processor_count
+    return memory <= _block_memory(device) and 2 * blocks >= processors
+
+
+def _block_memory(device: int) -> int:
+    """Return how much memory the threads of a block may share [bytes], as far as torch tells."""
     properties = torch.cuda.get_device_properties(device)
-    most = getattr(properties, "shared_memory_per_block_optin", _UNASKED_MEMORY)  # of torch's newer versions
-    return memory <= most and 2 * blocks >= properties.multi_processor_count
+    return getattr(properties, "shared_memory_per_block_optin", _UNASKED_MEMORY)
 
 
 def _launch(source: str, kernel: str, blocks: int, threads: int, memory: int, arguments: Sequence[Any]) -> None:
@@ -90,8 +95,6 @@ def _launch(source: str, kernel: str, blocks: int, threads: int, memory: int, ar
     _bind_context()
     stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
     function = _function(source, kernel, torch.cuda.current_device())
-    if memory > _UNASKED_MEMORY:
-        _check(_driver().cuFuncSetAttribute(function, _MEMORY_ATTRIBUTE, memory), kernel)
     sizes = (blocks, 1, 1, threads, 1, 1, memory)
     _check(_driver().cuLaunchKernel(function, *sizes, stream, addresses, None), kernel)
 
@@ -158,6 +161,7 @@ def _function(source: str, kernel: str, device: int) -> ctypes.c_void_p:
     function = ctypes.c_void_p()
     module = _module(source, device)
     _check(_driver().cuModuleGetFunction(ctypes.byref(function), module, kernel.encode()), kernel)
+    _check(_driver().cuFuncSetAttribute(function, _MEMORY_ATTRIBUTE, _block_memory(device)), kernel)
     return function
 
 

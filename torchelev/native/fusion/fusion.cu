@@ -27,10 +27,10 @@ struct Hits {
     const int64_t* slots;
 
     // Point k of a row that has M of them, of S sensors.
-    Point get(int64_t row, int32_t k, int32_t M, int32_t S, const Settings& s) const {
+    Point get(int64_t row, int32_t k, int64_t M, int64_t S, const Settings& s) const {
         const float* x = points + 3 * row * M + k;
         const float xyz[3] = {x[0], x[M], x[2 * M]};
-        const int64_t hit = row * M + k, sensor = row * S + k / (M / S);
+        const int64_t hit = row * M + k, sensor = row * S + k / (int32_t(M) / int32_t(S));
         return make_point(xyz, origins + 3 * sensor, noise[hit], shared ? shared[hit] : 0.0f, s);
     }
 };
@@ -50,7 +50,7 @@ extern "C" __global__ void sort_points(Hits hits, const int32_t* numbers, Sorted
     if (at.k >= M || !hits.used[k]) return;
     const int64_t cell = at.row * C + hits.slots[k];
     const int32_t start = sorted.ends[cell] - sorted.counts[cell];
-    result[start + numbers[k]] = hits.get(at.row, int32_t(at.k), int32_t(M), int32_t(S), s);
+    result[start + numbers[k]] = hits.get(at.row, int32_t(at.k), M, S, s);
 }
 
 // Average the points of each cell: (B, C) [m], NO_HEIGHT without points.
@@ -83,7 +83,7 @@ extern "C" __global__ void sort_in_block(Hits hits, int32_t* counts, int32_t* en
     __syncthreads();
     for (int32_t k = first; k < M; k += step)
         if (hits.used[hit + k])
-            result[hit + atomicAdd(&next[hits.slots[hit + k]], 1)] = hits.get(row, k, int32_t(M), int32_t(S), s);
+            result[hit + atomicAdd(&next[hits.slots[hit + k]], 1)] = hits.get(row, k, M, S, s);
     __syncthreads();
     for (int32_t k = first; k < C; k += step) {  // `next` is now where each cell's points end
         const int32_t begin = k ? next[k - 1] : 0, end = next[k];

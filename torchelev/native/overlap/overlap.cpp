@@ -1,8 +1,15 @@
 // Cells of other floors than the robot's: stages/overlap/clear.py.
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same cells are near
+#else
+#pragma GCC optimize("fp-contract=off")
+#endif
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <limits>
+#include <type_traits>
 
 #include "../lanes.h"
 #include "../threads.h"
@@ -13,7 +20,7 @@ constexpr float STANCE_SQUARE = STANCE * STANCE;
 
 // `OverlapConfig`, and which rows and columns may lie within the radius.
 struct Settings {
-    float radius, height, base_height, max_base_height;
+    float radius_square, slope, height, base_height, max_base_height;
     int32_t first_row, end_row, first_column, end_column;
 };
 
@@ -33,7 +40,8 @@ struct Map {
     const float *x, *y;
     float z;
 
-    // Call `look(place, count, distance, near)` for vectors of cells some of which are near; `count` of them exist.
+    // Call `look(place, count, square, near)` for vectors of cells some of which are near; `count` of them exist, and
+    // `square` [m^2] is that of their distance.
     template <class Look> void each(const Look& look) const {
         for (int64_t i = s.first_row; i < s.end_row; i++)
             for (int64_t j = s.first_column; j < s.end_column; j += LANES) {
@@ -59,9 +67,9 @@ struct Map {
   private:
     template <class Look, class Count>
     void look_at(const Look& look, int64_t place, Count count, float x, Lanes y) const {
-        const Lanes distance = root(x * x + y * y);
-        const Flags near = distance <= s.radius;
-        if (any(near)) look(place, count, distance, near);
+        const Lanes square = x * x + y * y;
+        const Flags near = square <= s.radius_square;
+        if (any(near)) look(place, count, square, near);
     }
 };
 
@@ -86,11 +94,11 @@ struct Mean {
 // The height of the ground on which the robot stands [m], from the base's: `ground_below`.
 float ground_below(const Map& map) {
     Mean of_all, of_known, of_hit;
-    map.each([&](int64_t place, auto count, Lanes distance, Flags near) {
-        const Lanes height = map.height(place, count), square = distance * distance + STANCE_SQUARE;
+    map.each([&](int64_t place, auto count, Lanes square, Flags near) {
+        const Lanes height = map.height(place, count);
         const Flags below = near & map.known(place, count) & (height <= 0);
         if (!any(below)) return;
-        const Lanes weight = 1 / (square * square);
+        const Lanes spread = square + STANCE_SQUARE, weight = 1 / (spread * spread);
         of_all.add(below, weight, height);
         of_known.add(below & (height >= -map.s.max_base_height), weight, height);
         of_hit.add(below & map.hit(place, count), weight, height);
@@ -118,11 +126,10 @@ struct Floor {
 // Clear the cells and bounds of other floors, and return the number of cells.
 int64_t clear(const Map& map, const Floor& floor) {
     const Layers& l = map.layers;
-    const float slope = map.s.height / map.s.radius;
     int64_t number = 0;
-    map.each([&](int64_t place, auto count, Lanes distance, Flags near) {
+    map.each([&](int64_t place, auto count, Lanes square, Flags near) {
         const Flags known = map.known(place, count), bounded = load_bytes(l.bounded + place, count) > 0;
-        const Lanes allowance = pick(known & map.hit(place, count), distance * slope, all(0));
+        const Lanes allowance = pick(known & map.hit(place, count), root(square) * map.s.slope, all(0));
         const Flags other = near & known & floor.is_outside(map.height(place, count), allowance);
         const Lanes bound = load(l.upper_bound + place, count) - map.z;
         const Flags other_bound = other | (near & bounded & floor.is_outside(bound, all(0)));

@@ -74,7 +74,7 @@ extern "C" __global__ void lowest_slopes(const int64_t* index, const float* valu
     __syncthreads();
     for (int32_t n = first; n < N; n += step) {
         const int64_t place = index[ray + n];
-        if (place < number) atomicMin(&lowest[place], ordered(__float_as_int(values[ray + n])));
+        if (place >= 0 && place < number) atomicMin(&lowest[place], ordered(__float_as_int(values[ray + n])));
     }
     __syncthreads();
     for (int32_t k = first; k < width; k += step)

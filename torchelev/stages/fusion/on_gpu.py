@@ -76,7 +76,7 @@ def _update(
     shared = None if shared is None else shared.contiguous()
     with torch.cuda.device_of(points):
         hits = kernels.addresses_of([points, noise, shared, origin, inside, slot])
-        cells, in_scan, *kept = _sort(hits, slot, layers[0], origin.shape[1], own)
+        cells, in_scan, memory = _sort(hits, slot, layers[0], origin.shape[1], own)
         new = [torch.empty_like(layer) for layer in layers]
         tallies = [slot.new_zeros(B), slot.new_zeros(B)]
         heavy = slot.new_empty(B * M // _FEW, dtype=torch.int32), slot.new_zeros(1, dtype=torch.int32)
@@ -84,6 +84,7 @@ def _update(
         update = cells, in_scan, *maps, C // width, width, own
         kernels.launch(_SOURCE, "update_cells", B, C, *update)
         kernels.launch(_SOURCE, "update_heavy_cells", 1, _HEAVY_THREADS, *update, _HEAVY_THREADS)
+        del memory  # not before: `cells` holds nothing but its addresses
     return [*new, *tallies]
 
 

@@ -57,11 +57,11 @@ def clear_by_tensors(state: MapState, around: Around, cfg: OverlapConfig) -> Cle
     x, y, base, part = around
     rows, columns = slice(*part[:2]), slice(*part[2:])
     cells = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in READ})
-    distance = (x[:, rows].square() + y[:, :, columns].square()).sqrt()
-    near = distance <= cfg.radius
+    square = x[:, rows].square() + y[:, :, columns].square()  # [m^2] of the distance
+    near = square <= cfg.radius**2
     height, hit = (cells.elevation - base).detach(), cells.validity & (cells.time == 0)
-    floor = own_floor(ground_below(height, cells.validity & near, hit & near, distance, cfg), cfg)
-    slope = torch.where(hit, distance * (cfg.height / cfg.radius), 0.0)
+    floor = own_floor(ground_below(height, cells.validity & near, hit & near, square, cfg), cfg)
+    slope = torch.where(hit, square.sqrt() * (cfg.height / cfg.radius), 0.0)
     other = near & cells.validity & is_outside(height, floor, slope)
     other_bound = near & cells.bounded & is_outside((cells.upper_bound - base).detach(), floor, 0.0)
     left = clear(cells, other, other_bound)
@@ -101,16 +101,18 @@ def clear(state: MapState, cells: Bool[Tensor, "B H W"], bounds: Bool[Tensor, "B
 
 
 def ground_below(
-    height: Tensor, known: Bool[Tensor, "B H W"], hit: Bool[Tensor, "B H W"], distance: Tensor, cfg: OverlapConfig
+    height: Tensor, known: Bool[Tensor, "B H W"], hit: Bool[Tensor, "B H W"], square: Tensor, cfg: OverlapConfig
 ) -> Float[Tensor, "B 1 1"]:
     """Return the height of the ground on which the robot stands [m], from the base's; NaN-free, 0 where none is known.
+
+    `square` is that of the cells' distance d [m^2].
 
     The mean, weighted by 1 / (d^2 + STANCE^2)^2, of the known cells within `max_base_height` below the base. Or of the
     cells that this scan hit at any depth below it: where the former are the smaller part of what is below, and thus
     furniture or a wall, and where the latter are higher by half of `height`, and thus a bridge over what was known.
     """
     below = known & (height <= 0)
-    weight = torch.where(below, (distance.square() + STANCE**2).square().reciprocal(), 0.0)
+    weight = torch.where(below, (square + STANCE**2).square().reciprocal(), 0.0)
     within, of_known = weighted_mean(height, torch.where(height >= -cfg.max_base_height, weight, 0.0))
     seen, of_hit = weighted_mean(height, torch.where(hit, weight, 0.0))
     stands = (within > 0.5 * weight.sum((1, 2), keepdim=True)) & ((seen == 0) | (of_hit <= of_known + 0.5 * cfg.height))

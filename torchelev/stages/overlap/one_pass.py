@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 STANCE = 0.5  # [m] half the size of the ground that a robot stands on
 READ = ("elevation", "upper_bound", "time", "validity", "bounded", "challenger_support")  # in the order of C++
-_NUMBERS = ("radius", "height", "base_height", "max_base_height")  # of the config, in the order of C++
+_NUMBERS = ("radius", "height", "base_height", "max_base_height")  # of the config; those of C++ are made of them
 _LIBRARY = "overlap/overlap.cpp", {"STANCE": f"{STANCE!r}f"}
 
 
@@ -50,7 +50,7 @@ class _Settings(ctypes.Structure):
     """`Settings` of overlap.cpp."""
 
     _fields_ = (
-        *((name, ctypes.c_float) for name in _NUMBERS),
+        *((name, ctypes.c_float) for name in ("radius_square", "slope", *_NUMBERS[1:])),
         *((name, ctypes.c_int32) for name in ("first_row", "end_row", "first_column", "end_column")),
     )
 
@@ -79,7 +79,8 @@ def in_one_pass(twin: Clear) -> Clear:
             left = twin(state, Around(x, y, base, (part[0], part[1], part[2], part[3])), cfg)
             return [as_bytes(left.validity), as_bytes(left.bounded), left.challenger_support, left.number]
         cleared = _fake(x, y, base, part, layers)
-        own = _Settings(*settings, *part)
+        radius, height, *_ = settings
+        own = _Settings(radius**2, height / radius, *settings[1:], *part)
         run(library.clear_other_floors, [x, y, base, *layers, *cleared], *layers[0].shape, ctypes.byref(own))
         return cleared
 
