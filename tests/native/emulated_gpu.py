@@ -1,6 +1,6 @@
 """CUDA kernels on a CPU, thread after thread: each source is compiled as C++, with a GPU's names defined.
 
-A warp has one thread here: `tests/test_gpu.py` tests what threads share.
+A warp, and a block that shares memory, has one thread here: `tests/test_gpu.py` tests what threads share.
 """
 
 import contextlib
