@@ -10,13 +10,8 @@ from torch._inductor.codegen.cpp import CppScheduling
 from torch._inductor.cpu_vec_isa import VecAVX2, pick_vec_isa
 from torch._inductor.utils import run_and_get_code
 
-from torchelev.compiled.compiler import (
-    KERNEL_ARGUMENTS,
-    announced_compilation,
-    choose_bytes_as_integers,
-    compiled,
-    pass_bytes_on,
-)
+from torchelev.compiled.compiler import KERNEL_ARGUMENTS, announced_compilation, compiled
+from torchelev.compiled.mask_bytes import choose_bytes_as_integers, pass_bytes_on
 from torchelev.ops.moving import move_in_place
 from torchelev.ops.storage import as_bytes, as_mask
 

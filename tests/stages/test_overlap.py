@@ -19,6 +19,19 @@ from torchelev.stages.recenter import recenter
 from torchelev.state import map_layers
 
 
+def random_floors(rng, emap, known):
+    """Poses, a measurement without points, and a state some of whose cells were just hit."""
+    B, grid = emap.num_envs, emap.cfg.grid
+    T = torch.cat([pose((*rng.uniform(-2, 2, 2), rng.uniform(-0.3, 1.5))) for _ in range(B)])
+    m = emap.measure(nans(B), T, T, 0.1)
+    state = random_state(rng, grid, B, known=known)._replace(corner=recenter(emap.state, m, grid).corner)
+    return (
+        T,
+        m,
+        state._replace(time=state.time * torch.from_numpy(rng.random(state.time.shape) < rng.choice([0.5, 1.0]))),
+    )
+
+
 @given(
     st.integers(0, 10_000),
     st.floats(0.1, 0.8),
@@ -29,11 +42,8 @@ from torchelev.state import map_layers
 def test_agrees_with_the_reference(seed, radius, height, base_height, max_base_height):
     rng = np.random.default_rng(seed)
     emap = small_map(2, (7, 6), dtype=torch.float64)
-    T = torch.cat([pose((*rng.uniform(-2, 2, 2), rng.uniform(-0.3, 1.5))) for _ in range(2)])
-    m = emap.measure(nans(2), T, T, 0.1)
-    corner = recenter(emap.state, m, emap.cfg.grid).corner
-    state = random_state(rng, emap.cfg.grid, 2, known=rng.choice([0.1, 0.6, 1.0]))._replace(corner=corner)
-    state = state._replace(time=state.time * torch.from_numpy(rng.random(state.time.shape) < rng.choice([0.5, 1.0])))
+    T, m, state = random_floors(rng, emap, rng.choice([0.1, 0.6, 1.0]))
+    corner = state.corner
     cfg = OverlapConfig(radius=radius, height=height, base_height=base_height, max_base_height=max_base_height)
     after = clear_other_floors(state, m, emap.cfg.grid, cfg)
     for b in range(2):
@@ -65,14 +75,10 @@ def test_one_pass_agrees_with_tensors(with_native, seed, num_envs, cells, radius
     torch.set_num_threads(threads)
     rng = np.random.default_rng(seed)
     emap = small_map(num_envs, cells)
-    T = torch.cat([pose((*rng.uniform(-2, 2, 2), rng.uniform(-0.3, 1.5))) for _ in range(num_envs)])
-    m = emap.measure(nans(num_envs), T, T, 0.1)
+    _, m, state = random_floors(rng, emap, rng.choice([0.0, 0.1, 0.6, 1.0]))
     if rng.random() < 0.2:
         m = m._replace(base=torch.where(torch.arange(num_envs)[:, None] == 0, torch.nan, m.base))
-    corner = recenter(emap.state, m, emap.cfg.grid).corner
-    state = random_state(rng, emap.cfg.grid, num_envs, known=rng.choice([0.0, 0.1, 0.6, 1.0]))._replace(corner=corner)
     state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
-    state = state._replace(time=state.time * torch.from_numpy(rng.random(state.time.shape) < rng.choice([0.5, 1.0])))
     cfg = OverlapConfig(radius=radius, height=height, base_height=0.2, max_base_height=rng.uniform(0.2, 0.8))
     with patch.dict(os.environ, {} if with_native else {"TORCHELEV_NATIVE": "0"}):
         got, expected = (by(one_pass, state, m, emap.cfg.grid, cfg) for one_pass in (True, False))

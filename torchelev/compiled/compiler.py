@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.compiled.mask_bytes import choose_bytes_as_integers, pass_bytes_on
+
 KERNEL_ARGUMENTS = 16  # measured: 12 to 24 do as well
 PATCHES = 2  # version of the patches of the compiler below, which its cache does not see: raise it with each change
 
@@ -25,11 +27,12 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
     from torch._inductor import compile, config  # takes a second to import, which only compiling needs
 
     options: dict[str, Any] = {}
-    if all(value.device.type == "cpu" for value in inputs if isinstance(value, Tensor)):
+    devices = {value.device.type for value in inputs if isinstance(value, Tensor)}
+    if devices <= {"cpu"}:
         # What is read so often, or takes so many operations, is stored unasked. The usual limits, which other devices
         # keep, are so low that all sums over a window are stored.
         options |= {"realize_reads_threshold": 20, "realize_opcount_threshold": 120}
-    elif torch.__version__ >= "2.11" and any(value.is_cuda for value in inputs if isinstance(value, Tensor)):
+    elif "cuda" in devices and torch.__version__ >= "2.11":
         # Kernels that need nothing of each other become one: half of them are shorter than a launch. Tried with 2.11.
         options["combo_kernels"] = True
     if hasattr(config.cpp, "enable_tiling_heuristics"):
@@ -44,68 +47,6 @@ def inductor(graph: torch.fx.GraphModule, inputs: list[Any]) -> Callable[..., An
     tag = cache.patch(cache_key_tag=f"{cache.cache_key_tag}torchelev {PATCHES}")  # type: ignore[attr-defined]
     with short_kernels(), fast_mask_loads(), tag:
         return compile(graph, inputs, options)
-
-
-def choose_bytes_as_integers(graph: torch.fx.GraphModule) -> None:
-    """Let `torch.where` choose bytes as integers of 32 bits: of bytes alone the compiler makes no vectors."""
-    for node in graph.graph.find_nodes(op="call_function", target=torch.where):
-        result = node.meta.get("example_value")
-        if result is None or result.dtype != torch.uint8:
-            continue
-        with graph.graph.inserting_before(node):
-            mask, *values = node.args
-            values = [_converted(v, torch.int32) if isinstance(v, torch.fx.Node) else v for v in values]
-            chosen = graph.graph.call_function(torch.where, (mask, *values))
-            chosen.meta["example_value"] = result.to(torch.int32)
-            node.replace_all_uses_with(_converted(chosen, torch.uint8))
-        graph.graph.erase_node(node)
-    graph.recompile()
-
-
-def pass_bytes_on(graph: torch.fx.GraphModule) -> None:
-    """Let bytes that `as_mask` made a mask of, and `as_bytes` bytes again, stay as they are.
-
-    Operators take and return masks as bytes. The bytes must not change before they are used for the last time, and what
-    is returned must be no argument.
-    """
-    places = {node: place for place, node in enumerate(graph.graph.nodes)}
-    for node in graph.graph.find_nodes(op="call_method", target="to"):
-        source = _bytes_of_mask(node)
-        if source is None:
-            continue
-        last = max((places[user] for user in node.users), default=0)
-        before = [user for user in source.users if places[user] < last]
-        if all(_reads(user, source) for user in before) and all(_reads(user, node) for user in node.users):
-            node.replace_all_uses_with(source)
-    graph.recompile()
-
-
-def _reads(user: torch.fx.Node, value: torch.fx.Node) -> bool:
-    """Tell whether a node certainly does nothing with a value but read it: no writing, and no view of it."""
-    if user.op == "call_method":
-        return user.target == "to" or (user.target == "copy_" and user.args[0] is not value)
-    schema = getattr(user.target, "_schema", None)  # of operators; functions such as `setitem` have none
-    return schema is not None and not schema.is_mutable and all(r.alias_info is None for r in schema.returns)
-
-
-def _bytes_of_mask(node: torch.fx.Node) -> torch.fx.Node | None:
-    """Return the bytes that `as_bytes` makes again, if `node` is its last step and a mask of `as_mask` is its input."""
-    steps: list[Any] = [node]
-    for target, value in (("to", torch.uint8), ("to", torch.int32), ("gt", 0), ("to", torch.int32)):
-        step = steps[-1]
-        if not isinstance(step, torch.fx.Node) or step.target != target or step.args[1:] != (value,):
-            return None
-        steps.append(step.args[0])
-    source = steps[-1]
-    example = source.meta.get("example_value") if isinstance(source, torch.fx.Node) else None
-    return source if example is not None and example.dtype == torch.uint8 else None
-
-
-def _converted(node: torch.fx.Node, dtype: torch.dtype) -> torch.fx.Node:
-    """Insert a conversion, with an example of its values: of graphs with a node that lacks one there is no cache."""
-    new = node.graph.call_method("to", (node, dtype))
-    new.meta["example_value"] = node.meta["example_value"].to(dtype)
-    return new
 
 
 @contextlib.contextmanager

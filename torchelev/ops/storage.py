@@ -106,7 +106,7 @@ def as_bytes(mask: Tensor) -> Tensor:
 
 def as_mask(bytes_: Tensor) -> Tensor:
     """Return the mask that `as_bytes` made bytes of. Compiled code compares integers eight times as fast as bytes."""
-    # As a method, by which `compiler.pass_bytes_on` tells masks from counts that are compared with 0.
+    # As a method, by which `mask_bytes.pass_bytes_on` tells masks from counts that are compared with 0.
     return bytes_.to(torch.int32).gt(0) if torch.compiler.is_compiling() else bytes_.view(torch.bool)
 
 

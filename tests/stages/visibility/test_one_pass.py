@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tests.helpers import assert_close, differences, random_clouds, random_poses, random_state, small_map
 from torchelev import RaycastConfig
 from torchelev.native.library import find_compiler
+from torchelev.stages.cpp_layers import has_one_pass
 from torchelev.stages.visibility import one_pass
 from torchelev.stages.visibility.clean_up import apply_in_one_pass, apply_rays, clear_seen_through
 from torchelev.stages.visibility.lowest_rays import RayBins, View
@@ -114,9 +115,9 @@ def test_the_stage_agrees_with_and_without_gradients(num_sensors):
     state = random_state(rng, emap.cfg.grid, 2, dtype=torch.float32)
     m = emap.measure(cloud, T, None, 0.1)
     fast = clear_seen_through(state, m, emap.cfg.grid, RULES[0])
-    assert one_pass.has_one_pass(state)
+    assert has_one_pass(state)
     with torch.enable_grad():
-        assert not one_pass.has_one_pass(state)
+        assert not has_one_pass(state)
         slow = clear_seen_through(state, m, emap.cfg.grid, RULES[0])
     assert_close(slow, fast)
     assert (fast.validity != state.validity).any()
@@ -124,9 +125,9 @@ def test_the_stage_agrees_with_and_without_gradients(num_sensors):
 
 def test_double_precision_and_other_devices_have_no_one_pass():
     state = rays_over((3, 4), np.random.default_rng(0))[0]
-    assert one_pass.has_one_pass(state)
-    assert not one_pass.has_one_pass(state._replace(elevation=state.elevation.double()))
-    assert not one_pass.has_one_pass(state._replace(elevation=state.elevation.to("meta")))
+    assert has_one_pass(state)
+    assert not has_one_pass(state._replace(elevation=state.elevation.double()))
+    assert not has_one_pass(state._replace(elevation=state.elevation.to("meta")))
 
 
 def test_it_is_registered_right():

@@ -14,9 +14,10 @@ from torchelev.grid import GridConfig, grid_of
 from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.indexing import can_select
-from torchelev.ops.native import computes, run
+from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.cells import PointCells
+from torchelev.stages.cpp_layers import has_one_pass
 from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.fusion.points import CellLayers, HitPoints
@@ -44,7 +45,7 @@ class _Settings(ctypes.Structure):
 
 def can_update_hit(state: MapState) -> bool:
     """Tell whether `update_hit` takes the state: float32 on a CPU, without a gradient."""
-    return computes(state.elevation) and can_select(state.elevation) and not torch.is_grad_enabled()
+    return has_one_pass(state) and can_select(state.elevation)
 
 
 def update_hit(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:

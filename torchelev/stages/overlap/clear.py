@@ -12,8 +12,9 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
+from torchelev.stages.cpp_layers import has_one_pass
 from torchelev.stages.overlap.config import OverlapConfig
-from torchelev.stages.overlap.one_pass import READ, STANCE, Around, Cleared, has_one_pass, in_one_pass
+from torchelev.stages.overlap.one_pass import READ, STANCE, Around, Cleared, in_one_pass
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
 
 
 def near_part(grid: GridConfig, cfg: OverlapConfig) -> tuple[int, int, int, int]:
-    """Return the first and last but one row, and column, that may lie within the radius."""
+    """Return which rows and columns may lie within the radius: from, to, from, to, the ends excluded."""
     rows, columns = (middle(size, cfg.radius / grid.resolution) for size in (grid.height, grid.width))
     return rows.start, rows.stop, columns.start, columns.stop
 
@@ -105,11 +106,10 @@ def ground_below(
 ) -> Float[Tensor, "B 1 1"]:
     """Return the height of the ground on which the robot stands [m], from the base's; NaN-free, 0 where none is known.
 
-    `square` is that of the cells' distance d [m^2].
-
-    The mean, weighted by 1 / (d^2 + STANCE^2)^2, of the known cells within `max_base_height` below the base. Or of the
-    cells that this scan hit at any depth below it: where the former are the smaller part of what is below, and thus
-    furniture or a wall, and where the latter are higher by half of `height`, and thus a bridge over what was known.
+    The mean, weighted by 1 / (d^2 + STANCE^2)^2, of the known cells within `max_base_height` below the base, with
+    `square` = d^2 [m^2] and d the distance from the base. Or of the cells that this scan hit at any depth below it:
+    where the former are the smaller part of what is below, and thus furniture or a wall, and where the latter are
+    higher by half of `height`, and thus a bridge over what was known.
     """
     below = known & (height <= 0)
     weight = torch.where(below, (square + STANCE**2).square().reciprocal(), 0.0)

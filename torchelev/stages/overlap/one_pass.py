@@ -11,10 +11,11 @@ from torch import Tensor
 
 from torchelev.native.library import load
 from torchelev.ops.define import operator
-from torchelev.ops.native import computes, run
+from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.stages.cpp_layers import layers_of, named, new_layers
 from torchelev.stages.overlap.config import OverlapConfig
-from torchelev.state import MASKS, MapState, partial_state
+from torchelev.state import MapState, partial_state
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
@@ -31,7 +32,7 @@ class Around(NamedTuple):
     x: Float[Tensor, "B H 1"]  #: [m] from the base to the cells' centres
     y: Float[Tensor, "B 1 W"]  #: [m] from the base to the cells' centres
     base: Float[Tensor, "B 1 1"]  #: [m] height of the base
-    part: tuple[int, int, int, int]  #: first and last but one row, and column, that may lie within the radius
+    part: tuple[int, int, int, int]  #: rows from, rows to, columns from, columns to that may be near; ends excluded
 
 
 class Cleared(NamedTuple):
@@ -55,11 +56,6 @@ class _Settings(ctypes.Structure):
     )
 
 
-def has_one_pass(state: MapState) -> bool:
-    """Tell whether what `in_one_pass` returns may run: it computes float32 on a CPU, and has no gradient."""
-    return computes(state.elevation) and not torch.is_grad_enabled()
-
-
 def in_one_pass(twin: Clear) -> Clear:
     """Return a function that does what its twin does, and calls it where C++ cannot be built."""
 
@@ -73,10 +69,10 @@ def in_one_pass(twin: Clear) -> Clear:
     ) -> list[Tensor]:
         library = load(*_LIBRARY)
         if library is None or layers[0].numel() == 0:
-            masks = {name: as_mask(layer) for name, layer in zip(READ, layers, strict=True) if name in MASKS}
-            state = partial_state(**(dict(zip(READ, layers, strict=True)) | masks))
             cfg = OverlapConfig(**dict(zip(_NUMBERS, settings, strict=True)))
-            left = twin(state, Around(x, y, base, (part[0], part[1], part[2], part[3])), cfg)
+            left = twin(
+                partial_state(**named(READ, layers)), Around(x, y, base, (part[0], part[1], part[2], part[3])), cfg
+            )
             return [as_bytes(left.validity), as_bytes(left.bounded), left.challenger_support, left.number]
         cleared = _fake(x, y, base, part, layers)
         radius, height, *_ = settings
@@ -85,9 +81,9 @@ def in_one_pass(twin: Clear) -> Clear:
         return cleared
 
     def clear(state: MapState, around: Around, cfg: OverlapConfig) -> Cleared:
-        layers = [as_bytes(getattr(state, name)) if name in MASKS else getattr(state, name) for name in READ]
         x, y, base, part = around
         settings = [float(getattr(cfg, name)) for name in _NUMBERS]
+        layers = layers_of(state, READ)
         validity, bounded, support, number = clear_layers(x, y, base, list(part), layers, settings)
         return Cleared(as_mask(validity), as_mask(bounded), support, number)
 
@@ -95,5 +91,4 @@ def in_one_pass(twin: Clear) -> Clear:
 
 
 def _fake(x: Tensor, y: Tensor, base: Tensor, part: list[int], layers: list[Tensor], *_: object) -> list[Tensor]:
-    new = [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in layers[3:]]
-    return [*new, x.new_empty(x.shape[0], dtype=torch.int64)]
+    return [*new_layers(READ, layers, Cleared._fields[:-1]), x.new_empty(x.shape[0], dtype=torch.int64)]

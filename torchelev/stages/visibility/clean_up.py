@@ -11,6 +11,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
+from torchelev.stages.cpp_layers import has_one_pass
 from torchelev.stages.visibility.accepted_rays import accepted_rays
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import (
@@ -22,7 +23,7 @@ from torchelev.stages.visibility.lowest_rays import (
     lowest_slopes,
     view_from,
 )
-from torchelev.stages.visibility.one_pass import has_one_pass, in_one_pass
+from torchelev.stages.visibility.one_pass import in_one_pass
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.stages.visibility.rays import height_margin, sensor_rays
 from torchelev.state import MapState, Measurement, tally

@@ -5,19 +5,18 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig, grid_of
 from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.masks import NOWHERE
-from torchelev.ops.native import computes, run
-from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.ops.native import run
+from torchelev.stages.cpp_layers import layers_of, named, new_layers
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import NO_RAY, RayBins, View
 from torchelev.stages.visibility.polar_table import PolarGrid
-from torchelev.state import MASKS, MapState, partial_state
+from torchelev.state import MapState, partial_state
 
 CHANGED = ("validity", "bounded", "upper_bound", "challenger_support")
 _HEIGHTS = ("elevation", "variance", "time", "gradient_x", "gradient_y", "challenger", "upper_bound")
@@ -26,11 +25,6 @@ _CONSTANTS = {"NO_RAY": f"{NO_RAY!r}f", "NOWHERE": f"{NOWHERE!r}f"}
 _LARGEST = 2**30  # entries of a table, as they are counted in 32 bits
 
 Apply = Callable[[MapState, RayBins, View, PolarGrid, GridConfig, RaycastConfig], MapState]
-
-
-def has_one_pass(state: MapState) -> bool:
-    """Tell whether what `in_one_pass` returns may run: it computes float32 on a CPU, and has no gradient."""
-    return computes(state.elevation) and not torch.is_grad_enabled()
 
 
 def in_one_pass(twin: Apply) -> Apply:
@@ -55,7 +49,7 @@ def in_one_pass(twin: Apply) -> Apply:
         changed = _native(rays, view, layers, polar, settings)
         if changed is None:
             state, grid, cfg = _described(layers, *settings)
-            changed = _layers(twin(state, RayBins(*rays), View(*view), polar, grid, cfg), CHANGED)
+            changed = layers_of(twin(state, RayBins(*rays), View(*view), polar, grid, cfg), CHANGED)
         return changed
 
     def apply(
@@ -63,30 +57,14 @@ def in_one_pass(twin: Apply) -> Apply:
     ) -> MapState:
         sizes = polar.ranges, polar.azimuths, polar.bins, list(polar.widen)
         settings = [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.gate]
-        changed = apply_to_layers(list(rays), list(view), _layers(state, READ), *sizes, settings)
-        return state._replace(**_named(CHANGED, changed))  # type: ignore[arg-type]
+        changed = apply_to_layers(list(rays), list(view), layers_of(state, READ), *sizes, settings)
+        return state._replace(**named(CHANGED, changed))  # type: ignore[arg-type]
 
     return apply
 
 
-def _layers(state: MapState, names: tuple[str, ...]) -> list[Tensor]:
-    """Return layers of the state, masks as bytes."""
-    return [as_bytes(getattr(state, name)) if name in MASKS else getattr(state, name) for name in names]
-
-
-def _named(names: tuple[str, ...], layers: list[Tensor]) -> dict[str, Tensor]:
-    """Return layers by name, masks of bytes."""
-    return {name: as_mask(layer) if name in MASKS else layer for name, layer in zip(names, layers, strict=True)}
-
-
-def _new(layers: list[Tensor]) -> list[Tensor]:
-    """Return memory for the changed layers."""
-    old = (layers[READ.index(name)] for name in CHANGED)
-    return [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in old]
-
-
 def _fake(rays: list[Tensor], view: list[Tensor], layers: list[Tensor], *_: object) -> list[Tensor]:
-    return _new(layers)
+    return new_layers(READ, layers, CHANGED)
 
 
 def _described(
@@ -94,7 +72,7 @@ def _described(
 ) -> tuple[MapState, GridConfig, RaycastConfig]:
     """Return what the operator was called for, as far as its twin asks."""
     cfg = RaycastConfig(min_time=min_time, min_incidence=min_incidence, gate=gate)
-    return partial_state(**_named(READ, layers)), grid_of(layers[0].shape[1:], resolution), cfg
+    return partial_state(**named(READ, layers)), grid_of(layers[0].shape[1:], resolution), cfg
 
 
 def _native(
@@ -106,7 +84,7 @@ def _native(
     library = load("rays/rays.cpp", _CONSTANTS)
     if library is None:
         return None
-    changed = _new(layers)
+    changed = new_layers(READ, layers, CHANGED)
     sizes = (*rays[0].shape, *layers[0].shape[1:], polar.ranges, polar.azimuths, len(polar.widen))
     widen = (ctypes.c_int64 * len(polar.widen))(*polar.widen)
     run(library.apply_rays, [*rays, *view, *layers, *changed], *sizes, widen, polar.bins, *map(float, settings))

@@ -1,0 +1,33 @@
+"""What the stages in C++ share: when they may run, and a state's layers as they take and return them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchelev.ops.native import computes
+from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.state import MASKS, MapState
+
+
+def has_one_pass(state: MapState) -> bool:
+    """Tell whether a stage in C++ may run on a state: it computes float32 on a CPU, and has no gradient."""
+    return computes(state.elevation) and not torch.is_grad_enabled()
+
+
+def layers_of(state: MapState, names: Sequence[str]) -> list[Tensor]:
+    """Return layers of the state (B, H, W), masks as bytes."""
+    return [as_bytes(getattr(state, name)) if name in MASKS else getattr(state, name) for name in names]
+
+
+def named(names: Sequence[str], layers: Sequence[Tensor]) -> dict[str, Tensor]:
+    """Return layers by name, bytes as masks."""
+    return {name: as_mask(layer) if name in MASKS else layer for name, layer in zip(names, layers, strict=True)}
+
+
+def new_layers(names: Sequence[str], layers: Sequence[Tensor], changed: Sequence[str]) -> list[Tensor]:
+    """Return memory for those of the named layers that a stage changes."""
+    old = (layers[names.index(name)] for name in changed)
+    return [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in old]
