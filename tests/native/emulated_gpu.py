@@ -79,6 +79,7 @@ def launch(source, kernel, rows, number, *arguments):
 def emulated_kernels(in_blocks):
     """Emulate kernels; `in_blocks`: those whose blocks share memory, where there is a choice."""
     with (
+        patch.object(kernels, "work_on", lambda _: True),
         patch.object(kernels, "launch", launch),
         patch.object(kernels, "launch_blocks", launch_blocks),
         patch.object(kernels, "suits_blocks", lambda *_: in_blocks),

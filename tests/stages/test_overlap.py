@@ -1,5 +1,6 @@
 """Other floors near the robot."""
 
+import contextlib
 import os
 from dataclasses import asdict
 from unittest.mock import patch
@@ -12,7 +13,9 @@ from hypothesis import strategies as st
 
 from tests import reference
 from tests.helpers import nans, pose, random_state, seen_from, small_map
+from tests.native.emulated_gpu import emulated_kernels
 from torchelev import OverlapConfig
+from torchelev.native.library import find_compiler
 from torchelev.stages.overlap import clear as stage
 from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
@@ -62,16 +65,19 @@ def by(one_pass, *arguments):
         return clear_other_floors(*arguments)
 
 
-@pytest.mark.parametrize("with_native", [True, False])
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
+
+
+@pytest.mark.parametrize("code", ["c++", "tensors", pytest.param("kernels", marks=needs_compiler)])
 @given(
     st.integers(0, 10_000),
     st.integers(1, 3),
-    st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    st.tuples(st.integers(1, 40), st.integers(1, 40)) | st.just((70, 90)),
     st.floats(0.1, 1.5),
     st.floats(0.05, 0.8),
     st.integers(1, 2),
 )
-def test_one_pass_agrees_with_tensors(with_native, seed, num_envs, cells, radius, height, threads):
+def test_one_pass_agrees_with_tensors(code, seed, num_envs, cells, radius, height, threads):
     torch.set_num_threads(threads)
     rng = np.random.default_rng(seed)
     emap = small_map(num_envs, cells)
@@ -80,7 +86,8 @@ def test_one_pass_agrees_with_tensors(with_native, seed, num_envs, cells, radius
         m = m._replace(base=torch.where(torch.arange(num_envs)[:, None] == 0, torch.nan, m.base))
     state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
     cfg = OverlapConfig(radius=radius, height=height, base_height=0.2, max_base_height=rng.uniform(0.2, 0.8))
-    with patch.dict(os.environ, {} if with_native else {"TORCHELEV_NATIVE": "0"}):
+    emulated = emulated_kernels(True) if code == "kernels" else contextlib.nullcontext()
+    with emulated, patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"} if code == "tensors" else {}):
         got, expected = (by(one_pass, state, m, emap.cfg.grid, cfg) for one_pass in (True, False))
     for name in ("validity", "bounded", "challenger_support"):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name

@@ -1,5 +1,6 @@
-"""Normals and the analytic rating in one pass: C++ against the equations in float64."""
+"""Normals and the analytic rating in one pass: C++ and the kernel against the equations in float64."""
 
+import contextlib
 import math
 
 import numpy as np
@@ -8,6 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.native.emulated_gpu import emulated_kernels
+from torchelev.native.library import find_compiler
 from torchelev.ops.windows import window_moments
 from torchelev.stages.surface import known_ground, min_spread
 from torchelev.traversability import planes
@@ -17,8 +20,13 @@ RADII = st.integers(1, 5)
 CRITICAL = [1.0, 2.0, 1.0]
 
 
-def one_pass(elevation, validity, *settings):
-    with torch.no_grad():
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
+BOTH = pytest.mark.parametrize("by", ["c++", pytest.param("kernel", marks=needs_compiler)])
+
+
+def one_pass(elevation, validity, *settings, by="c++"):
+    emulated = emulated_kernels(True) if by == "kernel" else contextlib.nullcontext()
+    with torch.no_grad(), emulated:
         return planes._in_one_pass(elevation, validity, *settings)
 
 
@@ -32,8 +40,9 @@ def near_limit(validity, radius):
     return (smaller - min_spread(radius)).abs() < 1e-5
 
 
-def assert_agree(elevation, validity, radius, cells, resolution, critical, tolerance):
-    got = one_pass(torch.where(validity, elevation, torch.nan), validity, radius, cells, resolution, critical)
+def assert_agree(elevation, validity, radius, cells, resolution, critical, tolerance, by):
+    settings = radius, cells, resolution, critical
+    got = one_pass(torch.where(validity, elevation, torch.nan), validity, *settings, by=by)
     expected = planes._layers(elevation.double(), validity, radius, cells, resolution, critical)
     limits = [near_limit(validity, radius)] * 3 + [near_limit(validity, max(1, cells))] * 2
     assert len(got) == len(expected) == (5 if cells else 3)
@@ -44,6 +53,7 @@ def assert_agree(elevation, validity, radius, cells, resolution, critical, toler
     return got
 
 
+@BOTH
 @given(
     st.integers(0, 10_000),
     SIZES,
@@ -53,17 +63,18 @@ def assert_agree(elevation, validity, radius, cells, resolution, critical, toler
     st.sampled_from([0.0, -1e5]),
     st.integers(1, 2),
 )
-def test_agrees_with_the_equations(seed, size, radius, cells, known, altitude, threads):
+def test_agrees_with_the_equations(by, seed, size, radius, cells, known, altitude, threads):
     rng, shape = np.random.default_rng(seed), (2, *size)
     heights = altitude + rng.uniform(-0.3, 0.3, shape) + 0.05 * np.arange(size[1])
     elevation = torch.from_numpy(heights).float()
     validity = torch.from_numpy(rng.uniform(0, 1, shape) < known)
     torch.set_num_threads(threads)
-    assert_agree(elevation, validity, radius, cells, 0.1, CRITICAL[: 3 if cells else 0], 2e-4)
+    assert_agree(elevation, validity, radius, cells, 0.1, CRITICAL[: 3 if cells else 0], 2e-4, by)
 
 
+@BOTH
 @pytest.mark.parametrize("cells", [1, 2, 3])
-def test_blocks_of_unknown_cells(cells):
+def test_blocks_of_unknown_cells(by, cells):
     """Windows reach from known blocks over unknown ones, beyond the lanes of a vector and the rows of a tile."""
     rng = np.random.default_rng(cells)
     elevation = torch.from_numpy(rng.uniform(-0.3, 0.3, (3, 140, 290))).float()
@@ -71,17 +82,18 @@ def test_blocks_of_unknown_cells(cells):
     validity[1, 60:68, 120:140] = validity[1, 5:9, :7] = validity[1, -3:, -20:] = True
     validity[2, :, 40:41] = validity[2, 100:103] = True
     torch.set_num_threads(2)
-    got = assert_agree(elevation, validity, 1, cells, 0.1, CRITICAL, 2e-4)
+    got = assert_agree(elevation, validity, 1, cells, 0.1, CRITICAL, 2e-4, by)
     assert not any(layer[0].any() for layer in got) and got[2][1].any() and got[4][1].any()
 
 
+@BOTH
 @pytest.mark.parametrize("unknown", [math.nan, math.inf, -3e38])
-def test_what_unknown_cells_hold_does_not_matter(unknown):
+def test_what_unknown_cells_hold_does_not_matter(by, unknown):
     rng = np.random.default_rng(0)
     elevation = torch.from_numpy(rng.uniform(-0.3, 0.3, (1, 20, 70))).float()
     validity = torch.from_numpy(rng.uniform(0, 1, (1, 20, 70)) < 0.6)
-    expected = one_pass(elevation, validity, 1, 2, 0.1, CRITICAL)
-    got = one_pass(torch.where(validity, elevation, unknown), validity, 1, 2, 0.1, CRITICAL)
+    expected = one_pass(elevation, validity, 1, 2, 0.1, CRITICAL, by=by)
+    got = one_pass(torch.where(validity, elevation, unknown), validity, 1, 2, 0.1, CRITICAL, by=by)
     assert all(map(torch.equal, got, expected))
 
 
@@ -95,12 +107,13 @@ def test_any_number_of_threads_gives_the_same():
     assert all(map(torch.equal, both, one_pass(elevation, validity, 1, 2, 0.1, CRITICAL)))
 
 
+@BOTH
 @pytest.mark.parametrize("gradient", [0.0, 1e-3, 0.3, 0.42, 1.0, 2.0, 2.5, 30.0])
-def test_slopes(gradient):
+def test_slopes(by, gradient):
     """The inclination of planes to 1e-6 rad."""
     elevation = (gradient * torch.arange(-4.0, 5.0)[:, None]).expand(1, 9, 9).contiguous()
     validity = torch.ones(elevation.shape, dtype=torch.bool)
-    rating = one_pass(elevation, validity, 1, 1, 1.0, [1.6, 1e6, 1e6])[3]
+    rating = one_pass(elevation, validity, 1, 1, 1.0, [1.6, 1e6, 1e6], by=by)[3]
     slope = 1.6 * (1 - rating[0, 1:-1, 1:-1])
     torch.testing.assert_close(slope, torch.full_like(slope, math.atan(gradient)), atol=1.5e-6, rtol=0)
 
@@ -116,9 +129,15 @@ def test_without_a_compiler_the_equations_run(monkeypatch):
 
 def test_gradients_take_the_equations():
     elevation = torch.rand(1, 9, 8, requires_grad=True)
-    assert not planes._suits(elevation) and planes._suits(elevation.detach())
+    assert not planes._suits(elevation, 1) and planes._suits(elevation.detach(), 1)
     with torch.no_grad():
-        assert planes._suits(elevation) and not planes._suits(elevation.double())
+        assert planes._suits(elevation, 1) and not planes._suits(elevation.double(), 1)
+
+
+def test_kernels_take_windows_that_threads_can_share(monkeypatch):
+    monkeypatch.setattr(planes.on_gpu, "computes", lambda _: True)
+    elevation = torch.rand(1, 9, 8, dtype=torch.float64)
+    assert planes._suits(elevation, 32) and not planes._suits(elevation, 33)
 
 
 @pytest.mark.parametrize("cells, critical", [(2, CRITICAL), (0, [])])

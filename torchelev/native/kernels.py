@@ -43,6 +43,11 @@ def can_launch(device: int) -> bool:
 can_launch._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
+def work_on(layer: Tensor) -> bool:
+    """Tell whether operators that have kernels use them for a layer: it is on a GPU."""
+    return layer.is_cuda
+
+
 def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) -> None:
     """Run a kernel on the current stream, with at least `number` threads for each of `rows` rows.
 

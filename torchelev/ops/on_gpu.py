@@ -1,4 +1,4 @@
-"""Polar tables by CUDA kernels (`torchelev/native/tables/tables.cu`): the same as `torchelev.ops.operators`."""
+"""Polar tables by CUDA kernels (`torchelev/native/tables/tables.cu`), like `ops.operators`; when others may run."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.native import kernels
 from torchelev.ops import scatter
+from torchelev.ops.transforms import is_transforming
 
 _SOURCE = "tables/tables.cu"
 _LEVELS = 16  # that a table may be widened by
@@ -19,6 +20,12 @@ class _Levels(ctypes.Structure):
     """`Levels` of tables.cu."""
 
     _fields_ = (("rows", ctypes.c_int64 * _LEVELS),)
+
+
+def computes(layer: Tensor) -> bool:
+    """Tell whether kernels may compute what has no gradient of a layer: it is float32 on a GPU; no transform runs."""
+    is_plain = layer.is_cuda and layer.dtype == torch.float32 and not is_transforming()
+    return is_plain and kernels.can_launch(layer.get_device())
 
 
 def can_tabulate(values: Tensor, widen: Sequence[int]) -> bool:

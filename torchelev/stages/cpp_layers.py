@@ -1,4 +1,4 @@
-"""What the stages in C++ share: when they may run, and a state's layers as they take and return them."""
+"""What stages in C++ and CUDA share: when they may run, and a state's layers as they take and return them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchelev.ops.native import computes
+from torchelev.ops import native, on_gpu
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.state import MASKS, MapState
 
 
 def has_one_pass(state: MapState) -> bool:
     """Tell whether a stage in C++ may run on a state: it computes float32 on a CPU, and has no gradient."""
-    return computes(state.elevation) and not torch.is_grad_enabled()
+    return native.computes(state.elevation) and not torch.is_grad_enabled()
+
+
+def has_kernels(state: MapState) -> bool:
+    """Tell whether a stage of CUDA kernels may run on a state: it is of float32 on a GPU, and has no gradient."""
+    return on_gpu.computes(state.elevation) and not torch.is_grad_enabled()
 
 
 def layers_of(state: MapState, names: Sequence[str]) -> list[Tensor]:

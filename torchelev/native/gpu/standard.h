@@ -11,6 +11,7 @@ template <class T> constexpr T max(T a, T b) { return a < b ? b : a; }
 template <class T> constexpr T min(T a, T b) { return b < a ? b : a; }
 template <class T> constexpr T clamp(T value, T low, T high) { return max(low, min(value, high)); }
 
+using ::atan;
 using ::fabs;
 using ::floor;
 using ::sqrt;

@@ -13,16 +13,11 @@
 
 #include "../lanes.h"
 #include "../threads.h"
+#include "floor.h"
 
 namespace {
 
 constexpr float STANCE_SQUARE = STANCE * STANCE;
-
-// `OverlapConfig`, and which rows and columns may lie within the radius.
-struct Settings {
-    float radius_square, slope, height, base_height, max_base_height;
-    int32_t first_row, end_row, first_column, end_column;
-};
 
 // Maps (B, H, W); masks are bytes. The last three are the results.
 struct Layers {
@@ -73,15 +68,14 @@ struct Map {
     }
 };
 
-// A weighted mean of heights.
-struct Mean {
+// `Total` of vectors.
+struct Totals {
     Lanes weights{}, moments{};
 
     void add(Flags cells, Lanes weight, Lanes height) {
         weights += pick(cells, weight, all(0)), moments += pick(cells, weight * height, all(0));
     }
-    float weight() const { return sum(weights); }
-    float value() const { return sum(moments) / std::max(weight(), 1e-12f); }
+    Total total() const { return {sum(weights), sum(moments)}; }
 
   private:
     static float sum(Lanes values) {
@@ -93,35 +87,18 @@ struct Mean {
 
 // The height of the ground on which the robot stands [m], from the base's: `ground_below`.
 float ground_below(const Map& map) {
-    Mean of_all, of_known, of_hit;
+    Totals all, within, hit;
     map.each([&](int64_t place, auto count, Lanes square, Flags near) {
         const Lanes height = map.height(place, count);
         const Flags below = near & map.known(place, count) & (height <= 0);
         if (!any(below)) return;
         const Lanes spread = square + STANCE_SQUARE, weight = 1 / (spread * spread);
-        of_all.add(below, weight, height);
-        of_known.add(below & (height >= -map.s.max_base_height), weight, height);
-        of_hit.add(below & map.hit(place, count), weight, height);
+        all.add(below, weight, height);
+        within.add(below & (height >= -map.s.max_base_height), weight, height);
+        hit.add(below & map.hit(place, count), weight, height);
     });
-    const bool is_most = of_known.weight() > 0.5f * of_all.weight();
-    const bool is_level = of_hit.weight() == 0 || of_hit.value() <= of_known.value() + 0.5f * map.s.height;
-    return is_most && is_level ? of_known.value() : of_hit.value();
+    return ground_of(all.total(), within.total(), hit.total(), map.s);
 }
-
-// The heights that belong to the robot's floor [m], from the base's: `own_floor`.
-struct Floor {
-    float lower, upper;
-
-    Floor(float ground, const Settings& s) {
-        const bool flies = ground < -s.max_base_height;
-        const float robot = flies ? 0.0f : std::min(ground + s.base_height, 0.0f);
-        lower = flies ? -std::numeric_limits<float>::infinity() : robot - s.height;
-        upper = std::max(robot + s.height, 0.0f);
-    }
-    Flags is_outside(Lanes height, Lanes allowance) const {
-        return (height < lower - allowance) | (height > upper + allowance);
-    }
-};
 
 // Clear the cells and bounds of other floors, and return the number of cells.
 int64_t clear(const Map& map, const Floor& floor) {

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.native import kernels
 from torchelev.ops.define import operator
-from torchelev.ops.transforms import is_transforming
+from torchelev.stages.cpp_layers import has_kernels
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.native import ARGUMENTS, c_settings, config_of, numbers
 from torchelev.stages.fusion.points import CellLayers, HitPoints
@@ -29,15 +29,8 @@ def can_update_on_gpu(state: MapState, points: Tensor) -> bool:
 
     It adds up in any order, so it is not used where results must repeat.
     """
-    layer = state.elevation
-    is_plain = layer.is_cuda and layer.dtype == torch.float32 and not torch.is_grad_enabled() and not is_transforming()
-    fits_in_32_bits = max(points.numel() // 3, layer.numel()) < 2**31
-    return (
-        is_plain
-        and fits_in_32_bits
-        and not torch.are_deterministic_algorithms_enabled()
-        and kernels.can_launch(layer.get_device())
-    )
+    fits_in_32_bits = max(points.numel() // 3, state.elevation.numel()) < 2**31
+    return fits_in_32_bits and has_kernels(state) and not torch.are_deterministic_algorithms_enabled()
 
 
 def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:

@@ -1,4 +1,4 @@
-"""Other floors cleared in one pass of C++ (`torchelev/native/overlap`): the same as `clear_by_tensors`."""
+"""Other floors cleared by C++ or CUDA kernels (`torchelev/native/overlap`): the same as `clear_by_tensors`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.native import kernels
 from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.native import run
@@ -24,6 +25,8 @@ STANCE = 0.5  # [m] half the size of the ground that a robot stands on
 READ = ("elevation", "upper_bound", "time", "validity", "bounded", "challenger_support")  # in the order of C++
 _NUMBERS = ("radius", "height", "base_height", "max_base_height")  # of the config; those of C++ are made of them
 _LIBRARY = "overlap/overlap.cpp", {"STANCE": f"{STANCE!r}f"}
+_SOURCE, _PART = "overlap/overlap.cu", 4096  # cells of a block, as in the source
+_SUMS = 6  # of a part of a map, as in the source
 
 
 class Around(NamedTuple):
@@ -57,7 +60,7 @@ class _Settings(ctypes.Structure):
 
 
 def in_one_pass(twin: Clear) -> Clear:
-    """Return a function that does what its twin does, and calls it where C++ cannot be built."""
+    """Return a function that does what its twin does, and calls it where neither C++ nor kernels run."""
 
     @operator(
         "clear_other_floors(Tensor x, Tensor y, Tensor base, int[] part, Tensor[] layers, float[] settings) "
@@ -67,16 +70,16 @@ def in_one_pass(twin: Clear) -> Clear:
     def clear_layers(
         x: Tensor, y: Tensor, base: Tensor, part: list[int], layers: list[Tensor], settings: list[float]
     ) -> list[Tensor]:
+        cleared, own = _fake(x, y, base, part, layers), _c_settings(part, settings)
+        if kernels.work_on(x):
+            _launch([x, y, base], layers, cleared, own)
+            return cleared
         library = load(*_LIBRARY)
         if library is None or layers[0].numel() == 0:
             cfg = OverlapConfig(**dict(zip(_NUMBERS, settings, strict=True)))
-            left = twin(
-                partial_state(**named(READ, layers)), Around(x, y, base, (part[0], part[1], part[2], part[3])), cfg
-            )
+            around = Around(x, y, base, (part[0], part[1], part[2], part[3]))
+            left = twin(partial_state(**named(READ, layers)), around, cfg)
             return [as_bytes(left.validity), as_bytes(left.bounded), left.challenger_support, left.number]
-        cleared = _fake(x, y, base, part, layers)
-        radius, height, *_ = settings
-        own = _Settings(radius**2, height / radius, *settings[1:], *part)
         run(library.clear_other_floors, [x, y, base, *layers, *cleared], *layers[0].shape, ctypes.byref(own))
         return cleared
 
@@ -88,6 +91,26 @@ def in_one_pass(twin: Clear) -> Clear:
         return Cleared(as_mask(validity), as_mask(bounded), support, number)
 
     return clear
+
+
+def _c_settings(part: list[int], settings: list[float]) -> _Settings:
+    radius, height, *_ = settings
+    return _Settings(radius**2, height / radius, *settings[1:], *part)
+
+
+def _launch(around: list[Tensor], layers: list[Tensor], cleared: list[Tensor], settings: _Settings) -> None:
+    """Write what is left of the cells by kernels."""
+    B, H, W = layers[0].shape
+    blocks = B * -(-H * W // _PART)
+    around, layers = [value.contiguous() for value in around], [layer.contiguous() for layer in layers]
+    cleared[-1].zero_()
+    places, maps = kernels.addresses_of(around), kernels.addresses_of([*layers, *cleared])
+    with torch.cuda.device_of(layers[0]):
+        sums = layers[0].new_empty(blocks, _SUMS)
+        memory = 4 * kernels.LARGE_BLOCK
+        below = places, maps, sums, H, W, ctypes.c_float(STANCE), settings
+        kernels.launch_blocks(_SOURCE, "sum_below", blocks, memory, *below)
+        kernels.launch_blocks(_SOURCE, "clear_other_floors", blocks, 0, places, maps, sums, H, W, settings)
 
 
 def _fake(x: Tensor, y: Tensor, base: Tensor, part: list[int], layers: list[Tensor], *_: object) -> list[Tensor]:
