@@ -94,6 +94,23 @@ def test_one_pass_agrees_with_tensors(code, seed, num_envs, cells, radius, heigh
     assert torch.equal(got.statistics.cleared_other_floors, expected.statistics.cleared_other_floors)
 
 
+@needs_compiler
+@pytest.mark.parametrize("first_row", [0, 46])
+def test_kernels_know_the_ground_of_all_parts_of_a_map(first_row):
+    """Ground 0.5 m below the base, in one part of the map alone, and beside it cells too high for the robot on it."""
+    emap = small_map(1, (70, 90))
+    T = pose((0.0, 0.0, 0.0))
+    m, cfg = emap.measure(nans(1), T, T, 0.1), OverlapConfig(radius=2.0, height=0.4, base_height=0.2)
+    row = torch.arange(70)[:, None].expand(1, 70, 90)
+    known = (row >= first_row) & (row < first_row + 23)
+    elevation = torch.where(torch.arange(90) % 9 == 0, 0.3, -0.5).expand_as(row)
+    state = emap.state._replace(validity=known, elevation=elevation, time=torch.ones_like(elevation))
+    with emulated_kernels(True):
+        left = by(True, state, m, emap.cfg.grid, cfg)
+    assert torch.equal(left.validity, by(False, state, m, emap.cfg.grid, cfg).validity)
+    assert left.statistics.cleared_other_floors.item() > 20
+
+
 @pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.05, 0.05), (0.25, 0.15)])
 @pytest.mark.parametrize("radius", [1.5, 3.0])
 def test_one_pass_takes_the_same_cells_for_near(x, y, radius):
