@@ -108,7 +108,7 @@ def test_kernels_know_the_ground_of_all_parts_of_a_map(first_row):
     with emulated_kernels(True):
         left = by(True, state, m, emap.cfg.grid, cfg)
     assert torch.equal(left.validity, by(False, state, m, emap.cfg.grid, cfg).validity)
-    assert left.statistics.cleared_other_floors.item() > 20
+    assert left.statistics.cleared_other_floors.item() >= 20
 
 
 @pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.05, 0.05), (0.25, 0.15)])
