@@ -33,11 +33,17 @@ def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: W
     return count_bounded(state)
 
 
-def rate_surface(state: MapState, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
-    """Compute normals and traversability from the elevation."""
+def rate_surface(
+    state: MapState, cfg: ElevationMapConfig, weights: Weights | None = None, into: MapState | None = None
+) -> MapState:
+    """Compute normals and traversability from the elevation.
+
+    Given a state whose masks are bytes, what C++ or a kernel computes is written into its layers instead.
+    """
     head = cfg.traversability
     analytic = head if isinstance(head, TraversabilityConfig) else None
-    state = state._replace(**rate_planes(state.elevation, state.validity, cfg.grid, cfg.surface, analytic))
+    layers = rate_planes(state.elevation, state.validity, cfg.grid, cfg.surface, analytic, into)
+    state = state._replace(**layers)
     if head is None:
         return rate_all(state)
     if isinstance(head, TraversabilityConfig):

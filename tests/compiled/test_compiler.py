@@ -14,6 +14,7 @@ from torchelev.compiled.compiler import KERNEL_ARGUMENTS, announced_compilation,
 from torchelev.compiled.mask_bytes import choose_bytes_as_integers, pass_bytes_on
 from torchelev.ops.moving import move_in_place
 from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.traversability import planes
 
 pytestmark = pytest.mark.compiles
 
@@ -105,6 +106,18 @@ def test_bytes_are_passed_on():
     assert next(n for n in graph.graph.nodes if n.target == "copy_").args[1].op == "placeholder"
 
 
+def test_bytes_are_passed_on_to_what_writes_into_other_tensors():
+    def write(stored, other):
+        mask = as_mask(stored)
+        planes._write_planes(torch.zeros(1, 1, 4), as_bytes(mask), *_written(other))
+        return other + as_bytes(mask & (other > 0))
+
+    (usual, got), graph = rewritten(write, STORED, OTHER)
+    assert all(map(torch.equal, got, usual))
+    writes = torch.ops.torchelev.write_planes.default
+    assert graph.graph.find_nodes(op="call_function", target=writes)[0].args[1].op == "placeholder"
+
+
 def _then(change):
     def copy(stored, other):
         mask = as_mask(stored)
@@ -113,6 +126,10 @@ def _then(change):
         return other + 1
 
     return copy
+
+
+def _written(mask):
+    return [torch.empty(1, 1, 4), torch.empty(1, 1, 4), mask], 1, 0, 0.1, []
 
 
 def _change_result(stored, other):
@@ -136,6 +153,7 @@ def _add(stored):
         _then(lambda stored: stored.zero_()),
         _then(lambda stored: stored.view(-1).zero_()),
         _then(lambda stored: torch.bitwise_xor(stored, stored, out=stored)),
+        _then(lambda stored: planes._write_planes(torch.zeros(1, 1, 4), stored, *_written(stored))),
         _then(_set),
         _then(_add),
         _change_result,

@@ -9,10 +9,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers import random_state
 from tests.native.emulated_gpu import emulated_kernels
+from torchelev import GridConfig, TraversabilityConfig
+from torchelev.compiled.update import with_masks
 from torchelev.native.library import find_compiler
+from torchelev.ops.storage import as_bytes
 from torchelev.ops.windows import window_moments
-from torchelev.stages.surface import known_ground, min_spread
+from torchelev.stages.surface import SurfaceConfig, known_ground, min_spread
+from torchelev.state import blank_state
 from torchelev.traversability import planes
 
 SIZES = st.sampled_from([(1, 1), (3, 2), (9, 40), (70, 19), (66, 150), (1, 300)])  # some are tiles and more
@@ -143,4 +148,25 @@ def test_kernels_take_windows_that_threads_can_share(monkeypatch):
 @pytest.mark.parametrize("cells, critical", [(2, CRITICAL), (0, [])])
 def test_the_operator_is_registered_right(cells, critical):
     elevation, known = torch.rand(2, 9, 8), (torch.rand(2, 9, 8) < 0.8).to(torch.uint8)
-    torch.library.opcheck(torch.ops.torchelev.rate_planes.default, (elevation, known, 1, cells, 0.1, critical))
+    layers = [torch.zeros_like(layer) for layer in (elevation, elevation, known, elevation, known)[: 5 if cells else 3]]
+    arguments = elevation, known, layers, 1, cells, 0.1, critical
+    torch.library.opcheck(torch.ops.torchelev.write_planes.default, arguments)
+    expected = planes._layers(elevation, known.bool(), 1, cells, 0.1, critical)
+    planes._write_planes(*arguments)
+    for layer, other in zip(layers, expected, strict=True):
+        torch.testing.assert_close(layer, other.to(layer.dtype), atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize("head", [None, TraversabilityConfig()])
+def test_layers_are_written_into_a_state(head):
+    grid, surface = GridConfig(length_x=0.9, length_y=0.8, resolution=0.1), SurfaceConfig()
+    state = random_state(np.random.default_rng(0), grid, 2)
+    elevation, validity = state.elevation.float(), state.validity
+    new = planes.rate_planes(elevation, validity, grid, surface, head)
+    blank = with_masks(blank_state(grid, 2, "cpu", torch.float32), as_bytes)
+    with torch.no_grad():
+        assert planes.rate_planes(elevation, validity, grid, surface, head, blank) == {}
+        taken = planes.rate_planes(elevation.double(), validity, grid, surface, head, blank)
+    assert taken.keys() == new.keys() and len(new) == (5 if head else 3)
+    for name, layer in new.items():
+        torch.testing.assert_close(getattr(blank, name), layer.to(getattr(blank, name).dtype))

@@ -46,7 +46,14 @@ def _reads(user: torch.fx.Node, value: torch.fx.Node) -> bool:
     if user.op == "call_method":
         return user.target == "to" or (user.target == "copy_" and user.args[0] is not value)
     schema = getattr(user.target, "_schema", None)  # of operators; functions such as `setitem` have none
-    return schema is not None and not schema.is_mutable and all(r.alias_info is None for r in schema.returns)
+    if schema is None or any(r.alias_info is not None for r in schema.returns):
+        return False
+    given = dict(zip((a.name for a in schema.arguments), user.args, strict=False)) | user.kwargs
+    written: list[torch.fx.Node] = []
+    for argument in schema.arguments:
+        if argument.alias_info is not None:
+            torch.fx.node.map_arg(given.get(argument.name), written.append)
+    return value not in written
 
 
 def _bytes_of_mask(node: torch.fx.Node) -> torch.fx.Node | None:

@@ -114,17 +114,19 @@ def let_time_pass(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> M
     return age(reset_statistics(state, m), m, cfg.aging)
 
 
-def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
+def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig, _: MapState) -> MapState:
     """Compensate the height drift, and fuse the points' heights."""
     state = compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)
     return fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
 
 
-def apply_rays(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
-    """Clear what is gone or another floor, and rate what is left."""
+def apply_rays(
+    state: MapState, m: Measurement, cfg: ElevationMapConfig, into: MapState, weights: Weights | None = None
+) -> MapState:
+    """Clear what is gone or another floor, and rate what is left; `into`: the stored state, see `rate_surface`."""
     state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
     state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
-    state = rate_surface(state, cfg, weights)
+    state = rate_surface(state, cfg, weights, into)
     return count_bounded(state)
 
 
@@ -159,7 +161,7 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
     def in_place(stages: Callable[..., MapState]) -> KeptGraph:
         def run(stored: MapState, m: Measurement, *weights: Weights | None) -> None:
             state = with_masks(stored, as_mask)
-            write_changes(stored, state, stages(state, with_masks(m, as_mask), cfg, *weights))
+            write_changes(stored, state, stages(state, with_masks(m, as_mask), cfg, stored, *weights))
 
         return KeptGraph(run, (stages.__name__, *settings), measured)
 

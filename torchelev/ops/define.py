@@ -11,8 +11,10 @@ from torch import Tensor
 _LIBRARY = torch.library.Library("torchelev", "FRAGMENT")
 
 
-def operator(schema: str, fake: Callable[..., Tensor | Sequence[Tensor]]) -> Callable[..., Any]:
-    """Register a function that returns new tensors as an operator. It has no gradient: call it without grad mode.
+def operator(schema: str, fake: Callable[..., Tensor | Sequence[Tensor] | None]) -> Callable[..., Any]:
+    """Register a function as an operator, which returns new tensors or writes into its arguments.
+
+    It has no gradient: call it without grad mode.
 
     Args:
         schema: name, arguments and results, such as "half(Tensor values) -> Tensor".

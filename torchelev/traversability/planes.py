@@ -21,6 +21,7 @@ from torchelev.ops.masks import NOWHERE
 from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.surface import MIN_DET, MIN_TRACE, Normals, SurfaceConfig, known_ground, min_spread, normals
+from torchelev.state import MASKS, MapState
 from torchelev.traversability.heads import Critical, PlaneRating, TraversabilityConfig, traversability
 
 if TYPE_CHECKING:
@@ -40,12 +41,24 @@ def rate_planes(
     grid: GridConfig,
     surface: SurfaceConfig,
     head: TraversabilityConfig | None,
+    into: MapState | None = None,
 ) -> dict[str, Any]:
-    """Return the layers (B, H, W) of `Normals` and, given the analytic head, those of `PlaneRating`, by name."""
+    """Return the layers (B, H, W) of `Normals` and, given the analytic head, those of `PlaneRating`, by name.
+
+    Given a state whose masks are bytes, C++ and kernels write into its layers, and none is returned.
+    """
     cells, critical = (0, []) if head is None else (head.cells(grid), list(head.critical))
-    compute = _in_one_pass if _suits(elevation, max(surface.radius, cells)) else _layers
-    layers = compute(elevation, validity, surface.radius, cells, grid.resolution, critical)
-    return dict(zip(_NAMES, layers, strict=False))
+    settings = surface.radius, cells, grid.resolution, critical
+    if not _suits(elevation, max(surface.radius, cells)):
+        return dict(zip(_NAMES, _layers(elevation, validity, *settings), strict=False))
+    if into is None:
+        return dict(zip(_NAMES, _in_one_pass(elevation, validity, *settings), strict=False))
+    _write_planes(elevation, as_bytes(validity), [getattr(into, name) for name in _names(cells)], *settings)
+    return {}
+
+
+def _names(cells: int) -> tuple[str, ...]:
+    return _NAMES if cells else Normals._fields
 
 
 def _suits(elevation: Tensor, rim: int) -> bool:
@@ -66,41 +79,20 @@ def _layers(
     return [*planes, *traversability(ground, validity, cells, resolution, Critical(*critical))]
 
 
-def _in_one_pass(elevation: Tensor, validity: Tensor, *settings: Any) -> list[Tensor]:
+def _in_one_pass(elevation: Tensor, validity: Tensor, radius: int, cells: int, *others: Any) -> list[Tensor]:
     """Return what `_layers` does, by C++ or a kernel."""
-    layers = _rate_planes(elevation, as_bytes(validity), *settings)
+    kinds = [torch.uint8 if name in MASKS else elevation.dtype for name in _names(cells)]
+    layers = [elevation.new_empty(elevation.shape, dtype=kind) for kind in kinds]
+    _write_planes(elevation, as_bytes(validity), layers, radius, cells, *others)
     return [as_mask(layer) if layer.dtype == torch.uint8 else layer for layer in layers]
 
 
-def _fake(
-    elevation: Tensor, known: Tensor, radius: int, cells: int, resolution: float, critical: list[float]
-) -> list[Tensor]:
-    return _empty_layers(elevation, cells)
-
-
 @operator(
-    "rate_planes(Tensor elevation, Tensor known, int radius, int cells, float resolution, float[] critical) "
-    "-> Tensor[]",
-    _fake,
+    "write_planes(Tensor elevation, Tensor known, Tensor(a!)[] layers, int radius, int cells, float resolution, "
+    "float[] critical) -> ()",
+    lambda *_: None,
 )
-def _rate_planes(
-    elevation: Tensor, known: Tensor, radius: int, cells: int, resolution: float, critical: list[float]
-) -> list[Tensor]:
-    """Return what `_layers` does, masks as bytes; without a head, `cells` is 0."""
-    layers = _empty_layers(elevation, cells)
-    if kernels.work_on(elevation):
-        _launch(elevation, known, layers, radius, cells, resolution, critical)
-        return layers
-    library = load("surface/surface.cpp", _CONSTANTS)
-    if library is None or elevation.numel() == 0:
-        layers = _layers(elevation, as_mask(known), radius, cells, resolution, critical)
-        return [as_bytes(layer) if layer.dtype == torch.bool else layer for layer in layers]
-    settings = ctypes.byref(_settings(radius, cells, resolution, critical))
-    run(library.rate_surface, [elevation, known, *_padded(layers)], *elevation.shape, radius, cells, settings)
-    return layers
-
-
-def _launch(
+def _write_planes(
     elevation: Tensor,
     known: Tensor,
     layers: list[Tensor],
@@ -109,13 +101,32 @@ def _launch(
     resolution: float,
     critical: list[float],
 ) -> None:
+    """Write what `_layers` returns into contiguous layers, masks as bytes; without a head, `cells` is 0."""
+    settings = _settings(radius, cells, resolution, critical)
+    results = [*layers, *[None] * (len(_NAMES) - len(layers))]
+    if kernels.work_on(elevation):
+        _launch(elevation.contiguous(), known.contiguous(), results, radius, cells, settings)
+        return
+    library = load("surface/surface.cpp", _CONSTANTS)
+    if library is not None and elevation.numel() > 0:
+        tensors = [elevation, known, *results]
+        run(library.rate_surface, tensors, *elevation.shape, radius, cells, ctypes.byref(settings))
+        return
+    for layer, value in zip(
+        layers, _layers(elevation, as_mask(known), radius, cells, resolution, critical), strict=True
+    ):
+        layer.copy_(value)
+
+
+def _launch(
+    elevation: Tensor, known: Tensor, results: list[Tensor | None], radius: int, cells: int, settings: _Settings
+) -> None:
     """Write the layers by a kernel."""
     (B, *size), rim = elevation.shape, max(radius, cells)
     tiles = math.prod(-(-length // tile) for length, tile in zip(size, _TILE, strict=True))
     memory = 4 * math.prod(tile + 2 * rim for tile in _TILE)
-    results, settings = kernels.addresses_of(_padded(layers)), _settings(radius, cells, resolution, critical)
+    arguments = elevation, known, kernels.addresses_of(results), *size, radius, cells, settings
     with torch.cuda.device_of(elevation):
-        arguments = elevation.contiguous(), known.contiguous(), results, *size, radius, cells, settings
         kernels.launch_blocks(_SOURCE, "rate_surface", B * tiles, memory, *arguments)
 
 
@@ -132,14 +143,3 @@ class _Settings(ctypes.Structure):
 def _settings(radius: int, cells: int, resolution: float, critical: list[float]) -> _Settings:
     spreads = (ctypes.c_float * 2)(min_spread(radius), min_spread(cells))
     return _Settings(resolution, spreads, *(critical or 3 * [1.0]), MIN_DET, MIN_TRACE)
-
-
-def _padded(layers: list[Tensor]) -> list[Tensor | None]:
-    """Return the layers of the results, None where there is no head."""
-    return [*layers, *[None] * (len(_NAMES) - len(layers))]
-
-
-def _empty_layers(elevation: Tensor, cells: int) -> list[Tensor]:
-    number, mask = elevation, torch.empty((), dtype=torch.uint8, device=elevation.device)
-    kinds = [number, number, mask, number, mask][: len(_NAMES) if cells else len(Normals._fields)]
-    return [kind.new_empty(elevation.shape) for kind in kinds]
