@@ -7,7 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchelev.ops.operators import padded
-from torchelev.ops.windows import gaussian_sum, neighbours, sliding_maximum, sliding_sum, window_maximum, window_moments
+from torchelev.ops.windows import (
+    gaussian_sum,
+    neighbours,
+    sliding_maximum,
+    sliding_minimum,
+    sliding_sum,
+    window_maximum,
+    window_moments,
+)
 
 SIZES = st.tuples(st.integers(1, 2), st.integers(1, 7), st.integers(1, 6))
 
@@ -58,9 +66,10 @@ def test_gradients(function):
 
 
 @given(st.integers(1, 17), st.integers(0, 9), st.integers(0, 10_000))
-def test_sliding_maximum(width, more, seed):
+def test_sliding_extrema(width, more, seed):
     values = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, width + more)))
     assert torch.equal(sliding_maximum(values, width, 1), values.unfold(1, width, 1).amax(-1))
+    assert torch.equal(sliding_minimum(values, width, 1), values.unfold(1, width, 1).amin(-1))
 
 
 @given(st.integers(1, 17), st.integers(0, 9), st.integers(0, 10_000))

@@ -14,7 +14,7 @@ from torchelev.compiled.compiler import announced_compilation, packed
 from torchelev.compiled.elsewhere import run_elsewhere
 from torchelev.compiled.kept_graphs import Dynamic, KeptGraph, surroundings
 from torchelev.config import ElevationMapConfig
-from torchelev.native.library import is_native
+from torchelev.ops.moving import gains_by_moving_in_place
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, update_in_place
 from torchelev.stages.age import age
@@ -148,7 +148,7 @@ def graphs_of(cfg: ElevationMapConfig, kinds: tuple, sensors: int) -> Graphs:
 
     def first(stored: MapState, points: Tensor, *others: Any) -> Measurement:
         m = measure(points, *others, cfg.grid, cfg.sensor, stored.elevation.dtype)  # type: ignore[call-arg]
-        in_place = stored.elevation.is_cpu and is_native()
+        in_place = gains_by_moving_in_place(stored.elevation)
         moved = recenter(stored, m, cfg.grid, in_place=True) if in_place else stored
         old = with_masks(stored, as_mask)
         if in_place:

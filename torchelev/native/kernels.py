@@ -44,8 +44,8 @@ can_launch._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def work_on(layer: Tensor) -> bool:
-    """Tell whether operators that have kernels use them for a layer: it is on a GPU."""
-    return layer.is_cuda
+    """Tell whether a layer is on a GPU on which kernels run."""
+    return layer.is_cuda and can_launch(layer.get_device())
 
 
 def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) -> None:

@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.ops import native
+from torchelev.native.library import is_native
+from torchelev.ops import native, on_gpu
 from torchelev.ops.indexing import read
 from torchelev.ops.storage import realize_all
 
@@ -37,19 +38,25 @@ def move_layers(layers: dict[str, Tensor], shift: Int[Tensor, "B 2"], blank: dic
     return dict(zip((*names, *masks), (*values, *_from_bits(bits, len(masks))), strict=True))
 
 
+def gains_by_moving_in_place(layer: Tensor) -> bool:
+    """Tell whether `move_in_place` beats `move_layers` in compiled code, for maps with such a layer."""
+    return is_native() if layer.is_cpu else on_gpu.gains_by_moving_in_place(layer)
+
+
 @torch.library.custom_op(
     "torchelev::move_in_place",
     mutates_args=("layers",),
     schema="(Tensor(a!)[] layers, Tensor shift, float[] blanks) -> ()",
 )
 def move_in_place(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> None:
-    """Shift contiguous layers (B, H, W) on a CPU by whole cells (B, 2), each environment by its own; those of 0 stay.
+    """Shift contiguous layers (B, H, W) by whole cells (B, 2), each environment by its own; those of 0 stay.
 
     Layers of bytes get 0 in entering cells, whatever their blank.
     """
-    if native.move_layers(layers, shift, blanks):
+    if native.move_layers(layers, shift, blanks) or on_gpu.move_layers(layers, shift, blanks):
         return
-    for layer, value in zip(layers, moved(layers, shift, blanks), strict=True):
+    values = (moved if shift.is_cpu else _gathered)(layers, shift, blanks)
+    for layer, value in zip(layers, values, strict=True):
         layer.copy_(value)
 
 

@@ -119,6 +119,11 @@ def sliding_maximum(values: Tensor, width: int, dim: int) -> Tensor:
     return torch.maximum(values.narrow(dim, 0, length), values.narrow(dim, width - span, length))
 
 
+def sliding_minimum(values: Tensor, width: int, dim: int) -> Tensor:
+    """Return the minimum of every `width` neighbours along a dimension, which shrinks by width - 1."""
+    return -sliding_maximum(-values, width, dim)
+
+
 def gaussian_sum(values: Tensor, radius: int, sigma: float, dim: int) -> Tensor:
     """Sum exp(-k^2 / (2 sigma^2)) * values over |k| <= radius cells along a dimension, which shrinks by 2 radius.
 

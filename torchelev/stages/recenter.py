@@ -20,7 +20,7 @@ def recenter(state: MapState, m: Measurement, grid: GridConfig, in_place: bool =
     """Move the window by whole cells so that it follows the robot (paper, Sec. II: a robot-centric map).
 
     World-fixed cells keep their value to the bit, entering cells are blank. Environments move independently.
-    Without a base pose the window stays. `in_place`: the layers, on a CPU, move in their own memory.
+    Without a base pose the window stays. `in_place`: the layers move in their own memory.
     """
     return state if m.base is None else follow(state, m.base, m.anchor, grid, in_place)
 

@@ -107,7 +107,7 @@ def _write_planes(
     if kernels.work_on(elevation):
         _launch(elevation.contiguous(), known.contiguous(), results, radius, cells, settings)
         return
-    library = load("surface/surface.cpp", _CONSTANTS)
+    library = load("surface/surface.cpp", _CONSTANTS) if elevation.is_cpu else None
     if library is not None and elevation.numel() > 0:
         tensors = [elevation, known, *results]
         run(library.rate_surface, tensors, *elevation.shape, radius, cells, ctypes.byref(settings))

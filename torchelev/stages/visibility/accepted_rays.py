@@ -13,7 +13,7 @@ from torchelev.grid import GridConfig, locate
 from torchelev.ops.indexing import read
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.storage import stored
-from torchelev.ops.windows import neighbours
+from torchelev.ops.windows import neighbours, sliding_minimum
 from torchelev.stages.cells import lattice_offset
 from torchelev.stages.visibility.horizon import horizon
 from torchelev.stages.visibility.rays import Rays, height_margin
@@ -105,7 +105,7 @@ def ground_at_borders(ground: Tensor, grid: GridConfig) -> Float[Tensor, "B 4L"]
     The borders are those of low x, high x, low y and high y; L is the longer one's number of cells.
     """
     cells = max(1, int(NEAR / grid.resolution))
-    return border_minima(ground, cells, grid).unfold(2, 2 * cells + 1, 1).amin(-1).flatten(1)
+    return sliding_minimum(border_minima(ground, cells, grid), 2 * cells + 1, 2).flatten(1)
 
 
 @stored
