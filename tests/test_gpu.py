@@ -128,9 +128,10 @@ def drive(emap, updates=4, seed=0):
 @needs_gpu
 @in_blocks
 @pytest.mark.usefixtures("_kernels")
-@pytest.mark.parametrize("compiled, cells", [(False, 40), (False, 115), (True, 40)])  # 115: more than 48 kB in a block
-def test_gpu_gives_the_same_map(compiled, cells):
-    on_cpu, on_gpu = (ElevationMap(small_config((cells, cells), 0.05), 3, device) for device in ("cpu", "cuda"))
+@pytest.mark.parametrize("compiled, cells, maps", [(False, 40, 3), (False, 115, 3), (True, 40, 64)])
+def test_gpu_gives_the_same_map(compiled, cells, maps):
+    """115 cells: more than 48 kB in a block; 64 maps move in place."""
+    on_cpu, on_gpu = (ElevationMap(small_config((cells, cells), 0.05), maps, device) for device in ("cpu", "cuda"))
     if compiled:
         on_gpu.compile()
     drive(on_cpu), drive(on_gpu)
