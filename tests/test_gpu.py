@@ -139,6 +139,11 @@ def test_gpu_gives_the_same_map(compiled, cells, maps):
     both = on_gpu.validity.cpu() & on_cpu.validity
     difference = (on_gpu.elevation.cpu() - on_cpu.elevation)[both].abs()
     assert difference.median() < 1e-6 and difference.quantile(0.999) < 1e-4
+    for name in ("bounded", "has_normal", "rated", "challenger_support"):
+        assert (getattr(on_gpu.state, name).cpu() == getattr(on_cpu.state, name)).float().mean() > 0.998, name
+    for name in ("gradient_x", "gradient_y", "traversability"):
+        difference = (getattr(on_gpu.state, name).cpu() - getattr(on_cpu.state, name)).abs()
+        assert difference.median() < 1e-5 and difference.quantile(0.99) < 1e-3, name
 
 
 @needs_gpu
