@@ -7,14 +7,17 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from benchmarks.speed.completion import make_maps
-from tests.helpers import pose, random_poses, small_config, with_completion
+from tests.helpers import pose, random_poses, random_state, small_config, with_completion
 from tests.robot_body.bodies import random_body
 from tests.site.helpers import known_cells, robots
-from torchelev import BodyConfig, CompletionNet, ElevationMap, HeightScan, MapImage, SensorConfig
+from torchelev import BodyConfig, CompletionNet, ElevationMap, HeightScan, MapImage, OverlapConfig, SensorConfig
 from torchelev.completion.surroundings import count_steps
 from torchelev.native import kernels
 from torchelev.ops import operators
+from torchelev.pipeline import rate_surface
 from torchelev.site import SiteMap
+from torchelev.stages.overlap.clear import clear_other_floors
+from torchelev.state import map_layers
 
 in_blocks = pytest.mark.parametrize("in_blocks", [False, True])  # by kernels whose blocks share memory
 
@@ -161,6 +164,37 @@ def test_gpu_gives_the_same_map_where_cells_hold_many_points():
             emap.update(cloud.to(emap.device), T, T, 0.1)
     assert torch.equal(on_gpu.validity.cpu(), on_cpu.validity)
     assert (on_gpu.elevation.cpu() - on_cpu.elevation).abs().quantile(0.99) < 1e-4
+
+
+@needs_gpu
+def test_other_floors_and_surfaces_equal_those_of_the_cpu():
+    """On maps of two parts and many tiles."""
+    cfg = small_config((70, 90), 0.05, overlap=OverlapConfig(radius=1.5, height=0.3, base_height=0.2))
+    state = map_layers(single, random_state(np.random.default_rng(0), cfg.grid, 70, known=0.7))
+    relief = torch.where(torch.arange(90) < 45, 0.1, 1.0)
+    time = state.time * (torch.rand(state.time.shape) < 0.5)
+    state = state._replace(elevation=state.elevation * relief, time=time)
+    emap, T = ElevationMap(cfg, 70), pose((0.0, 0.0, 0.2), num_envs=70)
+    m = emap.measure(torch.full((70, 1, 3), torch.nan), T, T, 0.1)
+    with torch.no_grad():
+        on_cpu, on_gpu = (
+            rate_surface(clear_other_floors(*values, cfg.grid, cfg.overlap), cfg)
+            for values in ((state, m), (map_layers(to_gpu, state), type(m)(*map(to_gpu, m))))
+        )
+    assert on_cpu.statistics.cleared_other_floors.min() > 100 and on_cpu.traversability.mean() > 0.1
+    for name in ("validity", "bounded", "challenger_support", "has_normal", "rated"):
+        assert (getattr(on_gpu, name).cpu() == getattr(on_cpu, name)).float().mean() > 0.9999, name
+    for name in ("gradient_x", "gradient_y", "traversability"):
+        difference = (getattr(on_gpu, name).cpu() - getattr(on_cpu, name)).abs()
+        assert (difference < 1e-4).float().mean() > 0.9995, name
+
+
+def single(value):
+    return value.float() if value.is_floating_point() else value
+
+
+def to_gpu(value):
+    return None if value is None else value.cuda()
 
 
 @needs_gpu
