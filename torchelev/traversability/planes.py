@@ -32,7 +32,8 @@ _CONSTANTS = {
 }
 _NAMES = (*Normals._fields, *PlaneRating._fields)
 _SOURCE, _TILE = "surface/surface.cu", (16, 32)  # rows and columns, as in the source
-_LARGEST_RIM = 32  # [cells] of a tile whose heights fit into what threads share
+_WARPS, _SUMS = 32, 14  # of a block, and along each row of a tile, as in the source
+_LARGEST_RIM = 8  # [cells] of a tile that fits into the 64 kB that threads may share on any GPU
 
 
 def rate_planes(
@@ -112,9 +113,8 @@ def _write_planes(
         tensors = [elevation, known, *results]
         run(library.rate_surface, tensors, *elevation.shape, radius, cells, ctypes.byref(settings))
         return
-    for layer, value in zip(
-        layers, _layers(elevation, as_mask(known), radius, cells, resolution, critical), strict=True
-    ):
+    values = _layers(elevation, as_mask(known), radius, cells, resolution, critical)
+    for layer, value in zip(layers, values, strict=True):
         layer.copy_(value)
 
 
@@ -124,7 +124,8 @@ def _launch(
     """Write the layers by a kernel."""
     (B, *size), rim = elevation.shape, max(radius, cells)
     tiles = math.prod(-(-length // tile) for length, tile in zip(size, _TILE, strict=True))
-    memory = 4 * math.prod(tile + 2 * rim for tile in _TILE)
+    rows = _TILE[0] + 2 * rim
+    memory = 4 * (_WARPS + rows * (_TILE[1] + 2 * rim + _SUMS * _TILE[1]))
     arguments = elevation, known, kernels.addresses_of(results), *size, radius, cells, settings
     with torch.cuda.device_of(elevation):
         kernels.launch_blocks(_SOURCE, "rate_surface", B * tiles, memory, *arguments)
@@ -134,12 +135,12 @@ class _Settings(ctypes.Structure):
     """`Settings` of surface.cu, whose first six are those of surface.cpp."""
 
     _fields_ = (
-        ("resolution", ctypes.c_float),
+        ("per_cell", ctypes.c_float),
         ("min_spread", ctypes.c_float * 2),
-        *((name, ctypes.c_float) for name in (*Critical._fields, "min_det", "min_trace")),
+        *((name, ctypes.c_float) for name in ("per_slope", "per_step", "per_roughness", "min_det", "min_trace")),
     )
 
 
 def _settings(radius: int, cells: int, resolution: float, critical: list[float]) -> _Settings:
     spreads = (ctypes.c_float * 2)(min_spread(radius), min_spread(cells))
-    return _Settings(resolution, spreads, *(critical or 3 * [1.0]), MIN_DET, MIN_TRACE)
+    return _Settings(1 / resolution, spreads, *(1 / value for value in critical or 3 * [1.0]), MIN_DET, MIN_TRACE)

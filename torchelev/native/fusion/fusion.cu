@@ -158,15 +158,16 @@ extern "C" __global__ void update_cells(Sorted sorted, const float* in_scan, Map
     add_of_warp(results.ignored + at.row, ignored);
 }
 
-// Update the heavy cells, a warp for each.
+// Update the heavy cells, a team of `team` threads for each.
 extern "C" __global__ void update_heavy_cells(Sorted sorted, const float* in_scan, Map map, Results results,
-                                              Heavy heavy, int64_t rows, int64_t columns, Settings s, int64_t threads) {
+                                              Heavy heavy, int64_t rows, int64_t columns, Settings s, int64_t threads,
+                                              int64_t team) {
     const Scan scan{sorted, in_scan, map, rows, columns};
-    const int32_t C = int32_t(rows * columns), number = *heavy.number, step = int32_t(threads / warpSize);
-    for (int32_t k = int32_t(place(threads).k) / warpSize; k < number; k += step) {
+    const int32_t C = int32_t(rows * columns), number = *heavy.number, size = std::min(int32_t(team), warpSize);
+    for (int32_t k = int32_t(place(threads).k) / size; k < number; k += int32_t(threads) / size) {
         const int32_t cell = heavy.cells[k], row = cell / C;
-        const Cell after = scan.update(row, cell % C, sorted.of(cell, warpSize), s);
-        if (threadIdx.x % warpSize) continue;
+        const Cell after = scan.update(row, cell % C, sorted.of(cell, size), s);
+        if (threadIdx.x % size) continue;
         results.set(cell, after);
         atomicAdd(reinterpret_cast<unsigned long long*>(results.used + row), after.used);
         atomicAdd(reinterpret_cast<unsigned long long*>(results.ignored + row), after.ignored);

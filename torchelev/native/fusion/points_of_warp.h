@@ -1,4 +1,4 @@
-// The points of a cell on a GPU: one thread's, or shared by the threads of a warp, which all hold the same results.
+// The points of a cell on a GPU: one thread's, or shared by a team of a warp's threads, which all hold the same results.
 #pragma once
 
 #include "point.h"
@@ -6,7 +6,7 @@
 struct Points {
     const Point *first, *last;
     float number;
-    int stride;  // threads that share the points: 1, or a whole warp
+    int stride;  // threads that share the points: neighbours in a warp, a power of two of them
 
     struct Iterator {
         const Point* point;
@@ -23,13 +23,18 @@ struct Points {
 
     float highest(float value) const {
         for (int step = stride / 2; step > 0; step /= 2)
-            value = std::max(value, __shfl_xor_sync(0xffffffff, value, step));
+            value = std::max(value, __shfl_xor_sync(team(), value, step));
         return value;
     }
 
   private:
+    // The threads that share the points, as bits.
+    unsigned team() const {
+        const unsigned all = stride < 32 ? (1u << stride) - 1 : 0xffffffff;
+        return all << (threadIdx.x % warpSize / stride * stride);
+    }
     template <class Value> Value sum(Value value) const {
-        for (int step = stride / 2; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffff, value, step);
+        for (int step = stride / 2; step > 0; step /= 2) value += __shfl_xor_sync(team(), value, step);
         return value;
     }
 };

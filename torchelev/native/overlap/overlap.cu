@@ -15,6 +15,14 @@ struct Layers {
     const uint8_t *validity, *bounded, *challenger_support;
     uint8_t *new_validity, *new_bounded, *new_challenger_support;
     int64_t* numbers;
+
+    // The layers from a cell on.
+    Layers from(int64_t cell) const {
+        return {elevation + cell,    upper_bound + cell,  time + cell,
+                validity + cell,     bounded + cell,      challenger_support + cell,
+                new_validity + cell, new_bounded + cell,  new_challenger_support + cell,
+                numbers};
+    }
 };
 
 // The cells' places as seen from the bases (B, H) and (B, W), and the bases' heights (B) [m].
@@ -30,18 +38,23 @@ struct Sums {
 // A block's part of a map.
 struct Part {
     int64_t map;
-    int32_t first, end, columns;
+    int32_t first, end, rows, columns;
 
-    Part(int64_t H, int64_t W) : columns(int32_t(W)) {
-        const int32_t cells = int32_t(H * W), parts = (cells + PART - 1) / PART;
+    Part(int64_t H, int64_t W) : rows(int32_t(H)), columns(int32_t(W)) {
+        const int32_t cells = rows * columns, parts = (cells + PART - 1) / PART;
         map = unsigned(blockIdx.x) / unsigned(parts);
         first = int32_t(unsigned(blockIdx.x) % unsigned(parts)) * PART, end = std::min(cells, first + PART);
     }
-    // Call `look(place, square)` with this thread's cells and the squares [m^2] of their distances from the base.
-    template <class Look> void each(const Around& around, int64_t H, const Look& look) const {
-        for (int32_t k = first + threadIdx.x; k < end; k += blockDim.x) {
-            const float x = around.x[map * H + k / columns], y = around.y[map * columns + k % columns];
-            look(map * H * columns + k, x * x + y * y);
+    // Call `look(cell, square)` with this thread's cells of the map and the squares [m^2] of their distances.
+    template <class Look> void each(const Around& around, const Look& look) const {
+        const float *x = around.x + map * rows, *y = around.y + map * columns;
+        const int32_t step = blockDim.x, step_rows = step / columns, step_columns = step % columns;
+        int32_t i = (first + int32_t(threadIdx.x)) / columns, j = (first + int32_t(threadIdx.x)) % columns;
+#pragma unroll 4
+        for (int32_t cell = first + threadIdx.x; cell < end; cell += step) {
+            look(cell, x[i] * x[i] + y[j] * y[j]);
+            i += step_rows, j += step_columns;
+            if (j >= columns) i++, j -= columns;
         }
     }
 };
@@ -54,15 +67,16 @@ inline Total sum_of_block(Total own, float* memory) {
 extern "C" __global__ void sum_below(Around around, Layers layers, Sums* sums, int64_t H, int64_t W, float stance,
                                      Settings s) {
     const Part part(H, W);
+    const Layers map = layers.from(part.map * H * W);
     const float z = around.z[part.map];
     Sums own{};
-    part.each(around, H, [&](int64_t place, float square) {
-        const float height = layers.elevation[place] - z;
-        if (!(square <= s.radius_square && layers.validity[place] && height <= 0)) return;
+    part.each(around, [&](int32_t cell, float square) {
+        const float height = map.elevation[cell] - z, time = map.time[cell];
+        if (!(square <= s.radius_square && map.validity[cell] && height <= 0)) return;
         const float spread = square + stance * stance, weight = 1 / (spread * spread), moment = weight * height;
         own.all.weight += weight;
         if (height >= -s.max_base_height) own.within.weight += weight, own.within.moment += moment;
-        if (layers.time[place] == 0) own.hit.weight += weight, own.hit.moment += moment;
+        if (time == 0) own.hit.weight += weight, own.hit.moment += moment;
     });
     float* memory = reinterpret_cast<float*>(block_memory());
     own = {sum_of_block(own.all, memory), sum_of_block(own.within, memory), sum_of_block(own.hit, memory)};
@@ -81,15 +95,18 @@ extern "C" __global__ void clear_other_floors(Around around, Layers layers, cons
         all.hit.weight += sums[p].hit.weight, all.hit.moment += sums[p].hit.moment;
     }
     const Floor floor(ground_of(all.all, all.within, all.hit, s), s);
+    const Layers map = layers.from(part.map * H * W);
     const float z = around.z[part.map];
     int32_t number = 0;
-    part.each(around, H, [&](int64_t place, float square) {
-        const bool near = square <= s.radius_square, known = layers.validity[place], bounded = layers.bounded[place];
-        const float allowance = known && layers.time[place] == 0 ? std::sqrt(square) * s.slope : 0;
-        const bool other = near && known && floor.is_outside(layers.elevation[place] - z, allowance);
-        const bool other_bound = other || (near && bounded && floor.is_outside(layers.upper_bound[place] - z, 0.0f));
-        layers.new_validity[place] = known && !other, layers.new_bounded[place] = bounded && !other_bound;
-        layers.new_challenger_support[place] = other ? 0 : layers.challenger_support[place];
+    part.each(around, [&](int32_t cell, float square) {
+        const bool near = square <= s.radius_square, known = map.validity[cell], bounded = map.bounded[cell];
+        const float height = map.elevation[cell] - z, bound = map.upper_bound[cell] - z;
+        const uint8_t support = map.challenger_support[cell];
+        const float allowance = known && map.time[cell] == 0 ? std::sqrt(square) * s.slope : 0;
+        const bool other = near & known & floor.is_outside(height, allowance);
+        const bool other_bound = other | (near & bounded & floor.is_outside(bound, 0.0f));
+        map.new_validity[cell] = known & !other, map.new_bounded[cell] = bounded & !other_bound;
+        map.new_challenger_support[cell] = other ? 0 : support;
         number += other;
     });
     add_of_warp(&layers.numbers[part.map], number);

@@ -9,9 +9,9 @@ constexpr int ROWS = 64, COLUMNS = 128;  // of a tile: the sums of its last rows
 
 // What `_rate_planes` gives.
 struct Settings {
-    float resolution;     // [m]
+    float per_cell;       // [1/m]
     float min_spread[2];  // [cells^2] of the normals' windows and of the head's
-    float critical_slope, critical_step, critical_roughness;
+    float per_slope, per_step, per_roughness;  // 1 / critical values
 };
 
 // Layers of a map (H, W), from some cell on.
@@ -131,7 +131,7 @@ private:
     }
 
     [[gnu::always_inline]] void put_normals(const Layers& out, int column, int count, Flags known, const Planes& planes) const {
-        const float per_cell = 1 / settings_.resolution;
+        const float per_cell = settings_.per_cell;
         const Flags has_normal = known & planes.spans;
         put(out.gradient_x + column, pick(has_normal, planes.gradient_u * per_cell, all(0)), count);
         put(out.gradient_y + column, pick(has_normal, planes.gradient_v * per_cell, all(0)), count);
@@ -150,14 +150,14 @@ private:
 
     // `traversability` in heads.py, given the height range of the windows [m].
     [[gnu::always_inline]] Lanes rating(const Planes& planes, Lanes range) const {
-        const float per_cell = 1 / settings_.resolution;
+        const float per_cell = settings_.per_cell;
         const Lanes x = planes.gradient_u * per_cell, y = planes.gradient_v * per_cell;
         const Lanes slope = arctan(root(larger(x * x + y * y, all(1e-12f))));
         const Lanes explained = float(2 * cells_) * (absolute(planes.gradient_u) + absolute(planes.gradient_v));
         const Lanes step = larger(range - explained, all(0));
         const Lanes roughness = root(larger(planes.residual, all(1e-12f)));
-        const Lanes worst = larger(slope * (1 / settings_.critical_slope), step * (1 / settings_.critical_step));
-        return larger(1 - larger(worst, roughness * (1 / settings_.critical_roughness)), all(0));
+        const Lanes worst = larger(slope * settings_.per_slope, step * settings_.per_step);
+        return larger(1 - larger(worst, roughness * settings_.per_roughness), all(0));
     }
 };
 

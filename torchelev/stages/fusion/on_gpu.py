@@ -22,6 +22,7 @@ _SOURCE = "fusion/fusion.cu"
 _POINT_BYTES = 32  # of `Point` in point.h
 _FEW = 8  # as in fusion.cu: points of a cell up to which one thread takes it
 _HEAVY_THREADS = 2**16  # that share the other cells
+_WARP, _TEAM, _MANY_POINTS = 32, 8, 2**20  # how many share one: fewer, for less waiting, where there are many points
 
 
 def can_update_on_gpu(state: MapState, points: Tensor) -> bool:
@@ -76,7 +77,8 @@ def _update(
         maps = [kernels.addresses_of(values) for values in (layers, [*new, *tallies], heavy)]
         update = cells, in_scan, *maps, C // width, width, own
         kernels.launch(_SOURCE, "update_cells", B, C, *update)
-        kernels.launch(_SOURCE, "update_heavy_cells", 1, _HEAVY_THREADS, *update, _HEAVY_THREADS)
+        team = _TEAM if B * M > _MANY_POINTS else _WARP
+        kernels.launch(_SOURCE, "update_heavy_cells", 1, _HEAVY_THREADS, *update, _HEAVY_THREADS, team)
         del memory  # not before: `cells` holds nothing but its addresses
     return [*new, *tallies]
 
