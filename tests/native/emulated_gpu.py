@@ -18,6 +18,7 @@ GPU = """
 #include <cstdint>
 #include <cstring>
 #define __global__
+#define __launch_bounds__(...)
 #define __shared__
 #define __syncthreads()
 int32_t memory[1 << 16];

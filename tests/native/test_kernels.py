@@ -75,3 +75,14 @@ def test_blocks_suit_a_gpu_with_enough_memory_whose_half_they_keep_busy(monkeypa
 def test_compiled_code_asks():
     compiled = torch.compile(lambda x: x + kernels.can_launch(max(0, x.get_device())), fullgraph=True, backend="eager")
     assert compiled(torch.zeros(1)) == kernels.can_launch(0)
+
+
+def test_all_kernels_are_loaded(gpu):
+    loaded = []
+    gpu.setattr(kernels, "_function", lambda source, kernel, _: loaded.append(f"{source} {kernel}"))
+    gpu.setattr(kernels, "_launch", lambda *_: None)
+    gpu.setattr(torch, "ones", lambda *_, **__: torch.tensor(2.0))
+    assert kernels._try(0)
+    sources = [path.read_text(encoding="utf-8") for path in kernels._SOURCES.rglob("*.cu")]
+    assert len(set(loaded)) == sum(text.count('extern "C" __global__') for text in sources) > 8
+    assert "surface/surface.cu rate_surface" in loaded and "tables/tables.cu widen" in loaded

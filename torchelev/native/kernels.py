@@ -125,7 +125,7 @@ def _try(device: int) -> bool:
     """Run a kernel on the current device, and load all others."""
     try:
         for path in _SOURCES.rglob("*.cu"):  # while a graph is captured, none could be loaded
-            for kernel in re.findall(r"__global__ void (\w+)", path.read_text(encoding="utf-8")):
+            for kernel in re.findall(r"__global__[^;{]*?void (\w+)", path.read_text(encoding="utf-8")):
                 _function(path.relative_to(_SOURCES).as_posix(), kernel, device)
         one = torch.ones(1, device=device, dtype=torch.float32)
         launch("gpu/trial.cu", "double_it", 1, 1, one)

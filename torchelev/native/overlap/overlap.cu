@@ -50,7 +50,7 @@ struct Part {
         const float *x = around.x + map * rows, *y = around.y + map * columns;
         const int32_t step = blockDim.x, step_rows = step / columns, step_columns = step % columns;
         int32_t i = (first + int32_t(threadIdx.x)) / columns, j = (first + int32_t(threadIdx.x)) % columns;
-#pragma unroll 4
+#pragma unroll 2
         for (int32_t cell = first + threadIdx.x; cell < end; cell += step) {
             look(cell, x[i] * x[i] + y[j] * y[j]);
             i += step_rows, j += step_columns;

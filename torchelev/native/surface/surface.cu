@@ -135,9 +135,10 @@ inline void rate(const Tile& tile, int32_t place, bool is_known, int64_t cell, i
 
 // Rate maps (B, H, W). Heights count from the mean of a tile: squares of absolute ones would cost float32 its
 // millimetres.
-extern "C" __global__ void rate_surface(const float* __restrict__ elevation, const uint8_t* __restrict__ validity,
-                                        Layers out, int64_t H, int64_t W, int64_t radius, int64_t cells,
-                                        Settings settings) {
+extern "C" __global__ __launch_bounds__(512, 3) void rate_surface(const float* __restrict__ elevation,
+                                                                  const uint8_t* __restrict__ validity, Layers out,
+                                                                  int64_t H, int64_t W, int64_t radius, int64_t cells,
+                                                                  Settings settings) {
     const int32_t r = int32_t(radius), c = int32_t(cells), rows = int32_t(H), columns = int32_t(W);
     const Tile tile(r < c ? c : r, reinterpret_cast<float*>(block_memory()));
     const unsigned bands = (unsigned(rows) + ROWS - 1) / ROWS, strips = (unsigned(columns) + COLUMNS - 1) / COLUMNS;
