@@ -84,8 +84,8 @@ extern "C" __global__ void sum_below(Around around, Layers layers, Sums* sums, i
 }
 
 // Clear the cells and bounds of other floors.
-extern "C" __global__ void clear_other_floors(Around around, Layers layers, const Sums* sums, int64_t H, int64_t W,
-                                              Settings s) {
+extern "C" __global__ __launch_bounds__(512, 3) void clear_other_floors(Around around, Layers layers, const Sums* sums,
+                                                                        int64_t H, int64_t W, Settings s) {
     const Part part(H, W);
     const int64_t parts = (H * W + PART - 1) / PART;
     Sums all{};
