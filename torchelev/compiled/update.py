@@ -114,10 +114,10 @@ def let_time_pass(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> M
     return age(reset_statistics(state, m), m, cfg.aging)
 
 
-def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig, _: MapState) -> MapState:
-    """Compensate the height drift, and fuse the points' heights."""
+def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig, into: MapState) -> MapState:
+    """Compensate the height drift, and fuse the points' heights; `into`: the stored state, see `fuse`."""
     state = compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)
-    return fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
+    return fuse(state, m, cfg.grid, cfg.fusion, cfg.raycast is not None, into)
 
 
 def apply_rays(

@@ -78,6 +78,21 @@ def test_agrees_with_tensors(by, seed, num_envs, sensors, num_points, cfg, has_r
     assert_same(by, state, m, grid, cfg, has_rays)
 
 
+@pytest.mark.parametrize("is_own", [True, False])
+@given(st.integers(0, 10_000), st.booleans())
+def test_kernels_write_into_the_layers_of_a_state(is_own, seed, in_blocks):
+    """Of its own those that no cell reads of another; of another state all but the masks."""
+    state, m, grid = random_scan(seed, 2, 1, 300, False)
+    by = "kernels in blocks" if in_blocks else "kernels"
+    expected = fused(by, state, m, grid, FusionConfig(), True)
+    into = map_layers(torch.clone, state)
+    got = fused(by, into if is_own else state, m, grid, FusionConfig(), True, into)
+    written = {name for name in FUSED if getattr(got, name) is getattr(into, name)}
+    assert written == {*on_gpu.OWN} if is_own else written >= {"elevation", "support", *on_gpu.OWN}
+    for name in (*FUSED, "validity"):
+        assert torch.equal(getattr(got, name), getattr(expected, name)), name
+
+
 def test_graphs_of_kernels_serve_any_number_of_maps():
     graphs = []
 

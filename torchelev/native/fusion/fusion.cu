@@ -7,7 +7,8 @@
 #include "cell.h"
 #include "threads.h"
 
-constexpr int FEW = 8;  // points of a cell up to which one thread takes it, as few cells have more
+constexpr int AHEAD = 4;  // points that a thread reads at a time
+constexpr int FEW = 8;    // points of a cell up to which one thread takes it, as few cells have more
 
 // The points of all environments, those of a cell one after the other.
 struct Sorted {
@@ -61,17 +62,33 @@ extern "C" __global__ void average_points(Sorted sorted, float* in_scan, int64_t
     in_scan[cell] = sorted.counts[cell] ? mean_height(sorted.of(cell, 1)) : NO_HEIGHT;
 }
 
+// Call `use(k, slot)` for the used points of a row among its M, from `hit` on, that are this thread's of its block's.
+template <class Use> inline void each_hit(const Hits& hits, int64_t hit, int32_t M, const Use& use) {
+    const int32_t step = blockDim.x;
+    for (int32_t first = threadIdx.x; first < M; first += AHEAD * step) {
+        int32_t slots[AHEAD];
+#pragma unroll
+        for (int e = 0; e < AHEAD; e++) {
+            const int32_t k = first + e * step;
+            slots[e] = k < M && hits.used[hit + k] ? int32_t(hits.slots[hit + k]) : -1;
+        }
+#pragma unroll
+        for (int e = 0; e < AHEAD; e++)
+            if (slots[e] >= 0) use(first + e * step, slots[e]);
+    }
+}
+
 // Count, sort and average the points of maps whose counts fit into a block's own memory. A block for each map.
-extern "C" __global__ void sort_in_block(Hits hits, int32_t* counts, int32_t* ends, Point* result, float* in_scan,
-                                         int64_t M, int64_t S, int64_t C, Settings s) {
+extern "C" __global__ __launch_bounds__(512, 3) void sort_in_block(Hits hits, int32_t* counts, int32_t* ends,
+                                                                   Point* result, float* in_scan, int64_t M, int64_t S,
+                                                                   int64_t C, Settings s) {
     const int64_t row = blockIdx.x, hit = row * M, cell = row * C;
     const int32_t first = threadIdx.x, step = blockDim.x, share = (int32_t(C) + step - 1) / step;
     const int32_t own = std::min(first * share, int32_t(C)), own_end = std::min(own + share, int32_t(C));
     int32_t *next = block_memory(), *sums = next + C;  // (C,) where a cell's next point goes; (step,)
     for (int32_t k = first; k < C; k += step) next[k] = 0;
     __syncthreads();
-    for (int32_t k = first; k < M; k += step)
-        if (hits.used[hit + k]) atomicAdd(&next[hits.slots[hit + k]], 1);
+    each_hit(hits, hit, int32_t(M), [&](int32_t, int32_t slot) { atomicAdd(&next[slot], 1); });
     __syncthreads();
     int32_t before = 0;
     for (int32_t k = own; k < own_end; k++) before += next[k];
@@ -81,9 +98,9 @@ extern "C" __global__ void sort_in_block(Hits hits, int32_t* counts, int32_t* en
         next[k] = before, before += count;
     }
     __syncthreads();
-    for (int32_t k = first; k < M; k += step)
-        if (hits.used[hit + k])
-            result[hit + atomicAdd(&next[hits.slots[hit + k]], 1)] = hits.get(row, k, M, S, s);
+    each_hit(hits, hit, int32_t(M), [&](int32_t k, int32_t slot) {
+        result[hit + atomicAdd(&next[slot], 1)] = hits.get(row, k, M, S, s);
+    });
     __syncthreads();
     for (int32_t k = first; k < C; k += step) {  // `next` is now where each cell's points end
         const int32_t begin = k ? next[k - 1] : 0, end = next[k];

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.ops.indexing import write_cells
@@ -12,14 +13,21 @@ from torchelev.ops.masks import count
 from torchelev.stages.cells import cells_of
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.native import can_update_hit, update_hit
-from torchelev.stages.fusion.on_gpu import can_update_on_gpu, update_on_gpu
+from torchelev.stages.fusion.on_gpu import OWN, can_update_on_gpu, update_on_gpu
 from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update, update_all
 from torchelev.stages.pose_error import relative_variance
-from torchelev.state import BLANK, MapState, Measurement, tally
+from torchelev.state import BLANK, MASKS, MapState, Measurement, tally
 
 
-def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> MapState:
+def fuse(
+    state: MapState,
+    m: Measurement,
+    grid: GridConfig,
+    cfg: FusionConfig,
+    has_rays: bool,
+    into: MapState | None = None,
+) -> MapState:
     """Fuse the scan into the map (paper, Sec. II-C).
 
     The points of a cell become one height z_s with the variance R (`measure_cells`): those within the Mahalanobis gate
@@ -36,17 +44,20 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
     height that most points support wins, even if the first point was an outlier. A scan that disagrees raises the
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
     above the cell agree with each other (`challenge`): a new obstacle appears soon, even on settled ground.
+
+    Given another state, a GPU may write results into its layers, which the returned state then holds.
     """
     cells = cells_of(state, m, grid)
     noise = m.variance if m.noise is None else m.noise
     points = HitPoints(m.points, noise, relative_variance(state, m), m.origin, cells)
     before = CellLayers(*(getattr(state, name).flatten(1) for name in CellLayers._fields))
-    run = update_all
+    arguments = points, before, grid, cfg, has_rays
     if can_update_hit(state):
-        run = update_hit
+        new = update_hit(*arguments)
     elif can_update_on_gpu(state, m.points):
-        run = update_on_gpu
-    new = run(points, before, grid, cfg, has_rays)
+        new = update_on_gpu(*arguments, None if into is None else free_layers(state, into))
+    else:
+        new = update_all(*arguments)
     return tally(
         write_back(state, new, cfg),
         points_used=new.num_used,
@@ -56,10 +67,17 @@ def fuse(state: MapState, m: Measurement, grid: GridConfig, cfg: FusionConfig, h
     )
 
 
+def free_layers(state: MapState, into: MapState) -> dict[str, Tensor]:
+    """Return those layers of a state that the results may be written into while the cells of `state` are read."""
+    numbers = [name for name in CellLayers._fields if name not in MASKS]
+    return {n: getattr(into, n) for n in numbers if n in OWN or getattr(into, n) is not getattr(state, n)}
+
+
 def write_back(state: MapState, new: Update, cfg: FusionConfig) -> MapState:
     """Return the state with the new values of the cells; of other cells the variance alone is limited."""
     if new.cells is None:
-        layers = [layer.view(state.elevation.shape) for layer in new.layers]
+        shape = state.elevation.shape
+        layers = [layer if layer.shape == shape else layer.view(shape) for layer in new.layers]
     else:
         variance = torch.where(state.validity, state.variance.clamp(max=cfg.max_variance), BLANK["variance"])
         before = state._replace(variance=variance)

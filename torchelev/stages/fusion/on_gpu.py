@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update
 from torchelev.state import MapState
 
+OWN = ("variance", "challenger", "time")  # layers of which no cell looks at another's
 _SOURCE = "fusion/fusion.cu"
 _POINT_BYTES = 32  # of `Point` in point.h
 _FEW = 8  # as in fusion.cu: points of a cell up to which one thread takes it
@@ -34,20 +36,34 @@ def can_update_on_gpu(state: MapState, points: Tensor) -> bool:
     return fits_in_32_bits and has_kernels(state) and not torch.are_deterministic_algorithms_enabled()
 
 
-def update_on_gpu(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:
-    """Update all cells; arguments are those of `update_all`."""
+def update_on_gpu(
+    points: HitPoints,
+    before: CellLayers,
+    grid: GridConfig,
+    cfg: FusionConfig,
+    has_rays: bool,
+    into: Mapping[str, Tensor] | None = None,
+) -> Update:
+    """Update all cells; arguments are those of `update_all`.
+
+    `into`: layers that get the results instead of new ones. They may be those before if they are among `OWN`.
+    """
     hits = (*points[:-1], points.cells.inside, points.cells.slot)
-    *new, used, ignored = _update(*hits, list(before), grid.resolution, grid.width, has_rays, numbers(cfg))
-    return Update(CellLayers(*new), None, used, ignored)
+    new = CellLayers(*(torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in before))
+    new = new._replace(**(into or {}))
+    used, ignored = _update(*hits, list(before), list(new), grid.resolution, grid.width, has_rays, numbers(cfg))
+    return Update(new, None, used, ignored)
 
 
 def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
-    _, _, slot, layers, *_ = others
-    new = [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in layers]
-    return [*new, slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])]
+    _, _, slot, *_ = others
+    return [slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])]
 
 
-@operator(f"update_cells_on_gpu({ARGUMENTS}) -> Tensor[]", _fake)
+@operator(
+    f"update_cells_on_gpu({ARGUMENTS.replace('Tensor[] layers', 'Tensor[] layers, Tensor(a!)[] new')}) -> Tensor[]",
+    _fake,
+)
 def _update(
     points: Tensor,
     noise: Tensor,
@@ -56,12 +72,13 @@ def _update(
     inside: Tensor,
     slot: Tensor,
     layers: list[Tensor],
+    new: list[Tensor],
     resolution: float,
     width: int,
     has_rays: bool,
     settings: list[float],
 ) -> list[Tensor]:
-    """Return all layers (B, C), and the points used and ignored (B,)."""
+    """Write all layers (B, C) into contiguous new ones, and return the points used and ignored (B,)."""
     (B, M), C = slot.shape, layers[0].shape[1]
     own, layers = c_settings(config_of(tuple(settings)), resolution, has_rays), [layer.contiguous() for layer in layers]
     points, noise, origin, inside, slot = (
@@ -71,7 +88,6 @@ def _update(
     with torch.cuda.device_of(points):
         hits = kernels.addresses_of([points, noise, shared, origin, inside, slot])
         cells, in_scan, memory = _sort(hits, slot, layers[0], origin.shape[1], own)
-        new = [torch.empty_like(layer) for layer in layers]
         tallies = [slot.new_zeros(B), slot.new_zeros(B)]
         heavy = slot.new_empty(B * M // _FEW, dtype=torch.int32), slot.new_zeros(1, dtype=torch.int32)
         maps = [kernels.addresses_of(values) for values in (layers, [*new, *tallies], heavy)]
@@ -80,7 +96,7 @@ def _update(
         team = _TEAM if B * M > _MANY_POINTS else _WARP
         kernels.launch(_SOURCE, "update_heavy_cells", 1, _HEAVY_THREADS, *update, _HEAVY_THREADS, team)
         del memory  # not before: `cells` holds nothing but its addresses
-    return [*new, *tallies]
+    return tallies
 
 
 class _Sorted(NamedTuple):
