@@ -43,7 +43,7 @@ def random_scan(seed, num_envs, sensors, num_points, with_covariance):
     return state, emap.measure(cloud.float(), T, None, 0.1, pose_covariance=covariance), emap.cfg.grid
 
 
-def fused(by, *scan):
+def fused(by, *scan, function=stage.fuse):
     with (
         torch.no_grad(),
         patch.object(stage, "can_update_hit", lambda _: by == "C++"),
@@ -51,7 +51,7 @@ def fused(by, *scan):
         emulated_kernels(in_blocks=by.endswith("blocks")),
         patch.object(on_gpu, "_HEAVY_THREADS", 256),
     ):
-        return stage.fuse(*scan)
+        return function(*scan)
 
 
 def assert_same(by, *scan):
@@ -91,6 +91,21 @@ def test_kernels_write_into_the_layers_of_a_state(is_own, seed, in_blocks):
     assert written == {*on_gpu.OWN} if is_own else written >= {"elevation", "support", *on_gpu.OWN}
     for name in (*FUSED, "validity"):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
+
+
+@needs_compiler
+def test_kernels_write_into_a_state_in_compiled_code():
+    state, m, grid = random_scan(0, 2, 1, 300, False)
+    cfg, into = FusionConfig(), map_layers(torch.clone, state)
+    expected = fused("kernels", state, m, grid, cfg, True)
+    torch._dynamo.reset()
+    compiled = torch.compile(
+        lambda into, m: stage.fuse(into, m, grid, cfg, True, into), backend="aot_eager", fullgraph=True
+    )
+    got = fused("kernels", into, m, function=compiled)
+    for name in on_gpu.OWN:
+        assert torch.equal(getattr(into, name), getattr(expected, name)), name
+    assert torch.equal(got.elevation, expected.elevation)
 
 
 def test_graphs_of_kernels_serve_any_number_of_maps():

@@ -55,13 +55,13 @@ def update_on_gpu(
     return Update(new, None, used, ignored)
 
 
-def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
+def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> tuple[Tensor, Tensor]:
     _, _, slot, *_ = others
-    return [slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])]
+    return slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])
 
 
 @operator(
-    f"update_cells_on_gpu({ARGUMENTS.replace('Tensor[] layers', 'Tensor[] layers, Tensor(a!)[] new')}) -> Tensor[]",
+    f"update_cells_on_gpu({ARGUMENTS.replace('Tensor[] layers', 'Tensor[] layers, Tensor(a!)[] new')}) -> (Tensor, Tensor)",
     _fake,
 )
 def _update(
@@ -77,7 +77,7 @@ def _update(
     width: int,
     has_rays: bool,
     settings: list[float],
-) -> list[Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Write all layers (B, C) into contiguous new ones, and return the points used and ignored (B,)."""
     (B, M), C = slot.shape, layers[0].shape[1]
     own, layers = c_settings(config_of(tuple(settings)), resolution, has_rays), [layer.contiguous() for layer in layers]
@@ -88,7 +88,7 @@ def _update(
     with torch.cuda.device_of(points):
         hits = kernels.addresses_of([points, noise, shared, origin, inside, slot])
         cells, in_scan, memory = _sort(hits, slot, layers[0], origin.shape[1], own)
-        tallies = [slot.new_zeros(B), slot.new_zeros(B)]
+        tallies = slot.new_zeros(B), slot.new_zeros(B)
         heavy = slot.new_empty(B * M // _FEW, dtype=torch.int32), slot.new_zeros(1, dtype=torch.int32)
         maps = [kernels.addresses_of(values) for values in (layers, [*new, *tallies], heavy)]
         update = cells, in_scan, *maps, C // width, width, own
