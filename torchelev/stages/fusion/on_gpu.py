@@ -20,6 +20,7 @@ from torchelev.stages.fusion.update import Update
 from torchelev.state import MapState
 
 OWN = ("variance", "challenger", "time")  # layers of which no cell looks at another's
+_ARGUMENTS = ARGUMENTS.replace("Tensor[] layers", "Tensor[] layers, Tensor(a!)[] new")
 _SOURCE = "fusion/fusion.cu"
 _POINT_BYTES = 32  # of `Point` in point.h
 _FEW = 8  # as in fusion.cu: points of a cell up to which one thread takes it
@@ -60,10 +61,7 @@ def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) ->
     return slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])
 
 
-@operator(
-    f"update_cells_on_gpu({ARGUMENTS.replace('Tensor[] layers', 'Tensor[] layers, Tensor(a!)[] new')}) -> (Tensor, Tensor)",
-    _fake,
-)
+@operator(f"update_cells_on_gpu({_ARGUMENTS}) -> (Tensor, Tensor)", _fake)
 def _update(
     points: Tensor,
     noise: Tensor,
