@@ -46,7 +46,7 @@ def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
         return height, side
 
     monkeypatch.setattr(consensus, "resolve_contested", spy)
-    monkeypatch.setattr(fuse, "can_update_hit", lambda _: torch.compiler.is_compiling())  # the eager map by tensors
+    monkeypatch.setattr(fuse, "can_update_in_cpp", lambda _: torch.compiler.is_compiling())  # the eager map by tensors
     maps = {name: ElevationMap(config(), 2) for name in ("eager", "compiled", "twin")}
     maps["compiled"].compile()
     maps["twin"].compile()

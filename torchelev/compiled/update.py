@@ -20,6 +20,7 @@ from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, up
 from torchelev.stages.age import age
 from torchelev.stages.compensate import compensate
 from torchelev.stages.fusion.fuse import fuse
+from torchelev.stages.fusion.native import can_update_in_cpp
 from torchelev.stages.measure import measure
 from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
@@ -110,13 +111,18 @@ def compile_part(
 
 
 def let_time_pass(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> MapState:
-    """Start an update of a window that has moved: forget the last one's statistics, and age the cells."""
-    return age(reset_statistics(state, m), m, cfg.aging)
+    """Start an update of a window that has moved: forget the last one's statistics, and age the cells.
+
+    C++ fuses heights where they are stored: there, the drift is compensated before.
+    """
+    state = age(reset_statistics(state, m), m, cfg.aging)
+    return compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate) if can_update_in_cpp(state) else state
 
 
 def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig, into: MapState) -> MapState:
     """Compensate the height drift, and fuse the points' heights; `into`: the stored state, see `fuse`."""
-    state = compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)
+    if not can_update_in_cpp(state):
+        state = compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)
     return fuse(state, m, cfg.grid, cfg.fusion, cfg.raycast is not None, into)
 
 
@@ -137,8 +143,8 @@ class Graphs(NamedTuple):
     an update without its points or rays. Masks come and go as bytes, see `as_bytes`.
     """
 
-    move_window: KeptGraph  #: measures, moves the window and ages it
-    fuse_heights: KeptGraph  #: compensates drift and fuses the points' heights
+    move_window: KeptGraph  #: measures, moves the window and ages it; on a CPU compensates drift
+    fuse_heights: KeptGraph  #: compensates drift, unless that is done, and fuses the points' heights
     apply_rays: KeptGraph  #: clears cells, bounds unknown ones and rates the rest
 
 

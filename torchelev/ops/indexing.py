@@ -90,14 +90,6 @@ def _(layers: list[Tensor], cells: Tensor, values: list[Tensor]) -> list[Tensor]
     return [torch.empty_like(layer) for layer in layers]
 
 
-def write_cells(layers: list[Tensor], cells: Int[Tensor, "T"], values: list[Tensor]) -> list[Tensor]:
-    """Return layers (B, ...), masks or numbers, with values (1, T) in cells that are numbered across environments."""
-    masks = [layer.dtype == torch.bool for layer in layers]
-    pairs = zip(_without_masks(layers), _without_masks(values), strict=True)
-    new = [layer.flatten().index_copy(0, cells, value.view(-1)).view_as(layer) for layer, value in pairs]
-    return [as_mask(layer) if mask else layer for layer, mask in zip(new, masks, strict=True)]
-
-
 class SelectedCells:
     """The K cells that a mask selects, numbered across environments.
 

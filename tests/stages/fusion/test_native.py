@@ -12,10 +12,12 @@ from tests.helpers import random_poses, random_state, small_map
 from tests.native.emulated_gpu import emulated_kernels
 from tests.stages.fusion.test_fuse import CELLS, EDGES, FUSED, steps_and_outliers
 from torchelev import EdgeConfig, FusionConfig
+from torchelev.compiled.update import with_masks
 from torchelev.native.library import find_compiler
+from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.fusion import fuse as stage
 from torchelev.stages.fusion import on_gpu
-from torchelev.stages.fusion.native import can_update_hit, config_of, numbers
+from torchelev.stages.fusion.native import can_update_in_cpp, config_of, numbers
 from torchelev.state import map_layers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
@@ -46,7 +48,7 @@ def random_scan(seed, num_envs, sensors, num_points, with_covariance):
 def fused(by, *scan, function=stage.fuse):
     with (
         torch.no_grad(),
-        patch.object(stage, "can_update_hit", lambda _: by == "C++"),
+        patch.object(stage, "can_update_in_cpp", lambda _: by == "C++"),
         patch.object(stage, "can_update_on_gpu", lambda *_: by.startswith("kernels")),
         emulated_kernels(in_blocks=by.endswith("blocks")),
         patch.object(on_gpu, "_HEAVY_THREADS", 256),
@@ -94,6 +96,25 @@ def test_kernels_write_into_the_layers_of_a_state(is_own, seed, in_blocks):
 
 
 @needs_compiler
+@pytest.mark.parametrize("is_own", [True, False])
+@given(st.integers(0, 10_000))
+def test_cpp_writes_into_the_layers_of_a_state(is_own, seed):
+    """Whose masks are bytes; those of the returned state are the ones before."""
+    state, m, grid = random_scan(seed, 2, 1, 300, False)
+    into = with_masks(map_layers(torch.clone, state), as_bytes)
+    if not is_own:
+        state = state._replace(elevation=state.elevation + 0.01 * state.validity, challenger=state.challenger + 0.01)
+    expected = fused("C++", state, m, grid, FusionConfig(), True)
+    given = with_masks(into, as_mask) if is_own else state
+    got = fused("C++", given, m, grid, FusionConfig(), True, into)
+    assert got.validity is given.validity
+    for name in FUSED:
+        assert getattr(got, name) is getattr(into, name)
+    for name in (*FUSED, "validity"):
+        assert torch.equal(getattr(into, name), getattr(expected, name).to(getattr(into, name).dtype)), name
+
+
+@needs_compiler
 def test_kernels_write_into_a_state_in_compiled_code():
     state, m, grid = random_scan(0, 2, 1, 300, False)
     cfg, into = FusionConfig(), map_layers(torch.clone, state)
@@ -117,7 +138,7 @@ def test_graphs_of_kernels_serve_any_number_of_maps():
 
     torch._dynamo.reset()
     compiled = torch.compile(stage.fuse, backend=backend, fullgraph=True)
-    with patch.object(stage, "can_update_hit", lambda _: False), emulated_kernels(True):
+    with patch.object(stage, "can_update_in_cpp", lambda _: False), emulated_kernels(True):
         with patch.object(stage, "can_update_on_gpu", lambda *_: True), torch.no_grad():
             for num_envs in range(2, 7):
                 state, m, grid = random_scan(0, num_envs, 1, 30, False)
@@ -135,9 +156,9 @@ def test_without_a_compiler(monkeypatch):
     """Compiled code calls the operator all the same."""
     state, m, grid = random_scan(0, 2, 2, 300, True)
     with torch.no_grad():
-        assert can_update_hit(state) == (find_compiler() is not None)
+        assert can_update_in_cpp(state) == (find_compiler() is not None)
         monkeypatch.setenv("TORCHELEV_NATIVE", "0")
-        assert not can_update_hit(state)
+        assert not can_update_in_cpp(state)
     got, expected = (fused(by, state, m, grid, FusionConfig(), True) for by in ("C++", "tensors"))
     for name in (*FUSED, "validity"):
         torch.testing.assert_close(getattr(got, name), getattr(expected, name), atol=1e-6, rtol=0, msg=name)
@@ -145,9 +166,9 @@ def test_without_a_compiler(monkeypatch):
 
 def test_gradients_and_float64_go_by_tensors():
     state, _, _ = random_scan(0, 1, 1, 3, False)
-    assert not can_update_hit(state)
+    assert not can_update_in_cpp(state)
     with torch.no_grad():
-        assert not can_update_hit(state._replace(elevation=state.elevation.double()))
+        assert not can_update_in_cpp(state._replace(elevation=state.elevation.double()))
 
 
 @pytest.mark.parametrize("cfg", [*CONFIGS, FusionConfig(gate=float("inf"), edges=EdgeConfig(min_points=9))])

@@ -3,6 +3,7 @@
 #include <memory>
 #include <vector>
 
+#include "../lanes.h"
 #include "../threads.h"
 #include "points_of_thread.h"
 #include "cell.h"
@@ -25,7 +26,9 @@ struct Sorted {
     std::vector<int64_t> cells, starts;  // slots that are hit; where their points start
     std::unique_ptr<Point[]> sorted;
     std::vector<Consensus> consensus;  // of each cell
+    std::vector<Cell> after;           // what each cell holds after the update
 
+    void clear() { cells.clear(), starts.clear(); }
     Points points(int64_t k) const {
         return {&sorted[starts[k]], &sorted[starts[k + 1]], float(starts[k + 1] - starts[k])};
     }
@@ -67,39 +70,51 @@ void sort_points(Sorted& result, int64_t b, const Scan& scan, int64_t num_cells,
     });
 }
 
-// What the cells that are hit hold after the update, (T,) each, and what became of the points, (B,) each.
-struct Results {
-    int64_t* cells;
-    float *elevation, *variance, *support, *challenger, *time;
+// The layers of B environments, which the update changes, and what became of the points, (B,) each.
+struct Layers {
+    float *elevation, *variance, *support, *challenger;
     uint8_t *challenger_support, *known;
+    float* time;
     int64_t *used, *ignored;
 
-    void set(int64_t k, int64_t cell, const Cell& after) const {
-        cells[k] = cell;
-        elevation[k] = after.elevation, variance[k] = after.variance, support[k] = after.support;
-        challenger[k] = after.challenger, time[k] = after.time;
-        challenger_support[k] = after.challenger_support, known[k] = after.known;
+    Map from(int64_t cell) const {
+        return Map{elevation, variance, support, challenger, challenger_support, known, time}.from(cell);
+    }
+    void set(int64_t cell, const Cell& after) const {
+        elevation[cell] = after.elevation, variance[cell] = after.variance, support[cell] = after.support;
+        challenger[cell] = after.challenger, time[cell] = after.time;
+        challenger_support[cell] = after.challenger_support, known[cell] = after.known;
+    }
+    // Limit the variance of known cells; that of others is 1.
+    void limit_variance(int64_t first, int64_t last, float limit) const {
+        auto limit_some = [&](auto count) {
+            const Lanes limited = smaller(load(variance + first, count), all(limit));
+            store(variance + first, pick(load_bytes(known + first, count) > 0, limited, all(1)), count);
+        };
+        for (; first + LANES <= last; first += LANES) limit_some(std::integral_constant<int, LANES>());
+        limit_some(int(last - first));
     }
 };
 
 // The maps of B environments, and their scan.
 struct Maps {
-    Map map;
+    Layers layers;
     int64_t rows, columns;
     Scan scan;
-    float* in_scan;  // [m] the scan's mean in each cell
     const Settings& s;
 
-    Map of(int64_t b) const { return map.from(b * rows * columns); }
+    Map of(int64_t b) const { return layers.from(b * rows * columns); }
 
-    // Sort the points of environment b, and compare each cell's with its elevation.
-    void prepare(int64_t b, Sorted& sorted, int num_threads) const {
+    // Sort the points of environment b, and compare each cell's with its elevation; `means` [m] of the scan's cells.
+    void prepare(int64_t b, Sorted& sorted, float* means, int num_threads) const {
         const int64_t num_cells = rows * columns;
-        float* means = in_scan + b * num_cells;
+        sorted.clear();
         const int64_t parts = num_cells <= CELLS_PER_POINT * scan.number ? num_threads : 1;
         sort_points(sorted, b, scan, num_cells, {parts, num_threads}, s);
         const Parts all{num_threads > 1 ? PARTS_PER_THREAD * num_threads : 1, num_threads};
-        all(num_cells, [&](int64_t, int64_t first, int64_t last) { std::fill(means + first, means + last, NO_HEIGHT); });
+        all(num_cells, [&](int64_t, int64_t first, int64_t last) {
+            std::fill(means + first, means + last, NO_HEIGHT);
+        });
         sorted.consensus.resize(sorted.cells.size());
         all(sorted.cells.size(), [&](int64_t, int64_t first, int64_t last) {
             for (int64_t k = first; k < last; k++) {
@@ -109,52 +124,55 @@ struct Maps {
         });
     }
 
-    // Update the cells of environment b, the first of which is result `start`.
-    void update(int64_t b, const Sorted& sorted, int64_t start, const Results& results, int num_threads) const {
+    // Update the cells of environment b. None changes before all have looked at their neighbours.
+    void update(int64_t b, Sorted& sorted, const float* means, int num_threads) const {
         const Map own = of(b);
         const int64_t offset = b * rows * columns;
-        const Around around{rows, columns, own.elevation, in_scan + offset, own.known};
+        const Around around{rows, columns, own.elevation, means, own.known};
         const Parts parts{num_threads > 1 ? PARTS_PER_THREAD * num_threads : 1, num_threads};
+        layers.used[b] = layers.ignored[b] = 0;
+        sorted.after.resize(sorted.cells.size());
         parts(sorted.cells.size(), [&](int64_t, int64_t first, int64_t last) {
             int64_t used = 0, ignored = 0;
             for (int64_t k = first; k < last; k++) {
                 const int64_t slot = sorted.cells[k];
-                const Cell cell = update_cell(sorted.points(k), own, slot, sorted.consensus[k], around, s);
-                results.set(start + k, offset + slot, cell);
-                used += cell.used, ignored += cell.ignored;
+                sorted.after[k] = update_cell(sorted.points(k), own, slot, sorted.consensus[k], around, s);
+                used += sorted.after[k].used, ignored += sorted.after[k].ignored;
             }
-            __atomic_fetch_add(&results.used[b], used, __ATOMIC_RELAXED);
-            __atomic_fetch_add(&results.ignored[b], ignored, __ATOMIC_RELAXED);
+            __atomic_fetch_add(&layers.used[b], used, __ATOMIC_RELAXED);
+            __atomic_fetch_add(&layers.ignored[b], ignored, __ATOMIC_RELAXED);
+        });
+        parts(sorted.cells.size(), [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t k = first; k < last; k++) layers.set(offset + sorted.cells[k], sorted.after[k]);
+        });
+        parts(rows * columns, [&](int64_t, int64_t first, int64_t last) {
+            layers.limit_variance(offset + first, offset + last, s.max_variance);
         });
     }
 };
 
+// What a thread keeps of an environment.
+struct Scratch {
+    Sorted sorted;
+    std::unique_ptr<float[]> means;
+};
+
 }  // namespace
 
-// Update the cells that points fall into; write their number.
+// Update the cells of layers (B, rows, columns), and count the points used and ignored (B,).
 extern "C" int fuse_points(const float* points, const float* noise, const float* shared, const float* origins,
-                           const uint8_t* used, const int64_t* slots, const float* elevation, const float* variance,
-                           const float* support, const float* challenger, const uint8_t* challenger_support,
-                           const uint8_t* known, const float* time, int64_t* cells, float* elevations,
-                           float* variances, float* supports, float* challengers, uint8_t* challenger_supports,
-                           uint8_t* knowns, float* times, int64_t* num_used, int64_t* num_ignored, int64_t* count,
-                           int64_t B, int64_t M, int64_t S, int64_t rows, int64_t columns, const Settings* settings,
-                           int num_threads) {
+                           const uint8_t* used, const int64_t* slots, float* elevation, float* variance,
+                           float* support, float* challenger, uint8_t* challenger_support, uint8_t* known, float* time,
+                           int64_t* num_used, int64_t* num_ignored, int64_t B, int64_t M, int64_t S, int64_t rows,
+                           int64_t columns, const Settings* settings, int num_threads) {
     const Scan scan{points, noise, shared, origins, used, slots, M, S};
-    const Map map{elevation, variance, support, challenger, challenger_support, known, time};
-    const Results results{cells, elevations, variances,          supports, challengers,
-                          times, challenger_supports, knowns, num_used, num_ignored};
-    return code_of([&] {
-        const std::unique_ptr<float[]> in_scan(new float[B * rows * columns]);
-        const Maps maps{map, rows, columns, scan, in_scan.get(), *settings};
-        std::vector<Sorted> sorted(B);
-        for_environments(B, num_threads, [&](int64_t b, int threads) { maps.prepare(b, sorted[b], threads); });
-        std::vector<int64_t> starts{0};
-        for (const Sorted& each : sorted) starts.push_back(starts.back() + each.cells.size());
-        std::fill(num_used, num_used + B, 0), std::fill(num_ignored, num_ignored + B, 0);
-        for_environments(B, num_threads, [&](int64_t b, int threads) {
-            maps.update(b, sorted[b], starts[b], results, threads);
-        });
-        *count = starts.back();
-    });
+    const Layers layers{elevation, variance, support,  challenger, challenger_support,
+                        known,     time,     num_used, num_ignored};
+    const Maps maps{layers, rows, columns, scan, *settings};
+    auto make = [&] { return Scratch{{}, std::unique_ptr<float[]>(new float[rows * columns])}; };
+    auto update = [&](int64_t b, int threads, Scratch& scratch) {
+        maps.prepare(b, scratch.sorted, scratch.means.get(), threads);
+        maps.update(b, scratch.sorted, scratch.means.get(), threads);
+    };
+    return code_of([&] { for_environments(B, num_threads, make, update); });
 }

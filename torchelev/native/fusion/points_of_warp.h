@@ -1,4 +1,4 @@
-// The points of a cell on a GPU: one thread's, or shared by a team of a warp's threads, which all hold the same results.
+// The points of a cell on a GPU: one thread's, or shared by some of a warp's threads, which all hold the same results.
 #pragma once
 
 #include "point.h"

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.indexing import write_cells
 from torchelev.ops.masks import count
 from torchelev.stages.cells import cells_of
 from torchelev.stages.fusion.config import FusionConfig
-from torchelev.stages.fusion.native import can_update_hit, update_hit
+from torchelev.stages.fusion.native import can_update_in_cpp, update_in_cpp
 from torchelev.stages.fusion.on_gpu import OWN, can_update_on_gpu, update_on_gpu
 from torchelev.stages.fusion.points import CellLayers, HitPoints
-from torchelev.stages.fusion.update import Update, update_all
+from torchelev.stages.fusion.update import update_all
 from torchelev.stages.pose_error import relative_variance
-from torchelev.state import BLANK, MASKS, MapState, Measurement, tally
+from torchelev.state import MASKS, MapState, Measurement, tally
 
 
 def fuse(
@@ -45,21 +43,26 @@ def fuse(
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
     above the cell agree with each other (`challenge`): a new obstacle appears soon, even on settled ground.
 
-    Given another state, a GPU may write results into its layers, which the returned state then holds.
+    Given another state with the masks of this one as bytes, C++ and kernels may write results into its layers, which
+    the returned state then holds; not its masks.
     """
     cells = cells_of(state, m, grid)
     noise = m.variance if m.noise is None else m.noise
     points = HitPoints(m.points, noise, relative_variance(state, m), m.origin, cells)
     before = CellLayers(*(getattr(state, name).flatten(1) for name in CellLayers._fields))
     arguments = points, before, grid, cfg, has_rays
-    if can_update_hit(state):
-        new = update_hit(*arguments)
+    if can_update_in_cpp(state):
+        new = update_in_cpp(*arguments, None if into is None else own_layers(state, into))
     elif can_update_on_gpu(state, m.points):
         new = update_on_gpu(*arguments, None if into is None else free_layers(state, into))
     else:
         new = update_all(*arguments)
+    shape = state.elevation.shape
+    layers: dict[str, Any] = {n: x if x.shape == shape else x.view(shape) for n, x in new.layers._asdict().items()}
+    if into is not None and can_update_in_cpp(state):
+        layers["validity"] = state.validity
     return tally(
-        write_back(state, new, cfg),
+        state._replace(**layers),
         points_used=new.num_used,
         rejected_outside=count(m.used & ~cells.inside),
         rejected_edge=new.num_ignored,
@@ -67,20 +70,15 @@ def fuse(
     )
 
 
+def own_layers(state: MapState, into: MapState) -> list[Tensor]:
+    """Return the layers of `into`, whose masks are bytes and are those of `state`, with the numbers of `state`."""
+    for name in CellLayers._fields:
+        if name not in MASKS and getattr(into, name) is not getattr(state, name):
+            getattr(into, name).copy_(getattr(state, name))
+    return [getattr(into, name) for name in CellLayers._fields]
+
+
 def free_layers(state: MapState, into: MapState) -> dict[str, Tensor]:
-    """Return those layers of a state that the results may be written into while the cells of `state` are read."""
+    """Return those layers of `into` that the results may be written into while the cells of `state` are read."""
     numbers = [name for name in CellLayers._fields if name not in MASKS]
     return {n: getattr(into, n) for n in numbers if n in OWN or getattr(into, n) is not getattr(state, n)}
-
-
-def write_back(state: MapState, new: Update, cfg: FusionConfig) -> MapState:
-    """Return the state with the new values of the cells; of other cells the variance alone is limited."""
-    if new.cells is None:
-        shape = state.elevation.shape
-        layers = [layer if layer.shape == shape else layer.view(shape) for layer in new.layers]
-    else:
-        variance = torch.where(state.validity, state.variance.clamp(max=cfg.max_variance), BLANK["variance"])
-        before = state._replace(variance=variance)
-        layers = write_cells([getattr(before, name) for name in CellLayers._fields], new.cells, list(new.layers))
-    named: dict[str, Any] = dict(zip(CellLayers._fields, layers, strict=True))
-    return state._replace(**named)

@@ -1,9 +1,10 @@
-"""The update of the cells that points fall into, in C++ (`torchelev/native/fusion`)."""
+"""The update of all cells in C++ (`torchelev/native/fusion`), for float32 without a gradient."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -24,8 +25,8 @@ from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update, update_all
 from torchelev.state import MapState
 
-ARGUMENTS = (  # of the operators in C++ and on a GPU
-    "Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, Tensor[] layers, "
+ARGUMENTS = (  # of the operators in C++ and on a GPU, which write into the last layers
+    "Tensor points, Tensor noise, Tensor? shared, Tensor origin, Tensor inside, Tensor slot, {layers}, "
     "float resolution, int width, bool has_rays, float[] settings"
 )
 _SOURCE = "fusion/fusion.cpp"
@@ -43,19 +44,30 @@ class _Settings(ctypes.Structure):
     )
 
 
-def can_update_hit(state: MapState) -> bool:
-    """Tell whether `update_hit` takes the state: float32 on a CPU, without a gradient."""
+def can_update_in_cpp(state: MapState) -> bool:
+    """Tell whether `update_in_cpp` takes the state: float32 on a CPU, without a gradient."""
     return has_one_pass(state) and can_select(state.elevation)
 
 
-def update_hit(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: FusionConfig, has_rays: bool) -> Update:
-    """Update the cells that points fall into; arguments are those of `update_all`."""
+def update_in_cpp(
+    points: HitPoints,
+    before: CellLayers,
+    grid: GridConfig,
+    cfg: FusionConfig,
+    has_rays: bool,
+    into: Sequence[Tensor] | None = None,
+) -> Update:
+    """Update all cells; arguments are those of `update_all`.
+
+    `into`: the layers before, contiguous and masks as bytes, which then change instead of copies.
+    """
     layers = [as_bytes(layer) if layer.dtype == torch.bool else layer for layer in before]
+    layers = [layer.clone(memory_format=torch.contiguous_format) for layer in layers] if into is None else [*into]
     hits = (*points[:-1], as_bytes(points.cells.inside), points.cells.slot)
-    cells, *new, num_used, num_ignored = _update_hit(*hits, layers, grid.resolution, grid.width, has_rays, numbers(cfg))
-    pairs = zip(new, before, strict=True)
+    num_used, num_ignored = _update(*hits, layers, grid.resolution, grid.width, has_rays, numbers(cfg))
+    pairs = zip(layers, before, strict=True)
     values = [as_mask(value) if layer.dtype == torch.bool else value for value, layer in pairs]
-    return Update(CellLayers(*(value[None] for value in values)), cells, num_used, num_ignored)
+    return Update(CellLayers(*values), num_used, num_ignored)
 
 
 def numbers(cfg: FusionConfig) -> list[float]:
@@ -77,14 +89,14 @@ def config_of(settings: tuple[float, ...]) -> FusionConfig:
     return FusionConfig(**named, edges=EdgeConfig(**edges) if edges else None)
 
 
-def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> list[Tensor]:
-    _, _, slot, layers, *_ = others
-    T, B = torch.library.get_ctx().new_dynamic_size(), slot.shape[0]
-    return [slot.new_empty(T), *(layer.new_empty(T) for layer in layers), slot.new_empty(B), slot.new_empty(B)]
+def fake_tallies(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> tuple[Tensor, Tensor]:
+    """Return memory for the numbers of points used and ignored (B,)."""
+    _, _, slot, *_ = others
+    return slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])
 
 
-@operator(f"update_hit_cells({ARGUMENTS}) -> Tensor[]", _fake)
-def _update_hit(
+@operator(f"update_cells({ARGUMENTS.format(layers='Tensor(a!)[] layers')}) -> (Tensor, Tensor)", fake_tallies)
+def _update(
     points: Tensor,
     noise: Tensor,
     shared: Tensor | None,
@@ -96,34 +108,31 @@ def _update_hit(
     width: int,
     has_rays: bool,
     settings: list[float],
-) -> list[Tensor]:
-    """Return the T cells, their layers (T,) with masks as bytes, and the points used and ignored (B,)."""
+) -> tuple[Tensor, Tensor]:
+    """Update contiguous layers, masks as bytes, in place, and return the points used and ignored (B,)."""
     library, cfg = load(_SOURCE, {}), config_of(tuple(settings))
-    (B, M), C = slot.shape, layers[0].shape[1]
+    (B, M), C = slot.shape, layers[0].shape[1:].numel()
     if library is None:
         hits = HitPoints(points, noise, shared, origin, PointCells(slot, as_mask(inside), C))
-        return _update_all(hits, layers, resolution, width, cfg, has_rays)
-    ints = [torch.empty(size, dtype=torch.int64) for size in (B * M, B, B, 1)]
-    new = [torch.empty(B * M, dtype=layer.dtype) for layer in layers]
-    cells, num_used, num_ignored, count = ints
-    tensors = [points, noise, shared, origin, inside, slot, *layers, cells, *new, num_used, num_ignored, count]
+        return _update_by_tensors(hits, layers, resolution, width, cfg, has_rays)
+    tallies = fake_tallies(points, noise, shared, origin, inside, slot)
+    tensors = [points, noise, shared, origin, inside, slot, *layers, *tallies]
     own = c_settings(cfg, resolution, has_rays)
     run(library.fuse_points, tensors, B, M, origin.shape[1], C // width, width, ctypes.byref(own))
-    T = int(count)
-    return [cells[:T], *(layer[:T] for layer in new), num_used, num_ignored]
+    return tallies
 
 
-def _update_all(
+def _update_by_tensors(
     points: HitPoints, layers: list[Tensor], resolution: float, width: int, cfg: FusionConfig, has_rays: bool
-) -> list[Tensor]:
-    """Do the same by tensors, without a compiler."""
-    C = points.cells.num_cells
-    before = CellLayers(*layers)
+) -> tuple[Tensor, Tensor]:
+    """Do the same without a compiler."""
+    before = CellLayers(*(layer.flatten(1) for layer in layers))
     before = before._replace(validity=as_mask(before.validity))
-    new = update_all(points, before, grid_of((C // width, width), resolution), cfg, has_rays)
-    values = [as_bytes(value) if value.dtype == torch.bool else value for value in new.layers]
-    cells = torch.arange(len(points.cells.slot) * C)
-    return [cells, *(value.reshape(-1) for value in values), new.num_used, new.num_ignored]
+    grid = grid_of((points.cells.num_cells // width, width), resolution)
+    new = update_all(points, before, grid, cfg, has_rays)
+    for layer, value in zip(layers, new.layers, strict=True):
+        layer.copy_(value.view(layer.shape))
+    return new.num_used, new.num_ignored
 
 
 @functools.lru_cache(maxsize=64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,13 +14,13 @@ from torchelev.native import kernels
 from torchelev.ops.define import operator
 from torchelev.stages.cpp_layers import has_kernels
 from torchelev.stages.fusion.config import FusionConfig
-from torchelev.stages.fusion.native import ARGUMENTS, c_settings, config_of, numbers
+from torchelev.stages.fusion.native import ARGUMENTS, c_settings, config_of, fake_tallies, numbers
 from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update
 from torchelev.state import MapState
 
 OWN = ("variance", "challenger", "time")  # layers of which no cell looks at another's
-_ARGUMENTS = ARGUMENTS.replace("Tensor[] layers", "Tensor[] layers, Tensor(a!)[] new")
+_ARGUMENTS = ARGUMENTS.format(layers="Tensor[] layers, Tensor(a!)[] new")
 _SOURCE = "fusion/fusion.cu"
 _POINT_BYTES = 32  # of `Point` in point.h
 _FEW = 8  # as in fusion.cu: points of a cell up to which one thread takes it
@@ -53,15 +53,10 @@ def update_on_gpu(
     new = CellLayers(*(torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in before))
     new = new._replace(**(into or {}))
     used, ignored = _update(*hits, list(before), list(new), grid.resolution, grid.width, has_rays, numbers(cfg))
-    return Update(new, None, used, ignored)
+    return Update(new, used, ignored)
 
 
-def _fake(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> tuple[Tensor, Tensor]:
-    _, _, slot, *_ = others
-    return slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])
-
-
-@operator(f"update_cells_on_gpu({_ARGUMENTS}) -> (Tensor, Tensor)", _fake)
+@operator(f"update_cells_on_gpu({_ARGUMENTS}) -> (Tensor, Tensor)", fake_tallies)
 def _update(
     points: Tensor,
     noise: Tensor,

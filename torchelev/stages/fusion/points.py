@@ -27,7 +27,7 @@ class HitPoints(NamedTuple):
 
 
 class CellLayers(NamedTuple):
-    """What the update reads and writes of cells, (B, C) each, or (1, T) of those that are hit; see `MapState`."""
+    """What the update reads and writes of cells, (B, C) each; see `MapState`."""
 
     elevation: Tensor  #: [m]
     variance: Tensor  #: [m^2]

@@ -24,10 +24,9 @@ if TYPE_CHECKING:
 
 
 class Update(NamedTuple):
-    """What some cells hold after the scan, (1, T) each, or all, (B, C) each; and the points, per environment."""
+    """What all cells hold after the scan; and the points, per environment."""
 
-    layers: CellLayers  #: new values
-    cells: Int[Tensor, "T"] | None  #: numbers of the cells, across environments; None: all
+    layers: CellLayers  #: new values, (B, C) or (B, H, W) each
     num_used: Int[Tensor, "B"]  #: points that a cell took
     num_ignored: Int[Tensor, "B"]  #: points on the wrong side of a step
 
@@ -44,7 +43,7 @@ def update_all(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: Fus
     measured, ignored = measure_cells(scan, prior, consensus, cfg)
     decision = decide_by_vote(prior, measured, challenge, cfg, cfg.relief * grid.resolution)
     layers = update_cells(prior, before.time, measured, challenge, decision, cfg)
-    return Update(layers, None, (measured.kept * decision.takes).sum(1).to(torch.int64), count(ignored))
+    return Update(layers, (measured.kept * decision.takes).sum(1).to(torch.int64), count(ignored))
 
 
 def kalman_gain(variance: Tensor, R: Tensor, is_prior: Tensor) -> Tensor:
