@@ -14,8 +14,10 @@ from torchelev import BodyConfig, CompletionNet, ElevationMap, HeightScan, MapIm
 from torchelev.completion.surroundings import count_steps
 from torchelev.native import kernels
 from torchelev.ops import operators
+from torchelev.ops.moving import move_in_place
 from torchelev.pipeline import rate_surface
 from torchelev.site import SiteMap
+from torchelev.stages.fusion import on_gpu as fusion_on_gpu
 from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.state import map_layers
 
@@ -131,7 +133,7 @@ def drive(emap, updates=4, seed=0):
 @needs_gpu
 @in_blocks
 @pytest.mark.usefixtures("_kernels")
-@pytest.mark.parametrize("compiled, cells, maps", [(False, 40, 3), (False, 115, 3), (True, 40, 64)])
+@pytest.mark.parametrize("compiled, cells, maps", [(False, 40, 3), (False, 115, 3), (True, 40, 3), (True, 40, 64)])
 def test_gpu_gives_the_same_map(compiled, cells, maps):
     """115 cells: more than 48 kB in a block; 64 maps move in place."""
     on_cpu, on_gpu = (ElevationMap(small_config((cells, cells), 0.05), maps, device) for device in ("cpu", "cuda"))
@@ -152,8 +154,10 @@ def test_gpu_gives_the_same_map(compiled, cells, maps):
 @needs_gpu
 @in_blocks
 @pytest.mark.usefixtures("_kernels")
-def test_gpu_gives_the_same_map_where_cells_hold_many_points():
-    """A warp shares their points."""
+@pytest.mark.parametrize("many", [0, 2**20])
+def test_gpu_gives_the_same_map_where_cells_hold_many_points(monkeypatch, many):
+    """A team of threads shares their points, or a warp."""
+    monkeypatch.setattr(fusion_on_gpu, "_MANY_POINTS", many)
     on_cpu, on_gpu = (ElevationMap(small_config((20, 20), 0.05), 3, device) for device in ("cpu", "cuda"))
     generator = torch.Generator().manual_seed(0)
     for _ in range(3):
@@ -172,7 +176,7 @@ def test_other_floors_and_surfaces_equal_those_of_the_cpu():
     cfg = small_config((70, 90), 0.05, overlap=OverlapConfig(radius=1.5, height=0.3, base_height=0.2))
     state = map_layers(single, random_state(np.random.default_rng(0), cfg.grid, 70, known=0.7))
     relief = torch.where(torch.arange(90) < 45, 0.1, 1.0)
-    time = state.time * (torch.rand(state.time.shape) < 0.5)
+    time = state.time * torch.from_numpy(np.random.default_rng(1).random(state.time.shape) < 0.5)
     state = state._replace(elevation=state.elevation * relief, time=time)
     emap, T = ElevationMap(cfg, 70), pose((0.0, 0.0, 0.2), num_envs=70)
     m = emap.measure(torch.full((70, 1, 3), torch.nan), T, T, 0.1)
@@ -187,6 +191,20 @@ def test_other_floors_and_surfaces_equal_those_of_the_cpu():
     for name in ("gradient_x", "gradient_y", "traversability"):
         difference = (getattr(on_gpu, name).cpu() - getattr(on_cpu, name)).abs()
         assert (difference < 1e-4).float().mean() > 0.9995, name
+
+
+@needs_gpu
+def test_layers_move_in_place():
+    """By other steps in each map, in all directions, also out of it; maps have more cells than a block has threads."""
+    rng = np.random.default_rng(0)
+    shift = torch.from_numpy(rng.integers(-80, 80, (64, 2)) * (rng.random((64, 2)) < 0.8))
+    layers = [torch.from_numpy(rng.random((64, 70, 90))).float() for _ in range(3)]
+    layers += [layers[0] > 0.5, (100 * layers[1]).byte()]
+    expected = [layer.clone() for layer in layers]
+    moved = [layer.cuda() for layer in layers]
+    move_in_place(expected, shift, [1.0, 0.0, -2.0, 0.0, 0.0])
+    move_in_place(moved, shift.cuda(), [1.0, 0.0, -2.0, 0.0, 0.0])
+    assert all(torch.equal(layer.cpu(), other) for layer, other in zip(moved, expected, strict=True))
 
 
 def single(value):

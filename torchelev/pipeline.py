@@ -29,8 +29,7 @@ def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: W
     state = fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
     state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
     state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
-    state = rate_surface(state, cfg, weights)
-    return count_bounded(state)
+    return rate_surface(count_bounded(state), cfg, weights)
 
 
 def rate_surface(
@@ -38,7 +37,8 @@ def rate_surface(
 ) -> MapState:
     """Compute normals and traversability from the elevation.
 
-    Given a state whose masks are bytes, what C++ or a kernel computes is written into its layers instead.
+    Given a state whose masks are bytes, what C++ or a kernel computes is written into its layers. The returned state
+    then has the normals and ratings from before.
     """
     head = cfg.traversability
     analytic = head if isinstance(head, TraversabilityConfig) else None

@@ -128,6 +128,12 @@ def _then(change):
     return copy
 
 
+def _write_what_is_read(stored):
+    layers, *settings = _written(stored)
+    planes._write_planes(torch.zeros(1, 1, 4), as_bytes(as_mask(stored)), layers, *settings)
+    return stored
+
+
 def _written(mask):
     return [torch.empty(1, 1, 4), torch.empty(1, 1, 4), mask], 1, 0, 0.1, []
 
@@ -154,6 +160,7 @@ def _add(stored):
         _then(lambda stored: stored.view(-1).zero_()),
         _then(lambda stored: torch.bitwise_xor(stored, stored, out=stored)),
         _then(lambda stored: planes._write_planes(torch.zeros(1, 1, 4), stored, *_written(stored))),
+        lambda stored, other: _write_what_is_read(stored) + other,
         _then(_set),
         _then(_add),
         _change_result,

@@ -11,9 +11,13 @@ import tempfile
 from pathlib import Path
 from unittest.mock import patch
 
+import pytest
+
 from torchelev.native import kernels
 from torchelev.native.library import find_compiler
 
+MEMORY, UNTOUCHED = 4 * 2**16, 0x5A  # [bytes] of a block; what fills them
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 GPU = """
 #include <cstdint>
 #include <cstring>
@@ -59,11 +63,14 @@ def library(source):
 def launch_blocks(source, kernel, blocks, memory, *arguments):
     """Do what `kernels.launch_blocks` does, on tensors of the CPU, with one thread for each block."""
     emulated = library(source)
-    assert memory <= 4 * 2**16
+    whole = (ctypes.c_uint8 * MEMORY).in_dll(emulated, "memory")
+    beyond = (ctypes.c_uint8 * (MEMORY - memory)).from_buffer(whole, memory)
+    ctypes.memset(beyond, UNTOUCHED, len(beyond))
     values = [kernels._argument(value) for value in arguments]
     for block in range(blocks):
         emulated.take_place(block, 0, 1)
         getattr(emulated, kernel)(*values)
+    assert bytes(beyond).count(UNTOUCHED) == len(beyond), f"{kernel} takes more memory than it asks for"
 
 
 def launch(source, kernel, rows, number, *arguments):
@@ -80,7 +87,7 @@ def launch(source, kernel, rows, number, *arguments):
 def emulated_kernels(in_blocks):
     """Emulate kernels; `in_blocks`: those whose blocks share memory, where there is a choice."""
     with (
-        patch.object(kernels, "work_on", lambda _: True),
+        patch.object(kernels, "work_on", lambda *_: True),
         patch.object(kernels, "launch", launch),
         patch.object(kernels, "launch_blocks", launch_blocks),
         patch.object(kernels, "suits_blocks", lambda *_: in_blocks),

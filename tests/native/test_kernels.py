@@ -72,6 +72,17 @@ def test_blocks_suit_a_gpu_with_enough_memory_whose_half_they_keep_busy(monkeypa
     assert kernels.suits_blocks(0, blocks, memory) == (suits and memory <= 48 * 1024)
 
 
+@pytest.mark.parametrize("memory, works", [(48 * 1024, True), (48 * 1024 + 1, False)])
+def test_kernels_work_where_their_blocks_have_enough_memory(gpu, memory, works):
+    gpu.setattr(kernels, "_try", lambda device: True)
+    gpu.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace())
+    layer = SimpleNamespace(is_cuda=True, get_device=lambda: 0)
+    assert kernels.work_on(layer, memory) == works
+    gpu.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(shared_memory_per_block_optin=65536))
+    assert kernels.work_on(layer, memory)
+    assert not kernels.work_on(SimpleNamespace(is_cuda=False), memory)
+
+
 def test_compiled_code_asks():
     compiled = torch.compile(lambda x: x + kernels.can_launch(max(0, x.get_device())), fullgraph=True, backend="eager")
     assert compiled(torch.zeros(1)) == kernels.can_launch(0)

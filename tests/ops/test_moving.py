@@ -10,15 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
-from tests.native.emulated_gpu import emulated_kernels
-from torchelev.native.library import find_compiler
+from tests.native.emulated_gpu import emulated_kernels, needs_compiler
 from torchelev.ops import moving, native, on_gpu
 from torchelev.ops.moving import move_in_place
 
 SHIFTS = st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=3)
-
-
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 
 
 def assert_moved(seed, shifts, H, W, kinds):

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from tests import reference
 from tests.helpers import nans, pose, random_state, seen_from, small_map
-from tests.native.emulated_gpu import emulated_kernels
+from tests.native.emulated_gpu import emulated_kernels, needs_compiler
 from torchelev import OverlapConfig
-from torchelev.native.library import find_compiler
 from torchelev.stages.overlap import clear as stage
 from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
@@ -60,12 +59,13 @@ def test_agrees_with_the_reference(seed, radius, height, base_height, max_base_h
 
 
 def by(one_pass, *arguments):
-    """Clear in one pass of C++, or by tensors."""
-    with torch.no_grad(), patch.object(stage, "has_one_pass", lambda _: one_pass):
+    """Clear in one pass of C++, or by kernels where they are emulated; or by tensors."""
+    others = (
+        patch.object(stage, "has_one_pass", lambda _: one_pass),
+        patch.object(stage, "has_kernels", lambda _: False),
+    )
+    with torch.no_grad(), others[0], others[1]:
         return clear_other_floors(*arguments)
-
-
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 
 
 @pytest.mark.parametrize("code", ["c++", "tensors", pytest.param("kernels", marks=needs_compiler)])

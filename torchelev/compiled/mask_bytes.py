@@ -35,7 +35,7 @@ def pass_bytes_on(graph: torch.fx.GraphModule) -> None:
         if source is None:
             continue
         last = max((places[user] for user in node.users), default=0)
-        before = [user for user in source.users if places[user] < last]
+        before = [user for user in source.users if places[user] <= last]
         if all(_reads(user, source) for user in before) and all(_reads(user, node) for user in node.users):
             node.replace_all_uses_with(source)
     graph.recompile()

@@ -132,8 +132,7 @@ def apply_rays(
     """Clear what is gone or another floor, and rate what is left; `into`: the stored state, see `rate_surface`."""
     state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
     state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
-    state = rate_surface(state, cfg, weights, into)
-    return count_bounded(state)
+    return rate_surface(count_bounded(state), cfg, weights, into)
 
 
 class Graphs(NamedTuple):

@@ -19,6 +19,7 @@ from torchelev.native.library import is_switched_off
 _SOURCES = Path(__file__).parent
 _STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: gpu/standard.h is all of them
 _BLOCK, LARGE_BLOCK = 128, 512  # threads; of those that share memory
+SUM_MEMORY = 4 * 32  # [bytes] that `sum_of_block` of threads.h takes at most
 _UNASKED_MEMORY = 48 * 2**10  # [bytes] that a block may have unasked
 _MEMORY_ATTRIBUTE = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
 _CAN_LAUNCH: dict[int, bool] = {}  # by device
@@ -43,9 +44,11 @@ def can_launch(device: int) -> bool:
 can_launch._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
-def work_on(layer: Tensor) -> bool:
-    """Tell whether a layer is on a GPU on which kernels run."""
-    return layer.is_cuda and can_launch(layer.get_device())
+def work_on(layer: Tensor, memory: int = 0) -> bool:
+    """Tell whether a layer is on a GPU on which kernels run that share this much memory [bytes] in each block."""
+    if not layer.is_cuda or not can_launch(layer.get_device()):
+        return False
+    return memory <= _UNASKED_MEMORY or memory <= _block_memory(layer.get_device())
 
 
 def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) -> None:
@@ -89,7 +92,11 @@ def suits_blocks(device: int, blocks: int, memory: int) -> bool:
 def _block_memory(device: int) -> int:
     """Return how much memory the threads of a block may share [bytes], as far as torch tells."""
     properties = torch.cuda.get_device_properties(device)
-    return getattr(properties, "shared_memory_per_block_optin", _UNASKED_MEMORY)
+    memory: int = getattr(properties, "shared_memory_per_block_optin", _UNASKED_MEMORY)
+    return memory
+
+
+_block_memory._dynamo_marked_constant = True  # type: ignore[attr-defined]  # see `can_launch`
 
 
 def _launch(source: str, kernel: str, blocks: int, threads: int, memory: int, arguments: Sequence[Any]) -> None:

@@ -53,6 +53,8 @@ def move_in_place(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> N
 
     Layers of bytes get 0 in entering cells, whatever their blank.
     """
+    pairs = zip(layers, blanks, strict=True)
+    blanks = [0.0 if layer.dtype in (torch.bool, torch.uint8) else blank for layer, blank in pairs]
     if native.move_layers(layers, shift, blanks) or on_gpu.move_layers(layers, shift, blanks):
         return
     values = (moved if shift.is_cpu else _gathered)(layers, shift, blanks)

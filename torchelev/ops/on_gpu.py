@@ -15,7 +15,7 @@ from torchelev.ops.transforms import is_transforming
 _TABLES, _MOVING = "tables/tables.cu", "moving/moving.cu"
 _LEVELS = 16  # that a table may be widened by
 _LAYERS = 16  # that are moved at once
-_MANY = 64  # maps: fewer keep too few threads busy where each layer of each map is one block's
+_MANY = 64  # maps from which on one block for each layer of each map keeps a GPU busy
 
 
 class _Levels(ctypes.Structure):
@@ -30,9 +30,12 @@ class _Layers(ctypes.Structure):
     _fields_ = (("cells", ctypes.c_void_p * _LAYERS), ("blanks", ctypes.c_float * _LAYERS))
 
 
-def computes(layer: Tensor) -> bool:
-    """Tell whether kernels may compute what has no gradient of a layer: it is float32 on a GPU; no transform runs."""
-    return layer.dtype == torch.float32 and not is_transforming() and kernels.work_on(layer)
+def computes(layer: Tensor, memory: int = 0) -> bool:
+    """Tell whether kernels may compute what has no gradient of a layer: it is float32 on a GPU; no transform runs.
+
+    `memory`: what the threads of a block must share [bytes].
+    """
+    return layer.dtype == torch.float32 and not is_transforming() and kernels.work_on(layer, memory)
 
 
 def can_tabulate(values: Tensor, widen: Sequence[int]) -> bool:
@@ -76,7 +79,7 @@ def move_layers(layers: Sequence[Tensor], shift: Tensor, blanks: Sequence[float]
     with torch.cuda.device_of(shift):
         for kernel, own in chosen.items():
             cells = (ctypes.c_void_p * _LAYERS)(*(layers[k].data_ptr() for k in own))
-            values = (ctypes.c_float * _LAYERS)(*(blanks[k] if kernel == "move_floats" else 0.0 for k in own))
+            values = (ctypes.c_float * _LAYERS)(*(blanks[k] for k in own))
             number = len(own)
             kernels.launch_blocks(_MOVING, kernel, B * number, 0, _Layers(cells, values), shift, number, H, W)
     return True

@@ -32,8 +32,7 @@ _CONSTANTS = {
 }
 _NAMES = (*Normals._fields, *PlaneRating._fields)
 _SOURCE, _TILE = "surface/surface.cu", (16, 32)  # rows and columns, as in the source
-_WARPS, _SUMS = 32, 14  # of a block, and along each row of a tile, as in the source
-_LARGEST_RIM = 8  # [cells] of a tile that fits into the 64 kB that threads may share on any GPU
+_SUMS = 14  # along each row of a tile, as in the source
 
 
 def rate_planes(
@@ -46,7 +45,7 @@ def rate_planes(
 ) -> dict[str, Any]:
     """Return the layers (B, H, W) of `Normals` and, given the analytic head, those of `PlaneRating`, by name.
 
-    Given a state whose masks are bytes, C++ and kernels write into its layers, and none is returned.
+    Given a state whose masks are bytes, C++ and kernels write into its layers, and the result is empty.
     """
     cells, critical = (0, []) if head is None else (head.cells(grid), list(head.critical))
     settings = surface.radius, cells, grid.resolution, critical
@@ -65,7 +64,7 @@ def _names(cells: int) -> tuple[str, ...]:
 def _suits(elevation: Tensor, rim: int) -> bool:
     """Tell whether C++ or a kernel can take a layer, whose gradient they do not compute."""
     wants_gradient = torch.is_grad_enabled() and (torch.compiler.is_compiling() or elevation.requires_grad)
-    computes = native.computes(elevation) or (rim <= _LARGEST_RIM and on_gpu.computes(elevation))
+    computes = native.computes(elevation) or on_gpu.computes(elevation, _shared_memory(rim))
     return computes and not wants_gradient
 
 
@@ -124,11 +123,15 @@ def _launch(
     """Write the layers by a kernel."""
     (B, *size), rim = elevation.shape, max(radius, cells)
     tiles = math.prod(-(-length // tile) for length, tile in zip(size, _TILE, strict=True))
-    rows = _TILE[0] + 2 * rim
-    memory = 4 * (_WARPS + rows * (_TILE[1] + 2 * rim + _SUMS * _TILE[1]))
     arguments = elevation, known, kernels.addresses_of(results), *size, radius, cells, settings
     with torch.cuda.device_of(elevation):
-        kernels.launch_blocks(_SOURCE, "rate_surface", B * tiles, memory, *arguments)
+        kernels.launch_blocks(_SOURCE, "rate_surface", B * tiles, _shared_memory(rim), *arguments)
+
+
+def _shared_memory(rim: int) -> int:
+    """Return how much memory a block needs for its tile, whose rim has so many cells [bytes]."""
+    rows, columns = (length + 2 * rim for length in _TILE)
+    return kernels.SUM_MEMORY + 4 * rows * (columns + _SUMS * _TILE[1])
 
 
 class _Settings(ctypes.Structure):

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import random_poses, random_state, small_map
-from tests.native.emulated_gpu import emulated_kernels
+from tests.native.emulated_gpu import emulated_kernels, needs_compiler
 from tests.stages.fusion.test_fuse import CELLS, EDGES, FUSED, steps_and_outliers
 from torchelev import EdgeConfig, FusionConfig
 from torchelev.compiled.update import with_masks
@@ -20,7 +20,6 @@ from torchelev.stages.fusion import on_gpu
 from torchelev.stages.fusion.native import can_update_in_cpp, config_of, numbers
 from torchelev.state import map_layers
 
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 WAYS = ["C++", *(pytest.param(way, marks=needs_compiler) for way in ("kernels", "kernels in blocks"))]
 CONFIGS = [
     FusionConfig(),

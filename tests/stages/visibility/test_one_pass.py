@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.helpers import assert_close, differences, random_clouds, random_poses, random_state, small_map
 from torchelev import RaycastConfig
 from torchelev.native.library import find_compiler
-from torchelev.stages.cpp_layers import has_one_pass
+from torchelev.stages.fast_layers import has_one_pass
 from torchelev.stages.visibility import one_pass
 from torchelev.stages.visibility.clean_up import apply_in_one_pass, apply_rays, clear_seen_through
 from torchelev.stages.visibility.lowest_rays import RayBins, View

@@ -62,7 +62,7 @@ extern "C" __global__ void average_points(Sorted sorted, float* in_scan, int64_t
     in_scan[cell] = sorted.counts[cell] ? mean_height(sorted.of(cell, 1)) : NO_HEIGHT;
 }
 
-// Call `use(k, slot)` for the used points of a row among its M, from `hit` on, that are this thread's of its block's.
+// Call `use(k, slot)` for this thread's share of the used points of a row, which has M points and begins at `hit`.
 template <class Use> inline void each_hit(const Hits& hits, int64_t hit, int32_t M, const Use& use) {
     const int32_t step = blockDim.x;
     for (int32_t first = threadIdx.x; first < M; first += AHEAD * step) {
@@ -175,7 +175,8 @@ extern "C" __global__ void update_cells(Sorted sorted, const float* in_scan, Map
     add_of_warp(results.ignored + at.row, ignored);
 }
 
-// Update the heavy cells, a team of `team` threads for each.
+// Update the heavy cells, a team of `team` threads for each. The first of them writes, while others may still read what
+// they need no more.
 extern "C" __global__ void update_heavy_cells(Sorted sorted, const float* in_scan, Map map, Results results,
                                               Heavy heavy, int64_t rows, int64_t columns, Settings s, int64_t threads,
                                               int64_t team) {

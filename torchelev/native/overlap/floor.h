@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <limits>
 
-// `OverlapConfig`, and which rows and columns may lie within the radius.
+// `OverlapConfig`, and which rows and columns may lie within the radius: C++ looks at no others.
 struct Settings {
     float radius_square, slope, height, base_height, max_base_height;
     int32_t first_row, end_row, first_column, end_column;
@@ -18,9 +18,10 @@ struct Total {
     float mean() const { return moment / std::max(weight, 1e-12f); }
 };
 
-// The height of the ground, by the cells below the base: all, those within reach of a standing robot, those just hit.
-inline float ground_of(Total all, Total within, Total hit, const Settings& s) {
-    const bool is_most = within.weight > 0.5f * all.weight;
+// The height of the ground, by the cells below the base: the weight of all, and the heights of those within reach of a
+// standing robot and of those just hit.
+inline float ground_of(float weight, Total within, Total hit, const Settings& s) {
+    const bool is_most = within.weight > 0.5f * weight;
     const bool is_level = hit.weight == 0 || hit.mean() <= within.mean() + 0.5f * s.height;
     return is_most && is_level ? within.mean() : hit.mean();
 }

@@ -97,7 +97,7 @@ float ground_below(const Map& map) {
         within.add(below & (height >= -map.s.max_base_height), weight, height);
         hit.add(below & map.hit(place, count), weight, height);
     });
-    return ground_of(all.total(), within.total(), hit.total(), map.s);
+    return ground_of(all.total().weight, within.total(), hit.total(), map.s);
 }
 
 // Clear the cells and bounds of other floors, and return the number of cells.

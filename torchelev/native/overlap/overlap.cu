@@ -32,7 +32,8 @@ struct Around {
 
 // The sums of a part of a map that its ground is made of: `ground_of`.
 struct Sums {
-    Total all, within, hit;
+    float weight;
+    Total within, hit;
 };
 
 // A block's part of a map.
@@ -74,12 +75,12 @@ extern "C" __global__ void sum_below(Around around, Layers layers, Sums* sums, i
         const float height = map.elevation[cell] - z, time = map.time[cell];
         if (!(square <= s.radius_square && map.validity[cell] && height <= 0)) return;
         const float spread = square + stance * stance, weight = 1 / (spread * spread), moment = weight * height;
-        own.all.weight += weight;
+        own.weight += weight;
         if (height >= -s.max_base_height) own.within.weight += weight, own.within.moment += moment;
         if (time == 0) own.hit.weight += weight, own.hit.moment += moment;
     });
     float* memory = reinterpret_cast<float*>(block_memory());
-    own = {sum_of_block(own.all, memory), sum_of_block(own.within, memory), sum_of_block(own.hit, memory)};
+    own = {sum_of_block(own.weight, memory), sum_of_block(own.within, memory), sum_of_block(own.hit, memory)};
     if (threadIdx.x == 0) sums[blockIdx.x] = own;
 }
 
@@ -90,11 +91,11 @@ extern "C" __global__ __launch_bounds__(512, 3) void clear_other_floors(Around a
     const int64_t parts = (H * W + PART - 1) / PART;
     Sums all{};
     for (int64_t p = part.map * parts; p < (part.map + 1) * parts; p++) {
-        all.all.weight += sums[p].all.weight;
+        all.weight += sums[p].weight;
         all.within.weight += sums[p].within.weight, all.within.moment += sums[p].within.moment;
         all.hit.weight += sums[p].hit.weight, all.hit.moment += sums[p].hit.moment;
     }
-    const Floor floor(ground_of(all.all, all.within, all.hit, s), s);
+    const Floor floor(ground_of(all.weight, all.within, all.hit, s), s);
     const Layers map = layers.from(part.map * H * W);
     const float z = around.z[part.map];
     int32_t number = 0;

@@ -7,7 +7,7 @@ namespace {
 
 constexpr int ROWS = 64, COLUMNS = 128;  // of a tile: the sums of its last rows stay in the nearest cache
 
-// What `_rate_planes` gives.
+// The first of `_Settings` in planes.py.
 struct Settings {
     float per_cell;       // [1/m]
     float min_spread[2];  // [cells^2] of the normals' windows and of the head's

@@ -7,7 +7,7 @@
 #include "threads.h"
 
 constexpr int ROWS = 16, COLUMNS = 32;  // of a tile
-constexpr int WARPS = 32;               // of a block, at most
+constexpr int WARPS = 32;               // of a block, at most: `SUM_MEMORY` in kernels.py
 constexpr float INFINITE = std::numeric_limits<float>::infinity();
 
 struct Settings {

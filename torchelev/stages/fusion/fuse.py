@@ -43,8 +43,8 @@ def fuse(
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
     above the cell agree with each other (`challenge`): a new obstacle appears soon, even on settled ground.
 
-    Given another state with the masks of this one as bytes, C++ and kernels may write results into its layers, which
-    the returned state then holds; not its masks.
+    `into`: a state whose layers may be overwritten, its masks bytes; it may hold the numbers of `state`. Those that C++
+    or kernels write into it are part of the returned state, which keeps the masks of `state` where C++ writes them.
     """
     cells = cells_of(state, m, grid)
     noise = m.variance if m.noise is None else m.noise

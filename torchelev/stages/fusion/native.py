@@ -18,7 +18,7 @@ from torchelev.ops.indexing import can_select
 from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.cells import PointCells
-from torchelev.stages.cpp_layers import has_one_pass
+from torchelev.stages.fast_layers import has_one_pass
 from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.fusion.points import CellLayers, HitPoints

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.native import kernels
 from torchelev.ops.define import operator
-from torchelev.stages.cpp_layers import has_kernels
+from torchelev.stages.fast_layers import has_kernels
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.native import ARGUMENTS, c_settings, config_of, fake_tallies, numbers
 from torchelev.stages.fusion.points import CellLayers, HitPoints
@@ -25,7 +25,8 @@ _SOURCE = "fusion/fusion.cu"
 _POINT_BYTES = 32  # of `Point` in point.h
 _FEW = 8  # as in fusion.cu: points of a cell up to which one thread takes it
 _HEAVY_THREADS = 2**16  # that share the other cells
-_WARP, _TEAM, _MANY_POINTS = 32, 8, 2**20  # how many share one: fewer, for less waiting, where there are many points
+_WARP, _TEAM = 32, 8  # threads that share one of the other cells
+_MANY_POINTS = 2**20  # of all maps, above which a team shares one, else a warp
 
 
 def can_update_on_gpu(state: MapState, points: Tensor) -> bool:

@@ -12,7 +12,7 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
-from torchelev.stages.cpp_layers import has_kernels, has_one_pass
+from torchelev.stages.fast_layers import has_kernels, has_one_pass
 from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.stages.overlap.one_pass import READ, STANCE, Around, Cleared, in_one_pass
 from torchelev.state import MapState, Measurement, tally
@@ -41,8 +41,8 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     x, y = center_offsets(state, m, grid)
     base = m.base[..., None, None]
     around = Around(x - base[:, 0], y - base[:, 1], base[:, 2], near_part(grid, cfg))
-    in_one_pass = has_one_pass(state) or has_kernels(state)
-    left = (clear_in_one_pass if in_one_pass else clear_by_tensors)(state, around, cfg)
+    is_fast = has_one_pass(state) or has_kernels(state)
+    left = (clear_in_one_pass if is_fast else clear_by_tensors)(state, around, cfg)
     support = left.challenger_support
     state = state._replace(validity=left.validity, bounded=left.bounded, challenger_support=support)
     return tally(state, cleared_other_floors=left.number)

@@ -14,7 +14,7 @@ from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.stages.cpp_layers import layers_of, named, new_layers
+from torchelev.stages.fast_layers import layers_of, named, new_layers
 from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.state import MapState, partial_state
 
@@ -26,7 +26,7 @@ READ = ("elevation", "upper_bound", "time", "validity", "bounded", "challenger_s
 _NUMBERS = ("radius", "height", "base_height", "max_base_height")  # of the config; those of C++ are made of them
 _LIBRARY = "overlap/overlap.cpp", {"STANCE": f"{STANCE!r}f"}
 _SOURCE, _PART = "overlap/overlap.cu", 4096  # cells of a block, as in the source
-_SUMS = 6  # of a part of a map, as in the source
+_SUMS = 5  # of a part of a map, as in the source
 
 
 class Around(NamedTuple):
@@ -107,9 +107,8 @@ def _launch(around: list[Tensor], layers: list[Tensor], cleared: list[Tensor], s
     places, maps = kernels.addresses_of(around), kernels.addresses_of([*layers, *cleared])
     with torch.cuda.device_of(layers[0]):
         sums = layers[0].new_empty(blocks, _SUMS)
-        memory = 4 * kernels.LARGE_BLOCK
         below = places, maps, sums, H, W, ctypes.c_float(STANCE), settings
-        kernels.launch_blocks(_SOURCE, "sum_below", blocks, memory, *below)
+        kernels.launch_blocks(_SOURCE, "sum_below", blocks, kernels.SUM_MEMORY, *below)
         kernels.launch_blocks(_SOURCE, "clear_other_floors", blocks, 0, places, maps, sums, H, W, settings)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
-from torchelev.stages.cpp_layers import has_one_pass
+from torchelev.stages.fast_layers import has_one_pass
 from torchelev.stages.visibility.accepted_rays import accepted_rays
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import (

@@ -17,7 +17,7 @@ from torchelev.ops.native import run
 from torchelev.ops.operators import running_minimum
 from torchelev.ops.storage import as_bytes, as_mask, stored
 from torchelev.stages.cells import lattice_offset
-from torchelev.stages.cpp_layers import has_one_pass
+from torchelev.stages.fast_layers import has_one_pass
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.polar_table import PolarGrid, flat
 from torchelev.stages.visibility.rays import Rays, height_margin

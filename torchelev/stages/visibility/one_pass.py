@@ -12,7 +12,7 @@ from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.native import run
-from torchelev.stages.cpp_layers import layers_of, named, new_layers
+from torchelev.stages.fast_layers import layers_of, named, new_layers
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import NO_RAY, RayBins, View
 from torchelev.stages.visibility.polar_table import PolarGrid
