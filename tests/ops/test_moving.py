@@ -6,7 +6,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests import reference
@@ -36,7 +36,8 @@ def test_move_in_place_agrees_with_the_reference(seed, shifts, H, W, with_native
 
 
 @needs_compiler
-@given(st.integers(0, 10_000), SHIFTS, st.integers(1, 5), st.integers(1, 5))
+@given(st.integers(0, 10_000), SHIFTS, st.integers(1, 9), st.integers(1, 9))
+@example(0, [(-1, 0), (0, -1), (-2, 3), (1, 0), (0, 1), (2, -3)], 7, 9)
 def test_kernels_move_in_place(seed, shifts, H, W):
     others = patch.object(native, "move_layers", lambda *_: False), patch.object(moving, "moved", None)
     with emulated_kernels(True), others[0], others[1]:

@@ -89,9 +89,20 @@ def test_kernels_write_into_the_layers_of_a_state(is_own, seed, in_blocks):
     into = map_layers(torch.clone, state)
     got = fused(by, into if is_own else state, m, grid, FusionConfig(), True, into)
     written = {name for name in FUSED if getattr(got, name) is getattr(into, name)}
-    assert written == {*on_gpu.OWN} if is_own else written >= {"elevation", "support", *on_gpu.OWN}
+    own = {"variance", "challenger", "time"}  # of a cell's neighbours nothing of these is read
+    assert written == own if is_own else written >= {"elevation", "support", *own}
     for name in (*FUSED, "validity"):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
+
+
+@pytest.mark.parametrize("by", WAYS)
+@pytest.mark.parametrize("num_points", [0, 3])
+def test_variances_are_limited_in_all_cells(by, num_points):
+    state, m, grid = random_scan(0, 2, 1, num_points, False)
+    after = fused(by, state._replace(variance=torch.full_like(state.variance, 0.5)), m, grid, CONFIGS[2], True)
+    untouched = after.time == state.time
+    limited = torch.where(state.validity, CONFIGS[2].max_variance, 1.0)
+    assert torch.equal(after.variance[untouched], limited[untouched]) and untouched.float().mean() > 0.8
 
 
 @needs_compiler
