@@ -15,6 +15,8 @@ from tests import reference
 from tests.helpers import nans, pose, random_state, seen_from, small_map
 from tests.native.emulated_gpu import emulated_kernels, needs_compiler
 from torchelev import OverlapConfig
+from torchelev.compiled.update import with_masks
+from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.overlap import clear as stage
 from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
@@ -92,6 +94,21 @@ def test_one_pass_agrees_with_tensors(code, seed, num_envs, cells, radius, heigh
     for name in ("validity", "bounded", "challenger_support"):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
     assert torch.equal(got.statistics.cleared_other_floors, expected.statistics.cleared_other_floors)
+
+
+@pytest.mark.parametrize("code", ["c++", "tensors", pytest.param("kernels", marks=needs_compiler)])
+def test_masks_change_where_they_are_stored(code):
+    emap = small_map(2, (20, 30))
+    _, m, state = random_floors(np.random.default_rng(0), emap, 0.6)
+    state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
+    cfg = OverlapConfig(radius=1.5, height=0.2, base_height=0.1)
+    expected, into = by(False, state, m, emap.cfg.grid, cfg), with_masks(map_layers(torch.clone, state), as_bytes)
+    emulated = emulated_kernels(True) if code == "kernels" else contextlib.nullcontext()
+    with emulated, patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"} if code == "tensors" else {}):
+        by(True, with_masks(into, as_mask), m, emap.cfg.grid, cfg, into)
+    for name in ("validity", "bounded", "challenger_support"):
+        changed, other = getattr(into, name), getattr(expected, name)
+        assert torch.equal(changed, other.to(changed.dtype)) and not torch.equal(other, getattr(state, name)), name
 
 
 @needs_compiler

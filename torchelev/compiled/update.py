@@ -19,6 +19,7 @@ from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, update_in_place
 from torchelev.stages.age import age
 from torchelev.stages.compensate import compensate
+from torchelev.stages.fast_layers import has_one_pass
 from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.fusion.native import can_update_in_cpp
 from torchelev.stages.measure import measure
@@ -129,10 +130,12 @@ def fuse_heights(state: MapState, m: Measurement, cfg: ElevationMapConfig, into:
 def apply_rays(
     state: MapState, m: Measurement, cfg: ElevationMapConfig, into: MapState, weights: Weights | None = None
 ) -> MapState:
-    """Clear what is gone or another floor, and rate what is left; `into`: the stored state, see `rate_surface`."""
-    state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
-    state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
-    return rate_surface(count_bounded(state), cfg, weights, into)
+    """Clear what is gone or another floor, and rate what is left; `into`: the stored state, in which C++ changes it."""
+    stored = into if has_one_pass(state) else None
+    left = clear_seen_through(state, m, cfg.grid, cfg.raycast, stored)
+    left = clear_other_floors(left, m, cfg.grid, cfg.overlap, stored)
+    left = rate_surface(count_bounded(left), cfg, weights, into)
+    return left if stored is None else left._replace(validity=state.validity, bounded=state.bounded)
 
 
 class Graphs(NamedTuple):

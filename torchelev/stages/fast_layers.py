@@ -32,7 +32,17 @@ def named(names: Sequence[str], layers: Sequence[Tensor]) -> dict[str, Tensor]:
     return {name: as_mask(layer) if name in MASKS else layer for name, layer in zip(names, layers, strict=True)}
 
 
-def new_layers(names: Sequence[str], layers: Sequence[Tensor], changed: Sequence[str]) -> list[Tensor]:
-    """Return memory for those of the named layers that a stage changes."""
-    old = (layers[names.index(name)] for name in changed)
-    return [torch.empty_like(layer, memory_format=torch.contiguous_format) for layer in old]
+def layers_to_change(state: MapState, names: Sequence[str], into: MapState | None) -> list[Tensor]:
+    """Return layers that a stage may change in place, masks as bytes: those of `into`, or copies of those of `state`.
+
+    `into` is a state that holds the same, with its masks as bytes.
+    """
+    if into is not None:
+        return [getattr(into, name) for name in names]
+    return [layer.clone(memory_format=torch.contiguous_format) for layer in layers_of(state, names)]
+
+
+def put(layers: Sequence[Tensor], names: Sequence[str], state: MapState) -> None:
+    """Write layers of a state into memory of their own, masks as bytes."""
+    for layer, name in zip(layers, names, strict=True):
+        layer.copy_(getattr(state, name))

@@ -10,12 +10,15 @@ from hypothesis import strategies as st
 
 from tests.helpers import assert_close, differences, random_clouds, random_poses, random_state, small_map
 from torchelev import RaycastConfig
+from torchelev.compiled.update import with_masks
 from torchelev.native.library import find_compiler
-from torchelev.stages.fast_layers import has_one_pass
+from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.stages.fast_layers import has_one_pass, layers_of, layers_to_change
 from torchelev.stages.visibility import one_pass
 from torchelev.stages.visibility.clean_up import apply_in_one_pass, apply_rays, clear_seen_through
 from torchelev.stages.visibility.lowest_rays import RayBins, View
 from torchelev.stages.visibility.polar_table import PolarGrid
+from torchelev.state import map_layers
 
 RESOLUTION = 0.1
 RULES = [RaycastConfig(min_time=0.5), RaycastConfig(min_time=0.0, min_incidence=0.6, gate=1e4, max_range=1.5)]
@@ -100,10 +103,21 @@ def test_an_infinite_gate():
     agree(apply_rays(*inputs, cfg), apply_in_one_pass(*inputs, cfg))
 
 
-def test_without_cpp_tensors_do_it(monkeypatch):
-    inputs = rays_over((12, 31), np.random.default_rng(1), 2)
-    monkeypatch.setenv("TORCHELEV_NATIVE", "0")
-    assert differences(apply_rays(*inputs), apply_in_one_pass(*inputs)) == []
+@pytest.mark.parametrize("in_place", [False, True])
+@pytest.mark.parametrize("with_native", [False, True])
+def test_layers_change_where_they_are_stored(monkeypatch, with_native, in_place):
+    """With and without C++; the others stay as they were."""
+    state, *others = rays_over((12, 31), np.random.default_rng(1), 2)
+    if not with_native:
+        monkeypatch.setenv("TORCHELEV_NATIVE", "0")
+    before, into = map_layers(torch.clone, state), with_masks(map_layers(torch.clone, state), as_bytes)
+    after = apply_in_one_pass(with_masks(into, as_mask), *others, into if in_place else None)
+    expected = apply_rays(state, *others)
+    agree(expected, after)
+    if in_place:
+        agree(expected, with_masks(into, as_mask))
+    else:
+        assert not differences(before, with_masks(into, as_mask))
 
 
 @pytest.mark.parametrize("num_sensors", [1, 3])
@@ -133,10 +147,10 @@ def test_double_precision_and_other_devices_have_no_one_pass():
 def test_it_is_registered_right():
     """Fake shapes, aliasing and compilation, as torch checks them."""
     state, rays, view, polar, grid, cfg = rays_over((6, 5), np.random.default_rng(0), 2)
-    layers = [getattr(state, name) for name in one_pass.READ]
-    layers = [layer.view(torch.uint8) if layer.dtype == torch.bool else layer for layer in layers]
+    layers, changed = layers_of(state, one_pass.READ), layers_to_change(state, one_pass.CHANGED, None)
     settings = [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.gate]
-    arguments = (list(rays), list(view), layers, polar.ranges, polar.azimuths, polar.bins, list(polar.widen), settings)
+    sizes = polar.ranges, polar.azimuths, polar.bins, list(polar.widen)
+    arguments = list(rays), list(view), layers, changed, *sizes, settings
     torch.library.opcheck(torch.ops.torchelev.apply_rays.default, arguments)
 
 

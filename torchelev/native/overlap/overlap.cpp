@@ -19,11 +19,10 @@ namespace {
 
 constexpr float STANCE_SQUARE = STANCE * STANCE;
 
-// Maps (B, H, W); masks are bytes. The last three are the results.
+// Maps (B, H, W), of which the bytes change: masks and a count.
 struct Layers {
     const float *elevation, *upper_bound, *time;
-    const uint8_t *validity, *bounded, *challenger_support;
-    uint8_t *new_validity, *new_bounded, *new_challenger_support;
+    uint8_t *validity, *bounded, *challenger_support;
 };
 
 // One map: its cells' places as seen from the base, and the base's height [m].
@@ -112,9 +111,9 @@ int64_t clear(const Map& map, const Floor& floor) {
         const Flags other_bound = other | (near & bounded & floor.is_outside(bound, all(0)));
         if (!any(other_bound)) return;
         const Flags support = load_bytes(l.challenger_support + place, count);
-        store_bytes(l.new_validity + place, -(known & ~other), count);
-        store_bytes(l.new_bounded + place, -(bounded & ~other_bound), count);
-        store_bytes(l.new_challenger_support + place, support & ~other, count);
+        store_bytes(l.validity + place, -(known & ~other), count);
+        store_bytes(l.bounded + place, -(bounded & ~other_bound), count);
+        store_bytes(l.challenger_support + place, support & ~other, count);
         number += count_set(other);
     });
     return number;
@@ -122,22 +121,15 @@ int64_t clear(const Map& map, const Floor& floor) {
 
 }  // namespace
 
-// What is left of maps (B, H, W) without other floors than their robots'. `x` (B, H) and `y` (B, W) are the cells'
-// places as seen from the bases, `z` (B) the bases' heights [m]; `numbers` (B) of the cells cleared.
+// Clear other floors than their robots' in maps (B, H, W). `x` (B, H) and `y` (B, W) are the cells' places as seen from
+// the bases, `z` (B) the bases' heights [m]; `numbers` (B) of the cells cleared.
 extern "C" int clear_other_floors(const float* x, const float* y, const float* z, const float* elevation,
-                                  const float* upper_bound, const float* time, const uint8_t* validity,
-                                  const uint8_t* bounded, const uint8_t* challenger_support, uint8_t* new_validity,
-                                  uint8_t* new_bounded, uint8_t* new_challenger_support, int64_t* numbers, int64_t B,
-                                  int64_t H, int64_t W, const Settings* settings, int num_threads) {
-    const Layers layers{elevation, upper_bound,        time,         validity,   bounded,
-                        challenger_support, new_validity, new_bounded, new_challenger_support};
-    const int64_t cells = H * W;
+                                  const float* upper_bound, const float* time, uint8_t* validity, uint8_t* bounded,
+                                  uint8_t* challenger_support, int64_t* numbers, int64_t B, int64_t H, int64_t W,
+                                  const Settings* settings, int num_threads) {
+    const Layers layers{elevation, upper_bound, time, validity, bounded, challenger_support};
     auto work = [&](int64_t b) {
-        const int64_t first = b * cells;
-        std::memcpy(new_validity + first, validity + first, cells);
-        std::memcpy(new_bounded + first, bounded + first, cells);
-        std::memcpy(new_challenger_support + first, challenger_support + first, cells);
-        const Map map{layers, *settings, first, W, x + b * H, y + b * W, z[b]};
+        const Map map{layers, *settings, b * H * W, W, x + b * H, y + b * W, z[b]};
         numbers[b] = clear(map, Floor(ground_below(map), *settings));
     };
     return code_of([&] { for_each(int(B), num_threads, work); });

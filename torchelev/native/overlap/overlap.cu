@@ -9,19 +9,16 @@
 
 constexpr int32_t PART = 4096;  // cells
 
-// Maps (B, H, W) whose masks are bytes; what is left of them; and the numbers (B) of the cells cleared.
+// Maps (B, H, W), of which the bytes change: masks and a count; and the numbers (B) of the cells cleared.
 struct Layers {
     const float *elevation, *upper_bound, *time;
-    const uint8_t *validity, *bounded, *challenger_support;
-    uint8_t *new_validity, *new_bounded, *new_challenger_support;
+    uint8_t *validity, *bounded, *challenger_support;
     int64_t* numbers;
 
     // The layers from a cell on.
     Layers from(int64_t cell) const {
-        return {elevation + cell,    upper_bound + cell,  time + cell,
-                validity + cell,     bounded + cell,      challenger_support + cell,
-                new_validity + cell, new_bounded + cell,  new_challenger_support + cell,
-                numbers};
+        return {elevation + cell, upper_bound + cell,        time + cell, validity + cell,
+                bounded + cell,   challenger_support + cell, numbers};
     }
 };
 
@@ -102,12 +99,11 @@ extern "C" __global__ __launch_bounds__(512, 3) void clear_other_floors(Around a
     part.each(around, [&](int32_t cell, float square) {
         const bool near = square <= s.radius_square, known = map.validity[cell], bounded = map.bounded[cell];
         const float height = map.elevation[cell] - z, bound = map.upper_bound[cell] - z;
-        const uint8_t support = map.challenger_support[cell];
         const float allowance = known && map.time[cell] == 0 ? std::sqrt(square) * s.slope : 0;
         const bool other = near & known & floor.is_outside(height, allowance);
         const bool other_bound = other | (near & bounded & floor.is_outside(bound, 0.0f));
-        map.new_validity[cell] = known & !other, map.new_bounded[cell] = bounded & !other_bound;
-        map.new_challenger_support[cell] = other ? 0 : support;
+        if (other) map.validity[cell] = 0, map.challenger_support[cell] = 0;
+        if (other_bound) map.bounded[cell] = 0;
         number += other;
     });
     add_of_warp(&layers.numbers[part.map], number);

@@ -9,10 +9,10 @@ struct Settings {
 };
 
 struct Layers {
-    const float *elevation, *variance, *time, *gradient_x, *gradient_y, *challenger, *upper_bound;
-    const uint8_t *validity, *bounded, *challenger_support;
+    const float *elevation, *variance, *time, *gradient_x, *gradient_y, *challenger;
 };
 
+// Layers that rays change, in place.
 struct Changed {
     uint8_t *validity, *bounded;
     float* upper_bound;
@@ -56,11 +56,9 @@ inline Lanes lowest_slope(const Table& table, const Polar& polar, Lanes k, Lanes
     return lower_entries(table, k, a, b);
 }
 
-// Copy bytes; zero where the mask has a value.
-template <bool VALUE>
-inline void clear_where(const uint8_t* __restrict mask, const uint8_t* __restrict from, uint8_t* __restrict to,
-                        int count) {
-    for (int j = 0; j < count; j++) to[j] = from[j] & ((mask[j] == VALUE) - 1);
+// Set bytes to zero where the mask has a value.
+template <bool VALUE> inline void clear_where(const uint8_t* __restrict mask, uint8_t* __restrict bytes, int count) {
+    for (int j = 0; j < count; j++) bytes[j] &= (mask[j] == VALUE) - 1;
 }
 
 // One row of cells, so many metres along x from the sensor.
@@ -68,7 +66,7 @@ struct Row {
     const Table& table;
     const Polar& polar;
     const Settings& settings;
-    const Layers& old;
+    const Layers& layers;
     const Changed& changed;
     int64_t first;  // place of its first cell
     float x, z;     // [m] from the sensor, and the sensor's height
@@ -76,7 +74,13 @@ struct Row {
     int width;
 
     void apply() const {
-        pass_on();
+        apply_rays();
+        clear_where<true>(changed.validity + first, changed.bounded + first, width);
+        clear_where<false>(changed.validity + first, changed.challenger_support + first, width);
+    }
+
+  private:
+    void apply_rays() const {
         const float size = settings.resolution, reach = (table.far + 1) * size;  // a cell to spare for rounding
         const float square = reach * reach - x * x;
         if (table.far == 0 || square < 0) return;
@@ -92,16 +96,6 @@ struct Row {
         }
     }
 
-  private:
-    // What becomes of cells that no ray passes over.
-    void pass_on() const {
-        std::memcpy(changed.upper_bound + first, old.upper_bound + first, sizeof(float) * width);
-        std::memcpy(changed.validity + first, old.validity + first, width);
-        const uint8_t* known = old.validity + first;
-        clear_where<true>(known, old.bounded + first, changed.bounded + first, width);
-        clear_where<false>(known, old.challenger_support + first, changed.challenger_support + first, width);
-    }
-
     // `clear_and_bound`, of the cells from column j on; none lies in a range bin below `nearest`.
     template <class Count> void apply_at(int j, int nearest, Count count) const {
         const Lanes xs = all(x), ys = load(y + j, count);
@@ -113,7 +107,7 @@ struct Row {
         if (!any(found)) return;
         const int64_t n = first + j;
         const Lanes height = z + slope * rho;
-        Flags known = load_bytes(old.validity + n, count) > 0;
+        Flags known = load_bytes(changed.validity + n, count) > 0;
         if (any(found & known)) {
             known &= ~gone(n, count, found & known, ys, rho, slope, height);
             store_bytes(changed.validity + n, -known, count);
@@ -125,10 +119,10 @@ struct Row {
     // Eq. 3 and 4, of known cells with a ray over them.
     template <class Count>
     Flags gone(int64_t n, Count count, Flags cells, Lanes ys, Lanes rho, Lanes slope, Lanes height) const {
-        const Lanes depth = load(old.elevation + n, count) - height, variance = load(old.variance + n, count);
-        const Flags may = cells & (depth > root(variance)) & (load(old.time + n, count) > settings.min_time);
+        const Lanes depth = load(layers.elevation + n, count) - height, variance = load(layers.variance + n, count);
+        const Flags may = cells & (depth > root(variance)) & (load(layers.time + n, count) > settings.min_time);
         if (!any(may)) return may;
-        const Lanes gx = load(old.gradient_x + n, count), gy = load(old.gradient_y + n, count);
+        const Lanes gx = load(layers.gradient_x + n, count), gy = load(layers.gradient_y + n, count);
         const Lanes along = absolute(slope - (gx * x + gy * ys) / rho);
         const Lanes incidence = along / root((1 + slope * slope) * (1 + gx * gx + gy * gy));
         return may & ((incidence > settings.min_incidence) | passes_far_below(depth, variance, gx, gy));
@@ -142,17 +136,17 @@ struct Row {
 
     template <class Count>
     void refute_challengers(int64_t n, Count count, Flags found, Flags known, Lanes slope, Lanes height) const {
-        const Flags support = load_bytes(old.challenger_support + n, count);
+        const Flags support = load_bytes(changed.challenger_support + n, count);
         if (!any(support > 0)) return;
         const Lanes fall = absolute(slope) * settings.resolution;
-        const Flags passes_below = found & (height < load(old.challenger + n, count) + 0.70710678f * fall);
+        const Flags passes_below = found & (height < load(layers.challenger + n, count) + 0.70710678f * fall);
         store_bytes(changed.challenger_support + n, ~passes_below & known & support, count);
     }
 
     template <class Count>
     void lower_upper_bound(int64_t n, Count count, Flags found, Flags known, Lanes height) const {
-        const Flags bounds = found & ~known, bounded = load_bytes(old.bounded + n, count) > 0;
-        const Lanes upper_bound = load(old.upper_bound + n, count);
+        const Flags bounds = found & ~known, bounded = load_bytes(changed.bounded + n, count) > 0;
+        const Lanes upper_bound = load(changed.upper_bound + n, count);
         const Lanes lower = pick(bounded, smaller(upper_bound, height), height);
         store(changed.upper_bound + n, pick(bounds, lower, upper_bound), count);
         store_bytes(changed.bounded + n, -(bounds | (bounded & ~known)), count);

@@ -12,20 +12,18 @@ constexpr int64_t LARGE = 1000000;  // entries of a table that is worth several 
 constexpr int MAPS_PER_THREAD = 4;  // from which on each thread takes whole maps
 
 // What rays (B, N) of one sensor make of maps (B, H, W); masks are bytes. `x` (B, H) and `y` (B, W) are the cells'
-// places as seen from the sensors, and `z` (B) the sensors' heights [m]. The last four layers are the results.
+// places as seen from the sensors, and `z` (B) the sensors' heights [m]. The last four layers change.
 extern "C" int apply_rays(const int32_t* range, const int32_t* azimuth, const float* slope, const float* x,
                           const float* y, const float* z, const float* elevation, const float* variance,
                           const float* time, const float* gradient_x, const float* gradient_y, const float* challenger,
-                          const float* upper_bound, const uint8_t* validity, const uint8_t* bounded,
-                          const uint8_t* challenger_support, uint8_t* new_validity, uint8_t* new_bounded,
-                          float* new_upper_bound, uint8_t* new_challenger_support, int64_t B, int64_t N, int64_t H,
-                          int64_t W, int64_t ranges, int64_t azimuths, int64_t levels, const int64_t* widen, float bins,
-                          float resolution, float min_time, float min_incidence, float gate, int num_threads) {
+                          uint8_t* validity, uint8_t* bounded, float* upper_bound, uint8_t* challenger_support,
+                          int64_t B, int64_t N, int64_t H, int64_t W, int64_t ranges, int64_t azimuths, int64_t levels,
+                          const int64_t* widen, float bins, float resolution, float min_time, float min_incidence,
+                          float gate, int num_threads) {
     const Polar polar{int(ranges), int(azimuths), bins, widen, int(levels)};
     const Settings settings{resolution, min_time, min_incidence, gate};
-    const Layers layers{elevation,  variance,    time,     gradient_x, gradient_y,
-                        challenger, upper_bound, validity, bounded,    challenger_support};
-    const Changed changed{new_validity, new_bounded, new_upper_bound, new_challenger_support};
+    const Layers layers{elevation, variance, time, gradient_x, gradient_y, challenger};
+    const Changed changed{validity, bounded, upper_bound, challenger_support};
     const int64_t at_a_time = std::max(int64_t(1), AT_A_TIME / W);
     auto update = [&](int64_t b, int threads) {
         const int builders = ranges * azimuths < LARGE ? 1 : threads;

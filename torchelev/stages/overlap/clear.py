@@ -14,7 +14,7 @@ from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
 from torchelev.stages.fast_layers import has_kernels, has_one_pass
 from torchelev.stages.overlap.config import OverlapConfig
-from torchelev.stages.overlap.one_pass import READ, STANCE, Around, Cleared, in_one_pass
+from torchelev.stages.overlap.one_pass import CHANGED, READ, STANCE, Around, Cleared, in_one_pass
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
@@ -28,21 +28,26 @@ class Floor(NamedTuple):
     upper: Float[Tensor, "B 1 1"]  #: highest height of the floor
 
 
-def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: OverlapConfig | None) -> MapState:
+def clear_other_floors(
+    state: MapState, m: Measurement, grid: GridConfig, cfg: OverlapConfig | None, into: MapState | None = None
+) -> MapState:
     """Clear cells near the robot whose height differs from the robot's by more than a threshold (paper, Sec. II-F).
 
     The robot's height is its base's, z_b, or that of a low base on the same ground: min(z_b, z_g + base_height), with
     z_g from `ground_below`. So a tall robot keeps its ground. Cells hit by this scan may differ by height * (1 + d /
     radius) at distance d: a slope is no other floor. What lies below the base is no upper floor. Skipped without a base
     pose or `cfg`. A cell's upper bound goes too when it belongs to another floor. The window is centred on the base.
+    `into`: a state that holds the layers of `state`, masks as bytes, and in which C++ and kernels change them.
     """
     if m.base is None or cfg is None:
         return state
     x, y = center_offsets(state, m, grid)
     base = m.base[..., None, None]
     around = Around(x - base[:, 0], y - base[:, 1], base[:, 2], near_part(grid, cfg))
-    is_fast = has_one_pass(state) or has_kernels(state)
-    left = (clear_in_one_pass if is_fast else clear_by_tensors)(state, around, cfg)
+    if has_one_pass(state) or has_kernels(state):
+        left = clear_in_one_pass(state, around, cfg, into)
+    else:
+        left = clear_by_tensors(state, around, cfg)
     support = left.challenger_support
     state = state._replace(validity=left.validity, bounded=left.bounded, challenger_support=support)
     return tally(state, cleared_other_floors=left.number)
@@ -58,7 +63,7 @@ def clear_by_tensors(state: MapState, around: Around, cfg: OverlapConfig) -> Cle
     """Return what is left of the cells, and how many were cleared."""
     x, y, base, part = around
     rows, columns = slice(*part[:2]), slice(*part[2:])
-    cells = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in READ})
+    cells = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in (*READ, *CHANGED)})
     square = x[:, rows].square() + y[:, :, columns].square()  # [m^2] of the distance
     near = square <= cfg.radius**2
     height, hit = (cells.elevation - base).detach(), cells.validity & (cells.time == 0)

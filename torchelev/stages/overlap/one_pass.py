@@ -13,8 +13,7 @@ from torchelev.native import kernels
 from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.native import run
-from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.stages.fast_layers import layers_of, named, new_layers
+from torchelev.stages.fast_layers import layers_of, layers_to_change, named, put
 from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.state import MapState, partial_state
 
@@ -22,8 +21,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
 
 STANCE = 0.5  # [m] half the size of the ground that a robot stands on
-READ = ("elevation", "upper_bound", "time", "validity", "bounded", "challenger_support")  # in the order of C++
-_NUMBERS = ("radius", "height", "base_height", "max_base_height")  # of the config; those of C++ are made of them
+READ = ("elevation", "upper_bound", "time")  # in the order of C++, like CHANGED
+CHANGED = ("validity", "bounded", "challenger_support")
+_CONFIG = ("radius", "height", "base_height", "max_base_height")  # of the config; those of C++ are made of them
 _LIBRARY = "overlap/overlap.cpp", {"STANCE": f"{STANCE!r}f"}
 _SOURCE, _PART = "overlap/overlap.cu", 4096  # cells of a block, as in the source
 _SUMS = 5  # of a part of a map, as in the source
@@ -54,41 +54,49 @@ class _Settings(ctypes.Structure):
     """`Settings` of overlap.cpp."""
 
     _fields_ = (
-        *((name, ctypes.c_float) for name in ("radius_square", "slope", *_NUMBERS[1:])),
+        *((name, ctypes.c_float) for name in ("radius_square", "slope", *_CONFIG[1:])),
         *((name, ctypes.c_int32) for name in ("first_row", "end_row", "first_column", "end_column")),
     )
 
 
-def in_one_pass(twin: Clear) -> Clear:
+def in_one_pass(twin: Clear) -> Callable[..., Cleared]:
     """Return a function that does what its twin does, and calls it where neither C++ nor kernels run."""
 
     @operator(
-        "clear_other_floors(Tensor x, Tensor y, Tensor base, int[] part, Tensor[] layers, float[] settings) "
-        "-> Tensor[]",
-        _fake,
+        "clear_other_floors(Tensor x, Tensor y, Tensor base, int[] part, Tensor[] layers, Tensor(a!)[] changed, "
+        "float[] settings) -> Tensor",
+        _numbers,
     )
     def clear_layers(
-        x: Tensor, y: Tensor, base: Tensor, part: list[int], layers: list[Tensor], settings: list[float]
-    ) -> list[Tensor]:
-        cleared, own = _fake(x, y, base, part, layers), _c_settings(part, settings)
+        x: Tensor,
+        y: Tensor,
+        base: Tensor,
+        part: list[int],
+        layers: list[Tensor],
+        changed: list[Tensor],
+        settings: list[float],
+    ) -> Tensor:
+        number, own = _numbers(x), _c_settings(part, settings)
         if kernels.work_on(x):
-            _launch([x, y, base], layers, cleared, own)
-            return cleared
+            _launch([x, y, base], layers, changed, number, own)
+            return number
         library = load(*_LIBRARY) if x.is_cpu else None
         if library is None or layers[0].numel() == 0:
-            cfg = OverlapConfig(**dict(zip(_NUMBERS, settings, strict=True)))
+            cfg = OverlapConfig(**dict(zip(_CONFIG, settings, strict=True)))
             around = Around(x, y, base, (part[0], part[1], part[2], part[3]))
-            left = twin(partial_state(**named(READ, layers)), around, cfg)
-            return [as_bytes(left.validity), as_bytes(left.bounded), left.challenger_support, left.number]
-        run(library.clear_other_floors, [x, y, base, *layers, *cleared], *layers[0].shape, ctypes.byref(own))
-        return cleared
+            state = partial_state(**named((*READ, *CHANGED), [*layers, *changed]))
+            *left, number = twin(state, around, cfg)
+            put(changed, CHANGED, partial_state(**dict(zip(CHANGED, left, strict=True))))
+            return number
+        run(library.clear_other_floors, [x, y, base, *layers, *changed, number], *layers[0].shape, ctypes.byref(own))
+        return number
 
-    def clear(state: MapState, around: Around, cfg: OverlapConfig) -> Cleared:
+    def clear(state: MapState, around: Around, cfg: OverlapConfig, into: MapState | None = None) -> Cleared:
         x, y, base, part = around
-        settings = [float(getattr(cfg, name)) for name in _NUMBERS]
-        layers = layers_of(state, READ)
-        validity, bounded, support, number = clear_layers(x, y, base, list(part), layers, settings)
-        return Cleared(as_mask(validity), as_mask(bounded), support, number)
+        settings = [float(getattr(cfg, name)) for name in _CONFIG]
+        layers, changed = layers_of(state, READ), layers_to_change(state, CHANGED, into)
+        number = clear_layers(x, y, base, list(part), layers, changed, settings)
+        return Cleared(number=number, **named(CHANGED, changed))
 
     return clear
 
@@ -98,13 +106,14 @@ def _c_settings(part: list[int], settings: list[float]) -> _Settings:
     return _Settings(radius**2, height / radius, *settings[1:], *part)
 
 
-def _launch(around: list[Tensor], layers: list[Tensor], cleared: list[Tensor], settings: _Settings) -> None:
-    """Write what is left of the cells by kernels."""
+def _launch(
+    around: list[Tensor], layers: list[Tensor], changed: list[Tensor], number: Tensor, settings: _Settings
+) -> None:
+    """Clear cells by kernels, and count them."""
     B, H, W = layers[0].shape
     blocks = B * -(-H * W // _PART)
     around, layers = [value.contiguous() for value in around], [layer.contiguous() for layer in layers]
-    cleared[-1].zero_()
-    places, maps = kernels.addresses_of(around), kernels.addresses_of([*layers, *cleared])
+    places, maps = kernels.addresses_of(around), kernels.addresses_of([*layers, *changed, number.zero_()])
     with torch.cuda.device_of(layers[0]):
         sums = layers[0].new_empty(blocks, _SUMS)
         below = places, maps, sums, H, W, ctypes.c_float(STANCE), settings
@@ -112,5 +121,6 @@ def _launch(around: list[Tensor], layers: list[Tensor], cleared: list[Tensor], s
         kernels.launch_blocks(_SOURCE, "clear_other_floors", blocks, 0, places, maps, sums, H, W, settings)
 
 
-def _fake(x: Tensor, y: Tensor, base: Tensor, part: list[int], layers: list[Tensor], *_: object) -> list[Tensor]:
-    return [*new_layers(READ, layers, Cleared._fields[:-1]), x.new_empty(x.shape[0], dtype=torch.int64)]
+def _numbers(x: Tensor, *_: object) -> Tensor:
+    """Return memory for a number of each environment (B,)."""
+    return x.new_empty(x.shape[0], dtype=torch.int64)

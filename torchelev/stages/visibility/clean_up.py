@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool
 
 
-def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None) -> MapState:
+def clear_seen_through(
+    state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None, into: MapState | None = None
+) -> MapState:
     """Remove what rays passed below, and bound what no ray saw (paper, Sec. II-E and II-H).
 
     A known cell goes if a ray's height over it is below h - sigma, it was not hit for `min_time`, and |r . n| > alpha_n
@@ -40,6 +42,7 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     Eq. 4 keeps grazing rays from eroding smooth ground. It is not asked of a ray that `passes_far_below`: the last
     cells of an obstacle that left have tilted normals, and would stay forever.
     The upper bound of an unknown cell is the lowest ray height over it so far. None for `cfg`: the stage is skipped.
+    `into`: a state that holds the layers of `state`, masks as bytes, and in which C++ may change them.
     """
     if cfg is None:
         return state
@@ -47,8 +50,11 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
         bins = bins_of(accepted_rays(state, m, rays, grid, cfg), polar, grid)
-        apply = apply_in_one_pass if has_one_pass(state) else apply_rays
-        state = apply(state, bins, view_from(state, m, rays.origin, grid), polar, grid, cfg)
+        arguments = bins, view_from(state, m, rays.origin, grid), polar, grid, cfg
+        if has_one_pass(state):
+            state = apply_in_one_pass(state, *arguments, into)
+        else:
+            state = apply_rays(state, *arguments)
     return tally(state, cleared_seen_through=count(known & ~state.validity))
 
 

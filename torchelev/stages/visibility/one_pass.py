@@ -12,80 +12,85 @@ from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.native import run
-from torchelev.stages.fast_layers import layers_of, named, new_layers
+from torchelev.stages.fast_layers import layers_of, layers_to_change, named, put
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import NO_RAY, RayBins, View
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.state import MapState, partial_state
 
 CHANGED = ("validity", "bounded", "upper_bound", "challenger_support")
-_HEIGHTS = ("elevation", "variance", "time", "gradient_x", "gradient_y", "challenger", "upper_bound")
-READ = (*_HEIGHTS, "validity", "bounded", "challenger_support")  # in the order of C++, like CHANGED
+READ = ("elevation", "variance", "time", "gradient_x", "gradient_y", "challenger")  # in the order of C++, like CHANGED
 _CONSTANTS = {"NO_RAY": f"{NO_RAY!r}f", "NOWHERE": f"{NOWHERE!r}f"}
 _LARGEST = 2**30  # entries of a table, as they are counted in 32 bits
 
 Apply = Callable[[MapState, RayBins, View, PolarGrid, GridConfig, RaycastConfig], MapState]
 
 
-def in_one_pass(twin: Apply) -> Apply:
+def in_one_pass(twin: Apply) -> Callable[..., MapState]:
     """Return a function that does what its twin does, and calls it where C++ cannot be built."""
 
     @operator(
-        "apply_rays(Tensor[] rays, Tensor[] view, Tensor[] layers, int ranges, int azimuths, float bins, int[] widen, "
-        "float[] settings) -> Tensor[]",
-        _fake,
+        "apply_rays(Tensor[] rays, Tensor[] view, Tensor[] layers, Tensor(a!)[] changed, int ranges, int azimuths, "
+        "float bins, int[] widen, float[] settings) -> ()",
+        lambda *_: None,
     )
     def apply_to_layers(
         rays: list[Tensor],
         view: list[Tensor],
         layers: list[Tensor],
+        changed: list[Tensor],
         ranges: int,
         azimuths: int,
         bins: float,
         widen: list[int],
         settings: list[float],
-    ) -> list[Tensor]:
+    ) -> None:
         polar = PolarGrid(ranges, azimuths, bins, tuple(widen))
-        changed = _native(rays, view, layers, polar, settings)
-        if changed is None:
-            state, grid, cfg = _described(layers, *settings)
-            changed = layers_of(twin(state, RayBins(*rays), View(*view), polar, grid, cfg), CHANGED)
-        return changed
+        if not _native(rays, view, layers, changed, polar, settings):
+            state, grid, cfg = _described(layers, changed, *settings)
+            put(changed, CHANGED, twin(state, RayBins(*rays), View(*view), polar, grid, cfg))
 
     def apply(
-        state: MapState, rays: RayBins, view: View, polar: PolarGrid, grid: GridConfig, cfg: RaycastConfig
+        state: MapState,
+        rays: RayBins,
+        view: View,
+        polar: PolarGrid,
+        grid: GridConfig,
+        cfg: RaycastConfig,
+        into: MapState | None = None,
     ) -> MapState:
         sizes = polar.ranges, polar.azimuths, polar.bins, list(polar.widen)
         settings = [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.gate]
-        changed = apply_to_layers(list(rays), list(view), layers_of(state, READ), *sizes, settings)
+        changed = layers_to_change(state, CHANGED, into)
+        apply_to_layers(list(rays), list(view), layers_of(state, READ), changed, *sizes, settings)
         return state._replace(**named(CHANGED, changed))  # type: ignore[arg-type]
 
     return apply
 
 
-def _fake(rays: list[Tensor], view: list[Tensor], layers: list[Tensor], *_: object) -> list[Tensor]:
-    return new_layers(READ, layers, CHANGED)
-
-
 def _described(
-    layers: list[Tensor], resolution: float, min_time: float, min_incidence: float, gate: float
+    layers: list[Tensor], changed: list[Tensor], resolution: float, min_time: float, min_incidence: float, gate: float
 ) -> tuple[MapState, GridConfig, RaycastConfig]:
     """Return what the operator was called for, as far as its twin asks."""
     cfg = RaycastConfig(min_time=min_time, min_incidence=min_incidence, gate=gate)
-    return partial_state(**named(READ, layers)), grid_of(layers[0].shape[1:], resolution), cfg
+    return partial_state(**named((*READ, *CHANGED), [*layers, *changed])), grid_of(layers[0].shape[1:], resolution), cfg
 
 
 def _native(
-    rays: list[Tensor], view: list[Tensor], layers: list[Tensor], polar: PolarGrid, settings: list[float]
-) -> list[Tensor] | None:
-    """Return the changed layers; None where C++ cannot compute them."""
+    rays: list[Tensor],
+    view: list[Tensor],
+    layers: list[Tensor],
+    changed: list[Tensor],
+    polar: PolarGrid,
+    settings: list[float],
+) -> bool:
+    """Change layers; return False where C++ cannot."""
     if layers[0].numel() == 0 or polar.ranges * polar.azimuths > _LARGEST:
-        return None
+        return False
     library = load("rays/rays.cpp", _CONSTANTS)
     if library is None:
-        return None
-    changed = new_layers(READ, layers, CHANGED)
+        return False
     sizes = (*rays[0].shape, *layers[0].shape[1:], polar.ranges, polar.azimuths, len(polar.widen))
     widen = (ctypes.c_int64 * len(polar.widen))(*polar.widen)
     run(library.apply_rays, [*rays, *view, *layers, *changed], *sizes, widen, polar.bins, *map(float, settings))
-    return changed
+    return True
