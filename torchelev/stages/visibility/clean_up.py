@@ -46,7 +46,7 @@ def clear_seen_through(
     """
     if cfg is None:
         return state
-    polar, known = PolarGrid.of(grid, cfg), state.validity
+    polar, before = PolarGrid.of(grid, cfg), count(state.validity)  # counted now, as `into` changes
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
         bins = bins_of(accepted_rays(state, m, rays, grid, cfg), polar, grid)
@@ -55,7 +55,7 @@ def clear_seen_through(
             state = apply_in_one_pass(state, *arguments, into)
         else:
             state = apply_rays(state, *arguments)
-    return tally(state, cleared_seen_through=count(known & ~state.validity))
+    return tally(state, cleared_seen_through=before - count(state.validity))
 
 
 def apply_rays(
