@@ -30,6 +30,27 @@ def graphs():
     return torch._dynamo.utils.counters["stats"]["unique_graphs"]
 
 
+def assert_same(eager, compiled):
+    """Of two states: equal but for rounding, the statistics too."""
+    # The roughness of ground that few cells tell is the root of a rounding error.
+    assert_close(eager, compiled, 1e-5, skip=["traversability"])
+    torch.testing.assert_close(compiled.traversability, eager.traversability, atol=1e-3, rtol=0)
+    floats = {n for n, v in eager._asdict().items() if n != "statistics" and v.is_floating_point()}
+    assert differences(eager, compiled, skip=floats | {"drift_error", "drift_correction"}) == []
+
+
+def ring_seen_through():
+    """A ring, then lower ground behind it, and then the same from another floor: clouds, poses and times between."""
+    generator = torch.Generator().manual_seed(0)
+    share, angle = torch.rand(2, 600, generator=generator), 6.2832 * torch.rand(2, 600, generator=generator)
+    around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
+    ring, ground = (around * (near + width * share)[..., None] for near, width in ((0.1, 0.1), (0.25, 0.25)))
+    below, upstairs = pose(num_envs=2), pose((0.0, 0.0, 3.0), num_envs=2)
+    yield ring + torch.tensor([0.0, 0.0, -0.4]), below, 0.3
+    yield ground + torch.tensor([0.0, 0.0, -1.0]), below, 2.0
+    yield ground * torch.nan, upstairs, 0.3
+
+
 @pytest.mark.slow(5)
 def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
     """emap.compile() with the real compiler: results to rounding; no new graph for an equal config, N or slice.
@@ -71,15 +92,16 @@ def test_compiled_update_equals_eager_and_shares_its_graphs(monkeypatch):
         for emap in maps.values():
             emap.update(cloud, T, T, 0.3)
         for name in ("compiled", "twin"):
-            # The roughness of ground that few cells tell is the root of a rounding error.
-            assert_close(maps["eager"].state, maps[name].state, 1e-5, skip=["traversability"])
-            ratings = (maps[n].state.traversability for n in (name, "eager"))
-            torch.testing.assert_close(*ratings, atol=1e-3, rtol=0)
-            floats = {
-                n for n, v in maps["eager"].state._asdict().items() if n != "statistics" and v.is_floating_point()
-            }
-            rounded = floats | {"drift_error", "drift_correction"}
-            assert differences(maps["eager"].state, maps[name].state, skip=rounded) == []
+            assert_same(maps["eager"].state, maps[name].state)
+    cleared = []
+    for cloud, T, dt in ring_seen_through():
+        for emap in maps.values():
+            emap.update(cloud, T, T, dt)
+        for name in ("compiled", "twin"):
+            assert_same(maps["eager"].state, maps[name].state)
+        counts = maps["eager"].statistics
+        cleared.append((counts.cleared_seen_through.min() > 0, counts.cleared_other_floors.min() > 0))
+    assert any(rays for rays, _ in cleared) and any(floors for _, floors in cleared)
     assert graphs() == before
     for loss in losses.values():
         with pytest.raises(RuntimeError, match="modified by an inplace operation"):
