@@ -222,8 +222,8 @@ class ElevationMap(ReadableMap):
         environments have their own graphs, and so has the third; the fourth one's serve all others.
 
         An update is three graphs, each of which writes its part of the state. If it is interrupted, by Ctrl-C or for
-        lack of memory, the window may have moved while the points are not fused, or the points be fused while their
-        rays have cleared nothing. The map is still sound: go on with the next cloud.
+        lack of memory, the window may have moved and the drift been compensated while the points are not fused, or the
+        points be fused while their rays have cleared nothing. The map is still sound: go on with the next cloud.
 
         Raises:
             RuntimeError: if torch is older than 2.10, whose compiler cannot.

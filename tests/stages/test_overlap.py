@@ -128,6 +128,15 @@ def test_kernels_know_the_ground_of_all_parts_of_a_map(first_row):
     assert left.statistics.cleared_other_floors.item() >= 20
 
 
+def test_the_operator_is_registered_right():
+    rng = np.random.default_rng(0)
+    x, y, base = (torch.from_numpy(rng.normal(size=size)).float() for size in ((2, 6, 1), (2, 1, 5), (2, 1, 1)))
+    layers = [torch.from_numpy(rng.normal(size=(2, 6, 5))).float() for _ in range(3)]
+    changed = [(layer > 0).to(torch.uint8) for layer in layers]
+    arguments = x, y, base, [0, 6, 0, 5], layers, changed, [1.0, 0.5, 0.2, 0.8]
+    torch.library.opcheck(torch.ops.torchelev.clear_other_floors.default, arguments)
+
+
 @pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.05, 0.05), (0.25, 0.15)])
 @pytest.mark.parametrize("radius", [1.5, 3.0])
 def test_one_pass_takes_the_same_cells_for_near(x, y, radius):

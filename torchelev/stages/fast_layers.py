@@ -35,7 +35,7 @@ def named(names: Sequence[str], layers: Sequence[Tensor]) -> dict[str, Tensor]:
 def layers_to_change(state: MapState, names: Sequence[str], into: MapState | None) -> list[Tensor]:
     """Return layers that a stage may change in place, masks as bytes: those of `into`, or copies of those of `state`.
 
-    `into` is a state that holds the same, with its masks as bytes.
+    `into` is the stored state, which holds the same, masks as bytes.
     """
     if into is not None:
         return [getattr(into, name) for name in names]
@@ -43,6 +43,6 @@ def layers_to_change(state: MapState, names: Sequence[str], into: MapState | Non
 
 
 def put(layers: Sequence[Tensor], names: Sequence[str], state: MapState) -> None:
-    """Write layers of a state into memory of their own, masks as bytes."""
+    """Write layers of a state into the given ones, masks as bytes."""
     for layer, name in zip(layers, names, strict=True):
         layer.copy_(getattr(state, name))

@@ -15,9 +15,11 @@ from torchelev import EdgeConfig, FusionConfig
 from torchelev.compiled.update import with_masks
 from torchelev.native.library import find_compiler
 from torchelev.ops.storage import as_bytes, as_mask
+from torchelev.stages.cells import cells_of
 from torchelev.stages.fusion import fuse as stage
 from torchelev.stages.fusion import on_gpu
 from torchelev.stages.fusion.native import can_update_in_cpp, config_of, numbers
+from torchelev.stages.fusion.points import CellLayers
 from torchelev.state import map_layers
 
 WAYS = ["C++", *(pytest.param(way, marks=needs_compiler) for way in ("kernels", "kernels in blocks"))]
@@ -122,6 +124,15 @@ def test_cpp_writes_into_the_layers_of_a_state(is_own, seed):
         assert getattr(got, name) is getattr(into, name)
     for name in (*FUSED, "validity"):
         assert torch.equal(getattr(into, name), getattr(expected, name).to(getattr(into, name).dtype)), name
+
+
+def test_the_operator_is_registered_right():
+    state, m, grid = random_scan(0, 2, 1, 30, False)
+    cells = cells_of(state, m, grid)
+    layers = [getattr(with_masks(state, as_bytes), name) for name in CellLayers._fields]
+    scan = m.points, m.variance, None, m.origin, cells.inside.to(torch.uint8), cells.slot
+    arguments = *scan, layers, 0.1, grid.width, True, numbers(FusionConfig())
+    torch.library.opcheck(torch.ops.torchelev.update_cells.default, arguments)
 
 
 @needs_compiler

@@ -73,47 +73,54 @@ struct Row {
     const float* y;  // [m] from the sensor
     int width;
 
-    void apply() const {
-        apply_rays();
+    // Return how many cells are cleared.
+    int64_t apply() const {
+        const int64_t number = apply_rays();
         clear_where<true>(changed.validity + first, changed.bounded + first, width);
         clear_where<false>(changed.validity + first, changed.challenger_support + first, width);
+        return number;
     }
 
   private:
-    void apply_rays() const {
+    int64_t apply_rays() const {
         const float size = settings.resolution, reach = (table.far + 1) * size;  // a cell to spare for rounding
         const float square = reach * reach - x * x;
-        if (table.far == 0 || square < 0) return;
+        if (table.far == 0 || square < 0) return 0;
         const float end = __builtin_sqrtf(square);
         const int nearest = int(__builtin_fabsf(x) / size) - 1;
+        int64_t number = 0;
         for (int j = 0; j < width; j += LANES) {
             const int count = std::min(LANES, width - j);
             if (y[j] > end || y[j + count - 1] < -end) continue;
             if (count == LANES)
-                apply_at(j, nearest, std::integral_constant<int, LANES>());
+                number += apply_at(j, nearest, std::integral_constant<int, LANES>());
             else
-                apply_at(j, nearest, count);
+                number += apply_at(j, nearest, count);
         }
+        return number;
     }
 
     // `clear_and_bound`, of the cells from column j on; none lies in a range bin below `nearest`.
-    template <class Count> void apply_at(int j, int nearest, Count count) const {
+    template <class Count> int apply_at(int j, int nearest, Count count) const {
         const Lanes xs = all(x), ys = load(y + j, count);
         const Lanes rho = root(larger(xs * xs + ys * ys, all(1e-12f)));
         const Lanes k = smaller(floor_of(rho / settings.resolution), all(float(polar.ranges)));
         const Lanes azimuth = azimuth_fraction(xs, ys) * float(polar.azimuths);
         const Lanes slope = lowest_slope(table, polar, k, azimuth, nearest);
         const Flags found = slope < NO_RAY;
-        if (!any(found)) return;
+        if (!any(found)) return 0;
         const int64_t n = first + j;
         const Lanes height = z + slope * rho;
         Flags known = load_bytes(changed.validity + n, count) > 0;
+        int number = 0;
         if (any(found & known)) {
-            known &= ~gone(n, count, found & known, ys, rho, slope, height);
+            const Flags cleared = gone(n, count, found & known, ys, rho, slope, height);
+            number = count_set(cleared), known &= ~cleared;
             store_bytes(changed.validity + n, -known, count);
         }
         refute_challengers(n, count, found, known, slope, height);
         lower_upper_bound(n, count, found, known, height);
+        return number;
     }
 
     // Eq. 3 and 4, of known cells with a ray over them.

@@ -89,13 +89,13 @@ def config_of(settings: tuple[float, ...]) -> FusionConfig:
     return FusionConfig(**named, edges=EdgeConfig(**edges) if edges else None)
 
 
-def fake_tallies(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> tuple[Tensor, Tensor]:
+def new_tallies(points: Tensor, noise: Tensor, shared: Tensor | None, *others: Any) -> tuple[Tensor, Tensor]:
     """Return memory for the numbers of points used and ignored (B,)."""
     _, _, slot, *_ = others
     return slot.new_empty(slot.shape[0]), slot.new_empty(slot.shape[0])
 
 
-@operator(f"update_cells({ARGUMENTS.format(layers='Tensor(a!)[] layers')}) -> (Tensor, Tensor)", fake_tallies)
+@operator(f"update_cells({ARGUMENTS.format(layers='Tensor(a!)[] layers')}) -> (Tensor, Tensor)", new_tallies)
 def _update(
     points: Tensor,
     noise: Tensor,
@@ -115,7 +115,7 @@ def _update(
     if library is None:
         hits = HitPoints(points, noise, shared, origin, PointCells(slot, as_mask(inside), C))
         return _update_by_tensors(hits, layers, resolution, width, cfg, has_rays)
-    tallies = fake_tallies(points, noise, shared, origin, inside, slot)
+    tallies = new_tallies(points, noise, shared, origin, inside, slot)
     tensors = [points, noise, shared, origin, inside, slot, *layers, *tallies]
     own = c_settings(cfg, resolution, has_rays)
     run(library.fuse_points, tensors, B, M, origin.shape[1], C // width, width, ctypes.byref(own))

@@ -14,7 +14,7 @@ from torchelev.native import kernels
 from torchelev.ops.define import operator
 from torchelev.stages.fast_layers import has_kernels
 from torchelev.stages.fusion.config import FusionConfig
-from torchelev.stages.fusion.native import ARGUMENTS, c_settings, config_of, fake_tallies, numbers
+from torchelev.stages.fusion.native import ARGUMENTS, c_settings, config_of, new_tallies, numbers
 from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import Update
 from torchelev.state import MapState
@@ -57,7 +57,7 @@ def update_on_gpu(
     return Update(new, used, ignored)
 
 
-@operator(f"update_cells_on_gpu({_ARGUMENTS}) -> (Tensor, Tensor)", fake_tallies)
+@operator(f"update_cells_on_gpu({_ARGUMENTS}) -> (Tensor, Tensor)", new_tallies)
 def _update(
     points: Tensor,
     noise: Tensor,

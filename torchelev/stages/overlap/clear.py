@@ -37,7 +37,7 @@ def clear_other_floors(
     z_g from `ground_below`. So a tall robot keeps its ground. Cells hit by this scan may differ by height * (1 + d /
     radius) at distance d: a slope is no other floor. What lies below the base is no upper floor. Skipped without a base
     pose or `cfg`. A cell's upper bound goes too when it belongs to another floor. The window is centred on the base.
-    `into`: a state that holds the layers of `state`, masks as bytes, and in which C++ and kernels change them.
+    `into`: the stored state, which holds the layers of `state`, masks as bytes; in it C++ and kernels change them.
     """
     if m.base is None or cfg is None:
         return state

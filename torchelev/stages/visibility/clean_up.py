@@ -42,20 +42,22 @@ def clear_seen_through(
     Eq. 4 keeps grazing rays from eroding smooth ground. It is not asked of a ray that `passes_far_below`: the last
     cells of an obstacle that left have tilted normals, and would stay forever.
     The upper bound of an unknown cell is the lowest ray height over it so far. None for `cfg`: the stage is skipped.
-    `into`: a state that holds the layers of `state`, masks as bytes, and in which C++ may change them.
+    `into`: the stored state, which holds the layers of `state`, masks as bytes; in it C++ changes them.
     """
     if cfg is None:
         return state
-    polar, before = PolarGrid.of(grid, cfg), count(state.validity)  # counted now, as `into` changes
+    polar, cleared = PolarGrid.of(grid, cfg), torch.zeros_like(state.statistics.cleared_seen_through)
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
         bins = bins_of(accepted_rays(state, m, rays, grid, cfg), polar, grid)
         arguments = bins, view_from(state, m, rays.origin, grid), polar, grid, cfg
         if has_one_pass(state):
-            state = apply_in_one_pass(state, *arguments, into)
+            after, number = apply_in_one_pass(state, *arguments, into)
         else:
-            state = apply_rays(state, *arguments)
-    return tally(state, cleared_seen_through=before - count(state.validity))
+            after = apply_rays(state, *arguments)
+            number = count(state.validity & ~after.validity)
+        state, cleared = after, cleared + number
+    return tally(state, cleared_seen_through=cleared)
 
 
 def apply_rays(

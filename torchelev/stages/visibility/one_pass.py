@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig, grid_of
 from torchelev.native.library import load
 from torchelev.ops.define import operator
-from torchelev.ops.masks import NOWHERE
+from torchelev.ops.masks import NOWHERE, count
 from torchelev.ops.native import run
 from torchelev.stages.fast_layers import layers_of, layers_to_change, named, put
 from torchelev.stages.visibility.config import RaycastConfig
@@ -26,13 +27,16 @@ _LARGEST = 2**30  # entries of a table, as they are counted in 32 bits
 Apply = Callable[[MapState, RayBins, View, PolarGrid, GridConfig, RaycastConfig], MapState]
 
 
-def in_one_pass(twin: Apply) -> Callable[..., MapState]:
-    """Return a function that does what its twin does, and calls it where C++ cannot be built."""
+def in_one_pass(twin: Apply) -> Callable[..., tuple[MapState, Tensor]]:
+    """Return a function that does what its twin does, and calls it where C++ cannot be built.
+
+    It also returns how many cells were cleared (B,): compiled code would see `validity` as it is after the change.
+    """
 
     @operator(
         "apply_rays(Tensor[] rays, Tensor[] view, Tensor[] layers, Tensor(a!)[] changed, int ranges, int azimuths, "
-        "float bins, int[] widen, float[] settings) -> ()",
-        lambda *_: None,
+        "float bins, int[] widen, float[] settings) -> Tensor",
+        _new_number,
     )
     def apply_to_layers(
         rays: list[Tensor],
@@ -44,11 +48,15 @@ def in_one_pass(twin: Apply) -> Callable[..., MapState]:
         bins: float,
         widen: list[int],
         settings: list[float],
-    ) -> None:
+    ) -> Tensor:
         polar = PolarGrid(ranges, azimuths, bins, tuple(widen))
-        if not _native(rays, view, layers, changed, polar, settings):
+        number = _native(rays, view, layers, changed, polar, settings)
+        if number is None:
             state, grid, cfg = _described(layers, changed, *settings)
-            put(changed, CHANGED, twin(state, RayBins(*rays), View(*view), polar, grid, cfg))
+            after = twin(state, RayBins(*rays), View(*view), polar, grid, cfg)
+            number = count(state.validity & ~after.validity)
+            put(changed, CHANGED, after)
+        return number
 
     def apply(
         state: MapState,
@@ -58,14 +66,19 @@ def in_one_pass(twin: Apply) -> Callable[..., MapState]:
         grid: GridConfig,
         cfg: RaycastConfig,
         into: MapState | None = None,
-    ) -> MapState:
+    ) -> tuple[MapState, Tensor]:
         sizes = polar.ranges, polar.azimuths, polar.bins, list(polar.widen)
         settings = [grid.resolution, cfg.min_time, cfg.min_incidence, cfg.gate]
         changed = layers_to_change(state, CHANGED, into)
-        apply_to_layers(list(rays), list(view), layers_of(state, READ), changed, *sizes, settings)
-        return state._replace(**named(CHANGED, changed))  # type: ignore[arg-type]
+        number = apply_to_layers(list(rays), list(view), layers_of(state, READ), changed, *sizes, settings)
+        return state._replace(**named(CHANGED, changed)), number  # type: ignore[arg-type]
 
     return apply
+
+
+def _new_number(rays: list[Tensor], *_: object) -> Tensor:
+    """Return memory for a number of each environment (B,)."""
+    return rays[0].new_empty(rays[0].shape[0], dtype=torch.int64)
 
 
 def _described(
@@ -83,14 +96,15 @@ def _native(
     changed: list[Tensor],
     polar: PolarGrid,
     settings: list[float],
-) -> bool:
-    """Change layers; return False where C++ cannot."""
+) -> Tensor | None:
+    """Change layers, and return how many cells were cleared (B,); None where C++ cannot."""
     if layers[0].numel() == 0 or polar.ranges * polar.azimuths > _LARGEST:
-        return False
+        return None
     library = load("rays/rays.cpp", _CONSTANTS)
     if library is None:
-        return False
+        return None
+    number = _new_number(rays)
     sizes = (*rays[0].shape, *layers[0].shape[1:], polar.ranges, polar.azimuths, len(polar.widen))
     widen = (ctypes.c_int64 * len(polar.widen))(*polar.widen)
-    run(library.apply_rays, [*rays, *view, *layers, *changed], *sizes, widen, polar.bins, *map(float, settings))
-    return True
+    run(library.apply_rays, [*rays, *view, *layers, *changed, number], *sizes, widen, polar.bins, *map(float, settings))
+    return number
