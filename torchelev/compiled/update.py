@@ -142,7 +142,8 @@ class Graphs(NamedTuple):
     """The parts of an update, compiled: what one stores on its way is free again before the next.
 
     Each writes what it changes into the stored state, which saves a copy of every layer; what stops a later one leaves
-    an update without its points or rays, though on a CPU its drift is compensated. Masks come and go as bytes, see `as_bytes`.
+    an update without its points or rays, though on a CPU its drift is compensated. Masks come and go as bytes, see
+    `as_bytes`.
     """
 
     move_window: KeptGraph  #: measures, moves the window and ages it; on a CPU compensates drift
