@@ -42,6 +42,11 @@ def layers_to_change(state: MapState, names: Sequence[str], into: MapState | Non
     return [layer.clone(memory_format=torch.contiguous_format) for layer in layers_of(state, names)]
 
 
+def new_numbers(like: Tensor) -> Tensor:
+    """Return memory for a whole number of each environment (B,), given a tensor (B, ...)."""
+    return like.new_empty(like.shape[0], dtype=torch.int64)
+
+
 def put(layers: Sequence[Tensor], names: Sequence[str], state: MapState) -> None:
     """Write layers of a state into the given ones, masks as bytes."""
     for layer, name in zip(layers, names, strict=True):

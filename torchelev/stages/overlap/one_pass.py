@@ -13,7 +13,7 @@ from torchelev.native import kernels
 from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.native import run
-from torchelev.stages.fast_layers import layers_of, layers_to_change, named, put
+from torchelev.stages.fast_layers import layers_of, layers_to_change, named, new_numbers, put
 from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.state import MapState, partial_state
 
@@ -51,7 +51,7 @@ Clear = Callable[[MapState, Around, OverlapConfig], Cleared]
 
 
 class _Settings(ctypes.Structure):
-    """`Settings` of overlap.cpp."""
+    """`Settings` of floor.h."""
 
     _fields_ = (
         *((name, ctypes.c_float) for name in ("radius_square", "slope", *_CONFIG[1:])),
@@ -65,7 +65,7 @@ def in_one_pass(twin: Clear) -> Callable[..., Cleared]:
     @operator(
         "clear_other_floors(Tensor x, Tensor y, Tensor base, int[] part, Tensor[] layers, Tensor(a!)[] changed, "
         "float[] settings) -> Tensor",
-        _numbers,
+        lambda x, *_: new_numbers(x),
     )
     def clear_layers(
         x: Tensor,
@@ -76,7 +76,7 @@ def in_one_pass(twin: Clear) -> Callable[..., Cleared]:
         changed: list[Tensor],
         settings: list[float],
     ) -> Tensor:
-        number, own = _numbers(x), _c_settings(part, settings)
+        number, own = new_numbers(x), _c_settings(part, settings)
         if kernels.work_on(x):
             _launch([x, y, base], layers, changed, number, own)
             return number
@@ -119,8 +119,3 @@ def _launch(
         below = places, maps, sums, H, W, ctypes.c_float(STANCE), settings
         kernels.launch_blocks(_SOURCE, "sum_below", blocks, kernels.SUM_MEMORY, *below)
         kernels.launch_blocks(_SOURCE, "clear_other_floors", blocks, 0, places, maps, sums, H, W, settings)
-
-
-def _numbers(x: Tensor, *_: object) -> Tensor:
-    """Return memory for a number of each environment (B,)."""
-    return x.new_empty(x.shape[0], dtype=torch.int64)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig, grid_of
@@ -13,7 +12,7 @@ from torchelev.native.library import load
 from torchelev.ops.define import operator
 from torchelev.ops.masks import NOWHERE, count
 from torchelev.ops.native import run
-from torchelev.stages.fast_layers import layers_of, layers_to_change, named, put
+from torchelev.stages.fast_layers import layers_of, layers_to_change, named, new_numbers, put
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import NO_RAY, RayBins, View
 from torchelev.stages.visibility.polar_table import PolarGrid
@@ -36,7 +35,7 @@ def in_one_pass(twin: Apply) -> Callable[..., tuple[MapState, Tensor]]:
     @operator(
         "apply_rays(Tensor[] rays, Tensor[] view, Tensor[] layers, Tensor(a!)[] changed, int ranges, int azimuths, "
         "float bins, int[] widen, float[] settings) -> Tensor",
-        _new_number,
+        lambda rays, *_: new_numbers(rays[0]),
     )
     def apply_to_layers(
         rays: list[Tensor],
@@ -76,11 +75,6 @@ def in_one_pass(twin: Apply) -> Callable[..., tuple[MapState, Tensor]]:
     return apply
 
 
-def _new_number(rays: list[Tensor], *_: object) -> Tensor:
-    """Return memory for a number of each environment (B,)."""
-    return rays[0].new_empty(rays[0].shape[0], dtype=torch.int64)
-
-
 def _described(
     layers: list[Tensor], changed: list[Tensor], resolution: float, min_time: float, min_incidence: float, gate: float
 ) -> tuple[MapState, GridConfig, RaycastConfig]:
@@ -103,7 +97,7 @@ def _native(
     library = load("rays/rays.cpp", _CONSTANTS)
     if library is None:
         return None
-    number = _new_number(rays)
+    number = new_numbers(rays[0])
     sizes = (*rays[0].shape, *layers[0].shape[1:], polar.ranges, polar.azimuths, len(polar.widen))
     widen = (ctypes.c_int64 * len(polar.widen))(*polar.widen)
     run(library.apply_rays, [*rays, *view, *layers, *changed, number], *sizes, widen, polar.bins, *map(float, settings))
