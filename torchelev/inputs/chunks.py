@@ -11,7 +11,7 @@ from torchelev.grid import GridConfig
 from torchelev.inputs.update_inputs import Inputs
 from torchelev.state import MapState, map_layers
 
-CPU_CELLS = 2**18  # cells per chunk on a CPU; measured: 64 maps of 64 x 64 cells at a time, a third faster than 256
+CPU_CELLS = 2**19  # cells per chunk on a CPU; measured: 128 maps of 64 x 64 cells at a time, 6 % faster than 64
 
 
 def make_chunks(num_envs: int, grid: GridConfig, device: torch.device, max_envs: int | None) -> list[slice]:

@@ -56,10 +56,26 @@ inline int count_set(Flags flags) {
 }
 
 inline bool any(Flags flags) {
-    uint64_t words[2]{};
-    const Bytes bytes = __builtin_convertvector(flags & 1, Bytes);
-    std::memcpy(words, &bytes, sizeof bytes);
-    return words[0] | words[1];
+    uint64_t words[LANES / 2], set = 0;
+    std::memcpy(words, &flags, sizeof flags);
+    for (uint64_t word : words) set |= word;
+    return set;
+}
+
+// Return the lowest byte of each number.
+inline Bytes bytes_of(Flags numbers) {
+#if defined(__AVX2__) && !defined(__AVX512F__) && !defined(__clang__)  // GCC would move one number after the other
+    typedef uint8_t Parts __attribute__((vector_size(sizeof(Flags))));
+    const Parts lowest_first{0,  4,  8,  12, 0,  0,  0,  0,  0,  0,  0,  0,  0,  0,  0,  0,
+                             16, 20, 24, 28, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16};
+    const Flags packed = (Flags)__builtin_shuffle((Parts)numbers, lowest_first);
+    const int32_t halves[2]{packed[0], packed[4]};
+    Bytes bytes;
+    std::memcpy(&bytes, halves, sizeof bytes);
+    return bytes;
+#else
+    return __builtin_convertvector(numbers, Bytes);
+#endif
 }
 
 // Numbers of bytes, and bytes of numbers. A count that is known to the compiler takes one step.
@@ -70,7 +86,7 @@ template <class Count> inline Flags load_bytes(const uint8_t* values, Count coun
 }
 
 template <class Count> inline void store_bytes(uint8_t* values, Flags numbers, Count count) {
-    const Bytes bytes = __builtin_convertvector(numbers, Bytes);
+    const Bytes bytes = bytes_of(numbers);
     std::memcpy(values, &bytes, count);
 }
 

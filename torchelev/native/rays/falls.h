@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <memory>
 #include <utility>
 
 #include "../lanes.h"
@@ -26,14 +27,17 @@ class Ground {
     const float first_i, first_j;   // cell of the map that the lattice's corner lies in
     const float last_i, last_j;
     const int width;
+    std::unique_ptr<float[]> of_all;  // how far below the sensor each cell's lowest ground lies, once it is known
 
   public:
+    const int64_t number;  // of cells
+
     Ground(const Settings& settings, const Layers& layers, const float* origin, const float* offset, int64_t height,
            int64_t width)
         : settings(settings), layers(layers), x(origin[0]), y(origin[1]), z(origin[2]),
           first_i(__builtin_nearbyintf(offset[0] / settings.resolution)),
           first_j(__builtin_nearbyintf(offset[1] / settings.resolution)), last_i(float(height - 1)),
-          last_j(float(width - 1)), width(int(width)) {}
+          last_j(float(width - 1)), width(int(width)), number(height * width) {}
 
     // Return the falls -dz/dr to bins k of an azimuth.
     Lanes falls(Lanes k, float cosine, float sine) const {
@@ -42,16 +46,36 @@ class Ground {
         const Lanes j = floor_of((y + rho * sine) / settings.resolution) + first_j;
         const Lanes near_i = clamp(i, 0, last_i), near_j = clamp(j, 0, last_j);
         const Flags inside = (i == near_i) & (j == near_j);
-        return pick(inside, below_sensor(integers(near_i) * width + integers(near_j)), all(settings.beyond)) / rho;
+        const Flags slot = integers(near_i) * width + integers(near_j);
+        const Lanes below = of_all ? gather(of_all.get(), slot) : below_sensor([&](auto layer) {
+            return gather(layer, slot);
+        });
+        return pick(inside, below, all(settings.beyond)) / rho;
+    }
+
+    // Look at all cells now, in their order, which is quicker where bins are more than half as many.
+    void look_at_all(int num_threads) {
+        if (number < LANES) return;
+        of_all.reset(new float[number]);
+        for_each(int((number + CELLS_AT_A_TIME - 1) / CELLS_AT_A_TIME), num_threads, [&](int64_t part) {
+            const int64_t last = std::min(number, (part + 1) * CELLS_AT_A_TIME);
+            for (int64_t k = part * CELLS_AT_A_TIME; k < last; k += LANES) {
+                const int64_t first = std::min(k, number - LANES);  // the last ones with some of those before
+                store(of_all.get() + first, below_sensor([&](auto layer) { return load_as(layer + first); }));
+            }
+        });
     }
 
   private:
-    // Return how far below the sensor the cells' lowest ground lies [m], NO_FALL where it was not hit recently.
-    Lanes below_sensor(Flags slot) const {
-        const Flags recent = (gather(layers.validity, slot) > 0) & (gather(layers.time, slot) <= settings.min_time);
-        const Lanes deviation = root(gather(layers.variance, slot) + settings.relief);
+    static constexpr int64_t CELLS_AT_A_TIME = 8192;  // that are worth a thread
+
+    // Return how far below the sensor the cells' lowest ground lies [m], NO_FALL where it was not hit recently. `read`
+    // returns these cells' values of a layer.
+    template <class Read> Lanes below_sensor(const Read& read) const {
+        const Flags recent = (read(layers.validity) > 0) & (read(layers.time) <= settings.min_time);
+        const Lanes deviation = root(read(layers.variance) + settings.relief);
         const Lanes margin = smaller(settings.gate * deviation, all(NOWHERE));
-        return pick(recent, z - (gather(layers.elevation, slot) - margin), all(NO_FALL));
+        return pick(recent, z - (read(layers.elevation) - margin), all(NO_FALL));
     }
 };
 

@@ -56,11 +56,11 @@ class Horizon {
     std::unique_ptr<float[]> steepest;
 
   public:
-    Horizon(const Bins& bins, const Rays& rays, const Ground& ground, const float* cosines, const float* sines,
+    Horizon(const Bins& bins, const Rays& rays, Ground& ground, const float* cosines, const float* sines,
             int num_threads)
         : bins(bins), rays(rays), num_threads(num_threads) {
         measure();
-        place();
+        if (2 * place() > ground.number) ground.look_at_all(num_threads);
         const int64_t blocks = (bins.azimuths + AZIMUTHS_AT_A_TIME - 1) / AZIMUTHS_AT_A_TIME;
         for_each(int(blocks), num_threads, [&](int64_t block) {
             const int64_t last = std::min(bins.azimuths, (block + 1) * AZIMUTHS_AT_A_TIME);
@@ -100,13 +100,15 @@ class Horizon {
             number[i % azimuths] = std::max(number[i % azimuths], farthest[i]);
     }
 
-    void place() {
+    // Return the number of bins.
+    int64_t place() {
         int64_t size = 0;
         for (int32_t count : number) {
             first.push_back(size);
             size += (count + LANES - 1) / LANES * LANES;  // vectors are stored whole
         }
         steepest.reset(new float[size]);
+        return size;
     }
 };
 
@@ -124,7 +126,7 @@ extern "C" int horizon(const float* r, const float* azimuth, const float* origin
     auto look = [&](int64_t b, int threads) {
         const int64_t cell = b * H * W;
         const Layers layers{elevation + cell, variance + cell, time + cell, validity + cell};
-        const Ground ground(settings, layers, origin + 3 * b, offset + 2 * b, H, W);
+        Ground ground(settings, layers, origin + 3 * b, offset + 2 * b, H, W);
         const Rays rays{r + b * N, azimuth + b * N, N};
         Horizon(bins, rays, ground, cosines, sines, threads).look_up(limits + b * N);
     };

@@ -53,7 +53,7 @@ def has_credible_end(
     ground = supported_ground(state, cfg, grid.resolution)
     lowest = state.elevation - height_margin(state.variance, grid, cfg)
     floor, known = (read(layer, end.slot) for layer in (lowest, ground))
-    near = ground_at_borders(ground, grid).gather(1, end.border)
+    near = read(ground_at_borders(ground, grid), end.border)
     z = rays.origin[:, None, 2]
     height, deepest = z + end.reach * rays.slope, z + rays.r * rays.slope.clamp(max=0)
     over = (known < 0.5 * NOWHERE) & (height >= floor)

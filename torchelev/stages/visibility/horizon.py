@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
 _CONSTANTS = {"NO_FALL": f"{NO_FALL!r}f", "NOWHERE": f"{NOWHERE!r}f"}
-MANY = 2**19  # bins, from which on C++ beats compiled tensors, as most lie beyond all rays
 _LARGEST = 2**30  # bins of a table, as they are counted in 32 bits
 
 
@@ -64,8 +63,7 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
     polar = PolarGrid.of(grid, cfg)
     ranges, ways = 8 * (polar.ranges // 16 + 1), directions(polar.azimuths // 2, rays.r)
     seen = SeenRays(rays.r, rays.azimuth, rays.origin, lattice_offset(state, m, grid))
-    gains = not torch.compiler.is_compiling() or ranges * len(ways.sines) >= MANY
-    if not (gains and has_one_pass(state)):
+    if not has_one_pass(state):
         return limits_by_tensors(state, seen, ways, ranges, grid, cfg)
     layers = [state.elevation, state.variance, state.time, as_bytes(state.validity)]
     return _horizon(list(seen), layers, list(ways), ranges, [grid.resolution, cfg.gate, cfg.min_time])
