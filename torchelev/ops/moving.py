@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchelev.native.library import is_native
 from torchelev.ops import native, on_gpu
+from torchelev.ops.define import operator
 from torchelev.ops.indexing import read
 from torchelev.ops.storage import realize_all
 
@@ -43,11 +44,7 @@ def gains_by_moving_in_place(layer: Tensor) -> bool:
     return is_native() if layer.is_cpu else on_gpu.gains_by_moving_in_place(layer)
 
 
-@torch.library.custom_op(
-    "torchelev::move_in_place",
-    mutates_args=("layers",),
-    schema="(Tensor(a!)[] layers, Tensor shift, float[] blanks) -> ()",
-)
+@operator("move_in_place(Tensor(a!)[] layers, Tensor shift, float[] blanks) -> ()", lambda *_: None)
 def move_in_place(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> None:
     """Shift contiguous layers (B, H, W) by whole cells (B, 2), each environment by its own; those of 0 stay.
 
@@ -60,11 +57,6 @@ def move_in_place(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> N
     values = (moved if shift.is_cpu else _gathered)(layers, shift, blanks)
     for layer, value in zip(layers, values, strict=True):
         layer.copy_(value)
-
-
-@move_in_place.register_fake
-def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> None:
-    return None
 
 
 def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
