@@ -27,7 +27,7 @@ def cell_sums(index: Tensor, values: Tensor, size: int) -> Tensor | None:
         return None
     sums = values.new_empty(*values.shape[:2], size)
     rows = values.shape[0] * values.shape[1]
-    run(library.add_by_slot, [index, values, sums], rows, *index.shape, size)
+    run(library.add_by_slot, [index, values], [sums], rows, *index.shape, size)
     return sums
 
 
@@ -37,7 +37,7 @@ def running_minimum(table: Tensor) -> Tensor | None:
     if library is None:
         return None
     result = torch.empty_like(table, memory_format=torch.contiguous_format)
-    run(library.running_minimum, [table, result], *table.shape)
+    run(library.running_minimum, [table], [result], *table.shape)
     return result
 
 
@@ -51,7 +51,7 @@ def polar_minimum(
     table = values.new_empty(len(values), rows, azimuths)
     levels = (ctypes.c_int64 * len(widen))(*widen)
     sizes = (*values.shape, rows, azimuths, ranges)
-    run(library.polar_minimum, [index, values, table], *sizes, levels, len(widen), blank)
+    run(library.polar_minimum, [index, values], [table], *sizes, levels, len(widen), blank)
     return table
 
 
@@ -67,7 +67,7 @@ def move_layers(layers: Sequence[Tensor], shift: Tensor, blanks: Sequence[float]
         (ctypes.c_int64 * number)(*(layer.element_size() for layer in layers)),
         (ctypes.c_double * number)(*blanks),
     )
-    run(library.move_layers, [shift], *arrays, number, *layers[0].shape)
+    run(library.move_layers, [shift], [], *arrays, number, *layers[0].shape)
     return True
 
 
@@ -79,15 +79,22 @@ def _library(values: Tensor, index: Tensor | None = None) -> ctypes.CDLL | None:
     return load("tables/tables.cpp", {}) if is_plain else None
 
 
-def run(function: Any, tensors: Sequence[Tensor | None], *arguments: Any) -> None:
+def run(function: Any, read: Sequence[Tensor | None], written: Sequence[Tensor | None], *arguments: Any) -> None:
     """Call a library's function, which waits for torch's number of threads last.
 
     Args:
         function: of a library.
-        tensors: whose addresses it gets; those that it writes must be contiguous. None: a null pointer.
+        read: tensors whose addresses it gets first. None: a null pointer.
+        written: tensors into which it writes, whose addresses it gets next.
         arguments: an int becomes int64, a float float32.
+
+    Raises:
+        ValueError: a written tensor is not contiguous.
     """
-    arrays = [None if tensor is None else tensor.contiguous() for tensor in tensors]
+    if not all(tensor is None or tensor.is_contiguous() for tensor in written):
+        strides = [None if tensor is None else tensor.stride() for tensor in written]
+        raise ValueError(f"{function.__name__} writes into contiguous tensors, got strides {strides}: copy them before")
+    arrays = [None if tensor is None else tensor.contiguous() for tensor in read] + [*written]
     addresses = [ctypes.c_void_p(None if array is None else array.data_ptr()) for array in arrays]
     call(function, *addresses, *map(_number, arguments), torch.get_num_threads())
 

@@ -109,8 +109,7 @@ def _write_planes(
         return
     library = load("surface/surface.cpp", _CONSTANTS) if elevation.is_cpu else None
     if library is not None and elevation.numel() > 0:
-        tensors = [elevation, known, *results]
-        run(library.rate_surface, tensors, *elevation.shape, radius, cells, ctypes.byref(settings))
+        run(library.rate_surface, [elevation, known], results, *elevation.shape, radius, cells, ctypes.byref(settings))
         return
     values = _layers(elevation, as_mask(known), radius, cells, resolution, critical)
     for layer, value in zip(layers, values, strict=True):

@@ -108,16 +108,13 @@ def test_variances_are_limited_in_all_cells(by, num_points):
 
 
 @needs_compiler
-@pytest.mark.parametrize("is_own", [True, False])
 @given(st.integers(0, 10_000))
-def test_cpp_writes_into_the_layers_of_a_state(is_own, seed):
+def test_cpp_writes_into_the_layers_of_a_state(seed):
     """Whose masks are bytes; those of the returned state are the ones before."""
     state, m, grid = random_scan(seed, 2, 1, 300, False)
-    into = with_masks(map_layers(torch.clone, state), as_bytes)
-    if not is_own:
-        state = state._replace(elevation=state.elevation + 0.01 * state.validity, challenger=state.challenger + 0.01)
     expected = fused("C++", state, m, grid, FusionConfig(), True)
-    given = with_masks(into, as_mask) if is_own else state
+    into = with_masks(map_layers(torch.clone, state), as_bytes)
+    given = with_masks(into, as_mask)
     got = fused("C++", given, m, grid, FusionConfig(), True, into)
     assert got.validity is given.validity
     for name in FUSED:
@@ -126,13 +123,26 @@ def test_cpp_writes_into_the_layers_of_a_state(is_own, seed):
         assert torch.equal(getattr(into, name), getattr(expected, name).to(getattr(into, name).dtype)), name
 
 
-def test_the_operator_is_registered_right():
+def operands():
     state, m, grid = random_scan(0, 2, 1, 30, False)
     cells = cells_of(state, m, grid)
     layers = [getattr(with_masks(state, as_bytes), name) for name in CellLayers._fields]
     scan = m.points, m.variance, None, m.origin, cells.inside.to(torch.uint8), cells.slot
-    arguments = *scan, layers, 0.1, grid.width, True, numbers(FusionConfig())
-    torch.library.opcheck(torch.ops.torchelev.update_cells.default, arguments)
+    return *scan, layers, 0.1, grid.width, True, numbers(FusionConfig())
+
+
+def test_the_operator_is_registered_right():
+    torch.library.opcheck(torch.ops.torchelev.update_cells.default, operands())
+
+
+@needs_compiler
+def test_layers_that_are_not_contiguous_are_refused():
+    """C++ would write into a copy of them."""
+    arguments = operands()
+    layers = arguments[6]
+    layers[0] = torch.stack([layers[0], layers[0]], -1)[..., 0]
+    with pytest.raises(ValueError, match="contiguous"):
+        torch.ops.torchelev.update_cells(*arguments)
 
 
 @needs_compiler

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.stages.cells import cells_of
+from torchelev.stages.fast_layers import layers_to_change
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.native import can_update_in_cpp, update_in_cpp
 from torchelev.stages.fusion.on_gpu import OWN, can_update_on_gpu, update_on_gpu
@@ -43,20 +44,20 @@ def fuse(
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
     above the cell agree with each other (`challenge`): a new obstacle appears soon, even on settled ground.
 
-    `into`: a state whose layers may be overwritten, its masks bytes; it may hold the numbers of `state`. Those that C++
-    or kernels write into it are part of the returned state, which keeps the masks of `state` where C++ writes them.
+    `into`: a state whose layers may be overwritten, its masks bytes; for C++ it holds the layers of `state`. Those that
+    C++ or kernels write into it are part of the returned state, which keeps the masks of `state` where C++ writes them.
     """
     cells = cells_of(state, m, grid)
     noise = m.variance if m.noise is None else m.noise
     points = HitPoints(m.points, noise, relative_variance(state, m), m.origin, cells)
     before = CellLayers(*(getattr(state, name).flatten(1) for name in CellLayers._fields))
-    arguments = points, before, grid, cfg, has_rays
+    settings = grid, cfg, has_rays
     if can_update_in_cpp(state):
-        new = update_in_cpp(*arguments, None if into is None else own_layers(state, into))
+        new = update_in_cpp(points, layers_to_change(state, CellLayers._fields, into), *settings)
     elif can_update_on_gpu(state, m.points):
-        new = update_on_gpu(*arguments, None if into is None else free_layers(state, into))
+        new = update_on_gpu(points, before, *settings, None if into is None else free_layers(state, into))
     else:
-        new = update_all(*arguments)
+        new = update_all(points, before, *settings)
     shape = state.elevation.shape
     layers: dict[str, Any] = {n: x if x.shape == shape else x.view(shape) for n, x in new.layers._asdict().items()}
     if into is not None and can_update_in_cpp(state):
@@ -68,14 +69,6 @@ def fuse(
         rejected_edge=new.num_ignored,
         rejected_outlier=count(cells.inside) - new.num_ignored - new.num_used,
     )
-
-
-def own_layers(state: MapState, into: MapState) -> list[Tensor]:
-    """Return the layers of `into`, whose masks are bytes and are those of `state`, with the numbers of `state`."""
-    for name in CellLayers._fields:
-        if name not in MASKS and getattr(into, name) is not getattr(state, name):
-            getattr(into, name).copy_(getattr(state, name))
-    return [getattr(into, name) for name in CellLayers._fields]
 
 
 def free_layers(state: MapState, into: MapState) -> dict[str, Tensor]:

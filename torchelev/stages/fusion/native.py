@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig, grid_of
@@ -18,7 +16,7 @@ from torchelev.ops.indexing import can_select
 from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.cells import PointCells
-from torchelev.stages.fast_layers import has_one_pass
+from torchelev.stages.fast_layers import has_one_pass, named
 from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.fusion.points import CellLayers, HitPoints
@@ -50,24 +48,12 @@ def can_update_in_cpp(state: MapState) -> bool:
 
 
 def update_in_cpp(
-    points: HitPoints,
-    before: CellLayers,
-    grid: GridConfig,
-    cfg: FusionConfig,
-    has_rays: bool,
-    into: Sequence[Tensor] | None = None,
+    points: HitPoints, layers: list[Tensor], grid: GridConfig, cfg: FusionConfig, has_rays: bool
 ) -> Update:
-    """Update all cells; arguments are those of `update_all`.
-
-    `into`: the layers before, contiguous and masks as bytes, which then change instead of copies.
-    """
-    layers = [as_bytes(layer) if layer.dtype == torch.bool else layer for layer in before]
-    layers = [layer.clone(memory_format=torch.contiguous_format) for layer in layers] if into is None else [*into]
+    """Update all cells in place, of contiguous layers with masks as bytes; else as `update_all` does."""
     hits = (*points[:-1], as_bytes(points.cells.inside), points.cells.slot)
     num_used, num_ignored = _update(*hits, layers, grid.resolution, grid.width, has_rays, numbers(cfg))
-    pairs = zip(layers, before, strict=True)
-    values = [as_mask(value) if layer.dtype == torch.bool else value for value, layer in pairs]
-    return Update(CellLayers(*values), num_used, num_ignored)
+    return Update(CellLayers(**named(CellLayers._fields, layers)), num_used, num_ignored)
 
 
 def numbers(cfg: FusionConfig) -> list[float]:
@@ -116,9 +102,9 @@ def _update(
         hits = HitPoints(points, noise, shared, origin, PointCells(slot, as_mask(inside), C))
         return _update_by_tensors(hits, layers, resolution, width, cfg, has_rays)
     tallies = new_tallies(points, noise, shared, origin, inside, slot)
-    tensors = [points, noise, shared, origin, inside, slot, *layers, *tallies]
+    read = [points, noise, shared, origin, inside, slot]
     own = c_settings(cfg, resolution, has_rays)
-    run(library.fuse_points, tensors, B, M, origin.shape[1], C // width, width, ctypes.byref(own))
+    run(library.fuse_points, read, [*layers, *tallies], B, M, origin.shape[1], C // width, width, ctypes.byref(own))
     return tallies
 
 

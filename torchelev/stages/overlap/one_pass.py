@@ -88,7 +88,8 @@ def in_one_pass(twin: Clear) -> Callable[..., Cleared]:
             *left, number = twin(state, around, cfg)
             put(changed, CHANGED, partial_state(**dict(zip(CHANGED, left, strict=True))))
             return number
-        run(library.clear_other_floors, [x, y, base, *layers, *changed, number], *layers[0].shape, ctypes.byref(own))
+        written = [*changed, number]
+        run(library.clear_other_floors, [x, y, base, *layers], written, *layers[0].shape, ctypes.byref(own))
         return number
 
     def clear(state: MapState, around: Around, cfg: OverlapConfig, into: MapState | None = None) -> Cleared:

@@ -145,5 +145,5 @@ def _native(
     sizes = (*rays[0].shape, *layers[0].shape[1:], ranges, azimuths)
     step = 2 * resolution
     numbers = map(float, (resolution, step, (0.5 * resolution) ** 2, NO_FALL * step, gate, min_time))
-    run(library.horizon, [*rays, *layers, *ways, limits], *sizes, *numbers)
+    run(library.horizon, [*rays, *layers, *ways], [limits], *sizes, *numbers)
     return limits

@@ -100,5 +100,6 @@ def _native(
     number = new_numbers(rays[0])
     sizes = (*rays[0].shape, *layers[0].shape[1:], polar.ranges, polar.azimuths, len(polar.widen))
     widen = (ctypes.c_int64 * len(polar.widen))(*polar.widen)
-    run(library.apply_rays, [*rays, *view, *layers, *changed, number], *sizes, widen, polar.bins, *map(float, settings))
+    read, numbers = [*rays, *view, *layers], map(float, settings)
+    run(library.apply_rays, read, [*changed, number], *sizes, widen, polar.bins, *numbers)
     return number
