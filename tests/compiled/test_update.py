@@ -138,6 +138,20 @@ def test_an_update_that_is_stopped_leaves_a_sound_map(compile_with, monkeypatch)
     assert_close(eager.state, emap.state, 1e-5)
 
 
+def test_layers_that_are_not_contiguous_are_refused_before_anything_changes():
+    """Operators write into them where they are stored."""
+    emap = mapped()
+    emap.compile()
+    values = emap.state_dict()
+    values["elevation"] = values["elevation"].mT.contiguous().mT
+    emap.load_state_dict(values, assign=True)
+    before = snapshot(emap)
+    cloud, T = scan(5)
+    with pytest.raises(ValueError, match="contiguous layers.*elevation"):
+        emap.update(cloud, T, T, 0.3)
+    assert not differences(emap.state, before)
+
+
 PLAIN = {"drift": None, "raycast": None, "overlap": None, "traversability": None}  # quick to trace
 
 

@@ -20,10 +20,10 @@ def test_chunks_are_of_equal_size_up_to_rounding():
     assert ends(make_chunks(3, grid, CPU, 4)) == [(0, 3)]
 
 
-def test_caches_limit_a_chunk_on_a_cpu_alone():
+def test_a_chunk_is_limited_on_a_cpu_alone():
     grid = small_config((256, 256)).grid
-    assert len(make_chunks(8, grid, CPU, None)) == 2
-    assert len(make_chunks(8, grid, META, None)) == 1
+    assert len(make_chunks(16, grid, CPU, None)) == 2
+    assert len(make_chunks(16, grid, META, None)) == 1
 
 
 def test_a_map_is_updated_in_its_chunks():

@@ -14,6 +14,7 @@ from torchelev.compiled.compiler import announced_compilation, packed
 from torchelev.compiled.elsewhere import run_elsewhere
 from torchelev.compiled.kept_graphs import Dynamic, KeptGraph, surroundings
 from torchelev.config import ElevationMapConfig
+from torchelev.errors import require
 from torchelev.ops.moving import gains_by_moving_in_place
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, update_in_place
@@ -26,7 +27,7 @@ from torchelev.stages.measure import measure
 from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
 from torchelev.stages.visibility.clean_up import clear_seen_through
-from torchelev.state import MASKS, MapState, Measurement, blank_state, map_layers
+from torchelev.state import LAYERS, MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.traversability.weight_file import Weights
 
 
@@ -37,6 +38,9 @@ def compiled_update(
     if points.shape[2] < 2:  # the compiler treats sizes 0 and 1 as constants
         update_in_place(stored, points, *others, cfg=cfg, weights=weights)
         return
+    strided = [name for name in LAYERS if not getattr(stored, name).is_contiguous()]
+    hint = "load the map by `load_state`, or copy the layers"
+    require(not strided, "state", "must hold contiguous layers", ", ".join(strided), hint)
     with torch.inference_mode(False), torch.no_grad():
         inputs = [None if value is None else packed(value) for value in (points, *others)]
     kinds = tuple(None if value is None else (value.dtype, value.device) for value in inputs)

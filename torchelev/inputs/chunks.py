@@ -17,7 +17,7 @@ CPU_CELLS = 2**19  # cells per chunk on a CPU; measured: 128 maps of 64 x 64 cel
 def make_chunks(num_envs: int, grid: GridConfig, device: torch.device, max_envs: int | None) -> list[slice]:
     """Divide the environments into chunks of equal size, up to rounding.
 
-    `max_envs` limits a chunk. None: no limit on a GPU, and on a CPU as many as fit into its caches.
+    `max_envs` limits a chunk. None: no limit on a GPU, and on a CPU as many as are fastest.
     """
     if max_envs is None:
         max_envs = max(1, CPU_CELLS // grid.num_cells) if device.type == "cpu" else num_envs

@@ -35,7 +35,7 @@ def named(names: Sequence[str], layers: Sequence[Tensor]) -> dict[str, Tensor]:
 def layers_to_change(state: MapState, names: Sequence[str], into: MapState | None) -> list[Tensor]:
     """Return layers that a stage may change in place, masks as bytes: those of `into`, or copies of those of `state`.
 
-    `into` is the stored state, which holds the same, masks as bytes.
+    `into` is the stored state, whose layers already hold what those of `state` do, masks as bytes.
     """
     if into is not None:
         return [getattr(into, name) for name in names]

@@ -69,9 +69,11 @@ def test_both_agree(seed, num_envs, cells, num_rays, reach, place, known, thread
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("cells, num_rays, reach", [((500, 600), 20_000, 0.1), ((64, 48), 20_000, 0.5)])
+@pytest.mark.parametrize(
+    "cells, num_rays, reach", [((500, 600), 20_000, 0.1), ((501, 611), 20_000, 0.5), ((64, 48), 20_000, 0.5)]
+)
 def test_both_agree_on_large_maps_and_many_rays(cells, num_rays, reach, threads):
-    """Where several threads take the rays, and where rays outnumber the bins. Ten times: threads share differently."""
+    """Several threads take rays or cells, or rays outnumber the bins. Ten times: threads share differently."""
     torch.set_num_threads(threads)
     inputs = seen_by(cells, np.random.default_rng(0), 1, num_rays, reach, cfg=NO_MARGIN)
     expected = limits_by_tensors(*inputs)
@@ -110,6 +112,16 @@ def test_gradients_and_double_precision_take_the_tensors(num_sensors, monkeypatc
         torch.testing.assert_close(horizon(state, m, rays, grid, CFG), fast, atol=1e-6, rtol=1e-6)
     assert horizon(state._replace(elevation=state.elevation.double()), m, rays, grid, CFG).shape == fast.shape
     assert (fast < NO_FALL).any()
+
+
+def test_it_takes_float32_whatever_the_default():
+    inputs = seen_by((20, 20), np.random.default_rng(0))
+    torch.set_default_dtype(torch.float64)
+    try:
+        got = marched(*inputs)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    torch.testing.assert_close(got, limits_by_tensors(*inputs), atol=1e-6, rtol=1e-6)
 
 
 def test_it_is_registered_right():

@@ -27,7 +27,7 @@ class Ground {
     const float first_i, first_j;   // cell of the map that the lattice's corner lies in
     const float last_i, last_j;
     const int width;
-    std::unique_ptr<float[]> of_all;  // how far below the sensor each cell's lowest ground lies, once it is known
+    std::unique_ptr<float[]> of_all;  // `below_sensor` of each cell, after `look_at_all`
 
   public:
     const int64_t number;  // of cells
@@ -53,14 +53,14 @@ class Ground {
         return pick(inside, below, all(settings.beyond)) / rho;
     }
 
-    // Look at all cells now, in their order, which is quicker where bins are more than half as many.
+    // Look at all cells now, in their order, so that `falls` reads one number of a cell and not four.
     void look_at_all(int num_threads) {
         if (number < LANES) return;
         of_all.reset(new float[number]);
-        for_each(int((number + CELLS_AT_A_TIME - 1) / CELLS_AT_A_TIME), num_threads, [&](int64_t part) {
-            const int64_t last = std::min(number, (part + 1) * CELLS_AT_A_TIME);
-            for (int64_t k = part * CELLS_AT_A_TIME; k < last; k += LANES) {
-                const int64_t first = std::min(k, number - LANES);  // the last ones with some of those before
+        const Parts parts{std::max(int64_t(1), number / CELLS_AT_A_TIME), num_threads};
+        parts(number, [&](int64_t, int64_t begin, int64_t end) {
+            for (int64_t k = begin; k < end; k += LANES) {
+                const int64_t first = std::min(k, end - LANES);  // the last ones with some of those before
                 store(of_all.get() + first, below_sensor([&](auto layer) { return load_as(layer + first); }));
             }
         });

@@ -50,14 +50,13 @@ def fuse(
     cells = cells_of(state, m, grid)
     noise = m.variance if m.noise is None else m.noise
     points = HitPoints(m.points, noise, relative_variance(state, m), m.origin, cells)
-    before = CellLayers(*(getattr(state, name).flatten(1) for name in CellLayers._fields))
     settings = grid, cfg, has_rays
     if can_update_in_cpp(state):
         new = update_in_cpp(points, layers_to_change(state, CellLayers._fields, into), *settings)
     elif can_update_on_gpu(state, m.points):
-        new = update_on_gpu(points, before, *settings, None if into is None else free_layers(state, into))
+        new = update_on_gpu(points, flat_layers(state), *settings, None if into is None else free_layers(state, into))
     else:
-        new = update_all(points, before, *settings)
+        new = update_all(points, flat_layers(state), *settings)
     shape = state.elevation.shape
     layers: dict[str, Any] = {n: x if x.shape == shape else x.view(shape) for n, x in new.layers._asdict().items()}
     if into is not None and can_update_in_cpp(state):
@@ -69,6 +68,11 @@ def fuse(
         rejected_edge=new.num_ignored,
         rejected_outlier=count(cells.inside) - new.num_ignored - new.num_used,
     )
+
+
+def flat_layers(state: MapState) -> CellLayers:
+    """Return what the update reads and writes, (B, C) each."""
+    return CellLayers(*(getattr(state, name).flatten(1) for name in CellLayers._fields))
 
 
 def free_layers(state: MapState, into: MapState) -> dict[str, Tensor]:

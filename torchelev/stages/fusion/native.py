@@ -50,7 +50,7 @@ def can_update_in_cpp(state: MapState) -> bool:
 def update_in_cpp(
     points: HitPoints, layers: list[Tensor], grid: GridConfig, cfg: FusionConfig, has_rays: bool
 ) -> Update:
-    """Update all cells in place, of contiguous layers with masks as bytes; else as `update_all` does."""
+    """Do what `update_all` does, in place: `layers` are those of `CellLayers`, contiguous (B, H, W), masks as bytes."""
     hits = (*points[:-1], as_bytes(points.cells.inside), points.cells.slot)
     num_used, num_ignored = _update(*hits, layers, grid.resolution, grid.width, has_rays, numbers(cfg))
     return Update(CellLayers(**named(CellLayers._fields, layers)), num_used, num_ignored)

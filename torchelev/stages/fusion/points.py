@@ -27,7 +27,7 @@ class HitPoints(NamedTuple):
 
 
 class CellLayers(NamedTuple):
-    """What the update reads and writes of cells, (B, C) each; see `MapState`."""
+    """What the update reads and writes of cells, (B, C) or (B, H, W) each; see `MapState`."""
 
     elevation: Tensor  #: [m]
     variance: Tensor  #: [m^2]

@@ -141,7 +141,7 @@ def _native(
     library = load("rays/horizon.cpp", _CONSTANTS)
     if library is None:
         return None
-    limits = torch.empty(rays[0].shape)
+    limits = _fake(rays)
     sizes = (*rays[0].shape, *layers[0].shape[1:], ranges, azimuths)
     step = 2 * resolution
     numbers = map(float, (resolution, step, (0.5 * resolution) ** 2, NO_FALL * step, gate, min_time))
