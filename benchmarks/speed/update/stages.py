@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -18,7 +17,6 @@ from benchmarks.speed.workload import BPEARL, MANY_POINTS, Drive, full_config
 from torchelev import pipeline
 from torchelev.compiled import compiler
 from torchelev.compiled.update import with_masks
-from torchelev.inputs.chunks import CPU_CELLS
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages import age, compensate, measure, recenter
 from torchelev.stages.fusion import fuse
@@ -139,9 +137,7 @@ def _chunked_inputs(drive: Drive) -> list[tuple[MapState, Measurement]]:
     ahead[:, 0, 3] = emap.center[:, 0] + emap.cfg.grid.resolution
     measurement = emap.measure(points, T, ahead, drive.dt)
     state = map_layers(torch.clone, emap.state)
-    chunk = emap.chunk or max(1, CPU_CELLS // emap.cfg.grid.num_cells)
-    chunks = torch.arange(emap.num_envs).chunk(math.ceil(emap.num_envs / chunk))
-    return [_select(state, measurement, slice(int(ids[0]), int(ids[-1]) + 1)) for ids in chunks]
+    return [_select(state, measurement, envs) for envs in emap.chunks]
 
 
 def _select(state: MapState, measurement: Measurement, envs: slice) -> tuple[MapState, Measurement]:
