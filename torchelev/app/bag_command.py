@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from torchelev.app.fuse_scans import show_progress
+from torchelev.app.mapping.fuse_scans import show_progress
 from torchelev.app.results import align
 from torchelev.io import RecordingError
 from torchelev.io.bags import Bag, BagRecording, BagRequest, Topic, open_bag

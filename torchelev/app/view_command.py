@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from torchelev.app.config_file import load_config
-from torchelev.app.fuse_scans import fuse_all, new_map
-from torchelev.app.map_request import MapRequest
-from torchelev.app.open_scans import open_scans
+from torchelev.app.mapping.fuse_scans import fuse_all, new_map
+from torchelev.app.mapping.map_request import MapRequest
+from torchelev.app.mapping.open_scans import open_scans
 from torchelev.app.user_error import user_errors
 from torchelev.io import Frame, MappingRun
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchelev.io.recording import Frame
+from torchelev.io.folders.recording import Frame
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap

@@ -47,7 +47,7 @@ from benchmarks.quality.real.metrics import (
 )
 from torchelev import LearnedTraversabilityConfig as Head
 from torchelev.app.config_file import load_config
-from torchelev.app.fuse_scans import MapOptions, fuse_all, new_map
+from torchelev.app.mapping.fuse_scans import MapOptions, fuse_all, new_map
 from torchelev.app.results import markdown_table, write_json
 from torchelev.io import MappingRun, base_poses
 from torchelev.io.export import SavedMap, take

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from torchelev.io.bags.definitions import make_typestore
 from torchelev.io.bags.unfinished import UnfinishedBag
 from torchelev.io.errors import RecordingError
-from torchelev.io.scan_files import has_clouds
+from torchelev.io.folders.scan_files import has_clouds
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _HEAD_BYTES = 4096  # of a metadata.yaml, which begin with its key

@@ -18,7 +18,7 @@ from torchelev.io.bags.point_cloud import CloudError
 from torchelev.io.bags.scans import CLOUDS, IMAGES, Scan, read_scan
 from torchelev.io.bags.transforms import FrameError, TransformTree
 from torchelev.io.errors import RecordingError
-from torchelev.io.recording import Frame
+from torchelev.io.folders.recording import Frame
 
 ODOMETRY, POSE, CAMERA = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = {"/tf": False, "/tf_static": True}  # topic -> whether its transforms are static

@@ -14,7 +14,7 @@ from torchelev.io.export import load_npz
 @pytest.mark.parametrize("suffix", [".npz", ".png", ".ply"])
 @pytest.mark.parametrize("blocked", ["folder", "device"])
 def test_outputs_are_checked_before_mapping(run, recording, tmp_path, monkeypatch, suffix, blocked):
-    monkeypatch.setattr("torchelev.app.map_command.fuse_all", lambda *args: pytest.fail("mapped"))
+    monkeypatch.setattr("torchelev.app.mapping.map_command.fuse_all", lambda *args: pytest.fail("mapped"))
     path = tmp_path / f"map{suffix}"
     path.mkdir() if blocked == "folder" else path.symlink_to("/dev/full")
     code, _, err = run("map", recording)

@@ -5,7 +5,7 @@ import pytest
 from tests.helpers import mapped
 from torchelev.io import RecordingError
 from torchelev.io.export import save_npz
-from torchelev.io.scan_files import find_scans
+from torchelev.io.folders.scan_files import find_scans
 
 
 def write_scans(folder, names, suffix=".npy"):

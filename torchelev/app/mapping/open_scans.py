@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import click
 from numpy.typing import NDArray
 
-from torchelev.app.fuse_scans import MapOptions, Scans, show_progress
-from torchelev.app.map_request import MapRequest
+from torchelev.app.mapping.fuse_scans import MapOptions, Scans, show_progress
+from torchelev.app.mapping.map_request import MapRequest
 from torchelev.io import FileLayout, base_poses, is_bag, open_recording, read_transform
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchelev.frames import transform
 from torchelev.io.errors import RecordingError
-from torchelev.io.layout import FileLayout, read_bin
+from torchelev.io.folders.layout import FileLayout, read_bin
 
 
 def read_cloud(path: str | Path, layout: FileLayout | None = None) -> NDArray[np.float32]:

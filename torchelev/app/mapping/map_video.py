@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchelev.app.due_scans import DueScans
 from torchelev.app.interrupts import defer_interrupts
+from torchelev.app.mapping.due_scans import DueScans
 from torchelev.errors import require
 from torchelev.io import Frame, MappingRun
 

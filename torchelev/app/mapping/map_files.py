@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchelev.app.report import choose_panels
+from torchelev.app.mapping.report import choose_panels
 from torchelev.io import MappingRun
 from torchelev.output_files import require_writable
 

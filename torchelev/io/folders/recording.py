@@ -10,12 +10,12 @@ from typing import NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.io.clouds import read_cloud
-from torchelev.io.depth import Intrinsics, check_size, read_depth, read_intrinsics
 from torchelev.io.errors import RecordingError
-from torchelev.io.layout import FileLayout, require_plausible_steps
-from torchelev.io.poses import Poses, read_poses
-from torchelev.io.scan_files import find_scans
+from torchelev.io.folders.clouds import read_cloud
+from torchelev.io.folders.depth import Intrinsics, check_size, read_depth, read_intrinsics
+from torchelev.io.folders.layout import FileLayout, require_plausible_steps
+from torchelev.io.folders.poses import Poses, read_poses
+from torchelev.io.folders.scan_files import find_scans
 
 _POSE_FILES = ("poses.txt", "groundtruth.txt")
 _TIME_TOLERANCE = 0.02  # [s] between a scan's timestamp and its pose's, as in TUM's own tools

@@ -7,14 +7,14 @@ from pathlib import Path
 import click
 
 from torchelev.app.config_file import load_config
-from torchelev.app.fuse_scans import MapOptions, Scans, fuse_all, new_map
 from torchelev.app.interrupts import defer_interrupts
-from torchelev.app.map_files import prepare_outputs, write_outputs
-from torchelev.app.map_recorder import MapRecorder
-from torchelev.app.map_request import MapRequest
-from torchelev.app.map_video import MapVideo
-from torchelev.app.open_scans import open_scans
-from torchelev.app.report import suggest_options, summarize
+from torchelev.app.mapping.fuse_scans import MapOptions, Scans, fuse_all, new_map
+from torchelev.app.mapping.map_files import prepare_outputs, write_outputs
+from torchelev.app.mapping.map_recorder import MapRecorder
+from torchelev.app.mapping.map_request import MapRequest
+from torchelev.app.mapping.map_video import MapVideo
+from torchelev.app.mapping.open_scans import open_scans
+from torchelev.app.mapping.report import suggest_options, summarize
 from torchelev.app.user_error import BAD_INPUT, UserError, user_errors
 from torchelev.io import Frame, MappingRun, RecordingError, is_bag
 

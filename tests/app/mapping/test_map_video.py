@@ -8,8 +8,8 @@ import pytest
 from tests.app.drives import NUM_SCANS
 from tests.io.bags.synthetic import SCANS, write_drive
 from tests.viz.test_video import read_frames
-from torchelev.app import map_video
-from torchelev.app.due_scans import DueScans
+from torchelev.app.mapping import map_video
+from torchelev.app.mapping.due_scans import DueScans
 from torchelev.io import Frame, MappingRun
 
 

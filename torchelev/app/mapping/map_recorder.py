@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchelev.app.due_scans import DueScans
 from torchelev.app.interrupts import defer_interrupts
+from torchelev.app.mapping.due_scans import DueScans
 from torchelev.io import Frame, MappingRun
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""`torchelev map`: its options, the scans they name, fusing them, and the files it writes."""
