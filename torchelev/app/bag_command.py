@@ -9,7 +9,7 @@ from torchelev.app.mapping.fuse_scans import show_progress
 from torchelev.app.results import align
 from torchelev.io import RecordingError
 from torchelev.io.bags import Bag, BagRecording, BagRequest, Topic, open_bag
-from torchelev.io.bags.recording import TRANSFORMS
+from torchelev.io.bags.poses.reading import TRANSFORMS
 from torchelev.io.bags.scans import CLOUDS, IMAGES
 from torchelev.io.bags.transforms import TransformTree
 

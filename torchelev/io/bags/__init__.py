@@ -1,7 +1,8 @@
 """Bags, the recordings of ROS 1 and ROS 2: scans and poses out of them, as a recording that `torchelev map` fuses.
 
 Needs ``torchelev[bags]``; no ROS. `bag` reads messages, `point_cloud` and `scans` turn them into points, `transforms`
-finds poses, `recording` puts them together. `grid_maps` writes maps to bags and reads them.
+and `poses` find poses, `topics` says what is read, `recording` puts it together. `grid_maps` writes maps to bags and
+reads them.
 """
 
 from torchelev.io.bags.bag import Bag, Message, Topic, is_bag
@@ -14,7 +15,8 @@ from torchelev.io.bags.grid_maps import (
     to_bytes,
     write_grid_map,
 )
-from torchelev.io.bags.recording import BagRecording, BagRequest, open_bag
+from torchelev.io.bags.recording import BagRecording, open_bag
+from torchelev.io.bags.topics import BagRequest
 from torchelev.io.bags.transforms import TransformTree
 
 __all__ = [

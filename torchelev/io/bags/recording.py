@@ -3,40 +3,27 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from torchelev.frames import deskew
-from torchelev.io.bags.bag import Bag, Message, Topic
-from torchelev.io.bags.covariance import PoseCovariances
+from torchelev.io.bags.bag import Bag, Message
 from torchelev.io.bags.order import order_by_stamp
 from torchelev.io.bags.point_cloud import CloudError
-from torchelev.io.bags.scans import CLOUDS, IMAGES, Scan, read_scan
-from torchelev.io.bags.transforms import FrameError, TransformTree
+from torchelev.io.bags.poses.frames import choose_frames
+from torchelev.io.bags.poses.reading import read_poses
+from torchelev.io.bags.poses.within_scan import hold_still
+from torchelev.io.bags.scans import read_scan
+from torchelev.io.bags.topics import BagRequest, choose_topics, find_cameras
+from torchelev.io.bags.transforms import FrameError
 from torchelev.io.errors import RecordingError
 from torchelev.io.folders.recording import Frame
 
-ODOMETRY, POSE, CAMERA = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/CameraInfo"
-TRANSFORMS = {"/tf": False, "/tf_static": True}  # topic -> whether its transforms are static
 _PERIODS = 0.02, 1.0  # [s] shortest and longest period of scans that is believed
 _MAX_GAP = 1.0  # [s] between two poses without a warning
-_POSE_STEP, _MAX_POSES = 0.01, 64  # [s] between the poses of a scan, and how many there are at most
 _LATE = "some scans are older than those before them, and are fused with dt = 0"
-_BASES = ("base_link", "base_footprint", "base", "trunk", "body")
-
-
-class BagRequest(NamedTuple):
-    """What to read from a bag; None and () are found in the bag."""
-
-    clouds: Sequence[str] = ()  #: topics of clouds or laser scans
-    depths: Sequence[str] = ()  #: topics of depth images
-    map_frame: str | None = None  #: in which the map is built
-    base_frame: str | None = None  #: which the window follows
-    poses: str | None = None  #: topic of Odometry or PoseStamped in place of the transforms
 
 
 class BagRecording:
@@ -54,15 +41,13 @@ class BagRecording:
 
     def __init__(self, bag: Bag, request: BagRequest, show: Any = iter) -> None:
         self._bag, types = bag, {topic.name: topic for topic in bag.topics}
-        self.topics = _choose_topics(bag, types, request)
+        self.topics = choose_topics(bag, types, request)
         self._num = sum(types[name].num for name in self.topics)
         period = bag.duration / max(1, max(types[name].num for name in self.topics) - 1)
-        self.tree = TransformTree(float(np.clip(period, *_PERIODS)))
-        self._covariances = PoseCovariances()
-        self._cameras = _find_cameras(bag, types, request.depths)
-        self._read_poses(request, types, show)
+        self._cameras = find_cameras(bag, types, request.depths)
+        self.tree, self._covariances = read_poses(bag, request, types, float(np.clip(period, *_PERIODS)), show)
         sensor = self._first_frame()
-        self.map_frame, self.base_frame = _choose_frames(bag, self.tree, sensor, request)
+        self.map_frame, self.base_frame = choose_frames(bag, self.tree, sensor, request)
         self.has_base = self.base_frame != sensor
         gaps = [self.tree.describe_gaps(self.map_frame, frame, _MAX_GAP) for frame in (self.base_frame, sensor)]
         self.pose_notes = [*self.tree.describe_conflicts(), *dict.fromkeys(line for lines in gaps for line in lines)]
@@ -122,25 +107,11 @@ class BagRecording:
         dt = 0.0 if last is None else scan.stamp - last
         if dt < 0:
             self.notes[f"{message.topic}: {_LATE}"] = None
-        points = self._still(scan)
-        return Frame(points, T_map_sensor, max(0.0, dt), message.topic, T_map_base, covariance, scan.stamp)
-
-    def _still(self, scan: Scan) -> NDArray[np.float32]:
-        """Return the points as seen from the sensor's place at the stamp."""
-        if scan.times is None:
-            return scan.points
-        finite = scan.times[np.isfinite(scan.times)]
-        first, last = min(float(finite.min()), 0.0), max(float(finite.max()), 0.0)
-        num = int(np.clip(np.ceil((last - first) / _POSE_STEP) + 1, 2, _MAX_POSES))
-        times = np.linspace(first, last, num)
-        poses = self.tree.look_up(self.map_frame, scan.frame, scan.stamp + times)
-        known = np.isfinite(poses).all((1, 2))
-        if known.sum() < 2:
+        points = hold_still(self.tree, self.map_frame, scan)
+        if points is None:
             self.notes[f"{scan.frame}: too few poses within a scan to take its motion out"] = None
-            return scan.points
-        given = scan.points, scan.times, poses[known], times[known]
-        points, at, T, stamps = (torch.from_numpy(np.ascontiguousarray(value))[None] for value in given)
-        return deskew(points, at, T, stamps, torch.zeros(1), self.tree.max_extrapolation)[0].numpy()
+            points = scan.points
+        return Frame(points, T_map_sensor, max(0.0, dt), message.topic, T_map_base, covariance, scan.stamp)
 
     def _first_frame(self) -> str:
         """Return the frame of the first scan."""
@@ -148,30 +119,6 @@ class BagRecording:
             return message.data.header.frame_id.lstrip("/")
         reason = self._bag.ended_early or f"no messages on {', '.join(self.topics)}"
         raise RecordingError(self._bag.path, reason, "choose another topic with --points or --depth")
-
-    def _read_poses(self, request: BagRequest, types: dict[str, Topic], show: Any) -> None:
-        """Read all transforms, and the poses of the requested topic."""
-        topics = [*TRANSFORMS, *([request.poses] if request.poses else [])]
-        self._check_poses(request, types)
-        for message in show(self._bag.read(topics)):
-            if message.topic in TRANSFORMS:
-                self.tree.add_message(message.data, TRANSFORMS[message.topic])
-            elif types[message.topic].type == ODOMETRY:
-                self.tree.add_odometry(message.data)
-                self._covariances.add(message.data)
-            else:
-                self.tree.add_pose(message.data, str(request.base_frame))
-
-    def _check_poses(self, request: BagRequest, types: dict[str, Topic]) -> None:
-        """Refuse a topic of poses that is not there, is of another type or leaves the frame open."""
-        if request.poses is None:
-            return
-        kind = types[request.poses].type if request.poses in types else "not in the bag"
-        if kind not in (ODOMETRY, POSE):
-            have = _name([t for t in types.values() if t.type in (ODOMETRY, POSE)])
-            raise RecordingError(self._bag.path, f"--poses {request.poses} is {kind}", f"topics of poses are {have}")
-        if kind == POSE and request.base_frame is None:
-            raise RecordingError(self._bag.path, f"{request.poses} does not say whose pose it is", "give --base-frame")
 
 
 def open_bag(bag: Bag, request: BagRequest | None = None, show: Any = iter) -> BagRecording:
@@ -189,74 +136,3 @@ def open_bag(bag: Bag, request: BagRequest | None = None, show: Any = iter) -> B
         RecordingError: a topic or frame is missing, or several could be meant; the message names them.
     """
     return BagRecording(bag, request or BagRequest(), show)
-
-
-def _choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> list[str]:
-    """Return the requested topics, or the only one of clouds."""
-    for names, kinds, option in ((request.clouds, CLOUDS, "--points"), (request.depths, IMAGES, "--depth")):
-        for name in names:
-            kind = types[name].type if name in types else "not in the bag"
-            if kind not in kinds:
-                have = _name([topic for topic in types.values() if topic.type in kinds])
-                raise RecordingError(bag.path, f"{option} {name} is {kind}", f"such topics are {have}")
-    chosen = [*request.clouds, *request.depths]
-    if chosen:
-        return chosen
-    for kind in CLOUDS:
-        found = [topic for topic in types.values() if topic.type == kind]
-        if len(found) == 1:
-            return [found[0].name]
-        if found:
-            raise RecordingError(bag.path, f"there are {len(found)} topics of clouds: {_name(found)}", "give --points")
-    have = _name(list(types.values()))
-    raise RecordingError(bag.path, f"there is no topic of clouds; topics are {have}", "give --depth for depth images")
-
-
-def _name(topics: list[Topic]) -> str:
-    return ", ".join(topic.name for topic in topics) or "none"
-
-
-def _find_cameras(bag: Bag, types: dict[str, Topic], depths: Sequence[str]) -> dict[str, Any]:
-    """Return the CameraInfo of each topic of depth images: the one beside it."""
-    cameras = {}
-    for depth in depths:
-        # compressedDepth adds a level: /camera/depth/image_rect_raw/compressedDepth
-        folders = [depth.rsplit("/", level)[0] for level in (1, 2)]
-        info = next((f"{folder}/camera_info" for folder in folders if f"{folder}/camera_info" in types), None)
-        if info is None:
-            have = _name([topic for topic in types.values() if topic.type == CAMERA])
-            raise RecordingError(bag.path, f"{depth} has no camera_info beside it", f"topics of CameraInfo are {have}")
-        message = next(bag.read([info]), None)
-        if message is None:
-            raise RecordingError(bag.path, f"{info} holds no message", "record it with the images")
-        cameras[depth] = message.data
-    return cameras
-
-
-def _choose_frames(bag: Bag, tree: TransformTree, sensor: str, request: BagRequest) -> tuple[str, str]:
-    """Return the map's and the base's frame: the requested ones, or those between which the robot moves."""
-    given = [frame for frame in (request.map_frame, request.base_frame, sensor) if frame is not None]
-    missing = next((frame for frame in given if frame not in tree.frames), None)
-    if missing is not None:
-        have = ", ".join(tree.frames) or "none"
-        hint = "choose one of them" if tree.frames else "give --poses TOPIC if the bag holds Odometry"
-        raise RecordingError(bag.path, f"the transforms have no frame {missing}; frames are {have}", hint)
-    chain = tree.ancestors(sensor)
-    moving = [frame for frame in chain[:-1] if not tree.is_static(frame)]
-    if request.base_frame is None and not moving:
-        raise RecordingError(bag.path, f"no transform moves {sensor}; above it are {', '.join(chain[1:]) or 'none'}",
-                             "give --poses TOPIC, or --map-frame and --base-frame of a still robot")  # fmt: skip
-    named = [frame for frame in moving if frame.rsplit("/", 1)[-1] in _BASES]
-    base = request.base_frame or (named or moving)[0]
-    above = tree.ancestors(base)
-    if request.map_frame is None and len(above) < 2:
-        raise RecordingError(bag.path, f"there is no frame above {base}", "give --map-frame")
-    return request.map_frame or _moving_parent(tree, above), base
-
-
-def _moving_parent(tree: TransformTree, above: list[str]) -> str:
-    """Return the first frame in which the base moves: above it, odometry comes before localisation."""
-    for child, parent in zip(above, above[1:], strict=False):
-        if not tree.is_static(child):
-            return parent
-    return above[-1]
