@@ -111,7 +111,7 @@ _OPTIONS: list[Callable[[Any], Any]] = [
         "--extrinsics",
         metavar="FILE|NUMBERS",
         help="T_base_sensor, the sensor's pose on the robot: a file, or 12 numbers (3x4) in quotes; "
-        "turns overlap clearance on.",
+        "turns overlap clearance on. Of a bag: where its transforms do not say it, or in their place.",
     ),
     click.option(
         "--poses-of",
@@ -144,6 +144,36 @@ _OPTIONS: list[Callable[[Any], Any]] = [
     ),
     click.option("--map-frame", metavar="FRAME", help="Bag: frame in which the map is built, such as odom."),
     click.option("--base-frame", metavar="FRAME", help="Bag: frame that the map follows, such as base_link."),
+    click.option(
+        "--tf",
+        multiple=True,
+        metavar="TOPIC",
+        help="Bag: transforms, such as /robot1/tf; may be repeated.  [default: /tf and /tf_static, or those of the "
+        "scans' namespace]",
+    ),
+    click.option(
+        "--rays-from",
+        metavar="FRAME",
+        help="Bag: the sensor's frame, where rays start, of clouds that are in the map's frame already.  [default: the "
+        "base]",
+    ),
+    click.option(
+        "--clock-offset",
+        multiple=True,
+        metavar="[TOPIC=]S",
+        help="Bag: add this to the stamps of the scans [s], of one topic or all; may be repeated.",
+    ),
+    click.option(
+        "--stamps",
+        type=click.Choice(["header", "recorded"]),
+        default="header",
+        show_default=True,
+        help="Bag: times of scans and poses: their stamps, or when they were recorded.",
+    ),
+    click.option(
+        "--start", type=float, metavar="S", help="Bag: leave out what was recorded before [s from its start]."
+    ),
+    click.option("--end", type=float, metavar="S", help="Bag: leave out what was recorded after [s from its start]."),
     click.option(
         "--grid-map",
         type=click.Path(path_type=Path),

@@ -32,6 +32,12 @@ class MapRequest:
     depth: tuple[str, ...] = ()  #: topics of a bag's depth images
     map_frame: str | None = None  #: frame of a bag in which the map is built
     base_frame: str | None = None  #: frame of a bag that the window follows
+    tf: tuple[str, ...] = ()  #: topics of a bag's transforms; (): /tf and /tf_static, or those of the scans' namespace
+    rays_from: str | None = None  #: frame at which the rays of registered clouds start; None: the base
+    clock_offset: tuple[str, ...] = ()  #: [s] to add to the stamps of scans: S, or TOPIC=S
+    stamps: Literal["header", "recorded"] = "header"  #: times of a bag's messages
+    start: float | None = None  #: [s] after a bag's start; None: its start
+    end: float | None = None  #: [s] after a bag's start; None: its end
     grid_map: Path | None = None  #: bag to write the growing map to
     video: Path | None = None  #: of the growing map
     every: float | None = None  #: [s] between two maps or frames in them; None: see MapVideo, and 1 s of maps

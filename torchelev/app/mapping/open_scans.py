@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from numpy.typing import NDArray
@@ -12,6 +14,17 @@ from numpy.typing import NDArray
 from torchelev.app.mapping.fuse_scans import MapOptions, Scans, show_progress
 from torchelev.app.mapping.map_request import MapRequest
 from torchelev.io import FileLayout, base_poses, is_bag, open_recording, read_transform
+
+if TYPE_CHECKING:
+    from torchelev.io.bags import BagRequest
+
+_PLAIN = MapRequest(recording=Path())
+_ONLY_BAGS = (
+    "points", "depth", "map_frame", "base_frame", "tf", "rays_from", "clock_offset", "stamps", "start", "end",
+)  # fmt: skip
+_ONLY_FOLDERS = (
+    "intrinsics", "dt", "sensor_height", "bin_layout", "quaternions", "time_unit", "pcd_frame", "poses_of",
+)  # fmt: skip
 
 
 @contextmanager
@@ -51,8 +64,7 @@ def _open_folder(request: MapRequest) -> tuple[Scans, MapOptions]:
 def _check(request: MapRequest, mount: NDArray | None) -> None:
     """Reject options that contradict each other or are out of range."""
     height, dt = request.sensor_height, request.dt
-    names = ("points", "depth", "map_frame", "base_frame")
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name)]
+    given = [f"--{name.replace('_', '-')}" for name in _ONLY_BAGS if getattr(request, name) != getattr(_PLAIN, name)]
     if given:
         raise ValueError(f"{', '.join(given)}: only bags have topics and frames, and {request.recording} is none")
     if request.poses_of == "base" and mount is None:
@@ -67,28 +79,62 @@ def _check(request: MapRequest, mount: NDArray | None) -> None:
 
 @contextmanager
 def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
-    from torchelev.io.bags import Bag, BagRequest, open_bag
+    from torchelev.io.bags import Bag, open_bag
 
     _refuse_file_options(request)
-    poses = None if request.poses is None else str(request.poses)
-    wanted = BagRequest(request.points, request.depth, request.map_frame, request.base_frame, poses)
     with Bag(request.recording) as bag:
-        scans = open_bag(bag, wanted, lambda m: show_progress(m, "reading poses", "message"))
-        click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}")
+        scans = open_bag(bag, _to_bag_request(request), lambda m: show_progress(m, "reading poses", "message"))
+        rays = f", rays from {scans.rays_from}" if scans.rays_from else ""
+        click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}{rays}")
+        told = list(scans.pose_notes)
+        _warn(told)
         options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base)
         try:
             yield scans, options
         finally:
-            for note in scans.warnings:
-                click.echo(f"warning: {note}", err=True)
+            _warn([note for note in scans.warnings if note not in told])
+
+
+def _warn(notes: list[str]) -> None:
+    for note in notes:
+        click.echo(f"warning: {note}", err=True)
+
+
+def _to_bag_request(request: MapRequest) -> BagRequest:
+    from torchelev.io.bags import BagRequest
+
+    return BagRequest(
+        clouds=request.points,
+        depths=request.depth,
+        map_frame=request.map_frame,
+        base_frame=request.base_frame,
+        poses=None if request.poses is None else str(request.poses),
+        transforms=request.tf,
+        T_base_sensor=None if request.extrinsics is None else read_transform(request.extrinsics),
+        rays_from=request.rays_from,
+        clock_offsets=dict(_read_offset(text) for text in request.clock_offset),
+        stamps=request.stamps,
+        start=request.start,
+        end=request.end,
+    )
+
+
+def _read_offset(text: str) -> tuple[str, float]:
+    """Return the topic, "" for all, and the offset [s] of `--clock-offset`."""
+    topic, _, number = text.rpartition("=")
+    try:
+        offset = float(number)
+    except ValueError:
+        offset = math.nan
+    if not math.isfinite(offset):
+        raise ValueError(f"--clock-offset {text}: must be a number of seconds, or TOPIC=SECONDS")
+    return topic, offset
 
 
 def _refuse_file_options(request: MapRequest) -> None:
     """Reject options for what a bag itself says."""
-    names = ("intrinsics", "dt", "sensor_height", "extrinsics", "bin_layout", "quaternions", "time_unit", "pcd_frame")
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) is not None]
-    if given or request.poses_of == "base":
-        given = given or ["--poses-of"]
+    given = [f"--{name.replace('_', '-')}" for name in _ONLY_FOLDERS if getattr(request, name) != getattr(_PLAIN, name)]
+    if given:
         raise ValueError(
             f"{', '.join(given)}: only for folders of files; {request.recording} is a bag, which says it itself"
         )

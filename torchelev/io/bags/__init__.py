@@ -15,9 +15,9 @@ from torchelev.io.bags.grid_maps import (
     to_bytes,
     write_grid_map,
 )
+from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.bags.recording import BagRecording, open_bag
 from torchelev.io.bags.topics import BagRequest
-from torchelev.io.bags.transforms import TransformTree
 
 __all__ = [
     "Bag",

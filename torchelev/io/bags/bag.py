@@ -123,6 +123,11 @@ class Bag:
         return [Topic(name, info.msgtype or "several types", info.msgcount) for name, info in sorted(topics)]
 
     @property
+    def start(self) -> float:
+        """When the first message was recorded [s]."""
+        return self._reader.start_time / 1e9 if self._reader.message_count else 0.0
+
+    @property
     def duration(self) -> float:
         """Time between the first message and the last [s]."""
         return max(0.0, self._reader.duration / 1e9) if self._reader.message_count else 0.0
@@ -144,7 +149,7 @@ class Bag:
                 self._require_all(topics, num)
                 return
             except Exception as error:  # rosbags lets through what its file formats raise
-                read = "not read" if last is None else f"read up to {last - self._start:.1f} s after its start"
+                read = "not read" if last is None else f"read up to {last - self.start:.1f} s after its start"
                 self.ended_early = f"the bag is damaged, and was {read}: {_describe(error)}"
                 return
             last, num = time / 1e9, num + 1
@@ -164,10 +169,6 @@ class Bag:
         expected = sum(topic.num for topic in self.topics if topic.name in topics)
         if num < expected and not self.ended_early:
             self.ended_early = f"the bag is damaged: {expected - num} of {expected} messages are missing"
-
-    @property
-    def _start(self) -> float:
-        return self._reader.start_time / 1e9
 
 
 def _storage_file(path: Path) -> Path | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from torchelev.io.bags.bag import Message
 from torchelev.io.bags.scans import stamp_of
@@ -12,7 +12,13 @@ _MAX_WAIT = 1.0  # [s] of other sensors' stamps by which a message may come late
 _MAX_HELD = 32  # messages in memory
 
 
-def order_by_stamp(messages: Iterable[Message], topics: Sequence[str]) -> Iterator[Message]:
+def _stamp_of(message: Message) -> float:
+    return stamp_of(message.data.header)
+
+
+def order_by_stamp(
+    messages: Iterable[Message], topics: Sequence[str], time_of: Callable[[Message], float] = _stamp_of
+) -> Iterator[Message]:
     """Yield messages with headers by their stamps, those of one topic in the order in which they come.
 
     A message waits until each topic has one of the same time or later, for at most one second of stamps and 32
@@ -21,11 +27,12 @@ def order_by_stamp(messages: Iterable[Message], topics: Sequence[str]) -> Iterat
     Args:
         messages: in the order of their recording.
         topics: of all messages.
+        time_of: returns the time [s] of a message.
     """
     latest = dict.fromkeys(topics, -float("inf"))
     held: list[tuple[float, int, Message]] = []
     for number, message in enumerate(messages):
-        stamp = stamp_of(message.data.header)
+        stamp = time_of(message)
         latest[message.topic] = stamp
         heapq.heappush(held, (stamp, number, message))
         complete = max(min(latest.values()), max(latest.values()) - _MAX_WAIT)

@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 from torchelev.io.bags.bag import Bag, Message
 from torchelev.io.bags.order import order_by_stamp
 from torchelev.io.bags.point_cloud import CloudError
-from torchelev.io.bags.poses.frames import choose_frames
-from torchelev.io.bags.poses.reading import read_poses
+from torchelev.io.bags.poses.placing import Placed, place_poses
+from torchelev.io.bags.poses.reading import time_of
+from torchelev.io.bags.poses.transforms import FrameError
 from torchelev.io.bags.poses.within_scan import hold_still
-from torchelev.io.bags.scans import read_scan
+from torchelev.io.bags.scans import Scan, read_scan
 from torchelev.io.bags.topics import BagRequest, choose_topics, find_cameras
-from torchelev.io.bags.transforms import FrameError
 from torchelev.io.errors import RecordingError
 from torchelev.io.folders.recording import Frame
 
-_PERIODS = 0.02, 1.0  # [s] shortest and longest period of scans that is believed
 _MAX_GAP = 1.0  # [s] between two poses without a warning
 _LATE = "some scans are older than those before them, and are fused with dt = 0"
 
@@ -32,9 +31,10 @@ class BagRecording:
     Attributes:
         map_frame: in which the poses are.
         base_frame: whose pose a frame's `T_map_base` is.
-        has_base: whether that is another frame than the sensor's, so that the sensor's place on the robot is known.
+        rays_from: the frame at which the rays start of clouds that are in the map's frame already; "" for other clouds.
+        has_base: whether the base is another frame than the sensor's, so that the sensor's place on the robot is known.
         topics: of the scans.
-        pose_notes: frames with several parents, and gaps in the poses.
+        pose_notes: what is doubtful about the poses: frames, clocks, gaps, jumps. Known before the scans are read.
         skipped: number of scans that were left out when it was last read, by reason.
         notes: what is not used of the scans' messages.
     """
@@ -43,19 +43,26 @@ class BagRecording:
         self._bag, types = bag, {topic.name: topic for topic in bag.topics}
         self.topics = choose_topics(bag, types, request)
         self._num = sum(types[name].num for name in self.topics)
-        period = bag.duration / max(1, max(types[name].num for name in self.topics) - 1)
         self._cameras = find_cameras(bag, types, request.depths)
-        self.tree, self._covariances = read_poses(bag, request, types, float(np.clip(period, *_PERIODS)), show)
-        sensor = self._first_frame()
-        self.map_frame, self.base_frame = choose_frames(bag, self.tree, sensor, request)
-        self.has_base = self.base_frame != sensor
-        gaps = [self.tree.describe_gaps(self.map_frame, frame, _MAX_GAP) for frame in (self.base_frame, sensor)]
-        self.pose_notes = [*self.tree.describe_conflicts(), *dict.fromkeys(line for lines in gaps for line in lines)]
+        self._placed: Placed = place_poses(bag, request, self.topics, _MAX_GAP, show)
+        self._request, self.tree = request, self._placed.tree
+        self.map_frame, self.base_frame, self.rays_from = self._placed.map, self._placed.base, self._placed.rays_from
+        self.has_base = self.base_frame != self._placed.sensor
         self.skipped: Counter[str] = Counter()
         self.notes: dict[str, None] = {}
 
     def __len__(self) -> int:
         return self._num
+
+    @property
+    def pose_notes(self) -> list[str]:
+        """What is doubtful about the poses."""
+        return self._placed.notes
+
+    @property
+    def clock_offsets(self) -> dict[str, float]:
+        """Offsets [s] that the stamps of topics need, by their clocks."""
+        return self._placed.offsets
 
     @property
     def ended_early(self) -> str:
@@ -80,7 +87,7 @@ class BagRecording:
         self.skipped.clear()
         self.notes.clear()
         last: float | None = None
-        for message in order_by_stamp(self._bag.read(self.topics), self.topics):
+        for message in order_by_stamp(self._messages(), self.topics, self._time_of):
             try:
                 frame = self._to_frame(message, last)
             except CloudError as error:
@@ -92,33 +99,44 @@ class BagRecording:
                 last = frame.stamp if last is None else max(last, frame.stamp)
             yield frame
 
+    def _messages(self) -> Iterator[Message]:
+        """Read the scans that were recorded in the time that is mapped."""
+        start, end = self._placed.span
+        return (message for message in self._bag.read(self.topics) if start <= message.time <= end)
+
+    def _time_of(self, message: Message) -> float:
+        """Return the time [s] of a scan by the clock of the poses."""
+        offsets = self._request.clock_offsets
+        return time_of(message, self._request) + offsets.get(message.topic, offsets.get("", 0.0))
+
     def _to_frame(self, message: Message, last: float | None) -> Frame | None:
-        """Return a message's scan at its stamp; None, and counted, if it has no pose."""
-        scan = read_scan(message.data, self._cameras.get(message.topic))
+        """Return a message's scan at its stamp; None, and counted, if it has no pose or is not asked for."""
+        scan = read_scan(message.data, self._cameras.get(message.topic))._replace(stamp=self._time_of(message))
         if scan.note:
             self.notes[f"{message.topic}: {scan.note}"] = None
+        frame = self.rays_from if scan.frame in self._placed.fixed else scan.frame
         now = np.array([scan.stamp])
-        T_map_sensor = self.tree.look_up(self.map_frame, scan.frame, now)[0]
+        T_map_sensor = self.tree.look_up(self.map_frame, frame, now)[0]
         T_map_base = self.tree.look_up(self.map_frame, self.base_frame, now)[0]
         if not (np.isfinite(T_map_sensor).all() and np.isfinite(T_map_base).all()):
-            self.skipped[f"no pose of {scan.frame} in {self.map_frame} at that time"] += 1
+            self.skipped[f"no pose of {frame} in {self.map_frame} at that time"] += 1
             return None
-        covariance = self._covariances.of_sensor(scan.stamp, T_map_sensor[:3, 3] - T_map_base[:3, 3])
+        covariance = self._placed.covariances.of_sensor(scan.stamp, T_map_sensor[:3, 3] - T_map_base[:3, 3])
         dt = 0.0 if last is None else scan.stamp - last
         if dt < 0:
             self.notes[f"{message.topic}: {_LATE}"] = None
+        points = self._see(scan)
+        return Frame(points, T_map_sensor, max(0.0, dt), message.topic, T_map_base, covariance, scan.stamp)
+
+    def _see(self, scan: Scan) -> NDArray[np.float32]:
+        """Return the points as seen at the stamp, in the sensor's frame or in that where the rays start."""
+        if scan.frame in self._placed.fixed:
+            T = self.tree.look_up(self.rays_from, scan.frame, np.array([scan.stamp]))[0]
+            return (scan.points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
         points = hold_still(self.tree, self.map_frame, scan)
         if points is None:
             self.notes[f"{scan.frame}: too few poses within a scan to take its motion out"] = None
-            points = scan.points
-        return Frame(points, T_map_sensor, max(0.0, dt), message.topic, T_map_base, covariance, scan.stamp)
-
-    def _first_frame(self) -> str:
-        """Return the frame of the first scan."""
-        for message in self._bag.read(self.topics):
-            return message.data.header.frame_id.lstrip("/")
-        reason = self._bag.ended_early or f"no messages on {', '.join(self.topics)}"
-        raise RecordingError(self._bag.path, reason, "choose another topic with --points or --depth")
+        return scan.points if points is None else points
 
 
 def open_bag(bag: Bag, request: BagRequest | None = None, show: Any = iter) -> BagRecording:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag, Topic
 from torchelev.io.bags.scans import CLOUDS, IMAGES
@@ -20,6 +23,13 @@ class BagRequest(NamedTuple):
     map_frame: str | None = None  #: in which the map is built
     base_frame: str | None = None  #: which the window follows
     poses: str | None = None  #: topic of Odometry or PoseStamped in place of the transforms
+    transforms: Sequence[str] = ()  #: topics of TFMessage; (): /tf and /tf_static, or those of the scans' namespace
+    T_base_sensor: NDArray[np.float64] | None = None  #: (4, 4) where the sensor is on the base, in place of transforms
+    rays_from: str | None = None  #: frame at which the rays start of clouds that are in the map's frame; None: the base
+    clock_offsets: Mapping[str, float] = {}  #: [s] to add to the stamps of a topic's scans; "": of all others
+    stamps: Literal["header", "recorded"] = "header"  #: times of messages: their stamps, or when they were recorded
+    start: float | None = None  #: [s] after the bag's start, by the time of recording; None: its start
+    end: float | None = None  #: [s] as `start`; None: its end
 
 
 def choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> list[str]:

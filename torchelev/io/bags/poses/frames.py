@@ -1,39 +1,190 @@
-"""Choose the frame of the map and that of the robot's base."""
+"""Choose the frame of the map and that of the robot's base: the frames between which the robot travels.
+
+A map's frame is one in which the base travels as far as it does at all; of several, the one nearest to the base, so
+that odometry comes before localisation, which jumps. Frames of the robot, such as a footprint that moves below a body,
+are none. Names decide where motion does not: of a robot that stands still, or between frames that move alike.
+"""
 
 from __future__ import annotations
 
-from torchelev.io.bags.bag import Bag
+from pathlib import Path
+from typing import NamedTuple
+
+from torchelev.io.bags.poses.doubts import describe_stillness
+from torchelev.io.bags.poses.motion import motion
+from torchelev.io.bags.poses.names import is_base, is_robot, is_world
+from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.bags.topics import BagRequest
-from torchelev.io.bags.transforms import TransformTree
 from torchelev.io.errors import RecordingError
 
-_BASES = ("base_link", "base_footprint", "base", "trunk", "body")
+_CLEAR = 0.3  # [m] of travel that is no sway of a body
+_BRANCH = 1.0  # [m] that a base travels in a frame below it, such as odometry upside down; legs and wheels are nearer
+_HINT = (
+    "give --poses TOPIC, or --map-frame and --base-frame, as of a still robot; --rays-from FRAME if the clouds are in "
+    "the map's frame"
+)
 
 
-def choose_frames(bag: Bag, tree: TransformTree, sensor: str, request: BagRequest) -> tuple[str, str]:
-    """Return the map's and the base's frame: the requested ones, or those between which the robot moves."""
-    given = [frame for frame in (request.map_frame, request.base_frame, sensor) if frame is not None]
-    missing = next((frame for frame in given if frame not in tree.frames), None)
-    if missing is not None:
-        have = ", ".join(tree.frames) or "none"
-        hint = "choose one of them" if tree.frames else "give --poses TOPIC if the bag holds Odometry"
-        raise RecordingError(bag.path, f"the transforms have no frame {missing}; frames are {have}", hint)
+class Frames(NamedTuple):
+    """The frames of a recording."""
+
+    map: str  #: in which the map is built
+    base: str  #: that the window follows
+    notes: list[str]  #: what is doubtful about them
+
+
+def choose_frames(path: Path, tree: TransformTree, sensor: str, request: BagRequest) -> Frames:
+    """Return the map's and the base's frame: the requested ones, or those between which the robot moves.
+
+    Args:
+        path: of the bag, for errors.
+        tree: all transforms.
+        sensor: frame of the first scan.
+        request: frames that were asked for.
+
+    Raises:
+        RecordingError: a frame is missing, or nothing moves.
+    """
+    fixed = is_fixed(tree, sensor, request)
+    base = request.base_frame or (
+        _find_traveller(tree, sensor) if fixed else _find_base(tree, sensor, request.map_frame)
+    )
+    chosen = request.map_frame or (sensor if fixed else _choose_above(tree, base))
+    if chosen is None:
+        below = _choose_below(tree, sensor)
+        if below is None:
+            raise RecordingError(path, f"no transform moves {sensor}; {_describe(tree, sensor)}", _HINT)
+        chosen, base = below, request.base_frame or str(tree.parent(below))
+    is_asked = bool(request.map_frame and request.base_frame)
+    others = _candidates(tree, base)
+    doubts = describe_stillness(tree, chosen, base, sensor, others, is_asked)
+    return Frames(chosen, base, doubts or ([] if request.map_frame else _name_others(tree, chosen, base)))
+
+
+def _find_base(tree: TransformTree, sensor: str, map_frame: str | None) -> str:
+    """Return the frame of the robot's base above a sensor: one with its name, or the one that travels."""
     chain = tree.ancestors(sensor)
-    moving = [frame for frame in chain[:-1] if not tree.is_static(frame)]
-    if request.base_frame is None and not moving:
-        raise RecordingError(bag.path, f"no transform moves {sensor}; above it are {', '.join(chain[1:]) or 'none'}",
-                             "give --poses TOPIC, or --map-frame and --base-frame of a still robot")  # fmt: skip
-    named = [frame for frame in moving if frame.rsplit("/", 1)[-1] in _BASES]
-    base = request.base_frame or (named or moving)[0]
+    chain = chain[: chain.index(map_frame) + 1] if map_frame in chain else chain
+    named = [frame for frame in chain[:-1] if is_base(frame) and not tree.is_static(frame)]
+    moving = [frame for frame in _moving(tree, chain[:-1]) if not is_world(frame)]
+    return named[0] if named else _farthest(tree, moving) or chain[-1]
+
+
+def is_fixed(tree: TransformTree, sensor: str, request: BagRequest) -> bool:
+    """Return whether a cloud's frame is the map's, as that of clouds which odometry has registered.
+
+    A camera_init or odom below which something moves is; a frame without such a name if a robot's frame travels in it.
+    """
+    moving, asked = _moving(tree, _below(tree, sensor)), request.map_frame
+    if request.rays_from or asked == sensor:
+        return bool(moving)
+    if not moving or (asked and not set(tree.ancestors(asked)) & set(tree.ancestors(sensor))):
+        return False
+    if asked and not all(tree.is_constant(frame) for frame in tree.way(asked, sensor)):
+        return False
+    if is_world(sensor):
+        return True
+    is_top = not _moving(tree, tree.ancestors(sensor)[:-1]) and not is_robot(sensor)
+    return is_top and any(is_robot(f) and motion(tree, sensor, f).travel >= _BRANCH for f in moving)
+
+
+def find_robot(tree: TransformTree) -> str | None:
+    """Return the robot's base among all transforms, without regard to a sensor; None if no frame moves."""
+    frames = [frame for frame in tree.frames if tree.parent(frame) is not None]
+    moving = [frame for frame in _moving(tree, frames) if not is_world(frame)]
+    named = [frame for frame in frames if is_base(frame) and not tree.is_static(frame)]
+    return named[0] if named else _farthest(tree, moving)
+
+
+def _find_traveller(tree: TransformTree, fixed: str) -> str:
+    """Return the base below a fixed frame."""
+    moving = [frame for frame in _moving(tree, _below(tree, fixed)) if not is_world(frame)]
+    named = [frame for frame in _below(tree, fixed) if is_base(frame) and not tree.is_static(frame)]
+    return named[-1] if named else _farthest(tree, moving[::-1]) or fixed
+
+
+def _farthest(tree: TransformTree, frames: list[str]) -> str | None:
+    """Return the frame that travels farthest in its parent; of those that stay, the last one, next to the root."""
+    far = {frame: motion(tree, str(tree.parent(frame)), frame).travel for frame in frames}
+    if not far or max(far.values()) < _CLEAR:
+        return frames[-1] if frames else None
+    return max(far, key=lambda frame: far[frame])
+
+
+def _moving(tree: TransformTree, frames: list[str]) -> list[str]:
+    """Return those of the frames that move in their parents; where nothing does, those that could."""
+    could = [frame for frame in frames if tree.parent(frame) is not None and not tree.is_static(frame)]
+    return [frame for frame in could if not tree.is_constant(frame)] or could
+
+
+def _below(tree: TransformTree, frame: str) -> list[str]:
+    """Return all frames below one, parents first."""
+    found = [frame]
+    for parent in found:
+        found += [child for child in tree.children(parent) if child not in found]
+    return found[1:]
+
+
+def _choose_above(tree: TransformTree, base: str) -> str | None:
+    """Return the frame above the base in which it travels; None if all there are frames of the robot, and still."""
+    candidates = _candidates(tree, base)
+    far = {frame: motion(tree, frame, base).travel for frame in candidates}
+    if not far:
+        return None
+    if max(far.values()) >= _CLEAR:
+        return next(frame for frame in candidates if far[frame] >= max(far.values()) / 2)
+    named = [frame for frame in candidates if is_world(frame)]
+    return named[0] if named else None if is_robot(candidates[-1]) else candidates[-1]
+
+
+def _candidates(tree: TransformTree, base: str) -> list[str]:
+    """Return the frames above the base in whose parts something moves; no frames of the robot if there are others."""
     above = tree.ancestors(base)
-    if request.map_frame is None and len(above) < 2:
-        raise RecordingError(bag.path, f"there is no frame above {base}", "give --map-frame")
-    return request.map_frame or _moving_parent(tree, above), base
+    found = [_fixed_alike(tree, str(tree.parent(frame))) for frame in _moving(tree, above[:-1])]
+    return [frame for frame in found if not is_robot(frame)] or found
 
 
-def _moving_parent(tree: TransformTree, above: list[str]) -> str:
-    """Return the first frame in which the base moves: above it, odometry comes before localisation."""
-    for child, parent in zip(above, above[1:], strict=False):
-        if not tree.is_static(child):
-            return parent
-    return above[-1]
+def _fixed_alike(tree: TransformTree, frame: str) -> str:
+    """Return a frame, or instead of one of the robot a fixed frame above it that never moves against it."""
+    for other in tree.ancestors(frame) if is_robot(frame) else []:
+        if is_world(other):
+            return other
+        if tree.parent(other) is not None and not tree.is_constant(other):
+            break
+    return frame
+
+
+def _choose_below(tree: TransformTree, sensor: str) -> str | None:
+    """Return the frame below the robot in which it travels: odometry that is published upside down."""
+    robot = tree.ancestors(sensor)
+    for frame in robot:
+        robot += [child for child in tree.children(frame) if child not in robot and tree.is_constant(child)]
+    branches = [child for frame in robot for child in tree.children(frame) if child not in robot]
+    far = {child: motion(tree, child, str(tree.parent(child))).travel for child in branches}
+    named = [child for child in branches if is_world(child)]
+    others = [child for child in branches if not is_robot(child) and far[child] >= _BRANCH]
+    found = named or others
+    return max(found, key=lambda child: far[child]) if found else None
+
+
+def _describe(tree: TransformTree, sensor: str) -> str:
+    """Say what is around a sensor that nothing moves."""
+    above = ", ".join(tree.ancestors(sensor)[1:]) or "none"
+    moving = [f"{frame} in {tree.parent(frame)}" for frame in _moving(tree, _below(tree, tree.ancestors(sensor)[-1]))]
+    return f"above it are {above}" + (f", and what moves is {', '.join(moving)}" if moving else "")
+
+
+def _name_others(tree: TransformTree, chosen: str, base: str) -> list[str]:
+    """Return a sentence if the base travels in another frame too, and that moves against the chosen one."""
+    travel = motion(tree, chosen, base).travel
+    limit = max(_CLEAR, travel / 10)
+    for other in _candidates(tree, base):
+        if is_world(chosen) and is_world(other):
+            continue
+        if other != chosen and motion(tree, chosen, other).travel >= limit:
+            far = motion(tree, other, base).travel
+            return [
+                f"two frames could be the map's: {base} travels {travel:.1f} m in {chosen}, which was taken, and "
+                f"{far:.1f} m in {other}; choose with --map-frame {chosen} or --map-frame {other}"
+            ]
+    return []

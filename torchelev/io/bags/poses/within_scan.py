@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.frames import deskew
+from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.bags.scans import Scan
-from torchelev.io.bags.transforms import TransformTree
 
 _POSE_STEP, _MAX_POSES = 0.01, 64  # [s] between the poses of a scan, and how many there are at most
 

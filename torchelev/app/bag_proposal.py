@@ -1,0 +1,75 @@
+"""Propose the command that maps a bag: the first one that says all that the bag leaves open."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+
+from torchelev.io import RecordingError
+from torchelev.io.bags import Bag, BagRecording, BagRequest, Topic, open_bag
+from torchelev.io.bags.poses.clocks import ClockError
+from torchelev.io.bags.poses.reading import ODOMETRY
+from torchelev.io.bags.scans import CLOUDS, IMAGES
+
+
+def propose(bag: Bag) -> list[str]:
+    """Return the command that maps the bag with its first topic of clouds or depth images, or why there is none."""
+    first: RecordingError | None = None
+    for request in _requests(bag):
+        try:
+            request, recording = _open(bag, request)
+        except RecordingError as error:
+            first = first or error
+            continue
+        warnings = [f"warning: {note}" for note in recording.pose_notes]
+        return ["to map it", f"  {_command(bag, recording, request)}", *warnings]
+    return ["it cannot be mapped without more options:", f"  {first}"]
+
+
+def _requests(bag: Bag) -> Iterator[BagRequest]:
+    """Yield what could be asked: with the transforms, with each odometry, and that as the pose of each likely frame."""
+    plain = _choose_sensor(bag.topics)
+    yield plain
+    for topic in bag.topics:
+        if topic.type == ODOMETRY and topic.num:
+            yield plain._replace(poses=topic.name)
+            for base in ("base_link", "base_footprint", "body"):
+                yield plain._replace(poses=topic.name, base_frame=base)
+
+
+def _choose_sensor(topics: list[Topic]) -> BagRequest:
+    names = {kind: [topic.name for topic in topics if topic.type == kind and topic.num] for kind in CLOUDS}
+    clouds = next((found for found in names.values() if found), [])
+    depths = [topic.name for topic in topics if topic.type in IMAGES and "depth" in topic.name]
+    return BagRequest(clouds=clouds[:1], depths=[] if clouds else depths[:1])
+
+
+def _open(bag: Bag, request: BagRequest) -> tuple[BagRequest, BagRecording]:
+    """Open the scans, with the clocks of sensors set if they differ from that of the poses."""
+    try:
+        recording = open_bag(bag, request)
+        offsets = recording.clock_offsets
+    except ClockError as error:
+        if not error.offsets:
+            if request.stamps == "recorded":
+                raise
+            return _open(bag, request._replace(stamps="recorded"))
+        offsets = error.offsets
+    if not offsets:
+        return request, recording
+    request = request._replace(clock_offsets=offsets)
+    return request, open_bag(bag, request)
+
+
+def _command(bag: Bag, recording: BagRecording, request: BagRequest) -> str:
+    words = ["torchelev", "map", str(bag.path)]
+    words += [word for name in request.clouds for word in ("--points", name)]
+    words += [word for name in request.depths for word in ("--depth", name)]
+    words += ["--poses", request.poses] if request.poses else []
+    words += [
+        word for topic, offset in request.clock_offsets.items() for word in ("--clock-offset", f"{topic}={offset!r}")
+    ]
+    words += ["--stamps", "recorded"] if request.stamps == "recorded" else []
+    words += ["--map-frame", recording.map_frame, "--base-frame", recording.base_frame]
+    words += ["--rays-from", recording.rays_from] if recording.rays_from else []
+    return shlex.join(words)
