@@ -146,30 +146,33 @@ class Writer:
         point = self.make(f"geometry_msgs/msg/{place}", **dict(zip("xyz", T[:3, 3].tolist(), strict=True)))
         return point, self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
-    def transform(self, stamp: float, parent: str, child: str, T, is_static: bool = False) -> None:
+    def transform(
+        self, stamp: float, parent: str, child: str, T, is_static: bool = False, space="", recorded: float | None = None
+    ) -> None:
         place, turn = self.pose_parts(T, "Vector3")
         inner = self.make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
         header = self.header(stamp, parent)
         one = self.make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=inner)
         message = self.make("tf2_msgs/msg/TFMessage", transforms=[one])
-        self.write("/tf_static" if is_static else "/tf", "tf2_msgs/msg/TFMessage", stamp, message)
+        topic, time = f"{space}/tf_static" if is_static else f"{space}/tf", stamp if recorded is None else recorded
+        self.write(topic, "tf2_msgs/msg/TFMessage", time, message)
 
-    def odometry(self, stamp: float, T) -> None:
+    def odometry(self, stamp: float, T, child="base_link") -> None:
         place, turn = self.pose_parts(T, "Point")
         pose_ = self.make("geometry_msgs/msg/Pose", position=place, orientation=turn)
         zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
         twist = self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
         fields = dict(
             header=self.header(stamp, "odom"),
-            child_frame_id="base_link",
+            child_frame_id=child,
             pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=pose_, covariance=COVARIANCE.ravel()),
             twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )
         self.write(ODOM, "nav_msgs/msg/Odometry", stamp, self.make("nav_msgs/msg/Odometry", **fields))
 
-    def cloud(self, scan: Scan, topic=CLOUD, frame="lidar", **layout: Any) -> None:
+    def cloud(self, scan: Scan, topic=CLOUD, frame="lidar", recorded: float | None = None, **layout: Any) -> None:
         message = make_cloud(self, scan.points, scan.times, self.header(scan.stamp, frame), **layout)
-        self.write(topic, "sensor_msgs/msg/PointCloud2", scan.stamp, message)
+        self.write(topic, "sensor_msgs/msg/PointCloud2", scan.stamp if recorded is None else recorded, message)
         if self.kind == "mcap":
             self.bag.storage.close_chunk()  # else all is in one, and lost when the file is cut
 

@@ -10,7 +10,7 @@ from torchelev.io.bags.poses.rows import to_matrices
 from torchelev.io.bags.poses.transforms import TransformTree
 
 _STILL = 0.1  # [m], [rad] of a base that hardly moves
-_REACH = 3.0  # [m] by which parts of a robot move against each other
+REACH = 3.0  # [m] by which parts of a robot move against each other
 _BATCH = 100_000  # poses that are looked at at once
 
 
@@ -74,7 +74,7 @@ def describe_stillness(
         ]
     if is_asked:
         return []
-    if is_robot(map_frame) and base.travel < _REACH:
+    if is_robot(map_frame) and base.travel < REACH:
         return [
             f"{map_frame} has the name of a robot's frame: if the robot drives, the map moves with it; give --poses "
             "TOPIC, or --map-frame FRAME"

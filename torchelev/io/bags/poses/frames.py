@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from torchelev.io.bags.poses.doubts import describe_stillness
+from torchelev.io.bags.poses.doubts import REACH, describe_stillness
 from torchelev.io.bags.poses.motion import motion
 from torchelev.io.bags.poses.names import is_base, is_robot, is_world
 from torchelev.io.bags.poses.transforms import TransformTree
@@ -50,11 +50,12 @@ def choose_frames(path: Path, tree: TransformTree, sensor: str, request: BagRequ
         _find_traveller(tree, sensor) if fixed else _find_base(tree, sensor, request.map_frame)
     )
     chosen = request.map_frame or (sensor if fixed else _choose_above(tree, base))
-    if chosen is None:
+    if chosen is None or (not request.map_frame and is_robot(chosen)):
         below = _choose_below(tree, sensor)
-        if below is None:
-            raise RecordingError(path, f"no transform moves {sensor}; {_describe(tree, sensor)}", _HINT)
-        chosen, base = below, request.base_frame or str(tree.parent(below))
+        if below is not None:
+            chosen, base = below, request.base_frame or str(tree.parent(below))
+    if chosen is None:
+        raise RecordingError(path, f"no transform moves {sensor}; {_describe(tree, sensor)}", _HINT)
     is_asked = bool(request.map_frame and request.base_frame)
     others = _candidates(tree, base)
     doubts = describe_stillness(tree, chosen, base, sensor, others, is_asked)
@@ -82,10 +83,11 @@ def is_fixed(tree: TransformTree, sensor: str, request: BagRequest) -> bool:
         return False
     if asked and not all(tree.is_constant(frame) for frame in tree.way(asked, sensor)):
         return False
+    far = {frame: motion(tree, sensor, frame).travel for frame in moving}
     if is_world(sensor):
-        return True
+        return any(is_base(frame) or far[frame] >= _BRANCH for frame in moving)
     is_top = not _moving(tree, tree.ancestors(sensor)[:-1]) and not is_robot(sensor)
-    return is_top and any(is_robot(f) and motion(tree, sensor, f).travel >= _BRANCH for f in moving)
+    return is_top and any(is_robot(frame) and far[frame] >= REACH for frame in moving)
 
 
 def find_robot(tree: TransformTree) -> str | None:

@@ -18,7 +18,8 @@ def require_frames(bag: Bag, request: BagRequest, tree: TransformTree, sensors: 
         if frame is not None and frame not in tree.frames:
             have = ", ".join(tree.frames) or "none"
             is_asked = frame not in sensors
-            hint = "choose one of them" if is_asked and tree.frames else _hint(bag, request, tree, frame)
+            choose = f"choose one of them{_other_transforms(bag, request)}"
+            hint = choose if is_asked and tree.frames else _hint(bag, request, tree, frame)
             raise RecordingError(bag.path, f"the transforms have no frame {frame}; frames are {have}", hint)
 
 

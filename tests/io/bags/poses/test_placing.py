@@ -1,0 +1,201 @@
+"""What a bag leaves open is found, or named with the option that gives it; each such option gives the right poses."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.io.bags.synthetic import CLOUD, ODOM, START, T_BASE_LIDAR, Writer, drive
+from torchelev.io import RecordingError
+from torchelev.io.bags import Bag, BagRequest, open_bag
+from torchelev.io.bags.poses.clocks import ClockError
+from torchelev.io.bags.poses.rows import invert
+
+MOUNT = T_BASE_LIDAR.numpy()
+
+
+class Shape(NamedTuple):
+    """How the drive is recorded."""
+
+    tf: bool = True  # whether odom -> base_link is on /tf
+    odometry: str | None = None  # child of the odometry, if there is one
+    mount: bool = True  # whether base_link -> lidar is there
+    space: str = ""  # namespace of the topics
+    ahead: float = 0.0  # [s] by which the lidar's clock is ahead
+    stamped: bool = True  # or stamps are 0
+    registered: bool = False  # clouds are in odom
+    jump: float = 0.0  # [m] to the left after 0.3 s
+    again: float | None = None  # [m] to the left of a second run with the same stamps
+
+
+def write(path, shape):
+    """Write the drive; messages are recorded at the times of the poses' clock, the second run 10 s later."""
+    writer = Writer(path, "mcap")
+    if shape.mount:
+        writer.transform(START - 0.3, "base_link", "lidar", MOUNT, is_static=True, space=shape.space)
+    runs = [(0.0, 0.0)] if shape.again is None else [(0.0, 0.0), (10.0, shape.again)]
+    for later, shift in runs:
+        events = [(t, T) for t, T in zip(drive().stamps, drive().bases, strict=True)]
+        events += [(scan.stamp + 0.001, scan) for scan in drive().clouds]
+        for t, what in sorted(events, key=lambda event: event[0]):
+            if isinstance(what, np.ndarray):
+                left = shift + shape.jump * (t - START > 0.3)
+                _write_pose(
+                    writer, shape, t, t + later, [[1, 0, 0, 0], [0, 1, 0, left], [0, 0, 1, 0], [0, 0, 0, 1]] @ what
+                )
+            else:
+                _write_cloud(writer, shape, t + later, what)
+    writer.close()
+    return path
+
+
+def _write_pose(writer, shape, t, recorded, T):
+    if shape.tf:
+        writer.transform(t, "odom", "base_link", T, space=shape.space, recorded=recorded)
+    if shape.odometry is not None:
+        writer.odometry(t, T, shape.odometry)
+
+
+def _write_cloud(writer, shape, recorded, scan):
+    scan = scan._replace(stamp=scan.stamp + shape.ahead if shape.stamped else 0.0, times=None)
+    if shape.registered:
+        T = scan.T_map_sensor
+        scan = scan._replace(points=(scan.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+    frame = "odom" if shape.registered else "lidar"
+    writer.cloud(scan, f"{shape.space}{CLOUD}", frame, recorded)
+
+
+def read(path, **request):
+    with Bag(path) as bag:
+        recording = open_bag(bag, BagRequest(**request))
+        return recording, [frame for frame in recording if frame is not None]
+
+
+def assert_poses(frames, scans=None, sensor="T_map_sensor", atol=1e-6):
+    scans = drive().clouds if scans is None else scans
+    assert len(frames) == len(scans)
+    for frame, scan in zip(frames, scans, strict=True):
+        np.testing.assert_allclose(frame.T_map_sensor, getattr(scan, sensor), atol=atol)
+        np.testing.assert_allclose(frame.T_map_base, scan.T_map_base, atol=atol)
+
+
+CURED = {
+    "mounting": (Shape(odometry="base_link", tf=False, mount=False), dict(poses=ODOM, T_base_sensor=MOUNT)),
+    "mounting beside /tf": (Shape(mount=False), dict(T_base_sensor=MOUNT)),
+    "mounting in place of that in the bag": (Shape(), dict(T_base_sensor=MOUNT)),
+    "namespace": (Shape(space="/robot1"), {}),
+    "named topics": (Shape(space="/robot1"), dict(transforms=["/robot1/tf", "/robot1/tf_static"])),
+    "odometry without child": (Shape(tf=False, odometry=""), dict(poses=ODOM, base_frame="base_link")),
+    "clock ahead": (Shape(ahead=37.0), dict(clock_offsets={CLOUD: -37.0})),
+    "clock of all topics": (Shape(ahead=37.0), dict(clock_offsets={"": -37.0})),
+}
+
+
+@pytest.mark.parametrize("name", CURED)
+def test_the_poses_are_right(tmp_path, name):
+    shape, request = CURED[name]
+    recording, frames = read(write(tmp_path / "drive", shape), **request)
+    assert (recording.map_frame, recording.base_frame) == ("odom", "base_link")
+    assert recording.warnings == []
+    assert_poses(frames)
+
+
+NAMED = {
+    "mounting": (Shape(odometry="base_link", tf=False, mount=False), {}, "give --poses /odom, and --extrinsics with"),
+    "mounting with --poses": (
+        Shape(odometry="base_link", tf=False, mount=False), dict(poses=ODOM),
+        "frames are base_link, odom; give --extrinsics with the pose of lidar on base_link",
+    ),
+    "odometry without child": (Shape(tf=False, odometry=""), dict(poses=ODOM), "whose pose it is; give --base-frame"),
+    "no such transforms": (Shape(), dict(transforms=["/x"]), "--tf /x holds no transforms; topics of"),
+    "unread transforms": (
+        Shape(space="/robot1"), dict(transforms=["/robot1/tf_static"], map_frame="odom"), "--tf /robot1/tf",
+    ),
+    "empty time": (Shape(), dict(start=2.0, end=1.0), "--start 2.0 is not before --end 1.0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_the_option_is_named(tmp_path, name):
+    shape, request, words = NAMED[name]
+    with pytest.raises(RecordingError) as error:
+        read(write(tmp_path / "drive", shape), **request)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("ahead", [37.0, 812.25 - START])
+def test_clocks_that_differ_are_named_with_both_ranges_and_the_offset(tmp_path, ahead):
+    path = write(tmp_path / "drive", Shape(ahead=ahead))
+    with pytest.raises(ClockError) as error:
+        read(path)
+    assert f"stamps of {CLOUD} are {START + ahead:,.3f} .." in str(error.value)
+    assert f"those of base_link {START - 0.3:,.3f} .. {START + 0.9:,.3f}" in str(error.value)
+    assert f"--clock-offset {CLOUD}=" in str(error.value) and "or --stamps recorded" in str(error.value)
+    assert_poses(read(path, clock_offsets=error.value.offsets)[1], atol=2e-3)  # recorded 1 ms later
+    assert_poses(read(path, stamps="recorded")[1], atol=2e-3)
+
+
+def test_a_clock_that_is_ahead_by_less_than_the_bag_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("torchelev.io.bags.poses.clocks._DIFFERENCE", 0.2)
+    recording, _ = read(write(tmp_path / "drive", Shape(ahead=0.3)))
+    (note,) = recording.pose_notes
+    assert "the clocks differ by 0.299 s; give" in note and f"--clock-offset {CLOUD}=-0.299" in note
+
+
+def test_stamps_that_were_never_filled_in_are_named(tmp_path):
+    path = write(tmp_path / "drive", Shape(stamped=False))
+    with pytest.raises(ClockError, match=f"those of {CLOUD} were never filled in; give --stamps recorded"):
+        read(path)
+    assert_poses(read(path, stamps="recorded")[1], atol=2e-3)
+
+
+def test_registered_clouds_are_seen_from_the_robot(tmp_path):
+    path = write(tmp_path / "drive", Shape(registered=True))
+    recording, frames = read(path)
+    assert (recording.map_frame, recording.base_frame, recording.rays_from) == ("odom", "base_link", "base_link")
+    assert recording.warnings == [] and recording.has_base
+    assert_poses(frames, sensor="T_map_base")
+    recording, from_lidar = read(path, rays_from="lidar")
+    assert_poses(from_lidar)
+    for frame, scan in zip(from_lidar, drive().clouds, strict=True):
+        np.testing.assert_allclose(frame.points, scan.points, atol=1e-5)
+
+
+def test_a_jump_is_named_and_both_cures_map_a_part_without_it(tmp_path):
+    path = write(tmp_path / "drive", Shape(jump=3.0))
+    (note,) = read(path)[0].pose_notes
+    assert note.startswith("base_link jumps by 3.0 m in odom within 0.02 s, 0.6 s after its first pose")
+    words = note.split()
+    end, start = float(words[words.index("--end") + 1]), float(words[words.index("--start") + 1])
+    before, after = read(path, end=end), read(path, start=start)
+    assert before[0].pose_notes == after[0].pose_notes == []
+    assert_poses(before[1], drive().clouds[:4])
+    assert [frame.T_map_base[1, 3] > 2.9 for frame in after[1]] == [True] * 2
+
+
+def test_a_clock_that_restarts_is_named_and_runs_are_not_mixed(tmp_path):
+    path = write(tmp_path / "drive", Shape(again=2.0))
+    recording, frames = read(path, end=11.2)
+    (note,) = recording.pose_notes
+    assert note.startswith("the clock goes back by 1.2 s: stamps of base_link ") and "are followed by" in note
+    assert_poses(frames)
+    words = note.split()
+    second, frames = read(path, start=float(words[words.index("--start", words.index("as")) + 1]))
+    assert second.pose_notes == [] and len(frames) == 6 and all(frame.T_map_base[1, 3] > 1.9 for frame in frames)
+
+
+def test_transforms_of_several_robots_must_be_chosen(tmp_path):
+    writer = Writer(tmp_path / "drive", "mcap")
+    for space in ("/a", "/b"):
+        writer.transform(START, "odom", "base_link", MOUNT, space=space)
+    writer.cloud(drive().clouds[0])
+    writer.close()
+    with pytest.raises(RecordingError, match="transforms are on /a/tf, /b/tf; choose them with --tf TOPIC"):
+        read(tmp_path / "drive")
+
+
+def test_the_mounting_is_kept_through_a_quaternion():
+    from torchelev.io.bags.poses.rows import from_matrix, to_matrices
+
+    for T in (MOUNT, invert(drive().bases[-1]), np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])):
+        np.testing.assert_allclose(to_matrices(np.array([[0.0, *from_matrix(T), 0.0]]))[0], T, atol=1e-12)
