@@ -24,6 +24,7 @@ class Shape(NamedTuple):
     ahead: float = 0.0  # [s] by which the lidar's clock is ahead
     stamped: bool = True  # or stamps are 0
     registered: bool = False  # clouds are in odom
+    inverted: bool = False  # base_link -> odom is on /tf
     jump: float = 0.0  # [m] to the left after 0.3 s
     again: float | None = None  # [m] to the left of a second run with the same stamps
 
@@ -50,7 +51,9 @@ def write(path, shape):
 
 
 def _write_pose(writer, shape, t, recorded, T):
-    if shape.tf:
+    if shape.inverted:
+        writer.transform(t, "base_link", "odom", invert(np.asarray(T)), space=shape.space, recorded=recorded)
+    elif shape.tf:
         writer.transform(t, "odom", "base_link", T, space=shape.space, recorded=recorded)
     if shape.odometry is not None:
         writer.odometry(t, T, shape.odometry)

@@ -53,10 +53,14 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
     Raises:
         RecordingError: poses, frames or times are missing or could be several; the message names the option to give.
     """
+    unknown = [topic for topic in request.clock_offsets if topic and topic not in topics]
+    if unknown:
+        reason = f"--clock-offset {unknown[0]}: is no topic of scans"
+        raise RecordingError(bag.path, f"{reason}; these are {', '.join(topics)}")
     tree, covariances = read_poses(bag, request, list(topics), _period(bag, topics), show)
     span, notes = _choose_span(bag, request, tree)
     scans = [_first_scans(bag, request, topic, span) for topic in topics]
-    scans = _require_scans(bag, topics, [one for one in scans if len(one.stamps)])
+    scans = _require_scans(bag, request, topics, [one for one in scans if len(one.stamps)])
     sensors = list(dict.fromkeys(one.frame for one in scans))
     _mount(bag, request, tree, sensors)
     require_frames(bag, request, tree, sensors)
@@ -65,6 +69,9 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
         require_way(bag.path, tree, frames.map, sensor)
     require_way(bag.path, tree, frames.map, frames.base)
     fixed = _find_fixed(tree, frames.map, frames.base, sensors, request)
+    if request.rays_from and not fixed:
+        reason = f"--rays-from {request.rays_from}: no cloud is in the map's frame {frames.map}"
+        raise RecordingError(bag.path, f"{reason}; clouds are in {', '.join(sensors)}", "leave it out")
     _hold_constant(tree, frames.map, frames.base)
     ways = [frame for end in (frames.base, *sensors) for frame in tree.moving_between(frames.map, end)]
     offsets, clocks = _check_clocks(bag, tree, frames.map, frames.base, scans)
@@ -117,9 +124,14 @@ def _first_scans(bag: Bag, request: BagRequest, topic: str, span: tuple[float, f
     return FirstScans(topic, frame, np.array(stamps), np.array(recorded), offset, end)
 
 
-def _require_scans(bag: Bag, topics: Sequence[str], scans: list[FirstScans]) -> list[FirstScans]:
+def _require_scans(bag: Bag, request: BagRequest, topics: Sequence[str], scans: list[FirstScans]) -> list[FirstScans]:
     if not scans:
-        reason = bag.ended_early or f"no messages on {', '.join(topics)}"
+        times = [
+            f" {word} --{key} {value:g}"
+            for key, word, value in (("start", "after", request.start), ("end", "before", request.end))
+            if value is not None
+        ]
+        reason = bag.ended_early or f"no messages on {', '.join(topics)}{' and'.join(times)}"
         raise RecordingError(bag.path, reason, "choose another topic with --points or --depth")
     return scans
 
