@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from torchelev.io import RecordingError
 from torchelev.io.bags import Bag, BagRecording, BagRequest, Topic, open_bag
 from torchelev.io.bags.poses.clocks import ClockError
-from torchelev.io.bags.poses.reading import ODOMETRY
+from torchelev.io.bags.poses.reading import ODOMETRY, TRANSFORMS
 from torchelev.io.bags.scans import CLOUDS, IMAGES
 
 
@@ -30,6 +30,10 @@ def _requests(bag: Bag) -> Iterator[BagRequest]:
     """Yield what could be asked: with the transforms, with each odometry, and that as the pose of each likely frame."""
     plain = _choose_sensor(bag.topics)
     yield plain
+    transforms = [topic.name for topic in bag.topics if topic.type in TRANSFORMS and topic.num]
+    spaces = {name.rsplit("/", 1)[0] for name in transforms} - {""}
+    if len(spaces) == 1:  # of several robots, only the user knows the one that is meant
+        yield plain._replace(transforms=tuple(name for name in transforms if name.startswith(f"{min(spaces)}/")))
     for topic in bag.topics:
         if topic.type == ODOMETRY and topic.num:
             yield plain._replace(poses=topic.name)
@@ -65,6 +69,7 @@ def _command(bag: Bag, recording: BagRecording, request: BagRequest) -> str:
     words = ["torchelev", "map", str(bag.path)]
     words += [word for name in request.clouds for word in ("--points", name)]
     words += [word for name in request.depths for word in ("--depth", name)]
+    words += [word for name in request.transforms for word in ("--tf", name)]
     words += ["--poses", request.poses] if request.poses else []
     words += [
         word for topic, offset in request.clock_offsets.items() for word in ("--clock-offset", f"{topic}={offset!r}")

@@ -22,6 +22,7 @@ from torchelev.io.errors import RecordingError
 from torchelev.io.folders.recording import Frame
 
 _MAX_GAP = 1.0  # [s] between two poses without a warning
+_OTHER_CLOCK = "these stamps are not those of the poses; give --stamps recorded"
 _LATE = "some scans are older than those before them, and are fused with dt = 0"
 
 
@@ -114,6 +115,9 @@ class BagRecording:
         scan = read_scan(message.data, self._cameras.get(message.topic))._replace(stamp=self._time_of(message))
         if scan.note:
             self.notes[f"{message.topic}: {scan.note}"] = None
+        if message.topic not in self.clock_offsets and self._placed.clock.differs(scan.stamp, message.time):
+            self.skipped[f"the clock of {message.topic} was set meanwhile: {_OTHER_CLOCK}"] += 1
+            return None
         frame = self.rays_from if scan.frame in self._placed.fixed else scan.frame
         now = np.array([scan.stamp])
         T_map_sensor = self.tree.look_up(self.map_frame, frame, now)[0]

@@ -202,3 +202,31 @@ def test_the_mounting_is_kept_through_a_quaternion():
 
     for T in (MOUNT, invert(drive().bases[-1]), np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])):
         np.testing.assert_allclose(to_matrices(np.array([[0.0, *from_matrix(T), 0.0]]))[0], T, atol=1e-12)
+
+
+def test_a_mounting_below_a_sensor_with_poses_gives_the_base(tmp_path):
+    writer = Writer(tmp_path / "drive", "mcap")
+    for t, T in zip(drive().stamps, drive().bases, strict=True):
+        writer.transform(t, "map", "lidar", T @ MOUNT)
+    for scan in drive().clouds:
+        writer.cloud(scan._replace(times=None))
+    writer.close()
+    recording, frames = read(tmp_path / "drive", T_base_sensor=MOUNT)
+    assert (recording.map_frame, recording.base_frame, recording.has_base) == ("map", "base_link", True)
+    assert_poses(frames)
+
+
+def test_a_lidar_whose_clock_is_set_meanwhile_loses_these_scans_only(tmp_path):
+    writer = Writer(tmp_path / "drive", "mcap")
+    stamps = np.arange(-0.3, 9.0, 0.1)
+    for t in stamps:
+        writer.transform(START + t, "odom", "lidar", np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * max(0.0, t))
+    for t in np.arange(0.0, 8.0, 0.5):
+        scan = drive().clouds[0]._replace(stamp=START + t - (3.0 if t >= 6.0 else 0.0), times=None)
+        writer.cloud(scan, recorded=START + t)
+    writer.close()
+    recording, frames = read(tmp_path / "drive")
+    assert len(frames) == 12 and recording.pose_notes == []
+    (warning,) = recording.warnings
+    assert warning.startswith(f"4 of 16 scans were left out: the clock of {CLOUD} was set meanwhile")
+    assert len(read(tmp_path / "drive", stamps="recorded")[1]) == 16

@@ -15,7 +15,9 @@ from torchelev.io.errors import RecordingError
 _BACK = 0.5  # [s] by which stamps of one sender go back only if its clock does
 _AHEAD = 5.0  # [s] more than the time between two recordings: the clock was set
 _MANY = 20  # more steps back are two senders, each with its clock
-_DIFFERENCE = 1.0  # [s] between two clocks; delays of sensors are shorter
+_DIFFERENCE = 2.0  # [s] between two clocks; delays of sensors and of odometry are shorter
+_TOGETHER = 1.0  # [s] between two recordings at one time
+_SLOWEST = 0.01  # of the time of stamps; bags that were recorded faster have no times of recording
 _SNAP = 0.3  # [s] to a difference of time scales or zones
 _SCALES = np.array([18.0, 19.0, 37.0])  # GPS - UTC, TAI - GPS, TAI - UTC
 _ZONE = 1800.0  # [s]
@@ -53,49 +55,68 @@ class ClockError(RecordingError):
         self.offsets = offsets
 
 
-def compare_clocks(tree: TransformTree, frames: Sequence[str], scans: FirstScans) -> Difference | None:
-    """Compare the stamps of a topic's scans with those of the moving frames that their poses need.
+class PoseClock:
+    """The clock of the moving frames on the ways from the map to some frames.
 
-    Stamps that were recorded at the same time differ by a clock's offset and short delays. If the times of recording
-    say nothing, as they lie apart, the ranges of the stamps do.
+    Args:
+        tree: all transforms.
+        map_frame: the map's frame.
+        ends: frames whose poses in the map are needed.
     """
-    rows = [tree.recorded_rows(frame) for frame in frames]
-    rows = [row for row in rows if len(row) > 1]
-    if not rows or not len(scans.stamps):
-        return None
-    low = max(float(row[:, 0].min()) for row in rows)
-    high = min(float(row[:, 0].max()) for row in rows)
-    first = float(scans.stamps.min()) + scans.offset
-    last = first + max(0.0, scans.end - float(scans.recorded[0]))
-    told = (
-        f"stamps of {scans.topic} are {first:,.3f} .. {last:,.3f} s, those of "
-        f"{', '.join(frames)} {low:,.3f} .. {high:,.3f} s"
-    )
-    is_apart = last < low - _DIFFERENCE or first > high + _DIFFERENCE
-    if is_apart and not scans.stamps.any():
-        return Difference(f"{told}: those of {scans.topic} were never filled in", "--stamps recorded", None, True)
-    if is_apart and any(not row[:, 0].any() for row in rows):
-        return Difference(f"{told}: those of the poses were never filled in", "--stamps recorded", None, True)
-    offset = _measure(rows[0], scans)
-    if offset is None or abs(offset) < _DIFFERENCE:
-        return Difference(f"{told}: no scan lies within the poses", "", None, True) if is_apart else None
-    needed = round(scans.offset - _snap(offset), 6)
-    cure = f"--clock-offset {scans.topic}={needed!r} or --stamps recorded"
-    return Difference(f"{told}: the clocks differ by {abs(offset):,.3f} s", cure, needed, is_apart)
 
+    def __init__(self, tree: TransformTree, map_frame: str, ends: Sequence[str]) -> None:
+        moving = dict.fromkeys(frame for end in ends for frame in tree.moving_between(map_frame, end))
+        rows = {frame: tree.recorded_rows(frame) for frame in moving}
+        rows = {frame: row for frame, row in rows.items() if len(row) > 1}
+        self._names = ", ".join(rows)
+        self._ranges = [(float(row[:, 0].min()), float(row[:, 0].max())) for row in rows.values()]
+        self._is_unset = any(not row[:, 0].any() for row in rows.values())
+        first = next(iter(rows.values()), np.zeros((0, 9)))
+        order = np.argsort(first[:, -1], kind="stable")
+        self._recorded, self._stamps = first[order, -1], first[order, 0]
+        if len(first) and not np.ptp(self._recorded) >= _SLOWEST * np.ptp(self._stamps):
+            self._recorded = self._stamps = np.zeros(0)
 
-def _measure(rows: NDArray[np.float64], scans: FirstScans) -> float | None:
-    """Return by how much the scans' clock is ahead of the poses' [s]; None if nothing was recorded together."""
-    recorded, stamps = rows[:, -1], rows[:, 0]
-    if not np.isfinite(recorded).all():
-        return None
-    order = np.argsort(recorded, kind="stable")
-    at = np.clip(np.searchsorted(recorded[order], scans.recorded), 0, len(order) - 1)
-    near = np.abs(recorded[order][at] - scans.recorded) < _DIFFERENCE
-    if not near.any():
-        return None
-    together = np.interp(scans.recorded, recorded[order], stamps[order])
-    return float(np.median((scans.stamps + scans.offset - together)[near]))
+    def measure(self, stamp: float, recorded: float) -> float | None:
+        """Return by how much a stamp is ahead of this clock [s]; None if no pose was recorded at its time."""
+        at = int(np.searchsorted(self._recorded, recorded))
+        near = self._recorded[max(at - 1, 0) : at + 1]
+        if not len(near) or np.abs(near - recorded).min() > _TOGETHER:
+            return None
+        return stamp - float(np.interp(recorded, near, self._stamps[max(at - 1, 0) : at + 1]))
+
+    def differs(self, stamp: float, recorded: float) -> bool:
+        """Return whether a stamp [s] is certainly of another clock."""
+        ahead = self.measure(stamp, recorded)
+        return ahead is not None and abs(ahead) > _DIFFERENCE
+
+    def compare(self, scans: FirstScans) -> Difference | None:
+        """Compare the stamps of a topic's scans with those of the poses.
+
+        Stamps that were recorded at the same time differ by a clock's offset and short delays. If nothing was recorded
+        at the same time, the ranges of the stamps are compared.
+        """
+        if not self._ranges:
+            return None
+        low, high = max(first for first, _ in self._ranges), min(last for _, last in self._ranges)
+        first = float(scans.stamps.min()) + scans.offset
+        last = first + max(0.0, scans.end - float(scans.recorded[0]))
+        ranges = (
+            f"stamps of {scans.topic} are {first:,.3f} .. {last:,.3f} s, those of {self._names} {low:,.3f} .. "
+            f"{high:,.3f} s"
+        )
+        is_apart = last < low - _TOGETHER or first > high + _TOGETHER
+        if is_apart and (self._is_unset or not scans.stamps.any()):
+            unset = "the poses" if self._is_unset else scans.topic
+            return Difference(f"{ranges}: those of {unset} were never filled in", "--stamps recorded", None, True)
+        pairs = zip(scans.stamps + scans.offset, scans.recorded, strict=True)
+        found = [ahead for ahead in (self.measure(*pair) for pair in pairs) if ahead is not None]
+        offset = float(np.median(found)) if found else None
+        if offset is None or abs(offset) < _DIFFERENCE:
+            return Difference(f"{ranges}: no scan lies within the poses", "", None, True) if is_apart else None
+        needed = round(scans.offset - _snap(offset), 6)
+        cure = f"--clock-offset {scans.topic}={needed!r} or --stamps recorded"
+        return Difference(f"{ranges}: the clocks differ by {abs(offset):,.3f} s", cure, needed, is_apart)
 
 
 def _snap(offset: float) -> float:

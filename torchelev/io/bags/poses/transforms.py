@@ -136,7 +136,7 @@ class TransformTree:
         """Return whether all poses of a frame in its parent are the same, whatever their topic."""
         if frame not in self._constant:
             edge = self._edges[frame]
-            self._constant[frame] = edge.is_static or is_constant(np.array(edge.rows).reshape(-1, WIDTH))
+            self._constant[frame] = edge.is_static or is_constant(self.recorded_rows(frame))
         return self._constant[frame]
 
     def look_up(self, target: str, source: str, times: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -171,12 +171,12 @@ class TransformTree:
         """Return the poses of a frame as rows (K, 9), by their stamps, each stamp once."""
         if frame not in self._sorted:
             rows = self.recorded_rows(frame)
-            self._sorted[frame] = rows if len(rows) == 1 else rows[np.unique(rows[:, 0], return_index=True)[1]]
+            self._sorted[frame] = rows[np.unique(rows[:, 0], return_index=True)[1]]
         return self._sorted[frame]
 
     def recorded_rows(self, frame: str) -> NDArray[np.float64]:
         """Return the poses of a frame as rows (K, 9), in the order in which they were recorded."""
-        return np.array(self._edges[frame].rows).reshape(-1, WIDTH)
+        return np.frombuffer(self._edges[frame].rows).reshape(-1, WIDTH)  # no copy: hours of poses are large
 
     def _chain(self, frames: list[str], times: NDArray) -> NDArray:
         """Return the pose of the first frame in the parent of the last one."""
