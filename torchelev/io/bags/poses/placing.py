@@ -97,7 +97,7 @@ def _mount(bag: Bag, request: BagRequest, tree: TransformTree, sensors: list[str
         have = ", ".join(tree.frames) or "none"
         raise RecordingError(bag.path, f"--extrinsics: no frame moves; frames are {have}", "give --poses TOPIC")
     if base == sensor or (base not in tree.frames and sensor in tree.frames):
-        base = request.base_frame if base != sensor else "base_link"
+        base = "base_link" if base == sensor else base
         tree.add(sensor, base, 0.0, from_matrix(invert(request.T_base_sensor)), is_static=True)
     else:
         tree.replace(sensor)

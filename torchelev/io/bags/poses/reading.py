@@ -94,7 +94,7 @@ def choose_transforms(bag: Bag, request: BagRequest, scans: list[str]) -> list[s
             )
     if request.transforms:
         return list(request.transforms)
-    plain = [name for name in ("/tf", "/tf_static") if name in have]
+    plain: list[str] = [name for name in ("/tf", "/tf_static") if name in have]
     spaces = sorted({_namespace(name) for name in have if not is_static_topic(name)} - {""})
     if "/tf" in plain or not spaces:
         return plain
