@@ -98,6 +98,12 @@ SOUND = {
     "odometry above and below": (
         tree_of({("odom", "body"): drive, ("body", "vision"): back(drive)}, [("body", "lidar")]), "odom", "body",
     ),
+    "odometry below a body that moves": (
+        tree_of({("base_link", "body"): sway, ("body", "odom"): back(drive)}, LIDAR), "odom", "base_link",
+    ),
+    "odometry below the lidar": (
+        tree_of({("lidar", "odom"): back(drive), ("odom", "map"): correct}, LIDAR), "odom", "base_link",
+    ),
     "arm": (
         tree_of({("base", "link1"): spin, ("link1", "link2"): nod}, [("world", "base"), ("link2", "lidar")]),
         "world", "link2",

@@ -230,3 +230,31 @@ def test_a_lidar_whose_clock_is_set_meanwhile_loses_these_scans_only(tmp_path):
     (warning,) = recording.warnings
     assert warning.startswith(f"4 of 16 scans were left out: the clock of {CLOUD} was set meanwhile")
     assert len(read(tmp_path / "drive", stamps="recorded")[1]) == 16
+
+
+def test_poses_of_two_clocks_are_named(tmp_path):
+    writer = Writer(tmp_path / "drive", "mcap")
+    for t, T in zip(drive().stamps, drive().bases, strict=True):
+        writer.transform(t, "odom", "base_link", T)
+        writer.transform(
+            t - 5.0, "base_link", "lidar", np.diag([1.0, 1, 1, 1]) + np.eye(4, k=3) * (t % 0.1), recorded=t
+        )
+    writer.cloud(drive().clouds[0]._replace(times=None))
+    writer.close()
+    with pytest.raises(ClockError, match="5.000 s behind the other poses: their clocks differ; give --stamps recorded"):
+        read(tmp_path / "drive")
+    assert len(read(tmp_path / "drive", stamps="recorded")[1]) == 1
+
+
+def test_poses_without_stamps_are_named(tmp_path):
+    writer = Writer(tmp_path / "drive", "mcap")
+    for t, T in zip(drive().stamps, drive().bases, strict=True):
+        writer.transform(0.0, "odom", "lidar", T, recorded=t)
+    for scan in drive().clouds:
+        writer.cloud(scan._replace(times=None))
+    writer.close()
+    with pytest.raises(ClockError, match="those of the poses were never filled in; give --stamps recorded"):
+        read(tmp_path / "drive")
+    _, frames = read(tmp_path / "drive", stamps="recorded")
+    for frame, scan in zip(frames, drive().clouds, strict=True):
+        np.testing.assert_allclose(frame.T_map_sensor, scan.T_map_base, atol=1e-6)

@@ -17,6 +17,7 @@ _AHEAD = 5.0  # [s] more than the time between two recordings: the clock was set
 _MANY = 20  # more steps back are two senders, each with its clock
 _DIFFERENCE = 2.0  # [s] between two clocks; delays of sensors and of odometry are shorter
 _TOGETHER = 1.0  # [s] between two recordings at one time
+_SOME = 20  # poses of a frame whose stamps are looked at
 _SLOWEST = 0.01  # of the time of stamps; bags that were recorded faster have no times of recording
 _SNAP = 0.3  # [s] to a difference of time scales or zones
 _SCALES = np.array([18.0, 19.0, 37.0])  # GPS - UTC, TAI - GPS, TAI - UTC
@@ -62,6 +63,9 @@ class PoseClock:
         tree: all transforms.
         map_frame: the map's frame.
         ends: frames whose poses in the map are needed.
+
+    Attributes:
+        notes: on frames whose clocks differ.
     """
 
     def __init__(self, tree: TransformTree, map_frame: str, ends: Sequence[str]) -> None:
@@ -76,6 +80,18 @@ class PoseClock:
         self._recorded, self._stamps = first[order, -1], first[order, 0]
         if len(first) and not np.ptp(self._recorded) >= _SLOWEST * np.ptp(self._stamps):
             self._recorded = self._stamps = np.zeros(0)
+        self.notes = [note for note in map(self._compare_frame, rows, rows.values()) if note]
+
+    def _compare_frame(self, frame: str, rows: NDArray[np.float64]) -> str:
+        """Return a sentence if the poses of a frame are stamped by another clock; "" if not."""
+        some = rows[np.linspace(0, len(rows) - 1, _SOME).astype(int)]
+        found = [ahead for ahead in (self.measure(row[0], row[-1]) for row in some) if ahead is not None]
+        if not found or abs(offset := float(np.median(found))) < _DIFFERENCE:
+            return ""
+        return (
+            f"stamps of {frame} are {rows[:, 0].min():,.3f} .. {rows[:, 0].max():,.3f} s, {abs(offset):,.3f} s "
+            f"{'ahead of' if offset > 0 else 'behind'} the other poses: their clocks differ; give --stamps recorded"
+        )
 
     def measure(self, stamp: float, recorded: float) -> float | None:
         """Return by how much a stamp is ahead of this clock [s]; None if no pose was recorded at its time."""

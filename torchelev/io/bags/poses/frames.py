@@ -53,7 +53,7 @@ def choose_frames(path: Path, tree: TransformTree, sensor: str, request: BagRequ
     if chosen is None or (not request.map_frame and is_robot(chosen)):
         below = _choose_below(tree, sensor)
         if below is not None:
-            chosen, base = below, request.base_frame or str(tree.parent(below))
+            chosen, base = below, request.base_frame or _base_above(tree, sensor)
     if chosen is None:
         raise RecordingError(path, f"no transform moves {sensor}; {_describe(tree, sensor)}", _HINT)
     is_asked = bool(request.map_frame and request.base_frame)
@@ -158,15 +158,18 @@ def _fixed_alike(tree: TransformTree, frame: str) -> str:
 
 def _choose_below(tree: TransformTree, sensor: str) -> str | None:
     """Return the frame below the robot in which it travels: odometry that is published upside down."""
-    robot = tree.ancestors(sensor)
-    for frame in robot:
-        robot += [child for child in tree.children(frame) if child not in robot and tree.is_constant(child)]
-    branches = [child for frame in robot for child in tree.children(frame) if child not in robot]
-    far = {child: motion(tree, child, str(tree.parent(child))).travel for child in branches}
-    named = [child for child in branches if is_world(child)]
-    others = [child for child in branches if not is_robot(child) and far[child] >= _BRANCH]
-    found = named or others
-    return max(found, key=lambda child: far[child]) if found else None
+    root = tree.ancestors(sensor)[-1]
+    frames = [frame for frame in _below(tree, root) if not is_robot(frame)]
+    far = {frame: motion(tree, frame, root).travel for frame in frames}
+    named = [frame for frame in frames if is_world(frame) and tree.moving_between(frame, root)]
+    found = named or [frame for frame in frames if far[frame] >= _BRANCH and frame not in tree.ancestors(sensor)]
+    return next((frame for frame in found if far[frame] >= max(far[one] for one in found) / 2), None)
+
+
+def _base_above(tree: TransformTree, sensor: str) -> str:
+    """Return the base above a sensor whose root is a frame of the robot."""
+    chain = tree.ancestors(sensor)
+    return next((frame for frame in chain if is_base(frame)), chain[-1])
 
 
 def _describe(tree: TransformTree, sensor: str) -> str:

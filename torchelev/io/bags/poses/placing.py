@@ -18,9 +18,11 @@ from torchelev.io.bags.poses.reading import read_poses
 from torchelev.io.bags.poses.rows import from_matrix, invert
 from torchelev.io.bags.poses.spans import choose_span, read_first
 from torchelev.io.bags.poses.transforms import TransformTree
+from torchelev.io.bags.scans import clean
 from torchelev.io.bags.topics import BagRequest
 from torchelev.io.errors import RecordingError
 
+_FRAMES = ("map_frame", "base_frame", "rays_from")
 _PERIODS = 0.02, 1.0  # [s] shortest and longest period of scans that is believed
 
 
@@ -54,6 +56,7 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
         RecordingError: poses, frames or times are missing or could be several; the message names the option to give.
     """
     _require_topics(bag, request, topics)
+    request = request._replace(**{name: clean(frame) for name in _FRAMES if (frame := getattr(request, name))})
     tree, covariances = read_poses(bag, request, list(topics), _period(bag, topics), show)
     span, notes = choose_span(bag, request, tree)
     scans = read_first(bag, request, topics, span)
@@ -68,7 +71,13 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
     _hold_constant(tree, frames.map, frames.base)
     clock = PoseClock(tree, frames.map, [frames.base, *sensors])
     offsets, differences = _compare_clocks(bag, clock, scans)
-    notes += [*frames.notes, *differences, *_doubt(bag, tree, frames, sensors, max_gap), *covariances.notes]
+    notes += [
+        *frames.notes,
+        *differences,
+        *clock.notes,
+        *_doubt(bag, tree, frames, sensors, max_gap),
+        *covariances.notes,
+    ]
     return Placed(tree, covariances, frames.map, frames.base, sensors[0], fixed, rays_from, span, clock, offsets, notes)
 
 
@@ -132,7 +141,7 @@ def _compare_clocks(bag: Bag, clock: PoseClock, scans: list[FirstScans]) -> tupl
     offsets = {topic: one.offset for topic, one in differences.items() if one.offset is not None}
     notes = [one.sentence + (f"; give {one.cure}" if one.cure else "") for one in differences.values()]
     if len(differences) == len(scans) and any(one.is_hopeless for one in differences.values()):
-        raise ClockError(bag.path, ". ".join(notes), offsets)
+        raise ClockError(bag.path, ". ".join([*clock.notes, *notes]), offsets)
     return offsets, notes
 
 
