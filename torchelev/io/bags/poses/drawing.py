@@ -27,4 +27,6 @@ def _kind(tree: TransformTree, frame: str) -> str:
     if tree.is_static(frame):
         return "static"
     num = len(tree.recorded_rows(frame))
-    return f"{num:,} poses" + (", all the same" if num > 1 and tree.is_constant(frame) else "")
+    return ("1 pose" if num == 1 else f"{num:,} poses") + (
+        ", all the same" if num > 1 and tree.is_constant(frame) else ""
+    )

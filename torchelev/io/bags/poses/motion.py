@@ -50,7 +50,7 @@ def find_jumps(stamps: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArr
 
 
 def _exceeds(steps: NDArray, spans: NDArray, tolerance: float, acceleration: float) -> NDArray[np.bool_]:
-    """Return which of the steps (K, D) differ from both neighbours by more than is plausible."""
+    """Return which of the steps (K, D) differ from both neighbours, and from none, by more than is plausible."""
     if len(steps) < 3:
         return np.zeros(len(steps), dtype=bool)
     rates = steps / spans[:, None]
@@ -58,7 +58,7 @@ def _exceeds(steps: NDArray, spans: NDArray, tolerance: float, acceleration: flo
     sizes = np.linalg.norm(steps, axis=1)
     odd = [np.linalg.norm(steps - near * spans[:, None], axis=1) for near in (before, after)]
     limit = np.maximum(tolerance + acceleration / 2 * spans**2, _USUAL * np.quantile(sizes, 0.95))
-    return np.minimum(*odd) > limit
+    return np.minimum(np.minimum(*odd), sizes) > limit
 
 
 def angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
