@@ -41,6 +41,9 @@ SOUND = {
     "walking footprint, own names": (
         tree_of({("start", "ground"): drive, ("ground", "frame"): sway}, [("frame", "lidar")]), "start", "ground",
     ),
+    "walking footprint with a name of its own": (
+        tree_of({("start", "ground"): drive, ("ground", "base_link"): sway}, LIDAR), "start", "base_link",
+    ),
     "mast": (
         tree_of(
             {("odom", "base_footprint"): drive, ("base_footprint", "base_stabilized"): sway,

@@ -134,7 +134,9 @@ def test_clocks_that_differ_are_named_with_both_ranges_and_the_offset(tmp_path, 
     assert f"stamps of {CLOUD} are {START + ahead:,.3f} .." in str(error.value)
     assert f"those of base_link {START - 0.3:,.3f} .. {START + 0.9:,.3f}" in str(error.value)
     assert f"--clock-offset {CLOUD}=" in str(error.value) and "or --stamps recorded" in str(error.value)
-    assert_poses(read(path, clock_offsets=error.value.offsets)[1], atol=2e-3)  # recorded 1 ms later
+    offset = -37.0 if ahead == 37.0 else 0.001 - ahead  # messages are recorded 1 ms later
+    assert error.value.offsets == {CLOUD: pytest.approx(offset, abs=1e-5)}
+    assert_poses(read(path, clock_offsets=error.value.offsets)[1], atol=2e-3)
     assert_poses(read(path, stamps="recorded")[1], atol=2e-3)
 
 
@@ -258,3 +260,44 @@ def test_poses_without_stamps_are_named(tmp_path):
     _, frames = read(tmp_path / "drive", stamps="recorded")
     for frame, scan in zip(frames, drive().clouds, strict=True):
         np.testing.assert_allclose(frame.T_map_sensor, scan.T_map_base, atol=1e-6)
+
+
+def write_slowly(path, mounted, posed=lambda t: True, moves=True):
+    """Write the drive with the mounting on /tf, at the times for which `mounted` holds."""
+    writer = Writer(path, "mcap")
+    for t, T in zip(drive().stamps, drive().bases, strict=True):
+        if posed(t - START):
+            writer.transform(t, "odom", "base_link", T if moves else drive().bases[0])
+        if mounted(t - START):
+            writer.transform(t + 0.1, "base_link", "lidar", MOUNT, recorded=t)
+    for scan in drive().clouds:
+        writer.cloud(scan._replace(times=None))
+    writer.close()
+    return path
+
+
+def test_a_mounting_on_tf_holds_at_all_times(tmp_path):
+    recording, frames = read(write_slowly(tmp_path / "drive", lambda t: t < -0.1))
+    assert recording.warnings == []
+    assert_poses(frames)
+
+
+def test_poses_of_a_still_robot_hold_only_while_they_are_sent(tmp_path):
+    path = write_slowly(tmp_path / "drive", lambda t: True, lambda t: t < 0.05, moves=False)
+    recording, frames = read(path, map_frame="odom", base_frame="base_link")
+    assert (
+        len(frames) == 3
+    )  # one of them a period of the scans later, and not those for which nothing says where the robot was
+    assert recording.warnings == ["3 of 6 scans were left out: no pose of lidar in odom at that time"]
+
+
+def test_poses_that_move_take_the_place_of_a_static_one(tmp_path):
+    writer = Writer(tmp_path / "drive", "mcap")
+    for t, T in zip(drive().stamps, drive().bases, strict=True):
+        writer.transform(t, "odom", "base_link", T)
+        writer.transform(t, "odom", "base_link", np.eye(4), is_static=True)
+    writer.transform(START, "base_link", "lidar", MOUNT, is_static=True)
+    for scan in drive().clouds:
+        writer.cloud(scan._replace(times=None))
+    writer.close()
+    assert_poses(read(tmp_path / "drive")[1])

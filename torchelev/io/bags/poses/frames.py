@@ -186,8 +186,8 @@ def _name_others(tree: TransformTree, chosen: str, base: str) -> list[str]:
     for other in _candidates(tree, base):
         if is_world(chosen) and is_world(other):
             continue
-        if other != chosen and motion(tree, chosen, other).travel >= limit:
-            far = motion(tree, other, base).travel
+        far = motion(tree, other, base).travel
+        if other != chosen and far >= limit and motion(tree, chosen, other).travel >= limit:
             return [
                 f"two frames could be the map's: {base} travels {travel:.1f} m in {chosen}, which was taken, and "
                 f"{far:.1f} m in {other}; choose with --map-frame {chosen} or --map-frame {other}"
