@@ -301,3 +301,9 @@ def test_poses_that_move_take_the_place_of_a_static_one(tmp_path):
         writer.cloud(scan._replace(times=None))
     writer.close()
     assert_poses(read(tmp_path / "drive")[1])
+
+
+def test_a_slash_before_a_frame_that_was_asked_for_is_dropped(tmp_path):
+    recording, frames = read(write(tmp_path / "drive", Shape()), map_frame="/odom", base_frame="/base_link")
+    assert (recording.map_frame, recording.base_frame) == ("odom", "base_link")
+    assert_poses(frames)

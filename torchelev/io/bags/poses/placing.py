@@ -22,7 +22,6 @@ from torchelev.io.bags.scans import clean
 from torchelev.io.bags.topics import BagRequest
 from torchelev.io.errors import RecordingError
 
-_FRAMES = ("map_frame", "base_frame", "rays_from")
 _PERIODS = 0.02, 1.0  # [s] shortest and longest period of scans that is believed
 
 
@@ -56,7 +55,7 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
         RecordingError: poses, frames or times are missing or could be several; the message names the option to give.
     """
     _require_topics(bag, request, topics)
-    request = request._replace(**{name: clean(frame) for name in _FRAMES if (frame := getattr(request, name))})
+    request = _clean_frames(request)
     tree, covariances = read_poses(bag, request, list(topics), _period(bag, topics), show)
     span, notes = choose_span(bag, request, tree)
     scans = read_first(bag, request, topics, span)
@@ -79,6 +78,13 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
         *covariances.notes,
     ]
     return Placed(tree, covariances, frames.map, frames.base, sensors[0], fixed, rays_from, span, clock, offsets, notes)
+
+
+def _clean_frames(request: BagRequest) -> BagRequest:
+    """Return the request with names of frames as the tree has them, without a slash in front."""
+    asked = (request.map_frame, request.base_frame, request.rays_from)
+    map_frame, base_frame, rays_from = (clean(frame) if frame else None for frame in asked)
+    return request._replace(map_frame=map_frame, base_frame=base_frame, rays_from=rays_from)
 
 
 def _require_topics(bag: Bag, request: BagRequest, topics: Sequence[str]) -> None:
