@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.evidence import GATES, MIN_POINTS, Evidence, gather_evidence
 from torchelev.diagnosis.history import MAX_ENVS, InputHistory
+from torchelev.diagnosis.shared_range import find_points_on_path, find_shared_range
 from torchelev.state import MapState
 
 _REASONS = {
@@ -38,6 +39,23 @@ def _find_millimetres(seen: Evidence) -> str | None:
         return None
     median = float(np.median(seen.distances))
     return f"points: the median distance is {median:,.0f} m, as of millimetres: check units, and multiply them by 0.001"
+
+
+def _find_far_cloud(seen: Evidence) -> str | None:
+    """Find points in another frame than the sensor's: near each other, and far from where the pose has the sensor."""
+    cloud = seen.far_cloud
+    if cloud is None:
+        return None
+    where = f"points: they lie {cloud.distance:,.0f} m from the sensor and within {cloud.radius:,.1f} m of each other"
+    if cloud.is_at_sensor:
+        return (
+            f"{where}, where T_map_sensor has the sensor: they are in the map frame already, and the pose is applied "
+            "twice; give sensor-frame points, inverse(T_map_sensor) times these"
+        )
+    return (
+        f"{where}: they are in the map's frame, such as a national grid, and T_map_sensor lacks the sensor's place in "
+        "it; give its pose in that frame, and sensor-frame points: subtract its position in float64"
+    )
 
 
 def _find_wrong_poses(seen: Evidence) -> str | None:
@@ -72,7 +90,7 @@ def _find_wrong_base(seen: Evidence) -> str | None:
 
 def _find_closed_gate(seen: Evidence) -> str | None:
     """Find sensor gates that reject nearly all points."""
-    if seen.num_points < MIN_POINTS or seen.is_in_millimetres:
+    if seen.num_points < MIN_POINTS or seen.is_in_millimetres or seen.far_cloud:
         return None
     for name in GATES:
         tested = seen.num_points - (0 if name == "invalid" else seen.gates["invalid"])
@@ -180,6 +198,9 @@ def _height_over_ground(points: NDArray, position: NDArray) -> NDArray:
 
 _RULES = (
     _find_millimetres,
+    _find_far_cloud,
+    find_shared_range,
+    find_points_on_path,
     _find_wrong_poses,
     _find_wrong_base,
     _find_closed_gate,

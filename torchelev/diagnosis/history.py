@@ -13,7 +13,9 @@ from torchelev.inputs.update_inputs import Inputs
 MAX_ENVS = 4  # the first environments: a wrong convention is wrong in all of them
 _MAX_UPDATES = 8
 _MAX_POINTS = 3000  # per sensor, evenly spaced
-_STRIDE = 4  # after the first updates every fourth is kept, so that a robot moves between the first and the last
+# After the first updates two of seven are kept, so that a robot moves between the first and the last, and sensors that
+# take turns, two to six of them, are all among them.
+_PERIOD = 7
 
 
 class PastUpdate(NamedTuple):
@@ -39,7 +41,7 @@ class InputHistory:
         """Keep an update's inputs, if it is their turn."""
         if torch.compiler.is_compiling():
             return
-        if self._num_updates < _MAX_UPDATES or self._num_updates % _STRIDE == 0:
+        if self._num_updates < _MAX_UPDATES or self._num_updates % _PERIOD < 2:
             self._updates.append(PastUpdate(self._num_updates, _thin(inputs)))
         self._num_updates += 1
 
@@ -65,7 +67,7 @@ class InputHistory:
 
 def _thin(inputs: Inputs) -> Inputs:
     """Copy the inputs of the first environments, with every k-th point."""
-    step = max(1, -(-inputs.points.shape[2] // _MAX_POINTS))
+    step = max(1, -(-inputs.points.shape[2] // _MAX_POINTS)) | 1  # odd: rings and columns often are powers of two
 
     def copy(value: Tensor) -> Tensor:
         return value[:MAX_ENVS].detach().clone()
