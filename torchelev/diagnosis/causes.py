@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.evidence import GATES, MIN_POINTS, Evidence, gather_evidence
 from torchelev.diagnosis.history import MAX_ENVS, InputHistory
+from torchelev.diagnosis.sensor_bias import find_alternating_corrections, find_sensor_bias
 from torchelev.diagnosis.shared_range import find_points_on_path, find_shared_range
 from torchelev.state import MapState
 
@@ -26,9 +27,8 @@ _REASONS = {
 
 def diagnose(cfg: ElevationMapConfig, state: MapState, history: InputHistory) -> list[str]:
     """Return what looks wrong, worst first: of each rule the finding in the first environment that has one."""
-    updates = [(env, history.updates_of(env)) for env in range(min(MAX_ENVS, len(state.elevation)))]
-    evidence = [gather_evidence(cfg, state, known, env) for env, known in updates if known]
-    findings = ((rule(seen) for seen in evidence) for rule in _RULES)
+    evidence = [gather_evidence(cfg, state, history, env) for env in range(min(MAX_ENVS, len(state.elevation)))]
+    findings = ((rule(seen) for seen in evidence if seen) for rule in _RULES)
     sentences = [next((text for text in texts if text), None) for texts in findings]
     return [text for text in sentences if text]
 
@@ -203,6 +203,8 @@ _RULES = (
     find_points_on_path,
     _find_wrong_poses,
     _find_wrong_base,
+    find_sensor_bias,
+    find_alternating_corrections,
     _find_closed_gate,
     _find_window_off_points,
     _find_clearing,

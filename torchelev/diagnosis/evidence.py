@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -12,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.config import ElevationMapConfig
-from torchelev.diagnosis.history import PastUpdate
+from torchelev.diagnosis.history import InputHistory, PastUpdate
 from torchelev.diagnosis.pose_hypotheses import explain
 from torchelev.diagnosis.scan_fit import Fit, Scan
 from torchelev.grid import cell_centers
@@ -47,6 +46,7 @@ class Evidence:
     overhang: list[NDArray]  #: mask of the points that only the exclusion ramp rejected
     epsilon: float  #: relative spacing of numbers in the dtype of the points
     statistics: dict[str, float]  #: of the last update
+    corrections: list[float]  #: [m] of the height drift, of updates in a row
     num_known: int  #: known cells
     num_near: int  #: known cells within the radius of overlap clearance
     oldest: float  #: [s] since the last hit of the known cell that waits longest
@@ -123,8 +123,11 @@ class Evidence:
         return np.concatenate([cloud[mask] @ T[:3, :3].T + T[:3, 3] for cloud, T, mask in given])
 
 
-def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[PastUpdate], env: int) -> Evidence:
-    """Read what is known of one environment back to the host."""
+def gather_evidence(cfg: ElevationMapConfig, state: MapState, history: InputHistory, env: int) -> Evidence | None:
+    """Read what is known of one environment back to the host; None if it has had no update."""
+    updates = history.updates_of(env)
+    if not updates:
+        return None
     inputs = [update.inputs for update in updates]
     measured = [_measure_again(cfg, update, env) for update in updates]
     known, corner = state.validity[env], state.corner[env].double().cpu().numpy()
@@ -140,6 +143,7 @@ def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[
         overhang=[(m.casts & ~m.used)[0].cpu().numpy() for m in measured],
         epsilon=torch.finfo(inputs[0].points.dtype).eps,
         statistics={name: float(value[env]) for name, value in state.statistics._asdict().items()},
+        corrections=[*history.corrections_of(env), float(state.statistics.drift_correction[env])],
         num_known=int(known.sum()),
         num_near=_count_near(cfg, state, updates[-1], env),
         oldest=float(torch.where(known, state.time[env], 0.0).max()),

@@ -48,8 +48,8 @@ def _find_shell(clouds: list[_Cloud], tolerance: float) -> str | None:
     if share < _MIN_SHARE or not _is_shell(clouds, at_limit, share, 0.3 * tolerance):
         return None
     return (
-        f"points: {_percent(share)} of the points share one range of {limit:.2f} m, the largest: the sensor's limit, at "
-        "which misses are no hits; make such points NaN, or set sensor.max_distance a little lower"
+        f"points: {_percent(share)} of the points share one range of {limit:.2f} m, the largest: the sensor's limit, "
+        "at which misses are no hits; make such points NaN, or set sensor.max_distance a little lower"
     )
 
 
