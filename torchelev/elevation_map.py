@@ -18,6 +18,7 @@ from torchelev.compiled.update import compile_ahead, compiled_update
 from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
+from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
 from torchelev.diagnosis.pace import Pace, paced
 from torchelev.errors import require, require_count
@@ -75,6 +76,7 @@ class ElevationMap(ReadableMap):
     ) -> None:
         cfg = checks.given_or_default(ElevationMapConfig, cfg)
         num_envs = require_count("num_envs", num_envs, "give the number of maps")
+        survive_forks()
         super().__init__(cfg, num_envs, device, head, completion_net)
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
