@@ -14,6 +14,7 @@ from torchelev.diagnosis.evidence import GATES, MIN_POINTS, Evidence, gather_evi
 from torchelev.diagnosis.history import MAX_ENVS, InputHistory
 from torchelev.diagnosis.sensor_bias import find_alternating_corrections, find_sensor_bias
 from torchelev.diagnosis.shared_range import find_points_on_path, find_shared_range
+from torchelev.diagnosis.surfaces import find_cut_hillside, is_overgrown
 from torchelev.state import MapState
 
 _REASONS = {
@@ -137,7 +138,7 @@ def _find_contradictions(seen: Evidence) -> str | None:
     """Find scans that contradict the map: the outlier gate rejects a large part of them."""
     outliers = seen.statistics["rejected_outlier"]
     total = outliers + seen.statistics["points_used"]
-    if outliers < MIN_POINTS or outliers < 0.3 * total or seen.explained[1]:
+    if outliers < MIN_POINTS or outliers < 0.3 * total or seen.explained[1] or is_overgrown(seen):
         return None
     hint = "check that poses belong to their scans and that the map's z axis points up; see fusion.gate"
     return f"poses: {100 * outliers / total:.0f} % of the points contradict the map; {hint}"
@@ -205,6 +206,7 @@ _RULES = (
     _find_wrong_base,
     find_sensor_bias,
     find_alternating_corrections,
+    find_cut_hillside,
     _find_closed_gate,
     _find_window_off_points,
     _find_clearing,
