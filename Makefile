@@ -82,6 +82,7 @@ bench: setup  ## measure speed and scale, under ten minutes
 quality: setup  ## measure accuracy and features, five minutes
 	$(BIN)/python -m benchmarks.quality.accuracy
 	$(BIN)/python -m benchmarks.quality.features
+	$(BIN)/python -m benchmarks.quality.silence
 	$(BIN)/python -m docs.readme_tables
 
 docs: setup  ## build the documentation in docs/_build/html, warnings as errors; needs no network once it is set up

@@ -63,7 +63,9 @@ def test_the_example_of_the_contract():
     for name in Statistics._fields:
         statistic = getattr(emap.statistics, name)
         assert statistic.shape == (2,), name
-        assert statistic.dtype == (torch.float32 if name in ("drift_error", "drift_correction") else torch.int64)
+        assert statistic.dtype == (
+            torch.float32 if name in ("drift_error", "drift_correction", "disagreement") else torch.int64
+        )
     assert emap.statistics.points_used.min() > 0
 
 

@@ -18,6 +18,7 @@ from torchelev.compiled.update import compile_ahead, compiled_update
 from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
+from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
 from torchelev.diagnosis.pace import Pace, paced
 from torchelev.errors import require, require_count
@@ -30,6 +31,7 @@ from torchelev.ops.transforms import require_reverse_mode
 from torchelev.pipeline import rate_surface, update_in_place, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
+from torchelev.stages.disagreement import relative_variance, with_disagreement, without_disagreement
 from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure import measure
 from torchelev.state import MapState, Measurement, forget, map_layers
@@ -74,6 +76,7 @@ class ElevationMap(ReadableMap):
     ) -> None:
         cfg = checks.given_or_default(ElevationMapConfig, cfg)
         num_envs = require_count("num_envs", num_envs, "give the number of maps")
+        survive_forks()
         super().__init__(cfg, num_envs, device, head, completion_net)
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
@@ -131,7 +134,7 @@ class ElevationMap(ReadableMap):
             ValueError: if a shape, device or value is wrong. Nothing has changed then.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
-        self._history.add(inputs)
+        self._history.add(inputs, self.state.statistics.drift_correction)
         self._derived.clear()
         if self.device.type == "cpu":
             keep_freed_memory(self._num_bytes)
@@ -140,7 +143,7 @@ class ElevationMap(ReadableMap):
         run = functools.partial(run, cfg=self._update_cfg, weights=weights)
         before = self._take_out_predictions()
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
-        with torch.inference_mode():
+        with torch.inference_mode(), relative_variance(self.state):
             run_in_chunks(run, self.state, inputs, self.chunks)
         if before is not None:
             with torch.no_grad():
@@ -195,7 +198,9 @@ class ElevationMap(ReadableMap):
         require(other == dtype, "measurement", f"must be of the state's dtype, {dtype}", other, hint, TypeError)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
         before, state = state, forget_completed(state) if self._writes_back else state
+        state = state._replace(variance=without_disagreement(state))
         new = pipeline.forward(state, measurement, self.cfg, self._weights)
+        new = new._replace(variance=with_disagreement(new))
         if self._writes_back:
             new = self._write_back(before, new)
         return without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))

@@ -54,9 +54,10 @@ def rate_surface(
 
 
 def reset_statistics(state: MapState, m: Measurement) -> MapState:
-    """Set the statistics to zero, and to what the sensor's gates rejected."""
+    """Set the statistics to zero, and to what the sensor's gates rejected; keep those that drift compensation reads."""
     gates = ("rejected_invalid", "rejected_range", "rejected_body", "rejected_overhang")
-    zeros = {name: torch.zeros_like(value) for name, value in state.statistics._asdict().items()}
+    kept = ("drift_correction", "disagreement")
+    zeros = {n: torch.zeros_like(value) for n, value in state.statistics._asdict().items() if n not in kept}
     return tally(state, **(zeros | {name: getattr(m, name) for name in gates}))
 
 

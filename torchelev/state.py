@@ -28,6 +28,8 @@ class Statistics(NamedTuple):
     drift_points: Int[Tensor, "B"]  #: that measured the height drift
     drift_error: Float[Tensor, "B"]  #: [m] mean height error of these points
     drift_correction: Float[Tensor, "B"]  #: [m] added to the map's heights
+    #: [m] by which sensors, or successive scans, disagree in height; its square is part of every variance
+    disagreement: Float[Tensor, "B"]
     cleared_seen_through: Int[Tensor, "B"]  #: cells that visibility clean-up removed
     cleared_other_floors: Int[Tensor, "B"]  #: cells that overlap clearance removed
     cells_bounded: Int[Tensor, "B"]  #: unknown cells that have an upper bound
@@ -96,7 +98,7 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
     number = torch.zeros(num_envs, device=device, dtype=dtype)
     zero = torch.zeros(num_envs, device=device, dtype=torch.int64)
     corner = torch.stack([zero + cells for cells in blank_corner(grid)], -1)
-    heights = {"drift_error", "drift_correction"}
+    heights = {"drift_error", "drift_correction", "disagreement"}
     kinds = dict.fromkeys(MASKS, torch.bool) | {"challenger_support": torch.uint8}
     values = {name: (layer + BLANK.get(name, 0.0)).to(kinds.get(name, dtype)) for name in LAYERS}
     statistics = Statistics(*(number.clone() if f in heights else zero.clone() for f in Statistics._fields))

@@ -64,3 +64,23 @@ def test_finds_the_cells_at_steps():
     scene = make_course()
     xy = torch.tensor([[[0.0, 0.413], [0.0, -0.2]]], dtype=torch.float64)
     assert demo.find_steps(scene, xy, 0.0).tolist() == [[True, False]]
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (["--seconds", "nan"], "seconds: must be positive, got nan"),
+        (["--seconds", "-5"], "seconds: must be positive, got -5.0"),
+        (["--out", "d.xyz"], "must be a picture, got one of suffix .xyz"),
+        (["--out", "nowhere/d.png"], "there is no folder"),
+    ],
+)
+def test_bad_options_are_one_line_before_the_walk(options, words, tmp_path, monkeypatch):
+    from click.testing import CliRunner
+
+    from torchelev.app.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(demo, "DemoWalk", None)
+    done = CliRunner().invoke(main, ["demo", "--quiet", *options])
+    assert done.exit_code == 2 and words in done.output and done.output.count("\n") == 1

@@ -53,6 +53,13 @@ def with_legs(points, T, base):
     return torch.cat([points, leg], 1), T, base
 
 
+def mounting(T, base):
+    """Return the rotation (1, 4, 4) of the sensor on its base."""
+    M = torch.linalg.inv(base) @ T
+    M[..., :3, 3] = 0.0
+    return M
+
+
 MISTAKES = {
     "in the map frame already": lambda p, T, base: (move(T, p), T, base),
     "millimetres": lambda p, T, base: (1000 * p, T, base),
@@ -219,3 +226,59 @@ def test_random_sound_scenes_are_passed_over(seed):
         base = path.T_map_base[k, None] if knows_base else None
         emap.update(points[None], path.T_map_sensor[k, None], base, dt=DT)
     assert emap.diagnose() == []
+
+
+TWICE = {
+    "as the points have the axes of the base already": lambda p, T, base: (move(mounting(T, base), p), T, base),
+    "is applied twice in T_map_sensor": lambda p, T, base: (p, T @ mounting(T, base), base),
+}
+
+
+@pytest.mark.parametrize("words", TWICE)
+@pytest.mark.parametrize("num_scans", [1, 12])
+@pytest.mark.parametrize("pitch", [12.0, 20.0, 35.0])
+def test_a_mounting_that_is_applied_twice_is_named(words, pitch, num_scans):
+    """The ground is tilted by no more than a hill would be, but moves with the robot."""
+    scene, camera = library.flat(), SENSORS["camera"][0]
+    path = walk(scene, [(-1.0, 0.0), (1.0, 0.0)], dt=DT, T_base_sensor=mount(pitch), sway=0.0)
+    poses = list(zip(path.T_map_sensor, path.T_map_base, strict=True))[:num_scans]
+    scans = [(camera.cast(scene, T)[None], T[None], base[None]) for T, base in poses]
+    assert map_of(scans).diagnose() == []
+    first, *_ = map_of(scans, TWICE[words]).diagnose()
+    assert words in first and sum(other in first for other in TWICE) == 1
+
+
+GRID = torch.tensor([603412.0, 187250.0, 940.0], dtype=torch.float64)  # [m] a place in a national grid
+
+
+def test_points_in_a_national_grid_are_not_in_millimetres(walked):
+    """They lie far away but close together."""
+    points, T, base = walked[0]
+    (sentence,) = map_of([(points.double() + GRID, torch.eye(4, dtype=torch.float64)[None], None)]).diagnose()
+    assert "they lie 631," in sentence and "in the map's frame, such as a national grid" in sentence
+    T = T.clone()
+    T[:, :3, 3] += GRID
+    (sentence,) = map_of([(points.double() @ T[..., :3, :3].mT + T[:, None, :3, 3], T, None)]).diagnose()
+    assert "the pose is applied twice" in sentence
+
+
+def test_registered_points_around_a_base_60_m_away_are_named(walked):
+    """Their rays would start at the map's origin."""
+    points, _, base = walked[0]
+    away = points + torch.tensor([60.0, 0.0, 0.0])
+    (sentence,) = map_of([(away, torch.eye(4)[None].double(), base + shift(0, 60.0))]).diagnose()
+    assert "they are in the map's frame" in sentence
+
+
+def test_millimetres_of_a_narrow_view_stay_millimetres():
+    narrow = torch.tensor([3000.0, 0, 0]) + 400 * torch.rand(1, 2000, 3, generator=torch.Generator().manual_seed(0))
+    (sentence,) = map_of([(narrow, torch.eye(4)[None], None)]).diagnose()
+    assert "as of millimetres" in sentence
+
+
+def test_infinite_points_are_no_matter(walked, recwarn):
+    """Simulators return misses as infinite points."""
+    points, T, base = walked[0]
+    points = points.clone()
+    points[:, ::7], points[:, 3::7] = torch.inf, -torch.inf
+    assert map_of([(points, T, base)]).diagnose() == [] and not recwarn.list

@@ -12,13 +12,14 @@ from torchelev import __version__
 from torchelev.app.mapping.map_command import run_map
 from torchelev.app.mapping.map_options import MAP_HELP, map_options
 from torchelev.app.mapping.map_request import MapRequest
-from torchelev.app.user_error import user_errors
+from torchelev.app.user_error import plain_warnings, user_errors
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__)
 def main() -> None:
     """Build elevation maps from point clouds and depth images."""
+    click.get_current_context().with_resource(plain_warnings())
 
 
 @main.command("map", help=MAP_HELP, short_help="Build an elevation map from scans with poses, or a bag.")
@@ -46,9 +47,10 @@ def bag_command(bag: Path) -> None:
 @click.option("--quiet", is_flag=True, help="Hide the progress bar.")
 def demo_command(out: Path, seconds: float | None, quiet: bool) -> None:
     """Map a simulated walk with a depth camera and compare the map with the ground truth."""
-    from torchelev.app.demo import run_demo
+    with user_errors():
+        from torchelev.app.demo import run_demo
 
-    click.echo(run_demo(out=out, seconds=seconds, progress=not quiet))
+        click.echo(run_demo(out=out, seconds=seconds, progress=not quiet))
     click.echo(f"wrote {out}")
 
 

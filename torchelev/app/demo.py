@@ -5,6 +5,7 @@ Run ``make demo`` or ``torchelev demo``. Needs ``torchelev[io]``.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from tqdm import tqdm
 from torchelev.app.demo_course import LANDMARKS, ROUTE, make_course
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
+from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.output_files import require_writable
 from torchelev.sim import DepthCamera, Scene, Trajectory, mount, outliers, range_noise, steps, walk
@@ -130,8 +132,14 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
         The errors of the map and the speed of updates.
 
     Raises:
-        WriteError: the picture cannot be written; raised before the walk.
+        WriteError: the picture cannot be written; raised before the walk, as is ValueError.
+        ValueError: the suffix is no picture's, or the time is not positive.
     """
+    if seconds is not None:
+        require(0 < seconds < math.inf, "seconds", "must be positive", seconds, "leave it out for the whole course")
+    from torchelev.viz.style import require_picture
+
+    require_picture(out)
     require_writable(out)
     demo, hit = DemoWalk(seconds), _HitCells(GRID.resolution)
     for scan in tqdm(demo, desc="walking and mapping", unit="scan", disable=not progress):

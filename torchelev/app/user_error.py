@@ -1,7 +1,8 @@
-"""Errors of the user: one line on stderr and exit code 2, without a traceback."""
+"""Errors of the user and warnings: one line each on stderr, without a traceback or a line of source."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,7 +10,7 @@ import click
 
 from torchelev.io.errors import RecordingError
 
-BAD_INPUT = 2  # exit code
+BAD_INPUT, EMPTY_MAP = 2, 3  # exit codes
 # The extra of torchelev that installs a package.
 _EXTRAS = {"rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site"}
 
@@ -21,6 +22,28 @@ class UserError(click.ClickException):
 
     def __init__(self, error: object) -> None:
         super().__init__(" ".join(str(error).split()))
+
+
+class EmptyMapError(click.ClickException):
+    """A map that holds nothing, or next to nothing, of its recording: print one line to stderr and exit with code 3."""
+
+    exit_code = EMPTY_MAP
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Print each different warning of the block as one line on stderr."""
+    seen: set[str] = set()
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        text = " ".join(str(message).split())
+        if text not in seen:
+            seen.add(text)
+            click.echo(f"warning: {text}", err=True)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.evidence import GATES, MIN_POINTS, Evidence, gather_evidence
 from torchelev.diagnosis.history import MAX_ENVS, InputHistory
+from torchelev.diagnosis.sensor_bias import find_alternating_corrections, find_sensor_bias
+from torchelev.diagnosis.shared_range import find_points_on_path, find_shared_range
+from torchelev.diagnosis.surfaces import find_cut_hillside, is_overgrown
 from torchelev.state import MapState
 
 _REASONS = {
@@ -25,9 +28,8 @@ _REASONS = {
 
 def diagnose(cfg: ElevationMapConfig, state: MapState, history: InputHistory) -> list[str]:
     """Return what looks wrong, worst first: of each rule the finding in the first environment that has one."""
-    updates = [(env, history.updates_of(env)) for env in range(min(MAX_ENVS, len(state.elevation)))]
-    evidence = [gather_evidence(cfg, state, known, env) for env, known in updates if known]
-    findings = ((rule(seen) for seen in evidence) for rule in _RULES)
+    evidence = [gather_evidence(cfg, state, history, env) for env in range(min(MAX_ENVS, len(state.elevation)))]
+    findings = ((rule(seen) for seen in evidence if seen) for rule in _RULES)
     sentences = [next((text for text in texts if text), None) for texts in findings]
     return [text for text in sentences if text]
 
@@ -38,6 +40,23 @@ def _find_millimetres(seen: Evidence) -> str | None:
         return None
     median = float(np.median(seen.distances))
     return f"points: the median distance is {median:,.0f} m, as of millimetres: check units, and multiply them by 0.001"
+
+
+def _find_far_cloud(seen: Evidence) -> str | None:
+    """Find points in another frame than the sensor's: near each other, and far from where the pose has the sensor."""
+    cloud = seen.far_cloud
+    if cloud is None:
+        return None
+    where = f"points: they lie {cloud.distance:,.0f} m from the sensor and within {cloud.radius:,.1f} m of each other"
+    if cloud.is_at_sensor:
+        return (
+            f"{where}, where T_map_sensor has the sensor: they are in the map frame already, and the pose is applied "
+            "twice; give sensor-frame points, inverse(T_map_sensor) times these"
+        )
+    return (
+        f"{where}: they are in the map's frame, such as a national grid, and T_map_sensor lacks the sensor's place in "
+        "it; give its pose in that frame, and sensor-frame points: subtract its position in float64"
+    )
 
 
 def _find_wrong_poses(seen: Evidence) -> str | None:
@@ -72,7 +91,7 @@ def _find_wrong_base(seen: Evidence) -> str | None:
 
 def _find_closed_gate(seen: Evidence) -> str | None:
     """Find sensor gates that reject nearly all points."""
-    if seen.num_points < MIN_POINTS or seen.is_in_millimetres:
+    if seen.num_points < MIN_POINTS or seen.is_in_millimetres or seen.far_cloud:
         return None
     for name in GATES:
         tested = seen.num_points - (0 if name == "invalid" else seen.gates["invalid"])
@@ -119,7 +138,7 @@ def _find_contradictions(seen: Evidence) -> str | None:
     """Find scans that contradict the map: the outlier gate rejects a large part of them."""
     outliers = seen.statistics["rejected_outlier"]
     total = outliers + seen.statistics["points_used"]
-    if outliers < MIN_POINTS or outliers < 0.3 * total or seen.explained[1]:
+    if outliers < MIN_POINTS or outliers < 0.3 * total or seen.explained[1] or is_overgrown(seen):
         return None
     hint = "check that poses belong to their scans and that the map's z axis points up; see fusion.gate"
     return f"poses: {100 * outliers / total:.0f} % of the points contradict the map; {hint}"
@@ -180,8 +199,14 @@ def _height_over_ground(points: NDArray, position: NDArray) -> NDArray:
 
 _RULES = (
     _find_millimetres,
+    _find_far_cloud,
+    find_shared_range,
+    find_points_on_path,
     _find_wrong_poses,
     _find_wrong_base,
+    find_sensor_bias,
+    find_alternating_corrections,
+    find_cut_hillside,
     _find_closed_gate,
     _find_window_off_points,
     _find_clearing,

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from torchelev.config import ElevationMapConfig
-from torchelev.diagnosis.history import PastUpdate
+from torchelev.diagnosis.history import InputHistory, PastUpdate
 from torchelev.diagnosis.pose_hypotheses import explain
 from torchelev.diagnosis.scan_fit import Fit, Scan
 from torchelev.grid import cell_centers
@@ -19,7 +19,16 @@ from torchelev.stages.measure import measure
 from torchelev.state import MapState, Measurement
 
 MIN_POINTS = 20  # points that a fraction or a median must rest on
+_FAR = 250.0  # [m] beyond what sensors of robots measure
 GATES = ("invalid", "range", "body", "overhang")  # of the sensor, in their order
+
+
+class FarCloud(NamedTuple):
+    """A cloud whose points are near each other and far from the sensor."""
+
+    distance: float  #: [m] of its middle from the sensor
+    radius: float  #: [m] median distance of its points from the middle
+    is_at_sensor: bool  #: read in the map frame, it lies where the pose says that the sensor is
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,10 @@ class Evidence:
     dt: NDArray  #: [s]
     gates: dict[str, int]  #: points of all updates, by the gate that rejected them
     used: list[NDArray]  #: mask of the points that passed the sensor's gates
+    overhang: list[NDArray]  #: mask of the points that only the exclusion ramp rejected
+    epsilon: float  #: relative spacing of numbers in the dtype of the points
     statistics: dict[str, float]  #: of the last update
+    corrections: list[float]  #: [m] of the height drift, of updates in a row
     num_known: int  #: known cells
     num_near: int  #: known cells within the radius of overlap clearance
     oldest: float  #: [s] since the last hit of the known cell that waits longest
@@ -59,16 +71,38 @@ class Evidence:
         return np.concatenate([np.linalg.norm(scan.points, axis=1) for scan in self.scans] or [np.zeros(0)])
 
     @cached_property
+    def is_beyond_range(self) -> bool:
+        """Whether most points are rejected for their distance."""
+        return len(self.distances) >= MIN_POINTS and self.gates["range"] >= 0.5 * len(self.distances)
+
+    @cached_property
+    def far_cloud(self) -> FarCloud | None:
+        """The cloud, if its points are near each other and far from the sensor: they are in another frame."""
+        if not self.is_beyond_range:
+            return None
+        scan = self.scans[-1]
+        middle = np.median(scan.points, axis=0)
+        distance = float(np.linalg.norm(middle))
+        radius = float(np.median(np.linalg.norm(scan.points - middle, axis=1)))
+
+        def is_at(T: NDArray | None) -> bool:
+            return T is not None and bool(np.linalg.norm(middle - T[:3, 3]) < 0.2 * distance)
+
+        is_near = radius < min(0.2 * distance, self.cfg.sensor.max_distance)  # in metres; millimetres spread farther
+        is_elsewhere = is_at(scan.T) or is_at(scan.base) or distance >= _FAR
+        return FarCloud(distance, radius, is_at(scan.T)) if is_near and is_elsewhere else None
+
+    @cached_property
     def is_in_millimetres(self) -> bool:
-        """Whether the points lie hundreds of times as far away as sensors measure."""
-        if len(self.distances) < MIN_POINTS or self.gates["range"] < 0.5 * len(self.distances):
+        """Whether the points lie hundreds of times as far away as sensors measure, and as far from each other."""
+        if not self.is_beyond_range or self.far_cloud is not None:
             return False
-        return float(np.median(self.distances)) >= max(250.0, 2 * self.cfg.sensor.max_distance)
+        return float(np.median(self.distances)) >= max(_FAR, 2 * self.cfg.sensor.max_distance)
 
     @cached_property
     def explained(self) -> tuple[Fit, list[str]]:
         """How well poses and points fit, and the mistakes that would explain why they do not."""
-        is_comparable = self.scans and not self.is_in_millimetres
+        is_comparable = self.scans and not (self.is_in_millimetres or self.far_cloud)
         return explain(self.scans) if is_comparable else (Fit(np.nan, np.nan, np.nan, np.nan), [])
 
     @cached_property
@@ -84,12 +118,16 @@ class Evidence:
 
     def used_points(self, k: int) -> NDArray:
         """Return the points (n, 3) [m] of update k that passed the sensor's gates, map frame."""
-        clouds = [cloud @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(self.points[k], self.poses[k], strict=True)]
-        return np.concatenate(clouds)[self.used[k]]
+        sensors = np.split(self.used[k], len(self.points[k]))
+        given = zip(self.points[k], self.poses[k], sensors, strict=True)
+        return np.concatenate([cloud[mask] @ T[:3, :3].T + T[:3, 3] for cloud, T, mask in given])
 
 
-def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[PastUpdate], env: int) -> Evidence:
-    """Read what is known of one environment back to the host."""
+def gather_evidence(cfg: ElevationMapConfig, state: MapState, history: InputHistory, env: int) -> Evidence | None:
+    """Read what is known of one environment back to the host; None if it has had no update."""
+    updates = history.updates_of(env)
+    if not updates:
+        return None
     inputs = [update.inputs for update in updates]
     measured = [_measure_again(cfg, update, env) for update in updates]
     known, corner = state.validity[env], state.corner[env].double().cpu().numpy()
@@ -102,7 +140,10 @@ def gather_evidence(cfg: ElevationMapConfig, state: MapState, updates: Sequence[
         dt=np.array([float(given.dt[env]) for given in inputs]),
         gates={name: sum(int(getattr(m, f"rejected_{name}")) for m in measured) for name in GATES},
         used=[m.used[0].cpu().numpy() for m in measured],
+        overhang=[(m.casts & ~m.used)[0].cpu().numpy() for m in measured],
+        epsilon=torch.finfo(inputs[0].points.dtype).eps,
         statistics={name: float(value[env]) for name, value in state.statistics._asdict().items()},
+        corrections=[*history.corrections_of(env), float(state.statistics.drift_correction[env])],
         num_known=int(known.sum()),
         num_near=_count_near(cfg, state, updates[-1], env),
         oldest=float(torch.where(known, state.time[env], 0.0).max()),

@@ -12,8 +12,11 @@ from torchelev.inputs.update_inputs import Inputs
 
 MAX_ENVS = 4  # the first environments: a wrong convention is wrong in all of them
 _MAX_UPDATES = 8
+_MAX_CORRECTIONS = 32  # of updates in a row
 _MAX_POINTS = 3000  # per sensor, evenly spaced
-_STRIDE = 4  # after the first updates every fourth is kept, so that a robot moves between the first and the last
+# After the first updates two of seven are kept, so that a robot moves between the first and the last, and sensors that
+# take turns, two to six of them, are all among them.
+_PERIOD = 7
 
 
 class PastUpdate(NamedTuple):
@@ -33,13 +36,16 @@ class InputHistory:
     def __init__(self) -> None:
         self._updates: deque[PastUpdate] = deque(maxlen=_MAX_UPDATES)
         self._num_updates = 0
+        self._corrections: deque[tuple[int, Tensor]] = deque(maxlen=_MAX_CORRECTIONS)
         self._first: Tensor | None = None  # (MAX_ENVS,) number of the first update since the last reset; None: 0
 
-    def add(self, inputs: Inputs) -> None:
-        """Keep an update's inputs, if it is their turn."""
+    def add(self, inputs: Inputs, last_correction: Tensor) -> None:
+        """Keep an update's inputs, if it is their turn, and the drift correction (B,) [m] of the update before it."""
         if torch.compiler.is_compiling():
             return
-        if self._num_updates < _MAX_UPDATES or self._num_updates % _STRIDE == 0:
+        with torch.inference_mode(False), torch.no_grad():
+            self._corrections.append((self._num_updates - 1, last_correction[:MAX_ENVS].detach().clone()))
+        if self._num_updates < _MAX_UPDATES or self._num_updates % _PERIOD < 2:
             self._updates.append(PastUpdate(self._num_updates, _thin(inputs)))
         self._num_updates += 1
 
@@ -47,6 +53,7 @@ class InputHistory:
         """Forget the inputs of all environments, or of some: after a reset, poses may be in another map frame."""
         if (env_ids is None and mask is None) or torch.compiler.is_compiling():
             self._updates.clear()
+            self._corrections.clear()
             self._num_updates, self._first = 0, None
             return
         with torch.inference_mode(False), torch.no_grad():
@@ -62,10 +69,15 @@ class InputHistory:
         first = 0 if self._first is None else int(self._first[env])
         return [update for update in self._updates if update.number >= first]
 
+    def corrections_of(self, env: int) -> list[float]:
+        """Return the drift corrections [m] of the last updates but one since an environment's reset, in their order."""
+        first = 0 if self._first is None else int(self._first[env])
+        return [float(correction[env]) for number, correction in self._corrections if number >= first]
+
 
 def _thin(inputs: Inputs) -> Inputs:
     """Copy the inputs of the first environments, with every k-th point."""
-    step = max(1, -(-inputs.points.shape[2] // _MAX_POINTS))
+    step = max(1, -(-inputs.points.shape[2] // _MAX_POINTS)) | 1  # odd: rings and columns often are powers of two
 
     def copy(value: Tensor) -> Tensor:
         return value[:MAX_ENVS].detach().clone()

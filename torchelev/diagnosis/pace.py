@@ -15,6 +15,7 @@ from typing import Any, TypeVar, cast
 
 import torch
 
+from torchelev.diagnosis.forks import warn_of_fork
 from torchelev.ops.waiting import adapted_waits, are_waits_short
 
 WINDOW = 9  # updates per median; more than half of them must be slow, so that compiling a few does not count
@@ -87,6 +88,7 @@ def paced(update: Update) -> Update:
     def timed(emap: Any, /, *args: Any, **kwargs: Any) -> None:
         if torch.compiler.is_compiling():  # a graph of the caller's own cannot contain a clock
             return update(emap, *args, **kwargs)
+        warn_of_fork()
         start = emap.pace.clock()
         with adapted_waits(emap.device):
             update(emap, *args, **kwargs)

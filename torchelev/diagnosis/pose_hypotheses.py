@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torchelev.diagnosis.scan_fit import Fit, Scan, Undo, evaluate, find_plane
 from torchelev.frames.camera_axes import CAMERA_AXES
 
+_TILTED, _LEVEL = np.cos(np.radians([8.0, 1.5]))  # cosines of the ground's tilt
 _OPTICAL = CAMERA_AXES["optical"]  # takes x right, y down, z forward to x forward, y left, z up
 
 
@@ -68,6 +69,25 @@ def _correct_base(correct: Callable[[NDArray], NDArray]) -> Undo:
     return undo
 
 
+def _correct_mounting(correct: Callable[[NDArray], NDArray]) -> Undo:
+    """Undo a mistake in the sensor's rotation on its base."""
+
+    def undo(scan: Scan) -> tuple[NDArray, NDArray]:
+        if scan.base is None or not np.isfinite(scan.base).all():
+            return _keep(scan)
+        R_map_base = scan.base[:3, :3]
+        return _compose(R_map_base @ correct(R_map_base.T @ scan.T[:3, :3]), scan.T[:3, 3]), np.zeros(3)
+
+    return undo
+
+
+def _halve(R: NDArray) -> NDArray:
+    """Return the rotation that gives R when it is applied twice."""
+    q = to_quaternion(R)
+    q = (q if q[0] >= 0 else -q) + [1.0, 0.0, 0.0, 0.0]
+    return to_rotation(q / np.linalg.norm(q))
+
+
 def _reorder(shift: int) -> Callable[[NDArray], NDArray]:
     """Return the correction of a rotation whose quaternion (w, x, y, z) was shifted: 1 moves its last entry to w."""
     return lambda R: to_rotation(np.roll(to_quaternion(R), shift))
@@ -90,6 +110,14 @@ _MISTAKES: dict[str, Undo] = {
     "a quaternion in the order w x y z was read as x y z w: "
     "reorder it": _correct(_reorder(-1)),
 }  # fmt: skip
+_MOUNTING_MISTAKES: dict[str, Undo] = {
+    "the sensor's mounting is applied twice, as the points have the axes of the base already: "
+    "give the points in the sensor's axes, or a pose with the rotation of T_map_base": _correct_mounting(
+        lambda R: np.eye(3)
+    ),
+    "the rotation of the sensor's mounting is applied twice in T_map_sensor: "
+    "multiply T_map_base by it once": _correct_mounting(_halve),
+}  # fmt: skip
 _BASE_MISTAKES: dict[str, Undo] = {
     "the base's quaternion, in the order x y z w, was read as w x y z, and T_map_sensor follows from it: "
     "reorder it": _correct_base(_reorder(1)),
@@ -104,8 +132,19 @@ def explain(scans: list[Scan]) -> tuple[Fit, list[str]]:
     given = evaluate(scans, planes, _keep)
     mistakes = _MISTAKES if given.is_wrong else {}
     if not (given.is_sound and given.lowest > 0.8):  # a base tilts as it turns, so that most scans may still fit
-        mistakes = mistakes | _BASE_MISTAKES
+        mistakes = mistakes | _MOUNTING_MISTAKES | _BASE_MISTAKES
     fits = {name: evaluate(scans, planes, undo) for name, undo in mistakes.items()}
     sound = {name: f for name, f in fits.items() if f.is_sound and f.score > given.score + 0.25}
+    if not sound and given.level < _TILTED and _is_still_and_level(scans):
+        fits = {name: evaluate(scans, planes, undo) for name, undo in _MOUNTING_MISTAKES.items()}
+        sound = {name: f for name, f in fits.items() if f.is_sound and f.lowest > _LEVEL}
     best = max((f.score for f in sound.values()), default=0.0)
     return given, [name for name, f in sound.items() if f.score > best - 0.02]
+
+
+def _is_still_and_level(scans: list[Scan]) -> bool:
+    """Return whether the robot stands, upright: a ground that is tilted as its sensor is then has no other trace."""
+    bases = [scan.base for scan in scans if scan.base is not None]
+    if len(bases) < len(scans) or min(T[2, 2] for T in bases) < _LEVEL:
+        return False
+    return float(np.ptp([T[:3, 3] for T in bases], axis=0).max()) < 0.2

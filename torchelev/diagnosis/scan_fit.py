@@ -16,7 +16,7 @@ _NUM_PLANES = 80  # random planes per scan (RANSAC)
 _MAX_DISTANCE = 10.0  # [m] of the points from their sensor
 _CELL_SIZE = 0.15  # [m] of the cells in which scans are compared
 _TOLERANCE = 0.08  # [m] within which scans agree in a cell
-_MIN_CELLS = 40  # cells that a comparison of scans must rest on
+MIN_CELLS = 40  # cells that a comparison of scans must rest on
 
 
 @dataclass(frozen=True)
@@ -90,13 +90,13 @@ def evaluate(scans: list[Scan], planes: list[Plane | None], undo: Undo) -> Fit:
             up = float(T[2, :3] @ plane.normal) * np.sign(height)
             levels.append(up if abs(height) > 0.05 else -1.0)  # the sensor would lie in the ground
         near = scan.points[np.linalg.norm(scan.points - position, axis=1) < _MAX_DISTANCE]
-        cells.append(_average_cells(near @ T[:3, :3].T + T[:3, 3]))
+        cells.append(average_cells(near @ T[:3, :3].T + T[:3, 3]))
     if not levels:
         return Fit(np.nan, np.nan, _compare(cells), np.nan)
     return Fit(float(np.median(levels)), min(levels), _compare(cells), float(np.std(heights)))
 
 
-def _average_cells(points: NDArray) -> dict[tuple[int, int], float]:
+def average_cells(points: NDArray) -> dict[tuple[int, int], float]:
     """Return the mean height [m] of each cell whose points have nearly the same."""
     keys, inverse = np.unique(np.floor(points[:, :2] / _CELL_SIZE).astype(np.int64), axis=0, return_inverse=True)
     inverse = inverse.ravel()
@@ -110,4 +110,4 @@ def _compare(cells: list[dict[tuple[int, int], float]]) -> float:
     """Return the fraction of the cells in which the last scan agrees with another one; NaN if they share too few."""
     last = cells[-1]
     agrees = [abs(z - other[key]) < _TOLERANCE for other in cells[:-1] for key, z in last.items() if key in other]
-    return float(np.mean(agrees)) if len(agrees) >= _MIN_CELLS else np.nan
+    return float(np.mean(agrees)) if len(agrees) >= MIN_CELLS else np.nan

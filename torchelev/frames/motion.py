@@ -103,8 +103,10 @@ def deskew(
     # Relative to the instant before the precision is that of the points: 100 km away, float32 misses centimetres.
     relative = torch.linalg.inv(T_at) @ poses
     segments = _find_segments(relative, stamps, times, max_extrapolation)
-    T, rotation, shift = (value.to(points.dtype) for value in segments)
-    return (T[..., :3, :3] @ _turn(rotation, points)[..., None])[..., 0] + T[..., :3, 3] + shift
+    dtype = torch.promote_types(points.dtype, torch.float32)  # halves would lose centimetres
+    T, rotation, shift = (value.to(dtype) for value in segments)
+    moved = (T[..., :3, :3] @ _turn(rotation, points.to(dtype))[..., None])[..., 0] + T[..., :3, 3] + shift
+    return moved.to(points.dtype)
 
 
 def _check(poses: Tensor, stamps: Tensor, max_extrapolation: float) -> None:

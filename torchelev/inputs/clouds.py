@@ -47,6 +47,7 @@ def depth_to_points(
     require(along in ("z", "ray"), "along", 'must be "z" or "ray"', repr(along), 'pinhole depth images are "z"')
     require_axes("frame", frame)
     _check_images(depth, intrinsics)
+    dtype = depth.dtype if depth.dtype.is_floating_point else torch.float32
     depth = _in_metres(depth, scale)
     intrinsics = intrinsics.to(depth)
     v = torch.arange(depth.shape[-2], device=depth.device, dtype=depth.dtype)[:, None]
@@ -57,7 +58,7 @@ def depth_to_points(
     if along == "ray":
         rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     hit = torch.isfinite(depth) & (depth > 0)
-    return (rays * torch.where(hit, depth, math.nan)[..., None]).flatten(-3, -2)
+    return (rays * torch.where(hit, depth, math.nan)[..., None]).flatten(-3, -2).to(dtype)
 
 
 def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
@@ -83,16 +84,21 @@ def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
 
 
 def _in_metres(depth: Tensor, scale: float | None) -> Tensor:
-    """Return depth as floats [m]; integers need a scale, as their unit is not known."""
+    """Return depth as floats [m], at least float32; integers need a scale, as their unit is not known."""
     kind = depth.dtype
     numbers = kind != torch.bool and not kind.is_complex
     require(numbers, "depth", "must be floats or integers", kind, "give metres, or integers and scale=", TypeError)
     known = kind.is_floating_point or scale is not None
     require(known, "scale", "is required for integer depth", "None", "give metres per unit: 0.001 for millimetres")
-    if scale is None:
-        return depth
-    require_positive(scale=scale)
-    return (depth if kind.is_floating_point else depth.to(torch.float32)) * scale
+    if scale is not None:
+        require_positive(scale=scale)
+    depth = depth.to(_full_precision(kind))
+    return depth if scale is None else depth * scale
+
+
+def _full_precision(dtype: torch.dtype) -> torch.dtype:
+    """Return the dtype to compute in: halves lose centimetres, and their sums overflow; integers become float32."""
+    return torch.promote_types(dtype, torch.float32)
 
 
 def voxel_filter(points: Float[Tensor, "B N 3"], size: float, max_points: int | None = None) -> Float[Tensor, "B K 3"]:
@@ -115,7 +121,7 @@ def voxel_filter(points: Float[Tensor, "B N 3"], size: float, max_points: int | 
     require(fits, "points", "expected (B, N, 3)", tuple(points.shape), "add the first dimension: points[None]")
     floats, hint = points.dtype.is_floating_point, "convert them with .to(torch.float32)"
     require(floats, "points", "must be floats", points.dtype, hint, TypeError)
-    means = _voxel_means(points, size)
+    means = _voxel_means(points.to(_full_precision(points.dtype)), size).to(points.dtype)
     if max_points is None:
         return means
     K = require_count("max_points", max_points, "give how many points to keep, or None")

@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ from typing import Any
 
 _SOURCES = Path(__file__).parent
 _FLAGS = "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -fPIC -shared -pthread -Wno-psabi".split()
+_UNFINISHED = "building-"  # folders of builds
+_BUILD_TIME = 300  # [s] at most
 _OFF = ("0", "off", "false", "no")
 
 
@@ -119,13 +122,22 @@ def cache_folder() -> Path:
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchelev"
 
 
+def _remove_abandoned(cache: Path) -> None:
+    """Remove folders of builds that were killed: older than any build takes."""
+    for folder in cache.glob(f"{_UNFINISHED}*"):
+        with contextlib.suppress(OSError):
+            if time.time() - folder.stat().st_mtime > 2 * _BUILD_TIME:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
 def _build(compiler: list[str], flags: list[str], source: Path, path: Path) -> None:
     """Compile a file; the library appears whole or not at all, also if several processes build it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    _remove_abandoned(path.parent)
+    with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=path.parent) as folder:
         built = Path(folder) / path.name
         command = [*compiler, *flags, str(source), "-o", str(built)]
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=300)
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=_BUILD_TIME)
         os.replace(built, path)
 
 

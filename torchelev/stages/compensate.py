@@ -12,6 +12,7 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE, count
 from torchelev.ops.storage import realize
 from torchelev.stages.cells import cells_of, center_offsets
+from torchelev.stages.disagreement import compare_scans, compare_sensors
 from torchelev.stages.pose_error import share_pose_error
 from torchelev.state import MapState, Measurement, tally
 
@@ -54,8 +55,11 @@ def compensate(
 
     with h the height of the cell's plane below the point. The sum covers the points whose cell is known, certain and
     rated at least `min_traversability`, with |p_z - h| <= max_error, and then those within `gate` standard deviations
-    of their mean. No correction if n < min_points or |e| > max_drift, or without `cfg`.
+    of their mean. No correction if n < min_points or |e| > max_drift, or without `cfg`. Notes by how much scans, or the
+    sensors of one, disagree.
     """
+    if m.origin.shape[1] > 1:
+        state = tally(state, disagreement=compare_sensors(state, m, grid))
     if cfg is None:
         return share_pose_error(state, m, torch.zeros_like(m.dt, dtype=torch.bool))
     cells = cells_of(state, m, grid)
@@ -77,6 +81,9 @@ def compensate(
     applies = (number >= cfg.min_points) & (mean.abs() <= cfg.max_drift)
     correction = torch.where(applies, cfg.gain * mean, 0.0)
     shift = correction[:, None, None]
+    if m.origin.shape[1] == 1:
+        of_mean = masked_mean(noise + cfg.relief**2, counts) / number.clamp(min=1)
+        state = tally(state, disagreement=compare_scans(state, correction, of_mean))
     state = state._replace(
         elevation=state.elevation + shift * state.validity,
         challenger=state.challenger + shift.detach() * (state.challenger_support > 0),

@@ -24,6 +24,7 @@ from matplotlib.image import AxesImage
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from torchelev.errors import require
 from torchelev.output_files import MARK, atomic_file
 
 UNKNOWN_COLOR = "#d9d9d9"  #: cells without a value
@@ -108,6 +109,13 @@ def save(figure: Figure, path: str | Path) -> None:
     """
     for suffix in (".png", ".svg"):
         write(figure, Path(path).with_suffix(suffix))
+
+
+def require_picture(path: str | Path) -> None:
+    """Raise ValueError unless `write` knows the format that the ending of `path` names."""
+    known, suffix = sorted(Figure().canvas.get_supported_filetypes()), Path(path).suffix
+    is_known = suffix.lower().removeprefix(".") in ("", *known)
+    require(is_known, "out", "must be a picture", f"one of suffix {suffix}", f"name it .png, or {', '.join(known)}")
 
 
 def write(figure: Figure, path: str | Path) -> None:

@@ -61,7 +61,7 @@ def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
     assert saved.center[2] == pytest.approx(0, abs=1e-6)
     # A base 4 m below the ground: everything near belongs to another floor.
     code, _, err = run("map", recording, "--size", 4, "--sensor-height", HEIGHT + 4)
-    assert code == 0 and "and 0 are left, as other floors: check T_map_base" in err
+    assert code == 3 and "and 0 are left, as other floors: check T_map_base" in err
     assert not np.isfinite(load_npz(tmp_path / "map.npz").layers["elevation"]).any()
 
 
@@ -216,7 +216,7 @@ def test_a_wrong_frame_is_pointed_out(run, recording, tmp_path):
     poses[:, :3, :3] = poses[:, :3, :3] @ np.diag([1.0, -1, -1])  # upside down: the ground is above the sensor
     write_poses(recording / "poses.txt", poses)
     code, out, err = run("map", recording, "--size", 8)
-    assert code == 0 and "overhang 12,000" in out
+    assert code == 3 and "overhang 12,000" in out
     assert "the sensor is mounted upside down, which T_map_sensor does not say" in err
 
 
@@ -239,9 +239,9 @@ def test_millimetres_are_told_to_be_units(run, recording, suffix, poses_too):
         poses[:, :3, 3] *= 1000
         write_poses(recording / "poses.txt", poses)
     code, out, err = run("map", recording, "--size", 8)
-    assert code == 0 and "0 used (0.0 %); rejected: range 80,000" in out
+    assert code == 3 and "0 used (0.0 %); rejected: range 80,000" in out
     assert err.startswith("warning: points: the median distance is ") and "as of millimetres: check units" in err
-    assert err.count("\n") == 1, "the cause is told, not its consequences"
+    assert err.count("\n") == 2 and "\nError: the map is empty" in err, "the cause is told, not its consequences"
 
 
 @pytest.mark.slow(3)
@@ -305,3 +305,69 @@ def test_layouts_by_option(run, recording, tmp_path):
     assert code == 2 and "000000.bin: does not look like KITTI's" in err and "nothing was mapped yet" in err
     assert run("map", recording, "--size", 8, "--bin-layout", "float32x5")[0] == 0
     assert value_at(load_npz(tmp_path / "map.npz"), 2.5, 1.5) == pytest.approx(0.4, abs=0.01)
+
+
+def recording_of(folder, clouds):
+    """A folder of clouds (N, 3) and level poses 1 m above the ground."""
+    folder.mkdir()
+    for k, points in enumerate(clouds):
+        np.save(folder / f"{k:06d}.npy", points.astype(np.float32))
+    np.savetxt(folder / "poses.txt", [np.append(np.eye(4)[:3].ravel()[:11], 1.0) for _ in clouds])
+    return folder
+
+
+def flat(number, distance=3.0):
+    xy = np.random.default_rng(0).uniform(-1, 1, (number, 2)) * distance
+    return np.column_stack([xy, np.full(number, -1.0)])
+
+
+@pytest.mark.parametrize(
+    "cloud, words",
+    [
+        (flat(500) + [400.0, 0, 0], "the map is empty: 0 of 1,000 points were used, most were rejected as 'range'"),
+        (np.full((500, 3), np.nan), "the map is empty: 0 of 1,000 points"),
+        (np.vstack([flat(3), flat(497) + [400.0, 0, 0]]), "the map is nearly empty: 6 of 1,000 points were used"),
+    ],
+)
+def test_an_empty_map_has_an_exit_code_of_its_own(run, tmp_path, cloud, words):
+    code, out, err = run("map", recording_of(tmp_path / "drive", [cloud, cloud]))
+    assert code == 3 and "wrote" in out and words in err.splitlines()[-1] and err.splitlines()[-1].startswith("Error: ")
+
+
+def test_a_map_of_a_fraction_of_the_points_is_none_of_these(run, tmp_path):
+    cloud = np.vstack([flat(30), flat(970) + [400.0, 0, 0]])
+    assert run("map", recording_of(tmp_path / "drive", [cloud, cloud]))[0] == 0
+
+
+def test_warnings_are_one_line_each(run, tmp_path, monkeypatch):
+    """Of the library, once for each text, without a line of source."""
+    import warnings
+
+    from torchelev.io import MappingRun
+
+    original = MappingRun.add
+
+    def add(self, *args):
+        warnings.warn("updates took\nlong", RuntimeWarning, stacklevel=1)
+        return original(self, *args)
+
+    monkeypatch.setattr(MappingRun, "add", add)
+    cloud = flat(500)
+    cloud[::7], cloud[3::7] = np.inf, -np.inf
+    code, _, err = run("map", recording_of(tmp_path / "drive", [cloud] * 3))
+    assert code == 0 and err.splitlines() == ["warning: updates took long"]
+
+
+def test_a_full_disk_while_a_bag_is_closed_keeps_the_map(run, tmp_path, monkeypatch):
+    """SQLite says so by an error of its own."""
+    import sqlite3
+
+    from rosbags.rosbag2 import Writer
+
+    def close(self):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(Writer, "close", close)
+    code, _, err = run("map", recording_of(tmp_path / "drive", [flat(500)] * 2), "--grid-map", "grown.db3")
+    assert code == 2 and "grown.db3: cannot be written (database or disk is full)" in err
+    assert (tmp_path / "map.partial.npz").exists()

@@ -58,3 +58,13 @@ def test_missing_points_stay_missing(points):
 
 def test_same_seed_same_noise(points):
     torch.testing.assert_close(range_noise(points, generator()), range_noise(points, generator()), atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_noise_of_halves_is_that_of_float32(points, dtype):
+    """The square of 300 m is beyond what float16 holds, and bfloat16 has no share of 0.001."""
+    far = (points * 60).to(dtype)
+    for noise in (range_noise, dropout, lambda p, g: outliers(p, g, dust=0.001)):
+        exact = noise(far.float(), torch.Generator().manual_seed(0))
+        halves = noise(far, torch.Generator().manual_seed(0))
+        torch.testing.assert_close(halves, exact.to(dtype), equal_nan=True)

@@ -86,3 +86,9 @@ def test_a_slow_page_never_holds_the_loop_up(emap, port, monkeypatch):
 def test_wrong_settings_are_named(emap, port, wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: must"):
         LiveView(emap, port=port, **wrong)
+
+
+def test_a_closed_view_shows_nothing(emap, port):
+    view = LiveView(emap, port=port)
+    view.close()
+    assert view.show() is False

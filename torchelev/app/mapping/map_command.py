@@ -14,8 +14,8 @@ from torchelev.app.mapping.map_recorder import MapRecorder
 from torchelev.app.mapping.map_request import MapRequest
 from torchelev.app.mapping.map_video import MapVideo
 from torchelev.app.mapping.open_scans import open_scans
-from torchelev.app.mapping.report import suggest_options, summarize
-from torchelev.app.user_error import BAD_INPUT, UserError, user_errors
+from torchelev.app.mapping.report import describe_emptiness, suggest_options, summarize
+from torchelev.app.user_error import BAD_INPUT, EmptyMapError, UserError, user_errors
 from torchelev.io import Frame, MappingRun, RecordingError, is_bag
 
 _INTERRUPTED = 130  # exit code
@@ -94,6 +94,9 @@ def _finish(run: MappingRun, num_scans: int, prefix: Path, stopped: BaseExceptio
         return BAD_INPUT
     for line in run.emap.diagnose():
         click.echo(f"warning: {line}", err=True)
+    emptiness = describe_emptiness(run)
+    if emptiness:
+        raise EmptyMapError(emptiness)
     return 0
 
 

@@ -14,6 +14,8 @@ from torchelev.io import MappingRun
 if TYPE_CHECKING:
     from torchelev.viz.plot import Panel
 
+_MIN_USED = 0.01  # of the finite points; a map of fewer says nothing of the place that was recorded
+
 
 def summarize(run: MappingRun, num_scans: int) -> list[str]:
     """Return lines on scans, window, coverage, points and time; `num_scans` is the length of the recording."""
@@ -32,6 +34,20 @@ def summarize(run: MappingRun, num_scans: int) -> list[str]:
         f"points    {used:,} used ({used_percent:.1f} %); rejected: {reasons or 'none'}",
         f"time      {np.median(run.update_ms):.1f} ms per scan (median; slowest {max(run.update_ms):.1f} ms)",
     ]
+
+
+def describe_emptiness(run: MappingRun) -> str | None:
+    """Return why a map holds next to nothing of its recording: less than 1 % of the points, or no cell; else None."""
+    counts = run.counts
+    total, used = run.num_points - counts["rejected_invalid"], counts["points_used"]
+    rejected = {name: n for name, n in counts.items() if name.startswith("rejected_") and n}
+    reason = max(rejected, key=lambda name: rejected[name]).removeprefix("rejected_") if rejected else "no points"
+    if total <= 0 or used < _MIN_USED * total:
+        amount = "empty" if not used else "nearly empty"
+        return f"the map is {amount}: {used:,} of {run.num_points:,} points were used, most were rejected as '{reason}'"
+    if not float(run.emap.layer("validity").sum()):
+        return f"the map is empty at the end, though {used:,} points were used: they were cleared, or left behind"
+    return None
 
 
 def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,7 @@ import numpy as np
 
 from torchelev.errors import require
 from torchelev.io.bags.definitions import make_typestore
-from torchelev.output_files import require_writable
+from torchelev.output_files import WriteError, require_writable
 
 _STORAGE = {".mcap": "MCAP", ".db3": "SQLITE3", "": "MCAP"}
 
@@ -79,9 +82,10 @@ class BagWriter:
 
     def write(self, topic: str, type_: str, stamp: float, message: Any) -> None:
         """Append a message, recorded at a time [s]."""
-        if topic not in self._connections:
-            self._connections[topic] = self._bag.add_connection(topic, type_, typestore=self.store)
-        self._bag.write(self._connections[topic], round(stamp * 1e9), self.serialize(message, type_))
+        with self._full_disk_named():
+            if topic not in self._connections:
+                self._connections[topic] = self._bag.add_connection(topic, type_, typestore=self.store)
+            self._bag.write(self._connections[topic], round(stamp * 1e9), self.serialize(message, type_))
 
     def serialize(self, message: Any, type_: str) -> bytes:
         """Return a message in the encoding of the bag: ROS 1's, or CDR."""
@@ -93,10 +97,19 @@ class BagWriter:
         if not self._folder.exists():
             return
         try:
-            self._bag.close()
+            with self._full_disk_named():
+                self._bag.close()
             self._written().replace(self.path)
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+    @contextmanager
+    def _full_disk_named(self) -> Iterator[None]:
+        """Raise WriteError for what SQLite says of a full disk, which is no OSError."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise WriteError(self.path, str(error)) from error
 
     def _written(self) -> Path:
         """Return the file, or the folder, that was written."""

@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
 import torch
 from torch import Tensor
 
+Noise = TypeVar("Noise", bound=Callable[..., Tensor])
 
+
+def _in_full_precision(noise: Noise) -> Noise:
+    """Compute the noise of halves in float32: their squared distances overflow, and small shares are rounded away."""
+
+    @functools.wraps(noise)
+    def computed(points: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        return noise(points.to(torch.promote_types(points.dtype, torch.float32)), *args, **kwargs).to(points.dtype)
+
+    return cast(Noise, computed)
+
+
+@_in_full_precision
 def range_noise(
     points: Tensor, generator: torch.Generator | None = None, *, constant: float = 0.003, quadratic: float = 0.0015
 ) -> Tensor:
@@ -25,12 +42,14 @@ def range_noise(
     return points * (1 + error / d.clamp(min=1e-6))
 
 
+@_in_full_precision
 def dropout(points: Tensor, generator: torch.Generator | None = None, *, share: float = 0.05) -> Tensor:
     """Replace a fraction `share` of the points (..., 3) by NaN: missing returns."""
     is_lost = torch.rand(points.shape[:-1], generator=generator, dtype=points.dtype) < share
     return points.masked_fill(is_lost[..., None], float("nan"))
 
 
+@_in_full_precision
 def outliers(
     points: Tensor,
     generator: torch.Generator | None = None,

@@ -103,8 +103,10 @@ class LiveView:
             plan: planned path, map frame.
 
         Returns:
-            Whether it will be shown.
+            Whether it will be shown; never once the page is closed.
         """
+        if self._stopped:
+            return False
         start = time.perf_counter()
         self._arguments = (T_map_base, T_map_sensor, points, scan, plan)
         if start < self._due or self._next is not None:
