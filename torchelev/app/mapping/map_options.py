@@ -142,6 +142,24 @@ _OPTIONS: list[Callable[[Any], Any]] = [
     click.option(
         "--depth", multiple=True, metavar="TOPIC", help="Bag: depth images with a CameraInfo; may be repeated."
     ),
+    click.option(
+        "--camera-info",
+        multiple=True,
+        metavar="TOPIC",
+        help="Bag: CameraInfo of the depth images, once or for each --depth.  [default: the one beside them]",
+    ),
+    click.option(
+        "--depth-scale",
+        type=float,
+        metavar="M",
+        help="Bag: metres per unit of depth.  [default: what librealsense recorded, or 0.001 of integers, 1 of floats]",
+    ),
+    click.option(
+        "--depth-axes",
+        type=click.Choice(["optical", "forward", "opengl"]),
+        help="Bag: axes of the depth images' frame: optical (z forward, y down), forward (x forward, z up), as "
+        "simulators stamp them, or opengl (z backward, y up).  [default: optical]",
+    ),
     click.option("--map-frame", metavar="FRAME", help="Bag: frame in which the map is built, such as odom."),
     click.option("--base-frame", metavar="FRAME", help="Bag: frame that the map follows, such as base_link."),
     click.option(
