@@ -10,7 +10,7 @@ import click
 
 MAP_HELP = """Build an elevation map from RECORDING, a folder of scans with poses, or a bag.
 
-A bag is a file .bag (ROS 1), .mcap or .db3 (ROS 2), or a ROS 2 folder. Its
+A bag is a file .bag (ROS 1), .mcap or .db3 (ROS 2), or a folder of them. Its
 topics and frames are found where there is no doubt; `torchelev bag` lists them.
 
 \b

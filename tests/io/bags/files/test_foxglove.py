@@ -49,15 +49,20 @@ def messages(T=None):
     """Topic, name of the type and fields of all messages of the drive."""
     told = drive()
     first = told.stamps[0]
-    yield first, "/tf", "FrameTransforms", {"transforms": [transform(first, "base_link", "lidar", T_BASE_LIDAR)]}
-    yield first, "/tf", "FrameTransform", transform(first, "base_link", "camera", T_BASE_CAMERA)
+    yield (
+        first,
+        "/transforms",
+        "FrameTransforms",
+        {"transforms": [transform(first, "base_link", "lidar", T_BASE_LIDAR)]},
+    )
+    yield first, "/transforms", "FrameTransform", transform(first, "base_link", "camera", T_BASE_CAMERA)
     K = CAMERA.intrinsics.double().numpy().ravel().tolist()
     info = stamped(first, frame_id="camera", width=CAMERA.width, height=CAMERA.height, K=K)
     yield first, "/camera/depth/camera_info", "CameraCalibration", info
     for stamp, base in zip(told.stamps, told.bases, strict=True):
-        yield stamp, "/tf", "FrameTransform", transform(stamp, "odom", "base_link", base)
+        yield stamp, "/transforms", "FrameTransform", transform(stamp, "odom", "base_link", base)
         for child, mount in (("lidar", T_BASE_LIDAR), ("camera", T_BASE_CAMERA)):
-            yield stamp, "/tf", "FrameTransform", transform(stamp, "base_link", child, mount)
+            yield stamp, "/transforms", "FrameTransform", transform(stamp, "base_link", child, mount)
     for scan in told.clouds:
         yield scan.stamp, "/lidar", "PointCloud", cloud(scan, T)
     for scan, image in told.depths:
