@@ -43,7 +43,8 @@ def read_points(message: Any, stamp: float, period: float | None = None) -> Clou
     if missing:
         raise CloudError(f"the cloud has no field {', '.join(missing)}; it has {', '.join(fields) or 'none'}")
     columns = [_read_column(message, fields[name]) for name in "xyz"]
-    points = np.stack([column.astype(np.float32) for column in columns], -1)
+    with np.errstate(over="ignore"):  # a missing return may be the largest double
+        points = np.stack([column.astype(np.float32) for column in columns], -1)
     name = next((name for name in TIME_FIELDS if name in fields), None)
     if name is None or not len(points):
         return Cloud(points, None)

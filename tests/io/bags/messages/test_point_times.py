@@ -18,6 +18,8 @@ def test_a_scan_takes_no_longer_than_the_period_in_any_unit(unit, dtype):
 
 
 def test_times_from_0_to_1_are_fractions_of_the_period_and_said():
+    np.testing.assert_allclose(to_seconds(np.float32(SPAN * 10 - 1), STAMP, PERIOD), SPAN - 0.1, atol=1e-6)
+    assert to_seconds(np.float32(SPAN * 10), STAMP, 0.3) is None  # of a topic from which scans were dropped
     raw = np.float32(SPAN * 10)
     np.testing.assert_allclose(to_seconds(raw, STAMP, PERIOD), SPAN, atol=1e-6)
     np.testing.assert_allclose(to_seconds(raw, STAMP, 1.0), SPAN * 10, atol=1e-6)  # a scan of a second
@@ -61,6 +63,15 @@ def test_points_without_a_time_are_left_out_and_counted():
     cloud = read(times)
     assert np.isnan(cloud.times[1])
     assert cloud.notes[0].text == "1 of 5 points have no time in field timestamp, and are left out"
+
+
+@pytest.mark.parametrize("odd", [3.0, -3.0, 1e9])
+def test_few_times_that_lie_apart_do_not_change_the_unit(odd):
+    times = np.linspace(0, 0.1, 500)
+    times[7] = odd
+    seconds = to_seconds(times.astype(np.float32), STAMP, PERIOD)
+    assert np.isnan(seconds[7])
+    np.testing.assert_allclose(np.delete(seconds, 7), np.delete(times, 7), atol=1e-6)
 
 
 @pytest.mark.parametrize("offset", [37.0, -1_699_999_000.0, 5.0])

@@ -11,6 +11,8 @@ TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offs
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SHORTEST, _LONGEST = 2e-3, 2.0  # [s] of a scan whose period is unknown
 _MARGIN = 1.2  # by which a scan may be longer than the period of its topic
+_SLOWEST = 0.21  # [s] period of lidars whose times may be fractions of it: 5 Hz and more
+_FEW = 100  # one of so many times may lie apart from all others
 _ABSOLUTE = 1e8  # [s] since 1970; larger times are no offsets from the message's stamp
 
 
@@ -31,7 +33,8 @@ def to_seconds(
         is_hit: (N,) whether a point is a return: only their times count. None: all are.
 
     Returns:
-        (N,) [s]; NaN for points that are no return, and for times of 0 among times since 1970.
+        (N,) [s]; NaN for points that are no return, and for few times that lie apart from all others, as zeros do among
+        times since 1970.
     """
     times = _known_times(raw, is_hit)
     finite = times[np.isfinite(times)]
@@ -40,13 +43,13 @@ def to_seconds(
     units = list(_UNITS.values())
     for unit in reversed(units) if raw.dtype.kind in "iu" else units:
         is_absolute = float(np.median(np.abs(finite))) * unit > _ABSOLUTE
-        used = finite[finite != 0] if is_absolute else finite
         origin = np.longdouble(stamp) if is_absolute else np.longdouble(0)
-        first, last = float(used.min() * unit - origin), float(used.max() * unit - origin)
+        first, last = (float(end * unit - origin) for end in _ends(finite[finite != 0] if is_absolute else finite))
         if _is_scan(first, last, period, is_absolute):
             seconds = (times * unit - origin).astype(np.float64)
-            return np.where(times == 0, np.nan, seconds) if is_absolute else seconds
-    return times.astype(np.float64) * period if period is not None and is_fraction(finite) else None
+            longest = longest_scan(period)
+            return np.where((seconds >= last - longest) & (seconds <= first + longest), seconds, np.nan)
+    return times.astype(np.float64) * period if period is not None and is_fraction(finite, period) else None
 
 
 def describe_times(
@@ -62,9 +65,9 @@ def describe_times(
         text = f"the times in field {name} run from {finite.min():.14g} to {finite.max():.14g}: in no unit is that a"
         text = f"{text} scan of at most {limit:.2g} s at its stamp, {stamp:.14g} s"
         return Note(f"{text}; they are not used", f"times of {name}")
-    if period is not None and is_fraction(finite) and longest_scan(period) < np.ptp(finite):
-        text = f"the times in field {name} run from 0 to 1: taken as fractions of the period of {period:.3g} s"
-        return Note(text, f"fractions of {name}")
+    if period is not None and is_fraction(finite, period) and longest_scan(period) < np.ptp(finite):
+        text = f"the times in field {name} run from {round(float(finite.min()))} to {round(float(finite.max()))}"
+        return Note(f"{text}: taken as fractions of the period of {period:.3g} s", f"fractions of {name}")
     missing = int((is_hit & ~np.isfinite(times)).sum())
     if missing:
         text = f"{missing} of {is_hit.sum()} points have no time in field {name}, and are left out"
@@ -72,9 +75,17 @@ def describe_times(
     return None
 
 
-def is_fraction(finite: NDArray) -> bool:
-    """Return whether times run from 0 to 1."""
-    return bool(abs(finite.min()) <= 0.05 and abs(finite.max() - 1) <= 0.05)
+def is_fraction(finite: NDArray, period: float) -> bool:
+    """Return whether times run from 0 to 1 or from -1 to 0, of a topic from which hardly any scans were dropped."""
+    first, last = float(finite.min()), float(finite.max())
+    return period <= _SLOWEST and min(abs(first), abs(first + 1)) <= 0.05 and abs(last - first - 1) <= 0.05
+
+
+def _ends(times: NDArray[np.longdouble]) -> tuple[np.longdouble, np.longdouble]:
+    """Return the first time and the last one, without the few that lie apart from all others."""
+    apart = len(times) // _FEW
+    ordered = np.partition(times, [apart, len(times) - 1 - apart])
+    return ordered[apart], ordered[len(times) - 1 - apart]
 
 
 def _known_times(raw: NDArray, is_hit: NDArray[np.bool_] | None) -> NDArray[np.longdouble]:
