@@ -2,8 +2,7 @@
 
 Needs ``torchelev[bags]``; no ROS. `bag` reads messages of `files`; `point_cloud` and `scans` turn them into points by
 `messages`; `poses` finds poses; `topics`, `cameras` and `periods` say what is read and how; `recording` puts it all
-together.
-`grid_maps` writes maps to bags and reads them.
+together. `grid_maps` writes maps to bags and reads them.
 """
 
 from torchelev.io.bags.bag import Bag, Message, Topic, is_bag

@@ -156,6 +156,8 @@ def test_points_come_out_as_they_went_in_also_from_a_pose_of_their_own(tmp_path)
     for pose in (None, T):
         with Bag(write(tmp_path / "drive.mcap", "json", pose)) as bag:
             first = next(bag.read(["/lidar"])).data
+            datatypes = {field.name: field.datatype for field in first.fields}
+            assert datatypes == {"t": 6, "x": 7, "y": 7, "z": 8}  # as sensor_msgs/PointField counts them
             scan = read_scan(first)
             np.testing.assert_allclose(scan.points, drive().clouds[0].points, atol=1e-5)
             times, hit = drive().clouds[0].times, np.isfinite(scan.points).all(1)
