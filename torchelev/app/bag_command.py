@@ -27,6 +27,7 @@ def describe_bag(path: Path) -> str:
     """
     with Bag(path) as bag:
         rows = [("topic", "type", "messages", "Hz", "frame")] + [_row(bag, topic) for topic in bag.topics]
+        rows += [(topic.name, topic.type, f"{topic.num:,}", "", f"not read: {topic.problem}") for topic in bag.unread]
         tree = _read_tree(bag)
         lines = [f"{path}: {bag.duration:.1f} s", "", *align(rows), "", "transforms"]
         lines += [f"  {line}" for line in draw_tree(tree)] or ["  none"]

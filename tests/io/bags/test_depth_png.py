@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.io.bags.synthetic import CAMERA, Writer, drive
+from tests.io.bags.synthetic import CAMERA, T_BASE_CAMERA, Writer, drive
 from tests.io.bags.test_recording import map_bag
 from torchelev.io.bags import BagRequest
-from torchelev.io.bags.depth_png import decode_depth
+from torchelev.io.bags.messages.depth_png import decode_depth
 from torchelev.io.bags.point_cloud import CloudError
 from torchelev.io.bags.scans import read_scan
 
@@ -81,7 +81,7 @@ def test_what_holds_no_depth_is_refused(data, encoding, words):
 def test_a_cut_image_is_a_scan_left_out(tmp_path, monkeypatch):
     writer, topic = Writer(tmp_path / "drive", "mcap"), "/camera/depth/image_raw/compressedDepth"
     for stamp, T in zip(drive().stamps, drive().bases, strict=True):
-        writer.transform(stamp, "odom", "camera", T)
+        writer.transform(stamp, "odom", "camera", T @ T_BASE_CAMERA.numpy())
     (first, depth), (second, _), *_ = drive().depths
     writer.camera_info(first.stamp)
     writer.depth(first.stamp, depth, "png", topic)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.io.bags.synthetic import DEPTH, Writer, drive
+from tests.io.bags.synthetic import DEPTH, T_BASE_CAMERA, Writer, drive
 from tests.io.bags.test_recording import map_bag
 from torchelev.io.bags import Bag, BagRequest, open_bag
 from torchelev.io.bags.bag import Message
@@ -66,8 +66,8 @@ def test_a_wrong_stamp_does_not_end_the_order():
 def test_scans_of_a_bag_are_fused_in_the_order_of_their_stamps(tmp_path):
     writer = Writer(tmp_path / "drive", "mcap")
     for stamp, T in zip(drive().stamps, drive().bases, strict=True):
-        for child in ("lidar", "camera"):
-            writer.transform(stamp, "odom", child, T)
+        writer.transform(stamp, "odom", "lidar", T)
+        writer.transform(stamp, "odom", "camera", T @ T_BASE_CAMERA.numpy())
     writer.camera_info(drive().stamps[0])
     write = writer.write
     writer.write = lambda topic, name, stamp, one: write(topic, name, stamp + 0.28 * (topic == DEPTH), one)

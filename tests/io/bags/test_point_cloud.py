@@ -46,7 +46,7 @@ def test_any_layout_is_read(seed, num_points, has_times, layout):
         assert read.times is None
     else:
         np.testing.assert_allclose(read.times, times, atol=1e-6)
-    assert read.note == ""
+    assert read.notes == ()
 
 
 SPAN = np.linspace(0.0, 0.1, 5)  # [s]
@@ -74,7 +74,8 @@ def test_times_that_are_none_are_not_used(raw):
 
 def test_unclear_times_are_said():
     message = cloud(np.zeros((5, 3), np.float32), SPAN * 100, time="timestamp")
-    assert "times in field timestamp do not look like" in read_points(message, STAMP).note
+    (note,) = read_points(message, STAMP).notes
+    assert "the times in field timestamp run from 1700000000.25 to 1700000010.25: in no unit" in note.text
 
 
 @given(
@@ -96,6 +97,32 @@ def test_nonsense_is_refused_or_read_and_never_raises_otherwise(offsets, step, r
         assert "contradict" in str(error) or "unknown type" in str(error)
 
 
+@pytest.mark.parametrize("row_step", [0, 12 * 4000])
+def test_rows_without_padding_are_read_whatever_row_step_says(row_step):
+    points = np.random.default_rng(0).normal(size=(32, 3)).astype(np.float32)
+    message = cloud(points, rows=4)
+    message.row_step = row_step
+    np.testing.assert_array_equal(read_points(message, STAMP).points, points)
+    message.data = message.data[:-1]
+    with pytest.raises(CloudError, match="contradict each other: 4 x 8 points of 12 bytes"):
+        read_points(message, STAMP)
+
+
+def test_data_may_be_bytes():
+    points = np.random.default_rng(0).normal(size=(32, 3)).astype(np.float32)
+    message = cloud(points)
+    for data in (message.data.tobytes(), bytearray(message.data), message.data.tolist()):
+        message.data = data
+        np.testing.assert_array_equal(read_points(message, STAMP).points, points)
+
+
+def test_what_is_no_message_is_refused_in_words():
+    with pytest.raises(
+        CloudError, match="expected a PointCloud2 with fields and point_step, got bytes; deserialise it"
+    ):
+        read_points(b"0123", STAMP)
+
+
 def test_a_cloud_without_heights_is_refused():
     message = cloud(np.zeros((2, 3), np.float32), order="xy")
     with pytest.raises(CloudError, match="the cloud has no field z; it has x, y"):
@@ -115,7 +142,7 @@ def test_a_laser_scan():
 
 
 IMAGE = dict(header=HEADER, height=2, width=3, is_bigendian=0, encoding="32FC1", step=12, data=np.zeros(24, np.uint8))
-INFO = SimpleNamespace(height=2, width=3, k=np.array([1.0, 0, 1, 0, 1, 1, 0, 0, 1]))
+INFO = SimpleNamespace(height=2, width=3, k=np.array([1.0, 0, 1, 0, 1, 1, 0, 0, 1]), p=np.zeros(12), d=np.zeros(5))
 BAD_IMAGES = {
     "colour": (dict(encoding="rgb8"), {}, "images of rgb8 hold no depth; 16UC1 and 32FC1 do"),
     "cut": (dict(data=np.zeros(20, np.uint8)), {}, "has 20 bytes, too few for 2 rows of 12"),

@@ -10,7 +10,7 @@ import click
 
 MAP_HELP = """Build an elevation map from RECORDING, a folder of scans with poses, or a bag.
 
-A bag is a file .bag (ROS 1), .mcap or .db3 (ROS 2), or a ROS 2 folder. Its
+A bag is a file .bag (ROS 1), .mcap or .db3 (ROS 2), or a folder of them. Its
 topics and frames are found where there is no doubt; `torchelev bag` lists them.
 
 \b
@@ -141,6 +141,24 @@ _OPTIONS: list[Callable[[Any], Any]] = [
     click.option("--points", multiple=True, metavar="TOPIC", help="Bag: clouds or laser scans; may be repeated."),
     click.option(
         "--depth", multiple=True, metavar="TOPIC", help="Bag: depth images with a CameraInfo; may be repeated."
+    ),
+    click.option(
+        "--camera-info",
+        multiple=True,
+        metavar="TOPIC",
+        help="Bag: CameraInfo of the depth images, once or for each --depth.  [default: the one beside them]",
+    ),
+    click.option(
+        "--depth-scale",
+        type=float,
+        metavar="M",
+        help="Bag: metres per unit of depth.  [default: what librealsense recorded, or 0.001 of integers, 1 of floats]",
+    ),
+    click.option(
+        "--depth-axes",
+        type=click.Choice(["optical", "forward", "opengl"]),
+        help="Bag: axes of the depth images' frame: optical (z forward, y down), forward (x forward, z up), as "
+        "simulators stamp them, or opengl (z backward, y up).  [default: optical]",
     ),
     click.option("--map-frame", metavar="FRAME", help="Bag: frame in which the map is built, such as odom."),
     click.option("--base-frame", metavar="FRAME", help="Bag: frame that the map follows, such as base_link."),

@@ -30,6 +30,9 @@ class MapRequest:
     pcd_frame: Literal["sensor", "viewpoint"] | None = None  #: see FileLayout.pcd_frame
     points: tuple[str, ...] = ()  #: topics of a bag's clouds
     depth: tuple[str, ...] = ()  #: topics of a bag's depth images
+    camera_info: tuple[str, ...] = ()  #: topics of the CameraInfo of a bag's depth images
+    depth_scale: float | None = None  #: [m] per unit of a bag's depth; None: the bag's, or that of the encoding
+    depth_axes: Literal["optical", "forward", "opengl"] | None = None  #: of the frame of a bag's depth images
     map_frame: str | None = None  #: frame of a bag in which the map is built
     base_frame: str | None = None  #: frame of a bag that the window follows
     tf: tuple[str, ...] = ()  #: topics of a bag's transforms; (): /tf and /tf_static, or those of the scans' namespace

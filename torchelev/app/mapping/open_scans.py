@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 _PLAIN = MapRequest(recording=Path())
 _ONLY_BAGS = (
-    "points", "depth", "map_frame", "base_frame", "tf", "rays_from", "clock_offset", "stamps", "start", "end",
+    "points", "depth", "camera_info", "depth_scale", "depth_axes",
+    "map_frame", "base_frame", "tf", "rays_from", "clock_offset", "stamps", "start", "end",
 )  # fmt: skip
 _ONLY_FOLDERS = (
     "intrinsics", "dt", "sensor_height", "bin_layout", "quaternions", "time_unit", "pcd_frame", "poses_of",
@@ -80,10 +81,13 @@ def _check(request: MapRequest, mount: NDArray | None) -> None:
 @contextmanager
 def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
     from torchelev.io.bags import Bag, open_bag
+    from torchelev.io.bags.topics import describe_unread
 
     _refuse_file_options(request)
     with Bag(request.recording) as bag:
         scans = open_bag(bag, _to_bag_request(request), lambda m: show_progress(m, "reading poses", "message"))
+        if bag.unread:
+            click.echo(f"not read  {describe_unread(bag)}")
         rays = f", rays from {scans.rays_from}" if scans.rays_from else ""
         click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}{rays}")
         told = list(scans.pose_notes)
@@ -109,6 +113,9 @@ def _to_bag_request(request: MapRequest) -> BagRequest:
         map_frame=request.map_frame,
         base_frame=request.base_frame,
         poses=None if request.poses is None else str(request.poses),
+        camera_infos=request.camera_info,
+        depth_scale=request.depth_scale,
+        depth_axes=request.depth_axes or "optical",
         transforms=request.tf,
         T_base_sensor=None if request.extrinsics is None else read_transform(request.extrinsics),
         rays_from=request.rays_from,

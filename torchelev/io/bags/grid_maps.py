@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag
-from torchelev.io.bags.definitions import GRID_MAP, make_typestore
+from torchelev.io.bags.files.definitions import GRID_MAP, make_typestore
 from torchelev.io.bags.scans import stamp_of
 from torchelev.io.bags.writing import BagWriter
 from torchelev.io.errors import RecordingError
@@ -155,7 +155,10 @@ def read_grid_maps(path: str | Path, topic: str | None = None) -> Iterator[Recor
         if topic is not None and topic not in topics:
             raise RecordingError(path, f"there is no topic {topic} of GridMaps", f"such topics are {have}")
         if topic is None and len(topics) != 1:
-            raise RecordingError(path, f"there are {len(topics)} topics of GridMaps: {have}", "name one with topic=")
+            unread = "".join(f"; {one.name} of {one.type} is not read: {one.problem}" for one in bag.unread)
+            raise RecordingError(
+                path, f"there are {len(topics)} topics of GridMaps: {have}{unread}", "name one with topic="
+            )
         for message in bag.read([topic or topics[0]]):
             yield from_message(message.data)
         if bag.ended_early:

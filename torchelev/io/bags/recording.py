@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag, Message
+from torchelev.io.bags.cameras import doubt_axes, find_cameras
+from torchelev.io.bags.messages.cloud import Reasons
 from torchelev.io.bags.order import order_by_stamp
+from torchelev.io.bags.periods import find_period
 from torchelev.io.bags.point_cloud import CloudError
 from torchelev.io.bags.poses.placing import Placed, place_poses
 from torchelev.io.bags.poses.reading import time_of
 from torchelev.io.bags.poses.transforms import FrameError
 from torchelev.io.bags.poses.within_scan import hold_still
 from torchelev.io.bags.scans import Scan, read_scan
-from torchelev.io.bags.topics import BagRequest, choose_topics, find_cameras
+from torchelev.io.bags.topics import BagRequest, choose_topics
 from torchelev.io.errors import RecordingError
 from torchelev.io.folders.recording import Frame
 
@@ -44,13 +46,13 @@ class BagRecording:
         self._bag, types = bag, {topic.name: topic for topic in bag.topics}
         self.topics = choose_topics(bag, types, request)
         self._num = sum(types[name].num for name in self.topics)
-        self._cameras = find_cameras(bag, types, request.depths)
+        self._cameras = find_cameras(bag, types, request)
+        self._periods = {name: find_period(bag, name) for name in self.topics if name not in self._cameras}
         self._placed: Placed = place_poses(bag, request, self.topics, _MAX_GAP, show)
         self._request, self.tree = request, self._placed.tree
         self.map_frame, self.base_frame, self.rays_from = self._placed.map, self._placed.base, self._placed.rays_from
         self.has_base = self.base_frame != self._placed.sensor
-        self.skipped: Counter[str] = Counter()
-        self.notes: dict[str, None] = {}
+        self.skipped, self.notes = Reasons(), Reasons()
 
     def __len__(self) -> int:
         return self._num
@@ -92,7 +94,7 @@ class BagRecording:
             try:
                 frame = self._to_frame(message, last)
             except CloudError as error:
-                self.skipped[str(error)] += 1
+                self.skipped.count(str(error), error.kind)
                 frame = None
             except FrameError as error:
                 raise RecordingError(self._bag.path, str(error), "give --map-frame and --base-frame") from error
@@ -112,23 +114,26 @@ class BagRecording:
 
     def _to_frame(self, message: Message, last: float | None) -> Frame | None:
         """Return a message's scan at its stamp; None, and counted, if it has no pose or is not asked for."""
-        scan = read_scan(message.data, self._cameras.get(message.topic))._replace(stamp=self._time_of(message))
-        if scan.note:
-            self.notes[f"{message.topic}: {scan.note}"] = None
+        camera, period = self._cameras.get(message.topic), self._periods.get(message.topic)
+        scan = read_scan(message.data, camera, period)._replace(stamp=self._time_of(message))
+        for note in scan.notes:
+            self.notes.count(f"{message.topic}: {note.text}", f"{message.topic}: {note.kind}")
         if message.topic not in self.clock_offsets and self._placed.clock.differs(scan.stamp, message.time):
-            self.skipped[f"the clock of {message.topic} was set meanwhile: {_OTHER_CLOCK}"] += 1
+            self.skipped.count(f"the clock of {message.topic} was set meanwhile: {_OTHER_CLOCK}")
             return None
         frame = self.rays_from if scan.frame in self._placed.fixed else scan.frame
         now = np.array([scan.stamp])
         T_map_sensor = self.tree.look_up(self.map_frame, frame, now)[0]
         T_map_base = self.tree.look_up(self.map_frame, self.base_frame, now)[0]
         if not (np.isfinite(T_map_sensor).all() and np.isfinite(T_map_base).all()):
-            self.skipped[f"no pose of {frame} in {self.map_frame} at that time"] += 1
+            self.skipped.count(f"no pose of {frame} in {self.map_frame} at that time")
             return None
+        if doubt := doubt_axes(camera, scan.frame, T_map_sensor):
+            self.notes.count(f"{message.topic}: {doubt}")
         covariance = self._placed.covariances.of_sensor(scan.stamp, T_map_sensor[:3, 3] - T_map_base[:3, 3])
         dt = 0.0 if last is None else scan.stamp - last
         if dt < 0:
-            self.notes[f"{message.topic}: {_LATE}"] = None
+            self.notes.count(f"{message.topic}: {_LATE}")
         points = self._see(scan)
         return Frame(points, T_map_sensor, max(0.0, dt), message.topic, T_map_base, covariance, scan.stamp)
 
@@ -139,7 +144,7 @@ class BagRecording:
             return (scan.points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
         points = hold_still(self.tree, self.map_frame, scan)
         if points is None:
-            self.notes[f"{scan.frame}: too few poses within a scan to take its motion out"] = None
+            self.notes.count(f"{scan.frame}: too few poses within a scan to take its motion out")
         return scan.points if points is None else points
 
 

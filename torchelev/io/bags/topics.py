@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag, Topic
+from torchelev.io.bags.messages.packets import converter_of
 from torchelev.io.bags.scans import CLOUDS, IMAGES
 from torchelev.io.errors import RecordingError
-
-CAMERA = "sensor_msgs/msg/CameraInfo"
 
 
 class BagRequest(NamedTuple):
@@ -30,13 +29,16 @@ class BagRequest(NamedTuple):
     stamps: Literal["header", "recorded"] = "header"  #: times of messages: their stamps, or when they were recorded
     start: float | None = None  #: [s] after the bag's start, by the time of recording; None: its start
     end: float | None = None  #: [s] as `start`; None: its end
+    camera_infos: Sequence[str] = ()  #: topics of CameraInfo: one for all of `depths`, or one for each
+    depth_scale: float | None = None  #: metres per unit of depth; None: the bag's, or that of the images' encoding
+    depth_axes: str = "optical"  #: axes of the frame of depth images, see `depth_to_points`
 
 
 def choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> list[str]:
     """Return the requested topics, or the only one of clouds."""
     for names, kinds, option in ((request.clouds, CLOUDS, "--points"), (request.depths, IMAGES, "--depth")):
         for name in names:
-            kind = types[name].type if name in types else "not in the bag"
+            kind = types[name].type if name in types else _absence(bag, name)
             if kind not in kinds:
                 have = name_topics([topic for topic in types.values() if topic.type in kinds])
                 raise RecordingError(bag.path, f"{option} {name} is {kind}", f"such topics are {have}")
@@ -51,27 +53,31 @@ def choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> lis
             raise RecordingError(
                 bag.path, f"there are {len(found)} topics of clouds: {name_topics(found)}", "give --points"
             )
-    have = name_topics(list(types.values()))
-    raise RecordingError(bag.path, f"there is no topic of clouds; topics are {have}", "give --depth for depth images")
+    raise RecordingError(bag.path, f"there is no topic of clouds; topics are {name_topics(bag.topics)}", _hint(bag))
+
+
+def _hint(bag: Bag) -> str:
+    """Return how a bag without a topic of clouds can be mapped."""
+    packets = [(topic, converter) for topic in (*bag.topics, *bag.unread) if (converter := converter_of(topic.type))]
+    if packets:
+        (topic, converter), *_ = packets
+        return f"{topic.name} holds a lidar's packets, {topic.type}: replay it through {converter}, record PointCloud2"
+    if bag.unread:
+        return f"not read: {describe_unread(bag)}; give --depth for depth images"
+    return "give --depth for depth images"
+
+
+def describe_unread(bag: Bag) -> str:
+    """Return the topics of a bag that cannot be read, with the type, number and reason of each, in one line."""
+    return "; ".join(f"{topic.name} ({topic.num:,} of {topic.type}: {topic.problem})" for topic in bag.unread)
+
+
+def _absence(bag: Bag, name: str) -> str:
+    """Return why a topic is not among those that can be read."""
+    unread = next((topic for topic in bag.unread if topic.name == name), None)
+    return "not in the bag" if unread is None else f"{unread.type}, not read: {unread.problem}"
 
 
 def name_topics(topics: list[Topic]) -> str:
     """Return the names of topics in one line."""
     return ", ".join(topic.name for topic in topics) or "none"
-
-
-def find_cameras(bag: Bag, types: dict[str, Topic], depths: Sequence[str]) -> dict[str, Any]:
-    """Return the CameraInfo of each topic of depth images: the one beside it."""
-    cameras = {}
-    for depth in depths:
-        # compressedDepth adds a level: /camera/depth/image_rect_raw/compressedDepth
-        folders = [depth.rsplit("/", level)[0] for level in (1, 2)]
-        info = next((f"{folder}/camera_info" for folder in folders if f"{folder}/camera_info" in types), None)
-        if info is None:
-            have = name_topics([topic for topic in types.values() if topic.type == CAMERA])
-            raise RecordingError(bag.path, f"{depth} has no camera_info beside it", f"topics of CameraInfo are {have}")
-        message = next(bag.read([info]), None)
-        if message is None:
-            raise RecordingError(bag.path, f"{info} holds no message", "record it with the images")
-        cameras[depth] = message.data
-    return cameras

@@ -97,7 +97,7 @@ def choose_transforms(bag: Bag, request: BagRequest, scans: list[str]) -> list[s
     plain: list[str] = [name for name in ("/tf", "/tf_static") if name in have]
     spaces = sorted({_namespace(name) for name in have if not is_static_topic(name)} - {""})
     if "/tf" in plain or not spaces:
-        return plain
+        return plain if "/tf" in plain else have  # Foxglove's transforms are on any topic
     near = [space for space in spaces if scans and scans[0].startswith(f"{space}/")] or spaces
     if len(near) > 1:
         raise RecordingError(bag.path, f"transforms are on {_join(have)}", "choose them with --tf TOPIC, repeated")
