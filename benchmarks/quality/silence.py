@@ -39,6 +39,7 @@ def diagnose_scene(seed: int) -> tuple[str, list[str]]:
     name = list(kinds)[seed % len(kinds)]
     scene = kinds[name]()
     is_camera = rng.random() < 0.5
+    sensor: DepthCamera | Lidar
     if is_camera:
         sensor, pitch = DepthCamera(64, 48, max_range=rng.uniform(4, 10)), rng.uniform(10, 50)
     else:
