@@ -22,7 +22,7 @@ from torchelev.gym import ElevationMapObservation
 from torchelev.sim import DepthCamera, mount
 from torchelev.viz.plot import Panel, save_layers
 
-RAYS = DepthCamera(width=64, height=48).directions.numpy()  # (N, 3) x forward, y left, z up
+RAYS, MAX_RANGE = DepthCamera(width=64, height=48).directions.numpy(), 6.0  # (N, 3) x forward, y left, z up; [m]
 T_BASE_SENSORS = torch.stack([mount(pitch_deg=35, z=0.3, yaw_deg=yaw) for yaw in (0, 90, 180, 270)])  # (4, 4, 4)
 BOXES = [(1.6, 0.6, 0.15), (-1.5, 1.2, 0.3), (0.3, -1.8, 0.25), (-1.2, -1.4, 0.1)]  # x, y, half height [m]
 
@@ -52,9 +52,9 @@ def cast(model, data, T):
     geom, distance = np.zeros(len(RAYS), np.int32), np.zeros(len(RAYS))
     directions, torso = (RAYS @ T[:3, :3].T).ravel(), model.body("torso").id
     skipped = None, 1, torso  # no groups of geoms, static ones too, and not the robot's own torso
-    mujoco.mj_multiRay(model, data, T[:3, 3].copy(), directions, *skipped, geom, distance, None, len(RAYS), 6.0)
-    is_ground = (geom >= 0) & (model.geom_bodyid[geom] == 0)  # the world's own geoms are body 0
-    return np.where(is_ground, distance, np.nan)[:, None] * RAYS
+    mujoco.mj_multiRay(model, data, T[:3, 3].copy(), directions, *skipped, geom, distance, None, len(RAYS), MAX_RANGE)
+    is_world = (geom >= 0) & (model.geom_bodyid[geom] == 0)  # the world's own geoms are body 0
+    return np.where(is_world & (distance <= MAX_RANGE), distance, np.nan)[:, None] * RAYS
 
 
 parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])

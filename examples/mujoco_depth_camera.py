@@ -37,8 +37,7 @@ K = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0,
 def make_renderer(model):
     try:
         renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
-        renderer.enable_depth_rendering()
-        return renderer
+        return renderer.enable_depth_rendering() or renderer
     except Exception as error:  # its type differs by platform
         print(f"MuJoCo cannot render here ({error!r}): casting rays in place of rendering")
 
@@ -54,7 +53,8 @@ def see(model, data, renderer):
     world = (rays @ data.cam_xmat[0].reshape(3, 3).T).ravel()
     geom, distance = results = np.zeros(len(rays), np.int32), np.zeros(len(rays))
     mujoco.mj_multiRay(model, data, data.cam_xpos[0], world, None, 1, -1, *results, None, len(rays), MAX_RANGE)
-    return torch.from_numpy(np.where(geom < 0, np.nan, distance)[:, None] * rays).float()[None]
+    hit = np.where((geom < 0) | (distance > MAX_RANGE), np.nan, distance)  # the cutoff alone does not end rays
+    return torch.from_numpy(hit[:, None] * rays).float()[None]
 
 
 parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])

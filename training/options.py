@@ -30,3 +30,26 @@ def runs_option(default: str) -> Callable[[Command], Command]:
         show_default=True,
         help="Folder of the trainings.",
     )
+
+
+def smoke_option(**values: object) -> Callable[[Command], Command]:
+    """Return the option --smoke, which gives other options small values in place of their defaults.
+
+    Options that stand on the command line keep what they are given.
+
+    Args:
+        values: The small values, by the names of the command's parameters.
+    """
+
+    def use_small_values(context: click.Context, _: click.Parameter, is_smoke: bool) -> None:
+        if is_smoke:
+            context.default_map = {**(context.default_map or {}), **values}
+
+    return click.option(
+        "--smoke",
+        is_flag=True,
+        is_eager=True,  # before other options take their defaults
+        expose_value=False,
+        callback=use_small_values,
+        help="Try the whole command in a minute or two: small values where an option is left out. No useful result.",
+    )

@@ -149,6 +149,17 @@ class ResumableRunner(OnPolicyRunner):
         torch.distributed.init_process_group("gloo", rank=rank, world_size=world)
 
 
+def export_onnx(runner: OnPolicyRunner, path: Path, **metadata: str) -> None:
+    """Write the policy to one ONNX file: with its weights, which torch puts beside it, and further metadata."""
+    import onnx
+
+    runner.export_policy_to_onnx(str(path.parent), path.name)
+    model = onnx.load(str(path))
+    onnx.helper.set_model_props(model, metadata)
+    onnx.save(model, str(path))
+    path.with_name(f"{path.name}.data").unlink(missing_ok=True)
+
+
 def _read(path: Path, device: torch.device | str) -> dict[str, Any]:
     """Return what a checkpoint holds.
 

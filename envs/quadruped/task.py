@@ -23,7 +23,7 @@ from envs.quadruped.sight import SIGHTS, TruthSight, View
 from torchelev.errors import require, require_count
 from torchelev.frames.arrays import assemble
 from torchelev.observations.patterns import compute_heading
-from torchelev.sim import terrain_grid
+from torchelev.sim import surface_of, terrain_grid
 
 NUM_ACTIONS = 12
 ENDINGS = ("crossed", "fallen", "timed_out")  # how an episode can end
@@ -111,7 +111,7 @@ class Quadruped(nn.Module):
         self.terrain = terrain_grid(
             terrain.kinds, terrain.num_levels, difficulty=terrain.difficulty, length=terrain.length,
             resolution=terrain.resolution, seed=terrain.seed, device=device,
-        )  # fmt: skip
+        ).with_surface(**surface_of("mujoco"))  # fmt: skip
         self.physics = Physics(self.terrain, num_envs, self.cfg.random, seed)
         self.generator = torch.Generator(device)
         self.odometry = LegOdometry(self.cfg.odometry, num_envs, device)

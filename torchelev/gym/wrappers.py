@@ -20,7 +20,7 @@ reset and step, and adds what `read` returns to the observation. MuJoCo's Ant wi
 ...     geom, distance = np.zeros(len(rays), np.int32), np.zeros(len(rays))
 ...     world, torso = (rays @ T[:3, :3].T).ravel(), model.body("torso").id
 ...     mujoco.mj_multiRay(model, data, T[:3, 3], world, None, 1, torso, geom, distance, None, len(rays), 8.0)
-...     nothing_or_a_leg = (geom < 0) | (model.geom_bodyid[geom] != 0)
+...     nothing_or_a_leg = (geom < 0) | (distance > 8.0) | (model.geom_bodyid[geom] != 0)
 ...     return np.where(nothing_or_a_leg, np.nan, distance)[:, None] * rays
 >>> ant = gymnasium.make("Ant-v5")
 >>> env = ElevationMapObservation(

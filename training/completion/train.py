@@ -23,7 +23,7 @@ from training.completion.cells import (
 from training.completion.evaluate import COMPLETED, evaluate, learned, table
 from training.completion.maps import YARD_CONFIG, TrueMap, WalkConfig, Walks, make_walks
 from training.completion.trainer import FitConfig, Trainer
-from training.options import jobs_option
+from training.options import jobs_option, smoke_option
 from training.resume import checkpoint_path, command_errors, write_result
 
 _POSITIVE = click.IntRange(1)
@@ -48,6 +48,7 @@ _WALKS_SEED = 0
 )
 @click.option("--data", type=click.Path(path_type=Path), default=None, help="Folder of the walks. Default: OUT/data.")
 @jobs_option
+@smoke_option(walks=1, drives=1, collages=1, steps=4, evaluation_walks=1)
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
 def main(
     seed: int,

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchelev.errors import require
-from training.runner import ResumableRunner
+from training.runner import ResumableRunner, export_onnx
 
 _TOLERANCE = 1e-4  # largest difference of an action
 
@@ -28,7 +28,7 @@ def export(runner: ResumableRunner, folder: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporters warn about their own deprecations
         runner.export_policy_to_jit(str(folder), "policy.pt")
-        runner.export_policy_to_onnx(str(folder), "policy.onnx")
+        export_onnx(runner, folder / "policy.onnx")
     actor = runner.get_inference_policy(device="cpu")
     observation = runner.env.get_observations().to("cpu")
     with torch.inference_mode():

@@ -16,6 +16,7 @@ from torchelev.observations.fill import FILLS
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export
+from training.options import smoke_option
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
 
@@ -110,6 +111,7 @@ def make_runner(
 )
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
 @click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Compile the map's update.")
+@smoke_option(num_envs=8, iterations=2, episodes=4, compiled=False)
 @click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Episodes of the evaluation.")
 def main(
     num_envs: int,

@@ -18,7 +18,7 @@ from envs.quadruped import QuadrupedConfig
 from envs.quadruped.sight import make_scans
 from torchelev.errors import message, require
 from torchelev.observations.scan_layout import require_layout, scan_layout
-from training.runner import ResumableRunner
+from training.runner import ResumableRunner, export_onnx
 
 LAYOUT = "torchelev.json"  # name of the layout in a TorchScript file, and of its metadata in an ONNX file
 GROUPS = ("policy", "height_scan", "feet")  # in the order in which the network takes them, side by side
@@ -69,10 +69,9 @@ def export(runner: ResumableRunner, cfg: QuadrupedConfig, folder: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporters warn about their own deprecations
         runner.export_policy_to_jit(str(folder), "policy.pt")
-        runner.export_policy_to_onnx(str(folder), "policy.onnx")
+        export_onnx(runner, folder / "policy.onnx", **{LAYOUT: layout})
         scripted = torch.jit.load(str(folder / "policy.pt"), map_location="cpu")
         torch.jit.save(scripted, str(folder / "policy.pt"), _extra_files={LAYOUT: layout})
-    _add_metadata(folder / "policy.onnx", layout)
     observation = runner.env.get_observations().to("cpu")
     actor = runner.get_inference_policy(device="cpu")
     with torch.inference_mode():
@@ -83,15 +82,6 @@ def export(runner: ResumableRunner, cfg: QuadrupedConfig, folder: Path) -> None:
         error = float(np.abs(actual - expected[: len(actual)]).max())
         require(error < _TOLERANCE, name, "must act as the policy does", f"an error of {error:.2g}", "report it")
     actor.to(runner.device)
-
-
-def _add_metadata(path: Path, layout: str) -> None:
-    import onnx
-
-    model = onnx.load(str(path))
-    onnx.helper.set_model_props(model, {LAYOUT: layout})
-    onnx.save(model, str(path))
-    path.with_name(f"{path.name}.data").unlink(missing_ok=True)  # the weights are in the file itself now
 
 
 def load_policy(path: Path, cfg: QuadrupedConfig) -> LoadedPolicy:

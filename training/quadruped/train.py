@@ -14,6 +14,7 @@ from envs.quadruped import Quadruped, QuadrupedConfig
 from envs.quadruped.config import PERCEPTION
 from envs.quadruped.rsl_rl import RslRlQuadruped
 from torchelev.errors import require
+from training.options import smoke_option
 from training.quadruped.evaluate import evaluate, table
 from training.quadruped.play import play
 from training.quadruped.policy import GROUPS, LoadedPolicy, export, load_policy, sight_of
@@ -93,6 +94,7 @@ def make_runner(
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
 @click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Compile the map's update.")
 @click.option("--episodes", type=_POSITIVE, default=280, show_default=True, help="Episodes of the evaluation.")
+@smoke_option(num_envs=7, iterations=2, episodes=7, compiled=False)
 @click.option(
     "--play",
     "played",

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from torchelev.robot import RobotConfig
-from training.options import paper_weights_option
+from training.options import paper_weights_option, smoke_option
 from training.resume import checkpoint_path, command_errors, write_result
 from training.traversability.evaluate import evaluate, table
 from training.traversability.heads import baselines
@@ -47,6 +47,7 @@ _POSITIVE = click.IntRange(1)
     help="Output folder.",
 )
 @click.option("--data", type=click.Path(path_type=Path), default=None, help="Folder of the maps. Default: OUT/data.")
+@smoke_option(batches=1, exact_batches=1, steps=4, evaluation_batches=1)
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
 def main(
     robot: RobotConfig | None,

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from envs.quadruped import Quadruped
 from envs.quadruped.config import GaitConfig, RandomConfig
 from envs.quadruped.gait import foot_positions
 from envs.quadruped.kinematics import joint_angles
 from envs.quadruped.physics import ROBOT, Physics, build_model, lay_out
-from tests.envs.quadruped.cases import SMALL
+from tests.envs.quadruped.cases import FLAT_CFG, SMALL
 from torchelev.sim import terrain_grid
+from torchelev.sim.terrains.shapes import SHAPES
 
 TERRAIN = terrain_grid(SMALL.kinds, 2, length=SMALL.length, resolution=0.05, seed=1)
 SAME = RandomConfig(num_bodies=1, payload=(0, 0), center_of_mass=0.0, strength=(1, 1), friction=(1, 1))
@@ -27,20 +29,24 @@ def standing(physics, tiles):
     return qpos
 
 
-def test_mujoco_and_the_map_stand_on_the_same_ground():
-    heights, origins = lay_out(TERRAIN)
+@pytest.mark.parametrize("kind", SHAPES)
+def test_eyes_see_the_ground_that_feet_stand_on(kind):
+    terrain = dataclasses.replace(SMALL, kinds=(kind,), num_levels=4, difficulty=(0.0, 1.0), resolution=0.05)
+    task = Quadruped(dataclasses.replace(FLAT_CFG, terrain=terrain), 1, perception="blind")
+    field, (heights, origins) = task.terrain.field, lay_out(task.terrain)
+    assert task.truth.field is field
     model = build_model(ROBOT, heights, 0.05)
     data = mujoco.MjData(model)
     data.qpos[2] = 50.0  # out of the rays' way
     mujoco.mj_forward(model, data)
     xy = (torch.rand(4, 50, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 5.0
-    expected = TERRAIN.field.height(torch.arange(4), xy).numpy()
+    expected = field.height(torch.arange(4), xy).numpy()
     hit = np.zeros(1, np.int32)
     for tile in range(4):
         for place, z in zip((origins[tile] + xy[tile]).numpy(), expected[tile], strict=True):
             start = np.array([*place, 10.0])
             distance = mujoco.mj_ray(model, data, start, np.array([0, 0, -1.0]), None, 1, -1, hit, None)
-            assert abs(10.0 - distance - z) < 0.03, "a cell is two triangles here and bilinear there"
+            assert abs(10.0 - distance - z) < 0.001
 
 
 def test_a_robot_stands_and_its_sensors_say_so():

@@ -5,6 +5,7 @@ import torch
 
 from torchelev.sim.sensors.casting import cast
 from torchelev.sim.terrains.heightfield import HeightField
+from torchelev.sim.terrains.surfaces import Surface
 
 FINE = 5e-4  # [m] step of the march
 TERRAINS = ["flat", "slope", "rough", "stairs", "stones", "gaps", "poles"]
@@ -35,9 +36,26 @@ def clearance(field, tile, points):
     cell = np.minimum(at.astype(int), size - 2)
     (u, v), (i, j) = np.moveaxis(at - cell, -1, 0), np.moveaxis(cell, -1, 0)
     k = np.broadcast_to(tile.reshape(-1, *[1] * (points.ndim - 2)), i.shape)
-    near = heights[k, i, j] * (1 - v) + heights[k, i, j + 1] * v
-    far = heights[k, i + 1, j] * (1 - v) + heights[k, i + 1, j + 1] * v
-    return points[..., 2] - near * (1 - u) - far * u
+    a, b, c, d = (heights[k, i + m, j + n] for m, n in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    return points[..., 2] - BETWEEN[field.surface](a, b, c, d, u, v)
+
+
+def bilinear(a, b, c, d, u, v):
+    return (a * (1 - u) + b * u) * (1 - v) + (c * (1 - u) + d * u) * v
+
+
+def rising(a, b, c, d, u, v):
+    """Two triangles, a b d and a d c, by their own corners."""
+    return np.where(u > v, a + (b - a) * u + (d - b) * v, a + (d - c) * u + (c - a) * v)
+
+
+def falling(a, b, c, d, u, v):
+    """Two triangles, a b c and d c b."""
+    return np.where(u + v < 1, a + (b - a) * u + (c - a) * v, d + (c - d) * (1 - u) + (b - d) * (1 - v))
+
+
+BETWEEN = dict(zip(Surface, (bilinear, rising, falling), strict=True))  # of corners a (0, 0), b (1, 0), c (0, 1), d
+SURFACES = [("bilinear", "rising"), ("triangles", "rising"), ("triangles", "falling")]
 
 
 def along(origins, directions, t):
@@ -109,9 +127,10 @@ def difficult_rays(kind, rng, field, N):
 
 
 def scene(seed, B=3, M=40, kind="any", resolution=0.04):
-    """A field of mixed terrain and rays from one origin per environment."""
+    """A field of mixed terrain and surface, and rays from one origin per environment."""
     rng = np.random.default_rng(seed)
     field = difficult_terrain(TERRAINS[seed % len(TERRAINS)], rng, resolution, K=B)
+    field = field.with_surface(*SURFACES[seed // len(TERRAINS) % len(SURFACES)])
     tile, origins, _ = difficult_rays(kind, rng, field, B)
     return field, torch.from_numpy(tile), torch.from_numpy(origins), unit(rng, B, M).float()
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tests.sim.sensors.ray_cases import (
     FINE,
     RAYS,
+    SURFACES,
     TERRAINS,
     along,
     clearance,
@@ -110,13 +111,13 @@ def test_range_is_the_limit(path):
     assert one(field, (0.0, 0.0, 1.0), [0.0, 0.0, -1.0], 0.999).isinf().all()
 
 
-@pytest.mark.slow(8)
+@pytest.mark.slow(13)
 @pytest.mark.parametrize("terrain", TERRAINS)
 def test_equals_a_fine_march(terrain):
-    """All kinds of rays on one kind of terrain: 3,150 of them, and 22,050 over all terrains, by C++ and by tensors."""
+    """All kinds of rays on one kind of terrain: 5,250 of them, and 36,750 over all terrains, by C++ and by tensors."""
     rng, N, reach, touching = np.random.default_rng(TERRAINS.index(terrain)), 150, 1.5, 0
-    for resolution in (0.02, 0.035, 0.05):
-        field = difficult_terrain(terrain, rng, resolution)
+    for resolution, surface in zip((0.02, 0.035, 0.05, 0.035, 0.05), (0, 0, 0, 1, 2), strict=True):
+        field = difficult_terrain(terrain, rng, resolution).with_surface(*SURFACES[surface])
         for kind in RAYS:
             tile, origins, d = difficult_rays(kind, rng, field, N)
             expected = march(field, tile, origins.astype(float), d.astype(float), reach)
@@ -126,7 +127,7 @@ def test_equals_a_fine_march(terrain):
                 differ = np.flatnonzero(~far & ~np.isclose(got, expected, rtol=0, atol=0.005))
                 touching += len(differ)
                 assert all(only_touches(field, tile[n], origins[n], d[n], got[n], expected[n]) for n in differ), kind
-    assert touching <= 20  # of 6,300
+    assert touching <= 33  # of 10,500
 
 
 def only_touches(field, tile, origin, d, got, expected):
@@ -237,6 +238,7 @@ def test_batch_equals_single(seed):
     for b in range(4):
         same(cast(field, tiles[b : b + 1], origin[b : b + 1], d[b : b + 1], 4.0), together[b : b + 1])
         alone = HeightField(field.heights[tiles[b]][None], field.resolution)
+        alone.surface = field.surface
         same(cast(alone, torch.tensor([0]), origin[b : b + 1], d[b : b + 1], 4.0), together[b : b + 1])
 
 

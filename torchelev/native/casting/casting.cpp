@@ -14,6 +14,7 @@ namespace {
 constexpr int AT_A_TIME = 1024;  // rays that a thread takes
 
 // Trace rays from one origin; a lane takes the next ray as soon as its own has ended.
+template <Surface surface>
 void trace(const Field& field, const float* origin, const float* directions, int count, float resolution,
            float max_range, float* distance) {
     // Along a unit vector a ray crosses at most two borders per cell length, and may try to jump before each.
@@ -27,7 +28,7 @@ void trace(const Field& field, const float* origin, const float* directions, int
         const Flags jumping = active & (rays.level >= 0);
         const bool jumps = 2 * count_set(jumping) > left;  // a turn is one kind of work: what more of the rays need
         if (jumps) jump(field, rays, jumping);
-        const Flags hits = jumps ? Flags{} : cross(field, rays, active & ~jumping);
+        const Flags hits = jumps ? Flags{} : cross<surface>(field, rays, active & ~jumping);
         rays.turns -= jumps ? jumping : active & ~jumping;
         const Flags ends = active & (hits | (rays.along > max_range) | (rays.turns > max_turns));
         if (!count_set(ends)) continue;
@@ -58,11 +59,12 @@ void stop_at_boxes(const Box* boxes, int num_boxes, const float* directions, int
 
 // Distances (B, M) of rays from origins (B, 3) [cells, cells, m], counted from the rim of the tiles, along directions
 // (B, M, 3). `heights` are (K, rows + 1, columns + 1), `bounds` and `sizes` those of `Bounds`, tile by tile within each
-// level. Returns what `code_of` does.
+// level, `surface` a `Surface`. Returns what `code_of` does.
 extern "C" int cast(const float* heights, const float* bounds, const int64_t* levels, const int64_t* sizes,
                     const int64_t* tiles, const float* origins, const float* directions, const Box* boxes,
-                    float* distance, int rows, int columns, int B, int M, int num_boxes, float resolution,
+                    float* distance, int surface, int rows, int columns, int B, int M, int num_boxes, float resolution,
                     float max_range, int num_threads) {
+    const auto trace_surface = surface == BILINEAR ? trace<BILINEAR> : surface == RISING ? trace<RISING> : trace<FALLING>;
     const int parts = (M + AT_A_TIME - 1) / AT_A_TIME;
     return code_of([&] {
         std::vector<int> order(B);  // robots on the same tile one after the other, while it is in the caches
@@ -74,7 +76,7 @@ extern "C" int cast(const float* heights, const float* bounds, const int64_t* le
             Field field{heights + tiles[b] * (rows + 1) * (columns + 1), bounds + tiles[b] * sizes[0], {}, rows, columns};
             for (int l = 0; l <= TOP; l++)
                 field.offset[l] = int32_t(levels[l] + tiles[b] * sizes[l] - tiles[b] * sizes[0]);
-            trace(field, origins + 3 * b, directions + 3 * first, count, resolution, max_range, distance + first);
+            trace_surface(field, origins + 3 * b, directions + 3 * first, count, resolution, max_range, distance + first);
             if (num_boxes) stop_at_boxes(boxes + b * num_boxes, num_boxes, directions + 3 * first, count, distance + first);
         });
     });

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../lanes.h"
+#include "surfaces.h"
 
 constexpr int TOP = 6;    // level of the bound of the whole tile; the blocks of level l have 2^l cells along a side
 constexpr int FIRST = 3;  // level that a ray begins at
@@ -66,28 +67,25 @@ inline void jump(const Field& field, Rays& rays, Flags jumping) {
     rays.level = pick_int(jumping, next, rays.level);
 }
 
-// Intersect the rays with the surface of their cells, and go on to the next ones. See `_intersect` in tracing.py.
-// Returns which hit; `along` is then that distance.
-inline Flags cross(const Field& field, Rays& rays, Flags crossing) {
+// Intersect the rays with the surface of their cells, and go on to the next ones. Returns which hit;
+// `along` is then that distance.
+template <Surface surface> inline Flags cross(const Field& field, Rays& rays, Flags crossing) {
     const Lanes u = rays.at(0, rays.along) - rays.cell[0], v = rays.at(1, rays.along) - rays.cell[1];
     const int width = field.columns + 1;
     const Flags row = integers(clamp(rays.cell[0], 0, field.rows - 1));
     const Flags first = row * width + integers(clamp(rays.cell[1], 0, field.columns - 1));
     const Lanes a = gather(field.heights, first), b = gather(field.heights, first + width) - a;
     const Lanes c = gather(field.heights, first + 1) - a, d = gather(field.heights, first + width + 1) - a - b - c;
-    const Lanes slope_x = b + d * v, over = rays.at(2, rays.along) - a - slope_x * u - c * v;
-    const Lanes sinking = slope_x * rays.step[0] + (c + d * u) * rays.step[1] - rays.step[2];
-    const Lanes bend = d * rays.step[0] * rays.step[1];
-    const Lanes ahead = 2 * over / (sinking + root(sinking * sinking + 4 * bend * over));
     const Lanes leave_x = larger(rays.inverse[0] * (0.5f - rays.sign[0] * (u - 0.5f)), all(0));
     const Lanes leave_y = larger(rays.inverse[1] * (0.5f - rays.sign[1] * (v - 0.5f)), all(0));
     const Lanes leave = smaller(leave_x, leave_y);
-    const Flags is_below = over <= 0, hits = crossing & (is_below | ((ahead >= 0) & (ahead <= leave)));
+    const Meeting meeting = meet<surface>({a, b, c, d}, u, v, rays.at(2, rays.along), rays.step, leave);
+    const Lanes ahead = meeting.ahead;
+    const Flags is_below = meeting.over <= 0, hits = crossing & (is_below | ((ahead >= 0) & (ahead <= leave)));
     const Flags through_x = leave_x <= leave_y, goes = crossing & ~hits;
     rays.along = pick(hits, rays.along + pick(is_below, all(0), ahead), pick(goes, rays.along + leave, rays.along));
     rays.cell[0] = pick(goes & through_x, rays.cell[0] + rays.sign[0], rays.cell[0]);
     rays.cell[1] = pick(goes & ~through_x, rays.cell[1] + rays.sign[1], rays.cell[1]);
-    const Lanes above = over - leave * (sinking + bend * leave);
-    rays.level = pick_int(goes & (above * rays.slowness > 2 * rays.fastest), 0, rays.level);
+    rays.level = pick_int(goes & (meeting.above * rays.slowness > 2 * rays.fastest), 0, rays.level);
     return hits;
 }

@@ -12,7 +12,8 @@ from torchelev.errors import require
 from torchelev.inputs.checks import require_indices
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.sim.sensors import native
-from torchelev.sim.sensors.tracing import HUGE, trace
+from torchelev.sim.sensors.crossing import HUGE
+from torchelev.sim.sensors.tracing import trace
 from torchelev.sim.terrains.heightfield import HeightField
 
 if TYPE_CHECKING:

@@ -43,7 +43,7 @@ def cast(
     inputs = (field.padded, *bounds, tile_ids, start, directions, solids)
     arrays = [*(value.contiguous() for value in inputs), distance]
     pointers = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
-    cells = [size - 1 for size in field.padded.shape[1:]]
+    sizes = [*(size - 1 for size in field.padded.shape[1:]), *distance.shape, solids.shape[1]]
     numbers = [ctypes.c_float(field.resolution), ctypes.c_float(max_range)]
-    call(library.cast, *pointers, *cells, *distance.shape, solids.shape[1], *numbers, torch.get_num_threads())
+    call(library.cast, *pointers, int(field.surface), *sizes, *numbers, torch.get_num_threads())
     return distance

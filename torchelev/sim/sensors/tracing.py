@@ -2,7 +2,7 @@
 
 The rays advance in rounds of two parts. `skip` jumps through the air over blocks of cells: a ray cannot hit anything
 in a block until it has descended to the block's highest point, so that free space costs few steps. `search` then
-intersects the next cells exactly: in each cell the height over the bilinear surface is quadratic along the ray. Every
+intersects the next cells exactly, see `crossing`. Every
 round advances by at least `count` cells, which bounds the number of rounds: after the last one, every ray is decided.
 A CPU continues with the undecided rays only. A GPU continues with all rays, because to select some of them it would
 have to wait for the host.
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.sim.sensors.crossing import intersect
 from torchelev.sim.terrains.heightfield import HeightField
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ _FIRST_SKIPS, _SKIPS = 3, 2  # jumps before the first search, and before every l
 MAX_CELLS = 32  # searched in a round, along x and along y each
 _MAX_WORK = 16384  # cells along x that a CPU searches in a round, for all rays together
 _TINY = 1e-9
-HUGE = 1e30  # [m] longer than any range
 
 
 class Rays(NamedTuple):
@@ -142,26 +142,7 @@ def search(field: HeightField, rays: Rays, count: int) -> tuple[Float[Tensor, "N
     offset[:, 0], offset[0, 1 : count + 1], offset[1, count + 1 :] = 0.0, passed[0], passed[1]
     inside -= offset
     z = torch.addcmul(place[2], entry, rays.step[2])
-    hit = _intersect(field, rays, offset.add_(cell[:, None]), inside, z)
-    return hit.add_(entry).amin(0), border[:, count].amin(0)
-
-
-def _intersect(field: HeightField, rays: Rays, cell: Tensor, inside: Tensor, z: Tensor) -> Float[Tensor, "E N"]:
-    """Return how far [m] behind its entry into each of E cells a ray hits the surface, HUGE if not within the cell.
-
-    At s metres behind the entry, the height over the surface is over - sinking s - bend s^2. `inside` (2, E, N) is the
-    position of the entry in the cell, from 0 to 1, and `z` (E, N) [m] its height.
-    """
-    (u, v), (step_x, step_y, step_z) = inside, rays.step
-    a, b, c, d = field.surface(cell, rays.tile)
-    slope_x = torch.addcmul(b, d, v)
-    over = z.sub_(a).addcmul_(slope_x, u, value=-1).addcmul_(c, v, value=-1)
-    sinking = slope_x.mul_(step_x).addcmul_(c.addcmul_(d, u), step_y).sub_(step_z)
-    # The first root, in the form that also holds for bend = 0; NaN where there is none.
-    root = d.mul_(4 * step_x * step_y).mul_(over).addcmul_(sinking, sinking)
-    root = over.mul(2).div_(sinking.addcmul_(root.rsqrt(), root))
     leave = (rays.inverse[:, None] * (0.5 - rays.sign[:, None] * (inside - 0.5))).amin(0)
-    # Negative where the root is not in [0, leave]. On a CPU, conditions take many times as long as this arithmetic.
-    outside = (leave - root).mul_(root).clamp_(max=0)
-    root = root.sub_(outside.mul_(HUGE)).nan_to_num_(HUGE, HUGE, HUGE)
-    return torch.minimum(root, over.clamp_(min=0).mul_(HUGE))  # a ray that enters below the ground hits there
+    coefficients = field.coefficients(offset.add_(cell[:, None]), rays.tile)
+    hit = intersect(field.surface, coefficients, inside, z, rays.step, leave)
+    return hit.add_(entry).amin(0), border[:, count].amin(0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,18 +16,23 @@ from torchelev.sim.terrains.shapes import SHAPES, TABLE
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Terrain:
     """K tiles, each in its own frame, whose origin is the tile's centre: a flat start platform at z = 0."""
 
-    field: HeightField  #: the surface to walk on and to see: the truth at the samples, bilinear between them
+    field: HeightField  #: the surface to walk on and to see: the truth at the samples
     kind: tuple[str, ...]  #: name of each tile's kind
     kinds: tuple[str, ...]  #: the kinds that `kind_ids` refers to
     kind_ids: Int[Tensor, "K"]  #: index in `kinds` of each tile
     difficulty: Float[Tensor, "K"]  #: from 0 (easiest) to 1 (hardest)
     random: Float[Tensor, "K R"]  #: table of random numbers from 0 to 1 for each tile
+
+    def with_surface(self, surface: str, diagonal: str = "rising") -> Self:
+        """Return the same tiles with another surface between the samples; see `HeightField`."""
+        return replace(self, field=self.field.with_surface(surface, diagonal))
 
     def truth(self, tile_ids: Int[Tensor, "B"], xy: Float[Tensor, "B M 2"]) -> Float[Tensor, "B M"]:
         """Return the true height [m] at xy [m] on each environment's tile, in closed form.

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.sim.terrains.surfaces import Coefficients, Surface, require_surface
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -38,20 +39,31 @@ class HeightField:
     """K terrain tiles, each in its own frame, whose origin is the centre of the tile.
 
     Sample [k, i, j] is the height at x = (i - (H - 1) / 2) * resolution, and y likewise with j. Between samples the
-    surface is bilinear. Beyond the rim of a tile the height of the rim continues. Cells lie between the samples. Their
-    indices run from 0, before the first sample, to H (W), behind the last one; these two extend to infinity. With its
-    bounds a tile takes 2.4 times the memory of its samples.
+    surface is bilinear, or it is two triangles in each cell, as physics engines take it: `torchelev.sim.surface_of`
+    names those of an engine. Heights and rays then meet what feet stand on. Beyond the rim of a tile the height of the
+    rim continues. Cells lie between the samples. Their indices run from 0, before the first sample, to H (W), behind
+    the last one; these two extend to infinity. With its bounds a tile takes 2.4 times the memory of its samples.
 
     Args:
         heights: (K, H, W) [m], at least 2 x 2 samples for each tile. They are copied.
         resolution: Distance between samples [m].
+        surface: "bilinear" or "triangles".
+        diagonal: The edge that the two triangles of a cell share: "rising" runs from sample (i, j) to (i + 1, j + 1),
+            "falling" from (i + 1, j) to (i, j + 1). A bilinear surface has none.
 
     Raises:
         TypeError: `heights` is not a tensor.
-        ValueError: The shape does not fit, a height is not finite, or the resolution is not positive.
+        ValueError: The shape does not fit, a height is not finite, the resolution is not positive, or there is no such
+            surface or diagonal.
     """
 
-    def __init__(self, heights: Float[Tensor, "K H W"], resolution: float) -> None:
+    def __init__(
+        self,
+        heights: Float[Tensor, "K H W"],
+        resolution: float,
+        surface: str = "bilinear",
+        diagonal: str = "rising",
+    ) -> None:
         actual = type(heights).__name__
         require(isinstance(heights, Tensor), "heights", "must be a tensor", actual, "use torch.as_tensor", TypeError)
         fits = heights.ndim == 3 and heights.shape[0] >= 1 and min(heights.shape[1:]) >= 2
@@ -60,6 +72,7 @@ class HeightField:
         require(fits, "heights", f"must have at most {_MAX_SAMPLES} samples a tile", tuple(heights.shape), "split it")
         require(bool(heights.isfinite().all()), "heights", "must be finite", "NaN or inf", "fill the holes")
         require(0 < resolution < math.inf, "resolution", "must be positive", resolution, "give metres per sample")
+        self.surface: Surface = require_surface(surface, diagonal)
         self.resolution = float(resolution)
         self.padded = F.pad(heights.float()[:, None], (1, 1, 1, 1), mode="replicate")[:, 0].contiguous()
         size = self.padded.new_tensor(self.padded.shape[1:])
@@ -90,6 +103,16 @@ class HeightField:
         moved.bounds = Bounds(*(value.to(device) for value in self.bounds))
         return moved
 
+    def with_surface(self, surface: str, diagonal: str = "rising") -> HeightField:
+        """Return the same tiles, which share their memory, with another surface between the samples.
+
+        Raises:
+            ValueError: There is no such surface or diagonal.
+        """
+        changed = copy.copy(self)
+        changed.surface = require_surface(surface, diagonal)
+        return changed
+
     def height(self, tile_ids: Int[Tensor, "B"], xy: Float[Tensor, "B M 2"]) -> Float[Tensor, "B M"]:
         """Return the height of the surface [m] at xy [m] on each environment's tile; NaN counts as 0.
 
@@ -108,15 +131,11 @@ class HeightField:
         offset = (xy / self.resolution).to(self.padded.dtype).nan_to_num(0.0)  # NaN would become an index
         position = offset.movedim(-1, 0) + self.middle[:, None, None]
         cell = position.floor()
-        a, b, c, d = self.surface(cell, tile_ids[:, None])
         u, v = position - cell
-        return a + b * u + (c + d * u) * v
+        return self.surface.height(self.coefficients(cell, tile_ids[:, None]), u, v)
 
-    def surface(self, cell: Float[Tensor, "2 *N"], tile: Int[Tensor, "*N"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return a, b, c, d (*N) of the surface z = a + b u + c v + d u v [m], with u and v from 0 to 1 in the cell.
-
-        Cells may lie beyond the rim.
-        """
+    def coefficients(self, cell: Float[Tensor, "2 *N"], tile: Int[Tensor, "*N"]) -> Coefficients:
+        """Return a, b, c, d (*N) of the surface in cells, which may lie beyond the rim; see `surfaces`."""
         cell = torch.minimum(cell.clamp(min=0), self.last.view(2, *[1] * (cell.ndim - 1)))
         W = self.padded.shape[2]
         index = torch.add(cell[1], cell[0], alpha=W).to(torch.int64) + tile * (self.padded.shape[1] * W)
