@@ -529,18 +529,22 @@ def spans_plane(cells, radius):
     return across >= max(0.25, 0.16 * full) - 1e-3
 
 
+def step_at(elevation, validity, i, j, radius):
+    """The largest height difference between a known cell and those around it."""
+    return max(abs(elevation[c] - elevation[i, j]) for c in window(validity, i, j, radius))
+
+
 def traversability(elevation, validity, i, j, resolution, *, radius, critical_slope, critical_step, critical_roughness):
     """1 - max(slope / critical, step / critical, roughness / critical), not below 0; `radius` in metres.
 
-    None where the cells of the window do not span a plane.
+    None where the cells of the window do not span a plane. A step is a height difference within 0.1 m and the window.
     """
     cells = max(1, round(radius / resolution))
     spans, gx, gy, residual = fit_plane(elevation, validity, i, j, cells, resolution)
     if not spans:
         return None
-    heights = [elevation[c] for c in window(validity, i, j, cells)]
-    explained = 2 * cells * resolution * (abs(gx) + abs(gy))
-    slope, step = math.atan(math.hypot(gx, gy)), max(0.0, max(heights) - min(heights) - explained)
+    step = step_at(elevation, validity, i, j, min(cells, max(1, round(0.1 / resolution))))
+    slope = math.atan(math.hypot(gx, gy))
     return max(0.0, 1 - max(slope / critical_slope, step / critical_step, math.sqrt(residual) / critical_roughness))
 
 

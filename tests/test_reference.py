@@ -290,13 +290,15 @@ def test_fit_plane():
 
 
 def test_traversability():
-    critical = dict(radius=0.1, critical_slope=math.pi / 2, critical_step=0.5, critical_roughness=10.0)
+    critical = dict(radius=0.1, critical_slope=math.pi / 2, critical_step=0.4, critical_roughness=10.0)
     i, j = np.indices((3, 3))
     known = np.ones((3, 3), bool)
-    slope = reference.traversability(0.1 * i, known, 1, 1, 0.1, **critical)  # 45 degrees of 90; the plane explains 0.2
+    slope = reference.traversability(0.1 * i, known, 1, 1, 0.1, **critical)  # 45 degrees of 90; 0.1 from cell to cell
     assert slope == pytest.approx(0.5)
     peak = np.where((i == 1) & (j == 1), 0.1, 0.0)
-    assert reference.traversability(peak, known, 1, 1, 0.1, **critical) == pytest.approx(1 - 0.1 / 0.5)
+    assert reference.traversability(peak, known, 1, 1, 0.1, **critical) == pytest.approx(1 - 0.1 / 0.4)
+    # A wall is a step whatever the plane.
+    assert reference.traversability(0.3 * (i > 1), known, 1, 1, 0.1, **critical) == pytest.approx(1 - 0.3 / 0.4)
     assert reference.traversability(100 * peak, known, 1, 1, 0.1, **critical) == 0.0
 
 

@@ -113,6 +113,12 @@ def _build(cls: type, values: object, where: str) -> Any:
     return cls(**{name: _convert(hints[name], value, f"{where}.{name}") for name, value in values.items()})
 
 
+def _share_of_settings(names: set[str], settings: set[str]) -> tuple[int, float]:
+    """Return how many of a type's settings are named, and which share of them."""
+    number = len(names & settings)
+    return number, number / len(settings)
+
+
 def _convert(hint: Any, value: object, where: str) -> Any:
     """Return a setting of this type from its plain value."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
@@ -123,9 +129,8 @@ def _convert(hint: Any, value: object, where: str) -> Any:
     kind = kinds[0]
     if dataclasses.is_dataclass(kind):
         names = set(value) if isinstance(value, dict) else set()
-        kind = max(
-            kinds, key=lambda k: len(names & set(_setting_types(k)))
-        )  # of several types, the one with these settings
+        # Of several types, the one that has these settings, and few others: `robot` alone is the learned head's.
+        kind = max(kinds, key=lambda k: _share_of_settings(names, set(_setting_types(k))))
         return _build(typing.cast(type, kind), value, where)
     element = next(iter(typing.get_args(kind)), None)
     if dataclasses.is_dataclass(element):

@@ -141,6 +141,7 @@ def test_layers_of_filters_are_saved_too(tmp_path):
 
 def test_refuses_a_layer_named_as_a_fact(tmp_path):
     with pytest.raises(
-        ValueError, match="layers: must not be named resolution, center, axes, config, file, got center"
+        ValueError,
+        match="layers: must not be named resolution, center, axes, config, file, or begin with map_, got center",
     ):
         save_npz(tmp_path / "map.npz", with_filter("center"))

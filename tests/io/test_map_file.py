@@ -21,9 +21,9 @@ from torchelev import (
     SensorConfig,
 )
 from torchelev.filters import FilterConfig, register
-from torchelev.io.export import load_map, load_npz, save_map, save_npz
+from torchelev.io.export import load_map, load_npz, save_map, save_npz, take, write_npz
 from torchelev.io.map_file import FORMAT, VERSION, read_npz
-from torchelev.state import MapState, Statistics
+from torchelev.state import MapState, Statistics, map_layers
 
 LIVELY = dict(
     sensor=SensorConfig(body=BodyConfig(lower=(-0.1, -0.1, -2), upper=(0.1, 0.1, 2))),
@@ -149,10 +149,21 @@ def test_refuses_other_files(tmp_path):
         load_map(other)
 
 
-def test_says_who_reads_layers_of_one_map(tmp_path):
-    save_npz(tmp_path / "layers.npz", mapped())
-    with pytest.raises(ValueError, match="read files of save_npz with load_npz"):
+def test_says_who_reads_layers_alone(tmp_path):
+    write_npz(tmp_path / "layers.npz", take(mapped()))
+    with pytest.raises(ValueError, match="or read layers alone with load_npz"):
         load_map(tmp_path / "layers.npz")
+
+
+def test_layers_of_one_map_are_the_whole_map_too(tmp_path):
+    """`torchelev map` writes them: one environment, to the bit, for `load_map` as for NumPy."""
+    emap = mapped()
+    save_npz(tmp_path / "map.npz", emap, env=1)
+    loaded, saved = load_map(tmp_path / "map.npz"), load_npz(tmp_path / "map.npz")
+    assert loaded.num_envs == 1 and loaded.cfg == emap.cfg and set(saved.layers) == set(emap.layers)
+    assert differences(loaded.state, map_layers(lambda value: value[1:2], emap.state)) == []
+    for name, layer in saved.layers.items():
+        np.testing.assert_array_equal(loaded.layer(name)[0].numpy(), layer)
 
 
 def test_refuses_a_file_that_was_cut_or_damaged(path):

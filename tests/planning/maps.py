@@ -8,15 +8,20 @@ import torch
 from hypothesis import strategies as st
 
 from tests.helpers import random_state, small_map
+from torchelev import TraversabilityConfig
 
 SEEDS = st.integers(0, 10_000)
 CELLS, RESOLUTION = (16, 14), 0.125  # m, exact in floating point
 CORNER = torch.tensor([[-8, -7], [40, -33]])
 
 
-def ground_map(traversability=1.0, known=True, num_envs=1, dtype=torch.float64):
+#: A head whose robot has no limits: random heights are full of steps.
+NO_LIMITS = TraversabilityConfig(critical_slope=math.inf, critical_step=math.inf)
+
+
+def ground_map(traversability=1.0, known=True, num_envs=1, dtype=torch.float64, head=None):
     """A map of 16 x 14 cells of 12.5 cm; the first one spans x from -1 to 1, y from -0.875 to 0.875."""
-    emap = small_map(num_envs, CELLS, RESOLUTION, dtype)
+    emap = small_map(num_envs, CELLS, RESOLUTION, dtype, traversability=head or TraversabilityConfig())
     emap.corner.copy_(CORNER[:num_envs])
     emap.traversability.copy_(torch.as_tensor(traversability))
     emap.rated.fill_(True)
@@ -26,7 +31,7 @@ def ground_map(traversability=1.0, known=True, num_envs=1, dtype=torch.float64):
 
 def random_map(seed, num_envs=2, known=0.7):
     """Unknown cells hold NaN: none of it may be read."""
-    emap = ground_map(num_envs=num_envs)
+    emap = ground_map(num_envs=num_envs, head=NO_LIMITS)
     state = random_state(np.random.default_rng(seed), emap.cfg.grid, num_envs, known)
     traversability = torch.where(state.validity, state.traversability, torch.nan)
     emap.load_state(state._replace(corner=CORNER[:num_envs], traversability=traversability))
@@ -50,8 +55,8 @@ def random_polygons(rng, emap, number=6, vertices=5):
 
 
 def only(check):
-    """The four results of the only polygon."""
-    return tuple(values.flatten()[0].item() for values in check)
+    """The four results of the only polygon's rating."""
+    return tuple(values.flatten()[0].item() for values in check[:4])
 
 
 def near(*values):

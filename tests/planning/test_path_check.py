@@ -212,7 +212,7 @@ def test_checks_do_not_read_values(monkeypatch):
 
 def test_bad_values_elsewhere_are_not_safe(monkeypatch):
     """As on a GPU, where nothing is read."""
-    for module in ("footprint", "path_check"):
+    for module in ("ground_below", "path_check"):
         monkeypatch.setattr(f"torchelev.planning.{module}.readable", lambda *args: False)
     emap = ground_map(1.0)
     long = check_path(emap, path((-0.5, 0, 0), (0.0, 0, 0), (0.1, 0, 0)), FOOTPRINT, samples=2)

@@ -11,7 +11,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from benchmarks.quality.occlusion.refine import piece_costs, refine
 from benchmarks.quality.occlusion.rules import decide
 from benchmarks.quality.occlusion.scenes import VIEWS, abyss, cliff, hump, step_down, views
-from tests.planning.maps import CORNER, RESOLUTION, ground_map, place, random_map
+from tests.planning.maps import CORNER, NO_LIMITS, RESOLUTION, ground_map, place, random_map
 from tests.planning.test_cost_to_go import dijkstra
 from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import (
@@ -233,7 +233,7 @@ def test_maps_far_away_and_batches():
     start, goal = emap.center[:, :2] - 0.6, emap.center[:, :2] + 0.6
     both = plan(emap, start, goal)
     assert both.reached.all()
-    single = ground_map()
+    single = ground_map(head=NO_LIMITS)
     for b in range(2):
         for name, value in emap.state._asdict().items():
             if name != "statistics":

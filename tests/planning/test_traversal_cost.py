@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.helpers import random_state, small_map, with_completion
-from tests.planning.maps import RESOLUTION, ground_map, random_map
+from tests.planning.maps import NO_LIMITS, RESOLUTION, ground_map, random_map
 from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.planning.traversal_cost import TraversalCostConfig, cost_of_layers, traversal_cost
@@ -206,7 +206,7 @@ def test_batches_equal_single_maps():
     both = traversal_cost(emap)
     state = emap.state
     for b in range(2):
-        single = ground_map()
+        single = ground_map(head=NO_LIMITS)
         for name, value in state._asdict().items():
             if name != "statistics":
                 getattr(single, name).copy_(value[b : b + 1])

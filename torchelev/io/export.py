@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
-from torchelev.io.map_file import as_array, load_map, read_npz, save_map
+from torchelev.io.map_file import WHOLE, as_array, load_map, map_arrays, read_npz, save_map
 from torchelev.output_files import MARK, atomic_file
 from torchelev.state import map_layers
 
@@ -95,7 +95,8 @@ def save_npz(path: str | Path, emap: ElevationMap, env: int = 0) -> None:
     """Write the layers (H, W) of one environment, by their names, to an `.npz` that plain NumPy reads.
 
     Beside the layers it holds `resolution` [m], `center` (3,) [m] in the map frame, `axes` (the index convention in
-    words) and `config` (JSON). `load_npz` reads it back.
+    words) and `config` (JSON). `load_npz` reads these back. The arrays that begin with `map_` are the environment as
+    `save_map` keeps it, for `load_map`: a map that continues, or that paths are planned on.
 
     Args:
         path: the file to write, under this name as it is.
@@ -106,16 +107,19 @@ def save_npz(path: str | Path, emap: ElevationMap, env: int = 0) -> None:
         ValueError: the environment does not exist, or a filter's layer has a reserved name.
         WriteError: the file cannot be written; an existing one is left as it was.
     """
-    write_npz(path, take(emap, env))
+    saved = take(emap, env)
+    write_npz(path, saved, map_arrays(emap, map_layers(lambda value: value[env : env + 1], emap.state)))
 
 
-def write_npz(path: str | Path, saved: SavedMap) -> None:
-    """Write layers and their geometry, as `save_npz` does."""
-    clash = [name for name in (*_GEOMETRY, "file") if name in saved.layers]  # `file` is an argument of NumPy's savez
-    rule = f"must not be named {', '.join(_GEOMETRY)}, file"
+def write_npz(path: str | Path, saved: SavedMap, whole: dict[str, Any] | None = None) -> None:
+    """Write layers and their geometry, as `save_npz` does, and the arrays of a whole map, if given."""
+    reserved = (*_GEOMETRY, "file")  # `file` is an argument of NumPy's savez
+    clash = [name for name in saved.layers if name in reserved or name.startswith(WHOLE)]
+    rule = f"must not be named {', '.join(reserved)}, or begin with {WHOLE}"
     require(not clash, "layers", rule, ", ".join(clash), "rename the filter's layer")
     config = np.array(json.dumps(saved.config))
     arrays: dict[str, Any] = dict(saved.layers, resolution=saved.resolution, center=saved.center, axes=_AXES)
+    arrays |= {WHOLE + name: array for name, array in (whole or {}).items()}
     with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
         np.savez_compressed(file, config=config, **arrays)
 
@@ -132,7 +136,7 @@ def load_npz(path: str | Path) -> SavedMap:
     Raises:
         ValueError: not a file of `save_npz`, or a damaged one.
     """
-    arrays = read_npz(path, _HINT)
+    arrays = {name: array for name, array in read_npz(path, _HINT).items() if not name.startswith(WHOLE)}
     missing = set(_GEOMETRY) - set(arrays)
     if missing:
         raise ValueError(f"{path}: not a map, {', '.join(sorted(missing))} missing; {_HINT}")

@@ -25,6 +25,7 @@ from torchelev.state import MapState
 from torchelev.traversability.net import TraversabilityNet
 
 FORMAT, VERSION = "torchelev map", 2
+WHOLE = "map_"  # begins the names of the whole map's arrays in a file of save_npz, beside its layers
 _NEW_LAYERS = {"has_normal", "rated", "challenger", "challenger_support"}  # absent from version 1
 _OPTIONAL = {"pose_covariance", "elapsed"}  # absent from older files of both versions
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
@@ -44,19 +45,23 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     Raises:
         WriteError: the file cannot be written; an existing one is left as it was.
     """
+    with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
+        np.savez_compressed(file, **map_arrays(emap, emap.state))
+
+
+def map_arrays(emap: ElevationMap, state: MapState) -> dict[str, Any]:
+    """Return the arrays of `save_map` for a state of a map."""
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
     header |= {name: None if net is None else net.config for name, net in _nets(emap).items()}
-    arrays: dict[str, Any] = {name: as_array(value) for name, value in name_tensors(emap.state).items()}
-    arrays |= {name: as_array(value) for name, value in _weights(emap).items()}
-    with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+    arrays = {name: as_array(value) for name, value in (name_tensors(state) | _weights(emap)).items()}
+    return {"header": np.array(json.dumps(header)), **arrays}
 
 
 def load_map(
     path: str | Path, device: torch.device | str = "cpu", env_ids: Sequence[int] | Tensor | None = None
 ) -> ElevationMap:
-    """Read a file of `save_map` into a new map, which continues where the saved one stopped.
+    """Read a file of `save_map` or `save_npz` into a new map, which continues where the saved one stopped.
 
     Updates then give the same bits on the device type that the map was saved from, and agree up to rounding on others.
 
@@ -69,9 +74,11 @@ def load_map(
         The map.
 
     Raises:
-        ValueError: not a file of `save_map`, a damaged one, one of a newer version, or ids out of range.
+        ValueError: not such a file, or layers alone, a damaged file, one of a newer version, or ids out of range.
     """
     arrays = read_npz(path, "write it with save_map")
+    if WHOLE + "header" in arrays:  # of save_npz
+        arrays = {name.removeprefix(WHOLE): array for name, array in arrays.items() if name.startswith(WHOLE)}
     header = _header(path, arrays)
     ids = _ids(env_ids, _num_envs(path, arrays))
     try:
@@ -129,7 +136,7 @@ def _header(path: str | Path, arrays: dict[str, NDArray]) -> dict[str, Any]:
     except (KeyError, json.JSONDecodeError):
         header = None
     is_map = isinstance(header, dict) and header.get("format") == FORMAT and "config" in header
-    hint = "write it with save_map, or read files of save_npz with load_npz"
+    hint = "write it with save_map or save_npz, or read layers alone with load_npz"
     require(is_map, str(path), "must be a whole map", f"an .npz with {', '.join(arrays) or 'nothing'}", hint)
     assert isinstance(header, dict)
     version = header.get("version")

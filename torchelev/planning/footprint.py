@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,16 +11,14 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
-from torchelev.grid import GridConfig
-from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default, readable
-from torchelev.planning.polygons import PolygonCells, convex_hull, rasterize
-from torchelev.planning.standing import MAX_CELL_OFFSET, mark_standing_cells
+from torchelev.inputs.checks import given_or_default
+from torchelev.planning.ground_below import fit_below, read_ground
+from torchelev.planning.limits import ROUNDING, limits_of
+from torchelev.planning.polygons import convex_hull
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-ROUNDING = 1e-3  # [cells] tolerance on a polygon's extent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,28 +48,18 @@ class FootprintConfig:
             require(in_range, f"footprint.{name}", "must lie in [0, 1]", repr(value), "leave it out for its default")
         require_positive(**{"footprint.max_extent": self.max_extent})
 
-    def max_cells(self, grid: GridConfig) -> int:
-        """Return `max_extent` in cells, rounded up."""
-        return math.ceil(self.max_extent / grid.resolution - 1e-6)
-
 
 class FootprintCheck(NamedTuple):
     """Ratings of P footprints on each of B maps. Means and fractions lie in [0, 1]."""
 
-    safe: Bool[Tensor, "B P"]  #: mean traversability and fractions of unsafe and unknown cells meet the thresholds
+    #: mean traversability and fractions of unsafe and unknown cells meet the thresholds, and the ground the limits
+    safe: Bool[Tensor, "B P"]
     traversability: Float[Tensor, "B P"]  #: mean over the known cells; 0 if none is known
     unknown: Float[Tensor, "B P"]  #: fraction of cells unknown or outside the window, except under the standing robot
     unsafe: Float[Tensor, "B P"]  #: fraction of cells known to be unsafe
-
-
-class _Ground(NamedTuple):
-    """The cells below footprints."""
-
-    cells: PolygonCells
-    values: Float[Tensor, "B P S S"]  # 0 where not known
-    known: Bool[Tensor, "B P S S"]  # in the polygon and known
-    unsafe: Bool[Tensor, "B P S S"]  # in the polygon and known to be unsafe
-    assumed: Bool[Tensor, "B P S S"]  # in the polygon, unknown, and under the robot where it stands now
+    step: Float[Tensor, "B P"]  #: [m] the highest step of a cell, as of `limits.compute_steps`
+    slope: Float[Tensor, "B P"]  #: [rad] inclination of the plane through the known cells
+    clearance: Float[Tensor, "B P"]  #: [m] height of the highest known cell above the plane through the outer ones
 
 
 def check_footprint(
@@ -88,6 +75,9 @@ def check_footprint(
     A footprint is safe if the mean traversability of its known cells is high enough and its fractions of unsafe and
     unknown cells are low enough. A cell whose elevation is known but whose traversability is not counts as unknown. A
     footprint without any known cell is safe only where the robot stands now. The mean is differentiable in the state.
+
+    Nor may the ground exceed the robot's limits, however well it is rated (`limits.limits_of`): no cell has a higher
+    step, the plane through the known cells is not steeper, and no cell is higher above the outer ones than the belly.
 
     The paper's open code offers planners a similar check. It crops polygons at the window's border, ignores unknown
     cells and bounds the number of unsafe cells; here cells outside the window and unknown cells count as unknown, and
@@ -110,9 +100,10 @@ def check_footprint(
         KeyError: for an unknown layer.
     """
     cfg = given_or_default(FootprintConfig, cfg)
-    ground = _read_ground(emap, polygons, cfg, state, standing)
+    ground = read_ground(emap, polygons, cfg.layer, cfg.max_extent, state, standing)
     values = ground.values
-    masks = (ground.cells.inside, ground.known, ground.unsafe, ground.assumed)
+    is_unsafe = ground.known & (values < cfg.unsafe_traversability)
+    masks = (ground.cells.inside, ground.known, is_unsafe, ground.assumed)
     total, known, unsafe, assumed = (mask.flatten(-2).sum(-1, dtype=torch.int32) for mask in masks)
     mean = values.flatten(-2).sum(-1) / known.clamp(min=1).to(values.dtype)
     divisor = total.clamp(min=1).double()
@@ -120,7 +111,10 @@ def check_footprint(
     unsafe_fraction = (unsafe / divisor).to(values.dtype)
     has_few_bad_cells = (unsafe_fraction <= cfg.max_unsafe) & (unknown_fraction <= cfg.max_unknown)
     has_good_mean = torch.where(known > 0, mean >= cfg.min_traversability, assumed > 0)
-    return FootprintCheck(has_few_bad_cells & has_good_mean, mean, unknown_fraction, unsafe_fraction)
+    ground_values = (ground.steps.flatten(-2).amax(-1), *fit_below(ground, emap.cfg.grid.resolution))
+    step, slope, clearance = limits_of(emap.cfg).exceeded(*ground_values)
+    safe = has_few_bad_cells & has_good_mean & ~(step | slope | clearance)
+    return FootprintCheck(safe, mean, unknown_fraction, unsafe_fraction, *(v.to(mean.dtype) for v in ground_values))
 
 
 def unsafe_area(
@@ -130,7 +124,7 @@ def unsafe_area(
     *,
     state: MapState | None = None,
 ) -> list[list[np.ndarray]]:
-    """Return the convex hull of the unsafe cells below each footprint.
+    """Return the convex hull of the unsafe cells below each footprint, and of those with too high a step.
 
     The host waits for the device, as the hulls differ in length. Arguments and errors are those of `check_footprint`.
 
@@ -139,72 +133,12 @@ def unsafe_area(
         cell is unsafe.
     """
     cfg = given_or_default(FootprintConfig, cfg)
-    ground = _read_ground(emap, polygons, cfg, state)
+    ground = read_ground(emap, polygons, cfg.layer, cfg.max_extent, state)
     corner = (emap.state if state is None else state).corner
-    unsafe, first = ground.unsafe.cpu().numpy(), (ground.cells.first + corner[:, None]).cpu().numpy()
+    is_unsafe = ground.known & (ground.values < cfg.unsafe_traversability)
+    bad = is_unsafe | (ground.steps > limits_of(emap.cfg).step + ROUNDING)
+    unsafe, first = bad.cpu().numpy(), (ground.cells.first + corner[:, None]).cpu().numpy()
     return [
         [(convex_hull(cells) + offset) * emap.cfg.grid.resolution for cells, offset in zip(*both, strict=True)]
         for both in zip(unsafe, first, strict=True)
     ]
-
-
-def _read_ground(
-    emap: ElevationMap,
-    polygons: Tensor,
-    cfg: FootprintConfig,
-    state: MapState | None,
-    standing: Tensor | None = None,
-) -> _Ground:
-    """Check the inputs and read the cells below the polygons."""
-    is_rated = cfg.layer != "traversability" or emap.cfg.traversability is not None
-    hint = "give ElevationMapConfig a TraversabilityConfig, or FootprintConfig another layer"
-    require(is_rated, "traversability", "must not be switched off", "None", hint)
-    values, known = emap.read_layer(cfg.layer, state)
-    uv, is_usable = _to_cells(emap, polygons, cfg, (emap.state if state is None else state).corner)
-    cells = rasterize(torch.where(is_usable[..., None, None], uv, 0.0), cfg.max_cells(emap.cfg.grid) + 1)
-    cells = cells._replace(inside=cells.inside & is_usable[..., None, None])
-    assumed = torch.zeros_like(cells.inside)
-    if standing is not None:
-        below = mark_standing_cells(emap, standing, state) & ~known
-        assumed = _read_patches(values, below, cells, emap.cfg.grid)[1]
-    values, known = _read_patches(values, known, cells, emap.cfg.grid)
-    return _Ground(cells, values, known, known & (values < cfg.unsafe_traversability), assumed)
-
-
-def _to_cells(emap: ElevationMap, polygons: Tensor, cfg: FootprintConfig, corner: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the vertices in cells from the window's corner, and which polygons are finite and small enough."""
-    value = check_tensor("polygons", polygons, emap.device, FLOATS)
-    fits = value.ndim == 4 and value.shape[0] == emap.num_envs and value.shape[3] == 2
-    hint = "give x and y of polygons for each environment"
-    require(fits, "polygons", f"expected ({emap.num_envs}, P, V, 2)", tuple(value.shape), hint)
-    hint = "give the vertices in order, or repeat the last one"
-    require(value.shape[2] >= 3, "polygons", "must have at least 3 vertices", value.shape[2], hint)
-    grid = emap.cfg.grid
-    max_extent = cfg.max_cells(grid) + ROUNDING
-    uv = value.detach().double() / grid.resolution - corner[:, None, None]
-    extent = (uv.amax(-2) - uv.amin(-2)).amax(-1)
-    if readable(value, emap.check_values) and value.numel():
-        _require_small(uv, extent, max_extent, cfg, grid)
-    return uv, (uv.abs() < MAX_CELL_OFFSET).flatten(-2).all(-1) & (extent <= max_extent)
-
-
-def _require_small(uv: Tensor, extent: Tensor, max_extent: float, cfg: FootprintConfig, grid: GridConfig) -> None:
-    """Refuse polygons that are not finite or too large; this reads their values."""
-    is_finite = bool(torch.isfinite(uv).all())
-    require(is_finite, "polygons", "must be finite", "NaN or inf", "pad by repeating the last vertex, not with NaN")
-    largest = float(extent.max())
-    rule = f"must extend at most max_extent = {cfg.max_extent:g} m along x and y"
-    hint = "enlarge max_extent of FootprintConfig, or divide the polygon"
-    require(largest <= max_extent, "polygons", rule, f"{largest * grid.resolution:.6g} m", hint)
-
-
-def _read_patches(values: Tensor, known: Tensor, cells: PolygonCells, grid: GridConfig) -> tuple[Tensor, Tensor]:
-    """Read the polygons' cells: their values, 0 where not known, and where they are known."""
-    offset = torch.arange(cells.inside.shape[-1], device=values.device)
-    i, j = cells.first[..., 0, None] + offset, cells.first[..., 1, None] + offset
-    in_rows, in_columns = (i >= 0) & (i < grid.height), (j >= 0) & (j < grid.width)
-    i, j = i.clamp(0, grid.height - 1) * grid.width, j.clamp(0, grid.width - 1)
-    cell = (i[..., :, None] + j[..., None, :]).flatten(1)
-    is_known = known.flatten(1).gather(1, cell).view_as(cells.inside)
-    is_known = is_known & cells.inside & in_rows[..., :, None] & in_columns[..., None, :]
-    return torch.where(is_known, values.flatten(1).gather(1, cell).view_as(is_known), 0.0), is_known

@@ -12,6 +12,7 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
 from torchelev.inputs.checks import given_or_default, readable
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint
+from torchelev.planning.limits import Limits, limits_of
 from torchelev.planning.standing import MAX_CELL_OFFSET, check_polygon, check_poses, transform_polygon
 from torchelev.state import MapState
 
@@ -28,6 +29,7 @@ class PathCheck(NamedTuple):
     first_unsafe: Int[Tensor, "B"]  #: index of the first pose that cannot be reached safely; T if all can
     poses: Float[Tensor, "B M 3"]  #: x, y [m] and yaw [rad], map frame; every `samples`-th is a given pose
     footprints: FootprintCheck  #: (B, M), at these places
+    limits: Limits  #: of the robot, which hold besides the thresholds
 
     def explain(self) -> list[str]:
         """Say for each path whether it is safe, else why not. The host waits for the device.
@@ -44,8 +46,9 @@ class PathCheck(NamedTuple):
         if is_empty:
             return "the path is empty: no path was found; Path.explain() says why"
         x, y, _ = self.poses[b, sample].tolist()
-        mean, unknown, unsafe = (float(values[b, sample]) for values in self.footprints[1:])
+        mean, unknown, unsafe, *asked = (float(values[b, sample]) for values in self.footprints[1:])
         ground = f"mean traversability {mean:.2f}, {unsafe:.0%} of the cells unsafe, {unknown:.0%} unknown"
+        ground = "; ".join([*self.limits.describe(*asked), ground])
         return f"pose {pose} cannot be reached safely: at x = {x:.2f} m, y = {y:.2f} m {ground}"
 
 
@@ -106,7 +109,8 @@ def check_path(
     footprints = check_footprint(emap, polygons, cfg, standing=standing, state=state)
     is_close = (step <= 1 + ROUNDING).repeat_interleave(samples, 1)
     safe = footprints.safe & torch.cat([is_close.new_ones(len(is_close), 1), is_close], 1)
-    return PathCheck(safe.all(1), _find_first_unsafe(safe, samples), places, footprints._replace(safe=safe))
+    first_unsafe = _find_first_unsafe(safe, samples)
+    return PathCheck(safe.all(1), first_unsafe, places, footprints._replace(safe=safe), limits_of(emap.cfg))
 
 
 def _is_empty(poses: Float[Tensor, "B T 3"]) -> Bool[Tensor, "B"]:

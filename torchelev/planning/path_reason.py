@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.windows import AROUND, neighbours
+from torchelev.planning.limits import Limit
 from torchelev.planning.traversal_cost import mark_disc
 
 if TYPE_CHECKING:
@@ -49,6 +52,19 @@ _SENTENCES = {
     Reason.NO_PATH: "impassable or unknown ground separates the start from the goal",
     Reason.CELL_LIMIT: "the path is longer than max_cells; raise it, or plan again from the end of the path",
 }
+
+
+_LIMITS = {
+    Limit.NONE: "",
+    Limit.STEP: "; there, steps are higher than the robot can overcome",
+    Limit.SLOPE: "; there, the ground is steeper than the robot can climb",
+    Limit.CLEARANCE: "; there, the ground would touch the robot's belly",
+}
+
+
+def explain(reason: int, limit: int) -> str:
+    """Return a reason, and the limit of the robot that is part of it, as a sentence."""
+    return Reason(reason).sentence + _LIMITS[Limit(limit)]
 
 
 class Endpoint(NamedTuple):
@@ -99,6 +115,42 @@ def find_reason(
     ):
         reason = torch.where(holds, specific.value, reason)
     return reason
+
+
+def find_limit(
+    reason: Int[Tensor, "B"],
+    cost: Float[Tensor, "B H W"],
+    value: Float[Tensor, "B H W"],
+    exceeded: Sequence[Bool[Tensor, "B H W"]],
+    standing: Bool[Tensor, "B H W"],
+    start: Endpoint,
+    goal: Endpoint,
+) -> Int[Tensor, "B"]:
+    """Return the `Limit` of the robot that most of the ground exceeds for which a path ends, int64.
+
+    This ground is the goal, what encloses the start, or the border of what can be reached from the goal.
+
+    Args:
+        reason: the `Reason` of each map.
+        cost: the cost of each cell, as `traversal_cost` returns it.
+        value: the cost to go.
+        exceeded: the cells that exceed each limit, and those too close to them.
+        standing: the cells below the robot.
+        start: the start of the path.
+        goal: the goal of the path.
+    """
+    around = _mark_border(standing | mark_disc(start.cell, cost, 0.0))
+    border = torch.zeros_like(around)
+    for reasons, cells in (
+        ((Reason.NO_PATH,), _mark_border(torch.isfinite(value))),
+        ((Reason.START_UNKNOWN, Reason.START_IMPASSABLE), around),
+        ((Reason.GOAL_UNKNOWN, Reason.GOAL_IMPASSABLE), mark_disc(goal.cell, cost, 0.0)),
+    ):
+        holds = functools.reduce(torch.logical_or, (reason == which.value for which in reasons))
+        border = border | (cells & torch.isinf(cost) & holds[:, None, None])
+    counts = torch.stack([(border & cells).flatten(1).sum(1) for cells in exceeded])
+    most, which = counts.max(0)
+    return torch.where(most > 0, which + Limit.STEP.value, Limit.NONE.value)
 
 
 def read_cell(layer: Tensor, cell: Int[Tensor, "B 2"]) -> Tensor:

@@ -11,9 +11,10 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default, readable
 from torchelev.planning.cost_to_go import cost_to_go, descend
-from torchelev.planning.path_reason import Endpoint, Reason, find_reason, read_cell
+from torchelev.planning.limits import find_exceeded
+from torchelev.planning.path_reason import Endpoint, explain, find_limit, find_reason, read_cell
 from torchelev.planning.standing import mark_standing_cells
-from torchelev.planning.traversal_cost import TraversalCostConfig, mark_disc, traversal_cost
+from torchelev.planning.traversal_cost import TraversalCostConfig, mark_disc, traversal_cost, widen
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ class Path(NamedTuple):
     #: number of waypoints without the repeated ones; 0 if the start is outside the window
     count: Int[Tensor, "B"]  # type: ignore[assignment]
     reason: Int[Tensor, "B"]  #: why the path ends where it does, a `Reason`; `explain` puts it into words
+    limit: Int[Tensor, "B"]  #: the `limits.Limit` of the robot that the ground exceeds there, if any
 
     def poses(self, chord: float = 0.4) -> Float[Tensor, "B K 3"]:
         """Return x, y [m] and yaw [rad] of each waypoint, for `check_path`.
@@ -61,8 +63,8 @@ class Path(NamedTuple):
         return torch.where(torch.isfinite(self.cost)[:, None, None], poses, torch.nan)
 
     def explain(self) -> list[str]:
-        """Return each `reason` as a sentence. The host waits for the device."""
-        return [Reason(code).sentence for code in self.reason.tolist()]
+        """Return each `reason`, and the `limit`, as a sentence. The host waits for the device."""
+        return [explain(*codes) for codes in zip(self.reason.tolist(), self.limit.tolist(), strict=True)]
 
 
 def plan(
@@ -79,6 +81,7 @@ def plan(
 ) -> Path:
     """Find the cheapest path from start to goal over the cells of each map, by `traversal_cost`.
 
+    No path leads over ground beyond the robot's step, slope or clearance (`planning.limits`), whatever its rating.
     The cell of the start is passable even if it is rated impassable: a robot may leave such ground, and `check_path`
     reports it. Cells of unknown traversability below the robot are passable too (`torchelev.planning.standing`).
 
@@ -113,11 +116,14 @@ def plan(
     radius = cfg.stand_radius / grid.resolution
     below = mark_disc(start.cell, cost, radius) if standing is None else mark_standing_cells(emap, standing, state)
     reason = find_reason(cost, value, rated, below, start, goal, reached)
+    inflation = round(cfg.inflation_radius / grid.resolution)
+    exceeded = [widen(cells, inflation) for cells in find_exceeded(current, emap.cfg)]
+    limit = find_limit(reason, cost, value, exceeded, below, start, goal)
     xy = (path.cells + current.corner[:, None]).double().add(0.5) * grid.resolution
     num_steps = (path.cells[:, 1:] != path.cells[:, :-1]).any(-1).sum(1)
     count = torch.where(start.is_inside, num_steps + 1, 0)
     start_value = torch.where(start.is_inside, read_cell(value, start.cell), torch.inf)
-    return Path(xy, start_value, path.length, reached, count, reason)
+    return Path(xy, start_value, path.length, reached, count, reason, limit)
 
 
 def _find_cell(emap: ElevationMap, name: str, xy: object, state: MapState) -> Endpoint:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from torchelev.layers import Layer
 from torchelev.ops.operators import padded
 from torchelev.ops.windows import window_maximum
 from torchelev.planning.inclination import compute_inclination
+from torchelev.planning.limits import find_exceeded
 from torchelev.planning.standing import mark_standing_cells
 from torchelev.state import MapState
 
@@ -80,6 +82,7 @@ def traversal_cost(
         t known:                     1 + w_t (1 - t) + w_c (1 - q)   impassable where t < min_traversability
         only elevation or its bound: 1 + w_a a / max_a + w_c         impassable where a > max_inclination or unknown
         nothing known:               impassable
+        beyond the robot's limits:   impassable, whatever the rating (`planning.limits`)
 
     Behind an edge, rays that passed over it bound the unseen ground from above. The nearer the robot is, the steeper it
     looks down, and ground that its rays still miss falls away more steeply than they do. So a steep bound indicates a
@@ -115,7 +118,8 @@ def traversal_cost(
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
     rated, bound = (emap.read_layer(name, given) for name in ("traversability", cfg.unknown_layer))
     below = None if standing is None else mark_standing_cells(emap, standing, state)
-    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, below)
+    exceeded = functools.reduce(torch.logical_or, find_exceeded(state, emap.cfg))
+    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, below, exceeded)
 
 
 def cost_of_layers(
@@ -126,6 +130,7 @@ def cost_of_layers(
     confidence: Tensor | None = None,
     start: Int[Tensor, "B 2"] | None = None,
     standing: Bool[Tensor, "B H W"] | None = None,
+    exceeded: Bool[Tensor, "B H W"] | None = None,
 ) -> Float[Tensor, "B H W"]:
     """Compute `traversal_cost` from layers. Values of cells that are not known are ignored.
 
@@ -138,6 +143,7 @@ def cost_of_layers(
         confidence: confidence of the traversability, 0 to 1; None: 1.
         start: cell (i, j) on which each robot stands.
         standing: the cells on which the robots stand now.
+        exceeded: the cells beyond a limit of the robots.
     """
     t, is_rated = rated
     doubt = torch.zeros_like(t) if confidence is None else 1 - confidence.to(t.dtype).nan_to_num(0.0).clamp(0, 1)
@@ -153,17 +159,23 @@ def cost_of_layers(
     if standing is not None:
         # Before inflation, or unknown ground below the robot would enclose it.
         cost = _open(cost, ~is_rated & standing, cfg)
+    if exceeded is not None:
+        cost = torch.where(exceeded, torch.inf, cost)
     cost = _inflate(cost, round(cfg.inflation_radius / resolution))
     return cost if start is None else _open(cost, mark_disc(start, cost, 0.0), cfg)
 
 
 def _inflate(cost: Tensor, radius: int) -> Float[Tensor, "B H W"]:
     """Make all cells within a square of `radius` cells around impassable ground impassable."""
+    return cost if radius == 0 else torch.where(widen(torch.isinf(cost), radius), torch.inf, cost)
+
+
+def widen(cells: Bool[Tensor, "B H W"], radius: int) -> Bool[Tensor, "B H W"]:
+    """Mark all cells within a square of `radius` cells around marked ones."""
     if radius == 0:
-        return cost
-    is_blocked = torch.isinf(cost).to(cost.dtype)
-    (is_near,) = window_maximum([padded(is_blocked, radius, 0.0)], radius, radius)
-    return torch.where(is_near > 0, torch.inf, cost)
+        return cells
+    (is_near,) = window_maximum([padded(cells.to(torch.float32), radius, 0.0)], radius, radius)
+    return is_near > 0
 
 
 def _open(cost: Tensor, cells: Bool[Tensor, "B H W"], cfg: TraversalCostConfig) -> Float[Tensor, "B H W"]:

@@ -5,6 +5,7 @@ Two heads share one place in the map: an analytic one, and one that was trained 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -15,7 +16,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE
-from torchelev.ops.windows import window_maximum
+from torchelev.ops.windows import shifted, window_maximum
 from torchelev.robot import RobotConfig
 from torchelev.stages.surface import Ground, fit_plane
 from torchelev.state import MapState
@@ -29,22 +30,65 @@ if TYPE_CHECKING:
 __all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "TraversabilityConfig", "TraversabilityNet"]
 
 
+STEP_REACH = 0.1  # [m] within which a height difference is a step: a foot's length and the smear of an edge
+EDGE_SLOPE, EDGE_ROUGHNESS = 0.75, 12**-0.5  # at most, of a plane near a step h: in h / radius, and in h
+RATING_AT_LIMIT = 0.31  # of ground at the limits of `of_robot`: just above what `plan` and `check_path` refuse
+
+
 @dataclass(frozen=True, kw_only=True)
 class TraversabilityConfig:
-    """Critical values of the analytic head: at each of them traversability is zero."""
+    """Critical values of the analytic head: at each of them traversability is zero. Infinity switches one off.
+
+    `plan` and `check_path` enforce the limits of `robot` or, without one, the critical step and slope.
+
+    Raises:
+        ValueError: for a critical value that is not positive, or a slope of a right angle or more.
+        TypeError: for a robot that is no RobotConfig.
+    """
 
     radius: float = 0.1  #: [m] of the window that a foot or wheel needs
-    critical_slope: float = 0.7  #: [rad] inclination of the window's plane
-    critical_step: float = 0.2  #: [m] height of a step within the window
-    critical_roughness: float = 0.05  #: [m] standard deviation around the local plane
+    critical_slope: float = 0.7  #: [rad] inclination of the window's plane, below pi / 2; inf: slopes do not count
+    #: [m] height difference between a cell and those within the window, at most 0.1 m away; inf: steps do not count
+    critical_step: float = 0.2
+    critical_roughness: float = 0.05  #: [m] standard deviation around the local plane; inf: roughness does not count
+    robot: RobotConfig | None = None  #: the robot whose limits planning enforces, see `of_robot`; None: no robot
 
     # From which rating on cells measure the height drift; measured by `training.traversability.drift_gate`.
     drift_gate: ClassVar[float] = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("radius", "critical_slope", "critical_step", "critical_roughness"):
+        is_length = 0 < self.radius < math.inf
+        require(is_length, "traversability.radius", "must be positive and finite", self.radius, "give 0.1")
+        off = "give inf to switch it off"
+        for name in ("critical_slope", "critical_step", "critical_roughness"):
             value = getattr(self, name)
-            require(value > 0, f"traversability.{name}", "must be positive", value, "see its default")
+            require(value > 0, f"traversability.{name}", "must be positive", value, off)
+        is_slope, rule = self.critical_slope < math.pi / 2 or math.isinf(self.critical_slope), "must be below pi / 2"
+        hint = f"give radians, such as 0.7, or {off[5:]}"
+        require(is_slope, "traversability.critical_slope", rule, self.critical_slope, hint)
+        if self.robot is not None:
+            _require_robot(self.robot)
+
+    @classmethod
+    def of_robot(cls, robot: RobotConfig) -> TraversabilityConfig:
+        """Return the critical values for a robot, so that it takes the steps and slopes that it can.
+
+        Near the edge of a step h, a foot's window of radius r has a plane of a slope up to atan(3 h / (4 r)) and a
+        roughness up to h / sqrt(12). All that belongs to the highest step that the robot overcomes is rated 0.31 or
+        more, just above the thresholds of `plan` and `check_path`, which enforce the robot's own limits besides.
+
+        Args:
+            robot: its `foot_reach`, `step_height` and `max_slope` make the critical values.
+        """
+        share, step, radius = 1 - RATING_AT_LIMIT, robot.step_height, robot.foot_reach
+        slope = max(robot.max_slope, math.atan(EDGE_SLOPE * step / radius)) / share
+        return cls(
+            radius=radius,
+            critical_slope=slope if slope < math.pi / 2 else math.inf,
+            critical_step=step / share,
+            critical_roughness=EDGE_ROUGHNESS * step / share,
+            robot=robot,
+        )
 
     def cells(self, grid: GridConfig) -> int:
         """Return the window's radius in cells."""
@@ -75,13 +119,16 @@ class LearnedTraversabilityConfig:
     drift_gate: ClassVar[float] = 0.2  # as of the analytic head
 
     def __post_init__(self) -> None:
-        hint = "build a RobotConfig"
-        fits = isinstance(self.robot, RobotConfig)
-        require(fits, "traversability.robot", "must be a RobotConfig", repr(self.robot), hint, TypeError)
+        _require_robot(self.robot)
         path = self.weights is None or isinstance(self.weights, str | Path)
         require(path, "traversability.weights", "must be a path or None", repr(self.weights), "give a str", TypeError)
         if isinstance(self.weights, Path):
             object.__setattr__(self, "weights", str(self.weights))  # as files of settings hold it
+
+
+def _require_robot(robot: object) -> None:
+    fits = isinstance(robot, RobotConfig)
+    require(fits, "traversability.robot", "must be a RobotConfig", repr(robot), "build a RobotConfig", TypeError)
 
 
 def make_head(
@@ -107,11 +154,20 @@ def learned_rating(state: MapState, grid: GridConfig, cfg: LearnedTraversability
     return Rating(*(torch.sigmoid(logit).to(state.elevation.dtype) for logit in logits))
 
 
-def height_range(ground: Ground, radius: int) -> Tensor:
-    """Return how much higher the highest known cell of each window is than the lowest [m]; negative without any."""
+def step_cells(resolution: float) -> int:
+    """Return within how many cells a height difference is a step: `STEP_REACH`, or the neighbouring cells."""
+    return max(1, round(STEP_REACH / resolution))
+
+
+def find_steps(ground: Ground, radius: int) -> Float[Tensor, "B H W"]:
+    """Return the largest height difference [m] between each known cell and the known ones within `radius` cells of it.
+
+    s(c) = max over the known cells k of the window of |h_k - h_c|; arbitrary for unknown cells c.
+    """
     sunk = NOWHERE * (ground.known - 1)  # where nothing is known
     highest, minus_lowest = window_maximum([sunk + ground.height, sunk - ground.height], ground.rim, radius)
-    return highest + minus_lowest
+    height = shifted(ground.height, ground.rim)
+    return torch.maximum(highest - height, minus_lowest + height)
 
 
 def rate_all(state: MapState) -> MapState:
@@ -131,13 +187,14 @@ def traversability(
 ) -> PlaneRating:
     """Rate every known cell whose window spans a plane, by the worst of slope, step and roughness.
 
-    t = 1 - max(slope / critical, step / critical, roughness / critical), not below 0. The step is the height range of
-    the window less what its own plane explains.
+    t = 1 - max(slope / critical, step / critical, roughness / critical), not below 0. Slope and roughness are those of
+    the window's plane. The step is the largest height difference between the cell and the known cells at most
+    `STEP_REACH` away (`find_steps`), whatever the plane: a smooth slope a has a step of STEP_REACH tan a on any grid
+    of cells that are not larger.
     """
     plane = fit_plane(ground, radius, resolution)
     slope = torch.atan((plane.gradient_x.square() + plane.gradient_y.square()).clamp(min=1e-12).sqrt())
-    explained = 2 * radius * resolution * (plane.gradient_x.abs() + plane.gradient_y.abs())
-    step = (height_range(ground, radius) - explained).clamp(min=0)
+    step = find_steps(ground, min(radius, step_cells(resolution)))
     roughness = plane.residual.clamp(min=1e-12).sqrt()
     worst = torch.maximum(slope / critical.slope, step / critical.step)
     worst = torch.maximum(worst, roughness / critical.roughness)

@@ -22,7 +22,7 @@ from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.surface import MIN_DET, MIN_TRACE, Normals, SurfaceConfig, known_ground, min_spread, normals
 from torchelev.state import MASKS, MapState
-from torchelev.traversability.heads import Critical, PlaneRating, TraversabilityConfig, traversability
+from torchelev.traversability.heads import Critical, PlaneRating, TraversabilityConfig, step_cells, traversability
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -102,14 +102,15 @@ def _write_planes(
     critical: list[float],
 ) -> None:
     """Write what `_layers` returns into contiguous layers, masks as bytes; without a head, `cells` is 0."""
-    settings = _settings(radius, cells, resolution, critical)
+    settings, steps = _settings(radius, cells, resolution, critical), min(cells, step_cells(resolution))
     results = [*layers, *[None] * (len(_NAMES) - len(layers))]
     if kernels.work_on(elevation):
-        _launch(elevation.contiguous(), known.contiguous(), results, radius, cells, settings)
+        _launch(elevation.contiguous(), known.contiguous(), results, radius, cells, steps, settings)
         return
     library = load("surface/surface.cpp", _CONSTANTS) if elevation.is_cpu else None
     if library is not None and elevation.numel() > 0:
-        run(library.rate_surface, [elevation, known], results, *elevation.shape, radius, cells, ctypes.byref(settings))
+        sizes = *elevation.shape, radius, cells, steps
+        run(library.rate_surface, [elevation, known], results, *sizes, ctypes.byref(settings))
         return
     values = _layers(elevation, as_mask(known), radius, cells, resolution, critical)
     for layer, value in zip(layers, values, strict=True):
@@ -117,12 +118,18 @@ def _write_planes(
 
 
 def _launch(
-    elevation: Tensor, known: Tensor, results: list[Tensor | None], radius: int, cells: int, settings: _Settings
+    elevation: Tensor,
+    known: Tensor,
+    results: list[Tensor | None],
+    radius: int,
+    cells: int,
+    steps: int,
+    settings: _Settings,
 ) -> None:
     """Write the layers by a kernel."""
     (B, *size), rim = elevation.shape, max(radius, cells)
     tiles = math.prod(-(-length // tile) for length, tile in zip(size, _TILE, strict=True))
-    arguments = elevation, known, kernels.addresses_of(results), *size, radius, cells, settings
+    arguments = elevation, known, kernels.addresses_of(results), *size, radius, cells, steps, settings
     with torch.cuda.device_of(elevation):
         kernels.launch_blocks(_SOURCE, "rate_surface", B * tiles, _shared_memory(rim), *arguments)
 

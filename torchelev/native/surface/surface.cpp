@@ -45,8 +45,8 @@ struct Scratch {
 // Normals and ratings of tiles, row by row.
 class Rater {
 public:
-    Rater(const Settings& settings, int radius, int cells, Scratch& scratch)
-        : settings_(settings), cells_(cells), rim_(std::max(radius, cells)), row_(scratch.row),
+    Rater(const Settings& settings, int radius, int cells, int steps, Scratch& scratch)
+        : settings_(settings), cells_(cells), steps_(steps), rim_(std::max(radius, cells)), row_(scratch.row),
           normals_(scratch.lines[0]), head_(scratch.lines[cells != 0 && cells != radius]) {
         normals_.radius = radius, head_.radius = cells ? cells : radius;
     }
@@ -62,7 +62,7 @@ public:
 
 private:
     const Settings& settings_;
-    int cells_, rim_;
+    int cells_, steps_, rim_;
     Row& row_;
     Lines &normals_, &head_;  // the same if their windows are, or without a head
 
@@ -82,9 +82,9 @@ private:
         for (int row = -rim_; row < extent.rows + rim_; row++) {
             row_.read(row);
             if (head_.radius > normals_.radius)
-                sum_along<false, HAS_HEAD>(row_, row, extent.columns, normals_, head_);
+                sum_along<false, HAS_HEAD>(row_, row, extent.columns, steps_, normals_, head_);
             else
-                sum_along<HAS_HEAD, false>(row_, row, extent.columns, head_, normals_);
+                sum_along<HAS_HEAD, false>(row_, row, extent.columns, steps_, head_, normals_);
             const int middle = row - rim_;  // of the windows that this row completes
             if (middle >= 0) rate_row<HAS_HEAD>(middle, extent.columns, row_of(layers, map, extent, middle));
         }
@@ -142,19 +142,18 @@ private:
     [[gnu::always_inline]] void put_ratings(const Layers& out, const Window<RADIUS>& window, int column, int count, Flags known,
                      const Planes& planes) const {
         const Flags rated = known & planes.spans;
-        const Lanes highest = window.largest(Lines::HIGHEST, column);
-        const Lanes range = highest + window.largest(Lines::MINUS_LOWEST, column);
-        put(out.traversability + column, pick(rated, rating(planes, range), all(0)), count);
+        const Lanes height = window.at(0, Lines::HEIGHT, column);  // `find_steps`
+        const Lanes rise = window.largest(Lines::HIGHEST, column, steps_) - height;
+        const Lanes fall = window.largest(Lines::MINUS_LOWEST, column, steps_) + height;
+        put(out.traversability + column, pick(rated, rating(planes, larger(rise, fall)), all(0)), count);
         put(out.rated + column, rated, count);
     }
 
-    // `traversability` in heads.py, given the height range of the windows [m].
-    [[gnu::always_inline]] Lanes rating(const Planes& planes, Lanes range) const {
+    // `traversability` in heads.py, given the steps [m].
+    [[gnu::always_inline]] Lanes rating(const Planes& planes, Lanes step) const {
         const float per_cell = settings_.per_cell;
         const Lanes x = planes.gradient_u * per_cell, y = planes.gradient_v * per_cell;
         const Lanes slope = arctan(root(larger(x * x + y * y, all(1e-12f))));
-        const Lanes explained = float(2 * cells_) * (absolute(planes.gradient_u) + absolute(planes.gradient_v));
-        const Lanes step = larger(range - explained, all(0));
         const Lanes roughness = root(larger(planes.residual, all(1e-12f)));
         const Lanes worst = larger(slope * settings_.per_slope, step * settings_.per_step);
         return larger(1 - larger(worst, roughness * settings_.per_roughness), all(0));
@@ -165,11 +164,12 @@ int parts(int length, int size) { return (length + size - 1) / size; }
 
 }  // namespace
 
-// Layers of (B, H, W) as in planes.py; without the head, `cells` is 0, and so are `traversability` and `rated`.
+// Layers of (B, H, W) as in planes.py; without the head, `cells` is 0, and so are `traversability` and `rated`. `steps`
+// is the radius of `find_steps` in heads.py.
 // Returns what `code_of` does.
 extern "C" int rate_surface(const float* elevation, const uint8_t* validity, float* gradient_x, float* gradient_y,
                             uint8_t* has_normal, float* traversability, uint8_t* rated, int64_t B, int64_t H, int64_t W,
-                            int64_t radius, int64_t cells, const float* settings, int num_threads) {
+                            int64_t radius, int64_t cells, int64_t steps, const float* settings, int num_threads) {
     Settings numbers;
     std::memcpy(&numbers, settings, sizeof numbers);
     const Layers layers{gradient_x, gradient_y, has_normal, traversability, rated};
@@ -181,7 +181,7 @@ extern "C" int rate_surface(const float* elevation, const uint8_t* validity, flo
         const int row = band * H / bands, column = strip * W / strips;
         const Extent extent{row, int((band + 1) * H / bands) - row, column, int((strip + 1) * W / strips) - column};
         const Map map{elevation + first, validity + first, int(H), int(W)};
-        Rater(numbers, radius, cells, scratch).rate(map, extent, layers.from(first));
+        Rater(numbers, radius, cells, steps, scratch).rate(map, extent, layers.from(first));
     };
     return code_of([&] { for_each(B * bands * strips, num_threads, rate); });
 }

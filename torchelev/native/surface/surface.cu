@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <limits>
 
 #include "threads.h"
@@ -39,8 +40,9 @@ struct Tile {
     float& at(float* sums, int sum, int32_t place) const { return sums[sum * rows * COLUMNS + place]; }
 };
 
-// Sum along a row around each cell of a tile and of the rows above and below; heights count from `datum`.
-template <int SUMS> inline void sum_along_rows(const Tile& tile, float* sums, int32_t radius, float datum) {
+// Sum along a row around each cell of a tile and of the rows above and below; heights count from `datum`. The highest
+// and the lowest height are those within `steps` cells.
+template <int SUMS> inline void sum_along_rows(const Tile& tile, float* sums, int32_t radius, int32_t steps, float datum) {
     for (int32_t place = threadIdx.x; place < tile.rows * COLUMNS; place += blockDim.x) {
         const float* middle = tile.heights + place / COLUMNS * tile.width + place % COLUMNS + tile.rim;
         float n = 0, v_n = 0, vv_n = 0, z = 0, vz = 0, zz = 0, highest = -INFINITE, lowest = INFINITE;
@@ -50,7 +52,8 @@ template <int SUMS> inline void sum_along_rows(const Tile& tile, float* sums, in
             if (!(height < INFINITE)) continue;
             n += 1, v_n += column, vv_n += column * column;
             z += height, vz += column * height, zz += height * height;
-            highest = fmaxf(highest, height), lowest = fminf(lowest, height);
+            if (SUMS == Tile::HEAD && std::abs(v) <= steps)
+                highest = fmaxf(highest, height), lowest = fminf(lowest, height);
         }
         tile.at(sums, Tile::N, place) = n, tile.at(sums, Tile::V, place) = v_n, tile.at(sums, Tile::VV, place) = vv_n;
         tile.at(sums, Tile::Z, place) = z, tile.at(sums, Tile::VZ, place) = vz, tile.at(sums, Tile::ZZ, place) = zz;
@@ -64,7 +67,8 @@ struct Window {
     float n = 0, u = 0, v = 0, uu = 0, uv = 0, vv = 0, z = 0, uz = 0, vz = 0, zz = 0;
     float highest = -INFINITE, lowest = INFINITE;
 
-    template <int SUMS> static Window of(const Tile& tile, float* sums, int32_t place, int32_t radius) {
+    template <int SUMS>
+    static Window of(const Tile& tile, float* sums, int32_t place, int32_t radius, int32_t steps = 0) {
         Window w;
 #pragma unroll 5
         for (int32_t k = -radius; k <= radius; k++) {
@@ -74,7 +78,7 @@ struct Window {
             w.n += n, w.u += row * n, w.uu += row * row * n, w.v += v, w.uv += row * v, w.z += z, w.uz += row * z;
             w.vv += tile.at(sums, Tile::VV, at), w.vz += tile.at(sums, Tile::VZ, at);
             w.zz += tile.at(sums, Tile::ZZ, at);
-            if (SUMS < Tile::HEAD) continue;
+            if (SUMS < Tile::HEAD || std::abs(k) > steps) continue;
             w.highest = fmaxf(w.highest, tile.at(sums, Tile::HIGHEST, at));
             w.lowest = fminf(w.lowest, tile.at(sums, Tile::LOWEST, at));
         }
@@ -103,19 +107,18 @@ struct Plane {
     }
 };
 
-// `traversability` in heads.py, given the height range of a window [m].
-inline float rating(const Plane& plane, float range, int32_t cells, const Settings& s) {
+// `traversability` in heads.py, given the step [m].
+inline float rating(const Plane& plane, float step, const Settings& s) {
     const float x = plane.gradient_u * s.per_cell, y = plane.gradient_v * s.per_cell;
     const float slope = std::atan(std::sqrt(fmaxf(x * x + y * y, 1e-12f)));
-    const float step = range - float(2 * cells) * (std::fabs(plane.gradient_u) + std::fabs(plane.gradient_v));
     const float roughness = std::sqrt(fmaxf(plane.residual, 1e-12f));
-    const float worst = fmaxf(slope * s.per_slope, fmaxf(step, 0.0f) * s.per_step);
+    const float worst = fmaxf(slope * s.per_slope, step * s.per_step);
     return fmaxf(1 - fmaxf(worst, roughness * s.per_roughness), 0.0f);
 }
 
-// Rate a cell of the map, at a place of its tile.
-inline void rate(const Tile& tile, int32_t place, bool is_known, int64_t cell, int32_t radius, int32_t cells,
-                 const Settings& s, const Layers& out) {
+// Rate a cell of the map, at a place of its tile, of a height [m] from the datum.
+inline void rate(const Tile& tile, int32_t place, bool is_known, float height, int64_t cell, int32_t radius,
+                 int32_t cells, int32_t steps, const Settings& s, const Layers& out) {
     float x = 0, y = 0, traversability = 0;
     bool has_normal = false, rated = false;
     if (is_known) {
@@ -124,10 +127,10 @@ inline void rate(const Tile& tile, int32_t place, bool is_known, int64_t cell, i
         if (has_normal) x = plane.gradient_u * s.per_cell, y = plane.gradient_v * s.per_cell;
     }
     if (is_known && cells) {
-        const Window window = Window::of<Tile::HEAD>(tile, tile.head, place, cells);
+        const Window window = Window::of<Tile::HEAD>(tile, tile.head, place, cells, steps);
         const Plane plane(window, s.min_spread[1], s);
         rated = plane.spans;
-        if (rated) traversability = rating(plane, window.highest - window.lowest, cells, s);
+        if (rated) traversability = rating(plane, fmaxf(window.highest - height, height - window.lowest), s);
     }
     out.gradient_x[cell] = x, out.gradient_y[cell] = y, out.has_normal[cell] = has_normal;
     if (cells) out.traversability[cell] = traversability, out.rated[cell] = rated;
@@ -138,7 +141,7 @@ inline void rate(const Tile& tile, int32_t place, bool is_known, int64_t cell, i
 extern "C" __global__ __launch_bounds__(512, 3) void rate_surface(const float* __restrict__ elevation,
                                                                   const uint8_t* __restrict__ validity, Layers out,
                                                                   int64_t H, int64_t W, int64_t radius, int64_t cells,
-                                                                  Settings settings) {
+                                                                  int64_t steps, Settings settings) {
     const int32_t r = int32_t(radius), c = int32_t(cells), rows = int32_t(H), columns = int32_t(W);
     const Tile tile(r < c ? c : r, reinterpret_cast<float*>(block_memory()));
     const unsigned bands = (unsigned(rows) + ROWS - 1) / ROWS, strips = (unsigned(columns) + COLUMNS - 1) / COLUMNS;
@@ -156,13 +159,14 @@ extern "C" __global__ __launch_bounds__(512, 3) void rate_surface(const float* _
     }
     sum = sum_of_block(sum, tile.warps), known = sum_of_block(known, tile.warps);
     const float datum = sum / fmaxf(known, 1);
-    sum_along_rows<Tile::NORMALS>(tile, tile.normals, r, datum);
-    if (cells) sum_along_rows<Tile::HEAD>(tile, tile.head, c, datum);
+    sum_along_rows<Tile::NORMALS>(tile, tile.normals, r, 0, datum);
+    if (cells) sum_along_rows<Tile::HEAD>(tile, tile.head, c, int32_t(steps), datum);
     __syncthreads();
     for (int32_t k = threadIdx.x; k < ROWS * COLUMNS; k += blockDim.x) {
         const int32_t i = k / COLUMNS, j = k % COLUMNS;
         if (first_row + i >= rows || first_column + j >= columns) continue;
-        const bool is_known = tile.heights[(i + tile.rim) * tile.width + j + tile.rim] < INFINITE;
-        rate(tile, k, is_known, map + (first_row + i) * columns + first_column + j, r, c, settings, out);
+        const float height = tile.heights[(i + tile.rim) * tile.width + j + tile.rim];
+        const int64_t cell = map + (first_row + i) * columns + first_column + j;
+        rate(tile, k, height < INFINITE, height - datum, cell, r, c, int32_t(steps), settings, out);
     }
 }

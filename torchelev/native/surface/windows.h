@@ -7,7 +7,7 @@
 struct Sums {
     Lanes n{}, v_n{}, vv_n{};  // of known cells
     Lanes z{}, v_z{}, zz{};    // of their heights [m]
-    Lanes highest = all(-NOWHERE), minus_lowest = all(-NOWHERE);  // of them [m]
+    Lanes highest = all(-NOWHERE), minus_lowest = all(-NOWHERE);  // of those near enough for a step [m]
 
     template <bool HAS_RANGE> void add(const Row& row, int column, int v) {
         const Lanes known = load(row.known(column + v)), height = load(row.height(column + v));
@@ -23,7 +23,7 @@ struct Sums {
 // `Sums` of the last rows, for windows of one radius.
 class Lines {
 public:
-    enum Name { N, V_N, VV_N, Z, V_Z, ZZ, HIGHEST, MINUS_LOWEST, KNOWN, COUNT };
+    enum Name { N, V_N, VV_N, Z, V_Z, ZZ, HIGHEST, MINUS_LOWEST, HEIGHT, KNOWN, COUNT };
     int radius = 0;
 
     // Make room for rows of `columns` cells, `kept` rows of them.
@@ -45,6 +45,10 @@ public:
         put(row, HIGHEST, column, sums.highest), put(row, MINUS_LOWEST, column, sums.minus_lowest);
     }
 
+    void put_middle(float* row, const Row& cells, int column) const {
+        put(row, KNOWN, column, load(cells.known(column))), put(row, HEIGHT, column, load(cells.height(column)));
+    }
+
     void put(float* row, Name name, int column, Lanes values) const { store(row + at(name, column), values); }
 
 private:
@@ -52,23 +56,26 @@ private:
     int width_ = 0, kept_ = 0;
 };
 
-// Sum along a row around each of its cells; the windows of `inner` are part of those of `outer`.
+// Sum along a row around each of its cells; the windows of `inner` are part of those of `outer`. A height difference
+// within `steps` cells, which are no more than the radius of the lines that keep it, is a step.
 template <bool HAS_INNER_RANGE, bool HAS_OUTER_RANGE>
-inline void sum_along(const Row& row, int number, int columns, Lines& inner, Lines& outer) {
+inline void sum_along(const Row& row, int number, int columns, int steps, Lines& inner, Lines& outer) {
     constexpr bool HAS_RANGE = HAS_INNER_RANGE || HAS_OUTER_RANGE;
     float *inner_row = inner.row(number), *outer_row = outer.row(number);
     for (int column = 0; column < columns; column += LANES) {
         Sums sums;
         auto add = [&](int first, int last) {
-            for (int v = first; v <= last; v++)
+            int v = first;
+            for (; v <= std::min(last, steps); v++)
                 sums.add<HAS_RANGE>(row, column, -v), sums.add<HAS_RANGE>(row, column, v);
+            for (; v <= last; v++) sums.add<false>(row, column, -v), sums.add<false>(row, column, v);
         };
         sums.add<HAS_RANGE>(row, column, 0), add(1, inner.radius);
-        inner.put(inner_row, Lines::KNOWN, column, load(row.known(column)));
+        inner.put_middle(inner_row, row, column);
         inner.put<HAS_INNER_RANGE>(inner_row, column, sums);
         if (&outer == &inner) continue;
         add(inner.radius + 1, outer.radius);
-        outer.put(outer_row, Lines::KNOWN, column, load(row.known(column)));
+        outer.put_middle(outer_row, row, column);
         outer.put<HAS_OUTER_RANGE>(outer_row, column, sums);
     }
 }
@@ -92,9 +99,12 @@ public:
         for (int u = -r; u <= r; u++) work(u);
     }
 
-    [[gnu::always_inline]] Lanes largest(Lines::Name name, int column) const {
+    // The largest value of the rows at most `reach` away.
+    [[gnu::always_inline]] Lanes largest(Lines::Name name, int column, int reach) const {
         Lanes largest = at(0, name, column);
-        each([&](int u) { largest = larger(largest, at(u, name, column)); });
+        each([&](int u) {
+            if (std::abs(u) <= reach) largest = larger(largest, at(u, name, column));
+        });
         return largest;
     }
 

@@ -1,0 +1,78 @@
+"""`torchelev plan`, end to end."""
+
+import math
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, TraversabilityConfig
+from torchelev.app.cli import main
+from torchelev.io.export import save_map, save_npz, take, write_npz
+from torchelev.pipeline import rate_surface
+
+GRID = GridConfig(resolution=0.1, length_x=4.0, length_y=3.0)
+
+
+def world(height=0.3, gap=2.0, **stages):
+    """Ground with a step at x = 0, of height 0 for y > gap."""
+    emap = ElevationMap(ElevationMapConfig(grid=GRID, **stages))
+    x, y = emap.cell_centers().unbind(-1)
+    emap.elevation.copy_(torch.where((x > 0) & (x < 0.2) & (y < gap), height, 0.0))
+    emap.validity.fill_(True)
+    emap.variance.fill_(1e-4)
+    emap.load_state(rate_surface(emap.state, emap.cfg))
+    return emap
+
+
+def run(*arguments):
+    result = CliRunner().invoke(main, ["plan", *map(str, arguments)])
+    return result.exit_code, result.output
+
+
+ENDS = ("--start", -1.0, 0.05, "--goal", 1.0, 0.05)
+
+
+@pytest.mark.parametrize("save", [save_npz, save_map])
+def test_a_path_around_a_wall(tmp_path, save):
+    save(tmp_path / "map.npz", world(gap=0.5))
+    code, text = run(tmp_path / "map.npz", *ENDS, "--out", tmp_path / "path.png")
+    assert code == 0 and text.startswith("path") and "every footprint along the path is safe" in text
+    assert float(text.split(" m, ")[0].split()[-1]) > 2.3, "longer than the straight line"
+    assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_no_path_says_why(tmp_path):
+    save_npz(tmp_path / "map.npz", world())
+    code, text = run(tmp_path / "map.npz", *ENDS)
+    assert code == 1 and text.startswith("no path") and "steps are higher than the robot can overcome" in text
+
+
+def test_options_are_the_robots_limits(tmp_path):
+    save_npz(tmp_path / "map.npz", world(0.15, traversability=TraversabilityConfig(critical_step=0.1)))
+    assert run(tmp_path / "map.npz", *ENDS)[0] == 1
+    assert run(tmp_path / "map.npz", *ENDS, "--step-height", 0.16)[0] == 0
+    assert run(tmp_path / "map.npz", *ENDS, "--step-height", 0.12)[0] == 1
+
+
+def test_a_map_without_a_head_is_rated_for_the_default_robot(tmp_path):
+    save_npz(tmp_path / "map.npz", world(0.1, traversability=None))
+    assert run(tmp_path / "map.npz", *ENDS)[0] == 0
+
+
+@pytest.mark.parametrize("arguments, text", [
+    (("map.npz", "--goal", 9, 0), "goal_xy: must lie in the window"),
+    (("map.npz", "--goal", math.nan, 0), "goal_xy: must lie in the window"),
+    (("map.npz", "--goal", 1, 0, "--max-slope", 35), "robot.max_slope: must be below a right angle"),
+    (("none.npz", "--goal", 1, 0), "none.npz"),
+    (("layers.npz", "--goal", 1, 0), "must be a whole map"),
+    (("empty.npz", "--goal", 1, 0), "the map is empty"),
+    (("map.npz",), "Missing option '--goal'"),
+])  # fmt: skip
+def test_bad_input_is_one_line(tmp_path, arguments, text):
+    emap = world()
+    save_npz(tmp_path / "map.npz", emap)
+    write_npz(tmp_path / "layers.npz", take(emap))
+    save_npz(tmp_path / "empty.npz", ElevationMap(emap.cfg))
+    code, output = run(tmp_path / arguments[0], *arguments[1:])
+    assert code == (3 if arguments[0] == "empty.npz" else 2) and text in output and "Traceback" not in output

@@ -1,0 +1,123 @@
+"""`torchelev plan`: find a path over a saved map, check it, and draw it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import torch
+from torch import Tensor
+
+from torchelev.app.user_error import EmptyMapError, user_errors
+from torchelev.elevation_map import ElevationMap
+from torchelev.io.export import load_map, take
+from torchelev.pipeline import rate_surface
+from torchelev.planning.path_check import PathCheck, check_path
+from torchelev.planning.planner import Path as PlannedPath
+from torchelev.planning.planner import plan
+from torchelev.planning.traversal_cost import TraversalCostConfig
+from torchelev.robot import RobotConfig
+from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
+
+NO_PATH = 1  # exit code: there is no path, or it is not safe
+
+
+def run_plan(
+    map_file: Path,
+    goal: tuple[float, float],
+    start: tuple[float, float] | None,
+    out: Path | None,
+    robot: dict[str, float],
+) -> int:
+    """Plan, check and report; bad input becomes a one-line click error.
+
+    Args:
+        map_file: of `torchelev map`, `save_npz` or `save_map`, of which the first environment counts.
+        goal: x, y [m], map frame.
+        start: x, y [m], map frame; None: the window's centre, where the robot was last.
+        out: picture to write.
+        robot: fields of `RobotConfig` that were given; without any, the map's own head rates the ground.
+
+    Returns:
+        The exit code.
+    """
+    with user_errors():
+        emap = _load(map_file, robot)
+        starts = emap.center[:, :2].double() if start is None else torch.tensor([start], dtype=torch.float64)
+        path, check = _plan(emap, starts, torch.tensor([goal], dtype=torch.float64), _robot_of(emap, robot))
+        is_safe = bool(path.reached & check.safe)
+        click.echo(_describe(starts, goal, path, check))
+        if out is not None:
+            _draw(emap, path, goal, is_safe, out)
+            click.echo(f"wrote {out}")
+    return 0 if is_safe else NO_PATH
+
+
+def _load(map_file: Path, robot: dict[str, float]) -> ElevationMap:
+    """Read a map; rate its ground for a robot, if one is given."""
+    emap = load_map(map_file, env_ids=[0])
+    if not emap.state.validity.any():
+        raise EmptyMapError(f"{map_file}: the map is empty; see what `torchelev map` said when it wrote it")
+    if not robot and emap.cfg.traversability is not None:
+        return emap
+    head: TraversabilityConfig | LearnedTraversabilityConfig = TraversabilityConfig.of_robot(RobotConfig(**robot))
+    if isinstance(emap.cfg.traversability, LearnedTraversabilityConfig):
+        head = replace(emap.cfg.traversability, robot=RobotConfig(**robot))
+    cfg = replace(emap.cfg, traversability=head)
+    rated = ElevationMap(cfg, head=emap.head, completion_net=emap.completion_net).to(emap.elevation.dtype)
+    rated.load_state(rate_surface(emap.state, cfg, None if rated.head is None else rated.head.weights))
+    return rated
+
+
+def _robot_of(emap: ElevationMap, robot: dict[str, float]) -> RobotConfig:
+    head = emap.cfg.traversability
+    return (head.robot if head is not None else None) or RobotConfig(**robot)
+
+
+def _plan(emap: ElevationMap, start: Tensor, goal: Tensor, robot: RobotConfig) -> tuple[PlannedPath, PathCheck]:
+    """Plan for the robot's width or, where its footprint does not fit on the way, for all headings of its body.
+
+    The learned head's ratings include the body, whose centre alone is checked.
+    """
+    length, width = (robot.length, robot.width) if emap.head is None else (2 * robot.foot_reach,) * 2
+    corners = torch.tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * torch.tensor([length / 2, width / 2])
+    radius = math.hypot(length, width) / 2
+    # Between two waypoints the robot moves by a cell's diagonal, and turns by less than a right angle.
+    samples = math.ceil(2 + radius * math.pi / 2 / emap.cfg.grid.resolution)
+    results = []
+    for inflation in (width / 2, radius) if emap.head is None else (0.0,):
+        path = plan(emap, start, goal, TraversalCostConfig(inflation_radius=inflation))
+        results.append((path, check_path(emap, path.poses(), corners, samples=samples)))
+        if results[-1][1].safe:
+            return results[-1]
+    return results[0]
+
+
+def _describe(start: Tensor, goal: tuple[float, float], path: PlannedPath, check: PathCheck) -> str:
+    """Return where from and to, and the path's length or why there is none."""
+    ends = f"from ({start[0, 0]:.2f}, {start[0, 1]:.2f}) to ({goal[0]:.2f}, {goal[1]:.2f})"
+    if not path.reached:
+        return f"no path   {ends}: {path.explain()[0]}"
+    kind = "path     " if check.safe else "not safe "
+    return f"{kind} {ends}, {float(path.length):.2f} m, {int(path.count)} waypoints: {check.explain()[0]}"
+
+
+def _draw(emap: ElevationMap, path: PlannedPath, goal: tuple[float, float], is_safe: bool, out: Path) -> None:
+    """Draw the path on elevation and traversability."""
+    from torchelev.output_files import require_writable
+    from torchelev.viz.plot import Panel, draw_layers
+    from torchelev.viz.style import write
+
+    require_writable(out)
+    saved = take(emap, layers=("elevation", "traversability"))
+    figure = draw_layers(
+        [Panel(title=name, values=values) for name, values in saved.layers.items()], extent=saved.extent
+    )
+    xy = path.xy[0, : int(path.count)].numpy()
+    for axes in figure.axes[: len(saved.layers)]:
+        axes.plot(xy[:, 0], xy[:, 1], "k-" if is_safe else "k--", linewidth=1.5)
+        axes.plot(*xy[0], "ko", markersize=5)
+        axes.plot(*goal, "k*" if is_safe else "rX", markersize=9)
+    write(figure, out)
