@@ -56,7 +56,7 @@ def read_depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
     return depth_to_points(torch.from_numpy(depth)[None], matrix, along=along)[0].numpy()
 
 
-def _read_png(path: Path) -> NDArray[np.uint16]:
+def _read_png(path: Path) -> NDArray:
     import cv2
 
     # OpenCV silently fills the missing part of a truncated PNG with zeros; a complete one ends with an IEND chunk.

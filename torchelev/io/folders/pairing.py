@@ -21,7 +21,7 @@ _ONE_LINE = "write one line for each scan, or name the scans by the times of the
 class Pairing(NamedTuple):
     """The pose of each scan, and when it was taken."""
 
-    index: NDArray[np.int64]  #: (T,) of the poses
+    poses: NDArray[np.int64]  #: (T,) indices in the pose file
     stamps: NDArray[np.float64] | None  #: (T,) [s] of the scans, by the poses' clock; None: unknown
     notes: tuple[str, ...] = ()  #: what is doubtful
 

@@ -39,7 +39,8 @@ def _parse(path: Path) -> Any:
 
 def _repair_header(content: bytes) -> bytes:
     """Return a file without fields of COUNT 0, which take no bytes, and with a COUNT for each field."""
-    lines, position = [], 0
+    lines: list[str] = []
+    position = 0
     while len(lines) < _MAX_HEADER and (end := content.find(b"\n", position)) >= 0:
         lines.append(content[position:end].decode("ascii", errors="replace").strip())
         position = end + 1

@@ -54,7 +54,8 @@ def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:
     if rows.shape[1] in _INDEXED:
         rows = _drop_index(path, lines, rows)
     if rows.shape[1] == 16:
-        _require_lines(path, lines, (np.abs(rows[:, 12:] - [0, 0, 0, 1]) < 1e-6).all(1), "the last row is not 0 0 0 1")
+        is_last = np.abs(rows[:, 12:] - [0, 0, 0, 1]).max(axis=1) < 1e-6
+        _require_lines(path, lines, is_last, "the last row is not 0 0 0 1")
     if rows.shape[1] >= _KITTI_COLUMNS:
         T_map_sensor = np.tile(np.eye(4), (len(rows), 1, 1))
         T_map_sensor[:, :3] = rows[:, :_KITTI_COLUMNS].reshape(-1, 3, 4)

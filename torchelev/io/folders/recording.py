@@ -61,7 +61,7 @@ class Recording(Sequence[Frame]):
         files: T paths.
         T_map_sensor: (T, 4, 4) poses of the sensor.
         dt: (T,) [s] since the previous scan.
-        read: reads the cloud of a file.
+        read: reads the cloud of a file, or its points (N, 3) [m].
         note: a warning on how scans were matched with poses, or "".
         T_map_base: (T, 4, 4) poses of the base; None: unknown.
         clock: when scans and poses were taken; None: unknown.
@@ -75,7 +75,7 @@ class Recording(Sequence[Frame]):
         files: list[Path],
         T_map_sensor: NDArray,
         dt: NDArray,
-        read: Callable[[Path], CloudFile],
+        read: Callable[[Path], CloudFile | NDArray],
         note: str = "",
         T_map_base: NDArray | None = None,
         clock: _Clock | None = None,
@@ -103,7 +103,8 @@ class Recording(Sequence[Frame]):
 
     def _read_points(self, path: Path, index: int) -> NDArray[np.float32]:
         """Return a scan's points (N, 3) [m], as seen from its pose."""
-        cloud, clock = self._read(path), self._clock
+        read, clock = self._read(path), self._clock
+        cloud = read if isinstance(read, CloudFile) else CloudFile(read)
         if clock is None:
             points, notes = hold_still(cloud, None, 0.0, 0.0)
         else:
@@ -169,7 +170,7 @@ def open_recording(
     pose_file = Path(poses) if poses is not None else _find_poses(Path(folder))
     given = read_poses(pose_file, layout)
     pairing = pair(files, pose_file, given)
-    taken = pairing.stamps if given.times is None else given.times[pairing.index]
+    taken = pairing.stamps if given.times is None else given.times[pairing.poses]
     steps = compute_steps(files, pose_file, taken, dt)
     T, notes = given.T_map_sensor, pairing.notes
     if camera is not None and files[0].suffix.lower() != ".png":
@@ -182,7 +183,7 @@ def open_recording(
         return read_cloud_file(path, layout) if camera is None else CloudFile(read_depth_points(path, camera))
 
     clock = _find_clock(pairing, given.times, T, steps, dt)
-    return Recording(files, T[pairing.index], steps, read, "; ".join(notes), clock=clock)
+    return Recording(files, T[pairing.poses], steps, read, "; ".join(notes), clock=clock)
 
 
 def _find_poses(folder: Path) -> Path:
@@ -201,11 +202,11 @@ def _find_clock(
     stamps, pose_times = pairing.stamps, times
     if times is None:
         stamps = np.cumsum(steps) if dt else stamps
-        pose_times, T_map_sensor = stamps, T_map_sensor[pairing.index]
+        pose_times, T_map_sensor = stamps, T_map_sensor[pairing.poses]
     if stamps is None or pose_times is None or len(np.unique(pose_times)) < 2:
         return None
     unique, first = np.unique(pose_times, return_index=True)
     forward = steps[steps > 0]
     period = float(np.median(forward)) if len(forward) else None
-    taken = stamps if times is None else times[pairing.index]
+    taken = stamps if times is None else times[pairing.poses]
     return _Clock(SensorPath(unique, T_map_sensor[first], period), stamps, taken)

@@ -72,9 +72,10 @@ def _deskew(
     stamps = path.times[begin:end]
     if len(stamps) < 2 or np.diff(stamps).max() > _MAX_GAP:
         return None
-    given = points, times, path.T_map_sensor[begin:end], stamps - stamp, np.array(at - stamp)
-    tensors = [torch.from_numpy(np.ascontiguousarray(value))[None] for value in given]
-    return deskew(*tensors[:4], tensors[4].reshape(1), _MAX_OUTSIDE)[0].numpy()
+    given = points, times, path.T_map_sensor[begin:end], stamps - stamp
+    cloud, at_times, T, known = (torch.from_numpy(np.ascontiguousarray(value))[None] for value in given)
+    instant = torch.tensor([at - stamp], dtype=torch.float64)
+    return deskew(cloud, at_times, T, known, instant, _MAX_OUTSIDE)[0].numpy()
 
 
 def _find_times(cloud: CloudFile, path: SensorPath | None, stamp: float) -> tuple[str, NDArray | None]:
