@@ -63,7 +63,10 @@ def test_a_sensor_on_a_base_moves_with_it(tmp_path):
         np.testing.assert_allclose(frame.points[:, 0] + frame.T_map_sensor[0, 3], WALL + 0.5, atol=1e-3)
 
 
-@pytest.mark.parametrize("column", [np.random.default_rng(0).uniform(0, 1, 200), np.repeat(np.arange(50.0), 4)])
+DRAWN = np.random.default_rng(0).uniform(0, 1, 200)
+
+
+@pytest.mark.parametrize("column", [DRAWN, 0.1 * DRAWN, np.repeat(np.arange(50.0), 4)])
 def test_intensity_and_ring_are_no_times(tmp_path, column):
     write(tmp_path, lambda path, k: np.save(path, np.column_stack([seen(k), column])), ".npy")
     recording = open_recording(tmp_path)
