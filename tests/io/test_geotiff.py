@@ -43,3 +43,9 @@ def test_wrong_arguments_write_nothing(tmp_path):
     with pytest.raises(ValueError, match="epsg: must be the code of a projected system"):
         save_geotiff(tmp_path / "map.tif", mapped(), epsg=5)
     assert not list(tmp_path.iterdir())
+
+
+def test_no_coordinate_system_without_a_code(tmp_path):
+    save_geotiff(tmp_path / "map.tif", mapped(), layers=("elevation",))
+    with tifffile.TiffFile(tmp_path / "map.tif") as file:
+        assert 34735 not in file.pages[0].tags and 33550 in file.pages[0].tags

@@ -144,8 +144,8 @@ def test_cylinders_are_held_by_their_shapes(mjcf):
         ),
         (dict(links=["world"]), "links: must be bodies of the model, got world"),
         (dict(links="leg"), "links: must be a tuple of names, got 'leg'"),
-        (dict(links=["leg", "antenna"]), "links: must have collision shapes, got none of antenna"),
-        (dict(links=["table"]), "links: must have collision shapes, got none of table"),
+        (dict(links=["leg", "antenna"]), "links: must have shapes, got none of antenna"),
+        (dict(links=["table"]), "links: must have shapes, got none of table"),
         (dict(padding=-1.0), "body.padding"),
     ],
 )
@@ -163,7 +163,7 @@ def test_refuses_what_is_no_model(tmp_path, mjcf):
     with pytest.raises(TypeError, match="source: must be a path, an MjModel or an MjSpec, got int"):
         read_body(3)
     empty = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom type='plane' size='1 1 1'/></worldbody></mujoco>")
-    with pytest.raises(ValueError, match="source: must have collision shapes on links, got none"):
+    with pytest.raises(ValueError, match="source: must have shapes on links that move, got none"):
         read_body(empty)
     mjcf.write_text(MJCF.replace('name="arm" ', ""))
     with pytest.raises(ValueError, match="source: must name the bodies of its shapes, got body 6 without a name"):

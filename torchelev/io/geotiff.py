@@ -102,13 +102,14 @@ def write_bands(
 
 
 def _make_tags(names: Sequence[str], resolution: float, north_west: tuple[float, float], epsg: int | None) -> list:
-    keys = {_RASTER_TYPE: _PIXEL_IS_AREA}
-    if epsg is not None:
-        keys = {_MODEL_TYPE: _PROJECTED, **keys, _PROJECTED_CRS: epsg}
+    keys = {_MODEL_TYPE: _PROJECTED, _RASTER_TYPE: _PIXEL_IS_AREA}
+    crs = (
+        [] if epsg is None else [_geo_keys({**keys, _PROJECTED_CRS: epsg})]
+    )  # GDAL makes a coordinate system of any keys
     return [
+        *crs,
         (_PIXEL_SCALE, _DOUBLE, 3, (resolution, resolution, 0.0), True),
         (_TIE_POINT, _DOUBLE, 6, (0.0, 0.0, 0.0, *north_west, 0.0), True),
-        _geo_keys(keys),
         (_GDAL_METADATA, _ASCII, 0, _describe(names), True),
         (_GDAL_NODATA, _ASCII, 0, "nan", True),
     ]

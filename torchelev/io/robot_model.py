@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,17 +12,21 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.frames import transform
+from torchelev.io.models.shapes import robot_geoms
+from torchelev.io.models.urdf import load_urdf, parse_urdf
 from torchelev.robot_body.shapes import Box, Capsule, RobotBody
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_NO_SHAPES = ("mjGEOM_PLANE", "mjGEOM_HFIELD")  # ground
-
 
 def read_body(source: Any, links: Iterable[str] | None = None, **options: float) -> RobotBody:
-    """Read a robot's collision shapes from an MJCF or URDF file.
+    """Read a robot's shapes from an MJCF or URDF file.
+
+    All shapes of bodies that move count, whether they collide or not; of MJCF, meshes that do not collide are pictures,
+    and count only on links without other shapes or with much smaller ones. Of URDF, a link's <visual> counts if it has
+    no <collision>, and meshes are looked for in its package, beside the file and in the folders above it.
 
     Spheres, capsules and boxes are taken as they are. A cylinder becomes the capsule that holds it, or a box if it is
     flatter than wide; an ellipsoid or a mesh becomes the box around it, along the axes of its inertia. Shapes of bodies
@@ -40,15 +44,20 @@ def read_body(source: Any, links: Iterable[str] | None = None, **options: float)
 
     Raises:
         ImportError: if MuJoCo is missing.
-        ValueError: if MuJoCo cannot read the file, there is no such link, or it has no collision shape.
+        ValueError: if MuJoCo cannot read the file, a mesh is missing, the file is xacro, there is no such link, or it
+            has no shape.
+
+    Warns:
+        UserWarning: visual meshes of links without collision shapes are missing, and left out; names the links.
     """
-    model = _load(source)
+    links = _check_names(links)
+    model = _load(source, links)
     names = [model.body(k).name for k in range(model.nbody)]
     wanted = None if links is None else _check_links(links, names)
     capsules: list[Capsule] = []
     boxes: list[Box] = []
     found: set[str] = set()
-    for geom in _collision_geoms(model):
+    for geom in robot_geoms(model, lambda body: _link_of(model, body), lambda *of: _pose_in_link(model, *of)):
         body, link = int(model.geom_bodyid[geom]), _link_of(model, int(model.geom_bodyid[geom]))
         if wanted is not None and not wanted & {names[body], names[link]}:
             continue
@@ -62,9 +71,9 @@ def read_body(source: Any, links: Iterable[str] | None = None, **options: float)
             boxes.append(shape)
     without = sorted((wanted or set()) - found)
     hint = "leave them out: they take no room that the model knows of"
-    require(not without, "links", "must have collision shapes", f"none of {', '.join(without)}", hint)
-    hint = "MuJoCo takes geoms with contype or conaffinity for collision shapes"
-    require(bool(found), "source", "must have collision shapes on links", "none", hint)
+    require(not without, "links", "must have shapes", f"none of {', '.join(without)}", hint)
+    hint = "give it geoms, and its base a joint: bodies that never move belong to the world"
+    require(bool(found), "source", "must have shapes on links that move", "none", hint)
     return RobotBody(capsules=tuple(capsules), boxes=tuple(boxes), **options)
 
 
@@ -98,7 +107,7 @@ def link_poses(model: Any, data: Any, body: RobotBody, base: str | None = None) 
     return T_base_links
 
 
-def _load(source: Any) -> Any:
+def _load(source: Any, links: tuple[str, ...] | None) -> Any:
     """Return the MjModel of a file or spec, with the bodies that do not move against their parent kept apart."""
     try:
         import mujoco
@@ -113,19 +122,31 @@ def _load(source: Any) -> Any:
     if isinstance(source, mujoco.MjSpec):
         return source.copy().compile()
     require(Path(source).is_file(), "source", "must be an MJCF or URDF file", str(source), "check the path")
+    urdf = parse_urdf(Path(source))
     try:
+        if urdf is not None:
+            return load_urdf(Path(source), urdf, links)
         spec = mujoco.MjSpec.from_file(str(source))
-        spec.compiler.fusestatic = False  # or MuJoCo fuses the base of a URDF model into the world
+        spec.compiler.fusestatic = False  # a base of URDF that it includes stays apart from the world
         return spec.compile()
     except ValueError as error:
+        text = " ".join(str(error).split())
+        if text.startswith("source: "):
+            raise
         hint = "open it in MuJoCo's viewer: python -m mujoco.viewer --mjcf=FILE"
-        require(False, "source", "must be a model that MuJoCo reads", f"{source}: {' '.join(str(error).split())}", hint)
+        if "opening file" in text or "resource" in text:
+            hint = "copy its meshes and textures to where the model names them, or set meshdir"
+        require(False, "source", "must be a model that MuJoCo reads", f"{source}: {text}", hint)
+
+
+def _check_names(links: Iterable[str] | None) -> tuple[str, ...] | None:
+    hint = "give names such as ('base', 'FL_thigh'), or None"
+    require(not isinstance(links, str), "links", "must be a tuple of names", repr(links), hint)
+    return None if links is None else tuple(links)
 
 
 def _check_links(links: Iterable[str], names: list[str]) -> set[str]:
     """Return the names as a set; ValueError for those that the model lacks."""
-    hint = "give names such as ('base', 'FL_thigh'), or None"
-    require(not isinstance(links, str), "links", "must be a tuple of names", repr(links), hint)
     wanted = set(links)
     unknown = sorted(wanted - set(names[1:]))
     hint = f"there are {', '.join(name for name in names[1:] if name)}"
@@ -138,19 +159,6 @@ def _link_of(model: Any, body: int) -> int:
     while model.body_jntnum[body] == 0 and model.body_parentid[body] != 0:
         body = int(model.body_parentid[body])
     return body
-
-
-def _collision_geoms(model: Any) -> Iterator[int]:
-    """Yield the geoms that collide and belong to a tree of bodies that moves."""
-    import mujoco
-
-    moving = {int(model.body_rootid[k]) for k in range(1, model.nbody) if model.body_jntnum[k] > 0}
-    ground = {int(getattr(mujoco.mjtGeom, name)) for name in _NO_SHAPES}
-    for geom in range(model.ngeom):
-        collides = model.geom_contype[geom] != 0 or model.geom_conaffinity[geom] != 0
-        is_shape = int(model.geom_type[geom]) not in ground
-        if collides and is_shape and int(model.body_rootid[model.geom_bodyid[geom]]) in moving:
-            yield geom
 
 
 def _matrix(position: NDArray, quat_wxyz: NDArray) -> NDArray[np.float64]:

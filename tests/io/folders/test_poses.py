@@ -85,3 +85,22 @@ def test_refuses_what_is_no_text(tmp_path):
         read_poses(tmp_path / "poses.txt")
     with pytest.raises(RecordingError, match="no such pose file"):
         read_poses(tmp_path / "gone.txt")
+
+
+@pytest.mark.parametrize("columns", [13, 16, 17, 9, 8])
+def test_an_index_whole_matrices_and_a_header(tmp_path, columns):
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 3] = range(5)
+    tum = np.column_stack([0.1 * np.arange(5), poses[:, :3, 3], np.tile([0, 0, 0, 1], (5, 1))])
+    rows = {8: tum, 9: tum, 13: poses[:, :3].reshape(5, 12)}.get(columns, poses.reshape(5, 16))
+    if columns in (9, 13, 17):
+        rows = np.column_stack([3 + np.arange(5), rows])
+    header = "num t x y z qx qy qz qw\n" if columns == 9 else "t,x,y,z,qx,qy,qz,qw\n" if columns == 8 else ""
+    (tmp_path / "p.txt").write_text(header + "\n".join(" ".join(map(str, row)) for row in rows))
+    np.testing.assert_allclose(read_poses(tmp_path / "p.txt").T_map_sensor, poses)
+
+
+def test_thirteen_columns_whose_first_does_not_count(tmp_path):
+    (tmp_path / "p.txt").write_text("0.5 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(RecordingError, match="the first must count the poses"):
+        read_poses(tmp_path / "p.txt")

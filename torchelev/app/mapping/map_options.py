@@ -26,14 +26,19 @@ earlier are ignored.
 Point clouds, in metres, in the sensor frame:
   .bin (KITTI: float32 x y z intensity)  .npy  .npz  .ply  .pcd
 Depth images, with --intrinsics:
-  .png (uint16, in millimetres or as depth_scale in the intrinsics says;
-  camera frame: x right, y down, z forward)
+  .png (uint16, in millimetres or as depth_scale in the intrinsics says),
+  .npy or .npz (floats in metres, or uint16); camera frame: x right, y down,
+  z forward
+
+Times of points (a field t, time, timestamp ... or a column of seconds) take
+the motion within a scan out of it, if the poses have times or --dt is given.
 
 The pose file has one line per scan: the sensor's pose in a map frame whose
 z axis points up. A line holds 12 numbers (KITTI: the upper 3x4 of the pose
-matrix, row by row) or 8 numbers (TUM: t x y z qx qy qz qw). The poses of the
-KITTI odometry benchmark describe the camera, whose z axis points forward;
-convert them with its calibration first.
+matrix, row by row) or 8 numbers (TUM: t x y z qx qy qz qw), with an index
+before them or without. The poses of the KITTI odometry benchmark describe the
+camera, whose z axis points forward: put its calib.txt beside the poses or the
+scans, and they become the lidar's.
 
 \b
 Example: a folder drive/ with scans/000000.bin, ... and poses.txt

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchelev.app.mapping.fuse_scans import MapOptions, Scans, show_progress
 from torchelev.app.mapping.map_request import MapRequest
-from torchelev.io import FileLayout, base_poses, is_bag, open_recording, read_transform
+from torchelev.io import FileLayout, Recording, base_poses, is_bag, open_recording, read_transform
 
 if TYPE_CHECKING:
     from torchelev.io.bags import BagRequest
@@ -40,10 +40,15 @@ def open_scans(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
         with _open_bag(request) as opened:
             yield opened
     else:
-        yield _open_folder(request)
+        scans, options = _open_folder(request)
+        try:
+            yield scans, options
+        finally:
+            for note, number in scans.notes.items():
+                click.echo(f"warning: {note}" + (f" (and {number - 1} more scans)" if number > 1 else ""), err=True)
 
 
-def _open_folder(request: MapRequest) -> tuple[Scans, MapOptions]:
+def _open_folder(request: MapRequest) -> tuple[Recording, MapOptions]:
     mount = None if request.extrinsics is None else read_transform(request.extrinsics)
     _check(request, mount)
     options = MapOptions(T_base_sensor=mount, sensor_height=request.sensor_height, fixed=request.fixed)

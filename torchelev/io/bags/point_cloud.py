@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.bags.messages.cloud import Cloud, CloudError
-from torchelev.io.bags.messages.point_times import TIME_FIELDS, describe_times, to_seconds
 from torchelev.io.bags.messages.raw import as_bytes
+from torchelev.io.point_times import TIME_FIELDS, describe_times, to_seconds
 
 __all__ = ["Cloud", "CloudError", "read_points", "to_seconds"]
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag, Message
 from torchelev.io.bags.cameras import doubt_axes, find_cameras
-from torchelev.io.bags.messages.cloud import Reasons
 from torchelev.io.bags.order import order_by_stamp
 from torchelev.io.bags.periods import find_period
 from torchelev.io.bags.point_cloud import CloudError
@@ -22,6 +21,7 @@ from torchelev.io.bags.scans import Scan, read_scan
 from torchelev.io.bags.topics import BagRequest, choose_topics
 from torchelev.io.errors import RecordingError
 from torchelev.io.folders.recording import Frame
+from torchelev.io.notes import Reasons
 
 _MAX_GAP = 1.0  # [s] between two poses without a warning
 _OTHER_CLOCK = "these stamps are not those of the poses; give --stamps recorded"

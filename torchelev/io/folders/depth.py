@@ -1,44 +1,64 @@
-"""Read depth images and camera intrinsics."""
+"""Read depth images: PNG of 16 bits, and arrays as simulators write them."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
+from torchelev.io.folders.arrays import is_cloud, load_npy, load_npz
+from torchelev.io.folders.intrinsics import Intrinsics, check_size
 
-_HINT = "write four numbers fx fy cx cy [px], a 3x3 matrix, or YAML with those names"
-
-
-class Intrinsics(NamedTuple):
-    """A pinhole camera and the meaning of its depth values."""
-
-    matrix: NDArray[np.float64]  #: (3, 3) [px]
-    depth_scale: float = 0.001  #: [m] per unit of the image
-    along: Literal["z", "ray"] = "z"  #: depth is measured along the optical axis, or along each pixel's ray
+_NAMES = ("depth", "distance_to_image_plane", "distance_to_camera")
+_ALONG_RAY = "distance_to_camera"  # in file names of Isaac Sim's Replicator: along each pixel's ray
+_FAR = 200.0  # [m] a median depth beyond which values are no metres
 
 
 def read_depth(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32]:
-    """Read a 16-bit depth PNG.
+    """Read a depth image: a 16-bit PNG, or a `.npy` or `.npz` array (H, W).
 
     Args:
         path: the file.
-        depth_scale: [m] per unit of the image: 0.001 for millimetres.
+        depth_scale: [m] per unit of an image of integers: 0.001 for millimetres. Arrays of floats are in metres.
 
     Returns:
         Depth (H, W) [m], 0 where there was no return.
 
     Raises:
-        RecordingError: the file is missing, cut short or not a single-channel 16-bit image.
+        RecordingError: the file is missing, cut short or no depth image.
     """
-    import cv2
-
     path = Path(path)
     if not path.is_file():
         raise RecordingError(path, "no such file")
+    units = _read_png(path) if path.suffix.lower() == ".png" else _read_array(path)
+    if units.dtype.kind in "iu":
+        return units.astype(np.float32) * np.float32(depth_scale)
+    depth = np.where(np.isfinite(units) & (units > 0), units, 0).astype(np.float32)
+    median = float(np.median(depth[depth > 0])) if depth.any() else 0.0
+    if median > _FAR:
+        problem = f"the median depth is {median:.4g}: floats are depth in metres"
+        raise RecordingError(path, problem, "divide millimetres by 1000, or save them as uint16")
+    return depth
+
+
+def read_depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
+    """Read a depth image as points (H * W, 3) [m] in the camera frame: x right, y down, z forward."""
+    import torch
+
+    from torchelev.inputs.clouds import depth_to_points
+
+    depth = read_depth(path, camera.depth_scale)
+    check_size(path, camera, depth.shape)
+    matrix = torch.from_numpy(camera.matrix).float()
+    along = "ray" if _ALONG_RAY in path.stem else camera.along
+    return depth_to_points(torch.from_numpy(depth)[None], matrix, along=along)[0].numpy()
+
+
+def _read_png(path: Path) -> NDArray:
+    import cv2
+
     # OpenCV silently fills the missing part of a truncated PNG with zeros; a complete one ends with an IEND chunk.
     if b"IEND" not in path.read_bytes()[-16:]:
         raise RecordingError(path, "cut short or not a PNG", "copy the file again")
@@ -48,96 +68,15 @@ def read_depth(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float
     if image.dtype != np.uint16 or image.ndim != 2:
         problem = f"expected one 16-bit channel, got {image.dtype} {image.shape}"
         raise RecordingError(path, problem, "save depth in millimetres as uint16")
-    return image.astype(np.float32) * np.float32(depth_scale)
+    return image
 
 
-def read_intrinsics(path: str | Path) -> Intrinsics:
-    """Read camera intrinsics from text or YAML.
-
-    Text holds `fx fy cx cy`, optionally followed by `depth_scale`, or the nine numbers of a 3x3 matrix. YAML has the
-    keys `fx fy cx cy`, or `K` or `camera_matrix` with nine numbers, as ROS writes them; `depth_scale` [m per unit] and
-    `along` (`z` or `ray`) are optional.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The camera.
-
-    Raises:
-        RecordingError: the file is missing, holds none of these, or its values are out of range.
-    """
-    path = Path(path)
-    data = _load(path)
-    numbers = _parse_numbers(data)
-    if numbers is not None:
-        return _from_numbers(path, numbers)
-    if not isinstance(data, dict):
-        raise RecordingError(path, "holds no intrinsics", _HINT)
-    return _from_mapping(path, data)
-
-
-def check_size(path: str | Path, intrinsics: Intrinsics, shape: tuple[int, ...]) -> None:
-    """Raise RecordingError if the principal point is outside an image of `shape` (H, W): a mismatch of files."""
-    (cx, cy), (height, width) = intrinsics.matrix[:2, 2], shape
-    if not (0 < cx < width and 0 < cy < height):
-        problem = f"the intrinsics' cx {cx:g}, cy {cy:g} lie outside this image of {width} x {height} px"
-        raise RecordingError(path, problem, "give the intrinsics of this camera at this size")
-
-
-def _load(path: Path) -> Any:
-    import yaml
-
-    if not path.is_file():
-        raise RecordingError(path, "no such intrinsics file", "give one with --intrinsics")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        lines = [line for line in text.splitlines() if not line.startswith("%YAML")]  # OpenCV's header is not YAML
-        return yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RecordingError(path, f"is neither text nor YAML ({error})", _HINT) from error
-
-
-def _parse_numbers(data: object) -> list[float] | None:
-    """Return the numbers of plain text, which YAML loads as a string or, with brackets, as a list; else None."""
-    words = data.replace(",", " ").split() if isinstance(data, str) else data if isinstance(data, list) else None
-    try:
-        return None if words is None else np.array(words, dtype=np.float64).ravel().tolist()
-    except (TypeError, ValueError):
-        return None
-
-
-def _from_numbers(path: Path, numbers: list[float], **options: Any) -> Intrinsics:
-    if len(numbers) == 5:
-        options["depth_scale"] = numbers.pop()
-    if len(numbers) == 9:
-        numbers = [numbers[0], numbers[4], numbers[2], numbers[5]]
-    if len(numbers) != 4:
-        raise RecordingError(path, f"holds {len(numbers)} numbers", _HINT)
-    fx, fy, cx, cy = numbers
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    intrinsics = Intrinsics(matrix, **options)
-    _check_values(path, intrinsics)
-    return intrinsics
-
-
-def _from_mapping(path: Path, data: dict) -> Intrinsics:
-    options = {key: data[key] for key in ("depth_scale", "along") if key in data}
-    matrix = next((data[key] for key in ("K", "k", "camera_matrix") if key in data), None)
-    if isinstance(matrix, dict):
-        matrix = matrix.get("data")
-    numbers = _parse_numbers([data.get(key) for key in ("fx", "fy", "cx", "cy")] if matrix is None else matrix)
-    if numbers is None or np.isnan(numbers).any():
-        raise RecordingError(path, f"no fx, fy, cx, cy among the keys {list(data)}", _HINT)
-    return _from_numbers(path, numbers, **options)
-
-
-def _check_values(path: Path, intrinsics: Intrinsics) -> None:
-    matrix, scale, along = intrinsics
-    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
-        raise RecordingError(path, "fx and fy must be positive, all four finite", _HINT)
-    if not (isinstance(scale, int | float) and 0 < scale <= 1):
-        hint = "5000 units per metre are 0.0002, millimetres 0.001"
-        raise RecordingError(path, f"depth_scale must be metres per unit, in (0, 1], got {scale}", hint)
-    if along not in ("z", "ray"):
-        raise RecordingError(path, f"along must be 'z' or 'ray', got {along!r}")
+def _read_array(path: Path) -> NDArray:
+    array = load_npy(path) if path.suffix.lower() == ".npy" else load_npz(path, _NAMES)[0]
+    if is_cloud(array) and not (array.ndim == 3 and array.shape[0] == 1):
+        raise RecordingError(path, f"holds a point cloud {array.shape}, not depth (H, W)", "drop --intrinsics")
+    image = array.reshape([size for size in array.shape if size != 1]) if array.ndim > 2 else array
+    if image.ndim != 2 or image.dtype.kind not in "fiu" or image.dtype.itemsize < 2:
+        problem = f"expected depth (H, W) as floats in metres or integers of 16 bits, got {array.dtype} {array.shape}"
+        raise RecordingError(path, problem, "save one channel")
+    return image

@@ -58,7 +58,7 @@ _OTHER_LAYOUTS = [_BinLayout("<f4", n) for n in (3, 5, 6)] + [_BinLayout("<f8", 
 
 
 def read_bin(path: Path, layout: str | None = None) -> NDArray:
-    """Read x y z (N, 3) of a `.bin`; without a `layout` its size and values must fit KITTI's."""
+    """Read the numbers (N, C) of a `.bin`, x y z first; without a `layout` its size and values must fit KITTI's."""
     chosen, size = _KITTI if layout is None else _parse_bin(layout), path.stat().st_size
     if size % chosen.num_bytes:
         problem = f"cut short: {size} bytes are not a whole number of points of {chosen}"
@@ -68,7 +68,7 @@ def read_bin(path: Path, layout: str | None = None) -> NDArray:
     if layout is None:
         with np.errstate(invalid="ignore"):  # other layouts read as float32 can give signalling NaN
             _require_kitti(path, size)
-    return np.fromfile(path, dtype=chosen.dtype).reshape(-1, chosen.columns)[:, :3]
+    return np.fromfile(path, dtype=chosen.dtype).reshape(-1, chosen.columns)
 
 
 def _parse_bin(text: str) -> _BinLayout:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +13,14 @@ from torchelev.frames import transform_xyzw
 from torchelev.io.errors import RecordingError
 from torchelev.io.folders.layout import XYZW_COLUMNS, FileLayout, detect_quaternion_order, to_seconds
 
-_KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
+_KITTI_COLUMNS = 12
 _TOLERANCE = 0.02  # rotations rounded to three decimals are off by about 0.001; larger errors have other causes
-_POSE_HINT = "expected 12 numbers per line (KITTI: the upper 3x4 of the pose) or 8 (TUM: t x y z qx qy qz qw)"
+_INDEXED = {13: 12, 17: 16, 9: 8}  # columns with an index before the pose, and without it
+_COLUMNS = (8, 9, 12, 13, 16, 17)
+_POSE_HINT = (
+    "expected 12 or 16 numbers per line (KITTI: the pose, row by row) or 8 (TUM: t x y z qx qy qz qw), with an index "
+    "before them or without"
+)
 _TRANSFORM_HINT = "give 12 numbers (the upper 3x4 of T_base_sensor, row by row) or a file with them"
 _NOT_A_ROTATION = "the 3x3 part is not a rotation matrix, or is mirrored"
 
@@ -27,10 +33,10 @@ class Poses(NamedTuple):
 
 
 def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:
-    """Read a pose file, one pose per line: 12 numbers (KITTI) or 8 (TUM).
+    """Read a pose file, one pose per line: 12 or 16 numbers (KITTI) or 8 (TUM), an index before them or none.
 
-    Blank lines and lines that start with `#` are skipped; commas count as spaces. Each rotation is replaced by the
-    nearest rotation matrix, because files are often rounded to a few decimals.
+    Blank lines, lines that start with `#` and a first line of names are skipped; commas count as spaces. Each rotation
+    is replaced by the nearest rotation matrix, because files are often rounded to a few decimals.
 
     Args:
         path: the file.
@@ -43,12 +49,18 @@ def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:
         RecordingError: a line is not a pose, or quaternions look like w x y z; the message names the line.
     """
     path, layout = Path(path), layout or FileLayout()
-    lines, rows = _read_rows(path)
-    if rows.shape[1] == _KITTI_COLUMNS:
+    text = _read_text(path)
+    lines, rows = _read_rows(path, text)
+    if rows.shape[1] in _INDEXED:
+        rows = _drop_index(path, lines, rows)
+    if rows.shape[1] == 16:
+        is_last = np.abs(rows[:, 12:] - [0, 0, 0, 1]).max(axis=1) < 1e-6
+        _require_lines(path, lines, is_last, "the last row is not 0 0 0 1")
+    if rows.shape[1] >= _KITTI_COLUMNS:
         T_map_sensor = np.tile(np.eye(4), (len(rows), 1, 1))
-        T_map_sensor[:, :3] = rows.reshape(-1, 3, 4)
+        T_map_sensor[:, :3] = rows[:, :_KITTI_COLUMNS].reshape(-1, 3, 4)
         return Poses(_make_rigid(path, lines, T_map_sensor), None)
-    comments = "\n".join(line.partition("#")[2] for line in _read_text(path).splitlines())
+    comments = "\n".join([*(line.partition("#")[2] for line in text.splitlines()), _header(text)])
     order = detect_quaternion_order(path, comments, rows[:, 4:], layout.quaternions)
     quat_xyzw = rows[:, 4:][:, XYZW_COLUMNS[order]]
     norm = np.linalg.norm(quat_xyzw, axis=1, keepdims=True)
@@ -83,19 +95,36 @@ def read_transform(text_or_path: str | Path) -> NDArray[np.float64]:
     return result
 
 
-def _read_rows(path: Path) -> tuple[list[int], NDArray[np.float64]]:
-    """Return line numbers (T,) and the numbers on these lines (T, 8 or 12)."""
-    lines = [(number, line.split("#")[0]) for number, line in enumerate(_read_text(path).splitlines(), start=1)]
+def _read_rows(path: Path, text: str) -> tuple[list[int], NDArray[np.float64]]:
+    """Return line numbers (T,) and the numbers on these lines (T, C)."""
+    lines = [(number, line.split("#")[0]) for number, line in enumerate(text.splitlines(), start=1)]
+    if _header(text):
+        lines = lines[1:]
     rows = {number: _parse_line(path, number, line) for number, line in lines if line.strip()}
     if not rows:
         raise RecordingError(path, "holds no pose", _POSE_HINT)
     num_columns = len(next(iter(rows.values())))
     for number, row in rows.items():
-        if len(row) not in (_KITTI_COLUMNS, _TUM_COLUMNS):
+        if len(row) not in _COLUMNS:
             raise RecordingError(path, f"line {number} holds {len(row)} numbers", _POSE_HINT)
         if len(row) != num_columns:
             raise RecordingError(path, f"line {number} holds {len(row)} numbers, the lines before it {num_columns}")
     return list(rows), np.array(list(rows.values()), dtype=np.float64)
+
+
+def _header(text: str) -> str:
+    """Return the first line if it holds names of columns, as many as the next holds numbers; else ""."""
+    first, _, rest = text.partition("\n")
+    names, numbers = (line.replace(",", " ").split() for line in (first, rest.partition("\n")[0]))
+    return first if len(names) == len(numbers) and all(re.match("[^\\W\\d]", name) for name in names) else ""
+
+
+def _drop_index(path: Path, lines: list[int], rows: NDArray) -> NDArray[np.float64]:
+    """Return rows without their first column, which must count poses."""
+    index = rows[:, 0]
+    counts = (index == np.round(index)) & (np.diff(index, prepend=index[0] - 1) > 0)
+    _require_lines(path, lines, counts, f"of {rows.shape[1]} columns the first must count the poses")
+    return rows[:, 1:]
 
 
 def _read_text(path: Path) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, overload
@@ -11,15 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.clouds import read_cloud
-from torchelev.io.folders.depth import Intrinsics, check_size, read_depth, read_intrinsics
-from torchelev.io.folders.layout import FileLayout, require_plausible_steps
-from torchelev.io.folders.poses import Poses, read_poses
+from torchelev.io.folders.arrays import CloudFile
+from torchelev.io.folders.clouds import read_cloud_file
+from torchelev.io.folders.depth import read_depth, read_depth_points
+from torchelev.io.folders.intrinsics import read_intrinsics
+from torchelev.io.folders.kitti import convert, to_lidar
+from torchelev.io.folders.layout import FileLayout
+from torchelev.io.folders.pairing import Pairing, compute_steps, pair
+from torchelev.io.folders.poses import read_poses
 from torchelev.io.folders.scan_files import find_scans
+from torchelev.io.folders.within_scan import SensorPath, hold_still
+from torchelev.io.notes import Reasons
 
 _POSE_FILES = ("poses.txt", "groundtruth.txt")
-_TIME_TOLERANCE = 0.02  # [s] between a scan's timestamp and its pose's, as in TUM's own tools
-_DEFAULT_DT = 0.1  # [s]
 
 
 class Frame(NamedTuple):
@@ -34,6 +37,23 @@ class Frame(NamedTuple):
     stamp: float = 0.0  #: [s] of a bag's scan; 0 of a file
 
 
+class _Clock(NamedTuple):
+    """When the scans and their poses were taken."""
+
+    path: SensorPath
+    stamps: NDArray[np.float64]  #: (T,) [s] from which the times of a scan's points count
+    pose_times: NDArray[np.float64]  #: (T,) [s] of the pose that a scan takes
+
+    def part(self, index: slice) -> _Clock:
+        """Return the clock of some of the scans."""
+        return self._replace(stamps=self.stamps[index], pose_times=self.pose_times[index])
+
+    def apply_mount(self, T_base_sensor: NDArray[np.float64]) -> _Clock:
+        """Return the clock with the path of a sensor at T_base_sensor (4, 4) on what moved along this one."""
+        path = self.path._replace(T_map_sensor=self.path.T_map_sensor @ T_base_sensor)
+        return self._replace(path=path)
+
+
 class Recording(Sequence[Frame]):
     """Scans with poses. Indexing reads a scan from disk; a slice is a shorter recording.
 
@@ -41,9 +61,13 @@ class Recording(Sequence[Frame]):
         files: T paths.
         T_map_sensor: (T, 4, 4) poses of the sensor.
         dt: (T,) [s] since the previous scan.
-        read: reads the points (N, 3) [m] of a file.
+        read: reads the cloud of a file, or its points (N, 3) [m].
         note: a warning on how scans were matched with poses, or "".
         T_map_base: (T, 4, 4) poses of the base; None: unknown.
+        clock: when scans and poses were taken; None: unknown.
+
+    Attributes:
+        notes: what is not used of the scans that were read.
     """
 
     def __init__(
@@ -51,12 +75,13 @@ class Recording(Sequence[Frame]):
         files: list[Path],
         T_map_sensor: NDArray,
         dt: NDArray,
-        read: Callable[[Path], NDArray],
+        read: Callable[[Path], CloudFile | NDArray],
         note: str = "",
         T_map_base: NDArray | None = None,
+        clock: _Clock | None = None,
     ) -> None:
         self.files, self.T_map_sensor, self.dt, self._read, self.note = files, T_map_sensor, dt, read, note
-        self.T_map_base = T_map_base
+        self.T_map_base, self._clock, self.notes = T_map_base, clock, Reasons()
 
     def __len__(self) -> int:
         return len(self.files)
@@ -66,11 +91,27 @@ class Recording(Sequence[Frame]):
     @overload
     def __getitem__(self, index: slice) -> Recording: ...
     def __getitem__(self, index: int | slice) -> Frame | Recording:
+        bases = self.T_map_base
         if isinstance(index, slice):
-            bases = None if self.T_map_base is None else self.T_map_base[index]
-            return Recording(self.files[index], self.T_map_sensor[index], self.dt[index], self._read, self.note, bases)
-        path, base = self.files[index], None if self.T_map_base is None else self.T_map_base[index]
-        return Frame(self._read(path), self.T_map_sensor[index], float(self.dt[index]), path.name, base)
+            clock = None if self._clock is None else self._clock.part(index)
+            part = Recording(self.files[index], self.T_map_sensor[index], self.dt[index], self._read, self.note,
+                             None if bases is None else bases[index], clock)  # fmt: skip
+            part.notes = self.notes
+            return part
+        path, base = self.files[index], None if bases is None else bases[index]
+        return Frame(self._read_points(path, index), self.T_map_sensor[index], float(self.dt[index]), path.name, base)
+
+    def _read_points(self, path: Path, index: int) -> NDArray[np.float32]:
+        """Return a scan's points (N, 3) [m], as seen from its pose."""
+        read, clock = self._read(path), self._clock
+        cloud = read if isinstance(read, CloudFile) else CloudFile(read)
+        if clock is None:
+            points, notes = hold_still(cloud, None, 0.0, 0.0)
+        else:
+            points, notes = hold_still(cloud, clock.path, clock.stamps[index], clock.pose_times[index])
+        for note in notes:
+            self.notes.count(f"{path.name}: {note.text}", note.kind)
+        return points
 
     @property
     def middle(self) -> NDArray[np.float64]:
@@ -87,11 +128,13 @@ class Recording(Sequence[Frame]):
         Returns:
             The same scans with the sensor's poses.
         """
-        return Recording(self.files, self.T_map_sensor @ T_base_sensor, self.dt, self._read, self.note)
+        clock = None if self._clock is None else self._clock.apply_mount(T_base_sensor)
+        poses = self.T_map_sensor @ T_base_sensor
+        return Recording(self.files, poses, self.dt, self._read, self.note, clock=clock)
 
     def with_bases(self, T_map_base: NDArray[np.float64]) -> Recording:
         """Return the recording with poses (T, 4, 4) of the robot's base."""
-        return Recording(self.files, self.T_map_sensor, self.dt, self._read, self.note, T_map_base)
+        return Recording(self.files, self.T_map_sensor, self.dt, self._read, self.note, T_map_base, self._clock)
 
 
 def open_recording(
@@ -125,12 +168,22 @@ def open_recording(
     camera = None if intrinsics is None else read_intrinsics(intrinsics)
     files = find_scans(Path(folder), depth=camera is not None)
     pose_file = Path(poses) if poses is not None else _find_poses(Path(folder))
-    T_map_sensor, times, note = _assign_poses(files, pose_file, read_poses(pose_file, layout))
+    given = read_poses(pose_file, layout)
+    pairing = pair(files, pose_file, given)
+    taken = pairing.stamps if given.times is None else given.times[pairing.poses]
+    steps = compute_steps(files, pose_file, taken, dt)
+    T, notes = given.T_map_sensor, pairing.notes
+    if camera is not None and files[0].suffix.lower() != ".png":
+        read_depth(files[0])  # an array may also be a cloud
+    if camera is None:
+        T_camera_lidar, note = to_lidar(T, (files[0].parent, Path(folder), pose_file.parent, files[0].parent.parent))
+        T, notes = T if T_camera_lidar is None else convert(T, T_camera_lidar), (*notes, *filter(None, [note]))
 
-    def read(path: Path) -> NDArray:
-        return read_cloud(path, layout) if camera is None else _read_depth_points(path, camera)
+    def read(path: Path) -> CloudFile:
+        return read_cloud_file(path, layout) if camera is None else CloudFile(read_depth_points(path, camera))
 
-    return Recording(files, T_map_sensor, _compute_steps(files, pose_file, times, dt), read, note)
+    clock = _find_clock(pairing, given.times, T, steps, dt)
+    return Recording(files, T[pairing.poses], steps, read, "; ".join(notes), clock=clock)
 
 
 def _find_poses(folder: Path) -> Path:
@@ -142,77 +195,18 @@ def _find_poses(folder: Path) -> Path:
     raise RecordingError(folder, f"no pose file ({names}) in it or beside it", "give it with --poses")
 
 
-def _assign_poses(files: list[Path], pose_file: Path, poses: Poses) -> tuple[NDArray, NDArray | None, str]:
-    """Return each scan's pose (T, 4, 4), its time (T,) [s] if known, and a note if poses are left over."""
-    index, note = _match_times(files, pose_file, poses.times), ""
-    if index is None:
-        num_poses = len(poses.T_map_sensor)
-        index = _match_order(files, pose_file, num_poses)
-        if num_poses > len(files):
-            lines = f"{files[0].name} takes line {index[0] + 1}, {files[-1].name} line {index[-1] + 1}"
-            note = f"{pose_file}: {num_poses} poses for {len(files)} scans; each scan takes that of its number: {lines}"
-    return poses.T_map_sensor[index], None if poses.times is None else poses.times[index], note
-
-
-def _match_times(files: list[Path], pose_file: Path, times: NDArray | None) -> NDArray | None:
-    """Return the indices (T,) of the poses nearest in time; None without timestamps of a common clock."""
-    stamps = [_parse_timestamp(path.stem) for path in files]
-    if times is None or None in stamps:
+def _find_clock(
+    pairing: Pairing, times: NDArray | None, T_map_sensor: NDArray, steps: NDArray, dt: float | None
+) -> _Clock | None:
+    """Return when scans and poses were taken: by the poses' times, by the scans' names, or by `dt`; None: unknown."""
+    stamps, pose_times = pairing.stamps, times
+    if times is None:
+        stamps = np.cumsum(steps) if dt else stamps
+        pose_times, T_map_sensor = stamps, T_map_sensor[pairing.poses]
+    if stamps is None or pose_times is None or len(np.unique(pose_times)) < 2:
         return None
-    scan_times = np.array(stamps, dtype=np.float64)
-    if scan_times.max() < times.min() - 1 or scan_times.min() > times.max() + 1:
-        return None  # different clocks
-    index = np.array([np.abs(times - t).argmin() for t in scan_times])
-    gaps = np.abs(times[index] - scan_times)
-    if gaps.max() > _TIME_TOLERANCE:
-        name, gap = files[int(gaps.argmax())].name, gaps.max()
-        problem = f"no pose for scan {name}: the nearest is {gap:.3f} s away, at most {_TIME_TOLERANCE} s is allowed"
-        raise RecordingError(pose_file, problem, "add its pose or remove the scan")
-    return index
-
-
-def _parse_timestamp(stem: str) -> float | None:
-    """Return the time [s] in a file name: a decimal number, or s, ms, us or ns since 1970; None for other names."""
-    if not re.fullmatch(r"\d+\.\d+|\d{10,19}", stem):
-        return None
-    value = float(stem)
-    return value / 10 ** (3 * int(max(0, np.floor((np.log10(max(value, 1.0)) - 8) / 3))))
-
-
-def _match_order(files: list[Path], pose_file: Path, num_poses: int) -> NDArray:
-    """Return the indices (T,) of poses in the scans' order, or by the scans' numbers if there are more poses."""
-    if num_poses == len(files):
-        return np.arange(num_poses)
-    if num_poses > len(files) and all(path.stem.isdigit() for path in files):
-        index = np.array([int(path.stem) for path in files])
-        if index.max() < num_poses:
-            return index
-    scan = f"no pose for scan {files[num_poses].name}: " if num_poses < len(files) else ""
-    raise RecordingError(pose_file, f"{scan}{num_poses} poses for {len(files)} scans", "write one line for each scan")
-
-
-def _compute_steps(files: list[Path], pose_file: Path, times: NDArray | None, dt: float | None) -> NDArray[np.float64]:
-    """Return the times since the previous scan (T,) [s], 0 for the first."""
-    if dt is not None or times is None:
-        steps = np.full(len(files), _DEFAULT_DT if dt is None else dt)
-    else:
-        steps = np.diff(times, prepend=times[:1])
-    steps[0] = 0.0
-    if (steps < 0).any():
-        name = files[int((steps < 0).argmax())].name
-        raise RecordingError(pose_file, f"the pose of scan {name} is older than that of the scan before it", "sort it")
-    if dt is None and times is not None:
-        require_plausible_steps(pose_file, steps)
-    return steps
-
-
-def _read_depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
-    """Read a depth image as points (H * W, 3) [m] in the camera frame: x right, y down, z forward."""
-    import torch
-
-    from torchelev.inputs.clouds import depth_to_points
-
-    depth = read_depth(path, camera.depth_scale)
-    check_size(path, camera, depth.shape)
-    matrix = torch.from_numpy(camera.matrix).float()
-    return depth_to_points(torch.from_numpy(depth)[None], matrix, along=camera.along)[0].numpy()
+    unique, first = np.unique(pose_times, return_index=True)
+    forward = steps[steps > 0]
+    period = float(np.median(forward)) if len(forward) else None
+    taken = stamps if times is None else times[pairing.poses]
+    return _Clock(SensorPath(unique, T_map_sensor[first], period), stamps, taken)
