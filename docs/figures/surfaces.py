@@ -24,7 +24,7 @@ from docs.moving_picture.surface import surface
 from docs.moving_picture.walk import GRID, make_ground, walk
 from docs.moving_picture.walk import Path as RobotPath
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.io.folders.poses import read_poses
+from torchelev.io.poses import read_poses
 from torchelev.viz.style import DEVIATIONS, HEIGHTS, draw_cells, make_figure, save, styled
 
 PICTURES = Path(__file__).parents[1] / "pictures"

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from torchelev.io.folders.poses import read_poses
+from torchelev.io.poses import read_poses
 from torchelev.sim import Lidar
 from torchelev.sim.exact.scenes import boxes
 

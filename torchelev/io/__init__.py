@@ -7,14 +7,14 @@ Plots are in `torchelev.viz`.
 """
 
 from torchelev.io.bags import GridMapWriter, is_bag, read_grid_map, read_grid_maps, write_grid_map
+from torchelev.io.clouds import read_cloud
+from torchelev.io.depth import read_depth
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.clouds import read_cloud
-from torchelev.io.folders.depth import read_depth
-from torchelev.io.folders.intrinsics import Intrinsics, read_intrinsics
-from torchelev.io.folders.layout import FileLayout
-from torchelev.io.folders.poses import Poses, read_poses, read_transform
+from torchelev.io.files.intrinsics import Intrinsics, read_intrinsics
+from torchelev.io.files.layout import FileLayout
 from torchelev.io.folders.recording import Frame, Recording, open_recording
 from torchelev.io.mapping import MappingRun, base_poses
+from torchelev.io.poses import Poses, read_poses, read_transform
 from torchelev.io.robot_model import link_poses, read_body
 
 __all__ = [

@@ -1,1 +1,1 @@
-"""Folders of scans as recordings: clouds, depth images, intrinsics and pose files, in the layouts people have."""
+"""Folders of scans as recordings: which files are scans, which pose belongs to each, and motion within scans."""

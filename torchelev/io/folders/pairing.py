@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.layout import require_plausible_steps
-from torchelev.io.folders.poses import Poses
+from torchelev.io.files.layout import require_plausible_steps
 from torchelev.io.folders.scan_files import parse_stamp
+from torchelev.io.poses import Poses
 
 _TIME_TOLERANCE = 0.02  # [s] between a scan's timestamp and its pose's, as in TUM's own tools
 _FEW = 2  # poses more than scans that are numbered on from 0: which of them are too many is open

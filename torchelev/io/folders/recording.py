@@ -9,18 +9,18 @@ from typing import NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.io.clouds import read_cloud_file
+from torchelev.io.depth import read_depth, read_depth_points
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.arrays import CloudFile
-from torchelev.io.folders.clouds import read_cloud_file
-from torchelev.io.folders.depth import read_depth, read_depth_points
-from torchelev.io.folders.intrinsics import read_intrinsics
+from torchelev.io.files.arrays import CloudFile
+from torchelev.io.files.intrinsics import read_intrinsics
+from torchelev.io.files.layout import FileLayout
 from torchelev.io.folders.kitti import convert, to_lidar
-from torchelev.io.folders.layout import FileLayout
 from torchelev.io.folders.pairing import Pairing, compute_steps, pair
-from torchelev.io.folders.poses import read_poses
 from torchelev.io.folders.scan_files import find_scans
 from torchelev.io.folders.within_scan import SensorPath, hold_still
 from torchelev.io.notes import Reasons
+from torchelev.io.poses import read_poses
 
 _POSE_FILES = ("poses.txt", "groundtruth.txt")
 

@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from torchelev.io.clouds import CLOUD_SUFFIXES
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.clouds import CLOUD_SUFFIXES
 from torchelev.output_files import is_own_output
 
 # Files of these types may lie beside point clouds; any other file there is an error, not silently skipped.

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.frames import deskew
-from torchelev.io.folders.arrays import CloudFile
+from torchelev.io.files.arrays import CloudFile
 from torchelev.io.notes import Note
 from torchelev.io.point_times import describe_times, longest_scan, to_seconds
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchelev.frames import transform
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.arrays import CloudFile, from_fields
+from torchelev.io.files.arrays import CloudFile, from_fields
 
 _PER_FIELD = ("FIELDS", "SIZE", "TYPE", "COUNT")
 _MAX_HEADER = 64  # lines

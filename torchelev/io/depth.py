@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.arrays import is_cloud, load_npy, load_npz
-from torchelev.io.folders.intrinsics import Intrinsics, check_size
+from torchelev.io.files.arrays import is_cloud, load_npy, load_npz
+from torchelev.io.files.intrinsics import Intrinsics, check_size, read_intrinsics
+
+__all__ = ["Intrinsics", "read_depth", "read_depth_points", "read_intrinsics"]
 
 _NAMES = ("depth", "distance_to_image_plane", "distance_to_camera")
 _ALONG_RAY = "distance_to_camera"  # in file names of Isaac Sim's Replicator: along each pixel's ray

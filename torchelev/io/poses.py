@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchelev.frames import transform_xyzw
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.layout import XYZW_COLUMNS, FileLayout, detect_quaternion_order, to_seconds
+from torchelev.io.files.layout import XYZW_COLUMNS, FileLayout, detect_quaternion_order, to_seconds
 
 _KITTI_COLUMNS = 12
 _TOLERANCE = 0.02  # rotations rounded to three decimals are off by about 0.001; larger errors have other causes

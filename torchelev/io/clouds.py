@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
-from torchelev.io.folders.arrays import CloudFile, from_fields, read_npy, read_npz
-from torchelev.io.folders.layout import FileLayout, read_bin
-from torchelev.io.folders.pcd import read_pcd
+from torchelev.io.files.arrays import CloudFile, from_fields, read_npy, read_npz
+from torchelev.io.files.layout import FileLayout, read_bin
+from torchelev.io.files.pcd import read_pcd
 
 
 def read_cloud(path: str | Path, layout: FileLayout | None = None) -> NDArray[np.float32]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from torchelev.io import Intrinsics, RecordingError, read_depth, read_intrinsics
-from torchelev.io.folders.depth import read_depth_points
+from torchelev.io.depth import read_depth_points
 from torchelev.io.folders.scan_files import find_scans
 
 
