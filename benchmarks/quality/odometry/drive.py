@@ -115,7 +115,9 @@ class Drive:
     def bases(self) -> Tensor:
         """Poses (K, 4, 4) of the base at `times`: it stands on its wheels, and sways by 1 degree."""
         x, y, heading = self._path.T
-        ahead, left = (torch.stack([f(heading + turn) for f in (torch.cos, torch.sin)], -1) for turn in (0, math.pi / 2))
+        ahead, left = (
+            torch.stack([f(heading + turn) for f in (torch.cos, torch.sin)], -1) for turn in (0, math.pi / 2)
+        )
         xy = torch.stack([x, y], -1)
         front, back, one, other = (self.height(xy + _REACH * d) for d in (ahead, -ahead, left, -left))
         sway = math.radians(1.0) * torch.sin(2 * math.pi * 1.3 * self.times)

@@ -30,6 +30,8 @@ class BagRequest(NamedTuple):
     stamps: Literal["header", "recorded"] = "header"  #: times of messages: their stamps, or when they were recorded
     start: float | None = None  #: [s] after the bag's start, by the time of recording; None: its start
     end: float | None = None  #: [s] as `start`; None: its end
+    odometry: Literal["kiss-icp"] | None = None  #: finds poses from the first topic's clouds; None: they are known
+    imu: str | None = None  #: topic of Imu by which the map's z axis points up, with `odometry`; None: by the ground
 
 
 def choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> list[str]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torchelev.io.odometry.observability import cube_keys, measure_support
 
 _WINDOW = 15  # scans that decide
-_MIN_SUPPORT = 0.0025  # see measure_support; with less, simulated drives were off by more than a tenth of their way
+_MIN_SUPPORT = 0.003  # see measure_support; with less, simulated drives were off by more than a tenth of their way
 _WARM_UP = 3  # scans before the speed is known
 _MAX_ACCELERATION = 50.0  # [m/s^2] of a robot with a lidar
 _MAX_TURN = 0.6  # [rad] that a scan may be off from where the turn before leads
@@ -73,14 +73,14 @@ class Health:
         if support < _MIN_SUPPORT:
             raise OdometryError(
                 f"the clouds do not show how far the sensor moves, {time:.1f} s after the first: their surfaces "
-                f"constrain one direction by {support:.4f}, and {_MIN_SUPPORT} are needed; a corridor, a tunnel or flat "
-                f"open ground looks the same everywhere; {_INSTEAD}"
+                f"constrain one direction by {support:.4f}, and {_MIN_SUPPORT} are needed; a corridor, a tunnel or "
+                f"flat open ground looks the same everywhere; {_INSTEAD}"
             )
 
     def _check_jump(self, time: float, dt: float, step: NDArray[np.float64]) -> None:
         jump = float(np.linalg.norm(step[:3, 3]))
         turn = float(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
-        if jump > 0.5 * self._voxel + _MAX_ACCELERATION * dt**2 or turn > _MAX_TURN:
+        if jump > self._voxel + _MAX_ACCELERATION * dt**2 or turn > _MAX_TURN:
             raise OdometryError(
                 f"the odometry lost the clouds {time:.1f} s after the first: from one scan to the next its pose jumps "
                 f"by {jump:.2f} m and {np.degrees(turn):.0f} degrees against the motion before; fast turns in narrow "
