@@ -87,15 +87,15 @@ def up_from_imu(
             f"the IMU's mean acceleration is {size:.2f}, neither {GRAVITY:.2f} m/s^2 nor 1 g: gravity is taken out of "
             "it, or it has another unit; leave --imu out"
         )
-    up = mean / unit * GRAVITY - _velocity_change(track, start, end) / max(end - start, 1e-3)
+    up = mean / unit * GRAVITY - _mean_acceleration(track, start, end)
     return up / np.linalg.norm(up)
 
 
-def _velocity_change(track: Track, start: float, end: float) -> NDArray[np.float64]:
-    """Return the change of velocity (3,) [m/s] between two times [s]."""
-    half = min(0.5, (end - start) / 4)
-    places = track.at(np.array([start, start + half, end - half, end]))[:, :3, 3]
-    return (places[3] - places[2]) / half - (places[1] - places[0]) / half
+def _mean_acceleration(track: Track, start: float, end: float) -> NDArray[np.float64]:
+    """Return the change of velocity over time (3,) [m/s^2], between the first and the last half second."""
+    part = min(0.5, (end - start) / 4)
+    places = track.at(np.array([start, start + part, end - part, end]))[:, :3, 3]
+    return (places[3] - places[2] - places[1] + places[0]) / part / max(end - start - part, 1e-3)
 
 
 def align(up: NDArray[np.float64], ahead: NDArray[np.float64]) -> NDArray[np.float64]:

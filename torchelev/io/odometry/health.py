@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.io.odometry.observability import cube_keys, measure_support
+from torchelev.io.odometry.observability import Surfaces, cube_keys, find_surfaces, measure_shift, measure_support
 
 _WINDOW = 15  # scans that decide
 _MIN_SUPPORT = 0.003  # see measure_support; with less, simulated drives were off by more than a tenth of their way
@@ -16,6 +16,7 @@ _MAX_ACCELERATION = 50.0  # [m/s^2] of a robot with a lidar
 _MAX_TURN = 0.6  # [rad] that a scan may be off from where the turn before leads
 _KEPT = 5  # scans that the next one is compared with
 _MIN_OVERLAP = 0.4  # of a scan's cubes with those before, over the median
+_AVERAGED, _MAX_SHIFT = 10, 0.12  # scans, and [m] of their mean shift against those before; sound drives had 0.06
 _INSTEAD = "record wheel or inertial odometry with the bag, and map with its poses"
 
 
@@ -35,6 +36,8 @@ class Health:
         self._count = 0
         self._supports: deque[float] = deque(maxlen=_WINDOW)
         self._overlaps: deque[float] = deque(maxlen=4 * _WINDOW)
+        self._surfaces: deque[Surfaces] = deque(maxlen=_KEPT)
+        self._shifts: deque[NDArray[np.float64]] = deque(maxlen=_AVERAGED)
         self._seen: deque[NDArray[np.int64]] = deque(maxlen=_KEPT)
 
     def check(
@@ -56,7 +59,9 @@ class Health:
         self._check_support(time, points)
         if self._count > _WARM_UP:
             self._check_jump(time, dt, np.linalg.inv(expected) @ pose)
-        self._check_overlap(time, points @ pose[:3, :3].T + pose[:3, 3])
+        placed = points @ pose[:3, :3].T + pose[:3, 3]
+        self._check_shift(time, find_surfaces(placed, 2 * self._voxel), pose[:3, :3])
+        self._check_overlap(time, placed)
 
     def finish(self) -> None:
         """Judge a recording that is shorter than the window."""
@@ -85,6 +90,20 @@ class Health:
                 f"the odometry lost the clouds {time:.1f} s after the first: from one scan to the next its pose jumps "
                 f"by {jump:.2f} m and {np.degrees(turn):.0f} degrees against the motion before; fast turns in narrow "
                 f"rooms do this; {_INSTEAD}"
+            )
+
+    def _check_shift(self, time: float, surfaces: Surfaces, R: NDArray[np.float64]) -> None:
+        """Refuse surfaces that move with the sensor: where most points lie on a floor, their rings hold ICP fast."""
+        if len(self._surfaces) == _KEPT:
+            shift = measure_shift(self._surfaces[0], surfaces)
+            if shift is not None:
+                self._shifts.append(R.T @ shift)
+        self._surfaces.append(surfaces)
+        off = float(np.linalg.norm(np.mean(self._shifts, 0))) if len(self._shifts) == _AVERAGED else 0.0
+        if off > _MAX_SHIFT:
+            raise OdometryError(
+                f"the odometry lost the clouds {time:.1f} s after the first: over {_KEPT} scans walls move by "
+                f"{off:.2f} m with the sensor, as it follows the pattern of the points on the floor; {_INSTEAD}"
             )
 
     def _check_overlap(self, time: float, points: NDArray) -> None:
