@@ -107,7 +107,7 @@ class LidarOdometry:
             why = "".join(f"; {number} were left out: {reason}" for reason, number in self._skipped.items())
             raise OdometryError(f"odometry needs at least two scans, and {len(self._poses)} can be used{why}")
         self._health.finish()
-        poses = np.linalg.inv(self._poses[0]) @ np.array(self._poses)
+        poses: NDArray[np.float64] = np.linalg.inv(self._poses[0]) @ np.array(self._poses)
         return Track(np.array(self._times), np.array(self._stamps), poses, np.concatenate(self._nearby), self._skipped)
 
     def _start(self, points: NDArray[np.float64]) -> None:
@@ -139,8 +139,8 @@ class LidarOdometry:
             return points
         poses, stamps = self._recent()
         at = torch.tensor([middle - self._times[-1]], dtype=torch.float64)
-        given = (torch.from_numpy(np.ascontiguousarray(value))[None] for value in (points, times - self._times[-1]))
-        moved = deskew(*given, poses, stamps, at, 2 * _MAX_GAP)[0].numpy()
+        seen, measured = torch.from_numpy(points)[None], torch.from_numpy(times - self._times[-1])[None]
+        moved = deskew(seen, measured, poses, stamps, at, 2 * _MAX_GAP)[0].numpy()
         return moved[np.isfinite(moved).all(1)]
 
 
