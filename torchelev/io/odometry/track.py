@@ -107,7 +107,7 @@ class LidarOdometry:
             why = "".join(f"; {number} were left out: {reason}" for reason, number in self._skipped.items())
             raise OdometryError(f"odometry needs at least two scans, and {len(self._poses)} can be used{why}")
         self._health.finish()
-        poses: NDArray[np.float64] = np.linalg.inv(self._poses[0]) @ np.array(self._poses)
+        poses = (np.linalg.inv(self._poses[0]) @ np.array(self._poses)).astype(np.float64)
         return Track(np.array(self._times), np.array(self._stamps), poses, np.concatenate(self._nearby), self._skipped)
 
     def _start(self, points: NDArray[np.float64]) -> None:
