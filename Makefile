@@ -8,10 +8,10 @@ PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
 	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
-EXTRAS := io,bags,video,view,geo,site,rl,dev,docs
+EXTRAS := io,bags,odometry,video,view,geo,site,rl,dev,docs
 MJLAB := .venv-mjlab
 
-.PHONY: help demo test test-fast test-library test-mjlab matrix lint types setup bench quality docs clean
+.PHONY: help demo test test-fast test-library test-mjlab matrix lint types setup bench quality quality-odometry docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -83,6 +83,10 @@ quality: setup  ## measure accuracy and features, five minutes
 	$(BIN)/python -m benchmarks.quality.accuracy
 	$(BIN)/python -m benchmarks.quality.features
 	$(BIN)/python -m benchmarks.quality.silence
+	$(BIN)/python -m docs.readme_tables
+
+quality-odometry: setup  ## measure maps whose poses come from the clouds, five minutes
+	$(BIN)/python -m benchmarks.quality.odometry
 	$(BIN)/python -m docs.readme_tables
 
 docs: setup  ## build the documentation in docs/_build/html, warnings as errors; needs no network once it is set up

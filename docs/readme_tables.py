@@ -20,6 +20,7 @@ import training
 from benchmarks.gpu import report as gpu
 from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
+from benchmarks.quality.odometry import report as odometry
 from benchmarks.quality.real import completed, merged
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
@@ -144,6 +145,7 @@ TABLES = {
     "speed": _speed,
     "loop": _made_by(loop.table, "loop", "rows"),
     "long_run": _long_run,
+    "odometry": _made_by(odometry.table, "odometry"),
     "bags": _made_by(bags.table, "bags", "rows"),
     "live_view": _made_by(live_view.table, "live_view"),
     "site_merge": _made_by(site_merge.table, "site_merge", "rows"),

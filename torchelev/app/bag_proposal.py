@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from torchelev.io import RecordingError
 from torchelev.io.bags import Bag, BagRecording, BagRequest, Topic, open_bag
 from torchelev.io.bags.poses.clocks import ClockError
-from torchelev.io.bags.poses.reading import ODOMETRY, TRANSFORMS
+from torchelev.io.bags.poses.reading import ODOMETRY, POSE, TRANSFORMS
 from torchelev.io.bags.scans import CLOUDS, IMAGES
 
 
@@ -23,7 +23,20 @@ def propose(bag: Bag) -> list[str]:
             continue
         warnings = [f"warning: {note}" for note in recording.pose_notes]
         return ["to map it", f"  {_command(bag, recording, request)}", *warnings]
-    return ["it cannot be mapped without more options:", f"  {first}"]
+    found = ["it cannot be mapped without more options:", f"  {first}"]
+    return [*found, *_propose_odometry(bag)]
+
+
+def _propose_odometry(bag: Bag) -> list[str]:
+    """Return the command that finds poses from the clouds of a bag that has none."""
+    topic = next(iter(_choose_sensor(bag.topics).clouds), None)
+    kinds = {one.name: one.type for one in bag.topics}
+    if topic is None or kinds[topic] != CLOUDS[0] or any(kind in (ODOMETRY, POSE) for kind in kinds.values()):
+        return []
+    words = ["torchelev", "map", str(bag.path), "--points", topic, "--odometry", "kiss-icp"]
+    imu = next((one.name for one in bag.topics if one.type == "sensor_msgs/msg/Imu" and one.num), None)
+    words += ["--imu", imu] if imu else []
+    return ["its poses can be found from the clouds of a 3-D lidar, see torchelev[odometry]:", f"  {shlex.join(words)}"]
 
 
 def _requests(bag: Bag) -> Iterator[BagRequest]:

@@ -12,7 +12,10 @@ from torchelev.io.errors import RecordingError
 
 BAD_INPUT, EMPTY_MAP = 2, 3  # exit codes
 # The extra of torchelev that installs a package.
-_EXTRAS = {"rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site"}
+_EXTRAS = {
+    "rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site",
+    "kiss_icp": "odometry",
+}  # fmt: skip
 
 
 class UserError(click.ClickException):

@@ -198,6 +198,23 @@ _OPTIONS: list[Callable[[Any], Any]] = [
     ),
     click.option("--end", type=float, metavar="S", help="Bag: leave out what was recorded after [s from its start]."),
     click.option(
+        "--odometry",
+        type=click.Choice(["kiss-icp"]),
+        help="Bag without poses: find them from the clouds of the (first) --points; needs torchelev[odometry].",
+    ),
+    click.option(
+        "--imu",
+        metavar="TOPIC",
+        help="With --odometry: Imu by whose gravity the map's z axis points up.  [default: the normal of the ground "
+        "around the start]",
+    ),
+    click.option(
+        "--save-poses",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="With --odometry: write the lidar's pose at each scan's stamp to this TUM file.",
+    ),
+    click.option(
         "--grid-map",
         type=click.Path(path_type=Path),
         metavar="BAG",

@@ -41,6 +41,9 @@ class MapRequest:
     stamps: Literal["header", "recorded"] = "header"  #: times of a bag's messages
     start: float | None = None  #: [s] after a bag's start; None: its start
     end: float | None = None  #: [s] after a bag's start; None: its end
+    odometry: Literal["kiss-icp"] | None = None  #: finds a bag's poses from its clouds; None: it holds them
+    imu: str | None = None  #: topic by which z points up, with `odometry`; None: by the ground
+    save_poses: Path | None = None  #: TUM file for the poses of `odometry`
     grid_map: Path | None = None  #: bag to write the growing map to
     video: Path | None = None  #: of the growing map
     every: float | None = None  #: [s] between two maps or frames in them; None: see MapVideo, and 1 s of maps

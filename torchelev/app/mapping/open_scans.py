@@ -16,12 +16,13 @@ from torchelev.app.mapping.map_request import MapRequest
 from torchelev.io import FileLayout, Recording, base_poses, is_bag, open_recording, read_transform
 
 if TYPE_CHECKING:
-    from torchelev.io.bags import BagRequest
+    from torchelev.io.bags import BagRecording, BagRequest
 
 _PLAIN = MapRequest(recording=Path())
 _ONLY_BAGS = (
     "points", "depth", "camera_info", "depth_scale", "depth_axes",
     "map_frame", "base_frame", "tf", "rays_from", "clock_offset", "stamps", "start", "end",
+    "odometry", "imu", "save_poses",
 )  # fmt: skip
 _ONLY_FOLDERS = (
     "intrinsics", "dt", "sensor_height", "bin_layout", "quaternions", "time_unit", "pcd_frame", "poses_of",
@@ -89,12 +90,15 @@ def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
     from torchelev.io.bags.topics import describe_unread
 
     _refuse_file_options(request)
+    _require_odometry(request)
     with Bag(request.recording) as bag:
         scans = open_bag(bag, _to_bag_request(request), lambda m: show_progress(m, "reading poses", "message"))
         if bag.unread:
             click.echo(f"not read  {describe_unread(bag)}")
         rays = f", rays from {scans.rays_from}" if scans.rays_from else ""
         click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}{rays}")
+        if request.save_poses is not None:
+            _save_poses(request.save_poses, scans)
         told = list(scans.pose_notes)
         _warn(told)
         options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base)
@@ -102,6 +106,23 @@ def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
             yield scans, options
         finally:
             _warn([note for note in scans.warnings if note not in told])
+
+
+def _require_odometry(request: MapRequest) -> None:
+    """Refuse options that only --odometry reads."""
+    for name in ("imu", "save_poses"):
+        if getattr(request, name) is not None and request.odometry is None:
+            raise ValueError(f"--{name.replace('_', '-')}: only with --odometry; give --odometry kiss-icp")
+
+
+def _save_poses(path: Path, scans: BagRecording) -> None:
+    from torchelev.io.bags.poses.rows import from_matrix
+    from torchelev.io.odometry import write_tum
+
+    stamps, poses, sensor = scans.odometry_poses()
+    about = f"pose of {sensor} in {scans.map_frame}, z up, at the stamps of the scans [s]; by KISS-ICP"
+    write_tum(path, stamps, map(from_matrix, poses), about)
+    click.echo(f"poses     {path}: {len(stamps)} of {sensor} in {scans.map_frame}")
 
 
 def _warn(notes: list[str]) -> None:
@@ -128,6 +149,8 @@ def _to_bag_request(request: MapRequest) -> BagRequest:
         stamps=request.stamps,
         start=request.start,
         end=request.end,
+        odometry=request.odometry,
+        imu=request.imu,
     )
 
 

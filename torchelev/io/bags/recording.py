@@ -85,6 +85,12 @@ class BagRecording:
         places = self.tree.look_up(self.map_frame, self.base_frame, stamps)[:, :3, 3]
         return (np.nanmin(places, 0) + np.nanmax(places, 0)) / 2
 
+    def odometry_poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
+        """Return stamps (K,) [s], poses (K, 4, 4) and the frame of the lidar that `BagRequest.odometry` followed."""
+        stamps, sensor = self._placed.odometry_stamps, self._placed.sensor
+        stamps = np.zeros(0) if stamps is None else stamps
+        return stamps, self.tree.look_up(self.map_frame, sensor, stamps), sensor
+
     def __iter__(self) -> Iterator[Frame | None]:
         """Yield a frame for each message of a sensor: None where it has to be left out, see `skipped`."""
         self.skipped.clear()

@@ -32,6 +32,8 @@ class BagRequest(NamedTuple):
     camera_infos: Sequence[str] = ()  #: topics of CameraInfo: one for all of `depths`, or one for each
     depth_scale: float | None = None  #: metres per unit of depth; None: the bag's, or that of the images' encoding
     depth_axes: str = "optical"  #: axes of the frame of depth images, see `depth_to_points`
+    odometry: Literal["kiss-icp"] | None = None  #: finds poses from the first topic's clouds; None: they are known
+    imu: str | None = None  #: topic of Imu by which the map's z axis points up, with `odometry`; None: by the ground
 
 
 def choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> list[str]:

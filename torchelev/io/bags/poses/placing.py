@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag
 from torchelev.io.bags.covariance import PoseCovariances
 from torchelev.io.bags.poses.clocks import ClockError, FirstScans, PoseClock
 from torchelev.io.bags.poses.doubts import describe_jumps
 from torchelev.io.bags.poses.frames import Frames, choose_frames, find_robot
+from torchelev.io.bags.poses.lidar_odometry import add_lidar_odometry
 from torchelev.io.bags.poses.missing import require_frames, require_way
 from torchelev.io.bags.poses.names import is_world
 from torchelev.io.bags.poses.reading import read_poses
@@ -39,6 +41,7 @@ class Placed(NamedTuple):
     clock: PoseClock  #: of the poses
     offsets: dict[str, float]  #: [s] by which the clocks of topics are to be set
     notes: list[str]  #: what is doubtful
+    odometry_stamps: NDArray[np.float64] | None = None  #: (K,) [s] of the scans whose poses were found from clouds
 
 
 def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: float, show: Any = iter) -> Placed:
@@ -58,6 +61,10 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
     request = _clean_frames(request)
     tree, covariances = read_poses(bag, request, list(topics), _period(bag, topics), show)
     span, notes = choose_span(bag, request, tree)
+    odometry_stamps = None
+    if request.odometry:
+        odometry_stamps, doubts = add_lidar_odometry(bag, request, topics, span, tree, show)
+        notes += doubts
     scans = read_first(bag, request, topics, span)
     sensors = list(dict.fromkeys(one.frame for one in scans))
     request = _mount(bag, request, tree, sensors)
@@ -77,7 +84,8 @@ def place_poses(bag: Bag, request: BagRequest, topics: Sequence[str], max_gap: f
         *_doubt(bag, tree, frames, sensors, max_gap),
         *covariances.notes,
     ]
-    return Placed(tree, covariances, frames.map, frames.base, sensors[0], fixed, rays_from, span, clock, offsets, notes)
+    names = frames.map, frames.base, sensors[0], fixed, rays_from
+    return Placed(tree, covariances, *names, span, clock, offsets, notes, odometry_stamps)
 
 
 def _clean_frames(request: BagRequest) -> BagRequest:

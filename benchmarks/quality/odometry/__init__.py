@@ -1,0 +1,1 @@
+"""Maps with poses by lidar odometry, beside those with true poses, on a simulated drive over rough ground."""
