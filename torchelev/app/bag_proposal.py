@@ -9,7 +9,7 @@ from torchelev.io import RecordingError
 from torchelev.io.bags import Bag, BagRecording, BagRequest, Topic, open_bag
 from torchelev.io.bags.poses.clocks import ClockError
 from torchelev.io.bags.poses.reading import ODOMETRY, POSE, TRANSFORMS
-from torchelev.io.bags.scans import CLOUDS, IMAGES
+from torchelev.io.bags.scans import CLOUDS, IMAGES, LIDARS
 
 
 def propose(bag: Bag) -> list[str]:
@@ -31,7 +31,7 @@ def _propose_odometry(bag: Bag) -> list[str]:
     """Return the command that finds poses from the clouds of a bag that has none."""
     topic = next(iter(_choose_sensor(bag.topics).clouds), None)
     kinds = {one.name: one.type for one in bag.topics}
-    if topic is None or kinds[topic] != CLOUDS[0] or any(kind in (ODOMETRY, POSE) for kind in kinds.values()):
+    if topic is None or kinds[topic] not in LIDARS or any(kind in (ODOMETRY, POSE) for kind in kinds.values()):
         return []
     words = ["torchelev", "map", str(bag.path), "--points", topic, "--odometry", "kiss-icp"]
     imu = next((one.name for one in bag.topics if one.type == "sensor_msgs/msg/Imu" and one.num), None)

@@ -13,7 +13,8 @@ from torchelev.io.bags.messages.laser_scan import read_laser_scan
 from torchelev.io.bags.messages.livox import LIVOX, read_livox
 from torchelev.io.bags.point_cloud import read_points
 
-CLOUDS = ("sensor_msgs/msg/PointCloud2", *LIVOX, "sensor_msgs/msg/LaserScan")
+LIDARS = ("sensor_msgs/msg/PointCloud2", *LIVOX)  # in three dimensions
+CLOUDS = (*LIDARS, "sensor_msgs/msg/LaserScan")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 

@@ -21,7 +21,7 @@ _CLEAR = 0.3  # [m] of travel that is no sway of a body
 _BRANCH = 1.0  # [m] that a base travels in a frame below it, such as odometry upside down; legs and wheels are nearer
 _HINT = (
     "give --poses TOPIC, or --map-frame and --base-frame, as of a still robot; --rays-from FRAME if the clouds are in "
-    "the map's frame"
+    "the map's frame; --odometry kiss-icp to find poses from the clouds of a lidar"
 )
 
 

@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag, Message
 from torchelev.io.bags.order import order_by_stamp
+from torchelev.io.bags.periods import find_period
 from torchelev.io.bags.point_cloud import CloudError
 from torchelev.io.bags.poses.names import is_base, is_world
 from torchelev.io.bags.poses.reading import time_of
 from torchelev.io.bags.poses.rows import from_matrix, invert
 from torchelev.io.bags.poses.transforms import FrameError, TransformTree
-from torchelev.io.bags.scans import CLOUDS, clean, read_scan
+from torchelev.io.bags.scans import LIDARS, clean, read_scan
 from torchelev.io.bags.topics import BagRequest, name_topics
 from torchelev.io.errors import RecordingError
 from torchelev.io.odometry import OdometryError, Sweep, Track, align, estimate_track, up_from_ground, up_from_imu
 
-_IMU, _CLOUD = "sensor_msgs/msg/Imu", CLOUDS[0]
+_IMU = "sensor_msgs/msg/Imu"
 _MAP = "odom"  # name of the map's frame if none is asked for
 _NO_GROUND = "no ground was found around the first scans: the map's z axis is that of {}; give --imu TOPIC"
 
@@ -72,6 +73,7 @@ class _Reader:
         self.frame = ""
         self.delay = 0.0  # [s] of the first message's recording after its stamp
         self._num = next(one.num for one in bag.topics if one.name == topic)
+        self._period = find_period(bag, topic)
 
     def __len__(self) -> int:
         return self._num
@@ -86,7 +88,7 @@ class _Reader:
         messages = (one for one in self._bag.read([self._topic]) if self._span[0] <= one.time <= self._span[1])
         for message in order_by_stamp(messages, [self._topic], stamp):
             try:
-                scan = read_scan(message.data)
+                scan = read_scan(message.data, period=self._period)
             except CloudError:  # counted when the scans are mapped
                 continue
             if not self.frame:
@@ -96,10 +98,10 @@ class _Reader:
 
 def _require_clouds(bag: Bag, request: BagRequest, topic: str) -> None:
     kind = next(one.type for one in bag.topics if one.name == topic)
-    if kind != _CLOUD:
-        have = name_topics([one for one in bag.topics if one.type == _CLOUD])
+    if kind not in LIDARS:
+        have = name_topics([one for one in bag.topics if one.type in LIDARS])
         reason = f"--odometry {request.odometry}: {topic} is {kind}, and odometry needs a 3-D lidar"
-        raise RecordingError(bag.path, reason, f"topics of PointCloud2 are {have}; give the lidar's first, --points")
+        raise RecordingError(bag.path, reason, f"topics of clouds are {have}; give the lidar's first, --points")
     if request.poses or request.rays_from:
         option = "--poses" if request.poses else "--rays-from"
         raise RecordingError(bag.path, f"--odometry and {option} contradict each other", "give one of them")

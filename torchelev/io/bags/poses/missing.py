@@ -8,6 +8,7 @@ from torchelev.io.bags.bag import Bag
 from torchelev.io.bags.poses.frames import find_robot
 from torchelev.io.bags.poses.reading import ODOMETRY, POSE, TRANSFORMS, choose_transforms
 from torchelev.io.bags.poses.transforms import FrameError, TransformTree
+from torchelev.io.bags.scans import LIDARS
 from torchelev.io.bags.topics import BagRequest
 from torchelev.io.errors import RecordingError
 
@@ -44,7 +45,9 @@ def _hint(bag: Bag, request: BagRequest, tree: TransformTree, sensor: str) -> st
         return f"give --poses {odometry[0]}, and --extrinsics with the pose of {sensor} on the base"
     if poses and not request.poses:
         return f"give --poses {poses[0]} --base-frame {sensor} if these are the poses of {sensor}"
-    return f"give --poses TOPIC if the bag holds Odometry{_other_transforms(bag, request)}"
+    has_lidar = any(topic.type in LIDARS and topic.num for topic in bag.topics)
+    clouds = ", or --odometry kiss-icp to find poses from the clouds" if has_lidar else ""
+    return f"give --poses TOPIC if the bag holds Odometry{clouds}{_other_transforms(bag, request)}"
 
 
 def _other_transforms(bag: Bag, request: BagRequest) -> str:
