@@ -155,11 +155,7 @@ def bag_of(path, *transforms, topics=("/lidar/points",)):
 
 
 MISSING = {
-    "no transforms": (
-        (),
-        {},
-        "the transforms have no frame lidar; frames are none; give --poses TOPIC if the bag holds Odometry, or --odometry kiss-icp",
-    ),
+    "no transforms": ((), {}, "frames are none; give --poses TOPIC if the bag holds Odometry, or --odometry kiss-icp"),
     "no such frame": ([("odom", "lidar")], dict(map_frame="map"), "have no frame map; frames are lidar, odom"),
     "broken tree": (
         [("odom", "base_link"), ("mast", "lidar")],
