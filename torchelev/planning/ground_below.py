@@ -27,13 +27,13 @@ ROUNDING = 1e-3  # [cells] tolerance on a polygon's extent
 class GroundBelow(NamedTuple):
     """The cells below footprints."""
 
-    cells: PolygonCells
-    values: Float[Tensor, "B P S S"]  # 0 where not known
-    known: Bool[Tensor, "B P S S"]  # in the polygon and known
-    assumed: Bool[Tensor, "B P S S"]  # in the polygon, unknown, and under the robot where it stands now
-    steps: Float[Tensor, "B P S S"]  # [m] of the cells in the polygon, 0 elsewhere
-    height: Float[Tensor, "B P S S"]  # [m] elevation, 0 where not measured
-    measured: Bool[Tensor, "B P S S"]  # in the polygon, and the elevation is known
+    cells: PolygonCells  #: of each polygon
+    values: Float[Tensor, "B P S S"]  #: of the layer, 0 where not known
+    known: Bool[Tensor, "B P S S"]  #: in the polygon and known
+    assumed: Bool[Tensor, "B P S S"]  #: in the polygon, unknown, and under the robot where it stands now
+    steps: Float[Tensor, "B P S S"]  #: [m] of the cells in the polygon, 0 elsewhere
+    height: Float[Tensor, "B P S S"]  #: [m] elevation, 0 where not measured
+    measured: Bool[Tensor, "B P S S"]  #: in the polygon, and the elevation is known
 
 
 def read_ground(

@@ -37,7 +37,6 @@ class BagRecording:
         rays_from: the frame at which the rays start of clouds that are in the map's frame already; "" for other clouds.
         has_base: whether the base is another frame than the sensor's, so that the sensor's place on the robot is known.
         topics: of the scans.
-        pose_notes: what is doubtful about the poses: frames, clocks, gaps, jumps. Known before the scans are read.
         skipped: number of scans that were left out when it was last read, by reason.
         notes: what is not used of the scans' messages.
     """
@@ -59,7 +58,7 @@ class BagRecording:
 
     @property
     def pose_notes(self) -> list[str]:
-        """What is doubtful about the poses."""
+        """What is doubtful about the poses: frames, clocks, gaps, jumps. Known before the scans are read."""
         return self._placed.notes
 
     @property

@@ -22,14 +22,14 @@ class BagRequest(NamedTuple):
     map_frame: str | None = None  #: in which the map is built
     base_frame: str | None = None  #: which the window follows
     poses: str | None = None  #: topic of Odometry or PoseStamped in place of the transforms
-    transforms: Sequence[str] = ()  #: topics of TFMessage; (): /tf and /tf_static, or those of the scans' namespace
+    transforms: Sequence[str] = ()  #: topics of TFMessage, if not /tf and /tf_static or those of the scans' namespace
     T_base_sensor: NDArray[np.float64] | None = None  #: (4, 4) where the sensor is on the base, in place of transforms
     rays_from: str | None = None  #: frame at which the rays start of clouds that are in the map's frame; None: the base
     clock_offsets: Mapping[str, float] = {}  #: [s] to add to the stamps of a topic's scans; "": of all others
-    stamps: Literal["header", "recorded"] = "header"  #: times of messages: their stamps, or when they were recorded
+    stamps: Literal["header", "recorded"] = "header"  #: which time of a message counts, its stamp or its recording
     start: float | None = None  #: [s] after the bag's start, by the time of recording; None: its start
     end: float | None = None  #: [s] as `start`; None: its end
-    camera_infos: Sequence[str] = ()  #: topics of CameraInfo: one for all of `depths`, or one for each
+    camera_infos: Sequence[str] = ()  #: topics of CameraInfo, one for all of `depths` or one for each
     depth_scale: float | None = None  #: metres per unit of depth; None: the bag's, or that of the images' encoding
     depth_axes: str = "optical"  #: axes of the frame of depth images, see `depth_to_points`
     odometry: Literal["kiss-icp"] | None = None  #: finds poses from the first topic's clouds; None: they are known

@@ -37,18 +37,18 @@ class Frame(NamedTuple):
     stamp: float = 0.0  #: [s] of a bag's scan; 0 of a file
 
 
-class _Clock(NamedTuple):
+class ScanClock(NamedTuple):
     """When the scans and their poses were taken."""
 
     path: SensorPath
     stamps: NDArray[np.float64]  #: (T,) [s] from which the times of a scan's points count
     pose_times: NDArray[np.float64]  #: (T,) [s] of the pose that a scan takes
 
-    def part(self, index: slice) -> _Clock:
+    def part(self, index: slice) -> ScanClock:
         """Return the clock of some of the scans."""
         return self._replace(stamps=self.stamps[index], pose_times=self.pose_times[index])
 
-    def apply_mount(self, T_base_sensor: NDArray[np.float64]) -> _Clock:
+    def apply_mount(self, T_base_sensor: NDArray[np.float64]) -> ScanClock:
         """Return the clock with the path of a sensor at T_base_sensor (4, 4) on what moved along this one."""
         path = self.path._replace(T_map_sensor=self.path.T_map_sensor @ T_base_sensor)
         return self._replace(path=path)
@@ -78,7 +78,7 @@ class Recording(Sequence[Frame]):
         read: Callable[[Path], CloudFile | NDArray],
         note: str = "",
         T_map_base: NDArray | None = None,
-        clock: _Clock | None = None,
+        clock: ScanClock | None = None,
     ) -> None:
         self.files, self.T_map_sensor, self.dt, self._read, self.note = files, T_map_sensor, dt, read, note
         self.T_map_base, self._clock, self.notes = T_map_base, clock, Reasons()
@@ -197,7 +197,7 @@ def _find_poses(folder: Path) -> Path:
 
 def _find_clock(
     pairing: Pairing, times: NDArray | None, T_map_sensor: NDArray, steps: NDArray, dt: float | None
-) -> _Clock | None:
+) -> ScanClock | None:
     """Return when scans and poses were taken: by the poses' times, by the scans' names, or by `dt`; None: unknown."""
     stamps, pose_times = pairing.stamps, times
     if times is None:
@@ -209,4 +209,4 @@ def _find_clock(
     forward = steps[steps > 0]
     period = float(np.median(forward)) if len(forward) else None
     taken = stamps if times is None else times[pairing.poses]
-    return _Clock(SensorPath(unique, T_map_sensor[first], period), stamps, taken)
+    return ScanClock(SensorPath(unique, T_map_sensor[first], period), stamps, taken)
