@@ -98,8 +98,8 @@ def test_scans_that_are_left_out_are_counted(run, tmp_path):
 
 
 REFUSED = {
-    "options of files": (("--dt", 0.1), "--dt: only for folders of files"),
-    "poses of": (("--poses-of", "base"), "--poses-of: only for folders of files"),
+    "options of files": (("--dt", 0.1), "--dt: for folders of files only"),
+    "poses of": (("--poses-of", "base"), "--poses-of: for folders of files only"),
     "no such topic": (("--points", "/x"), "--points /x is not in the bag; such topics are /lidar/points"),
     "no such frame": (("--map-frame", "map"), "the transforms have no frame map; frames are base_link, camera, lidar"),
 }
