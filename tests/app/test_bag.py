@@ -114,7 +114,7 @@ def test_wrong_options_are_refused_in_one_line(run, bag, tmp_path, options, word
 
 def test_options_of_bags_are_refused_for_folders(run, recording):
     code, _, err = run("map", recording, "--points", "/x", "--map-frame", "odom")
-    assert code == 2 and "--points, --map-frame: only bags have topics and frames" in err
+    assert code == 2 and "--points, --map-frame: for bags only" in err
 
 
 @pytest.mark.parametrize("command", ["map", "bag"])

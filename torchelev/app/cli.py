@@ -91,7 +91,7 @@ Output files:
 @click.option(
     "--seconds", type=float, default=120.0, show_default=True, metavar="S", help="Simulated time at most [s]."
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the terrain and of all errors.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the terrain and of all errors.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -107,8 +107,10 @@ Output files:
     "Needs torchelev[site].  [default: a temporary folder]",
 )
 @click.option("--live", is_flag=True, help="Show the growing map in the browser; needs torchelev[view].")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Of --live; 0.0.0.0: let other machines connect.")
-@click.option("--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="Of --live.")
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, help="Address of --live; 0.0.0.0 lets other machines connect."
+)
+@click.option("--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="Port of --live.")
 @click.option("--quiet", is_flag=True, help="Hide the progress bar.")
 def fleet_command(quiet: bool, **options: Any) -> None:
     """Run `torchelev fleet`; its help text is `_FLEET_HELP`."""
@@ -132,8 +134,8 @@ options; or a map that was saved, .npz. Without it, a simulated walk is shown.
   torchelev view map.npz           a saved map
 
 The page plays the recording, pauses, steps and goes back. It colours the
-surface by any layer, shows cloud, frames, path and planes, and says the values
-of the cell that is clicked. Ctrl-C closes it.
+surface by any layer, shows cloud, frames, path and planes, and the values of
+the cell that is clicked. Ctrl-C closes it.
 """
 
 

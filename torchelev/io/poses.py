@@ -1,4 +1,4 @@
-"""Read poses: KITTI and TUM files, told apart by their number of columns, and single transforms."""
+"""Read poses: KITTI and TUM files, distinguished by their number of columns, and single transforms."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def _require_kitti(path: Path, size: int) -> None:
 
 
 def _fits_better(head: NDArray, other: _BinLayout) -> bool:
-    """Tell whether another layout explains the values clearly better than KITTI's."""
+    """Return whether another layout explains the values clearly better than KITTI's."""
     values, kitti = _values(head, other), _values(head, _KITTI)
     if _plausible_fraction(values[:, :3]) <= 0.97:
         return False

@@ -172,7 +172,7 @@ class SettingWatch:
 
 
 def _snap(offset: float) -> float:
-    """Return a difference between time scales or zones where it is meant; delays are a part of what was measured."""
+    """Return the difference of time scales or zones near an offset, which includes delays; else the offset."""
     known = np.concatenate([_SCALES, [_ZONE * max(1, round(abs(offset) / _ZONE))]])
     known = known[known <= 14 * 3600]
     nearest = known[np.abs(known - abs(offset)).argmin()] if len(known) else np.inf
