@@ -80,7 +80,7 @@ def _check(request: MapRequest, mount: NDArray | None) -> None:
     height, dt = request.sensor_height, request.dt
     given = [f"--{name.replace('_', '-')}" for name in _ONLY_BAGS if getattr(request, name) != getattr(_PLAIN, name)]
     if given:
-        raise ValueError(f"{', '.join(given)}: for bags only, and {request.recording} is a folder of files")
+        raise ValueError(f"{', '.join(given)}: for bags only, and {request.recording} is not a bag")
     if request.poses_of == "base" and mount is None:
         raise ValueError("--poses-of base: the sensor's pose on the robot is unknown; give --extrinsics")
     if mount is not None and height is not None:

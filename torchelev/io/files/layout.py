@@ -170,7 +170,7 @@ def _largest_angle(directions: NDArray) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
 
 
-def to_seconds(times: NDArray, unit: str | None) -> NDArray:
+def stamps_to_seconds(times: NDArray, unit: str | None) -> NDArray:
     """Return times (T,) in seconds; without a `unit`, they are in s, or since 1970 in the unit that fits their size."""
     if unit is not None:
         return times * _SECONDS[unit]
