@@ -98,8 +98,8 @@ def test_scans_that_are_left_out_are_counted(run, tmp_path):
 
 
 REFUSED = {
-    "options of files": (("--dt", 0.1), "--dt: only for folders of files"),
-    "poses of": (("--poses-of", "base"), "--poses-of: only for folders of files"),
+    "options of files": (("--dt", 0.1), "--dt: for folders of files only"),
+    "poses of": (("--poses-of", "base"), "--poses-of: for folders of files only"),
     "no such topic": (("--points", "/x"), "--points /x is not in the bag; such topics are /lidar/points"),
     "no such frame": (("--map-frame", "map"), "the transforms have no frame map; frames are base_link, camera, lidar"),
 }
@@ -114,7 +114,7 @@ def test_wrong_options_are_refused_in_one_line(run, bag, tmp_path, options, word
 
 def test_options_of_bags_are_refused_for_folders(run, recording):
     code, _, err = run("map", recording, "--points", "/x", "--map-frame", "odom")
-    assert code == 2 and "--points, --map-frame: only bags have topics and frames" in err
+    assert code == 2 and "--points, --map-frame: for bags only" in err
 
 
 @pytest.mark.parametrize("command", ["map", "bag"])

@@ -23,7 +23,7 @@ def test_options_of_depth_images_are_used(run, tmp_path):
 
 def test_options_of_depth_images_are_only_for_bags(run, recording):
     code, _, err = run("map", recording, "--depth-scale", 0.001, "--depth-axes", "forward")
-    assert code == 2 and "--depth-scale, --depth-axes: only bags have topics and frames" in err
+    assert code == 2 and "--depth-scale: is for depth images only" in err
 
 
 @pytest.mark.parametrize("command", ["bag", "map"])

@@ -90,4 +90,4 @@ def test_the_page_takes_the_same_options(run):
 
 def test_options_of_bags_are_refused_for_folders(run, recording):
     code, _, err = run("map", recording, "--tf", "/tf", "--stamps", "recorded", "--start", 1)
-    assert code == 2 and "--tf, --stamps, --start: only bags have topics and frames" in err
+    assert code == 2 and "--tf, --stamps, --start: for bags only" in err

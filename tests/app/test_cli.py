@@ -1,5 +1,6 @@
 """Commands, options and help texts."""
 
+import re
 import subprocess
 import sys
 
@@ -20,6 +21,26 @@ def test_help_tells_a_newcomer_what_to_give(run):
     for word in ("Example", "poses.txt", "KITTI", "TUM", "--intrinsics", "PREFIX.npz", "z axis points up"):
         assert word in " ".join(out.split())
     assert max(map(len, out.splitlines())) <= 80
+
+
+def options_by_group(text):
+    """Return the options below each title of a help text."""
+    groups, title = {}, ""
+    for line in text.splitlines():
+        title = line[:-1] if line[:1].strip() and line.endswith(":") else title
+        groups.setdefault(title, []).extend(re.findall(r"^  (?:-h, )?--([\w-]+)", line))
+    return groups
+
+
+@pytest.mark.parametrize(("command", "others"), [("map", ["out", "grid-map", "video", "every"]), ("view", ["host"])])
+def test_options_are_listed_by_group(run, command, others):
+    groups = options_by_group(run(command, "--help")[1])
+    assert groups["Recording"] == ["poses", "extrinsics", "depth-scale", "depth-axes"]
+    assert groups["Map"] == ["resolution", "size", "fixed", "device", "config"]
+    assert {"intrinsics", "dt"} <= set(groups["Folders of files"])
+    assert {"points", "tf"} <= set(groups["Bags"])
+    assert set(others) <= set(groups["Output" if command == "map" else "Page"])
+    assert groups["Other options"] == ["help"]
 
 
 @pytest.mark.parametrize("command", ["map", "demo", "fleet", "filters"])

@@ -88,7 +88,7 @@ def test_without_a_recording_the_demo_walks(run, port, shown, monkeypatch):
         (("drive", "--port", "0"), "0 is not in the range"),
         (("drive", "--host", "nonsense"), "host: must be an address of this machine, got 'nonsense'"),
         (("whole.npz", "--size", "3"), "--size: only for recordings"),
-        (("drive", "--points", "/cloud"), "only bags have topics"),
+        (("drive", "--points", "/cloud"), "--points: for bags only"),
     ],
 )
 def test_bad_input_is_one_line(run, recording, shown, tmp_path, args, words):

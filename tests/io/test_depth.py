@@ -47,12 +47,13 @@ def test_intrinsics_in_the_forms_people_have(tmp_path, text):
     (tmp_path / "camera.yaml").write_text(text)
     intrinsics = read_intrinsics(tmp_path / "camera.yaml")
     np.testing.assert_array_equal(intrinsics.matrix, [[500, 0, 320], [0, 510, 240], [0, 0, 1]])
-    assert intrinsics[1:] == (0.001, "z")
+    assert (intrinsics.depth_scale, intrinsics.along) == (0.001, "z")
 
 
 def test_intrinsics_with_scale_and_ray_depth(tmp_path):
     (tmp_path / "camera.yaml").write_text("{fx: 5, fy: 5, cx: 2, cy: 2, depth_scale: 0.0002, along: ray}")
-    assert read_intrinsics(tmp_path / "camera.yaml")[1:] == (0.0002, "ray")
+    intrinsics = read_intrinsics(tmp_path / "camera.yaml")
+    assert (intrinsics.depth_scale, intrinsics.along) == (0.0002, "ray")
 
 
 @pytest.mark.parametrize(
@@ -122,7 +123,7 @@ def test_arrays_of_millimetres(tmp_path):
     np.save(tmp_path / "d.npy", np.full((6, 8), 2500, np.uint16))
     assert read_depth(tmp_path / "d.npy")[0, 0] == 2.5
     np.save(tmp_path / "d.npy", np.full((6, 8), 2500.0))
-    with pytest.raises(RecordingError, match="the median depth is 2500"):
+    with pytest.raises(RecordingError, match="the median depth is 2500 m; give the metres per unit with --depth-scale"):
         read_depth(tmp_path / "d.npy")
 
 

@@ -12,8 +12,10 @@ import click
 
 from torchelev import __version__
 from torchelev.app.mapping.map_command import run_map
-from torchelev.app.mapping.map_options import MAP_HELP, map_options
+from torchelev.app.mapping.map_help import MAP_HELP
+from torchelev.app.mapping.map_options import map_options
 from torchelev.app.mapping.map_request import MapRequest
+from torchelev.app.option_groups import GroupedCommand, GroupedOption
 from torchelev.app.user_error import plain_warnings, user_errors
 from torchelev.robot import RobotConfig
 
@@ -25,7 +27,9 @@ def main() -> None:
     click.get_current_context().with_resource(plain_warnings())
 
 
-@main.command("map", help=MAP_HELP, short_help="Build an elevation map from scans with poses, or a bag.")
+@main.command(
+    "map", cls=GroupedCommand, help=MAP_HELP, short_help="Build an elevation map from scans with poses, or a bag."
+)
 @map_options
 def map_command(**options: Any) -> None:
     """Run `torchelev map`; its help text is `MAP_HELP`."""
@@ -87,7 +91,7 @@ Output files:
 @click.option(
     "--seconds", type=float, default=120.0, show_default=True, metavar="S", help="Simulated time at most [s]."
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the terrain and of all errors.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the terrain and of all errors.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -103,8 +107,10 @@ Output files:
     "Needs torchelev[site].  [default: a temporary folder]",
 )
 @click.option("--live", is_flag=True, help="Show the growing map in the browser; needs torchelev[view].")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Of --live; 0.0.0.0: let other machines connect.")
-@click.option("--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="Of --live.")
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, help="Address of --live; 0.0.0.0 lets other machines connect."
+)
+@click.option("--port", type=click.IntRange(1, 65535), default=8080, show_default=True, help="Port of --live.")
 @click.option("--quiet", is_flag=True, help="Hide the progress bar.")
 def fleet_command(quiet: bool, **options: Any) -> None:
     """Run `torchelev fleet`; its help text is `_FLEET_HELP`."""
@@ -128,8 +134,8 @@ options; or a map that was saved, .npz. Without it, a simulated walk is shown.
   torchelev view map.npz           a saved map
 
 The page plays the recording, pauses, steps and goes back. It colours the
-surface by any layer, shows cloud, frames, path and planes, and says the values
-of the cell that is clicked. Ctrl-C closes it.
+surface by any layer, shows cloud, frames, path and planes, and the values of
+the cell that is clicked. Ctrl-C closes it.
 """
 
 
@@ -142,15 +148,29 @@ def _view_command(recording: Path | None, host: str, port: int, paused: bool, **
 
 
 _OUTPUTS = ("recording", "out", "grid_map", "video", "every")  # parameters of `map` that `view` lacks
+_PAGE = "Page"
 _VIEW_OPTIONS: list[click.Parameter] = [
     click.Argument(["recording"], type=click.Path(path_type=Path), required=False),
-    click.Option(["--host"], default="127.0.0.1", show_default=True, help="0.0.0.0: let other machines connect."),
-    click.Option(["--port"], type=click.IntRange(1, 65535), default=8080, show_default=True, help="Of the page."),
-    click.Option(["--paused"], is_flag=True, help="Wait at the first scan."),
+    GroupedOption(
+        ["--host"],
+        group=_PAGE,
+        default="127.0.0.1",
+        show_default=True,
+        help="Address of the page; 0.0.0.0 lets other machines connect.",
+    ),
+    GroupedOption(
+        ["--port"],
+        group=_PAGE,
+        type=click.IntRange(1, 65535),
+        default=8080,
+        show_default=True,
+        help="Port of the page.",
+    ),
+    GroupedOption(["--paused"], group=_PAGE, is_flag=True, help="Wait at the first scan."),
     *(parameter for parameter in map_command.params if parameter.name not in _OUTPUTS),
 ]
 main.add_command(
-    click.Command(
+    GroupedCommand(
         "view", params=_VIEW_OPTIONS, callback=_view_command, help=_VIEW_HELP, short_help="Show a map in the browser."
     )
 )

@@ -1,4 +1,4 @@
-"""Read point clouds; the file's suffix tells the format."""
+"""Read point clouds in the format of the file's suffix."""
 
 from __future__ import annotations
 

@@ -18,12 +18,13 @@ _ALONG_RAY = "distance_to_camera"  # in file names of Isaac Sim's Replicator: al
 _FAR = 200.0  # [m] a median depth beyond which values are no metres
 
 
-def read_depth(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float32]:
+def read_depth(path: str | Path, depth_scale: float = 0.001, float_scale: float = 1.0) -> NDArray[np.float32]:
     """Read a depth image: a 16-bit PNG, or a `.npy` or `.npz` array (H, W).
 
     Args:
         path: the file.
-        depth_scale: [m] per unit of an image of integers: 0.001 for millimetres. Arrays of floats are in metres.
+        depth_scale: [m] per unit of an image of integers: 0.001 for millimetres.
+        float_scale: [m] per unit of an array of floats.
 
     Returns:
         Depth (H, W) [m], 0 where there was no return.
@@ -37,25 +38,25 @@ def read_depth(path: str | Path, depth_scale: float = 0.001) -> NDArray[np.float
     units = _read_png(path) if path.suffix.lower() == ".png" else _read_array(path)
     if units.dtype.kind in "iu":
         return units.astype(np.float32) * np.float32(depth_scale)
-    depth = np.where(np.isfinite(units) & (units > 0), units, 0).astype(np.float32)
+    depth = np.where(np.isfinite(units) & (units > 0), units, 0).astype(np.float32) * np.float32(float_scale)
     median = float(np.median(depth[depth > 0])) if depth.any() else 0.0
     if median > _FAR:
-        problem = f"the median depth is {median:.4g}: floats are depth in metres"
-        raise RecordingError(path, problem, "divide millimetres by 1000, or save them as uint16")
+        problem = f"the median depth is {median:.4g} m"
+        raise RecordingError(path, problem, "give the metres per unit with --depth-scale, 0.001 for millimetres")
     return depth
 
 
 def read_depth_points(path: Path, camera: Intrinsics) -> NDArray[np.float32]:
-    """Read a depth image as points (H * W, 3) [m] in the camera frame: x right, y down, z forward."""
+    """Read a depth image as points (H * W, 3) [m] in the camera frame, whose axes the camera names."""
     import torch
 
     from torchelev.inputs.clouds import depth_to_points
 
-    depth = read_depth(path, camera.depth_scale)
+    depth = read_depth(path, camera.depth_scale, camera.float_scale)
     check_size(path, camera, depth.shape)
     matrix = torch.from_numpy(camera.matrix).float()
     along = "ray" if _ALONG_RAY in path.stem else camera.along
-    return depth_to_points(torch.from_numpy(depth)[None], matrix, along=along)[0].numpy()
+    return depth_to_points(torch.from_numpy(depth)[None], matrix, along=along, frame=camera.axes)[0].numpy()
 
 
 def _read_png(path: Path) -> NDArray:

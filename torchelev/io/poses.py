@@ -1,4 +1,4 @@
-"""Read poses: KITTI and TUM files, told apart by their number of columns, and single transforms."""
+"""Read poses: KITTI and TUM files, distinguished by their number of columns, and single transforms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchelev.frames import transform_xyzw
 from torchelev.io.errors import RecordingError
-from torchelev.io.files.layout import XYZW_COLUMNS, FileLayout, detect_quaternion_order, to_seconds
+from torchelev.io.files.layout import XYZW_COLUMNS, FileLayout, detect_quaternion_order, stamps_to_seconds
 
 _KITTI_COLUMNS = 12
 _TOLERANCE = 0.02  # rotations rounded to three decimals are off by about 0.001; larger errors have other causes
@@ -66,7 +66,7 @@ def read_poses(path: str | Path, layout: FileLayout | None = None) -> Poses:
     norm = np.linalg.norm(quat_xyzw, axis=1, keepdims=True)
     _require_lines(path, lines, np.abs(norm[:, 0] - 1) <= _TOLERANCE, "the quaternion is not of length 1")
     T_map_sensor = transform_xyzw(rows[:, 1:4], quat_xyzw / norm).numpy()
-    return Poses(_make_rigid(path, lines, T_map_sensor), to_seconds(rows[:, 0], layout.time_unit))
+    return Poses(_make_rigid(path, lines, T_map_sensor), stamps_to_seconds(rows[:, 0], layout.time_unit))
 
 
 def read_transform(text_or_path: str | Path) -> NDArray[np.float64]:

@@ -160,7 +160,7 @@ MISSING = {
     "broken tree": (
         [("odom", "base_link"), ("mast", "lidar")],
         dict(map_frame="odom", base_frame="base_link"),
-        "no transform connects odom and lidar: odom hangs below odom, lidar below mast, and nothing says where mast is",
+        "no transform connects odom and lidar: odom is in the tree of odom, lidar in that of mast, and nothing places",
     ),
     "no such topic": (
         [("odom", "lidar")],

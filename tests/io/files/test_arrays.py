@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from torchelev.io import RecordingError, read_cloud
+from torchelev.io.clouds import read_cloud_file
 
 POINTS = np.random.default_rng(0).uniform(-5, 5, (4992, 6)).astype(np.float32)
 
@@ -33,3 +34,15 @@ def test_images_and_columns_first_are_refused(tmp_path, array, cure, suffix):
     np.save(path, array) if suffix == ".npy" else np.savez(path, array)
     with pytest.raises(RecordingError, match=cure):
         read_cloud(path)
+
+
+@pytest.mark.parametrize("kind", ["datetime64[us]", "timedelta64[ns]", "int64"])
+def test_times_of_any_kind_become_numbers(tmp_path, kind):
+    nanoseconds = 1_700_000_000_000_000_000 + 1000 * np.arange(4)
+    times = nanoseconds.astype(f"{kind[:-4]}[ns]").astype(kind) if "64[" in kind else nanoseconds
+    cloud = np.zeros(4, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", times.dtype)])
+    cloud["t"] = times
+    np.save(tmp_path / "a.npy", cloud)
+    np.savez(tmp_path / "a.npz", points=POINTS[:4, :3], timestamps=times)
+    for name in ("a.npy", "a.npz"):
+        np.testing.assert_array_equal(read_cloud_file(tmp_path / name).times, nanoseconds)

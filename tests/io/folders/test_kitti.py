@@ -34,7 +34,7 @@ def test_poses_of_the_camera_become_those_of_the_lidar(tmp_path):
     write(tmp_path, CAMERA_POSES, TR)
     recording = open_recording(tmp_path)
     np.testing.assert_allclose(recording.T_map_sensor, lidar_poses(), atol=1e-6)
-    assert "turned into the lidar's by" in recording.note and "calib.txt" in recording.note
+    assert "converted to the lidar's by" in recording.note and "calib.txt" in recording.note
 
 
 def test_poses_of_the_lidar_stay_beside_a_calibration(tmp_path):
@@ -56,10 +56,32 @@ def test_without_a_calibration_the_poses_are_doubted(tmp_path):
 
 def test_a_calibration_without_the_lidar_is_refused(tmp_path):
     write(tmp_path, CAMERA_POSES, "P0: 1 2 3\n")
-    with pytest.raises(RecordingError, match=r"calib\.txt: holds no place of the lidar"):
+    with pytest.raises(RecordingError, match=r"calib\.txt: does not hold the lidar's pose"):
         open_recording(tmp_path)
 
 
 def test_a_path_too_short_to_decide_is_named(tmp_path):
     write(tmp_path, T_CAMERA_LIDAR @ lidar_poses(0.01) @ np.linalg.inv(T_CAMERA_LIDAR), TR)
     assert "too short" in open_recording(tmp_path).note
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4])
+def test_a_path_of_half_a_metre_shows_its_direction(tmp_path, yaw):
+    straight = np.tile(np.eye(4), (6, 1, 1))
+    straight[:, 0, 3] = 0.1 * np.arange(6)
+    straight[:, :2, :3] = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ straight[:, :2, :3]
+    straight[:, :2, 3] = straight[:, 0:1, 3] * [np.cos(yaw), np.sin(yaw)]
+    write(tmp_path, T_CAMERA_LIDAR @ straight @ np.linalg.inv(T_CAMERA_LIDAR), TR)
+    np.testing.assert_allclose(open_recording(tmp_path).T_map_sensor, straight, atol=1e-6)
+
+
+def test_a_short_straight_path_is_not_taken_silently(tmp_path):
+    straight = np.tile(np.eye(4), (6, 1, 1))
+    straight[:, 0, 3] = 0.04 * np.arange(6)
+    write(tmp_path, T_CAMERA_LIDAR @ straight @ np.linalg.inv(T_CAMERA_LIDAR), TR)
+    assert "too short" in open_recording(tmp_path).note
+
+
+def test_a_sensor_that_stands_at_the_origin_needs_no_calibration(tmp_path):
+    write(tmp_path, np.tile(np.eye(4), (6, 1, 1)), TR)
+    assert open_recording(tmp_path).note == ""

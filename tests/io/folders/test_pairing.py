@@ -41,10 +41,12 @@ def test_times_order_scans(tmp_path):
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_which_of_13_poses_is_too_many_for_12_scans_is_open(tmp_path, first):
+def test_which_of_13_poses_is_too_many_for_12_scans_is_ambiguous(tmp_path, first):
     write_scans(tmp_path, [f"{first + k:06}" for k in range(12)])
     write_kitti(tmp_path / "poses.txt", range(13))
-    with pytest.raises(RecordingError, match=f"13 poses for 12 scans: which line belongs to 00000{first}.npy is open"):
+    with pytest.raises(
+        RecordingError, match=f"13 poses for 12 scans: which line belongs to 00000{first}.npy is ambiguous"
+    ):
         open_recording(tmp_path)
 
 

@@ -133,3 +133,20 @@ def test_depth_images_and_intrinsics_come_together(depth_folder):
     write_scans(depth_folder / "clouds", ["a"])
     with pytest.raises(RecordingError, match=r"a\.npy: holds a point cloud .*, not depth"):
         open_recording(depth_folder / "clouds", intrinsics=depth_folder / "camera.txt")
+
+
+def test_unit_and_axes_of_depth_images_can_be_given(depth_folder):
+    given = {"intrinsics": depth_folder / "camera.txt", "depth_scale": 0.01, "depth_axes": "forward"}
+    np.testing.assert_allclose(open_recording(depth_folder, **given)[0].points[3 * 8 + 6], [20, -10, 0], atol=1e-5)
+    (depth_folder / "0.png").unlink()
+    np.save(depth_folder / "0.npy", np.full((6, 8), 2000.0, np.float32))
+    given["depth_scale"] = 0.001
+    np.testing.assert_allclose(open_recording(depth_folder, **given)[0].points[3 * 8 + 6], [2, -1, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize("option", [{"depth_scale": 0.001}, {"depth_axes": "forward"}])
+def test_unit_and_axes_need_depth_images(tmp_path, option):
+    write_scans(tmp_path, ["a"])
+    write_kitti(tmp_path / "poses.txt", [0])
+    with pytest.raises(ValueError, match="--depth-.*: is for depth images only.*give their camera with --intrinsics"):
+        open_recording(tmp_path, **option)

@@ -92,4 +92,4 @@ def test_options_that_contradict_each_other_are_refused(bag, words, reason):
 def test_a_folder_refuses_odometry(tmp_path):
     (tmp_path / "000000.bin").write_bytes(bytes(16))
     done = CliRunner().invoke(main, ["map", str(tmp_path), "--odometry", "kiss-icp"])
-    assert done.exit_code == 2 and "--odometry: only bags" in done.output
+    assert done.exit_code == 2 and "--odometry: for bags only" in done.output

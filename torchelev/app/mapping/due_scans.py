@@ -8,7 +8,7 @@ _ROUNDING = 1e-6  # [s]
 
 
 class DueScans:
-    """Tells which scans are due: the first, and then one every so often.
+    """Decides which scans are due: the first, and then one every so often.
 
     Args:
         seconds: [s] of the recording between two of them, at least.
@@ -24,7 +24,7 @@ class DueScans:
         self._due, self._left = 0.0, 0
 
     def is_due(self, frame: Frame) -> bool:
-        """Tell whether a scan is due; called once for each."""
+        """Return whether a scan is due; called once for each."""
         self.time += frame.dt
         self._left -= 1
         is_due = self.time >= self._due - _ROUNDING and self._left < 0

@@ -31,8 +31,8 @@ class MapRequest:
     points: tuple[str, ...] = ()  #: topics of a bag's clouds
     depth: tuple[str, ...] = ()  #: topics of a bag's depth images
     camera_info: tuple[str, ...] = ()  #: topics of the CameraInfo of a bag's depth images
-    depth_scale: float | None = None  #: [m] per unit of a bag's depth; None: the bag's, or that of the encoding
-    depth_axes: Literal["optical", "forward", "opengl"] | None = None  #: of the frame of a bag's depth images
+    depth_scale: float | None = None  #: [m] per unit of depth; None: the recording's, or that of the encoding
+    depth_axes: Literal["optical", "forward", "opengl"] | None = None  #: of the frame of depth images; None: optical
     map_frame: str | None = None  #: frame of a bag in which the map is built
     base_frame: str | None = None  #: frame of a bag that the window follows
     tf: tuple[str, ...] = ()  #: topics of a bag's transforms; (): /tf and /tf_static, or those of the scans' namespace

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
 _PLAIN = MapRequest(recording=Path())
 _ONLY_BAGS = (
-    "points", "depth", "camera_info", "depth_scale", "depth_axes",
-    "map_frame", "base_frame", "tf", "rays_from", "clock_offset", "stamps", "start", "end",
-    "odometry", "imu", "save_poses",
+    "points", "depth", "camera_info", "map_frame", "base_frame", "tf", "rays_from", "clock_offset", "stamps",
+    "start", "end", "odometry", "imu", "save_poses",
 )  # fmt: skip
 _ONLY_FOLDERS = (
     "intrinsics", "dt", "sensor_height", "bin_layout", "quaternions", "time_unit", "pcd_frame", "poses_of",
@@ -59,7 +58,15 @@ def _open_folder(request: MapRequest) -> tuple[Recording, MapOptions]:
         time_unit=request.time_unit,
         pcd_frame=request.pcd_frame,
     )
-    scans = open_recording(request.recording, request.poses, request.intrinsics, request.dt, layout)
+    scans = open_recording(
+        request.recording,
+        request.poses,
+        request.intrinsics,
+        request.dt,
+        layout,
+        request.depth_scale,
+        request.depth_axes,
+    )
     if request.poses_of == "base" and mount is not None:
         scans = scans.apply_mount(mount)
     scans = scans.with_bases(base_poses(scans.T_map_sensor, mount, request.sensor_height))
@@ -73,7 +80,7 @@ def _check(request: MapRequest, mount: NDArray | None) -> None:
     height, dt = request.sensor_height, request.dt
     given = [f"--{name.replace('_', '-')}" for name in _ONLY_BAGS if getattr(request, name) != getattr(_PLAIN, name)]
     if given:
-        raise ValueError(f"{', '.join(given)}: only bags have topics and frames, and {request.recording} is none")
+        raise ValueError(f"{', '.join(given)}: for bags only, and {request.recording} is not a bag")
     if request.poses_of == "base" and mount is None:
         raise ValueError("--poses-of base: the sensor's pose on the robot is unknown; give --extrinsics")
     if mount is not None and height is not None:
@@ -99,13 +106,13 @@ def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
         click.echo(f"mapping   {', '.join(scans.topics)} in {scans.map_frame}, around {scans.base_frame}{rays}")
         if request.save_poses is not None:
             _save_poses(request.save_poses, scans)
-        told = list(scans.pose_notes)
-        _warn(told)
+        printed = list(scans.pose_notes)
+        _warn(printed)
         options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base)
         try:
             yield scans, options
         finally:
-            _warn([note for note in scans.warnings if note not in told])
+            _warn([note for note in scans.warnings if note not in printed])
 
 
 def _require_odometry(request: MapRequest) -> None:
@@ -167,9 +174,9 @@ def _read_offset(text: str) -> tuple[str, float]:
 
 
 def _refuse_file_options(request: MapRequest) -> None:
-    """Reject options for what a bag itself says."""
+    """Reject options for what a bag itself holds."""
     given = [f"--{name.replace('_', '-')}" for name in _ONLY_FOLDERS if getattr(request, name) != getattr(_PLAIN, name)]
     if given:
         raise ValueError(
-            f"{', '.join(given)}: only for folders of files; {request.recording} is a bag, which says it itself"
+            f"{', '.join(given)}: for folders of files only, and {request.recording} is a bag, which holds this itself"
         )

@@ -60,7 +60,9 @@ def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]
             f"note      the path spans {span:.0f} m and the map shows its end; use --fixed --size {size} to keep it all"
         )
     if not knows_base:
-        notes.append("note      overlap clearance is off; give --sensor-height or --extrinsics to turn it on")
+        notes.append(
+            "note      overlap clearance is off; give --extrinsics (or --sensor-height for a folder) to enable it"
+        )
     return notes
 
 

@@ -160,7 +160,7 @@ class Bag:
         return "not read" if time is None else f"read up to {time / 1e9 - self.start:.1f} s after its start"
 
     def _require_all(self, channels: Sequence[Channel], num: int) -> None:
-        """Say so if the bag counts more messages than could be read: its index is damaged."""
+        """Record damage if the bag counts more messages than could be read: its index is damaged."""
         expected = sum(channel.num for channel in channels)
         if num < expected and not self.ended_early:
             self._damage = f"the bag is damaged: {expected - num} of {expected} messages are missing"

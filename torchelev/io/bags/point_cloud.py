@@ -31,7 +31,7 @@ def read_points(message: Any, stamp: float, period: float | None = None) -> Clou
         period: [s] between two messages; None: unknown, a scan takes 2 s at most.
 
     Raises:
-        CloudError: there is no x, y or z, the sizes contradict each other, or the message is none.
+        CloudError: there is no x, y or z, the sizes contradict each other, or this is no PointCloud2.
     """
     if not hasattr(message, "fields") or not hasattr(message, "point_step"):
         kind = type(message).__name__
@@ -61,7 +61,7 @@ def _read_column(message: Any, field: Any) -> NDArray:
     kind = np.dtype((">" if message.is_bigendian else "<") + _TYPES[field.datatype])
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     data = as_bytes(message.data)
-    # Drivers leave row_step 0, or as it was before a crop: without padding, the number of bytes tells the rows.
+    # Drivers leave row_step 0, or as it was before a crop: without padding, the number of bytes gives the rows.
     is_packed = height <= 1 or len(data) == height * width * step
     row = width * step if is_packed else int(message.row_step)
     if field.offset + kind.itemsize > step or row < width * step or len(data) < row * (height - 1) + width * step:

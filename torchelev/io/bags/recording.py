@@ -13,6 +13,7 @@ from torchelev.io.bags.cameras import doubt_axes, find_cameras
 from torchelev.io.bags.order import order_by_stamp
 from torchelev.io.bags.periods import find_period
 from torchelev.io.bags.point_cloud import CloudError
+from torchelev.io.bags.poses.clocks import SettingWatch
 from torchelev.io.bags.poses.placing import Placed, place_poses
 from torchelev.io.bags.poses.reading import time_of
 from torchelev.io.bags.poses.transforms import FrameError
@@ -51,7 +52,7 @@ class BagRecording:
         self._request, self.tree = request, self._placed.tree
         self.map_frame, self.base_frame, self.rays_from = self._placed.map, self._placed.base, self._placed.rays_from
         self.has_base = self.base_frame != self._placed.sensor
-        self.skipped, self.notes = Reasons(), Reasons()
+        self.skipped, self.notes, self._watch = Reasons(), Reasons(), SettingWatch(self._placed.clock)
 
     def __len__(self) -> int:
         return self._num
@@ -75,7 +76,13 @@ class BagRecording:
     def warnings(self) -> list[str]:
         """What was left out when the scans were last read, what is wrong with the poses, and where the bag ended."""
         skipped = [f"{number} of {self._num} scans were left out: {reason}" for reason, number in self.skipped.items()]
-        return [*skipped, *self.pose_notes, *self.notes, *([self.ended_early] if self.ended_early else [])]
+        return [
+            *skipped,
+            *self.pose_notes,
+            *self._watch.notes,
+            *self.notes,
+            *([self.ended_early] if self.ended_early else []),
+        ]
 
     @property
     def middle(self) -> NDArray[np.float64]:
@@ -94,6 +101,7 @@ class BagRecording:
         """Yield a frame for each message of a sensor: None where it has to be left out, see `skipped`."""
         self.skipped.clear()
         self.notes.clear()
+        self._watch = SettingWatch(self._placed.clock)
         last: float | None = None
         for message in order_by_stamp(self._messages(), self.topics, self._time_of):
             try:
@@ -123,8 +131,9 @@ class BagRecording:
         scan = read_scan(message.data, camera, period)._replace(stamp=self._time_of(message))
         for note in scan.notes:
             self.notes.count(f"{message.topic}: {note.text}", f"{message.topic}: {note.kind}")
-        if message.topic not in self.clock_offsets and self._placed.clock.differs(scan.stamp, message.time):
-            self.skipped.count(f"the clock of {message.topic} was set meanwhile: {_OTHER_CLOCK}")
+        known = message.topic in self.clock_offsets
+        if not known and self._watch.is_set(message.topic, scan.stamp, message.time):
+            self.skipped.count(f"the clock of {message.topic} was set during the recording: {_OTHER_CLOCK}")
             return None
         frame = self.rays_from if scan.frame in self._placed.fixed else scan.frame
         now = np.array([scan.stamp])

@@ -14,6 +14,7 @@ from torchelev.io.point_times import TIME_FIELDS
 
 MAX_COLUMNS = 16  # numbers per point; wider arrays are images, or have one column per point
 _TIME_ARRAYS = (*TIME_FIELDS, "times", "timestamps")  # beside the points of a .npz
+_TIME_KINDS = "fiumM"
 _DEPTH_HINT = "of a depth image give the camera with --intrinsics"
 
 
@@ -58,8 +59,8 @@ def read_npz(path: Path) -> CloudFile:
     array, beside = load_npz(path, ("points", "xyz"))
     cloud = from_array(path, array)
     for name, values in beside.items():
-        if cloud.times is None and values.size == len(cloud.points) and values.dtype.kind in "fiu":
-            return cloud._replace(times=values.ravel(), time_name=name)
+        if cloud.times is None and values.size == len(cloud.points) and values.dtype.kind in _TIME_KINDS:
+            return cloud._replace(times=_to_numbers(values), time_name=name)
     return cloud
 
 
@@ -79,9 +80,15 @@ def from_fields(path: Path, array: Any) -> CloudFile:
     if missing:
         raise RecordingError(path, f"no field {' '.join(sorted(missing))}", "the cloud needs fields x, y and z")
     points = np.stack([np.asarray(array[name]).ravel() for name in "xyz"], axis=-1)
-    name = next((name for name in TIME_FIELDS if name in names and array.dtype[name].kind in "fiu"), None)
-    times = None if name is None else np.asarray(array[name]).ravel()
+    name = next((name for name in TIME_FIELDS if name in names and array.dtype[name].kind in _TIME_KINDS), None)
+    times = None if name is None else _to_numbers(np.asarray(array[name]))
     return CloudFile(points, times if times is not None and len(times) == len(points) else None, name or "")
+
+
+def _to_numbers(times: NDArray) -> NDArray:
+    """Return times as numbers (N,): datetime64 and timedelta64 as integers [ns]."""
+    kind = times.dtype.kind
+    return (times.astype(f"{kind}8[ns]").astype(np.int64) if kind in "mM" else times).ravel()
 
 
 def is_cloud(array: NDArray) -> bool:

@@ -20,8 +20,10 @@ class Intrinsics(NamedTuple):
     """A pinhole camera and the meaning of its depth values."""
 
     matrix: NDArray[np.float64]  #: (3, 3) [px]
-    depth_scale: float = 0.001  #: [m] per unit of the image
+    depth_scale: float = 0.001  #: [m] per unit of an image of integers
     along: Literal["z", "ray"] = "z"  #: depth is measured along the optical axis, or along each pixel's ray
+    float_scale: float = 1.0  #: [m] per unit of an array of floats
+    axes: str = "optical"  #: of the camera's frame, see `depth_to_points`
 
 
 def read_intrinsics(path: str | Path) -> Intrinsics:
@@ -137,7 +139,7 @@ def _matrix_numbers(data: dict, keys: tuple[str, ...]) -> list[float] | None:
 
 
 def _check_values(path: Path, intrinsics: Intrinsics) -> None:
-    matrix, scale, along = intrinsics
+    matrix, scale, along = intrinsics.matrix, intrinsics.depth_scale, intrinsics.along
     if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         raise RecordingError(path, "fx and fy must be positive, all four finite", _HINT)
     if not (isinstance(scale, int | float) and 0 < scale <= 1):

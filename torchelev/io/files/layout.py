@@ -95,7 +95,7 @@ def _require_kitti(path: Path, size: int) -> None:
 
 
 def _fits_better(head: NDArray, other: _BinLayout) -> bool:
-    """Tell whether another layout explains the values clearly better than KITTI's."""
+    """Return whether another layout explains the values clearly better than KITTI's."""
     values, kitti = _values(head, other), _values(head, _KITTI)
     if _plausible_fraction(values[:, :3]) <= 0.97:
         return False
@@ -170,7 +170,7 @@ def _largest_angle(directions: NDArray) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
 
 
-def to_seconds(times: NDArray, unit: str | None) -> NDArray:
+def stamps_to_seconds(times: NDArray, unit: str | None) -> NDArray:
     """Return times (T,) in seconds; without a `unit`, they are in s, or since 1970 in the unit that fits their size."""
     if unit is not None:
         return times * _SECONDS[unit]

@@ -14,7 +14,7 @@ from torchelev.io.folders.scan_files import parse_stamp
 from torchelev.io.poses import Poses
 
 _TIME_TOLERANCE = 0.02  # [s] between a scan's timestamp and its pose's, as in TUM's own tools
-_FEW = 2  # poses more than scans that are numbered on from 0: which of them are too many is open
+_FEW = 2  # poses more than scans that are numbered on from 0: which of them have no scan is ambiguous
 _ONE_LINE = "write one line for each scan, or name the scans by the times of their poses"
 
 
@@ -33,7 +33,7 @@ def pair(files: list[Path], pose_file: Path, poses: Poses) -> Pairing:
     are paired in order; if there are more poses than scans, numbered scans take the pose of their number.
 
     Raises:
-        RecordingError: a scan has no pose, or its pose is open.
+        RecordingError: a scan has no pose, or its pose is ambiguous.
     """
     names = [parse_stamp(path.stem) for path in files]
     named = None if None in names else np.array(names, dtype=np.float64)
@@ -107,7 +107,7 @@ def _match_order(files: list[Path], pose_file: Path, num_poses: int) -> tuple[ND
         raise RecordingError(pose_file, f"{scan}{counts}", _ONE_LINE)
     is_whole = len(files) > 1 and bool((np.diff(index) == 1).all()) and index[0] <= 1
     if is_whole and (index[0] == 1 or num_poses - len(files) <= _FEW):
-        open_line = f"which line belongs to {files[0].name} is open"
+        open_line = f"which line belongs to {files[0].name} is ambiguous"
         raise RecordingError(pose_file, f"{counts}: {open_line}", _ONE_LINE)
     lines = f"{files[0].name} takes line {index[0] + 1}, {files[-1].name} line {index[-1] + 1}"
     return index, (f"{pose_file}: {counts}; each scan takes that of its number: {lines}",)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, overload
@@ -9,16 +10,18 @@ from typing import NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.errors import require
 from torchelev.io.clouds import read_cloud_file
 from torchelev.io.depth import read_depth, read_depth_points
 from torchelev.io.errors import RecordingError
 from torchelev.io.files.arrays import CloudFile
-from torchelev.io.files.intrinsics import read_intrinsics
+from torchelev.io.files.intrinsics import Intrinsics, read_intrinsics
 from torchelev.io.files.layout import FileLayout
-from torchelev.io.folders.kitti import convert, to_lidar
-from torchelev.io.folders.pairing import Pairing, compute_steps, pair
+from torchelev.io.folders.clock import ScanClock, find_clock
+from torchelev.io.folders.kitti import to_lidar
+from torchelev.io.folders.pairing import compute_steps, pair
 from torchelev.io.folders.scan_files import find_scans
-from torchelev.io.folders.within_scan import SensorPath, hold_still
+from torchelev.io.folders.within_scan import hold_still
 from torchelev.io.notes import Reasons
 from torchelev.io.poses import read_poses
 
@@ -35,23 +38,6 @@ class Frame(NamedTuple):
     T_map_base: NDArray[np.float64] | None = None  #: (4, 4); None: unknown
     pose_covariance: NDArray[np.float64] | None = None  #: (6, 6) of the sensor's pose, see `ElevationMap.update`
     stamp: float = 0.0  #: [s] of a bag's scan; 0 of a file
-
-
-class ScanClock(NamedTuple):
-    """When the scans and their poses were taken."""
-
-    path: SensorPath
-    stamps: NDArray[np.float64]  #: (T,) [s] from which the times of a scan's points count
-    pose_times: NDArray[np.float64]  #: (T,) [s] of the pose that a scan takes
-
-    def part(self, index: slice) -> ScanClock:
-        """Return the clock of some of the scans."""
-        return self._replace(stamps=self.stamps[index], pose_times=self.pose_times[index])
-
-    def apply_mount(self, T_base_sensor: NDArray[np.float64]) -> ScanClock:
-        """Return the clock with the path of a sensor at T_base_sensor (4, 4) on what moved along this one."""
-        path = self.path._replace(T_map_sensor=self.path.T_map_sensor @ T_base_sensor)
-        return self._replace(path=path)
 
 
 class Recording(Sequence[Frame]):
@@ -143,6 +129,8 @@ def open_recording(
     intrinsics: str | Path | None = None,
     dt: float | None = None,
     layout: FileLayout | None = None,
+    depth_scale: float | None = None,
+    depth_axes: str | None = None,
 ) -> Recording:
     """Open a folder of point clouds, or of depth images if `intrinsics` is given.
 
@@ -157,15 +145,18 @@ def open_recording(
         intrinsics: the camera of depth images, see `read_intrinsics`; None: the scans are point clouds.
         dt: [s] between scans; None: from the poses' timestamps, or 0.1.
         layout: what the files leave open; None: see `FileLayout`.
+        depth_scale: [m] per unit of depth; None: that of the intrinsics for integers, and 1 for floats.
+        depth_axes: axes of the frame of depth images, see `depth_to_points`; None: optical.
 
     Returns:
         The recording. Scans are read when indexed.
 
     Raises:
         RecordingError: there are no scans, a scan has no pose, or a file cannot be read or contradicts its layout.
+        ValueError: `depth_scale` or `depth_axes` is given for point clouds, or the scale is not positive.
     """
     layout = layout or FileLayout()
-    camera = None if intrinsics is None else read_intrinsics(intrinsics)
+    camera = _read_camera(intrinsics, depth_scale, depth_axes)
     files = find_scans(Path(folder), depth=camera is not None)
     pose_file = Path(poses) if poses is not None else _find_poses(Path(folder))
     given = read_poses(pose_file, layout)
@@ -174,16 +165,30 @@ def open_recording(
     steps = compute_steps(files, pose_file, taken, dt)
     T, notes = given.T_map_sensor, pairing.notes
     if camera is not None and files[0].suffix.lower() != ".png":
-        read_depth(files[0])  # an array may also be a cloud
+        read_depth(files[0], camera.depth_scale, camera.float_scale)  # an array may also be a cloud
     if camera is None:
-        T_camera_lidar, note = to_lidar(T, (files[0].parent, Path(folder), pose_file.parent, files[0].parent.parent))
-        T, notes = T if T_camera_lidar is None else convert(T, T_camera_lidar), (*notes, *filter(None, [note]))
+        T, note = to_lidar(T, (files[0].parent, Path(folder), pose_file.parent, files[0].parent.parent))
+        notes = (*notes, *filter(None, [note]))
 
     def read(path: Path) -> CloudFile:
         return read_cloud_file(path, layout) if camera is None else CloudFile(read_depth_points(path, camera))
 
-    clock = _find_clock(pairing, given.times, T, steps, dt)
+    clock = find_clock(pairing, given.times, T, steps, dt)
     return Recording(files, T[pairing.poses], steps, read, "; ".join(notes), clock=clock)
+
+
+def _read_camera(path: str | Path | None, scale: float | None, axes: str | None) -> Intrinsics | None:
+    """Return the camera of depth images, with a unit and axes that were asked for; None: there are point clouds."""
+    asked, given = [("--depth-scale", scale), ("--depth-axes", axes)], path is not None
+    for name, value in asked:
+        require(value is None or given, name, "is for depth images only", value, "give their camera with --intrinsics")
+    rule = "must be positive and finite"
+    require(scale is None or 0 < scale < math.inf, "--depth-scale", rule, scale, "give metres per unit")
+    if path is None:
+        return None
+    camera = read_intrinsics(path)
+    camera = camera if scale is None else camera._replace(depth_scale=scale, float_scale=scale)
+    return camera if axes is None else camera._replace(axes=axes)
 
 
 def _find_poses(folder: Path) -> Path:
@@ -193,20 +198,3 @@ def _find_poses(folder: Path) -> Path:
                 return place / name
     names = " or ".join(_POSE_FILES)
     raise RecordingError(folder, f"no pose file ({names}) in it or beside it", "give it with --poses")
-
-
-def _find_clock(
-    pairing: Pairing, times: NDArray | None, T_map_sensor: NDArray, steps: NDArray, dt: float | None
-) -> ScanClock | None:
-    """Return when scans and poses were taken: by the poses' times, by the scans' names, or by `dt`; None: unknown."""
-    stamps, pose_times = pairing.stamps, times
-    if times is None:
-        stamps = np.cumsum(steps) if dt else stamps
-        pose_times, T_map_sensor = stamps, T_map_sensor[pairing.poses]
-    if stamps is None or pose_times is None or len(np.unique(pose_times)) < 2:
-        return None
-    unique, first = np.unique(pose_times, return_index=True)
-    forward = steps[steps > 0]
-    period = float(np.median(forward)) if len(forward) else None
-    taken = stamps if times is None else times[pairing.poses]
-    return ScanClock(SensorPath(unique, T_map_sensor[first], period), stamps, taken)

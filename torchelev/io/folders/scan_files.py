@@ -55,7 +55,7 @@ def find_scans(folder: Path, depth: bool = False) -> list[Path]:
 
 
 def has_clouds(folder: Path) -> bool:
-    """Tell whether a folder or its subfolder `scans` holds point clouds."""
+    """Return whether a folder or its subfolder `scans` holds point clouds."""
     return any(_has_scan(place, depth=False) for place in (folder, folder / _SCANS_FOLDER))
 
 
@@ -82,7 +82,7 @@ def _is_scan(path: Path, depth: bool) -> bool:
 
 
 def _is_input(path: Path) -> bool:
-    """Tell whether a path is a visible file that torchelev did not write; raise RecordingError for a broken link."""
+    """Return whether a path is a visible file that torchelev did not write; raise RecordingError for a broken link."""
     if path.name.startswith("."):
         return False
     if path.suffix.lower() in (*CLOUD_SUFFIXES, ".png") and path.is_symlink() and not path.exists():

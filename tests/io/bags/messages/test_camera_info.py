@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from torchelev.io.bags.messages.camera_info import read_intrinsics
+from torchelev.io.bags.messages.camera_info import choose_matrix
 from torchelev.io.bags.messages.cloud import CloudError
 
 K = np.array([[60.0, 0, 47.5], [0, 61.0, 35.5], [0, 0, 1]])
@@ -26,14 +26,14 @@ def camera(k, p, d=(), ros=2):
     ("k", "p"), [(K, P), (ZERO, P), (RAW, P), (K, np.zeros(12)), (K, ()), (K, np.full(12, np.nan))]
 )
 def test_p_is_taken_where_it_is_filled_in(k, p, ros):
-    matrix, note = read_intrinsics(camera(k, p, ros=ros))
+    matrix, note = choose_matrix(camera(k, p, ros=ros))
     np.testing.assert_array_equal(matrix, K)
     assert note is None
 
 
 def test_a_camera_without_focal_length_is_refused():
     with pytest.raises(CloudError, match="holds no calibration: the focal lengths of both P and K are not positive"):
-        read_intrinsics(camera(ZERO, np.zeros(12)))
+        choose_matrix(camera(ZERO, np.zeros(12)))
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_a_camera_without_focal_length_is_refused():
     ],
 )
 def test_distortion_that_is_not_applied_is_said(p, d, topic, is_said):
-    _, note = read_intrinsics(camera(K, p, d), topic)
+    _, note = choose_matrix(camera(K, p, d), topic)
     assert (note is not None) == is_said
     if note:
         assert "distortion, coefficients up to 0.3, which is not applied" in note.text

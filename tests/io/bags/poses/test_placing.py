@@ -144,7 +144,8 @@ def test_a_clock_that_is_ahead_by_less_than_the_bag_is_named(tmp_path, monkeypat
     monkeypatch.setattr("torchelev.io.bags.poses.clocks._DIFFERENCE", 0.2)
     recording, _ = read(write(tmp_path / "drive", Shape(ahead=0.3)))
     (note,) = recording.pose_notes
-    assert "the clocks differ by 0.299 s; give" in note and f"--clock-offset {CLOUD}=-0.299" in note
+    assert "the poses arrive 0.299 s late, which does no harm, or the clocks differ" in note
+    assert f"give --clock-offset {CLOUD}=-0.299 if they differ" in note
 
 
 def test_stamps_that_were_never_filled_in_are_named(tmp_path):
@@ -218,7 +219,7 @@ def test_a_mounting_below_a_sensor_with_poses_gives_the_base(tmp_path):
     assert_poses(frames)
 
 
-def test_a_lidar_whose_clock_is_set_meanwhile_loses_these_scans_only(tmp_path):
+def test_a_lidar_whose_clock_is_set_while_recording_loses_these_scans_only(tmp_path):
     writer = Writer(tmp_path / "drive", "mcap")
     stamps = np.arange(-0.3, 9.0, 0.1)
     for t in stamps:
@@ -230,8 +231,25 @@ def test_a_lidar_whose_clock_is_set_meanwhile_loses_these_scans_only(tmp_path):
     recording, frames = read(tmp_path / "drive")
     assert len(frames) == 12 and recording.pose_notes == []
     (warning,) = recording.warnings
-    assert warning.startswith(f"4 of 16 scans were left out: the clock of {CLOUD} was set meanwhile")
+    assert warning.startswith(f"4 of 16 scans were left out: the clock of {CLOUD} was set during the recording")
     assert len(read(tmp_path / "drive", stamps="recorded")[1]) == 16
+
+
+@pytest.mark.parametrize("pose_start", [0.3, -6.0])
+def test_poses_that_arrive_late_are_used(tmp_path, pose_start):
+    """A mapper that lags by 3 s at first, then by 6 s, before or while the scans begin."""
+    writer = Writer(tmp_path / "drive", "mcap")
+    for t in np.arange(pose_start, 9.0, 0.1):
+        T = np.eye(4) + np.eye(4, k=3) * max(0.0, t)
+        writer.transform(START + t, "odom", "lidar", T, recorded=START + t + 3 + 0.3 * max(0.0, t))
+    for t in np.arange(0.0, 8.0, 0.5):
+        writer.cloud(drive().clouds[0]._replace(stamp=START + t, times=None), recorded=START + t)
+    writer.close()
+    recording, frames = read(tmp_path / "drive")
+    assert len(frames) == 16 and recording.clock_offsets == {}
+    np.testing.assert_allclose([frame.T_map_sensor[0, 3] for frame in frames], np.arange(0.0, 8.0, 0.5), atol=1e-6)
+    (warning,) = recording.warnings
+    assert "arrive" in warning and "late, which does no harm" in warning and f"--clock-offset {CLOUD}=-" in warning
 
 
 def test_poses_of_two_clocks_are_named(tmp_path):

@@ -1,4 +1,4 @@
-"""Intrinsics of a depth image out of its CameraInfo."""
+"""The intrinsic matrix of a depth image out of its CameraInfo."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchelev.io.bags.messages.cloud import CloudError, Note
 _DISTORTED = 1e-3  # largest coefficient of a lens that is taken as without distortion
 
 
-def read_intrinsics(camera: Any, topic: str = "") -> tuple[NDArray[np.float64], Note | None]:
+def choose_matrix(camera: Any, topic: str = "") -> tuple[NDArray[np.float64], Note | None]:
     """Return the intrinsic matrix of a depth image: that of P where it is filled in, else K.
 
     ROS's own converters take depth images as rectified, whose matrix is P. Some drivers fill in only one of the two.

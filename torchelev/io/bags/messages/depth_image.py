@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.io.bags.messages.camera_info import read_intrinsics
+from torchelev.io.bags.messages.camera_info import choose_matrix
 from torchelev.io.bags.messages.cloud import Cloud, CloudError, Note
 from torchelev.io.bags.messages.depth_png import decode_depth
 from torchelev.io.bags.messages.raw import as_bytes
@@ -46,7 +46,7 @@ def read_depth_image(message: Any, settings: CameraSettings) -> Cloud:
     if (depth.shape[1], depth.shape[0]) != (camera.width, camera.height):
         actual, expected = f"{depth.shape[1]} x {depth.shape[0]}", f"{camera.width} x {camera.height}"
         raise CloudError(f"the depth image has {actual} pixels, and its CameraInfo {expected}")
-    matrix, note = read_intrinsics(camera, settings.topic)
+    matrix, note = choose_matrix(camera, settings.topic)
     K = torch.tensor(matrix, dtype=torch.float32)
     points = depth_to_points(torch.from_numpy(depth)[None], K, frame=settings.axes)[0].numpy()
     encoding = message.format if is_compressed else message.encoding

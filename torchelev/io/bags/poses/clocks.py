@@ -1,4 +1,4 @@
-"""Clocks that differ, restart or were never set: found before mapping, from stamps and the times of recording."""
+"""Clocks that differ or were never set: found before mapping, from stamps and the times of recording."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.errors import RecordingError
 
-_BACK = 0.5  # [s] by which stamps of one sender go back only if its clock does
-_AHEAD = 5.0  # [s] more than the time between two recordings: the clock was set
-_MANY = 20  # more steps back are two senders, each with its clock
 _DIFFERENCE = 2.0  # [s] between two clocks; delays of sensors and of odometry are shorter
+_LATEST = 10.0  # [s] by which a mapper that is slower than its sensors may publish poses late
 _TOGETHER = 1.0  # [s] between two recordings at one time
 _SOME = 20  # poses of a frame whose stamps are looked at
 _SLOWEST = 0.01  # of the time of stamps; bags that were recorded faster have no times of recording
@@ -101,10 +99,9 @@ class PoseClock:
             return None
         return stamp - float(np.interp(recorded, near, self._stamps[max(at - 1, 0) : at + 1]))
 
-    def differs(self, stamp: float, recorded: float) -> bool:
-        """Return whether a stamp [s] is certainly of another clock."""
-        ahead = self.measure(stamp, recorded)
-        return ahead is not None and abs(ahead) > _DIFFERENCE
+    def has_started(self, recorded: float) -> bool:
+        """Return whether poses were recorded before a time [s]."""
+        return len(self._recorded) > 0 and bool(self._recorded[0] <= recorded)
 
     def compare(self, scans: FirstScans) -> Difference | None:
         """Compare the stamps of a topic's scans with those of the poses.
@@ -131,57 +128,52 @@ class PoseClock:
         if offset is None or abs(offset) < _DIFFERENCE:
             return Difference(f"{ranges}: no scan lies within the poses", "", None, True) if is_apart else None
         needed = round(scans.offset - _snap(offset), 6)
-        cure = f"--clock-offset {scans.topic}={needed!r} or --stamps recorded"
-        return Difference(f"{ranges}: the clocks differ by {abs(offset):,.3f} s", cure, needed, is_apart)
+        cure = f"--clock-offset {scans.topic}={needed!r}"
+        if 0 < offset <= _LATEST and not is_apart:
+            late = f"{ranges}: the poses arrive {offset:,.3f} s late, which does no harm, or the clocks differ"
+            return Difference(late, f"{cure} if they differ", None, False)
+        difference = f"{ranges}: the clocks differ by {abs(offset):,.3f} s"
+        return Difference(difference, f"{cure} or --stamps recorded", needed, is_apart)
+
+
+class SettingWatch:
+    """Notices scans whose clock is set during a recording, so that it is not that of the poses any more.
+
+    Args:
+        clock: of the poses.
+
+    Attributes:
+        notes: on topics that began before the poses, and whose stamps are ahead of theirs.
+    """
+
+    def __init__(self, clock: PoseClock) -> None:
+        self._clock = clock
+        self._last: dict[str, float] = {}  # [s] by which the stamps of a topic were ahead of those of the poses
+        self._early: set[str] = set()  # topics that began before the poses, so that `compare` could not measure them
+        self.notes: list[str] = []
+
+    def is_set(self, topic: str, stamp: float, recorded: float) -> bool:
+        """Return whether a scan has a stamp of another clock; poses may arrive late, and ever later."""
+        ahead = self._clock.measure(stamp, recorded) if self._clock.has_started(recorded) else None
+        if ahead is None:
+            self._early |= {topic} - self._last.keys()
+            return False
+        last = self._last.get(topic, min(max(ahead, 0.0), _LATEST))
+        if abs(ahead) > _DIFFERENCE and abs(ahead - last) > _DIFFERENCE:
+            return True
+        if ahead > _DIFFERENCE and topic in self._early:
+            self._early.discard(topic)
+            self.notes.append(
+                f"stamps of {topic} are {ahead:,.3f} s ahead of those of the poses: the poses arrive late, which does "
+                f"no harm, or the clocks differ; give --clock-offset {topic}={round(-_snap(ahead), 6)!r} if they differ"
+            )
+        self._last[topic] = ahead
+        return False
 
 
 def _snap(offset: float) -> float:
-    """Return a difference between time scales or zones where it is meant; delays are a part of what was measured."""
+    """Return the difference of time scales or zones near an offset, which includes delays; else the offset."""
     known = np.concatenate([_SCALES, [_ZONE * max(1, round(abs(offset) / _ZONE))]])
     known = known[known <= 14 * 3600]
     nearest = known[np.abs(known - abs(offset)).argmin()] if len(known) else np.inf
     return float(np.sign(offset) * nearest) if abs(nearest - abs(offset)) < _SNAP else offset
-
-
-def find_restarts(tree: TransformTree) -> tuple[list[tuple[float, str]], list[str]]:
-    """Find where the clock of the transforms goes back, or jumps ahead.
-
-    Returns:
-        When that was recorded [s] with a sentence, in order; and notes on frames whose stamps go back again and again.
-    """
-    restarts: list[tuple[float, str]] = []
-    notes = []
-    for frame in tree.frames:
-        if tree.parent(frame) is None or tree.is_constant(frame):
-            continue
-        rows = tree.recorded_rows(frame)
-        steps = np.diff(rows[:, 0])
-        is_back = steps < -_BACK
-        is_ahead = steps > _AHEAD + 100 * np.abs(np.diff(rows[:, -1]))
-        if is_back.sum() > _MANY:
-            notes.append(
-                f"stamps of {frame} go back {is_back.sum()} times: two nodes with different clocks send its "
-                "transforms; give --poses TOPIC, or --tf TOPIC"
-            )
-            continue
-        for index in np.flatnonzero((is_back | is_ahead) & np.isfinite(rows[1:, -1])):
-            restarts.append(
-                (float(rows[index + 1, -1]), _describe(frame, rows[:, 0], int(index), bool(is_back[index])))
-            )
-    return sorted(restarts), notes
-
-
-def _describe(frame: str, stamps: NDArray[np.float64], index: int, is_back: bool) -> str:
-    before, after = stamps[: index + 1], stamps[index + 1 :]
-    verb = "goes back" if is_back else "jumps ahead"
-    return (
-        f"the clock {verb} by {abs(stamps[index + 1] - stamps[index]):,.1f} s: stamps of {frame} "
-        f"{before.min():,.3f} .. {before.max():,.3f} s are followed by {after.min():,.3f} .. {after.max():,.3f} s"
-    )
-
-
-def choose_run(start: float, end: float, restarts: list[tuple[float, str]]) -> tuple[float, float]:
-    """Return the longest time [s] between restarts of the clock, as it was recorded."""
-    bounds = [start, *(time for time, _ in restarts), end]
-    runs = list(zip(bounds, bounds[1:], strict=False))
-    return max(runs, key=lambda run: run[1] - run[0])

@@ -173,7 +173,7 @@ def _base_above(tree: TransformTree, sensor: str) -> str:
 
 
 def _describe(tree: TransformTree, sensor: str) -> str:
-    """Say what is around a sensor that nothing moves."""
+    """Return what is around a sensor that nothing moves."""
     above = ", ".join(tree.ancestors(sensor)[1:]) or "none"
     moving = [f"{frame} in {tree.parent(frame)}" for frame in _moving(tree, _below(tree, tree.ancestors(sensor)[-1]))]
     return f"above it are {above}" + (f", and what moves is {', '.join(moving)}" if moving else "")

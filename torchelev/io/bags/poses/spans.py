@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag
-from torchelev.io.bags.poses.clocks import FirstScans, choose_run, find_restarts
+from torchelev.io.bags.poses.clocks import FirstScans
 from torchelev.io.bags.poses.reading import time_of
 from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.bags.scans import clean
 from torchelev.io.bags.topics import BagRequest
 from torchelev.io.errors import RecordingError
 
+_BACK = 0.5  # [s] by which stamps of one sender go back only if its clock does
+_AHEAD = 5.0  # [s] more than the time between two recordings: the clock was set
+_MANY = 20  # more steps back are two senders, each with its clock
 _FIRST = 5  # scans of a topic whose stamps are looked at
 
 
@@ -67,3 +71,47 @@ def read_first(bag: Bag, request: BagRequest, topics: Sequence[str], span: tuple
         reason = bag.ended_early or f"no messages on {', '.join(topics)}{' and'.join(times)}"
         raise RecordingError(bag.path, reason, "choose another topic with --points or --depth")
     return found
+
+
+def find_restarts(tree: TransformTree) -> tuple[list[tuple[float, str]], list[str]]:
+    """Find where the clock of the transforms goes back, or jumps ahead.
+
+    Returns:
+        When that was recorded [s] with a sentence, in order; and notes on frames whose stamps go back again and again.
+    """
+    restarts: list[tuple[float, str]] = []
+    notes = []
+    for frame in tree.frames:
+        if tree.parent(frame) is None or tree.is_constant(frame):
+            continue
+        rows = tree.recorded_rows(frame)
+        steps = np.diff(rows[:, 0])
+        is_back = steps < -_BACK
+        is_ahead = steps > _AHEAD + 100 * np.abs(np.diff(rows[:, -1]))
+        if is_back.sum() > _MANY:
+            notes.append(
+                f"stamps of {frame} go back {is_back.sum()} times: two nodes with different clocks send its "
+                "transforms; give --poses TOPIC, or --tf TOPIC"
+            )
+            continue
+        for index in np.flatnonzero((is_back | is_ahead) & np.isfinite(rows[1:, -1])):
+            restarts.append(
+                (float(rows[index + 1, -1]), _describe(frame, rows[:, 0], int(index), bool(is_back[index])))
+            )
+    return sorted(restarts), notes
+
+
+def _describe(frame: str, stamps: NDArray[np.float64], index: int, is_back: bool) -> str:
+    before, after = stamps[: index + 1], stamps[index + 1 :]
+    verb = "goes back" if is_back else "jumps ahead"
+    return (
+        f"the clock {verb} by {abs(stamps[index + 1] - stamps[index]):,.1f} s: stamps of {frame} "
+        f"{before.min():,.3f} .. {before.max():,.3f} s are followed by {after.min():,.3f} .. {after.max():,.3f} s"
+    )
+
+
+def choose_run(start: float, end: float, restarts: list[tuple[float, str]]) -> tuple[float, float]:
+    """Return the longest time [s] between restarts of the clock, as it was recorded."""
+    bounds = [start, *(time for time, _ in restarts), end]
+    runs = list(zip(bounds, bounds[1:], strict=False))
+    return max(runs, key=lambda run: run[1] - run[0])

@@ -216,13 +216,13 @@ class TransformTree:
         return [line for line in lines if line]
 
     def explain(self, target: str, source: str) -> str:
-        """Say why there is no way between two frames."""
+        """Return why there is no way between two frames."""
         known = ", ".join(self.frames) or "none"
         for frame in (target, source):
             if frame not in self.frames:
                 return f"there is no frame {frame}; frames are {known}"
         tops = self.ancestors(target)[-1], self.ancestors(source)[-1]
         return (
-            f"no transform connects {target} and {source}: {target} hangs below {tops[0]}, {source} below {tops[1]}, "
-            f"and nothing says where {tops[1]} is in {tops[0]}; frames are {known}"
+            f"no transform connects {target} and {source}: {target} is in the tree of {tops[0]}, {source} in that of "
+            f"{tops[1]}, and nothing places {tops[1]} in {tops[0]}; frames are {known}"
         )
