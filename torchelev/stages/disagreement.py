@@ -1,4 +1,4 @@
-"""Sensors or poses that contradict each other in height: no cell is more certain than they agree."""
+"""By how much sensors, or successive scans, disagree in height; the variance of every cell covers it."""
 
 from __future__ import annotations
 
