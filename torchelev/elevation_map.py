@@ -326,9 +326,9 @@ class ElevationMap(ReadableMap):
         """
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         feet = checks.check_feet(feet, self.num_envs, self.device, self.check_values)
-        state = initialize(self.measured_state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
         self._derived.clear()
-        with torch.no_grad():
+        with torch.no_grad(), relative_variance(self.state):
+            state = initialize(self.measured_state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
             write(self.state, rate_surface(state, self.cfg, self._weights))
 
     def initialize_from(
@@ -359,9 +359,10 @@ class ElevationMap(ReadableMap):
         if T_map_base is not None:
             shape = (self.num_envs, 4, 4)
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
-        state = site.give(self, T_map_base, self._choose(*self._check_choice(env_ids, mask)))
+        chosen = self._choose(*self._check_choice(env_ids, mask))
         self._derived.clear()
-        with torch.no_grad():
+        with torch.no_grad(), relative_variance(self.state):
+            state = site.give(self, T_map_base, chosen)
             write(self.state, rate_surface(state, self.cfg, self._weights))
 
     # Diagnosis ------------------------------------------------------------------------------------------------------

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from torchelev.config import ElevationMapConfig, differing_fields
 from torchelev.errors import require
 from torchelev.grid import cell_centers, window_center
-from torchelev.state import MapState, Statistics, blank_state, map_layers
+from torchelev.state import CARRIED, MapState, Statistics, blank_state, map_layers
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 _LAYERS = MapState._fields[:-1]
 _STATISTICS = tuple(f"last_{name}" for name in Statistics._fields)
+_CARRIED = tuple(f"last_{name}" for name in CARRIED)
 
 
 def name_tensors(state: MapState) -> dict[str, Tensor]:
@@ -55,7 +56,7 @@ class MapBuffers(nn.Module):
         with torch.inference_mode(False):  # an inference tensor could not be written outside of that mode
             state = blank_state(cfg.grid, num_envs, device, torch.float32)
         for name, value in name_tensors(state).items():
-            self.register_buffer(name, value, persistent=name not in _STATISTICS)
+            self.register_buffer(name, value, persistent=name not in _STATISTICS or name in _CARRIED)
 
     @property
     def device(self) -> torch.device:
@@ -118,7 +119,7 @@ class MapBuffers(nn.Module):
         fields = [name for name in fields if not name.startswith(ignored)]
         hint = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", hint)
-        for name in ("pose_covariance", "elapsed"):  # absent from older checkpoints
+        for name in ("pose_covariance", "elapsed", *_CARRIED):  # absent from older checkpoints
             state_dict.setdefault(f"{prefix}{name}", torch.zeros_like(self.get_buffer(name)))
         self._forget_derived()
         super()._load_from_state_dict(state_dict, prefix, *args)

@@ -14,7 +14,7 @@ from torchelev.stages.measure import measure
 from torchelev.stages.overlap.clear import clear_other_floors
 from torchelev.stages.recenter import recenter
 from torchelev.stages.visibility.clean_up import clear_seen_through
-from torchelev.state import MapState, Measurement, map_layers, tally
+from torchelev.state import CARRIED, MapState, Measurement, map_layers, tally
 from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all
 from torchelev.traversability.planes import rate_planes
 from torchelev.traversability.weight_file import Weights
@@ -54,10 +54,9 @@ def rate_surface(
 
 
 def reset_statistics(state: MapState, m: Measurement) -> MapState:
-    """Set the statistics to zero, and to what the sensor's gates rejected; keep those that drift compensation reads."""
+    """Set the statistics to zero, and to what the sensor's gates rejected; keep those that the next update reads."""
     gates = ("rejected_invalid", "rejected_range", "rejected_body", "rejected_overhang")
-    kept = ("drift_correction", "disagreement")
-    zeros = {n: torch.zeros_like(value) for n, value in state.statistics._asdict().items() if n not in kept}
+    zeros = {n: torch.zeros_like(value) for n, value in state.statistics._asdict().items() if n not in CARRIED}
     return tally(state, **(zeros | {name: getattr(m, name) for name in gates}))
 
 

@@ -22,6 +22,7 @@ from torchelev.stages.complete import (
     make_completion_net,
     write_back,
 )
+from torchelev.stages.disagreement import without_disagreement
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
 from torchelev.traversability.net import Rating, TraversabilityNet
@@ -165,6 +166,7 @@ class ReadableMap(MapBuffers):
         state, cfg = self.state if state is None else state, self.cfg.traversability
         require(cfg is not None, "cfg.traversability", "must not be None", None, "give a TraversabilityConfig")
         if isinstance(cfg, LearnedTraversabilityConfig) and self._weights is not None:
+            state = state._replace(variance=without_disagreement(state))  # as updates rate
             return learned_rating(state, self.cfg.grid, cfg, self._weights)
         rated = rate_surface(state, self.cfg)
         return Rating(rated.traversability, rated.rated.to(rated.traversability.dtype))

@@ -83,6 +83,7 @@ class Measurement(NamedTuple):
 
 LAYERS = MapState._fields[4:-1]  # (B, H, W)
 MASKS = ("validity", "bounded", "has_normal", "rated")  # layers that are true or false
+CARRIED = ("drift_correction", "disagreement")  # statistics that the next update reads
 # What an unknown cell holds, by layer; everything else is zero.
 BLANK = {"variance": 1.0}
 

@@ -27,10 +27,11 @@ def test_sensors_that_agree_are_passed_over():
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("drift", [0.0, 0.01])
-def test_noise_and_drift_of_poses_are_passed_over(seed, drift):
+@pytest.mark.parametrize("noise, drift", [(0.015, 0.0), (0.015, 0.01), (0.01, 0.03)])
+def test_noise_and_drift_of_poses_are_passed_over(seed, noise, drift):
     emap = ElevationMap(ElevationMapConfig(grid=GRID))
-    noise = 0.015 * torch.randn(40, generator=torch.Generator().manual_seed(seed))
+    noises = noise * torch.randn(40, generator=torch.Generator().manual_seed(seed))
     for k, points in enumerate(clouds(0.0, count=1, num_scans=40)):
-        emap.update(points[:, 0] + torch.tensor([0.0, 0.0, drift * k + float(noise[k])]), T, T, dt=0.1)
-    assert emap.diagnose() == []
+        emap.update(points[:, 0] + torch.tensor([0.0, 0.0, drift * k + float(noises[k])]), T, T, dt=0.1)
+        if k in (12, 17, 24, 39):
+            assert emap.diagnose() == []

@@ -1,10 +1,15 @@
 """Sensors that disagree in height: the variance covers it, and heights are fused as if nothing were added."""
 
+import contextlib
+import copy
+
+import numpy as np
 import pytest
 import torch
 
 from tests.helpers import snapshot
-from torchelev import DriftConfig, ElevationMap, ElevationMapConfig, GridConfig
+from torchelev import DriftConfig, ElevationMap, ElevationMapConfig, GridConfig, LearnedTraversabilityConfig
+from torchelev.io.map_file import load_map, save_map
 
 GRID = GridConfig(resolution=0.05, length_x=4.0, length_y=4.0)
 T = torch.eye(4, dtype=torch.float64)[None]
@@ -84,9 +89,7 @@ def test_noise_of_the_poses_is_estimated_and_steady_drift_is_none():
 def test_heights_are_those_of_relative_variances(monkeypatch):
     """What is added to the variance on the way out is taken off on the way in."""
     emap = in_turns(clouds(0.05, num_scans=6))
-    monkeypatch.setattr(
-        "torchelev.elevation_map.relative_variance", lambda state: __import__("contextlib").nullcontext()
-    )
+    monkeypatch.setattr("torchelev.elevation_map.relative_variance", contextlib.nullcontext)
     plain = in_turns(clouds(0.05, num_scans=6))
     torch.testing.assert_close(emap.elevation, plain.elevation, atol=1e-6, rtol=0)
     added = emap.variance - plain.variance
@@ -111,3 +114,46 @@ def test_a_drift_that_is_not_corrected_leaves_it_as_it_was():
     emap.update(torch.full((1, 1, 3), torch.nan), T, T, dt=0.1)
     assert torch.equal(emap.statistics.disagreement, before)
     assert DriftConfig().min_points > 1
+
+
+def updated(emap, points):
+    emap.update(points, T[:, None].repeat(1, points.shape[1], 1, 1), T, dt=0.1)
+    return emap.variance.clone()
+
+
+def test_a_checkpoint_goes_on_as_its_map():
+    """Loaded where nothing, or something else, disagrees."""
+    *scans, last = clouds(0.05, num_scans=4)
+    emap = in_one_call(scans)
+    checkpoint = copy.deepcopy(emap.state_dict())
+    expected = updated(emap, last)
+    for other in (ElevationMap(emap.cfg), in_one_call(clouds(0.1, num_scans=3))):
+        other.load_state_dict(checkpoint)
+        assert torch.equal(updated(other, last), expected)
+
+
+def test_checkpoints_and_files_from_before_disagree_by_nothing(tmp_path):
+    emap = in_one_call(clouds(0.0, num_scans=2))
+    checkpoint = {name: value for name, value in emap.state_dict().items() if not name.startswith("last_")}
+    other = in_one_call(clouds(0.05, num_scans=2))
+    other.load_state_dict(checkpoint)
+    assert float(other.statistics.disagreement) == 0.0
+    save_map(tmp_path / "new.npz", emap)
+    with np.load(tmp_path / "new.npz") as file:
+        np.savez(tmp_path / "old.npz", **{name: file[name] for name in file.files if name != "last_disagreement"})
+    loaded = load_map(tmp_path / "old.npz")
+    assert float(loaded.statistics.disagreement) == 0.0 and torch.equal(loaded.variance, emap.variance)
+
+
+def test_cells_that_feet_initialise_get_the_disagreement_too():
+    emap = in_one_call(p[..., p[0, 0, :, 0] < 0, :] for p in clouds(0.05, count=2, num_scans=2))
+    unknown = ~emap.validity
+    emap.initialize(torch.tensor([[[1.0, 1.0, -0.6]]]), "nearest")
+    expected = emap.cfg.fusion.max_variance + float(emap.statistics.disagreement) ** 2
+    torch.testing.assert_close(emap.variance[unknown], torch.full_like(emap.variance[unknown], expected))
+
+
+def test_ratings_read_anew_are_those_of_the_update():
+    emap = in_one_call(clouds(0.05, num_scans=2), traversability=LearnedTraversabilityConfig())
+    known = emap.validity
+    torch.testing.assert_close(emap.rate().traversability[known], emap.traversability[known], atol=1e-4, rtol=0)

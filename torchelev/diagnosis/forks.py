@@ -11,7 +11,7 @@ import warnings
 
 import torch
 
-_lost_threads = 0  # of the parent, in a forked child that was not yet told
+_lost_threads = 0  # of the parent, in a forked child that has not warned yet
 
 
 @functools.cache

@@ -10,7 +10,7 @@ from torchelev.diagnosis.scan_fit import MIN_CELLS, average_cells
 
 _MIN_BIAS = 0.01  # [m]
 _MAX_SENSORS = 6  # that take turns
-_MIN_TURNS = 3  # of all sensors, that a period must rest on
+_MIN_TURNS = 5  # of all sensors, that a period must rest on
 _MIN_EXPLAINED = 0.8  # of the corrections' variance; noise of the poses leaves less than half of it to a period
 _CURE = "calibrate the heights at which they are mounted"
 
@@ -69,7 +69,7 @@ def find_alternating_corrections(seen: Evidence) -> str | None:
 
 def _repeated_heights(corrections: NDArray) -> NDArray | None:
     """Return the height [m] of each of a period's updates, from corrections (turns, period); None if none repeats."""
+    corrections = corrections - corrections.mean()  # what all of them share, such as steady drift, is no disagreement
     mean = corrections.mean(0)
     total, left = np.square(corrections).sum(), np.square(corrections - mean).sum()
-    # What all turns share, such as steady drift, is no disagreement.
-    return np.cumsum(mean - mean.mean()) if left < (1 - _MIN_EXPLAINED) * total else None
+    return np.cumsum(mean) if left < (1 - _MIN_EXPLAINED) * total else None

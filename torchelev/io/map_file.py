@@ -27,7 +27,7 @@ from torchelev.traversability.net import TraversabilityNet
 FORMAT, VERSION = "torchelev map", 2
 WHOLE = "map_"  # begins the names of the whole map's arrays in a file of save_npz, beside its layers
 _NEW_LAYERS = {"has_normal", "rated", "challenger", "challenger_support"}  # absent from version 1
-_OPTIONAL = {"pose_covariance", "elapsed"}  # absent from older files of both versions
+_OPTIONAL = {"pose_covariance", "elapsed", "last_disagreement"}  # absent from older files of both versions
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in checks.FLOATS}
 
 

@@ -1,4 +1,4 @@
-"""What a robot cannot do: step, slope and clearance of the ground, each against its own limit.
+"""Limits of the robot: step, slope and clearance of the ground, each compared with its own limit.
 
 The limits are those of the map's head: of its robot or, for an analytic head without one, its critical step and slope.
 They hold beside the ratings: ground beyond one of them is impassable, however well it is rated.
@@ -61,7 +61,7 @@ class Limits(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """What the ground of each cell asks of a robot, (B, H, W); 0 where the known cells do not tell."""
+    """Step, slope and clearance of the ground at each cell, (B, H, W); 0 where they are unknown."""
 
     step: Float[Tensor, "B H W"]  #: [m]
     slope: Float[Tensor, "B H W"]  #: [rad]

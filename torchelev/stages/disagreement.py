@@ -1,4 +1,4 @@
-"""Sensors or poses that contradict each other in height: no cell is more certain than they agree."""
+"""By how much sensors, or successive scans, disagree in height; the variance of every cell covers it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.inputs.checks import readable
+from torchelev.ops.indexing import read
 from torchelev.ops.operators import cell_sums
 from torchelev.ops.storage import stored
-from torchelev.stages.cells import cells_of
+from torchelev.stages.cells import PointCells, cells_of
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
@@ -55,28 +56,42 @@ def compare_sensors(state: MapState, m: Measurement, grid: GridConfig) -> Float[
     cells that at least two see, without the slope of the ground within a cell; 0 within the noise of these means.
     """
     cells, sensors = cells_of(state, m, grid), m.origin.shape[1]
-    x, y, z = m.points.detach().unbind(-1)
-    gx, gy = cells.take(state.gradient_x.detach(), state.gradient_y.detach())
-    inside = cells.inside.to(z.dtype)
-    level = (z * inside).sum(1, keepdim=True) / inside.sum(1, keepdim=True).clamp(min=1)
-    size = grid.resolution
-    z = z - level - gx * (x - (torch.floor(x / size) + 0.5) * size) - gy * (y - (torch.floor(y / size) + 0.5) * size)
-    columns = torch.stack([inside, inside * z]).view(2, -1, m.points.shape[1] // sensors)
-    number, moment = cell_sums(cells.slot.view(columns.shape[1:]), columns, grid.num_cells).unbind(0)
-    number, moment = (values.view(-1, sensors, grid.num_cells) for values in (number, moment))
-    seen, height = number > 0, moment / number.clamp(min=1)
-    error = height - height.sum(1, keepdim=True) / seen.sum(1, keepdim=True).clamp(min=1)
-    shared = seen & (seen.sum(1, keepdim=True) > 1) & (error.abs() <= _MAX_BIAS)
-    count = shared.sum(2)
-    bias = (error * shared).sum(2) / count.clamp(min=1)
-    counts = count >= _MIN_CELLS
-    mean = (bias * counts).sum(1, keepdim=True) / counts.sum(1, keepdim=True).clamp(min=1)
+    z, inside = _level_heights(state, m, grid, cells)
+    # Sums over cells are taken over points, of weight 1 / n in a cell with n of the sensor: these are fewer.
+    slot = cells.slot.view(len(m.origin) * sensors, -1)
+    columns = torch.stack([inside, inside * z])
+    sums = cell_sums(slot, columns.view(2, *slot.shape), grid.num_cells).unbind(0)
+    number, moment = (read(values, slot).view_as(z) for values in sums)
+    number = number.clamp(min=1)
+    weight, height = inside / number, moment / number
+    sensors_in_cell, mean = cells.take(*cells.sums(weight, weight * height))
+    error = height - mean / sensors_in_cell.clamp(min=1)
+    # Sums of weights are whole numbers up to rounding.
+    weight = weight * ((sensors_in_cell > 1.5) & (error.abs() <= _MAX_BIAS))
+    error, weight = (values.unflatten(1, (sensors, -1)) for values in (error, weight))
+    count = weight.sum(2)
+    bias = (weight * error).sum(2) / count.clamp(min=1)
+    counts = count > _MIN_CELLS - 0.5
     compared = counts.sum(1)
+    mean = (bias * counts).sum(1, keepdim=True) / compared[:, None].clamp(min=1)
     d2 = ((bias - mean).square() * counts).sum(1) / (compared - 1).clamp(min=1)
-    noise = ((error - bias[..., None]).square() * shared).sum(2) / count.clamp(min=1).square()  # of each mean
+    noise = (weight * (error - bias[..., None]).square()).sum(2) / count.clamp(min=1).square()  # of each mean
     noise = (noise * counts).sum(1) / compared.clamp(min=1)
     d = torch.where(d2 > _SIGNIFICANT**2 * noise, d2, 0.0).sqrt()
     return torch.where(compared > 1, d, state.statistics.disagreement)
+
+
+def _level_heights(state: MapState, m: Measurement, grid: GridConfig, cells: PointCells) -> tuple[Tensor, Tensor]:
+    """Return the height [m] of each point without the slope of its cell, and 1 where it measures the ground, else 0.
+
+    Heights count from the mean, so that their sums keep the precision.
+    """
+    x, y, z = m.points.detach().unbind(-1)
+    inside, size = cells.inside.to(z.dtype), grid.resolution
+    level = (z * inside).sum(1, keepdim=True) / inside.sum(1, keepdim=True).clamp(min=1)
+    gx, gy = cells.take(state.gradient_x.detach(), state.gradient_y.detach())
+    x, y = (values - (torch.floor(values / size) + 0.5) * size for values in (x, y))
+    return z - level - gx * x - gy * y, inside
 
 
 def without_disagreement(state: MapState) -> Tensor:
