@@ -14,7 +14,7 @@ from torchelev.io.folders.within_scan import SensorPath
 class ScanClock(NamedTuple):
     """When the scans and their poses were taken."""
 
-    path: SensorPath
+    path: SensorPath  #: of the sensor, by the times of its poses
     stamps: NDArray[np.float64]  #: (T,) [s] from which the times of a scan's points count
     pose_times: NDArray[np.float64]  #: (T,) [s] of the pose that a scan takes
 
