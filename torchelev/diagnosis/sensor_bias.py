@@ -52,7 +52,7 @@ def _cells_of(seen: Evidence, k: int, sensor: int) -> dict[tuple[int, int], floa
 
 
 def find_alternating_corrections(seen: Evidence) -> str | None:
-    """Find drift corrections that repeat: of sensors that take turns, each moves the map to its own height."""
+    """Find drift corrections that repeat: each of several sensors, or each phase of a gait, has its own height."""
     corrections = np.array(seen.corrections)
     for period in range(2, _MAX_SENSORS + 1):
         recent = corrections[-(len(corrections) // period) * period :]
@@ -61,8 +61,9 @@ def find_alternating_corrections(seen: Evidence) -> str | None:
         heights = _repeated_heights(recent.reshape(-1, period))
         if heights is not None and np.ptp(heights) >= _MIN_BIAS:
             return (
-                f"sensors: drift compensation moves the map by {100 * np.ptp(heights):.1f} cm and back, every {period} "
-                f"updates, as {period} sensors do that take turns and disagree in height; {_CURE}"
+                f"sensors or poses: drift compensation moves the map by {100 * np.ptp(heights):.1f} cm and back, every "
+                f"{period} updates: sensors take turns and disagree in height, or poses lag behind a robot that sways; "
+                f"{_CURE}, or take poses at the scans' time stamps"
             )
     return None
 
