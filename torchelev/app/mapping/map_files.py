@@ -47,9 +47,8 @@ def prepare_outputs(out: str, emap: ElevationMap) -> Path:
     if prefix.exists() and not prefix.is_file():
         raise ValueError(f"--out {out}: must not be a device or a pipe; give a folder or a file prefix")
     num_cells = emap.cfg.grid.height * emap.cfg.grid.width
-    state_bytes = sum(buffer.nbytes for buffer in emap.buffers()) // num_cells  # beside the layers
-    sizes = (4 * len(emap.layers) + state_bytes, 0, _MESH_BYTES)
-    for path, bytes_per_cell in zip(_add_suffixes(prefix), sizes, strict=True):
+    # The `.npz` holds the state, too; both compressed take less than the layers do uncompressed.
+    for path, bytes_per_cell in zip(_add_suffixes(prefix), (4 * len(emap.layers), 0, _MESH_BYTES), strict=True):
         require_writable(path, bytes_per_cell * num_cells)
     return prefix
 
