@@ -18,7 +18,7 @@ from torchelev.ops.moving import move_in_place
 from torchelev.pipeline import rate_surface
 from torchelev.site import SiteMap
 from torchelev.stages.fusion import on_gpu as fusion_on_gpu
-from torchelev.stages.overlap.clear import clear_other_floors
+from torchelev.stages.overlap.stage import clear_other_floors
 from torchelev.state import map_layers
 
 in_blocks = pytest.mark.parametrize("in_blocks", [False, True])  # by kernels whose blocks share memory

@@ -11,7 +11,7 @@ from tests.helpers import nans, pose, random_state, small_config, small_map
 from torchelev import GridConfig
 from torchelev.grid import cell_centers, locate
 from torchelev.stages.cells import PointCells, center_offsets, lattice_offset
-from torchelev.stages.recenter import recenter, window_corner
+from torchelev.stages.recenter.stage import recenter, window_corner
 from torchelev.state import BLANK, LAYERS, blank_state
 
 SEEDS = st.integers(0, 10_000)

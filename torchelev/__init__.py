@@ -11,13 +11,12 @@ from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
 from torchelev.robot import RobotConfig
 from torchelev.robot_body.shapes import Box, Capsule, RobotBody
-from torchelev.stages.age import AgingConfig
-from torchelev.stages.body import BodyConfig
-from torchelev.stages.compensate import DriftConfig
+from torchelev.stages.age.config import AgingConfig
+from torchelev.stages.compensate.config import DriftConfig
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
-from torchelev.stages.measure import ExclusionConfig, SensorConfig
+from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
 from torchelev.stages.overlap.config import OverlapConfig
-from torchelev.stages.surface import SurfaceConfig
+from torchelev.stages.surface.config import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.state import MapState, Measurement, Statistics
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig

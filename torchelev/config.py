@@ -12,12 +12,12 @@ from torchelev.completion.config import CompletionConfig
 from torchelev.errors import require
 from torchelev.filters.chain import FilterConfig, filters_from_list
 from torchelev.grid import GridConfig
-from torchelev.stages.age import AgingConfig
-from torchelev.stages.compensate import DriftConfig
+from torchelev.stages.age.config import AgingConfig
+from torchelev.stages.compensate.config import DriftConfig
 from torchelev.stages.fusion.config import FusionConfig
-from torchelev.stages.measure import SensorConfig
+from torchelev.stages.measure.config import SensorConfig
 from torchelev.stages.overlap.config import OverlapConfig
-from torchelev.stages.surface import SurfaceConfig
+from torchelev.stages.surface.config import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
 

@@ -31,9 +31,9 @@ from torchelev.ops.transforms import require_reverse_mode
 from torchelev.pipeline import rate_surface, update_in_place, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
-from torchelev.stages.disagreement import relative_variance, with_disagreement, without_disagreement
+from torchelev.stages.disagreement.stage import relative_variance, with_disagreement, without_disagreement
 from torchelev.stages.initialize import METHODS, Site, initialize
-from torchelev.stages.measure import measure
+from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement, forget, map_layers
 from torchelev.traversability.net import TraversabilityNet
 

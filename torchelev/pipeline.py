@@ -7,16 +7,16 @@ from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
 from torchelev.ops.masks import count
-from torchelev.stages.age import age
-from torchelev.stages.compensate import compensate
-from torchelev.stages.fusion.fuse import fuse
-from torchelev.stages.measure import measure
-from torchelev.stages.overlap.clear import clear_other_floors
-from torchelev.stages.recenter import recenter
-from torchelev.stages.visibility.clean_up import clear_seen_through
+from torchelev.stages.age.stage import age
+from torchelev.stages.compensate.stage import compensate
+from torchelev.stages.fusion.stage import fuse
+from torchelev.stages.measure.stage import measure
+from torchelev.stages.overlap.stage import clear_other_floors
+from torchelev.stages.recenter.stage import recenter
+from torchelev.stages.surface.stage import rate_planes
+from torchelev.stages.visibility.stage import clear_seen_through
 from torchelev.state import CARRIED, MapState, Measurement, map_layers, tally
 from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all
-from torchelev.traversability.planes import rate_planes
 from torchelev.traversability.weight_file import Weights
 
 

@@ -22,7 +22,7 @@ from torchelev.stages.complete import (
     make_completion_net,
     write_back,
 )
-from torchelev.stages.disagreement import without_disagreement
+from torchelev.stages.disagreement.stage import without_disagreement
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
 from torchelev.traversability.net import Rating, TraversabilityNet

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import nans, pose, random_state, scan, small_map
 from torchelev import AgingConfig, FusionConfig
-from torchelev.stages.age import age
-from torchelev.stages.measure import time_step
+from torchelev.stages.age.stage import age
+from torchelev.stages.measure.stage import time_step
 
 
 @given(st.integers(0, 10_000), st.floats(0, 5))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import pose, random_state, seen_from, small_config, small_map, terrain
 from torchelev import DriftConfig, LearnedTraversabilityConfig, SensorConfig, TraversabilityConfig
-from torchelev.stages.compensate import compensate
+from torchelev.stages.compensate.stage import compensate
 from torchelev.state import LAYERS
 
 SIGMA2 = 1e-4

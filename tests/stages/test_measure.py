@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import pose, random_poses, rotation, small_map
 from torchelev import BodyConfig, ExclusionConfig, SensorConfig, depth_to_points, voxel_filter
-from torchelev.stages.measure import above_ramp
+from torchelev.stages.measure.stage import above_ramp
 
 SEEDS = st.integers(0, 10_000)
 DTYPES = st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64])

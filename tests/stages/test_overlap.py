@@ -18,8 +18,8 @@ from torchelev import OverlapConfig
 from torchelev.compiled.update import with_masks
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.overlap import clear as stage
-from torchelev.stages.overlap.clear import clear_other_floors
-from torchelev.stages.recenter import recenter
+from torchelev.stages.overlap.stage import clear_other_floors
+from torchelev.stages.recenter.stage import recenter
 from torchelev.state import map_layers
 
 

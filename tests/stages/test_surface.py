@@ -12,7 +12,7 @@ from tests import reference
 from tests.helpers import pose, random_state, small_map
 from torchelev import SurfaceConfig
 from torchelev.pipeline import rate_surface
-from torchelev.stages.surface import fit_plane, known_ground
+from torchelev.plane_fit import fit_plane, known_ground
 
 SEEDS = st.integers(0, 10_000)
 

@@ -13,7 +13,7 @@ from tests import reference
 from tests.helpers import pose, random_state, small_config, small_map, terrain
 from torchelev import ElevationMapConfig, GridConfig, LearnedTraversabilityConfig, RobotConfig, TraversabilityConfig
 from torchelev.pipeline import rate_surface
-from torchelev.stages.surface import known_ground
+from torchelev.plane_fit import known_ground
 from torchelev.state import blank_state
 from torchelev.traversability.heads import find_steps
 

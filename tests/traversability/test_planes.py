@@ -15,7 +15,8 @@ from torchelev import GridConfig, TraversabilityConfig
 from torchelev.compiled.update import with_masks
 from torchelev.ops.storage import as_bytes
 from torchelev.ops.windows import window_moments
-from torchelev.stages.surface import SurfaceConfig, known_ground, min_spread
+from torchelev.plane_fit import known_ground, min_spread
+from torchelev.stages.surface.config import SurfaceConfig
 from torchelev.state import blank_state
 from torchelev.traversability import planes
 

@@ -18,15 +18,15 @@ from torchelev.errors import require
 from torchelev.ops.moving import gains_by_moving_in_place
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.pipeline import count_bounded, rate_surface, reset_statistics, update_in_place
-from torchelev.stages.age import age
-from torchelev.stages.compensate import compensate
+from torchelev.stages.age.stage import age
+from torchelev.stages.compensate.stage import compensate
 from torchelev.stages.fast_layers import has_one_pass
-from torchelev.stages.fusion.fuse import fuse
 from torchelev.stages.fusion.native import can_update_in_cpp
-from torchelev.stages.measure import measure
-from torchelev.stages.overlap.clear import clear_other_floors
-from torchelev.stages.recenter import recenter
-from torchelev.stages.visibility.clean_up import clear_seen_through
+from torchelev.stages.fusion.stage import fuse
+from torchelev.stages.measure.stage import measure
+from torchelev.stages.overlap.stage import clear_other_floors
+from torchelev.stages.recenter.stage import recenter
+from torchelev.stages.visibility.stage import clear_seen_through
 from torchelev.state import LAYERS, MASKS, MapState, Measurement, blank_state, map_layers
 from torchelev.traversability.weight_file import Weights
 

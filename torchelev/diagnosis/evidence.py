@@ -15,7 +15,7 @@ from torchelev.diagnosis.history import InputHistory, PastUpdate
 from torchelev.diagnosis.pose_hypotheses import explain
 from torchelev.diagnosis.scan_fit import Fit, Scan
 from torchelev.grid import cell_centers
-from torchelev.stages.measure import measure
+from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement
 
 MIN_POINTS = 20  # points that a fraction or a median must rest on

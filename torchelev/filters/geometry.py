@@ -21,7 +21,7 @@ from torchelev.filters.layer_tools import radius_cells
 from torchelev.filters.registry import register
 from torchelev.layers import Layer, normal_component
 from torchelev.ops.windows import window_moments
-from torchelev.stages.surface import Plane, fit_plane, known_ground
+from torchelev.plane_fit import Plane, fit_plane, known_ground
 
 _MIN_SQUARE = 1e-12  # smaller squares count as this one: the root's derivative is infinite at 0
 
@@ -42,7 +42,7 @@ def _plane_around(layer: Layer, resolution: float, radius: float) -> Plane:
 def slope(layer: Layer, *, resolution: float, radius: float = 0.1) -> Layer:
     """Return the inclination [rad] of the plane z = c + g_x x + g_y y around each cell: atan(sqrt(g_x^2 + g_y^2)).
 
-    At least 1e-6 rad. Unknown where the window's known cells do not span a plane (`stages.surface.spans_plane`).
+    At least 1e-6 rad. Unknown where the window's known cells do not span a plane (`plane_fit.spans_plane`).
 
     Args:
         layer: heights [m] and mask (B, H, W).

@@ -7,7 +7,7 @@ from torchelev.filters.registry import register
 from torchelev.layers import Layer
 from torchelev.ops.masks import where_finite
 from torchelev.ops.windows import window_moments
-from torchelev.stages.surface import known_ground, solve_gradient
+from torchelev.plane_fit import known_ground, solve_gradient
 
 # In units of the window's radius.
 _MIN_TRACE = 1e-6  # below it there is a single cell

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.windows import window_moments
-from torchelev.stages.surface import fit_plane, known_ground
+from torchelev.plane_fit import fit_plane, known_ground
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -48,7 +48,7 @@ def fit_planes(sums: Float[ndarray, "12 K"], prior: tuple[ndarray, ndarray] | No
     C is the scatter of the cells' x and y, c their covariance with z. The prior counts as much as one window. It
     decides where a region is a few cells or a line, and vanishes beside a region of many windows.
 
-    This is the host's twin of `stages.surface.fit_plane`, which fits one plane per cell on tensors: regions change in
+    This is the host's twin of `plane_fit.fit_plane`, which fits one plane per cell on tensors: regions change in
     size and number in every round, and each round here takes less time than a device takes to answer.
 
     Args:

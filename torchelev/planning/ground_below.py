@@ -12,10 +12,10 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.inputs.checks import FLOATS, check_tensor, readable
+from torchelev.plane_fit import solve_gradient, spans_plane
 from torchelev.planning.limits import compute_steps
 from torchelev.planning.polygons import PolygonCells, rasterize
 from torchelev.planning.standing import MAX_CELL_OFFSET, mark_standing_cells
-from torchelev.stages.surface import solve_gradient, spans_plane
 from torchelev.state import MapState
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchelev.ops.operators import padded
 from torchelev.ops.windows import shifted, window_maximum
+from torchelev.plane_fit import Ground, fit_plane, known_ground
 from torchelev.robot import RobotConfig
-from torchelev.stages.surface import Ground, fit_plane, known_ground
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig, find_steps, step_cells
 
 if TYPE_CHECKING:

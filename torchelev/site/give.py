@@ -10,7 +10,7 @@ from torch import Tensor
 from torchelev.site.fusion.entries import rise
 from torchelev.site.fusion.windows import Told, move_known
 from torchelev.stages.initialize import Remembered, recall
-from torchelev.stages.recenter import follow
+from torchelev.stages.recenter.stage import follow
 from torchelev.state import MapState
 
 if TYPE_CHECKING:

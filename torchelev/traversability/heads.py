@@ -17,8 +17,8 @@ from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.windows import shifted, window_maximum
+from torchelev.plane_fit import Ground, fit_plane
 from torchelev.robot import RobotConfig
-from torchelev.stages.surface import Ground, fit_plane
 from torchelev.state import MapState
 from torchelev.traversability.net import Rating, TraversabilityNet
 from torchelev.traversability.rate import rate

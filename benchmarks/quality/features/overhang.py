@@ -18,7 +18,8 @@ from benchmarks.quality.features.reading import (
 from benchmarks.quality.features.recordings import SimulatedRun
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
-from torchelev.stages.measure import ExclusionConfig, above_ramp
+from torchelev.stages.measure.config import ExclusionConfig
+from torchelev.stages.measure.stage import above_ramp
 
 
 def overhang_cells(recording: SimulatedRun, cfg: ElevationMapConfig) -> tuple[Figures, ElevationMap]:

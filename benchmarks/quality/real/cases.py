@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.io import Frame, Recording, open_recording, read_poses
-from torchelev.stages.measure import ExclusionConfig, above_ramp
+from torchelev.stages.measure.config import ExclusionConfig
+from torchelev.stages.measure.stage import above_ramp
 
 _ROBOT_RADIUS = 0.6  # [m] around the lidar of `offroad`, within which it sees the robot itself
 

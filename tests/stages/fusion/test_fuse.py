@@ -15,7 +15,7 @@ from tests.helpers import off_borders, pose, random_poses, random_state, scan, s
 from torchelev import EdgeConfig, FusionConfig, SensorConfig
 from torchelev.ops import indexing
 from torchelev.stages.fusion import contested
-from torchelev.stages.fusion.fuse import fuse
+from torchelev.stages.fusion.stage import fuse
 
 SEEDS = st.integers(0, 10_000)
 CELLS = (6, 5)

@@ -12,9 +12,9 @@ from tests import reference
 from tests.helpers import off_borders, pose, random_state, seen_from, small_map
 from torchelev import GridConfig, RaycastConfig, SensorConfig
 from torchelev.stages.visibility.accepted_rays import accepted_rays, has_credible_end
-from torchelev.stages.visibility.clean_up import clear_seen_through
 from torchelev.stages.visibility.polar_table import BREADTH, PolarGrid, azimuth_fraction
 from torchelev.stages.visibility.rays import sensor_rays
+from torchelev.stages.visibility.stage import clear_seen_through
 from torchelev.state import LAYERS
 
 CELLS, RESOLUTION = (40, 30), 0.1

@@ -15,10 +15,10 @@ from torchelev.native.library import find_compiler
 from torchelev.ops.storage import as_bytes, as_mask
 from torchelev.stages.fast_layers import has_one_pass, layers_of, layers_to_change
 from torchelev.stages.visibility import one_pass
-from torchelev.stages.visibility.clean_up import apply_in_one_pass as apply_and_count
-from torchelev.stages.visibility.clean_up import apply_rays, clear_seen_through
 from torchelev.stages.visibility.lowest_rays import RayBins, View
 from torchelev.stages.visibility.polar_table import PolarGrid
+from torchelev.stages.visibility.stage import apply_in_one_pass as apply_and_count
+from torchelev.stages.visibility.stage import apply_rays, clear_seen_through
 from torchelev.state import map_layers
 
 RESOLUTION = 0.1

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
 from torchelev.ops.operators import padded
 from torchelev.ops.storage import stored
 from torchelev.ops.windows import window_moments
@@ -18,16 +16,6 @@ if TYPE_CHECKING:
 
 MIN_DET = 1e-4  # [cells^4] of the covariance of places that spread in two directions
 MIN_TRACE = 1e-2  # [cells^2] of the covariance of places that spread in one
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfaceConfig:
-    """How far the plane of a normal reaches."""
-
-    radius: int = 1  #: [cells] 1: the 3 x 3 neighbours
-
-    def __post_init__(self) -> None:
-        require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
 
 
 class Ground(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,17 +10,10 @@ from torch import Tensor
 from torchelev.robot_body.own_points import find_own_points
 from torchelev.robot_body.posing import pose_body, relative_pose
 from torchelev.robot_body.shapes import RobotBody
+from torchelev.stages.measure.config import BodyConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-
-@dataclass(frozen=True, kw_only=True)
-class BodyConfig:
-    """A box in the base frame that holds the robot; points inside are the robot's own."""
-
-    lower: tuple[float, float, float] = (-0.4, -0.25, -0.2)  #: [m] x, y, z of the rear, right, lower corner
-    upper: tuple[float, float, float] = (0.4, 0.25, 0.3)  #: [m] x, y, z of the front, left, upper corner
 
 
 def rotate(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:

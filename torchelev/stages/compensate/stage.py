@@ -2,41 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE, count
 from torchelev.ops.storage import realize
 from torchelev.stages.cells import cells_of, center_offsets
-from torchelev.stages.disagreement import compare_scans, compare_sensors
+from torchelev.stages.compensate.config import DriftConfig
+from torchelev.stages.disagreement.stage import compare_scans, compare_sensors
 from torchelev.stages.pose_error import share_pose_error
 from torchelev.state import MapState, Measurement, tally
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriftConfig:
-    """Which points measure the drift, and how much of it is corrected."""
-
-    min_traversability: float | None = None  #: flat enough for a height error to mean drift; None: the head's own
-    max_variance: float = 0.01  #: [m^2] certain enough cells
-    max_error: float = 0.1  #: [m] larger errors of single points are obstacles
-    gate: float = 2.0  #: standard deviations around the mean error that still count
-    relief: float = 0.003  #: [m] standard deviation of height within a flat cell
-    min_points: int = 50  #: points that must measure the drift; raise it where few flat cells are in view
-    max_drift: float = 0.1  #: [m] a larger mean error is not corrected
-    gain: float = 1.0  #: the paper adds the whole mean error
-
-    def __post_init__(self) -> None:
-        require(0 < self.gain <= 1, "drift.gain", "must lie in (0, 1]", self.gain, "the paper's value is 1")
-        gate = self.min_traversability
-        share = gate is None or (isinstance(gate, int | float) and 0 <= gate <= 1)
-        hint = "leave it out for the head's own"
-        require(share, "drift.min_traversability", "must lie in [0, 1] or be None", repr(gate), hint)
-        require(self.min_points >= 1, "drift.min_points", "must be at least 1", self.min_points, "give 50")
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

@@ -20,7 +20,8 @@ from torchelev.ops.define import operator
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.native import run
 from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.stages.surface import MIN_DET, MIN_TRACE, Normals, SurfaceConfig, known_ground, min_spread, normals
+from torchelev.plane_fit import MIN_DET, MIN_TRACE, Normals, known_ground, min_spread, normals
+from torchelev.stages.surface.config import SurfaceConfig
 from torchelev.state import MASKS, MapState
 from torchelev.traversability.heads import Critical, PlaneRating, TraversabilityConfig, step_cells, traversability
 

@@ -2,63 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.inputs.checks import FARTHEST
 from torchelev.ops.masks import count
 from torchelev.ops.storage import stored
 from torchelev.robot_body.shapes import RobotBody
-from torchelev.stages.body import BodyConfig, inside_body, on_robot, rotate
+from torchelev.stages.measure.body import inside_body, on_robot, rotate
+from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
 from torchelev.stages.pose_error import project_covariance
 from torchelev.state import Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExclusionConfig:
-    """The ramp of the paper's Fig. 3: points above it are overhangs, not ground."""
-
-    slope: float = 0.3  #: tan(theta_a)
-    distance: float = 1.0  #: [m] b: horizontal distance at which the ramp starts to rise
-    offset: float = 0.2  #: [m] c: height above the sensor before b
-    height: float = 1.0  #: [m] d: height above the sensor that is never exceeded
-
-
-@dataclass(frozen=True, kw_only=True)
-class SensorConfig:
-    """Noise model and gates of the points."""
-
-    noise_factor: float = 1e-4  #: alpha_d: sigma_p^2 = alpha_d * d^2 + noise_floor; 1 % of the distance
-    noise_floor: float = 2.5e-5  #: [m^2] variance of a point beside the sensor: (5 mm)^2
-    min_distance: float = 0.1  #: [m] from the sensor; nearer points are ignored
-    max_distance: float = 50.0  #: [m] from the sensor; farther points are ignored
-    #: ramp above which points are overhangs; None: every point counts
-    exclusion: ExclusionConfig | None = ExclusionConfig()
-    #: the robot itself, whose points are ignored: a box in the base frame, or the shapes of its links; None: none are
-    body: BodyConfig | RobotBody | None = None
-
-    def __post_init__(self) -> None:
-        require(self.noise_factor >= 0, "sensor.noise_factor", "must not be negative", self.noise_factor, "give 1e-4")
-        require(self.noise_floor > 0, "sensor.noise_floor", "must be positive", self.noise_floor, "give 2.5e-5 m^2")
-        ordered, actual = 0 <= self.min_distance < self.max_distance, (self.min_distance, self.max_distance)
-        hint = "give 0 <= min < max in metres"
-        require(ordered, "sensor.min_distance, max_distance", "must be ordered", actual, hint)
-        is_body = self.body is None or isinstance(self.body, BodyConfig | RobotBody)
-        hint = "give a box in the base frame, or the shapes of the links"
-        require(is_body, "sensor.body", "must be a BodyConfig, a RobotBody or None", repr(self.body), hint, TypeError)
-
-    @property
-    def links(self) -> tuple[str, ...]:
-        """Names of the K links whose poses an update takes as `T_base_links`; none unless the body is a RobotBody."""
-        return self.body.links if isinstance(self.body, RobotBody) else ()
 
 
 def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[Tensor, "B M"]:

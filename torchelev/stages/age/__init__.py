@@ -1,0 +1,1 @@
+"""Process noise: certainty fades (paper, Sec. II-C)."""

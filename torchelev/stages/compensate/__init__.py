@@ -1,0 +1,1 @@
+"""Height drift compensation (paper, Sec. II-D)."""

@@ -1,0 +1,1 @@
+"""By how much sensors, or successive scans, disagree in height."""

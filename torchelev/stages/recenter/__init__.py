@@ -1,0 +1,1 @@
+"""The window follows the robot, by whole cells (paper, Sec. II)."""

@@ -1,0 +1,1 @@
+"""Normals and the analytic rating, which share their windows (paper, Sec. II-A and II-G)."""
