@@ -1,4 +1,4 @@
-"""What all tests share: hypothesis' profile, one thread, the compiler's backend, and how workers share the tests."""
+"""What all tests share: hypothesis' profile, one thread, and how workers share the tests."""
 
 import collections
 import socket
@@ -8,8 +8,6 @@ import torch
 from hypothesis import HealthCheck, Phase, settings
 
 import envs.offscreen  # noqa: F401  (before any test imports MuJoCo)
-from torchelev.compiled import compiler, kept_graphs
-from torchelev.compiled.update import graphs_of
 
 settings.register_profile(
     "torchelev",
@@ -40,21 +38,6 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-@pytest.fixture
-def compile_with(monkeypatch):
-    """Let emap.compile() use another backend of the compiler, with the guards of the real one, and keep no graph."""
-
-    def use(backend):
-        monkeypatch.setattr(compiler, "inductor", backend)
-        monkeypatch.setattr(kept_graphs, "can_keep", lambda _: False)
-        graphs_of.cache_clear()
-        torch._dynamo.reset()
-
-    yield use
-    graphs_of.cache_clear()
-    torch._dynamo.reset()
 
 
 @pytest.fixture

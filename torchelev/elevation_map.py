@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchelev import pipeline
-from torchelev.compiled.update import compile_ahead, compiled_update
 from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
@@ -25,13 +24,14 @@ from torchelev.errors import require, require_count
 from torchelev.inputs import checks
 from torchelev.inputs.chunks import make_chunks, run_in_chunks
 from torchelev.inputs.update_inputs import Inputs, check_inputs, placeholder_inputs, require_full_precision, requires_dt
+from torchelev.kernels.choose import Backend, choose
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import require_reverse_mode
-from torchelev.pipeline import rate_surface, update_in_place, write
+from torchelev.pipeline import rate, update_by_tensors, update_on_cpu, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
-from torchelev.stages.disagreement.stage import relative_variance, with_disagreement, without_disagreement
+from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement
 from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement, forget, map_layers
@@ -82,9 +82,8 @@ class ElevationMap(ReadableMap):
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
         self.pace = Pace()
         self._links = cfg.sensor.links
-        # Compiled graphs are shared by maps of equal ones.
+        # Compiled stages are shared by maps of equal ones.
         self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
-        self._compiled = False
         self._history = InputHistory()
         with torch.inference_mode(False):
             #: (B,) how often each environment was reset: what it told a site before does not count as its own
@@ -139,12 +138,13 @@ class ElevationMap(ReadableMap):
         if self.device.type == "cpu":
             keep_freed_memory(self._num_bytes)
         weights = None if self._weights is None else self._weights.detached()
-        run = compiled_update if self._compiled else update_in_place
-        run = functools.partial(run, cfg=self._update_cfg, weights=weights)
+        by_cpu = choose(self.elevation).name == "CPU"
+        run = functools.partial(update_on_cpu if by_cpu else update_by_tensors, cfg=self._update_cfg, weights=weights)
         before = self._take_out_predictions()
+        chunks = self.chunks if weights is not None or not by_cpu else [slice(0, self.num_envs)]
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
-        with torch.inference_mode(), relative_variance(self.state):
-            run_in_chunks(run, self.state, inputs, self.chunks)
+        with torch.inference_mode():
+            run_in_chunks(run, self.state, inputs, chunks)
         if before is not None:
             with torch.no_grad():
                 write(self.state, self._write_back(before, self.state))
@@ -198,9 +198,7 @@ class ElevationMap(ReadableMap):
         require(other == dtype, "measurement", f"must be of the state's dtype, {dtype}", other, hint, TypeError)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
         before, state = state, forget_completed(state) if self._writes_back else state
-        state = state._replace(variance=without_disagreement(state))
         new = pipeline.forward(state, measurement, self.cfg, self._weights)
-        new = new._replace(variance=with_disagreement(new))
         if self._writes_back:
             new = self._write_back(before, new)
         return without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))
@@ -217,25 +215,18 @@ class ElevationMap(ReadableMap):
 
     # Compiling ------------------------------------------------------------------------------------------------------
 
-    def compile(self) -> None:  # type: ignore[override]
-        """Make `update` run compiled; the first one then takes about a minute, and needs a C++ compiler.
+    @property
+    def backend(self) -> Backend:
+        """What runs `update`, and why it is not a faster backend."""
+        return choose(self.elevation)
 
-        On a CPU with torch 2.13 or later, later processes load what was compiled, in two to three seconds.
+    def compile(self) -> str:  # type: ignore[override]
+        """Build what `update` runs on, so that the first one does not; return in a sentence what that is.
 
-        Maps of equal configs share their compiled graphs, and so do clouds of any number of points. Compiled anew are
-        another number of sensors, and updates with a base pose after some without. The first two numbers of
-        environments have their own graphs, and so has the third; the fourth one's serve all others.
-
-        An update is three graphs, each of which writes its part of the state. If it is interrupted, by Ctrl-C or for
-        lack of memory, the window may have moved and the drift been compensated while the points are not fused, or the
-        points be fused while their rays have cleared nothing. The map is still sound: go on with the next cloud.
-
-        Raises:
-            RuntimeError: if torch is older than 2.10, whose compiler cannot.
+        Updates are compiled without it, too: the first one of a machine builds the C++, in about ten seconds.
         """
-        new, hint = torch.__version__ >= "2.10", "upgrade it, or leave updates uncompiled"
-        require(new, "torch", "must be 2.10 or later to compile updates", torch.__version__, hint, RuntimeError)
-        self._compiled = True
+        self.warm_up(1)
+        return str(self.backend)
 
     def warm_up(
         self,
@@ -247,13 +238,13 @@ class ElevationMap(ReadableMap):
         dtype: torch.dtype = torch.float32,
         pose_dtype: torch.dtype = torch.float64,
     ) -> None:
-        """Compile the updates to come, without touching the map, its statistics or its filtered layers.
+        """Run an update as those to come, without touching the map, its statistics or its filtered layers.
 
-        Call it after `compile`, with the sizes and dtypes that `update` will get. On a map that is not compiled, it
-        only checks its arguments.
+        What it builds and allocates, the first update then finds. Call it with the sizes and dtypes that `update` will
+        get.
 
         Args:
-            num_points: N, per sensor; all numbers from 2 on share their graphs.
+            num_points: N, per sensor.
             num_sensors: S.
             base: whether updates come with `T_map_base`.
             variance: whether updates come with `variance`.
@@ -270,11 +261,16 @@ class ElevationMap(ReadableMap):
         with torch.inference_mode(False), torch.no_grad():
             inputs = placeholder_inputs(self.num_envs, S, N, with_base=base, with_variance=variance, **kinds)
             inputs = self._check_inputs(*inputs)
-        if self._compiled:
-            ends = [chunk.indices(self.num_envs)[:2] for chunk in self.chunks]
-            sizes = dict.fromkeys(end - start for start, end in ends)  # the last chunk may be smaller
-            weights = None if self._weights is None else self._weights.detached()
-            compile_ahead(inputs, sizes, self.elevation.dtype, self._update_cfg, weights)
+        self._update_scratch(inputs)
+
+    def _update_scratch(self, inputs: Inputs) -> None:
+        """Run an update on blank maps, as large as these."""
+        weights = None if self._weights is None else self._weights.detached()
+        run = update_on_cpu if self.backend.name == "CPU" else update_by_tensors
+        run = functools.partial(run, cfg=self._update_cfg, weights=weights)
+        with torch.inference_mode():
+            blank = map_layers(torch.zeros_like, self.state)
+            run_in_chunks(run, blank, inputs, self.chunks)
 
     # Starting over --------------------------------------------------------------------------------------------------
 
@@ -327,9 +323,10 @@ class ElevationMap(ReadableMap):
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         feet = checks.check_feet(feet, self.num_envs, self.device, self.check_values)
         self._derived.clear()
-        with torch.no_grad(), relative_variance(self.state):
-            state = initialize(self.measured_state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
-            write(self.state, rate_surface(state, self.cfg, self._weights))
+        with torch.no_grad():
+            state = subtract_disagreement(self.measured_state)
+            state = initialize(state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
+            write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
 
     def initialize_from(
         self,
@@ -361,9 +358,10 @@ class ElevationMap(ReadableMap):
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
         chosen = self._choose(*self._check_choice(env_ids, mask))
         self._derived.clear()
-        with torch.no_grad(), relative_variance(self.state):
+        with torch.no_grad():
+            write(self.state, subtract_disagreement(self.state))
             state = site.give(self, T_map_base, chosen)
-            write(self.state, rate_surface(state, self.cfg, self._weights))
+            write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
 
     # Diagnosis ------------------------------------------------------------------------------------------------------
 

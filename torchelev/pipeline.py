@@ -1,56 +1,87 @@
-"""The paper's overview figure: the stages in their order."""
+"""The paper's overview figure: the stages in their order, for every backend."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
 import torch
-from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
-from torchelev.ops.masks import count
+from torchelev.inputs.update_inputs import Inputs
+from torchelev.kernels.cpu_update import CpuUpdate, as_inputs
+from torchelev.stages.age.kernel import KERNEL as AGE
 from torchelev.stages.age.stage import age
+from torchelev.stages.compensate.kernel import KERNEL as COMPENSATE
 from torchelev.stages.compensate.stage import compensate
+from torchelev.stages.disagreement.kernel import KERNEL as DISAGREEMENT
+from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement, without_disagreement
+from torchelev.stages.fusion.kernel import KERNEL as FUSION
 from torchelev.stages.fusion.stage import fuse
-from torchelev.stages.measure.stage import measure
+from torchelev.stages.measure.kernel import KERNEL as MEASURE
+from torchelev.stages.measure.stage import find_own, measure
+from torchelev.stages.overlap.kernel import KERNEL as OVERLAP
 from torchelev.stages.overlap.stage import clear_other_floors
+from torchelev.stages.recenter.kernel import KERNEL as RECENTER
 from torchelev.stages.recenter.stage import recenter
-from torchelev.stages.surface.stage import rate_planes
-from torchelev.stages.visibility.stage import clear_seen_through
-from torchelev.state import CARRIED, MapState, Measurement, map_layers, tally
-from torchelev.traversability.heads import TraversabilityConfig, learned_rating, rate_all
+from torchelev.stages.surface.kernel import KERNEL as SURFACE
+from torchelev.stages.surface.stage import rate_surface
+from torchelev.stages.visibility.kernel import KERNEL as VISIBILITY
+from torchelev.stages.visibility.stage import clear_seen_through, count_bounded
+from torchelev.state import CARRIED, MapState, Measurement, Statistics, map_layers, tally
+from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating
 from torchelev.traversability.weight_file import Weights
+
+KERNELS = (MEASURE, RECENTER, AGE, COMPENSATE, DISAGREEMENT, FUSION, VISIBILITY, OVERLAP, SURFACE)
+TENSORS = (("Statistics", Statistics, {}), ("MapState", MapState, {"statistics": "Statistics"}))
+
+
+class Stage(NamedTuple):
+    """One stage: its definition by tensors. `run_<name>` in its folder's cpu.cpp computes the same, in place."""
+
+    name: str
+    run: Callable[[MapState, Measurement, ElevationMapConfig], MapState]
+
+
+#: What an update does after `measure`: the only statement of the order. The learned head follows, see `rate_learned`.
+STAGES = (
+    Stage("reset_statistics", lambda state, m, cfg: reset_statistics(state, m)),
+    Stage("subtract_disagreement", lambda state, m, cfg: subtract_disagreement(state)),
+    Stage("recenter", lambda state, m, cfg: recenter(state, m, cfg.grid)),
+    Stage("age", lambda state, m, cfg: age(state, m, cfg.aging)),
+    Stage("compensate", lambda state, m, cfg: compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)),
+    Stage("fuse", lambda state, m, cfg: fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)),
+    Stage("clear_seen_through", lambda state, m, cfg: clear_seen_through(state, m, cfg.grid, cfg.raycast)),
+    Stage("clear_other_floors", lambda state, m, cfg: clear_other_floors(state, m, cfg.grid, cfg.overlap)),
+    Stage("count_bounded", lambda state, m, cfg: count_bounded(state)),
+    Stage("add_disagreement", lambda state, m, cfg: add_disagreement(state)),
+    Stage("rate_surface", lambda state, m, cfg: rate_surface(state, cfg.grid, cfg.surface, cfg.traversability)),
+)
 
 
 def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
     """Run the stages in their order (paper, Fig. 2). Pure: changes none of its arguments. `weights` are the head's."""
-    state = reset_statistics(state, m)
-    state = recenter(state, m, cfg.grid)
-    state = age(state, m, cfg.aging)
-    state = compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)
-    state = fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)
-    state = clear_seen_through(state, m, cfg.grid, cfg.raycast)
-    state = clear_other_floors(state, m, cfg.grid, cfg.overlap)
-    return rate_surface(count_bounded(state), cfg, weights)
+    for stage in STAGES:
+        state = stage.run(state, m, cfg)
+    return rate_learned(state, cfg, weights)
 
 
-def rate_surface(
-    state: MapState, cfg: ElevationMapConfig, weights: Weights | None = None, into: MapState | None = None
-) -> MapState:
-    """Compute normals and traversability from the elevation.
-
-    Given a state whose masks are bytes, what C++ or a kernel computes is written into its layers. The returned state
-    then has the normals and ratings from before.
-    """
+def rate_learned(state: MapState, cfg: ElevationMapConfig, weights: Weights | None) -> MapState:
+    """Rate known cells by the learned head, if that is configured; by tensors on every backend."""
     head = cfg.traversability
-    analytic = head if isinstance(head, TraversabilityConfig) else None
-    layers = rate_planes(state.elevation, state.validity, cfg.grid, cfg.surface, analytic, into)
-    state = state._replace(**layers)
-    if head is None:
-        return rate_all(state)
-    if isinstance(head, TraversabilityConfig):
+    if not isinstance(head, LearnedTraversabilityConfig):
         return state
     assert weights is not None
-    rating = learned_rating(state, cfg.grid, head, weights)
+    relative = state._replace(variance=without_disagreement(state))
+    rating = learned_rating(relative, cfg.grid, head, weights)
     return state._replace(traversability=rating.traversability, rated=state.validity)
+
+
+def rate(state: MapState, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
+    """Compute normals and traversability from the elevation."""
+    state = rate_surface(state, cfg.grid, cfg.surface, cfg.traversability)
+    return rate_learned(state, cfg, weights)
 
 
 def reset_statistics(state: MapState, m: Measurement) -> MapState:
@@ -60,30 +91,30 @@ def reset_statistics(state: MapState, m: Measurement) -> MapState:
     return tally(state, **(zeros | {name: getattr(m, name) for name in gates}))
 
 
-def count_bounded(state: MapState) -> MapState:
-    """Count the unknown cells that have an upper bound."""
-    return tally(state, cells_bounded=count(state.bounded & ~state.validity))
+# Backends -----------------------------------------------------------------------------------------------------------
 
 
-def update_in_place(
-    stored: MapState,
-    points: Tensor,
-    T_map_sensor: Tensor,
-    T_map_base: Tensor | None,
-    dt: Tensor,
-    variance: Tensor | None,
-    T_base_links: Tensor | None,
-    pose_covariance: Tensor | None = None,
-    *,
-    cfg: ElevationMapConfig,
-    weights: Weights | None = None,
-) -> None:
-    """Measure, fuse, and write the new values into the stored state's own tensors; points come as (B, S, N, 3)."""
-    inputs = points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance
+def update_by_tensors(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None) -> None:
+    """Measure, fuse, and write the new values into the stored state's own tensors."""
     m = measure(*inputs, cfg.grid, cfg.sensor, stored.elevation.dtype)
     write(stored, forward(stored, m, cfg, weights))
 
 
+def update_on_cpu(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None) -> None:
+    """Do the same in place, by one call of C++."""
+    values = inputs._asdict() | {"own": find_own(inputs, cfg.sensor)}
+    tensors = (*stored[:-1], *stored.statistics)
+    cpu_update(cfg)(("measure", *(stage.name for stage in STAGES)), tensors, as_inputs(values))
+    if isinstance(cfg.traversability, LearnedTraversabilityConfig):
+        write(stored, rate_learned(stored, cfg, weights))
+
+
+@functools.lru_cache(maxsize=64)
+def cpu_update(cfg: ElevationMapConfig) -> CpuUpdate:
+    """Return the compiled stages for a config."""
+    return CpuUpdate(KERNELS, TENSORS, cfg, ElevationMapConfig())
+
+
 def write(stored: MapState, new: MapState) -> None:
     """Copy the new values into the stored state's own tensors."""
-    map_layers(Tensor.copy_, stored, new)
+    map_layers(lambda old, value: old if value is old else old.copy_(value), stored, new)

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.operators import padded
-from torchelev.ops.storage import stored
 from torchelev.ops.windows import window_moments
 
 if TYPE_CHECKING:
@@ -83,7 +82,6 @@ def solve_gradient(
     return gu, gv
 
 
-@stored
 def spans_plane(uu: Tensor, uv: Tensor, vv: Tensor, radius: int) -> Bool[Tensor, "B H W"]:
     """Tell where the known cells of a window spread in two directions, by the covariance of their places [cells^2].
 

@@ -14,7 +14,6 @@ from torchelev.filters.chain import FilterChain
 from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer
 from torchelev.map_buffers import MapBuffers
-from torchelev.pipeline import rate_surface
 from torchelev.stages.complete import (
     COMPLETED,
     completed_layers,
@@ -23,6 +22,7 @@ from torchelev.stages.complete import (
     write_back,
 )
 from torchelev.stages.disagreement.stage import without_disagreement
+from torchelev.stages.surface.stage import rate_surface
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
 from torchelev.traversability.net import Rating, TraversabilityNet
@@ -168,7 +168,7 @@ class ReadableMap(MapBuffers):
         if isinstance(cfg, LearnedTraversabilityConfig) and self._weights is not None:
             state = state._replace(variance=without_disagreement(state))  # as updates rate
             return learned_rating(state, self.cfg.grid, cfg, self._weights)
-        rated = rate_surface(state, self.cfg)
+        rated = rate_surface(state, self.cfg.grid, self.cfg.surface, cfg)
         return Rating(rated.traversability, rated.rated.to(rated.traversability.dtype))
 
     def sample(

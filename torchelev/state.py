@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.ops.transforms import is_readable
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
 
@@ -60,7 +62,7 @@ class MapState(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """One instant's points of S sensors in the map frame, M = S * N. Made by `sensor.measure`.
+    """One instant's points of S sensors in the map frame, M = S * N. Made by `stages.measure`.
 
     Horizontal coordinates count from `anchor`, so that float32 keeps them exact far from the origin.
     """
@@ -110,7 +112,7 @@ def blank_state(grid: GridConfig, num_envs: int, device: torch.device | str, dty
 
 def forget(state: MapState, grid: GridConfig, env_ids: Tensor | None, mask: Tensor | None) -> None:
     """Make some environments of a state blank, in place: those of the ids or of the mask, or all."""
-    if mask is not None and mask.is_cpu and type(mask) is Tensor and not torch.compiler.is_compiling():
+    if mask is not None and is_readable(mask):
         env_ids, mask = mask.nonzero()[:, 0], None  # mostly few: a mask would be read for every cell of all
     for name, value in (state._asdict() | state.statistics._asdict()).items():
         if name not in ("corner", "statistics"):

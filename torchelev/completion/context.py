@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-
-from torchelev.ops.transforms import with_gradient
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -54,29 +52,9 @@ def sum_layers(
     return integral(F.pad(layers, (0, 0, 1, 0, 1, 0)))
 
 
-@torch.library.custom_op("torchelev::integral", mutates_args=())
-def _integral(layers: Tensor) -> Tensor:
-    """Sum (B, H, W, L) over all cells before each one, along both dimensions.
-
-    An operator, as torch 2.11 fails to compile running sums of float64 over one large map for a GPU.
-    """
+def integral(layers: Tensor) -> Tensor:
+    """Sum (B, H, W, L) over all cells before each one, along both dimensions."""
     return layers.cumsum(1).cumsum(2)
-
-
-@_integral.register_fake
-def _(layers: Tensor) -> Tensor:
-    return torch.empty_like(layers, memory_format=torch.contiguous_format)
-
-
-def _keep_nothing(ctx: Any, inputs: tuple, output: Tensor) -> None:
-    pass
-
-
-def _integral_backward(ctx: Any, grad: Tensor) -> Tensor:
-    return integral(grad.flip(1, 2).contiguous()).flip(1, 2)
-
-
-integral = with_gradient(_integral, _keep_nothing, _integral_backward)
 
 
 def describe(

@@ -15,7 +15,6 @@ from torchelev.filters.registry import register
 from torchelev.layers import Layer
 from torchelev.ops.masks import where_finite
 from torchelev.ops.operators import padded
-from torchelev.ops.storage import realize
 from torchelev.ops.windows import sliding_maximum
 
 if TYPE_CHECKING:
@@ -117,4 +116,4 @@ def lowest_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
 
 def highest_of_windows(rimmed: Tensor, width: int) -> Tensor:
     """Return the maxima of square windows of `width` cells: (B, H, W) -> (B, H - width + 1, W - width + 1)."""
-    return sliding_maximum(realize(sliding_maximum(rimmed, width, -2)), width, -1)
+    return sliding_maximum(sliding_maximum(rimmed, width, -2), width, -1)

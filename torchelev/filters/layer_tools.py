@@ -10,7 +10,6 @@ from torch import Tensor
 from torchelev.errors import message, require, require_positive
 from torchelev.filters import opencv
 from torchelev.layers import Layer
-from torchelev.ops.storage import as_bytes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -30,7 +29,7 @@ def as_nan(layer: Layer) -> Float[Tensor, "B H W"]:
 
 def known_weight(known: Bool[Tensor, "B H W"], dtype: torch.dtype) -> Float[Tensor, "B H W"]:
     """Return 1 where known and 0 elsewhere. On a CPU, conversion by way of bytes takes a fifth of the time."""
-    return as_bytes(known).to(dtype)
+    return known.view(torch.uint8).to(dtype)
 
 
 def radius_cells(radius: float, resolution: float) -> int:

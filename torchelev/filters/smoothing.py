@@ -16,7 +16,6 @@ from torchelev.filters.registry import register
 from torchelev.filters.sorting_network import lowest_of_windows
 from torchelev.layers import Layer
 from torchelev.ops.operators import padded
-from torchelev.ops.storage import realize
 from torchelev.ops.windows import gaussian_sum, sliding_sum
 
 if TYPE_CHECKING:
@@ -85,7 +84,7 @@ def median(layer: Layer, *, resolution: float, radius: float = 0.05) -> Layer:
     rimmed = padded(-with_blanks(-values, known), radius, -blank(values.dtype))
     ranked = torch.stack(lowest_of_windows(rimmed, width, width * width // 2 + 1))
     weight = padded(known_weight(known, values.dtype), radius, 0.0)
-    number = sliding_sum(realize(sliding_sum(weight, width, -2)), width, -1)
+    number = sliding_sum(sliding_sum(weight, width, -2), width, -1)
     # Unknown cells rank last, so the middle follows from the number of known ones. Halved as floats: integers are slow.
     below, above = ((0.5 * rank).to(torch.int64)[None] for rank in ((number - 1).clamp(min=0), number))
     return (0.5 * (ranked.gather(0, below) + ranked.gather(0, above)))[0], known
@@ -97,7 +96,7 @@ def _mean(layer: Layer, radius: int, sum_along: Callable[[Tensor, int], Tensor])
     weight = known_weight(known, values.dtype)
     datum = mean_of_known(values, weight)  # sums of absolute heights would cost float32 its millimetres
     both = padded(torch.cat([(values - datum) * weight, weight]), radius, 0.0)
-    total, weights = sum_along(realize(sum_along(both, -2)), -1).chunk(2)
+    total, weights = sum_along(sum_along(both, -2), -1).chunk(2)
     return total / weights.clamp(min=0.5) + datum, known
 
 

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import realize_all
-
 
 class _Step(NamedTuple):
     """One minimum or maximum. Wires hold the tensors between steps."""
@@ -104,7 +102,7 @@ def lowest_of_windows(rimmed: Tensor, width: int, keep: int) -> list[Tensor]:
     `rimmed` is (B, H + width - 1, W + width - 1).
     """
     H, W = (side - width + 1 for side in rimmed.shape[1:])
-    block = realize_all(*run(sorting(width), [rimmed.narrow(1, k, H) for k in range(width)])[:keep])
+    block = run(sorting(width), [rimmed.narrow(1, k, H) for k in range(width)])[:keep]
     result: list[Tensor] = []
     start, span = 0, 1
     while True:
@@ -117,4 +115,4 @@ def lowest_of_windows(rimmed: Tensor, width: int, keep: int) -> list[Tensor]:
             return result
         length = block[0].shape[2] - span // 2
         both = [wire.narrow(2, shift, length) for shift in (0, span // 2) for wire in block]
-        block = realize_all(*run(merging(len(block), len(block), keep), both))
+        block = run(merging(len(block), len(block), keep), both)

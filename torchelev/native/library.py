@@ -1,158 +1,21 @@
-"""The C++ libraries: built once for each machine, kept in the user's cache."""
+"""Libraries of `torchelev/native`; see `torchelev.kernels.cpu_build`."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
-import functools
-import hashlib
-import os
-import platform
-import shlex
-import shutil
-import subprocess
-import tempfile
-import time
-import warnings
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
-_SOURCES = Path(__file__).parent
-_FLAGS = "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -fPIC -shared -pthread -Wno-psabi".split()
-_UNFINISHED = "building-"  # folders of builds
-_BUILD_TIME = 300  # [s] at most
-_OFF = ("0", "off", "false", "no")
+from torchelev.kernels import cpu_build
+from torchelev.kernels.cpu_build import (  # noqa: F401
+    cache_folder,
+    call,
+    describe_processor,
+    find_compiler,
+    is_native,
+    is_switched_off,
+)
 
 
 def load(source: str, defines: Mapping[str, str]) -> ctypes.CDLL | None:
-    """Return a library, which is built if it is not in the cache.
-
-    The cache is the folder in the environment variable TORCHELEV_CACHE, else `torchelev` in the user's cache folder.
-
-    Args:
-        source: file in this folder.
-        defines: values of the constants that the source does not define.
-
-    Returns:
-        The library; None without a compiler, or with TORCHELEV_NATIVE=0 in the environment. If the compiler fails, a
-        warning says so.
-    """
-    if is_switched_off():
-        return None
-    return _load(source, tuple(sorted(defines.items())))
-
-
-def is_switched_off() -> bool:
-    """Tell whether TORCHELEV_NATIVE in the environment forbids to build anything."""
-    return os.environ.get("TORCHELEV_NATIVE", "1").lower() in _OFF
-
-
-def is_native() -> bool:
-    """Tell whether C++ is used: libraries can be built or are there, and TORCHELEV_NATIVE does not forbid it."""
-    return load("tables/tables.cpp", {}) is not None
-
-
-# As `torch.compiler.assume_constant_result` does, which would load the compiler: code that is compiled asks only once.
-is_native._dynamo_marked_constant = True  # type: ignore[attr-defined]
-
-
-@functools.cache
-def _load(source: str, defines: tuple[tuple[str, str], ...]) -> ctypes.CDLL | None:
-    flags = [*_FLAGS, *(f"-D{name}={value}" for name, value in defines)]
-    try:
-        compiler = find_compiler()
-        if compiler is None:
-            return None
-        path = cache_folder() / f"{Path(source).stem}-{_key(compiler, flags)}.so"
-        with contextlib.suppress(OSError):  # there is none, or a damaged one
-            return _open(path)
-        _build(compiler, flags, _SOURCES / source, path)
-        return _open(path)
-    except (OSError, RuntimeError, subprocess.SubprocessError) as error:  # RuntimeError: a user without a home
-        reason = getattr(error, "stderr", None) or error
-        warnings.warn(
-            f"{source} could not be built, and slower code does its work: {reason}. Set CXX to another compiler, "
-            "TORCHELEV_CACHE to a folder that can be written, or TORCHELEV_NATIVE=0 to build nothing.",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return None
-
-
-def _open(path: Path) -> ctypes.CDLL:
-    """Open a library, whose threads are those of torch's OpenMP where that is GNU's."""
-    library = ctypes.CDLL(str(path))
-    with contextlib.suppress(AttributeError):
-        library.use_team(ctypes.CDLL(None).GOMP_parallel)
-        # A forked child has none of the team's threads, and would wait for them forever.
-        os.register_at_fork(after_in_child=functools.partial(library.use_team, None))
-    return library
-
-
-def call(function: Any, *arguments: Any) -> None:
-    """Call a library's function.
-
-    Raises:
-        IndexError: it returned 1: an index is out of range.
-        MemoryError: it returned 2.
-    """
-    function.restype = ctypes.c_int
-    failure = function(*arguments)
-    if failure == 1:
-        raise IndexError(f"{function.__name__}: an index is out of range")
-    if failure:
-        raise MemoryError(f"{function.__name__} ran out of memory: give it fewer or smaller maps at a time")
-
-
-def find_compiler() -> list[str] | None:
-    """Return the C++ compiler: the command of the environment variable CXX, else the first that is found.
-
-    Raises FileNotFoundError if CXX names none.
-    """
-    chosen = shlex.split(os.environ.get("CXX", ""))
-    if chosen and not shutil.which(chosen[0]):
-        raise FileNotFoundError(f"CXX={os.environ['CXX']} is no command")
-    return chosen or next(([name] for name in ("c++", "g++", "clang++") if shutil.which(name)), None)
-
-
-def cache_folder() -> Path:
-    """Return the folder of the built libraries."""
-    chosen = os.environ.get("TORCHELEV_CACHE")
-    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchelev"
-
-
-def _remove_abandoned(cache: Path) -> None:
-    """Remove folders of builds that were killed: older than any build takes."""
-    for folder in cache.glob(f"{_UNFINISHED}*"):
-        with contextlib.suppress(OSError):
-            if time.time() - folder.stat().st_mtime > 2 * _BUILD_TIME:
-                shutil.rmtree(folder, ignore_errors=True)
-
-
-def _build(compiler: list[str], flags: list[str], source: Path, path: Path) -> None:
-    """Compile a file; the library appears whole or not at all, also if several processes build it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_abandoned(path.parent)
-    with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=path.parent) as folder:
-        built = Path(folder) / path.name
-        command = [*compiler, *flags, str(source), "-o", str(built)]
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=_BUILD_TIME)
-        os.replace(built, path)
-
-
-def _key(compiler: list[str], flags: list[str]) -> str:
-    """Return a hash of all that the library depends on: sources, flags, compiler and processor."""
-    version = subprocess.run([*compiler, "--version"], check=True, capture_output=True, timeout=60).stdout
-    parts = [version, " ".join(flags).encode(), describe_processor()]
-    parts += [path.read_bytes() for path in sorted(_SOURCES.rglob("*")) if path.suffix in (".cpp", ".h")]
-    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
-
-
-def describe_processor() -> bytes:
-    """Describe the processor, as -march=native makes code for this one."""
-    try:
-        lines = Path("/proc/cpuinfo").read_bytes().splitlines()
-    except OSError:
-        return f"{platform.machine()} {platform.processor()}".encode()
-    return b"\n".join(sorted({line for line in lines if line.startswith((b"model name", b"flags", b"Features"))}))
+    """Return a library of a source in this folder."""
+    return cpu_build.load(f"native/{source}", defines)

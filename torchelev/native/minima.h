@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cstdint>
 
-#include "tables/lower.h"
+#include "native/tables/lower.h"
 
 // Make each entry of a row the minimum of itself and the one `shift` on, all around; `start` has room for `shift`.
 inline void widen_row(float* row, int64_t width, int64_t shift, float* start) {

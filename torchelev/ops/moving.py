@@ -9,11 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.native.library import is_native
-from torchelev.ops import native, on_gpu
-from torchelev.ops.define import operator
 from torchelev.ops.indexing import read
-from torchelev.ops.storage import realize_all
+from torchelev.ops.transforms import is_readable
 
 if TYPE_CHECKING:
     from jaxtyping import Int
@@ -31,32 +28,10 @@ def move_layers(layers: dict[str, Tensor], shift: Int[Tensor, "B 2"], blank: dic
     # All masks move as the bits of one layer.
     values = [*(layers[name] for name in names), _as_bits([layers[name] for name in masks])]
     blanks = [*(blank.get(name, 0.0) for name in names), 0.0]
-    # Copying takes an eighth of the time of gathering that is not compiled, but has no gradient, and the host must know
-    # the shifts.
-    eager = not torch.compiler.is_compiling() and not torch.is_grad_enabled()
-    copies = eager and shift.shape[0] <= HOST_ENVIRONMENTS and shift.device.type == "cpu"
+    # Copying takes an eighth of the time of gathering, but has no gradient, and the host must know the shifts.
+    copies = not torch.is_grad_enabled() and shift.shape[0] <= HOST_ENVIRONMENTS and is_readable(shift)
     *values, bits = moved(values, shift, blanks) if copies else _gathered(values, shift, blanks)
     return dict(zip((*names, *masks), (*values, *_from_bits(bits, len(masks))), strict=True))
-
-
-def gains_by_moving_in_place(layer: Tensor) -> bool:
-    """Tell whether `move_in_place` beats `move_layers` in compiled code, for maps with such a layer."""
-    return is_native() if layer.is_cpu else on_gpu.gains_by_moving_in_place(layer)
-
-
-@operator("move_in_place(Tensor(a!)[] layers, Tensor shift, float[] blanks) -> ()", lambda *_: None)
-def move_in_place(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> None:
-    """Shift contiguous layers (B, H, W) by whole cells (B, 2), each environment by its own; those of 0 stay.
-
-    Layers of bytes get 0 in entering cells, whatever their blank.
-    """
-    pairs = zip(layers, blanks, strict=True)
-    blanks = [0.0 if layer.dtype in (torch.bool, torch.uint8) else blank for layer, blank in pairs]
-    if native.move_layers(layers, shift, blanks) or on_gpu.move_layers(layers, shift, blanks):
-        return
-    values = (moved if shift.is_cpu else _gathered)(layers, shift, blanks)
-    for layer, value in zip(layers, values, strict=True):
-        layer.copy_(value)
 
 
 def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
@@ -67,14 +42,10 @@ def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[
     entering = (i < 0) | (i >= H) | (j < 0) | (j >= W)
     index = i.clamp(0, H - 1) * W + j.clamp(0, W - 1)
     values = [read(layer, index) for layer in layers]
-    # Bytes become numbers here: among these, compiled code chooses so much faster that all of it takes half as long.
     blanked = [torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)]
-    return realize_all(*(value.to(layer.dtype) for value, layer in zip(blanked, layers, strict=True)))
+    return [value.to(layer.dtype) for value, layer in zip(blanked, layers, strict=True)]
 
 
-@torch.library.custom_op(
-    "torchelev::moved", mutates_args=(), schema="(Tensor[] layers, Tensor shift, float[] blanks) -> Tensor[]"
-)
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift layers (B, H, W) by whole cells (B, 2), environment by environment; the host reads the shifts."""
     H, W = layers[0].shape[1:]
@@ -86,11 +57,6 @@ def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tens
         torch.stack([F.pad(part, rim, value=blank) for part, rim in zip(layer, rims, strict=True)])
         for layer, blank in zip(layers, blanks, strict=True)
     ]
-
-
-@moved.register_fake
-def _(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
-    return [torch.empty_like(layer) for layer in layers]
 
 
 def _as_bits(masks: list[Tensor]) -> Tensor:

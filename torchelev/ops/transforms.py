@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torchelev.errors import require
 
 
 def is_transforming() -> bool:
-    """Tell whether a transform of `torch.func` runs: it wraps the tensors, whose values cannot be read then."""
+    """Return whether a transform of `torch.func` runs: it wraps the tensors, whose values cannot be read then."""
     return not torch.compiler.is_compiling() and torch._C._functorch.peek_interpreter_stack() is not None
 
 
@@ -50,21 +49,6 @@ def _is_batched(value: Tensor) -> bool:
     return False
 
 
-def with_gradient(operator: Any, keep: Callable[..., None], backward: Callable[..., Any]) -> Callable[..., Tensor]:
-    """Register the gradient of a custom operator, and return the operator such that `torch.func` takes it too.
-
-    Transforms refuse the gradients of custom operators, but not those of autograd functions.
-    """
-    operator.register_autograd(backward, setup_context=keep)
-    methods = {"forward": operator, "setup_context": keep, "backward": backward}
-    function: Any = type(
-        "Transformed", (torch.autograd.Function,), {name: staticmethod(method) for name, method in methods.items()}
-    )
-
-    def call(*arguments: Any) -> Tensor:
-        if not is_transforming():
-            return operator(*arguments)
-        batched = any(isinstance(value, Tensor) and _is_batched(value) for value in arguments)
-        return operator(*arguments) if batched else function.apply(*arguments)
-
-    return call
+def is_readable(values: Tensor) -> bool:
+    """Return whether the host may read the values without waiting: on a CPU, outside of transforms and compilers."""
+    return values.is_cpu and type(values) is Tensor and not is_transforming() and not torch.compiler.is_compiling()

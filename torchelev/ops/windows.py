@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.operators import padded
-from torchelev.ops.storage import realize_all
 
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 
@@ -64,7 +63,7 @@ def window_moments(layers: list[tuple[Tensor, int]], rim: int, radius: int) -> l
     """
     lines = [line for v, order in layers for line in _line_sums(v, rim, radius, -2, order)]
     if radius > 1:  # three values are summed anew at each reading, for less memory
-        lines = realize_all(*lines)
+        lines = lines
     orders = [order - a for _, order in layers for a in range(order + 1)]
     return [
         moment for line, order in zip(lines, orders, strict=True) for moment in _line_sums(line, rim, radius, -1, order)
@@ -75,7 +74,7 @@ def window_maximum(values: list[Tensor], rim: int, radius: int) -> list[Tensor]:
     """Return each layer's maxima over the (2 * radius + 1)^2 window around each cell; shapes as in `window_moments`."""
     for dim in (-2, -1):
         lines = ([_line(v, rim, dim, k) for k in range(-radius, radius + 1)] for v in values)
-        values = realize_all(*(functools.reduce(torch.maximum, line) for line in lines))
+        values = [functools.reduce(torch.maximum, line) for line in lines]
     return values
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.robot_body.posing import PosedBody, dot
 from torchelev.robot_body.shapes import RobotBody
 
@@ -42,7 +41,6 @@ def find_own_points(
     return min_excess <= 0
 
 
-@stored
 def _pieces_behind(x: Tensor, y: Tensor, z: Tensor, squared: Tensor, length: float) -> _Pieces:
     """Return the pieces of these points' rays that begin at the points, which lie at these squared distances."""
     distance = squared.clamp(min=_TINY).sqrt()

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.robot_body.shapes import RobotBody
 
 if TYPE_CHECKING:
@@ -56,7 +55,6 @@ def rotation_rows(quat_wxyz: tuple[float, float, float, float]) -> list[float]:
     ]
 
 
-@stored
 def relative_pose(
     T_a_sensor: Float[Tensor, "B S 4 4"], T_a_base: Float[Tensor, "B 4 4"], dtype: torch.dtype
 ) -> Float[Tensor, "B S 4 4"]:
@@ -70,7 +68,6 @@ def relative_pose(
     return torch.cat([rows, last]).movedim((0, 1), (-2, -1)).to(dtype)
 
 
-@stored
 def pose_body(
     body: RobotBody, T_sensor_base: Float[Tensor, "B S 4 4"], T_base_links: Float[Tensor, "B K 4 4"]
 ) -> PosedBody:

@@ -10,7 +10,6 @@ from torch import Tensor
 from torchelev.grid import GridConfig, locate
 from torchelev.ops.indexing import read
 from torchelev.ops.operators import cell_sums
-from torchelev.ops.storage import stored
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
@@ -33,7 +32,6 @@ class PointCells(NamedTuple):
         return [read(layer, self.slot) for layer in layers]
 
 
-@stored
 def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[Tensor, "B 2"]:
     """Return where the measurement's horizontal origin lies, seen from the window's corner [m]."""
     # A cell number fits float32 exactly only as a difference of near ones; far ones are clamped, they are outside.
@@ -41,7 +39,6 @@ def lattice_offset(state: MapState, m: Measurement, grid: GridConfig) -> Float[T
     return cells.to(m.points.dtype) * grid.resolution
 
 
-@stored
 def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[Tensor, Tensor]:
     """Return x (B, H, 1) and y (B, 1, W) of the cell centres [m], counted from the measurement's horizontal origin."""
     cells = (state.corner - m.anchor).clamp(-(2**22), 2**22).to(m.points.dtype) + 0.5
@@ -50,7 +47,6 @@ def center_offsets(state: MapState, m: Measurement, grid: GridConfig) -> tuple[T
     return (x * grid.resolution)[:, :, None], (y * grid.resolution)[:, None, :]
 
 
-@stored
 def cells_of(state: MapState, m: Measurement, grid: GridConfig) -> PointCells:
     """Find the cell of each point that measures the ground."""
     slot, inside = locate(m.points[..., 0], m.points[..., 1], lattice_offset(state, m, grid), grid)

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 
-@stored
 def project_covariance(
     relative: Float[Tensor, "B 3 M"], covariance: Float[Tensor, "B S 6 6"], dtype: torch.dtype
 ) -> Float[Tensor, "B M"]:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.ops.windows import shifted
 from torchelev.robot import RobotConfig
 from torchelev.traversability.features import Extremes, Surface, mean_of_three, squashed, taps, widened_mean
@@ -84,13 +83,11 @@ def _below_one(*squares: Tensor) -> Tensor:
     return 1 / functools.reduce(torch.mul, gates)
 
 
-@stored
 def _highest_near(extreme: Extremes) -> Tensor:
     """Return the highest ground [m] of 3 x 3 cells, far below all ground where it is not completed."""
     return extreme.near[0] - DEPTH * (1 - extreme.complete)
 
 
-@stored
 def _steepness(height: Tensor, steepest: float) -> Tensor:
     """Return the slope [m per cell] around each cell, at most `steepest`; edges beside the cell do not count.
 
@@ -146,7 +143,6 @@ def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> l
     return [step.narrow(-2, i - low[0], H).narrow(-1, j - low[1], W) for i, j in starts]
 
 
-@stored
 def _unexplained_rise(start: Tensor, end: Tensor, between: list[Tensor], explained: Tensor) -> Tensor:
     """Return the larger rise [m] of both directions between two feet, less what the slope explains."""
     return torch.maximum(_rise([start, *between, end]), _rise([end, *between[::-1], start])) - explained

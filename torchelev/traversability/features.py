@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.operators import padded
-from torchelev.ops.storage import stored
 from torchelev.ops.windows import shifted
 from torchelev.robot import RobotConfig
 from torchelev.traversability.stances import Scales
@@ -54,7 +53,6 @@ def widened_mean(values: Tensor, steps: Sequence[int]) -> Tensor:
     return values
 
 
-@stored
 def mean_of_nine(values: Tensor, step: int) -> Tensor:
     """Return the mean of 3 x 3 entries `step` apart."""
     return mean_of_three(mean_of_three(values, step, -2), step, -1)
@@ -67,7 +65,6 @@ def widened_maximum(values: Tensor, steps: Sequence[int]) -> Tensor:
     return values
 
 
-@stored
 def highest_of_nine(values: Tensor, step: int) -> Tensor:
     """Return the highest of 3 x 3 entries `step` apart."""
     for dim in (-2, -1):
@@ -115,7 +112,6 @@ def complete(
     return Surface(height, known, shares, means, hidden, unseen, noise)
 
 
-@stored
 def blend(shares: list[Tensor], means: list[Tensor]) -> list[Tensor]:
     """Return each window's mean, blended with that of the next larger one where it knows little."""
     means = list(means)
@@ -124,7 +120,6 @@ def blend(shares: list[Tensor], means: list[Tensor]) -> list[Tensor]:
     return means
 
 
-@stored
 def fill(height: Tensor, known: Tensor, mean: Tensor, bound: Tensor, is_bounded: Tensor) -> tuple[Tensor, Tensor]:
     """Fill unknown cells with the mean [m], not above their bound; return also how far below the mean it is [m]."""
     hidden = (mean - bound).clamp(min=0) * is_bounded

@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.ops.storage import realize, realize_all
 from torchelev.ops.windows import shifted
 from torchelev.robot import RobotConfig
 from torchelev.traversability.attitude import attitudes
@@ -26,19 +25,13 @@ def _condition(bias: Float[Tensor, "O"], weight: Float[Tensor, "O N"], values: l
     """Return bias + weight @ values."""
     for column, value in zip(weight.unbind(1), values, strict=True):
         bias = torch.add(bias, column, alpha=value)  # a constant of a compiled graph, where a tensor would be copied
-    return realize(bias)  # else every cell would compute it anew
+    return bias  # else every cell would compute it anew
 
 
 def _mix(
     weight: Float[Tensor, "O C"], layers: Sequence[Tensor], bias: Float[Tensor, "O"] | None = None
 ) -> Float[Tensor, "B O H W"]:
     """Return weight @ layers + bias in every cell, for C layers (B, H, W): a 1 x 1 convolution."""
-    if torch.compiler.is_compiling() and weight.device.type == "cpu" and not torch.is_grad_enabled():
-        # One pass over the layers takes a third of the time of a product of such narrow matrices.
-        pairs = [zip(row.unbind(), layers, strict=True) for row in weight.unbind()]
-        rows = [functools.reduce(torch.add, (factor * layer for factor, layer in row)) for row in pairs]
-        rows = rows if bias is None else [row + offset for row, offset in zip(rows, bias.unbind(), strict=True)]
-        return torch.stack(rows, 1)
     values = torch.stack(tuple(layers), 1)
     mixed = torch.bmm(weight.expand(len(values), -1, -1), values.flatten(2)).unflatten(2, values.shape[2:])
     return mixed if bias is None else mixed + bias[:, None, None]
@@ -46,7 +39,7 @@ def _mix(
 
 def _mix_few(weight: Float[Tensor, "O C"], values: Sequence[Tensor]) -> Float[Tensor, "B O H W"]:
     """Return what `_mix` does, without a copy of the layers: faster for few of them."""
-    columns = zip(weight.unbind(1), realize_all(*values), strict=True)
+    columns = zip(weight.unbind(1), values, strict=True)
     return functools.reduce(torch.add, (column[:, None, None] * value[:, None] for column, value in columns))
 
 

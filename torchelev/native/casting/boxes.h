@@ -1,7 +1,7 @@
 // Rays against boxes: `_distance_to_boxes` in casting.py.
 #pragma once
 
-#include "../lanes.h"
+#include "kernels/simd.h"
 
 struct Box {
     float rotation[9];  // its axes, in the frame of the rays

@@ -5,7 +5,7 @@
 #include <numeric>
 #include <vector>
 
-#include "../threads.h"
+#include "kernels/threads.h"
 #include "boxes.h"
 #include "field.h"
 

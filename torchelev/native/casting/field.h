@@ -1,7 +1,7 @@
 // Rays against a height field: tracing.py, sixteen at a time, each as far as it needs.
 #pragma once
 
-#include "../lanes.h"
+#include "kernels/simd.h"
 #include "surfaces.h"
 
 constexpr int TOP = 6;    // level of the bound of the whole tile; the blocks of level l have 2^l cells along a side

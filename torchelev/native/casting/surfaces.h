@@ -1,7 +1,7 @@
 // Where rays meet the surface of a cell: crossing.py.
 #pragma once
 
-#include "../lanes.h"
+#include "kernels/simd.h"
 
 enum Surface { BILINEAR, RISING, FALLING };  // in the order of surfaces.py
 

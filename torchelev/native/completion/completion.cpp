@@ -1,6 +1,6 @@
 // The completed maps: complete.py.
 
-#include "../threads.h"
+#include "kernels/threads.h"
 #include "predict.h"
 #include "refine.h"
 

@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "../lanes.h"
+#include "kernels/simd.h"
 #include "weights.h"
 
 constexpr int ROWS[] = {1, -1, 0, 0, 1, -1, 1, -1}, COLUMNS[] = {0, 0, 1, -1, 1, -1, -1, 1};

@@ -3,8 +3,8 @@
 #include <memory>
 #include <vector>
 
-#include "../lanes.h"
-#include "../threads.h"
+#include "kernels/simd.h"
+#include "kernels/threads.h"
 #include "points_of_thread.h"
 #include "cell.h"
 

@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <cstring>
 
-#include "../threads.h"
+#include "kernels/threads.h"
 
 namespace {
 

@@ -11,8 +11,8 @@
 #include <limits>
 #include <type_traits>
 
-#include "../lanes.h"
-#include "../threads.h"
+#include "kernels/simd.h"
+#include "kernels/threads.h"
 #include "floor.h"
 
 namespace {

@@ -6,8 +6,8 @@
 #include <memory>
 #include <utility>
 
-#include "../lanes.h"
-#include "../threads.h"
+#include "kernels/simd.h"
+#include "kernels/threads.h"
 
 // [m], RaycastConfig
 struct Settings {

@@ -8,9 +8,9 @@
 #include <utility>
 #include <vector>
 
-#include "../lanes.h"
-#include "../minima.h"
-#include "../threads.h"
+#include "kernels/simd.h"
+#include "native/minima.h"
+#include "kernels/threads.h"
 
 // Of rays from one sensor.
 struct Rays {

@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "../lanes.h"
+#include "kernels/simd.h"
 
 inline int whole_lanes(int count) { return (count + LANES - 1) / LANES * LANES; }
 

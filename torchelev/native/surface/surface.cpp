@@ -1,6 +1,6 @@
 // Normals and the analytic head's rating of maps: traversability/planes.py.
 
-#include "../threads.h"
+#include "kernels/threads.h"
 #include "planes.h"
 
 namespace {

@@ -5,8 +5,8 @@
 #include <cstdint>
 #include <vector>
 
-#include "../minima.h"
-#include "../threads.h"
+#include "native/minima.h"
+#include "kernels/threads.h"
 
 namespace {
 

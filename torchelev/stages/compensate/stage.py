@@ -7,7 +7,6 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE, count
-from torchelev.ops.storage import realize
 from torchelev.stages.cells import cells_of, center_offsets
 from torchelev.stages.compensate.config import DriftConfig
 from torchelev.stages.disagreement.stage import compare_scans, compare_sensors
@@ -47,7 +46,7 @@ def compensate(
     at_origin = state.elevation - gx * x - gy * y
     # Unsuitable cells get a height that no point is near.
     ground, gx, gy = cells.take(at_origin + NOWHERE * ~suits, gx, gy)
-    error = realize(pz - (ground + gx * px + gy * py))  # read by every sum below
+    error = pz - (ground + gx * px + gy * py)  # read by every sum below
     counts = cells.inside & (error.abs() <= cfg.max_error)
     mean = masked_mean(error, counts)
     noise = m.variance if m.noise is None else m.noise

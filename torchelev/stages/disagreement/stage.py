@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.inputs.checks import readable
 from torchelev.ops.indexing import read
 from torchelev.ops.operators import cell_sums
-from torchelev.ops.storage import stored
 from torchelev.stages.cells import PointCells, cells_of
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_SIGNIFICANT = 3.0  # standard errors
-_NEWEST = 0.2  # share of the newest scan in the running mean
-_MAX_BIAS = 0.1  # [m] from the mean of a cell; farther sensors see another side of an edge
-_MIN_CELLS = 20  # cells in which a sensor must be compared with others
-_LEAST = 1e-12  # [m^2] of a variance
+SIGNIFICANT = 3.0  # standard errors
+NEWEST = 0.2  # share of the newest scan in the running mean
+MAX_BIAS = 0.1  # [m] from the mean of a cell; farther sensors see another side of an edge
+MIN_CELLS = 20  # cells in which a sensor must be compared with others
+LEAST = 1e-12  # [m^2] of a variance
 
 
 def compare_scans(
@@ -43,12 +39,11 @@ def compare_scans(
         error_variance: [m^2] of the correction, as the noise of its points makes it; no c_k within it counts.
     """
     last, d2 = before.statistics.drift_correction, before.statistics.disagreement.square()
-    product = last * correction * (correction.square() > _SIGNIFICANT**2 * error_variance)
-    mean = (d2 - _NEWEST * (product + d2)).clamp(min=0)
+    product = last * correction * (correction.square() > SIGNIFICANT**2 * error_variance)
+    mean = (d2 - NEWEST * (product + d2)).clamp(min=0)
     return torch.where((last != 0) & (correction != 0), mean, d2).sqrt().detach()
 
 
-@stored
 def compare_sensors(state: MapState, m: Measurement, grid: GridConfig) -> Float[Tensor, "B"]:
     """Return the standard deviation [m] of the height error of each of S sensors, as the cells they share show it.
 
@@ -67,17 +62,17 @@ def compare_sensors(state: MapState, m: Measurement, grid: GridConfig) -> Float[
     sensors_in_cell, mean = cells.take(*cells.sums(weight, weight * height))
     error = height - mean / sensors_in_cell.clamp(min=1)
     # Sums of weights are whole numbers up to rounding.
-    weight = weight * ((sensors_in_cell > 1.5) & (error.abs() <= _MAX_BIAS))
+    weight = weight * ((sensors_in_cell > 1.5) & (error.abs() <= MAX_BIAS))
     error, weight = (values.unflatten(1, (sensors, -1)) for values in (error, weight))
     count = weight.sum(2)
     bias = (weight * error).sum(2) / count.clamp(min=1)
-    counts = count > _MIN_CELLS - 0.5
+    counts = count > MIN_CELLS - 0.5
     compared = counts.sum(1)
     mean = (bias * counts).sum(1, keepdim=True) / compared[:, None].clamp(min=1)
     d2 = ((bias - mean).square() * counts).sum(1) / (compared - 1).clamp(min=1)
     noise = (weight * (error - bias[..., None]).square()).sum(2) / count.clamp(min=1).square()  # of each mean
     noise = (noise * counts).sum(1) / compared.clamp(min=1)
-    d = torch.where(d2 > _SIGNIFICANT**2 * noise, d2, 0.0).sqrt()
+    d = torch.where(d2 > SIGNIFICANT**2 * noise, d2, 0.0).sqrt()
     return torch.where(compared > 1, d, state.statistics.disagreement)
 
 
@@ -96,7 +91,7 @@ def _level_heights(state: MapState, m: Measurement, grid: GridConfig, cells: Poi
 
 def without_disagreement(state: MapState) -> Tensor:
     """Return the variance (B, H, W) of each cell relative to the others, which updates compute with."""
-    return _add(state, -1.0).clamp(min=_LEAST)
+    return _add(state, -1.0).clamp(min=LEAST)
 
 
 def with_disagreement(state: MapState) -> Tensor:
@@ -108,19 +103,11 @@ def _add(state: MapState, sign: float) -> Tensor:
     return state.variance + sign * state.statistics.disagreement.square()[:, None, None] * state.validity
 
 
-@contextmanager
-def relative_variance(stored: MapState) -> Iterator[None]:
-    """Take the disagreement out of the stored variances while the block updates them, and add what it is then."""
-    if _may_disagree(stored):
-        stored.variance.copy_(without_disagreement(stored))
-    try:
-        yield
-    finally:
-        if _may_disagree(stored):
-            stored.variance.copy_(with_disagreement(stored))
+def subtract_disagreement(state: MapState) -> MapState:
+    """Make variances relative to the other cells of the map, for the stages that follow."""
+    return state._replace(variance=without_disagreement(state))
 
 
-def _may_disagree(state: MapState) -> bool:
-    """Return whether anything disagrees, or the host cannot know without waiting."""
-    disagreement = state.statistics.disagreement
-    return not readable(disagreement) or bool(disagreement.any())
+def add_disagreement(state: MapState) -> MapState:
+    """Make every variance cover by how much scans or sensors disagree, as this update knows it."""
+    return state._replace(variance=with_disagreement(state))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.consensus import Consensus
 from torchelev.stages.fusion.contested import ratio
@@ -59,7 +58,6 @@ def measure_cells(
     return cells, ignored
 
 
-@stored
 def choose_points(
     scan: ScanPoints, height: Tensor, variance: Tensor, side: Tensor, cfg: FusionConfig
 ) -> tuple[Tensor, Tensor]:

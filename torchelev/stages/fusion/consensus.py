@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.ops.indexing import SelectedCells
-from torchelev.ops.storage import stored
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.fusion.contested import NO_HEIGHT, CellHeights, ContestedCells, ratio
 from torchelev.stages.fusion.edges import side_of_step
@@ -98,7 +97,6 @@ def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: Fu
     return Consensus(height, side, trusted, number, variance, near, gate_at, SelectedCells(is_challenged))
 
 
-@stored
 def compare_with_prior(scan: ScanPoints, prior: Prior, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
     """Return which points agree with their cell's elevation, and the variance [m^2] by which it widens the gate."""
     elevation_at, variance_at = scan.cells.take(prior.elevation, prior.variance)
@@ -106,7 +104,6 @@ def compare_with_prior(scan: ScanPoints, prior: Prior, cfg: FusionConfig) -> tup
     return agrees(scan, elevation_at, gate_at, cfg), gate_at
 
 
-@stored  # or all four sums would be held as long as these two
 def trust_majority(number: Tensor, agreeing: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
     """Return the number of each cell's points, and whether its elevation is known and at least half agree with it."""
     return number.clamp(min=0), known & (2 * agreeing >= number)

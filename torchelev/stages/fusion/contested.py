@@ -75,8 +75,8 @@ class ContestedCells(SelectedCells):
         return values.index_select(-1, self.owner)
 
     def any_true(self, mask: Tensor) -> bool:
-        """Tell whether any is true; assume so in compiled code and on a GPU, where the host would have to wait."""
-        return torch.compiler.is_compiling() or not can_select(mask) or bool(mask.any())
+        """Tell whether any is true; assume so where the host would have to wait."""
+        return not can_select(mask) or bool(mask.any())
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:

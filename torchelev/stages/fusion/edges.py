@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.ops.windows import around
 from torchelev.stages.fusion.config import EdgeConfig
 
@@ -64,13 +63,11 @@ def top_of_step(points: ContestedCells, z: Tensor, cfg: EdgeConfig, rounds: int)
     return height
 
 
-@stored  # or the first round would compute it itself, and compile to other code than the others
 def levels(z: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:
     """Return the points' heights (P,) [m], and up to which heights each counts as past them."""
     return z, z + margin
 
 
-@stored
 def climb(points: ContestedCells, columns: Tensor, past: Tensor, highest: Tensor, height: Tensor) -> Tensor:
     """Move heights (K,) to the mean of the points past them, but no higher than `highest`."""
     moment, total = points.sum(columns * (past >= points.at_points(height))).unbind(0)
@@ -78,7 +75,6 @@ def climb(points: ContestedCells, columns: Tensor, past: Tensor, highest: Tensor
     return torch.where(highest >= mean, mean, height)
 
 
-@stored
 def level_reached(points: ContestedCells, reached: Tensor, number: int) -> Tensor:
     """Return the highest level (K,) that so many of a cell's points reach; `reached` (P,) is each point's level."""
     level = points.highest(reached)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
-from torchelev.ops.storage import stored
 from torchelev.stages.fusion.cell_measurement import CellMeasurement, measure_cells
 from torchelev.stages.fusion.challenge import Challenge, challenge_from_above
 from torchelev.stages.fusion.config import FusionConfig
@@ -51,7 +50,6 @@ def kalman_gain(variance: Tensor, R: Tensor, is_prior: Tensor) -> Tensor:
     return 1.0 / (1.0 + R * ratio(is_prior, variance))
 
 
-@stored
 def update_cells(
     prior: Prior,
     time: Tensor,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.storage import stored
 from torchelev.stages.fusion.cell_measurement import CellMeasurement
 from torchelev.stages.fusion.challenge import Challenge
 from torchelev.stages.fusion.config import FusionConfig
@@ -37,7 +36,6 @@ def decide_by_vote(
     return Decision(agrees, founds, takes, support)
 
 
-@stored
 def gate_cells(prior: Prior, measured: CellMeasurement, cfg: FusionConfig, relief: float) -> Bool[Tensor, "B C"]:
     """Tell where the scan's height agrees with the elevation: (z_s - h)^2 <= gate^2 (sigma_m^2 + R + relief^2)."""
     innovation = measured.height - prior.elevation
@@ -45,7 +43,6 @@ def gate_cells(prior: Prior, measured: CellMeasurement, cfg: FusionConfig, relie
     return prior.known & (measured.kept > 0) & (innovation.square() <= cfg.gate**2 * variance)
 
 
-@stored
 def take_heights(is_hit: Tensor, agrees: Tensor, is_open: Tensor) -> tuple[Tensor, Tensor]:
     """Return which cells the scan founds anew, those hit and open to it, and which take its height at all."""
     founds = is_hit & ~agrees & is_open

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.inputs.checks import FARTHEST
+from torchelev.inputs.update_inputs import Inputs
 from torchelev.ops.masks import count
-from torchelev.ops.storage import stored
 from torchelev.robot_body.shapes import RobotBody
 from torchelev.stages.measure.body import inside_body, on_robot, rotate
 from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
@@ -32,20 +32,17 @@ def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[
     return relative[..., 2] > limit
 
 
-@stored
 def anchor_of(position: Float[Tensor, "B 3"], resolution: float) -> Int[Tensor, "B 2"]:
     """Return the cell number of a position; in float64, or it is off by cells 100 km from the origin."""
     return torch.floor(position[:, :2].double() / resolution).to(torch.int64)
 
 
-@stored
 def relative_to(position: Float[Tensor, "B ... 3"], anchor: Tensor, resolution: float, dtype: torch.dtype) -> Tensor:
     """Return positions with x and y counted from the anchor cell's corner, in the map's precision."""
     corner = torch.nn.functional.pad(anchor.double() * resolution, (0, 1))
     return (position.double() - corner.view(-1, *[1] * (position.ndim - 2), 3)).to(dtype)
 
 
-@stored
 def sound_poses(
     T_map_sensor: Tensor, T_map_base: Tensor | None, T_base_links: Tensor | None
 ) -> tuple[Bool[Tensor, "B"], Tensor, Tensor | None, Tensor | None]:
@@ -109,7 +106,6 @@ class MapPoints(NamedTuple):
     position: Float[Tensor, "B 3 M"]  #: [m] from the measurement's anchor
 
 
-@stored  # with the coordinates outermost, as the stages read x, y and z apart
 def transform(points: SensorPoints, rotation: Float[Tensor, "B S 3 3"], origin: Float[Tensor, "B S 3"]) -> MapPoints:
     """Take points from their sensors' axes into the map's, p = R p_s + t (paper, Sec. II-A)."""
     relative = torch.stack(rotate(rotation, points.x, points.y, points.z), 1)
@@ -125,7 +121,6 @@ class Gates(NamedTuple):
     casts: Bool[Tensor, "B M"]  #: its ray clears and bounds cells
 
 
-@stored
 def gate_points(
     sensed: SensorPoints,
     mapped: MapPoints,
@@ -151,13 +146,11 @@ def gate_points(
     return Gates(variance, mapped.in_range & ~body & ~overhang, mapped.in_range & ~body)
 
 
-@stored
 def time_step(dt: Tensor, dtype: torch.dtype) -> Float[Tensor, "B"]:
     """Return dt [s]; no time passes where it is not finite or negative."""
     return dt.to(dtype).nan_to_num(0.0, 0.0).clamp(min=0)
 
 
-@stored
 def nan_where_unsound(base: Float[Tensor, "B 3"], sound: Bool[Tensor, "B"]) -> Float[Tensor, "B 3"]:
     """Return the base's position, NaN in environments without a sound pose: their windows stay."""
     return torch.where(sound[:, None], base, torch.nan)
@@ -191,8 +184,7 @@ def measure(
     mapped = transform(sensed, T_map_sensor[..., :3, :3].to(dtype), origin)
     own = None
     if isinstance(cfg.body, RobotBody) and T_map_base is not None and T_base_links is not None:
-        coordinates = sensed.x, sensed.y, sensed.z, sensed.distance2
-        own = on_robot(*coordinates, T_map_sensor, T_map_base, T_base_links, cfg.body)
+        own = on_links(sensed, T_map_sensor, T_map_base, T_base_links, cfg.body)
     gates = gate_points(sensed, mapped, variance, T_map_base, base, own, cfg)
     total, noise, of_position = gates.variance, None, None
     if pose_covariance is not None:
@@ -215,3 +207,23 @@ def measure(
         noise=noise,
         pose_covariance=of_position,
     )
+
+
+def on_links(
+    sensed: SensorPoints, T_map_sensor: Tensor, T_map_base: Tensor, T_base_links: Tensor, body: RobotBody
+) -> Bool[Tensor, "B S N"]:
+    """Return which points lie on the robot's links."""
+    coordinates = sensed.x, sensed.y, sensed.z, sensed.distance2
+    return on_robot(*coordinates, T_map_sensor, T_map_base, T_base_links, body)
+
+
+def find_own(inputs: Inputs, cfg: SensorConfig) -> Bool[Tensor, "B S N"] | None:
+    """Return which points of an update's inputs lie on the robot's links; None for a body without links."""
+    if not isinstance(cfg.body, RobotBody):
+        return None
+    sound, T_map_sensor, T_map_base, T_base_links = sound_poses(
+        inputs.T_map_sensor, inputs.T_map_base, inputs.T_base_links
+    )
+    assert T_map_base is not None and T_base_links is not None
+    sensed = gate_range(inputs.points.float(), None, sound, cfg)
+    return on_links(sensed, T_map_sensor, T_map_base, T_base_links, cfg.body)

@@ -10,15 +10,34 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
-from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
-from torchelev.stages.fast_layers import has_kernels, has_one_pass
 from torchelev.stages.overlap.config import OverlapConfig
-from torchelev.stages.overlap.one_pass import CHANGED, READ, STANCE, Around, Cleared, in_one_pass
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int, UInt8
+
+
+STANCE = 0.5  # [m] half the size of the ground that a robot stands on
+_LAYERS = ("elevation", "upper_bound", "time", "validity", "bounded", "challenger_support")
+
+
+class Around(NamedTuple):
+    """Where the cells lie, as seen from the robots' bases."""
+
+    x: Float[Tensor, "B H 1"]  #: [m] from the base to the cells' centres
+    y: Float[Tensor, "B 1 W"]  #: [m] from the base to the cells' centres
+    base: Float[Tensor, "B 1 1"]  #: [m] height of the base
+    part: tuple[int, int, int, int]  #: rows from, rows to, columns from, columns to that may be near; ends excluded
+
+
+class Cleared(NamedTuple):
+    """What is left of the cells."""
+
+    validity: Bool[Tensor, "B H W"]  #: see `MapState`
+    bounded: Bool[Tensor, "B H W"]  #: see `MapState`
+    challenger_support: UInt8[Tensor, "B H W"]  #: see `MapState`
+    number: Int[Tensor, "B"]  #: of cells whose heights were cleared
 
 
 class Floor(NamedTuple):
@@ -28,26 +47,20 @@ class Floor(NamedTuple):
     upper: Float[Tensor, "B 1 1"]  #: highest height of the floor
 
 
-def clear_other_floors(
-    state: MapState, m: Measurement, grid: GridConfig, cfg: OverlapConfig | None, into: MapState | None = None
-) -> MapState:
+def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: OverlapConfig | None) -> MapState:
     """Clear cells near the robot whose height differs from the robot's by more than a threshold (paper, Sec. II-F).
 
     The robot's height is its base's, z_b, or that of a low base on the same ground: min(z_b, z_g + base_height), with
     z_g from `ground_below`. So a tall robot keeps its ground. Cells hit by this scan may differ by height * (1 + d /
     radius) at distance d: a slope is no other floor. What lies below the base is no upper floor. Skipped without a base
     pose or `cfg`. A cell's upper bound goes too when it belongs to another floor. The window is centred on the base.
-    `into`: the stored state, which holds the layers of `state`, masks as bytes; in it C++ and kernels change them.
     """
     if m.base is None or cfg is None:
         return state
     x, y = center_offsets(state, m, grid)
     base = m.base[..., None, None]
     around = Around(x - base[:, 0], y - base[:, 1], base[:, 2], near_part(grid, cfg))
-    if has_one_pass(state) or has_kernels(state):
-        left = clear_in_one_pass(state, around, cfg, into)
-    else:
-        left = clear_by_tensors(state, around, cfg)
+    left = clear_near(state, around, cfg)
     support = left.challenger_support
     state = state._replace(validity=left.validity, bounded=left.bounded, challenger_support=support)
     return tally(state, cleared_other_floors=left.number)
@@ -59,11 +72,11 @@ def near_part(grid: GridConfig, cfg: OverlapConfig) -> tuple[int, int, int, int]
     return rows.start, rows.stop, columns.start, columns.stop
 
 
-def clear_by_tensors(state: MapState, around: Around, cfg: OverlapConfig) -> Cleared:
+def clear_near(state: MapState, around: Around, cfg: OverlapConfig) -> Cleared:
     """Return what is left of the cells, and how many were cleared."""
     x, y, base, part = around
     rows, columns = slice(*part[:2]), slice(*part[2:])
-    cells = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in (*READ, *CHANGED)})
+    cells = state._replace(**{name: getattr(state, name)[:, rows, columns] for name in _LAYERS})
     square = x[:, rows].square() + y[:, :, columns].square()  # [m^2] of the distance
     near = square <= cfg.radius**2
     height, hit = (cells.elevation - base).detach(), cells.validity & (cells.time == 0)
@@ -80,9 +93,6 @@ def clear_by_tensors(state: MapState, around: Around, cfg: OverlapConfig) -> Cle
     )
 
 
-clear_in_one_pass = in_one_pass(clear_by_tensors)
-
-
 def middle(size: int, radius: float) -> slice:
     """Return which of so many cells along a side may lie within a radius [cells] of the window's centre."""
     half = math.ceil(min(radius, size)) + 1
@@ -97,7 +107,6 @@ def put_back(layer: Tensor, part: Tensor, rows: slice, columns: slice) -> Tensor
     return layer.slice_scatter(strip, 1, rows.start, rows.stop)
 
 
-@stored
 def clear(state: MapState, cells: Bool[Tensor, "B H W"], bounds: Bool[Tensor, "B H W"]) -> MapState:
     """Forget the heights and bounds of some cells, and the bounds alone of others."""
     return state._replace(

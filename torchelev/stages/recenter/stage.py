@@ -8,21 +8,20 @@ import torch
 from torch import Tensor
 
 from torchelev.grid import GridConfig
-from torchelev.ops.moving import move_in_place, move_layers
-from torchelev.ops.storage import stored
+from torchelev.ops.moving import move_layers
 from torchelev.state import BLANK, LAYERS, MapState, Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
-def recenter(state: MapState, m: Measurement, grid: GridConfig, in_place: bool = False) -> MapState:
+def recenter(state: MapState, m: Measurement, grid: GridConfig) -> MapState:
     """Move the window by whole cells so that it follows the robot (paper, Sec. II: a robot-centric map).
 
     World-fixed cells keep their value to the bit, entering cells are blank. Environments move independently.
-    Without a base pose the window stays. `in_place`: the layers move in their own memory.
+    Without a base pose the window stays.
     """
-    return state if m.base is None else follow(state, m.base, m.anchor, grid, in_place)
+    return state if m.base is None else follow(state, m.base, m.anchor, grid)
 
 
 def follow(
@@ -30,21 +29,16 @@ def follow(
     base: Float[Tensor, "B 3"],
     anchor: Int[Tensor, "B 2"],
     grid: GridConfig,
-    in_place: bool = False,
 ) -> MapState:
     """Move the windows by whole cells to `base` [m], whose x, y count from cell `anchor`; not where it is NaN."""
     moves = torch.isfinite(base).all(1)
     corner, shift = move_corner(state, base, anchor, moves, grid)
     layers: dict[str, Any] = {name: getattr(state, name) for name in LAYERS}
-    if in_place:
-        move_in_place(list(layers.values()), shift, [BLANK.get(name, 0.0) for name in layers])
-    else:
-        layers = move_layers(layers, shift, BLANK)
+    layers = move_layers(layers, shift, BLANK)
     base_height = torch.where(moves, base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **layers)
 
 
-@stored
 def move_corner(
     state: MapState, base: Float[Tensor, "B 3"], anchor: Int[Tensor, "B 2"], moves: Bool[Tensor, "B"], grid: GridConfig
 ) -> tuple[Int[Tensor, "B 2"], Int[Tensor, "B 2"]]:

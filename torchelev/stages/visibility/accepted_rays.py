@@ -12,7 +12,6 @@ from torch import Tensor
 from torchelev.grid import GridConfig, locate
 from torchelev.ops.indexing import read
 from torchelev.ops.masks import NOWHERE
-from torchelev.ops.storage import stored
 from torchelev.ops.windows import neighbours, sliding_minimum
 from torchelev.stages.cells import lattice_offset
 from torchelev.stages.visibility.horizon import horizon
@@ -62,7 +61,6 @@ def has_credible_end(
     return end.inside & (over | low) | rays.overhang, torch.where(low & ~rays.overhang, raised, rays.slope)
 
 
-@stored
 def supported_ground(state: MapState, cfg: RaycastConfig, resolution: float) -> Float[Tensor, "B H W"]:
     """Return the elevation [m] of well supported cells, NOWHERE higher elsewhere."""
     return state.elevation + NOWHERE * ~well_supported(state, cfg, resolution)
@@ -108,7 +106,6 @@ def ground_at_borders(ground: Tensor, grid: GridConfig) -> Float[Tensor, "B 4L"]
     return sliding_minimum(border_minima(ground, cells, grid), 2 * cells + 1, 2).flatten(1)
 
 
-@stored
 def border_minima(ground: Tensor, cells: int, grid: GridConfig) -> Float[Tensor, "B 4 L+2*cells"]:
     """Return the lowest ground [m] within so many cells of each border, NOWHERE for so many cells beyond its ends."""
     rows, columns = (ground[:, :cells], ground[:, -cells:]), (ground[:, :, :cells], ground[:, :, -cells:])

@@ -8,27 +8,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.grid import GridConfig, grid_of, locate
-from torchelev.native.library import load
-from torchelev.ops.define import operator
+from torchelev.grid import GridConfig, locate
 from torchelev.ops.indexing import read
-from torchelev.ops.masks import NOWHERE
-from torchelev.ops.native import run
 from torchelev.ops.operators import running_minimum
-from torchelev.ops.storage import as_bytes, as_mask, stored
 from torchelev.stages.cells import lattice_offset
-from torchelev.stages.fast_layers import has_one_pass
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.polar_table import PolarGrid, flat
 from torchelev.stages.visibility.rays import Rays, height_margin
-from torchelev.state import MapState, Measurement, partial_state
+from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
-_CONSTANTS = {"NO_FALL": f"{NO_FALL!r}f", "NOWHERE": f"{NOWHERE!r}f"}
-_LARGEST = 2**30  # bins of a table, as they are counted in 32 bits
 
 
 class SeenRays(NamedTuple):
@@ -63,13 +55,9 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
     polar = PolarGrid.of(grid, cfg)
     ranges, ways = 8 * (polar.ranges // 16 + 1), directions(polar.azimuths // 2, rays.r)
     seen = SeenRays(rays.r, rays.azimuth, rays.origin, lattice_offset(state, m, grid))
-    if not has_one_pass(state):
-        return limits_by_tensors(state, seen, ways, ranges, grid, cfg)
-    layers = [state.elevation, state.variance, state.time, as_bytes(state.validity)]
-    return _horizon(list(seen), layers, list(ways), ranges, [grid.resolution, cfg.gate, cfg.min_time])
+    return limits_by_tensors(state, seen, ways, ranges, grid, cfg)
 
 
-@stored  # or each bin of every environment would compute them anew
 def directions(number: int, like: Tensor) -> Directions:
     """Return the directions of so many azimuths."""
     angle = (torch.arange(number, device=like.device, dtype=like.dtype) + 0.5) * (2 * math.pi / number)
@@ -98,52 +86,3 @@ def limits_by_tensors(
     a = torch.floor(rays.azimuth * azimuths).clamp(max=azimuths - 1)
     limit = steepest.flatten(1).gather(1, flat(k.clamp(min=0), a, azimuths).to(torch.int64))
     return torch.where(k >= 0, limit, NO_FALL)
-
-
-def _fake(rays: list[Tensor], *_: object) -> Tensor:
-    return torch.empty_like(rays[0], memory_format=torch.contiguous_format)
-
-
-@operator("horizon(Tensor[] rays, Tensor[] layers, Tensor[] ways, int ranges, float[] settings) -> Tensor", _fake)
-def _horizon(
-    rays: list[Tensor], layers: list[Tensor], ways: list[Tensor], ranges: int, settings: list[float]
-) -> Tensor:
-    """Return what `limits_by_tensors` does, from C++ that marches along each azimuth as far as its rays reach."""
-    limits = _native(rays, layers, ways, ranges, *settings)
-    if limits is None:
-        state, grid, cfg = _described(layers, *settings)
-        limits = limits_by_tensors(state, SeenRays(*rays), Directions(*ways), ranges, grid, cfg)
-    return limits
-
-
-def _described(
-    layers: list[Tensor], resolution: float, gate: float, min_time: float
-) -> tuple[MapState, GridConfig, RaycastConfig]:
-    """Return what the operator was called for, as far as its twin asks."""
-    elevation, variance, time, validity = layers
-    state = partial_state(elevation=elevation, variance=variance, time=time, validity=as_mask(validity))
-    return state, grid_of(elevation.shape[1:], resolution), RaycastConfig(gate=gate, min_time=min_time)
-
-
-def _native(
-    rays: list[Tensor],
-    layers: list[Tensor],
-    ways: list[Tensor],
-    ranges: int,
-    resolution: float,
-    gate: float,
-    min_time: float,
-) -> Tensor | None:
-    """Return the limits; None where C++ cannot compute them."""
-    azimuths = len(ways[0])
-    if layers[0].numel() == 0 or ranges * azimuths > _LARGEST:
-        return None
-    library = load("rays/horizon.cpp", _CONSTANTS)
-    if library is None:
-        return None
-    limits = _fake(rays)
-    sizes = (*rays[0].shape, *layers[0].shape[1:], ranges, azimuths)
-    step = 2 * resolution
-    numbers = map(float, (resolution, step, (0.5 * resolution) ** 2, NO_FALL * step, gate, min_time))
-    run(library.horizon, [*rays, *layers, *ways], [limits], *sizes, *numbers)
-    return limits

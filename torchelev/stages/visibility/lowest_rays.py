@@ -15,7 +15,6 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.ops.indexing import read
 from torchelev.ops.operators import polar_minimum
-from torchelev.ops.storage import stored
 from torchelev.stages.cells import center_offsets
 from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
 from torchelev.stages.visibility.rays import Rays
@@ -90,7 +89,6 @@ def find_lowest_rays(state: MapState, view: View, table: Tensor, polar: PolarGri
     return RayOverCell(found, z_s + slope * rho, slope.abs() * grid.resolution, incidence)
 
 
-@stored
 def lowest_slope(table: Tensor, k: Tensor, azimuth: Tensor, polar: PolarGrid) -> Float[Tensor, "B H W"]:
     """Return the lowest slope in all azimuth bins that cells at range k cover; `azimuth` counts bins."""
     # Two entries, the first and the last, hold the minimum of all.

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
-from torchelev.ops.storage import stored
-from torchelev.stages.fast_layers import has_one_pass
 from torchelev.stages.visibility.accepted_rays import accepted_rays
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.lowest_rays import (
@@ -23,7 +21,6 @@ from torchelev.stages.visibility.lowest_rays import (
     lowest_slopes,
     view_from,
 )
-from torchelev.stages.visibility.one_pass import in_one_pass
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.stages.visibility.rays import height_margin, sensor_rays
 from torchelev.state import MapState, Measurement, tally
@@ -32,9 +29,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool
 
 
-def clear_seen_through(
-    state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None, into: MapState | None = None
-) -> MapState:
+def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: RaycastConfig | None) -> MapState:
     """Remove what rays passed below, and bound what no ray saw (paper, Sec. II-E and II-H).
 
     A known cell goes if a ray's height over it is below h - sigma, it was not hit for `min_time`, and |r . n| > alpha_n
@@ -42,22 +37,15 @@ def clear_seen_through(
     Eq. 4 keeps grazing rays from eroding smooth ground. It is not asked of a ray that `passes_far_below`: the last
     cells of an obstacle that left have tilted normals, and would stay forever.
     The upper bound of an unknown cell is the lowest ray height over it so far. None for `cfg`: the stage is skipped.
-    `into`: the stored state, which holds the layers of `state`, masks as bytes; in it C++ changes them.
     """
     if cfg is None:
         return state
-    polar, cleared = PolarGrid.of(grid, cfg), torch.zeros_like(state.statistics.cleared_seen_through)
+    polar, before = PolarGrid.of(grid, cfg), state.validity
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
         bins = bins_of(accepted_rays(state, m, rays, grid, cfg), polar, grid)
-        arguments = bins, view_from(state, m, rays.origin, grid), polar, grid, cfg
-        if has_one_pass(state):
-            after, number = apply_in_one_pass(state, *arguments, into)
-        else:
-            after = apply_rays(state, *arguments)
-            number = count(state.validity & ~after.validity)
-        state, cleared = after, cleared + number
-    return tally(state, cleared_seen_through=cleared)
+        state = apply_rays(state, bins, view_from(state, m, rays.origin, grid), polar, grid, cfg)
+    return tally(state, cleared_seen_through=count(before & ~state.validity))
 
 
 def apply_rays(
@@ -68,10 +56,6 @@ def apply_rays(
     return clear_and_bound(state, find_lowest_rays(state, view, table, polar, grid), grid, cfg)
 
 
-apply_in_one_pass = in_one_pass(apply_rays)
-
-
-@stored
 def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: RaycastConfig) -> MapState:
     """Apply the lowest ray of one sensor to every cell (paper, eq. 3 and 4).
 
@@ -111,3 +95,8 @@ def passes_far_below(state: MapState, depth: Tensor, grid: GridConfig, cfg: Rayc
     """
     rise = (state.gradient_x.square() + state.gradient_y.square()).sqrt() * (0.5 * grid.resolution)
     return depth > height_margin(state.variance, grid, cfg) + rise
+
+
+def count_bounded(state: MapState) -> MapState:
+    """Count the unknown cells that have an upper bound."""
+    return tally(state, cells_bounded=count(state.bounded & ~state.validity))

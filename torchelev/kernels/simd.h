@@ -1,5 +1,4 @@
-// As many numbers at a time as fit the processor's vectors, and the functions of them that compilers do not vectorise
-// alike.
+// Portable SIMD vectors: LANES numbers at a time, and functions of them that compilers do not vectorise alike.
 #pragma once
 
 #include <cstdint>

@@ -1,0 +1,100 @@
+"""C structs derived from Python declarations: tensors of a NamedTuple by address, settings by value."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+Number = bool | int | float
+Settings = Mapping[str, Number | tuple[Number, ...]]
+
+_TYPES = {"Float": "float", "Float64": "double", "Int": "int64_t", "Bool": "uint8_t", "UInt8": "uint8_t"}
+_SIZES = ("B", "H", "W", "S", "N", "K")
+_LARGEST = 2**31 - 1  # C's settings are integers of 32 bits
+
+
+class Member(NamedTuple):
+    """A tensor of a NamedTuple."""
+
+    name: str  #: of the field
+    type: str  #: of its elements in C
+    shape: tuple[str, ...]  #: sizes by name or number, the first of them B
+
+
+def members(kind: Any) -> list[Member]:
+    """Return the tensors of a NamedTuple, whose annotations are as `Float[Tensor, "B H W"] | None`."""
+    found = []
+    for name, annotation in kind.__annotations__.items():
+        text = getattr(annotation, "__forward_arg__", str(annotation))
+        match = re.match(r"(\w+)\[Tensor, ['\"]([\w ]+)['\"]\]", text)
+        if match is not None:
+            found.append(Member(name, _TYPES[match[1]], tuple(match[2].split())))
+    return found
+
+
+def tensor_struct(name: str, kind: Any, nested: Mapping[str, str] | None = None) -> str:
+    """Return a C struct of pointers to a NamedTuple's tensors of B environments, with `at(b, sizes)` for one of them.
+
+    `nested` are the structs of further fields, by field.
+    """
+    tensors, nested = members(kind), nested or {}
+    fields = [f"    {m.type}* {m.name};" for m in tensors] + [f"    {t} {field};" for field, t in nested.items()]
+    moves = [f"        if ({m.name}) one.{m.name} += b * {_stride(m)};" for m in tensors]
+    moves += [f"        one.{field} = {field}.at(b, n);" for field in nested]
+    head = f"    {name} at(int64_t b, const Sizes& n) const {{\n        {name} one = *this;"
+    lines = [f"struct {name} {{", *fields, head, *moves, "        return one;", "    }", "};", ""]
+    return "\n".join(lines)
+
+
+def _stride(member: Member) -> str:
+    sizes = [size if size.isdigit() else f"n.{size}" for size in member.shape[1:]]
+    return " * ".join(sizes) or "1"
+
+
+def sizes_struct() -> str:
+    """Return the C struct of the sizes that shapes are made of."""
+    return f"struct Sizes {{\n    int64_t {', '.join(_SIZES)};\n}};\n"
+
+
+class Double(float):
+    """A setting that C keeps in double precision."""
+
+
+def _kind(value: Any) -> tuple[str, Any]:
+    """Return the type of a setting in C, and in ctypes."""
+    if isinstance(value, Double):
+        return "double", ctypes.c_double
+    return ("float", ctypes.c_float) if isinstance(value, float) else ("int32_t", ctypes.c_int32)
+
+
+def settings_struct(name: str, settings: Settings) -> str:
+    """Return a C struct of settings: floats as float, whole numbers and truth values as int32_t, tuples as arrays."""
+    lines = []
+    for field, value in settings.items():
+        first, size = (value[0], f"[{len(value)}]") if isinstance(value, tuple) else (value, "")
+        lines.append(f"    {_kind(first)[0]} {field}{size};")
+    return "\n".join([f"struct {name} {{", *lines, "};", ""])
+
+
+def c_settings(groups: Mapping[str, Settings]) -> ctypes.Structure:
+    """Return the settings of several kernels, by name, as the C struct of their structs."""
+    parts = {name: _c_struct(settings) for name, settings in groups.items()}
+    return _structure([(name, type(part)) for name, part in parts.items()])(**parts)
+
+
+def _c_struct(settings: Settings) -> ctypes.Structure:
+    types, values = [], {}
+    for field, value in settings.items():
+        kind = _kind(value[0] if isinstance(value, tuple) else value)[1]
+        numbers = [
+            min(v, _LARGEST) if isinstance(v, int) else v for v in (value if isinstance(value, tuple) else (value,))
+        ]
+        types.append((field, kind * len(numbers) if isinstance(value, tuple) else kind))
+        values[field] = (kind * len(numbers))(*numbers) if isinstance(value, tuple) else numbers[0]
+    return _structure(types)(**values)
+
+
+def _structure(fields: list[tuple[str, Any]]) -> type[ctypes.Structure]:
+    return type("Settings", (ctypes.Structure,), {"_fields_": fields})

@@ -1,0 +1,43 @@
+"""What the compiled code of this stage needs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torchelev.kernels.registry import Kernel
+from torchelev.kernels.structs import Settings
+from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
+from torchelev.stages.fusion.config import EdgeConfig
+
+if TYPE_CHECKING:
+    from torchelev.config import ElevationMapConfig
+
+
+def settings(cfg: ElevationMapConfig) -> Settings:
+    """Return what the equations need of a config."""
+    fusion, edges = cfg.fusion, cfg.fusion.edges or EdgeConfig(margin=0.0, min_settled=0.0)
+    return dict(
+        resolution=float(cfg.grid.resolution),
+        relief=float(fusion.relief * cfg.grid.resolution),
+        gate=float(fusion.gate),
+        max_gate_std=float(fusion.max_gate_std),
+        floor=float(fusion.scan_variance_floor),
+        outlier_variance=float(fusion.outlier_variance),
+        max_support=float(fusion.max_support),
+        max_variance=float(fusion.max_variance),
+        min_above=fusion.min_above,
+        max_above_per_scan=fusion.max_above_per_scan,
+        min_challengers=MIN_CHALLENGERS,
+        has_rays=cfg.raycast is not None,
+        has_edges=fusion.edges is not None,
+        min_points=edges.min_points,
+        min_extreme=edges.min_extreme,
+        refinements=edges.refinements,
+        min_share=float(edges.min_share),
+        min_passed=float(edges.min_passed),
+        margin=float(edges.margin),
+        min_settled=float(edges.min_settled),
+    )
+
+
+KERNEL = Kernel(name="fusion", folder="stages/fusion", settings=settings)

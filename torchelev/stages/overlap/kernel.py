@@ -1,0 +1,34 @@
+"""What the compiled code of this stage needs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torchelev.kernels.registry import Kernel
+from torchelev.kernels.structs import Settings
+from torchelev.stages.overlap.config import OverlapConfig
+from torchelev.stages.overlap.stage import STANCE, near_part
+
+if TYPE_CHECKING:
+    from torchelev.config import ElevationMapConfig
+
+
+def settings(cfg: ElevationMapConfig) -> Settings:
+    """Return what the equations need of a config."""
+    overlap = cfg.overlap or OverlapConfig()
+    first_row, end_row, first_column, end_column = near_part(cfg.grid, overlap)
+    return dict(
+        radius_square=float(overlap.radius**2),
+        slope=float(overlap.height / overlap.radius),
+        height=float(overlap.height),
+        base_height=float(overlap.base_height),
+        max_base_height=float(overlap.max_base_height),
+        stance=STANCE,
+        first_row=first_row,
+        end_row=end_row,
+        first_column=first_column,
+        end_column=end_column,
+    )
+
+
+KERNEL = Kernel(name="overlap", folder="stages/overlap", settings=settings)
