@@ -6,6 +6,8 @@
 #include <initializer_list>
 #include <type_traits>
 
+#include "kernels/scalar.h"
+
 #if defined(__AVX512F__)
 constexpr int LANES = 16;
 #elif defined(__AVX__)

@@ -12,8 +12,8 @@
 // GOMP_parallel of torch's OpenMP, which calls a function on each thread of a team. Threads of our own would compete for
 // the cores with that team, whose threads spin between operations.
 typedef void (*Parallel)(void (*function)(void*), void* data, unsigned num_threads, unsigned flags);
-static Parallel team = nullptr;
-extern "C" void use_team(Parallel parallel) { team = parallel; }
+inline Parallel team = nullptr;
+extern "C" [[gnu::weak]] void use_team(Parallel parallel) { team = parallel; }
 
 // Call `run()` on `num_threads` threads, the caller included. Without a team, on at most `count`, or as many as can
 // start.

@@ -40,6 +40,9 @@ class Memory {
 
 // One map's scan, as `Measurement` in state.py: M = S * N points in map axes. `run_measure` fills it in, up to `slot`.
 struct Measurement {
+    struct {
+        int64_t finite, in_range, casts, used;
+    } counts;                       // of points that pass one gate after the other
     int64_t number, sensors;        // M, S
     int64_t anchor[2];              // cell number that x = y = 0 stands for
     bool has_base, moves;           // a base pose was given; and its window follows, as the poses are sound

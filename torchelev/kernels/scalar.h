@@ -1,0 +1,22 @@
+// The functions of simd.h for single numbers, so that an equation written once runs on vectors and on a GPU's threads.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#ifdef __CUDACC__
+#define INLINE inline __device__
+#else
+#define INLINE inline
+#endif
+
+INLINE float pick(bool flag, float yes, float no) { return flag ? yes : no; }
+INLINE float smaller(float a, float b) { return a < b ? a : b; }
+INLINE float larger(float a, float b) { return a > b ? a : b; }
+INLINE float clamp(float a, float low, float high) { return smaller(larger(a, low), high); }
+INLINE float absolute(float a) { return std::fabs(a); }
+INLINE float root(float a) { return std::sqrt(a); }
+INLINE float floor_of(float a) { return std::floor(a); }
+INLINE bool any(bool flag) { return flag; }
+template <class V> INLINE V all(float value) { return V{} + value; }
+template <class V> INLINE V square(V a) { return a * a; }
