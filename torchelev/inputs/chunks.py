@@ -26,9 +26,9 @@ def make_chunks(num_envs: int, grid: GridConfig, device: torch.device, max_envs:
 
 
 def run_in_chunks(update: Callable[..., None], state: MapState, inputs: Inputs, chunks: list[slice]) -> None:
-    """Call `update(state, *inputs)` on each chunk of the environments."""
+    """Call `update(state, inputs)` on each chunk of the environments."""
     if len(chunks) == 1:
-        return update(state, *inputs)
+        return update(state, inputs)
     for envs in chunks:
         part = map_layers(lambda layer, envs=envs: layer[envs], state)
-        update(part, *(None if value is None else value[envs] for value in inputs))
+        update(part, Inputs(*(None if value is None else value[envs] for value in inputs)))

@@ -1,3 +1,15 @@
-#include "kernels/update.h"
+// Process noise: stage.py.
 
-extern "C" void run_age(Update&) {}
+#include <cmath>
+
+#include "kernels/update.h"
+#include "stages/age/equation.h"
+
+extern "C" void run_age(Update& u) {
+    const float dt = u.measurement.dt, added = u.settings.age.variance_rate * dt;
+    *u.state.elapsed += int64_t(std::nearbyint(double(dt) * 1e9));
+    float *time = u.state.time, *variance = u.state.variance;
+    u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t k = first; k < last; k++) time[k] += dt, variance[k] = aging::grow(variance[k], added);
+    });
+}

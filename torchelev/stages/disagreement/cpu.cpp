@@ -1,4 +1,28 @@
-#include "kernels/update.h"
+// The disagreement taken out of variances, and put in again: stage.py.
 
-extern "C" void run_subtract_disagreement(Update&) {}
-extern "C" void run_add_disagreement(Update&) {}
+#include "kernels/update.h"
+#include "stages/disagreement/equation.h"
+
+namespace {
+
+// Change the variance of each cell by `change(variance, d2)`, where d2 [m^2] is 0 in unknown cells.
+template <class Change> void change_variance(Update& u, const Change& change) {
+    const float d = *u.state.statistics.disagreement, d2 = d * d;
+    if (d == 0) return;
+    const MapState& map = u.state;
+    u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t k = first; k < last; k++)
+            map.variance[k] = change(map.variance[k], map.validity[k] ? d2 : 0.0f);
+    });
+}
+
+}  // namespace
+
+extern "C" void run_subtract_disagreement(Update& u) {
+    const DisagreementSettings& s = u.settings.disagreement;
+    change_variance(u, [&](float variance, float d2) { return disagreement::without(variance, d2, s); });
+}
+
+extern "C" void run_add_disagreement(Update& u) {
+    change_variance(u, [](float variance, float d2) { return variance + d2; });
+}

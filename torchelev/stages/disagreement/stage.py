@@ -91,7 +91,7 @@ def _level_heights(state: MapState, m: Measurement, grid: GridConfig, cells: Poi
 
 def without_disagreement(state: MapState) -> Tensor:
     """Return the variance (B, H, W) of each cell relative to the others, which updates compute with."""
-    return _add(state, -1.0).clamp(min=LEAST)
+    return torch.maximum(_add(state, -1.0), state.variance.clamp(max=LEAST))
 
 
 def with_disagreement(state: MapState) -> Tensor:
