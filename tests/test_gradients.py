@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.helpers import off_borders, pose, random_state, small_map
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 
 CELLS = (6, 5)
 
@@ -187,7 +187,7 @@ def test_gradients_of_flat_ground_are_finite(stage):
     validity[1, 2, 2] = True
     elevation = torch.zeros_like(state.elevation, requires_grad=True)
     state = state._replace(elevation=elevation, validity=validity)
-    after = rate_surface(state, emap.cfg)
+    after = rate(state, emap.cfg)
     read = after.gradient_x + after.gradient_y if stage == "normals" else after.traversability
     read.sum().backward()
     assert elevation.grad.isfinite().all()

@@ -233,17 +233,6 @@ def test_completion_compiles_as_one_graph():
     torch.testing.assert_close(compiled, run(emap.state))
 
 
-@pytest.mark.compiles
-@pytest.mark.slow(2)
-@pytest.mark.parametrize("when", ["read", "update"])
-def test_maps_whose_updates_are_compiled(when, compile_with):
-    compile_with("eager")
-    eager, fast = (small_map(2, **with_completion(when=when)) for _ in range(2))
-    fast.compile()
-    for seed in range(2):
-        torch.testing.assert_close(look(fast, seed).layer("completed"), look(eager, seed).layer("completed"))
-
-
 # Config, network, copies and files ------------------------------------------------------------------------------------
 
 

@@ -1,18 +1,26 @@
-"""Each stage by C++ against its definition by tensors, one after the other along walks of several configs."""
+"""Each stage by C++ against its definition by tensors: along walks of several configs, and on random maps."""
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 import torchelev as te
 from tests.answers import config, scans
+from tests.helpers import random_clouds, random_poses, random_state, small_map
+from tests.kernels.compare import (
+    NAMES,
+    assert_states_close,
+    by_cpu,
+    by_tensors,
+    clone,
+    inputs_of,
+    require_cpu_backend,
+)
 from torchelev import pipeline
-from torchelev.inputs.update_inputs import check_inputs
-from torchelev.kernels.choose import choose
-from torchelev.kernels.cpu_update import as_inputs
-from torchelev.stages.measure.stage import find_own, measure
-from torchelev.state import map_layers
 
 CONFIGS = {
     "default": {},
@@ -21,88 +29,82 @@ CONFIGS = {
     "wide surface": dict(surface=te.SurfaceConfig(radius=2)),
     "learned": dict(traversability=te.LearnedTraversabilityConfig()),
 }
-NAMES = [stage.name for stage in pipeline.STAGES]
-TINY = 1e-12
 
 
-def make_map(**stages):
-    emap = te.ElevationMap(config(**stages), 2)
-    if choose(emap.elevation).name != "CPU":
-        pytest.skip("needs a C++ compiler")
-    return emap
-
-
-def clone(state):
-    return map_layers(torch.clone, state)
-
-
-def run_on_cpu(emap, state, inputs, names):
-    values = inputs._asdict() | {"own": find_own(inputs, emap.cfg.sensor)}
-    pipeline.cpu_update(emap._update_cfg)(names, (*state[:-1], *state.statistics), as_inputs(values))
-
-
-def assert_states_close(actual, expected, what):
-    for name, value in (actual._asdict() | actual.statistics._asdict()).items():
-        if name == "statistics":
-            continue
-        wanted = getattr(expected, name) if hasattr(expected, name) else getattr(expected.statistics, name)
-        a, b = value.double(), wanted.double()
-        span = max(float(b.max() - b.min()), 1e-3) if b.numel() else 1.0
-        share = ((a - b).abs() > 2e-6 * span + TINY).double().mean() if b.numel() else 0.0
-        assert share <= 0.002, f"{what}: {name} differs in {share:.2%}, by up to {(a - b).abs().max():.3g}"
+def walk(emap):
+    """Inputs of all kinds along a walk."""
+    torch.manual_seed(0)
+    for k, (points, T_map_sensor, T_map_base) in enumerate(scans(8)):
+        variance = 1e-4 + 1e-4 * torch.rand(points.shape[:-1]) if k % 3 == 1 else None
+        covariance = 1e-4 * torch.eye(6).expand(2, 6, 6) if k % 3 == 2 else None
+        base = None if k == 5 else T_map_base
+        yield inputs_of(emap, points, T_map_sensor, base, 0.3, variance, None, covariance)
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("stages", CONFIGS.values(), ids=CONFIGS)
 def test_stage(stages, name):
-    emap = make_map(**stages)
-    cfg, number = emap._update_cfg, NAMES.index(name)
+    emap = require_cpu_backend(te.ElevationMap(config(**stages), 2))
     state = clone(emap.state)
-    torch.manual_seed(0)
-    for k, (points, T_map_sensor, T_map_base) in enumerate(scans(8)):
+    for k, inputs in enumerate(walk(emap)):
         if k == 7:
             state.elevation[:, 13:16, 10:14] += 3.0  # another floor
-        variance = 1e-4 + 1e-4 * torch.rand(points.shape[:-1]) if k % 3 == 1 else None
-        covariance = 1e-4 * torch.eye(6).expand(2, 6, 6) if k % 3 == 2 else None
-        of_map = (2, emap.device, torch.float32, (), False)
-        base = None if k == 5 else T_map_base
-        inputs = check_inputs(points, T_map_sensor, base, 0.3, variance, None, covariance, *of_map)
-        m = measure(*inputs, cfg.grid, cfg.sensor, torch.float32)
-        with torch.no_grad():
-            for stage in pipeline.STAGES[:number]:
-                state = stage.run(state, m, cfg)
-            actual = clone(state)
-            run_on_cpu(emap, actual, inputs, ("measure", name))
-            state = pipeline.STAGES[number].run(state, m, cfg)
-            assert_states_close(actual, state, f"scan {k}, {name}")
-            for stage in pipeline.STAGES[number + 1 :]:
-                state = stage.run(state, m, cfg)
-            state = clone(pipeline.rate_learned(state, cfg, emap._weights))
+        for stage in NAMES:
+            after = by_tensors(emap, state, inputs, stage)
+            if stage == name:
+                assert_states_close(by_cpu(emap, state, inputs, name), after, f"scan {k}, {name}")
+            state = after
+        state = clone(pipeline.rate_learned(state, emap.cfg, emap._weights))
+
+
+SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40)) | st.sampled_from([(70, 19), (66, 150), (1, 300)])
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(
+    st.integers(0, 10_000),
+    SIZES,
+    st.integers(1, 3),
+    st.sampled_from([0, 1, 40, 700]),
+    st.integers(1, 2),
+    st.sampled_from([0.0, 0.1, 0.6, 1.0]),
+)
+def test_stage_on_random_maps(name, seed, cells, sensors, num_points, threads, known):
+    rng = np.random.default_rng(seed)
+    radius, reach = int(rng.integers(1, 4)), float(rng.choice([0.1, 0.2, 0.5]))
+    heads = te.TraversabilityConfig(radius=reach), None
+    stages = dict(surface=te.SurfaceConfig(radius=radius), traversability=heads[int(rng.random() < 0.2)])
+    emap = require_cpu_backend(small_map(2, cells, overlap=te.OverlapConfig(radius=1.0, height=0.3), **stages))
+    T = torch.stack([random_poses(rng, 2) for _ in range(sensors)], 1)
+    clouds = [random_clouds(rng, T[:, k], num_points, cells=cells) for k in range(sensors)]
+    points = torch.stack(clouds, 1) if num_points else torch.zeros(2, sensors, 0, 3)
+    base = random_poses(rng, 2) if rng.random() < 0.8 else None
+    inputs = inputs_of(emap, points, T, base)
+    state = random_state(rng, emap.cfg.grid, 2, known, torch.float32)
+    state.time.mul_(torch.from_numpy(rng.random(state.time.shape) < 0.7))
+    torch.set_num_threads(threads)
+    expected = by_tensors(emap, state, inputs, name)
+    # A coin that a rounding tosses is one of few cells here.
+    share = 0.002 + 2 / state.elevation[0].numel()
+    assert_states_close(by_cpu(emap, state, inputs, name), expected, name, 1e-5, share)
 
 
 @pytest.mark.parametrize("stages", CONFIGS.values(), ids=CONFIGS)
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_update(stages, num_threads):
-    emap = make_map(**stages)
+    emap = require_cpu_backend(te.ElevationMap(config(**stages), 2))
     expected = clone(emap.state)
-    weights = emap._weights
-    before = torch.get_num_threads()
     torch.set_num_threads(num_threads)
-    try:
-        for points, T_map_sensor, T_map_base in scans(6):
-            emap.update(points, T_map_sensor, T_map_base, dt=0.3)
-            inputs = check_inputs(
-                points, T_map_sensor, T_map_base, 0.3, None, None, None, 2, emap.device, torch.float32, (), False
-            )
-            with torch.no_grad():
-                pipeline.update_by_tensors(expected, inputs, emap._update_cfg, weights)
-            assert_states_close(emap.state, expected, "update")
-            expected = clone(emap.state)
-    finally:
-        torch.set_num_threads(before)
+    for points, T_map_sensor, T_map_base in scans(6):
+        emap.update(points, T_map_sensor, T_map_base, dt=0.3)
+        inputs = inputs_of(emap, points, T_map_sensor, T_map_base)
+        with torch.no_grad():
+            pipeline.update_by_tensors(expected, inputs, emap.cfg, emap._weights)
+        assert_states_close(emap.state, expected, "update")
+        expected = clone(emap.state)
 
 
-def test_settings_of_equal_layout():
+def test_settings_keep_their_layout():
     """Whole numbers that a user gives for floats change no struct."""
     cfg = config(drift=te.DriftConfig(max_drift=1, gain=1), fusion=te.FusionConfig(gate=3, max_variance=1))
     cfg = dataclasses.replace(cfg, sensor=te.SensorConfig(min_distance=1, max_distance=50))

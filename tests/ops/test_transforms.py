@@ -99,7 +99,7 @@ def test_dual_levels_without_tangents_do_no_harm():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_gradient_of_the_polar_minimum(seed):
-    """Against finite differences, and, of equal values, to one of them alone."""
+    """Against finite differences, and equal values share it."""
     generator = torch.Generator().manual_seed(seed)
     index = torch.randint(0, 9 * 6, (2, 40), generator=generator)
     values = torch.rand(2, 40, dtype=torch.float64, generator=generator)
@@ -111,4 +111,4 @@ def test_gradient_of_the_polar_minimum(seed):
     equal = torch.full_like(values, 0.5).requires_grad_()
     (gradient,) = torch.autograd.grad(lowest(equal).sum(), equal)
     assert gradient.sum() == (lowest(equal) < 9).sum()
-    assert (gradient == gradient.round()).all()
+    assert (gradient >= 0).all()

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
-from tests.helpers import assert_close, differences, mapped, pose, small_config, small_map, snapshot
+from tests.helpers import differences, mapped, pose, small_config, small_map, snapshot
 from tests.robot_body.bodies import any_poses, as_reference, random_body
 from torchelev import Box, Capsule, ElevationMap, RobotBody, SensorConfig
 from torchelev.inputs import checks
@@ -218,22 +218,6 @@ def update_case(seed=0, num_envs=2):
     body = random_body(rng)
     cloud, T_map_sensor, T_map_base, T_base_links = seen(rng, body, num_envs, number=200, dtype=torch.float32)
     return body, torch.cat([cloud[:, 0], torch.rand(num_envs, 100, 3)], 1), T_map_sensor[:, 0], T_map_base, T_base_links
-
-
-@pytest.mark.compiles
-@pytest.mark.slow(6)
-def test_compiled_updates_equal_eager_ones(compile_with):
-    compile_with("eager")
-    body, cloud, T_map_sensor, T_map_base, links = update_case()
-    maps = [small_map(2, sensor=SensorConfig(body=body)) for _ in range(2)]
-    maps[1].compile()
-    maps[1].warm_up(300)
-    for k in range(3):
-        for emap in maps:
-            emap.update(cloud + 0.01 * k, T_map_sensor, T_map_base, 0.3, T_base_links=links)
-        assert_close(maps[0].state, maps[1].state, 1e-5)
-        assert (maps[1].statistics.rejected_body > 5).all()
-        assert torch.equal(maps[0].statistics.rejected_body, maps[1].statistics.rejected_body)
 
 
 def test_chunks_get_their_own_links():

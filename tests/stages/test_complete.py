@@ -163,17 +163,6 @@ def test_an_environment_that_knows_nothing_gets_no_predictions():
     assert emap.validity[0].all() and not emap.validity[1].any()
 
 
-@pytest.mark.compiles
-@pytest.mark.slow(2)
-def test_compiled_maps_write_back_too(compile_with):
-    compile_with("eager")
-    eager, fast = pair()[1], pair()[1]
-    fast.compile()
-    for seed in range(3):
-        look(eager, seed), look(fast, seed)
-    torch.testing.assert_close(fast.layer("elevation"), eager.layer("elevation"))
-
-
 def test_refuses():
     with pytest.raises(TypeError, match="completion.write_back: must be a bool, got 1"):
         CompletionConfig(write_back=1)

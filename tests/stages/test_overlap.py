@@ -1,9 +1,6 @@
 """Other floors near the robot."""
 
-import contextlib
-import os
 from dataclasses import asdict
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,14 +10,9 @@ from hypothesis import strategies as st
 
 from tests import reference
 from tests.helpers import nans, pose, random_state, seen_from, small_map
-from tests.native.emulated_gpu import emulated_kernels, needs_compiler
 from torchelev import OverlapConfig
-from torchelev.compiled.update import with_masks
-from torchelev.ops.storage import as_bytes, as_mask
-from torchelev.stages.overlap import clear as stage
 from torchelev.stages.overlap.stage import clear_other_floors
 from torchelev.stages.recenter.stage import recenter
-from torchelev.state import map_layers
 
 
 def random_floors(rng, emap, known):
@@ -58,97 +50,6 @@ def test_agrees_with_the_reference(seed, radius, height, base_height, max_base_h
         np.testing.assert_array_equal(after.validity[b], validity)
         np.testing.assert_array_equal(after.bounded[b], bounded)
         assert after.statistics.cleared_other_floors[b] == cleared
-
-
-def by(one_pass, *arguments):
-    """Clear in one pass of C++, or by kernels where they are emulated; or by tensors."""
-    others = (
-        patch.object(stage, "has_one_pass", lambda _: one_pass),
-        patch.object(stage, "has_kernels", lambda _: False),
-    )
-    with torch.no_grad(), others[0], others[1]:
-        return clear_other_floors(*arguments)
-
-
-@pytest.mark.parametrize("code", ["c++", "tensors", pytest.param("kernels", marks=needs_compiler)])
-@given(
-    st.integers(0, 10_000),
-    st.integers(1, 3),
-    st.tuples(st.integers(1, 40), st.integers(1, 40)) | st.just((70, 90)),
-    st.floats(0.1, 1.5),
-    st.floats(0.05, 0.8),
-    st.integers(1, 2),
-)
-def test_one_pass_agrees_with_tensors(code, seed, num_envs, cells, radius, height, threads):
-    torch.set_num_threads(threads)
-    rng = np.random.default_rng(seed)
-    emap = small_map(num_envs, cells)
-    _, m, state = random_floors(rng, emap, rng.choice([0.0, 0.1, 0.6, 1.0]))
-    if rng.random() < 0.2:
-        m = m._replace(base=torch.where(torch.arange(num_envs)[:, None] == 0, torch.nan, m.base))
-    state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
-    cfg = OverlapConfig(radius=radius, height=height, base_height=0.2, max_base_height=rng.uniform(0.2, 0.8))
-    emulated = emulated_kernels(True) if code == "kernels" else contextlib.nullcontext()
-    with emulated, patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"} if code == "tensors" else {}):
-        got, expected = (by(one_pass, state, m, emap.cfg.grid, cfg) for one_pass in (True, False))
-    for name in ("validity", "bounded", "challenger_support"):
-        assert torch.equal(getattr(got, name), getattr(expected, name)), name
-    assert torch.equal(got.statistics.cleared_other_floors, expected.statistics.cleared_other_floors)
-
-
-@pytest.mark.parametrize("code", ["c++", "tensors", pytest.param("kernels", marks=needs_compiler)])
-def test_masks_change_where_they_are_stored(code):
-    emap = small_map(2, (20, 30))
-    _, m, state = random_floors(np.random.default_rng(0), emap, 0.6)
-    state = map_layers(lambda v: v.float() if v.dtype == torch.float64 else v, state)
-    cfg = OverlapConfig(radius=1.5, height=0.2, base_height=0.1)
-    expected, into = by(False, state, m, emap.cfg.grid, cfg), with_masks(map_layers(torch.clone, state), as_bytes)
-    emulated = emulated_kernels(True) if code == "kernels" else contextlib.nullcontext()
-    with emulated, patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"} if code == "tensors" else {}):
-        by(True, with_masks(into, as_mask), m, emap.cfg.grid, cfg, into)
-    for name in ("validity", "bounded", "challenger_support"):
-        changed, other = getattr(into, name), getattr(expected, name)
-        assert torch.equal(changed, other.to(changed.dtype)) and not torch.equal(other, getattr(state, name)), name
-
-
-@needs_compiler
-@pytest.mark.parametrize("first_row", [0, 46])
-def test_kernels_know_the_ground_of_all_parts_of_a_map(first_row):
-    """Ground 0.5 m below the base, in one part of the map alone, and beside it cells too high for the robot on it."""
-    emap = small_map(1, (70, 90))
-    T = pose((0.0, 0.0, 0.0))
-    m, cfg = emap.measure(nans(1), T, T, 0.1), OverlapConfig(radius=2.0, height=0.4, base_height=0.2)
-    row = torch.arange(70)[:, None].expand(1, 70, 90)
-    known = (row >= first_row) & (row < first_row + 23)
-    elevation = torch.where(torch.arange(90) % 9 == 0, 0.3, -0.5).expand_as(row)
-    state = emap.state._replace(validity=known, elevation=elevation, time=torch.ones_like(elevation))
-    with emulated_kernels(True):
-        left = by(True, state, m, emap.cfg.grid, cfg)
-    assert torch.equal(left.validity, by(False, state, m, emap.cfg.grid, cfg).validity)
-    assert left.statistics.cleared_other_floors.item() >= 20
-
-
-def test_the_operator_is_registered_right():
-    rng = np.random.default_rng(0)
-    x, y, base = (torch.from_numpy(rng.normal(size=size)).float() for size in ((2, 6, 1), (2, 1, 5), (2, 1, 1)))
-    layers = [torch.from_numpy(rng.normal(size=(2, 6, 5))).float() for _ in range(3)]
-    changed = [(layer > 0).to(torch.uint8) for layer in layers]
-    arguments = x, y, base, [0, 6, 0, 5], layers, changed, [1.0, 0.5, 0.2, 0.8]
-    torch.library.opcheck(torch.ops.torchelev.clear_other_floors.default, arguments)
-
-
-@pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.05, 0.05), (0.25, 0.15)])
-@pytest.mark.parametrize("radius", [1.5, 3.0])
-def test_one_pass_takes_the_same_cells_for_near(x, y, radius):
-    """Cells on the circle itself, around a base at a corner or on the centre of a cell."""
-    emap = small_map(1, (100, 100))
-    T = pose((x, y, 9.0))
-    m, cfg = emap.measure(nans(1), T, T, 0.1), OverlapConfig(radius=radius, max_base_height=20.0)
-    corner = recenter(emap.state, m, emap.cfg.grid).corner
-    known = torch.ones_like(emap.validity)
-    state = emap.state._replace(corner=corner, validity=known, elevation=6.0 * (torch.rand(known.shape) > 0.5))
-    left = [by(one_pass, state, m, emap.cfg.grid, cfg).validity for one_pass in (True, False)]
-    assert torch.equal(*left) and not left[0].all()
 
 
 def upstairs_map():

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
-from tests.helpers import assert_close, differences, pose, random_poses, small_map
+from tests.helpers import differences, pose, random_poses, small_map
 from tests.test_properties import LIVELY, recording
 from torchelev import DriftConfig, FusionConfig, SensorConfig
 from torchelev.layers import LAYERS
@@ -142,17 +142,6 @@ def test_exact_poses_change_nothing(seed):
         told.update(cloud, T, T, dt, pose_covariance=torch.zeros(1, 6, 6))
         untold.update(cloud, T, T, dt)
     assert not differences(told.state, untold.state)
-
-
-def test_a_compiled_update_gives_the_same(compile_with):
-    rng = np.random.default_rng(0)
-    eager, compiled, covariance = small_map(2, **LIVELY), small_map(2, **LIVELY), covariances(rng, 2)
-    compile_with("eager")
-    compiled.compile()
-    for cloud, T, dt in recording(3, 2):
-        for emap in (eager, compiled):
-            emap.update(cloud, T, T, dt, pose_covariance=covariance)
-    assert_close(compiled.state, eager.state)
 
 
 def test_gradients_reach_the_covariance():

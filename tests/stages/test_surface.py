@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import pose, random_state, small_map
 from torchelev import SurfaceConfig
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.plane_fit import fit_plane, known_ground
 
 SEEDS = st.integers(0, 10_000)
@@ -40,7 +40,7 @@ def test_normals_of_a_plane(gx, gy, altitude):
     x, y = emap.cell_centers()[0].unbind(-1)
     z = gx * x + gy * y + altitude
     state = emap.state._replace(elevation=z[None].float(), validity=(x < 0.35)[None])
-    emap.load_state(rate_surface(state, emap.cfg))
+    emap.load_state(rate(state, emap.cfg))
     n = torch.stack([emap.layer(f"normal_{axis}") for axis in "xyz"], -1)
     known = emap.validity
     expected = torch.tensor([-gx, -gy, 1.0]) / math.sqrt(1 + gx * gx + gy * gy)
@@ -52,7 +52,7 @@ def test_normals_of_a_plane(gx, gy, altitude):
 @given(SEEDS)
 def test_normals_are_unit_vectors_that_point_up(seed):
     emap = small_map(2)
-    state = rate_surface(random_state(np.random.default_rng(seed), emap.cfg.grid, 2), emap.cfg)
+    state = rate(random_state(np.random.default_rng(seed), emap.cfg.grid, 2), emap.cfg)
     n = torch.stack([emap.layer(f"normal_{axis}", state=state) for axis in "xyz"], -1)
     n = n[state.validity & state.has_normal]
     torch.testing.assert_close(n.norm(dim=-1), torch.ones(len(n), dtype=n.dtype))
@@ -93,7 +93,7 @@ def test_cells_that_span_no_plane_have_neither_normal_nor_rating():
     x, _ = emap.cell_centers()[0].unbind(-1)
     rows = (torch.arange(30) % 5 == 0)[:, None].expand(30, 30)
     state = emap.state._replace(elevation=-1.19 * x[None].float(), validity=rows[None].clone())
-    state = rate_surface(state, emap.cfg)
+    state = rate(state, emap.cfg)
     emap.load_state(state)
     for name in ("traversability", "normal_x", "normal_y", "normal_z"):
         assert emap.layer(name).isnan().all()

@@ -6,11 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, LearnedTraversabilityConfig, RobotConfig
-from torchelev.compiled.update import Graphs
 from torchelev.io.map_file import load_map, save_map
 from torchelev.pipeline import rate_surface
 from torchelev.state import blank_state
@@ -67,27 +65,6 @@ def test_the_analytic_head_rates_under_the_same_interface():
     rating, known = emap.rate(), emap.state.validity
     assert torch.equal(rating.traversability[known], emap.layer("traversability")[known])
     assert (rating.traversability[~known] == 0).all() and torch.equal(rating.confidence, known.float())
-
-
-@pytest.mark.compiles
-@pytest.mark.slow(10)
-def test_compiled_is_eager_and_maps_of_other_weights_share_the_graph(cfg, tmp_path, compile_with):
-    counter = CompileCounter()
-    compile_with(counter)
-    torch.manual_seed(4)
-    TraversabilityNet().save(tmp_path / "other.pt")
-    pairs = []
-    for source in (None, tmp_path / "other.pt"):
-        eager, fast = ElevationMap(cfg, num_envs=2), ElevationMap(cfg, num_envs=2)
-        if source is not None:
-            for emap in (eager, fast):
-                emap.head.load_state_dict(TraversabilityNet.from_pretrained(source).state_dict())
-        fast.compile()
-        look(eager)
-        look(fast)
-        torch.testing.assert_close(fast.state.traversability, eager.state.traversability, atol=1e-5, rtol=0)
-        pairs.append(eager.state.traversability)
-    assert not torch.allclose(*pairs, atol=1e-3) and counter.frame_count == len(Graphs._fields)
 
 
 def test_gradients_reach_weights_and_elevation(cfg):

@@ -1,0 +1,62 @@
+"""A stage run by C++ and by tensors on the same state and inputs."""
+
+import pytest
+import torch
+
+from torchelev import pipeline
+from torchelev.inputs.update_inputs import check_inputs
+from torchelev.kernels.choose import choose
+from torchelev.kernels.cpu_update import as_inputs
+from torchelev.stages.measure.stage import find_own, measure
+from torchelev.state import map_layers
+
+NAMES = [stage.name for stage in pipeline.STAGES]
+
+
+def require_cpu_backend(emap):
+    if choose(emap.elevation).name != "CPU":
+        pytest.skip("needs a C++ compiler")
+    return emap
+
+
+def clone(state):
+    return map_layers(torch.clone, state)
+
+
+def inputs_of(emap, points, T_map_sensor, T_map_base, dt=0.3, variance=None, links=None, covariance=None):
+    return check_inputs(
+        *(points, T_map_sensor, T_map_base, dt, variance, links, covariance),
+        *(emap.num_envs, emap.device, torch.float32, emap.cfg.sensor.links, False),
+    )
+
+
+def by_tensors(emap, state, inputs, name):
+    cfg = emap.cfg
+    m = measure(*inputs, cfg.grid, cfg.sensor, torch.float32)
+    with torch.no_grad():
+        return pipeline.STAGES[NAMES.index(name)].run(state, m, cfg)
+
+
+def by_cpu(emap, state, inputs, *names):
+    """Run stages after `measure` on a copy of the state."""
+    after = clone(state)
+    values = inputs._asdict() | {"own": find_own(inputs, emap.cfg.sensor)}
+    pipeline.cpu_update(emap.cfg)(("measure", *names), (*after[:-1], *after.statistics), as_inputs(values))
+    return after
+
+
+def tensors_of(state):
+    return {n: v for n, v in (state._asdict() | state.statistics._asdict()).items() if n != "statistics"}
+
+
+def assert_states_close(actual, expected, what, tolerance=2e-6, share=0.002):
+    """All but a few values agree to a tolerance, in shares of the layer's range: a rounding may decide the others."""
+    wanted = tensors_of(expected)
+    for name, value in tensors_of(actual).items():
+        a, b = value.double(), wanted[name].double()
+        if b.numel() == 0:
+            continue
+        span = max(float(b.max() - b.min()), 1e-3)
+        differs = ((a - b).abs() > tolerance * span) | (a.isnan() != b.isnan())
+        worst = f"by up to {float((a - b).abs().max()):.3g}"
+        assert differs.double().mean() <= share, f"{what}: {name} differs in {differs.double().mean():.2%}, {worst}"
