@@ -27,7 +27,7 @@ from torchelev.inputs.update_inputs import Inputs, check_inputs, placeholder_inp
 from torchelev.kernels.choose import Backend, choose
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
-from torchelev.ops.transforms import require_reverse_mode
+from torchelev.ops.transforms import is_readable, require_reverse_mode
 from torchelev.pipeline import rate, update_by_tensors, update_on_cpu, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
@@ -36,6 +36,7 @@ from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement, forget, map_layers
 from torchelev.traversability.net import TraversabilityNet
+from torchelev.traversability.weight_file import Weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -84,6 +85,7 @@ class ElevationMap(ReadableMap):
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
         self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
+        self._key = pipeline.compile_stages(self._update_cfg)
         self._history = InputHistory()
         with torch.inference_mode(False):
             #: (B,) how often each environment was reset: what it told a site before does not count as its own
@@ -135,21 +137,32 @@ class ElevationMap(ReadableMap):
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
         self._history.add(inputs, self.state.statistics.drift_correction)
         self._derived.clear()
-        if self.device.type == "cpu":
+        if is_readable(self.elevation):
             keep_freed_memory(self._num_bytes)
         weights = None if self._weights is None else self._weights.detached()
-        by_cpu = choose(self.elevation).name == "CPU"
-        run = functools.partial(update_on_cpu if by_cpu else update_by_tensors, cfg=self._update_cfg, weights=weights)
         before = self._take_out_predictions()
-        chunks = self.chunks if weights is not None or not by_cpu else [slice(0, self.num_envs)]
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         with torch.inference_mode():
-            run_in_chunks(run, self.state, inputs, chunks)
+            self._run_stages(self.state, inputs, weights)
         if before is not None:
             with torch.no_grad():
                 write(self.state, self._write_back(before, self.state))
         if self.cfg.completion is not None and self.cfg.completion.when == "update":
             self._complete()
+
+    def _run_stages(self, state: MapState, inputs: Inputs, weights: Weights | None) -> None:
+        """Update a state of these maps by the backend that suits it."""
+        if self.backend.name == "CPU":
+            run = functools.partial(update_on_cpu, cfg=self._update_cfg, weights=weights, key=self._key)
+            # Chunks would save no memory: C++ keeps one map's for each thread.
+            return run_in_chunks(run, state, inputs, self.chunks) if weights else run(state, inputs)
+        run = functools.partial(update_by_tensors, cfg=self._update_cfg, weights=weights)
+        return run_in_chunks(run, state, inputs, self.chunks)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy or an unpickled map, whose process may know its config by another key."""
+        super().__setstate__(state)
+        self._key = pipeline.compile_stages(self._update_cfg)
 
     def _take_out_predictions(self) -> MapState | None:
         """Make the cells that completion filled unknown, and return a copy of the state with them; None without."""
@@ -266,11 +279,8 @@ class ElevationMap(ReadableMap):
     def _update_scratch(self, inputs: Inputs) -> None:
         """Run an update on blank maps, as large as these."""
         weights = None if self._weights is None else self._weights.detached()
-        run = update_on_cpu if self.backend.name == "CPU" else update_by_tensors
-        run = functools.partial(run, cfg=self._update_cfg, weights=weights)
         with torch.inference_mode():
-            blank = map_layers(torch.zeros_like, self.state)
-            run_in_chunks(run, blank, inputs, self.chunks)
+            self._run_stages(map_layers(torch.zeros_like, self.state), inputs, weights)
 
     # Starting over --------------------------------------------------------------------------------------------------
 

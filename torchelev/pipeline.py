@@ -10,6 +10,7 @@ import torch
 
 from torchelev.config import ElevationMapConfig
 from torchelev.inputs.update_inputs import Inputs
+from torchelev.kernels import cpu_update
 from torchelev.kernels.cpu_update import CpuUpdate, as_inputs
 from torchelev.stages.age.kernel import KERNEL as AGE
 from torchelev.stages.age.stage import age
@@ -100,19 +101,19 @@ def update_by_tensors(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig,
     write(stored, forward(stored, m, cfg, weights))
 
 
-def update_on_cpu(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None) -> None:
-    """Do the same in place, by one call of C++."""
+def update_on_cpu(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int) -> None:
+    """Do the same in place, by one call of C++; `key` is that of `compile_stages`."""
     values = inputs._asdict() | {"own": find_own(inputs, cfg.sensor)}
-    tensors = (*stored[:-1], *stored.statistics)
-    cpu_update(cfg)(("measure", *(stage.name for stage in STAGES)), tensors, as_inputs(values))
+    cpu_update.run(key, (*stored[:-1], *stored.statistics), as_inputs(values))
     if isinstance(cfg.traversability, LearnedTraversabilityConfig):
         write(stored, rate_learned(stored, cfg, weights))
 
 
-@functools.lru_cache(maxsize=64)
-def cpu_update(cfg: ElevationMapConfig) -> CpuUpdate:
-    """Return the compiled stages for a config."""
-    return CpuUpdate(KERNELS, TENSORS, cfg, ElevationMapConfig())
+@functools.lru_cache(maxsize=256)
+def compile_stages(cfg: ElevationMapConfig) -> int:
+    """Return a key of the compiled stages for a config; they are built when they first run."""
+    order = ("measure", *(stage.name for stage in STAGES))
+    return cpu_update.register(CpuUpdate(KERNELS, TENSORS, order, cfg, ElevationMapConfig()))
 
 
 def write(stored: MapState, new: MapState) -> None:

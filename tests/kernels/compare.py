@@ -6,7 +6,7 @@ import torch
 from torchelev import pipeline
 from torchelev.inputs.update_inputs import check_inputs
 from torchelev.kernels.choose import choose
-from torchelev.kernels.cpu_update import as_inputs
+from torchelev.kernels.cpu_update import as_inputs, compiled_stages
 from torchelev.stages.measure.stage import find_own, measure
 from torchelev.state import map_layers
 
@@ -41,7 +41,8 @@ def by_cpu(emap, state, inputs, *names):
     """Run stages after `measure` on a copy of the state."""
     after = clone(state)
     values = inputs._asdict() | {"own": find_own(inputs, emap.cfg.sensor)}
-    pipeline.cpu_update(emap.cfg)(("measure", *names), (*after[:-1], *after.statistics), as_inputs(values))
+    stages = compiled_stages(pipeline.compile_stages(emap.cfg))
+    stages.run((*after[:-1], *after.statistics), as_inputs(values), ("measure", *names))
     return after
 
 

@@ -36,37 +36,47 @@ class _Sizes(ctypes.Structure):
 
 
 class CpuUpdate:
-    """The compiled stages of one config.
+    """The compiled stages of one config, which are built when they first run.
 
     Args:
         kernels: of all stages.
         tensors: structs of tensors: name, NamedTuple, nested structs.
+        order: names of the stages, in their order.
         cfg: an ElevationMapConfig.
         default: the default config, from which the settings' types are.
     """
 
-    def __init__(
-        self, kernels: Sequence[Kernel], tensors: Sequence[tuple[str, Any, dict[str, str]]], cfg: Any, default: Any
-    ) -> None:
-        structs = header(kernels, default, [*tensors, ("Inputs", Inputs, {})])
-        sources = ("kernels/update.cpp", *dict.fromkeys(kernel.cpu_source for kernel in kernels))
-        self.library = load(sources, {}, {"generated.h": structs})
-        self._settings = c_settings({kernel.name: kernel.settings(cfg) for kernel in kernels})
+    def __init__(self, kernels: Sequence[Kernel], tensors: Sequence[Any], order: Sequence[str], cfg: Any, default: Any):
+        self._kernels, self._tensors, self._order = kernels, tensors, tuple(order)
+        self._cfg, self._default = cfg, default
 
-    def __call__(self, stages: Sequence[str], state: Sequence[Tensor], inputs: Inputs) -> None:
-        """Run stages, by name, on a state's tensors (B, ...), in place.
+    @functools.cached_property
+    def library(self) -> ctypes.CDLL | None:
+        """The library of all stages; None if it cannot be built."""
+        structs = header(self._kernels, self._default, [*self._tensors, ("Inputs", Inputs, {})])
+        sources = ("kernels/update.cpp", *dict.fromkeys(kernel.cpu_source for kernel in self._kernels))
+        return load(sources, {}, {"generated.h": structs})
+
+    @functools.cached_property
+    def _settings(self) -> ctypes.Structure:
+        return c_settings({kernel.name: kernel.settings(self._cfg) for kernel in self._kernels})
+
+    def run(
+        self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
+    ) -> None:
+        """Run stages, by name, or all, on a state's tensors (B, ...), in place.
 
         Raises:
             MemoryError: without enough memory. The maps are sound, but some may lack this update or a part of it.
         """
-        assert self.library is not None
+        points, links = inputs[0], inputs[_LINKS]
+        assert self.library is not None and points is not None
         B, H, W = state[_ELEVATION].shape
-        S, N = inputs.points.shape[1:3]
-        sizes = _Sizes(B, H, W, S, N, 0 if inputs.T_base_links is None else inputs.T_base_links.shape[1])
-        functions, number = self._functions(tuple(stages)), len(stages)
+        sizes = _Sizes(B, H, W, *points.shape[1:3], 0 if links is None else links.shape[1])
+        functions = self._functions(self._order if stages is None else tuple(stages))
         arguments = addresses(state), addresses(inputs), self._settings, sizes
         references = (ctypes.byref(value) for value in arguments)
-        call(self.library.update_maps, *references, functions, ctypes.c_int64(number), torch.get_num_threads())
+        call(self.library.update_maps, *references, functions, ctypes.c_int64(len(functions)), torch.get_num_threads())
 
     @functools.lru_cache(maxsize=8)  # noqa: B019  # of a few orders, for as long as the config is used
     def _functions(self, stages: tuple[str, ...]) -> Any:
@@ -75,6 +85,34 @@ class CpuUpdate:
         return (ctypes.c_void_p * len(stages))(*(pointer.value for pointer in pointers))
 
 
+_UPDATES: list[CpuUpdate] = []  # by key
+
+
+def register(update: CpuUpdate) -> int:
+    """Return a key of compiled stages, by which `run` finds them."""
+    _UPDATES.append(update)
+    return len(_UPDATES) - 1
+
+
+def compiled_stages(key: int) -> CpuUpdate:
+    """Return the compiled stages of a key."""
+    return _UPDATES[key]
+
+
+def run(key: int, state: Sequence[Tensor], inputs: Inputs) -> None:
+    """Run all stages in place; inside a `torch.compile` of the user's own as one operator of its graph."""
+    if torch.compiler.is_compiling():
+        torch.ops.torchelev.update_maps(list(state), list(inputs), key)
+    else:
+        _UPDATES[key].run(state, inputs)
+
+
+_OPERATORS = torch.library.Library("torchelev", "FRAGMENT")
+_OPERATORS.define("update_maps(Tensor(a!)[] state, Tensor?[] inputs, int key) -> ()")
+_OPERATORS.impl("update_maps", lambda state, inputs, key: _UPDATES[key].run(state, inputs), "CPU")
+torch.library.register_fake("torchelev::update_maps", lambda state, inputs, key: None, lib=_OPERATORS)
+
+_LINKS = Inputs._fields.index("T_base_links")
 _ELEVATION = 4  # place of the elevation among a state's tensors
 
 

@@ -52,7 +52,7 @@ def polar_minimum(index: Tensor, values: Tensor, azimuths: int, widen: list[int]
 def _scan_rows(rows: Sequence[Tensor]) -> None:
     """Turn each row into the minimum of itself and all before it, in place."""
     for before, row in itertools.pairwise(rows):
-        torch.minimum(before, row, out=row)
+        row.clamp_(max=before)
 
 
 def _scan(table: Tensor, from_end: bool) -> None:
@@ -66,7 +66,7 @@ def _scan(table: Tensor, from_end: bool) -> None:
     _scan_rows(steps[::-1] if from_end else steps)
     _scan_rows(ends[::-1] if from_end else ends)
     inner, before = (blocks[:, :-1], last[:, 1:]) if from_end else (blocks[:, 1:], last[:, :-1])
-    torch.minimum(inner, before.unsqueeze(2).clone(), out=inner)
+    inner.clamp_(max=before.unsqueeze(2).clone())
 
 
 def _widen(table: Tensor, widen: list[int]) -> None:
@@ -74,4 +74,4 @@ def _widen(table: Tensor, widen: list[int]) -> None:
     for half in table.chunk(2):  # of the environments, as each takes a copy, the largest of an update's values
         for level, rows in enumerate(widen):
             near = half[:, :rows]
-            torch.minimum(near, near.roll(-(2**level), 2), out=near)
+            near.clamp_(max=near.roll(-(2**level), 2))
