@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchelev.kernels.cpu_build import call, load
 from torchelev.kernels.registry import Kernel, header
-from torchelev.kernels.structs import c_settings
+from torchelev.kernels.structs import SIZES, c_settings
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float64
@@ -31,8 +31,10 @@ class Inputs(NamedTuple):
     pose_covariance: Float[Tensor, "B S 6 6"] | None
 
 
-class _Sizes(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_int64) for name in "BHWSNK")
+class Sizes(ctypes.Structure):
+    """The sizes that shapes are made of, as C has them."""
+
+    _fields_ = tuple((name, ctypes.c_int64) for name in SIZES)
 
 
 class CpuUpdate:
@@ -69,10 +71,8 @@ class CpuUpdate:
         Raises:
             MemoryError: without enough memory. The maps are sound, but some may lack this update or a part of it.
         """
-        points, links = inputs[0], inputs[_LINKS]
-        assert self.library is not None and points is not None
-        B, H, W = state[_ELEVATION].shape
-        sizes = _Sizes(B, H, W, *points.shape[1:3], 0 if links is None else links.shape[1])
+        assert self.library is not None
+        sizes = sizes_of(state, inputs)
         functions = self._functions(self._order if stages is None else tuple(stages))
         arguments = addresses(state), addresses(inputs), self._settings, sizes
         references = (ctypes.byref(value) for value in arguments)
@@ -113,6 +113,16 @@ _OPERATORS.impl("update_maps", lambda state, inputs, key: _UPDATES[key].run(stat
 torch.library.register_fake("torchelev::update_maps", lambda state, inputs, key: None, lib=_OPERATORS)
 
 _LINKS = Inputs._fields.index("T_base_links")
+
+
+def sizes_of(state: Sequence[Tensor], inputs: Sequence[Tensor | None]) -> Sizes:
+    """Return the sizes of a state's tensors and their inputs."""
+    points, links = inputs[0], inputs[_LINKS]
+    assert points is not None
+    S, N = points.shape[1:3]
+    return Sizes(*state[_ELEVATION].shape, S, N, 0 if links is None else links.shape[1], S * N)
+
+
 _ELEVATION = 4  # place of the elevation among a state's tensors
 
 

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from torchelev.kernels.structs import Settings, settings_struct, sizes_struct, tensor_struct
 
 PACKAGE = Path(__file__).parents[1]  # includes begin here, such as "stages/age/equation.h"
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A kernel of a stage's cuda.cu, which takes an `Update` of kernels/cuda/update.h."""
+
+    kernel: str  #: name of the function
+    blocks: Callable[[Any], int]  #: returns the number of blocks, by the sizes B, H, W, S, N, K, M
+    threads: int = 256  #: of a block
+    memory: Callable[[Any], int] = lambda sizes: 0  #: [bytes] that a block's threads share, by the sizes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,11 +29,20 @@ class Kernel:
     name: str  #: of the stage, and of its settings in C
     folder: str  #: of the stage, seen from the package
     settings: Callable[[Any], Settings]  #: returns what the equations need of an ElevationMapConfig, by name
+    #: launches of each stage of this kernel, by the stage's name
+    cuda: Mapping[str, Sequence[Launch]] = field(default_factory=dict)
+    #: arrays that the launches share, with those of other stages: name to C type and sizes, as "float B M"
+    scratch: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def cpu_source(self) -> str:
         """The C++ source, seen from the package."""
         return f"{self.folder}/cpu.cpp"
+
+    @property
+    def cuda_source(self) -> str:
+        """The CUDA source, seen from the package."""
+        return f"{self.folder}/cuda.cu"
 
     @property
     def struct(self) -> str:
@@ -40,3 +59,18 @@ def header(kernels: Sequence[Kernel], cfg: Any, tensors: Sequence[tuple[str, Any
     structs += [settings_struct(kernel.struct, kernel.settings(cfg)) for kernel in kernels]
     whole = "\n".join(f"    {kernel.struct} {kernel.name};" for kernel in kernels)
     return "\n".join(["#pragma once\n#include <cstdint>\n", *structs, f"struct Settings {{\n{whole}\n}};\n"])
+
+
+def per_map(sizes: Any) -> int:
+    """Return a block for each map."""
+    return int(sizes.B)
+
+
+def per_point(sizes: Any) -> int:
+    """Return blocks of 256 threads, one for each point; a map's points begin with a block."""
+    return int(sizes.B * -(-sizes.M // 256))
+
+
+def per_cell(sizes: Any) -> int:
+    """Return blocks of 256 threads, one for each cell; a map's cells begin with a block."""
+    return int(sizes.B * -(-(sizes.H * sizes.W) // 256))

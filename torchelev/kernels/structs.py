@@ -11,7 +11,7 @@ Number = bool | int | float
 Settings = Mapping[str, Number | tuple[Number, ...]]
 
 _TYPES = {"Float": "float", "Float64": "double", "Int": "int64_t", "Bool": "uint8_t", "UInt8": "uint8_t"}
-_SIZES = ("B", "H", "W", "S", "N", "K")
+SIZES = ("B", "H", "W", "S", "N", "K", "M")  # M = S * N
 _LARGEST = 2**31 - 1  # C's settings are integers of 32 bits
 
 
@@ -39,7 +39,16 @@ def tensor_struct(name: str, kind: Any, nested: Mapping[str, str] | None = None)
 
     `nested` are the structs of further fields, by field.
     """
-    tensors, nested = members(kind), nested or {}
+    return _pointers(name, members(kind), nested or {})
+
+
+def scratch_struct(name: str, arrays: Mapping[str, str]) -> str:
+    """Return a C struct of pointers to arrays, given C type and sizes of each, as "float B M"."""
+    parts = {field: text.split() for field, text in arrays.items()}
+    return _pointers(name, [Member(field, kind, tuple(sizes)) for field, (kind, *sizes) in parts.items()], {})
+
+
+def _pointers(name: str, tensors: list[Member], nested: Mapping[str, str]) -> str:
     fields = [f"    {m.type}* {m.name};" for m in tensors] + [f"    {t} {field};" for field, t in nested.items()]
     moves = [f"        if ({m.name}) one.{m.name} += b * {_stride(m)};" for m in tensors]
     moves += [f"        one.{field} = {field}.at(b, n);" for field in nested]
@@ -55,7 +64,7 @@ def _stride(member: Member) -> str:
 
 def sizes_struct() -> str:
     """Return the C struct of the sizes that shapes are made of."""
-    return f"struct Sizes {{\n    int64_t {', '.join(_SIZES)};\n}};\n"
+    return f"struct Sizes {{\n    int64_t {', '.join(SIZES)};\n}};\n"
 
 
 class Double(float):

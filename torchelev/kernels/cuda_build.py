@@ -5,28 +5,31 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
-import re
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchelev.native.library import is_switched_off
+from torchelev.kernels.cpu_build import is_switched_off
+from torchelev.kernels.registry import PACKAGE
 
-_SOURCES = Path(__file__).parent
-_STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: gpu/standard.h is all of them
-_BLOCK, LARGE_BLOCK = 128, 512  # threads; of those that share memory
-SUM_MEMORY = 4 * 32  # [bytes] that `sum_of_block` of threads.h takes at most
+_STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: standard.h is all of them
 _UNASKED_MEMORY = 48 * 2**10  # [bytes] that a block may have unasked
 _MEMORY_ATTRIBUTE = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
 _CAN_LAUNCH: dict[int, bool] = {}  # by device
 
 
+class Source(NamedTuple):
+    """A CUDA source."""
+
+    path: str  #: of the file, seen from the package
+    headers: tuple[tuple[str, str], ...] = ()  #: names and texts of headers besides those of the package
+
+
 def can_launch(device: int) -> bool:
-    """Tell whether kernels run on a GPU, given its number; False with TORCHELEV_NATIVE=0 in the environment.
+    """Return whether kernels run on a GPU, given its number; False with TORCHELEV_NATIVE=0 in the environment.
 
     If they do not, though torch's own do, a warning says so.
     """
@@ -44,62 +47,20 @@ def can_launch(device: int) -> bool:
 can_launch._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
-def work_on(layer: Tensor, memory: int = 0) -> bool:
-    """Tell whether a layer is on a GPU on which kernels run that share this much memory [bytes] in each block."""
-    if not layer.is_cuda or not can_launch(layer.get_device()):
-        return False
-    return memory <= _UNASKED_MEMORY or memory <= _block_memory(layer.get_device())
-
-
-def launch(source: str, kernel: str, rows: int, number: int, *arguments: Any) -> None:
-    """Run a kernel on the current stream, with at least `number` threads for each of `rows` rows.
+def launch(source: Source, kernel: str, blocks: int, threads: int, memory: int, *arguments: Any) -> None:
+    """Run a kernel on the current device and stream.
 
     Args:
-        source: file in this folder.
-        kernel: function in that file.
-        rows: number of rows.
-        number: threads per row, rounded up to whole blocks.
+        source: of the kernel.
+        kernel: function in that source.
+        blocks: number of blocks.
+        threads: threads of a block.
+        memory: how much memory the threads of a block share [bytes].
         arguments: tensors and None are passed as addresses, ints as int64, ctypes values as they are.
 
     Raises:
         RuntimeError: if the source does not compile, or the driver refuses.
     """
-    _launch(source, kernel, rows * -(-number // _BLOCK), _BLOCK, 0, arguments)
-
-
-def launch_blocks(source: str, kernel: str, blocks: int, memory: int, *arguments: Any) -> None:
-    """Run a kernel on the current stream, in blocks whose threads share memory.
-
-    Args:
-        source: file in this folder.
-        kernel: function in that file.
-        blocks: number of blocks.
-        memory: how much memory the threads of a block share [bytes].
-        arguments: as for `launch`.
-
-    Raises:
-        RuntimeError: if the source does not compile, or the driver refuses.
-    """
-    _launch(source, kernel, blocks, LARGE_BLOCK, memory, arguments)
-
-
-def suits_blocks(device: int, blocks: int, memory: int) -> bool:
-    """Tell whether a GPU has that much memory for each block, and at least half of it would be busy."""
-    processors = torch.cuda.get_device_properties(device).multi_processor_count
-    return memory <= _block_memory(device) and 2 * blocks >= processors
-
-
-def _block_memory(device: int) -> int:
-    """Return how much memory the threads of a block may share [bytes], as far as torch tells."""
-    properties = torch.cuda.get_device_properties(device)
-    memory: int = getattr(properties, "shared_memory_per_block_optin", _UNASKED_MEMORY)
-    return memory
-
-
-_block_memory._dynamo_marked_constant = True  # type: ignore[attr-defined]  # see `can_launch`
-
-
-def _launch(source: str, kernel: str, blocks: int, threads: int, memory: int, arguments: Sequence[Any]) -> None:
     if blocks == 0:
         return
     values = [_argument(value) for value in arguments]
@@ -111,15 +72,16 @@ def _launch(source: str, kernel: str, blocks: int, threads: int, memory: int, ar
     _check(_driver().cuLaunchKernel(function, *sizes, stream, addresses, None), kernel)
 
 
-def addresses_of(tensors: Sequence[Tensor | None]) -> ctypes.Structure:
-    """Return the addresses of tensors as a structure, which a kernel takes by value."""
-    return _pointers(len(tensors))(*(None if tensor is None else tensor.data_ptr() for tensor in tensors))
+def load(source: Source, kernel: str, device: int) -> None:
+    """Compile and load a kernel: while a graph is captured, none can be loaded."""
+    _function(source, kernel, device)
 
 
-@functools.cache
-def _pointers(number: int) -> type[ctypes.Structure]:
-    fields = [(f"p{k}", ctypes.c_void_p) for k in range(number)]
-    return type("Addresses", (ctypes.Structure,), {"_fields_": fields})
+def block_memory(device: int) -> int:
+    """Return how much memory the threads of a block may share [bytes], as torch knows it."""
+    properties = torch.cuda.get_device_properties(device)
+    memory: int = getattr(properties, "shared_memory_per_block_optin", _UNASKED_MEMORY)
+    return memory
 
 
 def _argument(value: Any) -> Any:
@@ -129,13 +91,10 @@ def _argument(value: Any) -> Any:
 
 
 def _try(device: int) -> bool:
-    """Run a kernel on the current device, and load all others."""
+    """Run a kernel on the current device."""
     try:
-        for path in _SOURCES.rglob("*.cu"):  # while a graph is captured, none could be loaded
-            for kernel in re.findall(r"__global__[^;{]*?void (\w+)", path.read_text(encoding="utf-8")):
-                _function(path.relative_to(_SOURCES).as_posix(), kernel, device)
         one = torch.ones(1, device=device, dtype=torch.float32)
-        launch("gpu/trial.cu", "double_it", 1, 1, one)
+        launch(Source("kernels/cuda/trial.cu"), "double_it", 1, 32, 0, one)
         if one.item() != 2:
             raise RuntimeError("a kernel computed something else")
     except (AttributeError, OSError, RuntimeError) as error:  # AttributeError: a library lacks a function
@@ -169,39 +128,40 @@ def _check(result: int, what: str) -> None:
 
 
 @functools.cache
-def _function(source: str, kernel: str, device: int) -> ctypes.c_void_p:
+def _function(source: Source, kernel: str, device: int) -> ctypes.c_void_p:
     function = ctypes.c_void_p()
     module = _module(source, device)
     _check(_driver().cuModuleGetFunction(ctypes.byref(function), module, kernel.encode()), kernel)
-    _check(_driver().cuFuncSetAttribute(function, _MEMORY_ATTRIBUTE, _block_memory(device)), kernel)
+    _check(_driver().cuFuncSetAttribute(function, _MEMORY_ATTRIBUTE, block_memory(device)), kernel)
     return function
 
 
 @functools.cache
-def _module(source: str, device: int) -> ctypes.c_void_p:
+def _module(source: Source, device: int) -> ctypes.c_void_p:
     """Compile a source for a GPU, which must be the current one, and load it there."""
     module = ctypes.c_void_p()
     major, minor = torch.cuda.get_device_capability(device)
-    _check(_driver().cuModuleLoadData(ctypes.byref(module), compile_source(source, f"sm_{major}{minor}")), source)
+    code = compile_source(source, f"sm_{major}{minor}")
+    _check(_driver().cuModuleLoadData(ctypes.byref(module), code), source.path)
     return module
 
 
-def compile_source(source: str, architecture: str) -> bytes:
+def compile_source(source: Source, architecture: str) -> bytes:
     """Return a source's machine code for GPUs of an architecture; raise RuntimeError if there is none."""
     nvrtc, program = _nvrtc(), ctypes.c_void_p()
-    path = _SOURCES / source
-    headers = {p.name: p.read_bytes() for folder in (path.parent, _SOURCES / "gpu") for p in folder.glob("*.h")}
-    headers |= dict.fromkeys(_STANDARD, b'#include "standard.h"\n')
+    headers = {p.relative_to(PACKAGE).as_posix(): p.read_bytes() for p in PACKAGE.rglob("*.h")}
+    headers |= {name: text.encode() for name, text in source.headers}
+    headers |= dict.fromkeys(_STANDARD, b'#include "kernels/cuda/standard.h"\n')
     texts, names = _strings(headers.values()), _strings(name.encode() for name in headers)
-    text = path.read_bytes()
-    failed = nvrtc.nvrtcCreateProgram(ctypes.byref(program), text, path.name.encode(), len(headers), texts, names)
+    text, name = (PACKAGE / source.path).read_bytes(), Path(source.path).name.encode()
+    failed = nvrtc.nvrtcCreateProgram(ctypes.byref(program), text, name, len(headers), texts, names)
     options = [f"--gpu-architecture={architecture}", "--std=c++17", "--device-as-default-execution-space"]
     failed = failed or nvrtc.nvrtcCompileProgram(program, len(options), _strings(o.encode() for o in options))
     log = _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
     code = _read(nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN, program)
     nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
     if failed:
-        raise RuntimeError(f"NVRTC did not compile {source}: {log.decode(errors='replace').strip()}")
+        raise RuntimeError(f"NVRTC did not compile {source.path}: {log.decode(errors='replace').strip()}")
     return code
 
 

@@ -1,0 +1,96 @@
+"""A whole update by CUDA kernels, for float32 maps on a GPU, in place."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchelev.kernels import cuda_build
+from torchelev.kernels.cpu_update import Inputs, Sizes, addresses, sizes_of
+from torchelev.kernels.registry import Kernel, Launch, header
+from torchelev.kernels.structs import c_settings, scratch_struct
+
+_DTYPES = {
+    "float": torch.float32,
+    "int32_t": torch.int32,
+    "int64_t": torch.int64,
+    "uint8_t": torch.uint8,
+    "double": torch.float64,
+}
+
+
+class CudaUpdate:
+    """The CUDA kernels of all stages of one config.
+
+    Args:
+        kernels: of all stages.
+        tensors: structs of tensors: name, NamedTuple, nested structs.
+        order: names of the stages, in their order.
+        cfg: an ElevationMapConfig.
+        default: the default config, from which the settings' types are.
+        launch: runs a kernel; tests give one that runs it on a CPU.
+    """
+
+    def __init__(
+        self,
+        kernels: Sequence[Kernel],
+        tensors: Sequence[Any],
+        order: Sequence[str],
+        cfg: Any,
+        default: Any,
+        launch: Callable[..., None] = cuda_build.launch,
+    ) -> None:
+        self._order, self._launch = tuple(order), launch
+        self._arrays: dict[str, str] = {}
+        for kernel in kernels:
+            self._arrays |= kernel.scratch
+        structs = header(kernels, default, [*tensors, ("Inputs", Inputs, {})])
+        whole = (("generated.h", f"{structs}\n{scratch_struct('Scratch', self._arrays)}"),)
+        self._launches: dict[str, list[tuple[cuda_build.Source, Launch]]] = {}
+        for kernel in kernels:
+            source = cuda_build.Source(kernel.cuda_source, whole)
+            self._launches |= {stage: [(source, one) for one in launches] for stage, launches in kernel.cuda.items()}
+        self._settings = c_settings({kernel.name: kernel.settings(cfg) for kernel in kernels})
+
+    def run(
+        self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
+    ) -> dict[str, Tensor]:
+        """Run stages, by name, or all, on a state's tensors (B, ...), in place; return what they passed on, by name."""
+        sizes = sizes_of(state, inputs)
+        scratch = self._allocate(sizes, state[0].device)
+        update = self._update(sizes, state, inputs, list(scratch.values()))
+        for stage in self._order if stages is None else stages:
+            for source, one in self._launches[stage]:
+                self._launch(source, one.kernel, one.blocks(sizes), one.threads, one.memory(sizes), update)
+        return scratch
+
+    def _allocate(self, sizes: Sizes, device: torch.device) -> dict[str, Tensor]:
+        parts = {name: text.split() for name, text in self._arrays.items()}
+        return {
+            name: torch.empty([_size(s, sizes) for s in shape], dtype=_DTYPES[kind], device=device)
+            for name, (kind, *shape) in parts.items()
+        }
+
+    def _update(self, sizes: Sizes, *tensors: Sequence[Tensor | None]) -> ctypes.Structure:
+        """Return `Update` of kernels/cuda/update.h."""
+        pointers = [addresses(values) for values in tensors]
+        update: ctypes.Structure = _structure(*map(len, pointers), type(self._settings))(
+            sizes, *pointers, self._settings
+        )
+        return update
+
+
+def _size(name: str, sizes: Sizes) -> int:
+    return int(name) if name.isdigit() else int(getattr(sizes, name))
+
+
+@functools.cache
+def _structure(state: int, inputs: int, scratch: int, settings: type) -> Any:
+    lists = {"state": state, "inputs": inputs, "scratch": scratch}
+    fields = [("sizes", Sizes), *((name, ctypes.c_void_p * size) for name, size in lists.items())]
+    return type("Update", (ctypes.Structure,), {"_fields_": [*fields, ("settings", settings)]})
