@@ -28,7 +28,7 @@ from torchelev.kernels.choose import Backend, choose
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import is_readable, require_reverse_mode
-from torchelev.pipeline import rate, update_by_tensors, update_on_cpu, write
+from torchelev.pipeline import rate, update_by_tensors, update_on_cpu, update_on_gpu, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
 from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement
@@ -152,11 +152,10 @@ class ElevationMap(ReadableMap):
 
     def _run_stages(self, state: MapState, inputs: Inputs, weights: Weights | None) -> None:
         """Update a state of these maps by the backend that suits it."""
-        if self.backend.name == "CPU":
-            run = functools.partial(update_on_cpu, cfg=self._update_cfg, weights=weights, key=self._key)
-            # Chunks would save no memory: C++ keeps one map's for each thread.
-            return run_in_chunks(run, state, inputs, self.chunks) if weights else run(state, inputs)
-        run = functools.partial(update_by_tensors, cfg=self._update_cfg, weights=weights)
+        run: Any = {"CPU": update_on_cpu, "CUDA": update_on_gpu, "TORCH": update_by_tensors}[self.backend.name]
+        run = functools.partial(run, cfg=self._update_cfg, weights=weights, key=self._key)
+        if run.func is update_on_cpu and weights is None:
+            return run(state, inputs)  # chunks would save no memory: C++ keeps one map's for each thread
         return run_in_chunks(run, state, inputs, self.chunks)
 
     def __setstate__(self, state: dict[str, Any]) -> None:

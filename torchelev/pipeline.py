@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -12,6 +12,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.inputs.update_inputs import Inputs
 from torchelev.kernels import cpu_update
 from torchelev.kernels.cpu_update import CpuUpdate, as_inputs
+from torchelev.kernels.cuda_update import CudaUpdate
 from torchelev.stages.age.kernel import KERNEL as AGE
 from torchelev.stages.age.stage import age
 from torchelev.stages.compensate.kernel import KERNEL as COMPENSATE
@@ -35,7 +36,7 @@ from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_
 from torchelev.traversability.weight_file import Weights
 
 KERNELS = (MEASURE, RECENTER, AGE, COMPENSATE, DISAGREEMENT, FUSION, VISIBILITY, OVERLAP, SURFACE)
-TENSORS = (("Statistics", Statistics, {}), ("MapState", MapState, {"statistics": "Statistics"}))
+TENSORS: tuple[Any, ...] = (("Statistics", Statistics, {}), ("MapState", MapState, {"statistics": "Statistics"}))
 
 
 class Stage(NamedTuple):
@@ -95,7 +96,9 @@ def reset_statistics(state: MapState, m: Measurement) -> MapState:
 # Backends -----------------------------------------------------------------------------------------------------------
 
 
-def update_by_tensors(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None) -> None:
+def update_by_tensors(
+    stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int = 0
+) -> None:
     """Measure, fuse, and write the new values into the stored state's own tensors."""
     m = measure(*inputs, cfg.grid, cfg.sensor, stored.elevation.dtype)
     write(stored, forward(stored, m, cfg, weights))
@@ -107,6 +110,23 @@ def update_on_cpu(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, wei
     cpu_update.run(key, (*stored[:-1], *stored.statistics), as_inputs(values))
     if isinstance(cfg.traversability, LearnedTraversabilityConfig):
         write(stored, rate_learned(stored, cfg, weights))
+
+
+def update_on_gpu(
+    stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int = 0
+) -> None:
+    """Do the same in place, by CUDA kernels."""
+    values = inputs._asdict() | {"own": find_own(inputs, cfg.sensor)}
+    with torch.cuda.device_of(stored.elevation):
+        cuda_stages(cfg).run((*stored[:-1], *stored.statistics), as_inputs(values))
+    if isinstance(cfg.traversability, LearnedTraversabilityConfig):
+        write(stored, rate_learned(stored, cfg, weights))
+
+
+@functools.lru_cache(maxsize=64)
+def cuda_stages(cfg: ElevationMapConfig) -> CudaUpdate:
+    """Return the CUDA kernels for a config; they are built when they first run."""
+    return CudaUpdate(KERNELS, TENSORS, ("measure", *(stage.name for stage in STAGES)), cfg, ElevationMapConfig())
 
 
 @functools.lru_cache(maxsize=256)

@@ -1,12 +1,19 @@
 """A stage run by C++ and by tensors on the same state and inputs."""
 
+import functools
+import tempfile
+from pathlib import Path
+
 import pytest
 import torch
 
-from torchelev import pipeline
+from tests.kernels.emulation.launcher import emulated
+from torchelev import ElevationMapConfig, pipeline
 from torchelev.inputs.update_inputs import check_inputs
 from torchelev.kernels.choose import choose
 from torchelev.kernels.cpu_update import as_inputs, compiled_stages
+from torchelev.kernels.cuda_update import CudaUpdate
+from torchelev.kernels.registry import PACKAGE
 from torchelev.stages.measure.stage import find_own, measure
 from torchelev.state import map_layers
 
@@ -43,6 +50,34 @@ def by_cpu(emap, state, inputs, *names):
     values = inputs._asdict() | {"own": find_own(inputs, emap.cfg.sensor)}
     stages = compiled_stages(pipeline.compile_stages(emap.cfg))
     stages.run((*after[:-1], *after.statistics), as_inputs(values), ("measure", *names))
+    return after
+
+
+@functools.cache
+def emulated_source(source):
+    """A CUDA source with its headers, for the CPU."""
+    folder = Path(tempfile.mkdtemp(prefix="torchelev-headers-"))
+    for name, text in source.headers:
+        (folder / name).write_text(text)
+    return emulated(PACKAGE / source.path, [folder, PACKAGE])
+
+
+def launch_emulated(source, kernel, blocks, threads, memory, update):
+    if blocks:
+        emulated_source(source)(kernel, blocks, threads, memory, update)
+
+
+def by_cuda(emap, state, inputs, *names):
+    """Run stages after `measure` and `locate` on a copy of the state, by CUDA kernels on the CPU."""
+    missing = [name for name in names if not any(name in kernel.cuda for kernel in pipeline.KERNELS)]
+    if missing:
+        pytest.skip(f"no CUDA kernels of {missing}")
+    after = clone(state)
+    values = inputs._asdict() | {"own": find_own(inputs, emap.cfg.sensor)}
+    update = CudaUpdate(
+        pipeline.KERNELS, pipeline.TENSORS, ("measure", *NAMES), emap.cfg, ElevationMapConfig(), launch_emulated
+    )
+    update.run((*after[:-1], *after.statistics), as_inputs(values), ("measure", "locate", *names))
     return after
 
 

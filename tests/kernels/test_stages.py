@@ -15,13 +15,16 @@ from tests.kernels.compare import (
     NAMES,
     assert_states_close,
     by_cpu,
+    by_cuda,
     by_tensors,
     clone,
     inputs_of,
     require_cpu_backend,
 )
+from tests.kernels.emulation.launcher import needs_emulation
 from torchelev import pipeline
 
+BACKENDS = [pytest.param(by_cpu, id="CPU"), pytest.param(by_cuda, id="CUDA", marks=needs_emulation)]
 CONFIGS = {
     "default": {},
     "without stages": dict(drift=None, raycast=None, overlap=None, traversability=None),
@@ -43,7 +46,8 @@ def walk(emap):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("stages", CONFIGS.values(), ids=CONFIGS)
-def test_stage(stages, name):
+@pytest.mark.parametrize("run", BACKENDS)
+def test_stage(run, stages, name):
     emap = require_cpu_backend(te.ElevationMap(config(**stages), 2))
     state = clone(emap.state)
     for k, inputs in enumerate(walk(emap)):
@@ -52,7 +56,7 @@ def test_stage(stages, name):
         for stage in NAMES:
             after = by_tensors(emap, state, inputs, stage)
             if stage == name:
-                assert_states_close(by_cpu(emap, state, inputs, name), after, f"scan {k}, {name}")
+                assert_states_close(run(emap, state, inputs, name), after, f"scan {k}, {name}")
             state = after
         state = clone(pipeline.rate_learned(state, emap.cfg, emap._weights))
 
@@ -61,6 +65,7 @@ SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40)) | st.sampled_from([(70
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("run", BACKENDS)
 @given(
     st.integers(0, 10_000),
     SIZES,
@@ -69,7 +74,7 @@ SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40)) | st.sampled_from([(70
     st.integers(1, 2),
     st.sampled_from([0.0, 0.1, 0.6, 1.0]),
 )
-def test_stage_on_random_maps(name, seed, cells, sensors, num_points, threads, known):
+def test_stage_on_random_maps(run, name, seed, cells, sensors, num_points, threads, known):
     rng = np.random.default_rng(seed)
     radius, reach = int(rng.integers(1, 4)), float(rng.choice([0.1, 0.2, 0.5]))
     heads = te.TraversabilityConfig(radius=reach), None
@@ -86,7 +91,7 @@ def test_stage_on_random_maps(name, seed, cells, sensors, num_points, threads, k
     expected = by_tensors(emap, state, inputs, name)
     # A coin that a rounding tosses is one of few cells here.
     share = 0.002 + 2 / state.elevation[0].numel()
-    assert_states_close(by_cpu(emap, state, inputs, name), expected, name, 1e-5, share)
+    assert_states_close(run(emap, state, inputs, name), expected, name, 1e-5, share)
 
 
 @pytest.mark.parametrize("stages", CONFIGS.values(), ids=CONFIGS)

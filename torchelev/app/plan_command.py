@@ -13,7 +13,7 @@ from torch import Tensor
 from torchelev.app.user_error import EmptyMapError, user_errors
 from torchelev.elevation_map import ElevationMap
 from torchelev.io.export import load_map, take
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.planning.path_check import PathCheck, check_path
 from torchelev.planning.planner import Path as PlannedPath
 from torchelev.planning.planner import plan
@@ -67,7 +67,7 @@ def _load(map_file: Path, robot: dict[str, float]) -> ElevationMap:
         head = replace(emap.cfg.traversability, robot=RobotConfig(**robot))
     cfg = replace(emap.cfg, traversability=head)
     rated = ElevationMap(cfg, head=emap.head, completion_net=emap.completion_net).to(emap.elevation.dtype)
-    rated.load_state(rate_surface(emap.state, cfg, None if rated.head is None else rated.head.weights))
+    rated.load_state(rate(emap.state, cfg, None if rated.head is None else rated.head.weights))
     return rated
 
 

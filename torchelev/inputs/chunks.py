@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -31,4 +32,5 @@ def run_in_chunks(update: Callable[..., None], state: MapState, inputs: Inputs, 
         return update(state, inputs)
     for envs in chunks:
         part = map_layers(lambda layer, envs=envs: layer[envs], state)
-        update(part, Inputs(*(None if value is None else value[envs] for value in inputs)))
+        of_part: Any = (None if value is None else value[envs] for value in inputs)
+        update(part, Inputs(*of_part))

@@ -20,7 +20,7 @@ from torchelev.errors import require
 from torchelev.inputs import checks
 from torchelev.map_buffers import name_tensors, state_of
 from torchelev.output_files import atomic_file
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.state import MapState
 from torchelev.traversability.net import TraversabilityNet
 
@@ -93,7 +93,7 @@ def load_map(
         value.copy_(torch.from_numpy(_array(path, arrays, name, value, tuple(value.shape))))
     state = _state(path, arrays, emap.state, ids, header["version"])
     if header["version"] < VERSION:
-        state = rate_surface(state, emap.cfg, None if emap.head is None else emap.head.weights)
+        state = rate(state, emap.cfg, None if emap.head is None else emap.head.weights)
     emap.load_state(state)
     return emap
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.kernels.cpu_build import find_compiler, is_native, is_switched_off
+from torchelev.kernels.cuda_build import can_launch
 from torchelev.ops.transforms import is_transforming
 
 
@@ -26,7 +27,7 @@ class Backend(NamedTuple):
 def choose(layer: Tensor) -> Backend:
     """Return the backend for maps with such a layer (B, H, W): asked once per update."""
     reason = _why_tensors(layer)
-    return Backend("TORCH", reason) if reason else Backend("CPU", "")
+    return Backend("TORCH", reason) if reason else Backend("CUDA" if layer.is_cuda else "CPU", "")
 
 
 def _why_tensors(layer: Tensor) -> str:
@@ -35,11 +36,21 @@ def _why_tensors(layer: Tensor) -> str:
         return f"the maps are {str(layer.dtype).removeprefix('torch.')}, and compiled code computes float32"
     if type(layer) not in (Tensor, torch.nn.Parameter) or is_transforming():
         return "a transform wraps the tensors"
-    if not layer.is_cpu:
-        return f"there are no kernels for {layer.device.type} yet"
+    if not layer.is_cpu and not layer.is_cuda:
+        return f"there is no compiled code for {layer.device.type}"
     if not layer.is_contiguous():
         return "the layers are not contiguous; load the map by load_state"
+    if layer.is_cuda:
+        return _why_no_kernels(layer)
     return "" if is_native() else _why_not_built()
+
+
+def _why_no_kernels(layer: Tensor) -> str:
+    if torch.are_deterministic_algorithms_enabled():
+        return "results must repeat, and kernels add up in any order"
+    if layer.numel() >= 2**31:
+        return "kernels count cells in 32 bits"
+    return "" if can_launch(layer.get_device()) else "CUDA kernels do not run on this GPU, or TORCHELEV_NATIVE=0"
 
 
 def _why_not_built() -> str:

@@ -120,7 +120,7 @@ def sizes_of(state: Sequence[Tensor], inputs: Sequence[Tensor | None]) -> Sizes:
     points, links = inputs[0], inputs[_LINKS]
     assert points is not None
     S, N = points.shape[1:3]
-    return Sizes(*state[_ELEVATION].shape, S, N, 0 if links is None else links.shape[1], S * N)
+    return Sizes(*state[_ELEVATION].shape, S, N, 0 if links is None else links.shape[1], S * N, S if S > 1 else 0)
 
 
 _ELEVATION = 4  # place of the elevation among a state's tensors

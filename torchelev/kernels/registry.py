@@ -61,6 +61,11 @@ def header(kernels: Sequence[Kernel], cfg: Any, tensors: Sequence[tuple[str, Any
     return "\n".join(["#pragma once\n#include <cstdint>\n", *structs, f"struct Settings {{\n{whole}\n}};\n"])
 
 
+def once(sizes: Any) -> int:
+    """Return blocks of 256 threads, one for each map."""
+    return int(-(-sizes.B // 256))
+
+
 def per_map(sizes: Any) -> int:
     """Return a block for each map."""
     return int(sizes.B)
@@ -74,3 +79,8 @@ def per_point(sizes: Any) -> int:
 def per_cell(sizes: Any) -> int:
     """Return blocks of 256 threads, one for each cell; a map's cells begin with a block."""
     return int(sizes.B * -(-(sizes.H * sizes.W) // 256))
+
+
+def block_sums(sizes: Any) -> int:
+    """Return the memory [bytes] that sums over a block's threads take: a number of eight bytes for each warp."""
+    return 8 * 32

@@ -37,12 +37,12 @@ inline int32_t sum_before(int32_t value, int32_t* sums) {
 }
 
 // The sum of what a block's threads bring, the same for all; all must call it, with memory for a number of each warp.
-inline float sum_of_block(float value, float* sums) {
+template <class Value> inline Value sum_of_block(Value value, Value* sums) {
     for (int step = warpSize / 2; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffff, value, step);
     __syncthreads();
     if (threadIdx.x % warpSize == 0) sums[threadIdx.x / warpSize] = value;
     __syncthreads();
-    float total = 0;
+    Value total = 0;
     for (int32_t warp = 0; warp < blockDim.x / warpSize; warp++) total += sums[warp];
     return total;
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, per_cell
 from torchelev.kernels.structs import Settings
 
 if TYPE_CHECKING:
@@ -16,4 +16,4 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     return dict(variance_rate=float(cfg.aging.variance_rate))
 
 
-KERNEL = Kernel(name="age", folder="stages/age", settings=settings)
+KERNEL = Kernel(name="age", folder="stages/age", settings=settings, cuda={"age": (Launch("age", per_cell),)})

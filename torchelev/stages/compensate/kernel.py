@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, block_sums, per_cell, per_map
 from torchelev.kernels.structs import Settings
 from torchelev.ops.masks import NOWHERE
 from torchelev.stages.compensate.config import DriftConfig
@@ -31,4 +31,25 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     )
 
 
-KERNEL = Kernel(name="compensate", folder="stages/compensate", settings=settings)
+KERNEL = Kernel(
+    name="compensate",
+    folder="stages/compensate",
+    settings=settings,
+    cuda={
+        "compensate": (
+            Launch("clear_sums", lambda sizes: per_cell(sizes) * sizes.P),
+            Launch("sum_heights", lambda sizes: per_map(sizes) if sizes.P else 0, threads=512, memory=block_sums),
+            Launch("compare_sensors", lambda sizes: per_map(sizes) if sizes.P else 0, threads=512, memory=block_sums),
+            Launch("find_drift", per_map, threads=512, memory=block_sums),
+            Launch("share_pose_error", per_map, threads=512, memory=block_sums),
+            Launch("shift_heights", per_cell),
+        )
+    },
+    scratch={
+        "sensor_number": "float B P H W",
+        "sensor_moment": "float B P H W",
+        "error": "float B M",
+        "correction": "float B",
+        "shared": "float B",
+    },
+)

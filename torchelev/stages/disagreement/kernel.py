@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, per_cell
 from torchelev.kernels.structs import Settings
 from torchelev.stages.disagreement import stage
 
@@ -24,4 +24,12 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     )
 
 
-KERNEL = Kernel(name="disagreement", folder="stages/disagreement", settings=settings)
+KERNEL = Kernel(
+    name="disagreement",
+    folder="stages/disagreement",
+    settings=settings,
+    cuda={
+        "subtract_disagreement": (Launch("subtract_disagreement", per_cell),),
+        "add_disagreement": (Launch("add_disagreement", per_cell),),
+    },
+)

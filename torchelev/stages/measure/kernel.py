@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from torchelev.inputs.checks import FARTHEST
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, once, per_point
 from torchelev.kernels.structs import Double, Settings
 from torchelev.stages.measure.config import BodyConfig, ExclusionConfig
 
@@ -36,4 +36,27 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     )
 
 
-KERNEL = Kernel(name="measure", folder="stages/measure", settings=settings)
+KERNEL = Kernel(
+    name="measure",
+    folder="stages/measure",
+    settings=settings,
+    cuda={
+        "measure": (Launch("place_measurement", once), Launch("measure_points", per_point)),
+        "reset_statistics": (Launch("reset_statistics", once),),
+    },
+    scratch={
+        "anchor": "int64_t B 2",
+        "origin": "float B S 3",
+        "base": "float B 3",
+        "sound": "int32_t B",
+        "dt": "float B",
+        "x": "float B M",
+        "y": "float B M",
+        "z": "float B M",
+        "noise": "float B M",
+        "of_pose": "float B M",
+        "used": "uint8_t B M",
+        "casts": "uint8_t B M",
+        "gated": "int64_t B 4",
+    },
+)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, once, per_point
 from torchelev.kernels.structs import Settings
 
 if TYPE_CHECKING:
@@ -16,4 +16,18 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     return dict(resolution=float(cfg.grid.resolution))
 
 
-KERNEL = Kernel(name="recenter", folder="stages/recenter", settings=settings)
+LOCATE = Launch("clear_located", once), Launch("locate_points", per_point)
+KERNEL = Kernel(
+    name="recenter",
+    folder="stages/recenter",
+    settings=settings,
+    cuda={
+        "recenter": (
+            Launch("find_shift", once),
+            Launch("move_layers", lambda sizes: 14 * sizes.B, threads=512),
+            *LOCATE,
+        ),
+        "locate": LOCATE,
+    },
+    scratch={"shift": "int64_t B 2", "slot": "int32_t B M", "located": "int64_t B 2"},
+)

@@ -33,8 +33,7 @@ def follow(
     """Move the windows by whole cells to `base` [m], whose x, y count from cell `anchor`; not where it is NaN."""
     moves = torch.isfinite(base).all(1)
     corner, shift = move_corner(state, base, anchor, moves, grid)
-    layers: dict[str, Any] = {name: getattr(state, name) for name in LAYERS}
-    layers = move_layers(layers, shift, BLANK)
+    layers: Any = move_layers({name: getattr(state, name) for name in LAYERS}, shift, BLANK)
     base_height = torch.where(moves, base[:, 2], state.base_height)
     return state._replace(corner=corner, base_height=base_height, **layers)
 
