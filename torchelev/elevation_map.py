@@ -230,7 +230,7 @@ class ElevationMap(ReadableMap):
     @property
     def backend(self) -> Backend:
         """What runs `update`, and why it is not a faster backend."""
-        return choose(self.elevation)
+        return choose(self.elevation, self._key)
 
     def compile(self) -> str:  # type: ignore[override]
         """Build what `update` runs on, so that the first one does not; return in a sentence what that is.

@@ -23,7 +23,6 @@ from benchmarks import RESULTS
 from benchmarks.gpu.agreement import correctness, host_never_waits
 from benchmarks.gpu.report import verdicts
 from benchmarks.gpu.timing import Figure, completion, many_robots, one_robot
-from benchmarks.speed.meter import fresh_compiler
 from benchmarks.speed.workload import Drive, full_config
 from torchelev.app.results import markdown_table, slug, write_json
 
@@ -31,7 +30,6 @@ from torchelev.app.results import markdown_table, slug, write_json
 def _agreement(device: str, seconds: float) -> Iterator[Figure]:
     yield "correctness", lambda: correctness(device)
     for compiled in () if device == "cpu" else (False, True):
-        fresh_compiler()
         drive = Drive(full_config(64), 1024, robots=8, device=device, compiled=compiled)
         name = f"host never waits, {'compiled' if compiled else 'eager'}"
         yield name, partial(host_never_waits, drive)

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed.meter import fresh_compiler
 from benchmarks.speed.workload import Drive, full_config
 from torchelev import ElevationMap
 
@@ -38,7 +37,6 @@ def correctness(device: str) -> dict[str, Any]:
     """Compare the GPU's maps with the CPU's, and with those of a second run."""
     on_cpu = driven("cpu", compiled=False)
     result: dict[str, Any] = {"eager": compare(driven(device, False), on_cpu)}
-    fresh_compiler()
     result["compiled"] = compare(driven(device, True), on_cpu)
     result["run to run"] = compare(driven(device, False), driven(device, False))
     with _deterministic():

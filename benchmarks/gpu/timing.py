@@ -12,7 +12,6 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.speed import meter
 from benchmarks.speed.completion import make_maps
-from benchmarks.speed.meter import fresh_compiler
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 from torchelev import CompletionNet
 from torchelev.completion.complete import CompletionInput
@@ -53,7 +52,6 @@ def _captured(drive: Drive) -> Callable[[], None]:
 def one_robot(device: str, seconds: float) -> Iterator[Figure]:
     """Time the paper's case, one robot: eager, compiled, captured."""
     for name, compiled in (("eager", False), ("compiled", True)):
-        fresh_compiler()
         drive = Drive(full_config(), BPEARL, device=device, compiled=compiled)
         drive.warm_up()
         yield f"one robot, {name}", partial(meter.milliseconds, drive, seconds)
@@ -76,7 +74,6 @@ def _waiting(run: Callable[[], None]) -> Callable[[], None]:
 def many_robots(device: str, seconds: float) -> Iterator[Figure]:
     """Time thousands of robots, on a CPU eight, and measure the traffic and bandwidth to compare the time with."""
     robots, points = (8, 512) if device == "cpu" else (4096, 3072)
-    fresh_compiler()
     cfg = full_config(64)
     drive = Drive(cfg, points, robots=robots, device=device, scans=2)
     drive.warm_up()
@@ -107,7 +104,6 @@ def completion(device: str, seconds: float) -> Iterator[Figure]:
     net = CompletionNet.from_pretrained().requires_grad_(False).to(device)
     for name, size in sizes.items():
         layers = CompletionInput(*(layer.to(device) for layer in make_maps(*size)))
-        fresh_compiler()
         compiled = torch.compile(net)
         for kind, complete in (("eager", net), ("compiled", compiled)):
             run = partial(complete, *layers, resolution=0.04)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, RobotConfig, TraversabilityConfig
 from torchelev.app.results import machine, markdown_table, write_json
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.planning.path_check import check_path
 from torchelev.planning.planner import plan
 
@@ -45,7 +45,7 @@ def measure(shape: str, height: float, resolution: float, head: TraversabilityCo
     x = emap.cell_centers()[..., 0].double()
     emap.state.elevation.copy_(height * SHAPES[shape](x))
     emap.state.validity.fill_(True)
-    emap.load_state(rate_surface(emap.state, emap.cfg))
+    emap.load_state(rate(emap.state, emap.cfg))
     path = plan(emap, torch.tensor([[-0.8, 0.05]]), torch.tensor([[0.8, 0.05]]))
     along = torch.linspace(-0.8, 0.8, 41)
     poses = torch.stack([along, torch.full_like(along, 0.05), torch.zeros_like(along)], -1)[None]

@@ -32,7 +32,6 @@ from tqdm import tqdm
 
 from benchmarks import RESULTS
 from benchmarks.speed.growth import plot, table, verdicts
-from benchmarks.speed.meter import fresh_compiler
 from benchmarks.speed.workload import BPEARL, MANY_POINTS, Drive, full_config
 from torchelev.app.results import commit, write_json
 
@@ -66,7 +65,6 @@ def onward(drive: Drive) -> None:
 def start(case: Case) -> tuple[Drive, bench.Timer]:
     """Make the robots of a case and the timer of their updates."""
     robots, side, points, _ = case
-    fresh_compiler()
     counters.clear()
     drive = Drive(full_config(side), points, robots=robots, scans=8 if robots == 1 else 4)
     onward(drive)

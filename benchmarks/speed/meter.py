@@ -16,18 +16,11 @@ import torch.utils.benchmark as bench
 from torch.profiler import ProfilerActivity, profile
 
 from torchelev import ElevationMapConfig
-from torchelev.compiled.update import graphs_of
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.state import blank_state
 
 Name = TypeVar("Name")
 Value = TypeVar("Value")
-
-
-def fresh_compiler() -> None:
-    """Forget compiled updates: torch compiles the one for a second number of robots for any number."""
-    torch._dynamo.reset()
-    graphs_of.cache_clear()
 
 
 def progress(values: Iterable[Value], name: str) -> Iterator[Value]:

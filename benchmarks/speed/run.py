@@ -47,7 +47,6 @@ def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[
         if resume and is_reproducible and measured.get(name) == stamp:
             print(f"{name}: measured at {revision}, skipped", file=sys.stderr)
             continue
-        meter.fresh_compiler()
         result[name] = SECTIONS[name](seconds)
         measured[name] = stamp
         write_json(path, result)

@@ -6,7 +6,10 @@ of policy training, 64 x 64 cells of 4 cm and 512 points each.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -64,6 +67,19 @@ def _cloud(robots: int, points: int, phase: int, reach: float, generator: torch.
     return xyz
 
 
+@contextlib.contextmanager
+def by_tensors() -> Iterator[None]:
+    """Let updates run by tensors."""
+    before = os.environ.get("TORCHELEV_NATIVE")
+    os.environ["TORCHELEV_NATIVE"] = "0"
+    try:
+        yield
+    finally:
+        del os.environ["TORCHELEV_NATIVE"]
+        if before is not None:
+            os.environ["TORCHELEV_NATIVE"] = before
+
+
 class Drive:
     """Robots that drive; each call fuses the next scan of every robot.
 
@@ -71,7 +87,7 @@ class Drive:
         cfg: the map's configuration.
         points: number of points of a scan.
         robots: number of environments.
-        compiled: compile the map's update.
+        compiled: run updates by compiled code, else by tensors.
         device: where the map and the scans are.
         scans: number of scans; they repeat.
         reach: longest horizontal distance of a point [m]; None: a little beyond the window's border.
@@ -89,8 +105,7 @@ class Drive:
     ) -> None:
         generator = torch.Generator().manual_seed(0)
         self.emap = ElevationMap(cfg, robots, device)
-        if compiled:
-            self.emap.compile()
+        self.compiled = compiled
         reach = 0.57 * cfg.grid.length_x if reach is None else reach
         self.clouds = [_cloud(robots, points, k, reach, generator).to(device) for k in range(scans)]
         # Back and forth by one cell per step; the height changes by a millimetre.
@@ -105,7 +120,8 @@ class Drive:
     def __call__(self) -> None:
         """Fuse the next scan."""
         points, T = self.next_scan()
-        self.emap.update(points, T, T, self.dt)
+        with contextlib.nullcontext() if self.compiled else by_tensors():
+            self.emap.update(points, T, T, self.dt)
 
     def next_scan(self) -> tuple[Tensor, Tensor]:
         """Return the next scans (B, N, 3) and poses (B, 4, 4)."""

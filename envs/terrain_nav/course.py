@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.sim import Course, CourseConfig, HeightField, make_course
 
 
@@ -32,4 +32,4 @@ def _rate(field: HeightField) -> Tensor:
     grid = GridConfig(resolution=field.resolution, length_x=size[0], length_y=size[1])
     emap = ElevationMap(ElevationMapConfig(grid=grid), field.num_tiles, field.device)
     known = emap.state._replace(elevation=field.heights, validity=torch.ones_like(emap.state.validity))
-    return rate_surface(known, emap.cfg).traversability
+    return rate(known, emap.cfg).traversability

@@ -10,7 +10,6 @@ import torch
 from tests.kernels.emulation.launcher import emulated
 from torchelev import ElevationMapConfig, pipeline
 from torchelev.inputs.update_inputs import check_inputs
-from torchelev.kernels.choose import choose
 from torchelev.kernels.cpu_update import as_inputs, compiled_stages
 from torchelev.kernels.cuda_update import CudaUpdate
 from torchelev.kernels.registry import PACKAGE
@@ -21,7 +20,7 @@ NAMES = [stage.name for stage in pipeline.STAGES]
 
 
 def require_cpu_backend(emap):
-    if choose(emap.elevation).name != "CPU":
+    if emap.backend.name != "CPU":
         pytest.skip("needs a C++ compiler")
     return emap
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.completion import native
+from torchelev.completion import completion_kernel
 from torchelev.completion.context import Context, describe, sum_layers
 from torchelev.completion.parameters import Weights
 from torchelev.completion.predict import Seen, predict
@@ -70,7 +70,7 @@ def _answer_all(weights: Weights, cells: Cells, place: Tensor) -> list[Tensor]:
 def complete_on_cpu(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[Tensor, Tensor]:
     """Return the same without gradients: in C++ where that can be built, else by tensors."""
     fields, named = Weights(*weights), CompletionInput(*layers)
-    fast = native.complete(fields, layers, resolution)
+    fast = completion_kernel.complete(fields, layers, resolution)
     return _answer_each(fields, Cells(named, resolution)) if fast is None else fast
 
 

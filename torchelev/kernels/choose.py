@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.kernels.cpu_build import find_compiler, is_native, is_switched_off
+from torchelev.kernels.cpu_build import find_compiler, is_switched_off
+from torchelev.kernels.cpu_update import is_built
 from torchelev.kernels.cuda_build import can_launch
 from torchelev.ops.transforms import is_transforming
 
@@ -24,13 +25,16 @@ class Backend(NamedTuple):
         return f"{self.name}: updates run by {what}" + (f", as {self.reason}" if self.reason else "")
 
 
-def choose(layer: Tensor) -> Backend:
-    """Return the backend for maps with such a layer (B, H, W): asked once per update."""
-    reason = _why_tensors(layer)
+def choose(layer: Tensor, key: int) -> Backend:
+    """Return the backend for maps with such a layer (B, H, W): asked once per update.
+
+    `key` is that of the compiled stages for a CPU.
+    """
+    reason = _why_tensors(layer, key)
     return Backend("TORCH", reason) if reason else Backend("CUDA" if layer.is_cuda else "CPU", "")
 
 
-def _why_tensors(layer: Tensor) -> str:
+def _why_tensors(layer: Tensor, key: int) -> str:
     """Return why compiled code cannot update such maps; empty where it can."""
     if layer.dtype != torch.float32:
         return f"the maps are {str(layer.dtype).removeprefix('torch.')}, and compiled code computes float32"
@@ -42,7 +46,7 @@ def _why_tensors(layer: Tensor) -> str:
         return "the layers are not contiguous; load the map by load_state"
     if layer.is_cuda:
         return _why_no_kernels(layer)
-    return "" if is_native() else _why_not_built()
+    return "" if is_built(key) else _why_not_built()
 
 
 def _why_no_kernels(layer: Tensor) -> str:

@@ -55,15 +55,6 @@ def is_switched_off() -> bool:
     return os.environ.get("TORCHELEV_NATIVE", "1").lower() in _OFF
 
 
-def is_native() -> bool:
-    """Return whether C++ can be built or is built, and TORCHELEV_NATIVE does not forbid it."""
-    return load("native/tables/tables.cpp", {}) is not None
-
-
-# As `torch.compiler.assume_constant_result` does, which would load the compiler: code that is compiled asks only once.
-is_native._dynamo_marked_constant = True  # type: ignore[attr-defined]
-
-
 @functools.cache
 def _load(
     sources: tuple[str, ...], defines: tuple[tuple[str, str], ...], headers: tuple[tuple[str, str], ...]

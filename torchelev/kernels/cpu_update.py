@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.kernels.cpu_build import call, load
+from torchelev.kernels.cpu_build import call, is_switched_off, load
 from torchelev.kernels.registry import Kernel, header
 from torchelev.kernels.structs import SIZES, c_settings
 
@@ -97,6 +97,15 @@ def register(update: CpuUpdate) -> int:
 def compiled_stages(key: int) -> CpuUpdate:
     """Return the compiled stages of a key."""
     return _UPDATES[key]
+
+
+def is_built(key: int) -> bool:
+    """Return whether the stages of a key are built, or could be now."""
+    return not is_switched_off() and _UPDATES[key].library is not None
+
+
+# As `torch.compiler.assume_constant_result` does, which would load the compiler: code that is compiled asks only once.
+is_built._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def run(key: int, state: Sequence[Tensor], inputs: Inputs) -> None:

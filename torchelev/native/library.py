@@ -11,7 +11,6 @@ from torchelev.kernels.cpu_build import (  # noqa: F401
     call,
     describe_processor,
     find_compiler,
-    is_native,
     is_switched_off,
 )
 

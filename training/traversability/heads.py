@@ -15,7 +15,7 @@ from torchelev import TraversabilityConfig
 from torchelev.filters.inpainting.inpaint import inpaint_minimum, inpaint_telea
 from torchelev.filters.smoothing import gaussian
 from torchelev.layers import Layer
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.state import blank_state
 from torchelev.traversability.paper_filter import RIM, PaperFilter
 from training.traversability.maps.data import MappedTerrain
@@ -38,9 +38,7 @@ def analytic(maps: MappedTerrain, layer: Layer, of_robot: bool) -> Float[Tensor,
         cfg = dataclasses.replace(cfg, critical_slope=robot.max_slope, critical_step=robot.step_height)
     map_cfg = dataclasses.replace(map_config(maps.resolution, values.shape[1] * maps.resolution), traversability=cfg)
     state = blank_state(map_cfg.grid, len(values), values.device, values.dtype)
-    return rate_surface(
-        state._replace(elevation=torch.where(known, values, 0.0), validity=known), map_cfg
-    ).traversability
+    return rate(state._replace(elevation=torch.where(known, values, 0.0), validity=known), map_cfg).traversability
 
 
 def as_mapped(maps: MappedTerrain) -> Layer:

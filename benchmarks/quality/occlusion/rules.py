@@ -6,7 +6,7 @@ import torch
 
 from benchmarks.quality.occlusion.scenes import GRID
 from torchelev import ElevationMap, filters
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.planning.planner import Path, plan
 from torchelev.planning.traversal_cost import TraversalCostConfig
 from torchelev.state import MapState
@@ -19,7 +19,7 @@ def _inpaint(emap: ElevationMap, filter_name: str) -> MapState:
     """Return the state with all unknown ground inpainted and rated like measured ground."""
     layer = (emap.state.elevation, emap.state.validity)
     elevation, known = filters.Filter(filter_name)(layer, resolution=GRID.resolution)
-    return rate_surface(emap.state._replace(elevation=elevation, validity=known), emap.cfg)
+    return rate(emap.state._replace(elevation=elevation, validity=known), emap.cfg)
 
 
 def decide(emap: ElevationMap, x: float, goal: float) -> dict[str, Path]:

@@ -55,7 +55,6 @@ def _on_threads(number: int, seconds: float) -> Iterator[dict[str, Any]]:
     cases = {f"{n:,} points": (full, n, 1) for n in sorted(row[1] for row in SENSORS)}
     cases[f"{MANY_ROBOTS} robots"] = (many, MANY_POINTS, MANY_ROBOTS)
     torch.set_num_threads(number)
-    meter.fresh_compiler()
     drives = {name: Drive(cfg, n, robots=count) for name, (cfg, n, count) in cases.items()}
     for drive in drives.values():
         drive.watch(8)
@@ -73,7 +72,6 @@ def robots(seconds: float) -> dict[str, Any]:
     moved = meter.needed_traffic(cfg, MANY_POINTS)
     rows = []
     for count in progress(ROBOTS, "robots"):
-        meter.fresh_compiler()
         drive = Drive(cfg, MANY_POINTS, robots=count, scans=4)
         drive.warm_up()
         time = meter.milliseconds(drive, seconds)

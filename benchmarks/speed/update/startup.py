@@ -1,4 +1,4 @@
-"""How long it takes to import torchelev and to run the first compiled update."""
+"""How long it takes to import torchelev and to run the first update."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ print(time.perf_counter() - t, peak_megabytes())
 
 
 def start(seconds: float) -> dict[str, Any]:
-    """Time the import and the first compiled update, with an empty and a filled compiler cache, in new processes."""
+    """Time the import and the first update, with an empty and a filled cache of libraries, in new processes."""
     imports = [float(_run_python(_IMPORT)[0]) for _ in progress(range(5), "start")]
     first = _FIRST_UPDATE.format(threads=torch.get_num_threads())
     with tempfile.TemporaryDirectory() as cache:
-        runs = [_run_python(first, TORCHINDUCTOR_CACHE_DIR=cache) for _ in progress(range(2), "start")]
+        runs = [_run_python(first, TORCHELEV_CACHE=cache) for _ in progress(range(2), "start")]
     (cold, messages), (cached, _) = runs
     result: dict[str, Any] = {"import_seconds": statistics.median(imports)}
     for name, numbers in (("", cold), ("cached_", cached)):
         seconds_taken, megabytes = map(float, numbers.split())
         result |= {f"{name}first_update_seconds": seconds_taken, f"{name}megabytes": megabytes}
-    return result | {"announced": messages.count("compiling the update")}
+    return result | {"announced": messages.count("torchelev: building")}
 
 
 def _run_python(code: str, **environment: str) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.inputs.checks import require_indices
 from torchelev.ops.storage import keep_freed_memory
-from torchelev.sim.sensors import native
+from torchelev.sim.sensors import casting_kernel
 from torchelev.sim.sensors.crossing import HUGE
 from torchelev.sim.sensors.tracing import trace
 from torchelev.sim.terrains.heightfield import HeightField
@@ -86,7 +86,7 @@ def _cast_part(
 ) -> Tensor:
     nearest = None
     if origin.is_cpu:
-        nearest = native.cast(field, tile_ids, origin, directions, max_range, _describe_boxes(boxes, origin))
+        nearest = casting_kernel.cast(field, tile_ids, origin, directions, max_range, _describe_boxes(boxes, origin))
     if nearest is None:
         nearest = trace(field, tile_ids, origin, directions, max_range)
         if boxes is not None:

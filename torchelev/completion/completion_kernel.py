@@ -1,4 +1,4 @@
-"""The completion in C++ (`torchelev/native/completion`): the same as `predict` and `refine`, many times faster."""
+"""The completion in C++ (`torchelev/completion/kernel`): the same as `predict` and `refine`, many times faster."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.completion import context, parameters, predict, refine, surroundings
 from torchelev.completion.parameters import Weights
-from torchelev.native.library import call, load
+from torchelev.kernels.cpu_build import call, load
 
 _LARGEST = 2**15 - 2  # cells along a side, as steps are counted in 16 bits
 _FLOATS = {
@@ -52,7 +52,7 @@ def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> t
         return None
     sizes = {"VIEWS": weights.view, "CELLS": weights.cell, "MEASURED": weights.measured}
     defines = {name: str(len(weight)) for name, weight in sizes.items()}
-    library = load("completion/completion.cpp", _CONSTANTS | defines)
+    library = load("completion/kernel/completion.cpp", _CONSTANTS | defines)
     if library is None:
         return None
     flat = torch.cat([weight.detach().flatten() for weight in weights])

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.completion.test_net import apply, random_layers, random_net
-from torchelev.completion import native
+from torchelev.completion import completion_kernel
 from torchelev.completion.complete import complete
 from torchelev.native.library import find_compiler
 
@@ -39,7 +39,7 @@ def test_every_cell_equals_that_of_the_tensors(seed, num_envs, H, W, known, reso
     layers = layers._replace(elevation=layers.elevation + altitude, upper_bound=layers.upper_bound + altitude)
     expected = by_tensors(net, layers, resolution)
     torch.set_num_threads(threads)
-    mean, std = native.complete(net.weights, layers, resolution)
+    mean, std = completion_kernel.complete(net.weights, layers, resolution)
     torch.testing.assert_close(mean, expected.mean, rtol=0, atol=1e-5 + 2 * altitude * torch.finfo(torch.float32).eps)
     torch.testing.assert_close(std, expected.std, rtol=1e-4, atol=0.0)
 
@@ -48,16 +48,16 @@ def test_layers_may_be_views():
     """Of cells that lie apart in memory, as in a transposed map."""
     net, layers = random_net(1, torch.float32), random_layers(1, 2, 20, 30, dtype=torch.float32)
     turned = apply(lambda layer: layer.mT, layers)
-    expected = native.complete(net.weights, apply(lambda layer: layer.mT.contiguous(), layers), 0.05)
-    for actual, same in zip(native.complete(net.weights, turned, 0.05), expected, strict=True):
+    expected = completion_kernel.complete(net.weights, apply(lambda layer: layer.mT.contiguous(), layers), 0.05)
+    for actual, same in zip(completion_kernel.complete(net.weights, turned, 0.05), expected, strict=True):
         assert torch.equal(actual, same)
 
 
 def test_altitude_costs_no_precision_and_large_values_nothing():
     net, layers = random_net(2, torch.float32), random_layers(2, 1, 20, 20, dtype=torch.float32)
-    low = native.complete(net.weights, layers, 0.05)
+    low = completion_kernel.complete(net.weights, layers, 0.05)
     rise = 2.0**10
-    high = native.complete(
+    high = completion_kernel.complete(
         net.weights,
         layers._replace(elevation=layers.elevation + rise, upper_bound=layers.upper_bound + rise),
         0.05,
@@ -66,18 +66,18 @@ def test_altitude_costs_no_precision_and_large_values_nothing():
     torch.testing.assert_close(high[1], low[1], rtol=0.05, atol=1e-3)
     lost = torch.full_like(layers.elevation, torch.nan)
     blank = layers._replace(upper_bound=torch.where(layers.bounded, layers.upper_bound, lost))
-    for actual, same in zip(native.complete(net.weights, blank, 0.05), low, strict=True):
+    for actual, same in zip(completion_kernel.complete(net.weights, blank, 0.05), low, strict=True):
         assert torch.equal(actual, same)
 
 
 def test_what_is_not_of_float32_or_of_one_shape_is_left_to_the_tensors():
     double, single = random_net(), random_net(dtype=torch.float32)
     layers = random_layers(dtype=torch.float32)
-    assert native.complete(single.weights, layers, 0.05) is not None
-    assert native.complete(double.weights, random_layers(), 0.05) is None
-    assert native.complete(double.weights, layers, 0.05) is None
-    assert native.complete(single.weights, layers._replace(variance=layers.variance.double()), 0.05) is None
-    assert native.complete(single.weights, layers._replace(age=layers.age[:, :1, :1]), 0.05) is None
+    assert completion_kernel.complete(single.weights, layers, 0.05) is not None
+    assert completion_kernel.complete(double.weights, random_layers(), 0.05) is None
+    assert completion_kernel.complete(double.weights, layers, 0.05) is None
+    assert completion_kernel.complete(single.weights, layers._replace(variance=layers.variance.double()), 0.05) is None
+    assert completion_kernel.complete(single.weights, layers._replace(age=layers.age[:, :1, :1]), 0.05) is None
 
 
 def test_forward_mode_and_vmap_are_refused():

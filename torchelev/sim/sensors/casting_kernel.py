@@ -1,4 +1,4 @@
-"""Ray casting in C++ (`torchelev/native/casting`): the same as `trace` and the boxes, several times as fast."""
+"""Ray casting in C++ (`torchelev/sim/sensors/kernel`): the same as `trace` and the boxes, several times as fast."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.inputs.checks import readable
-from torchelev.native.library import call, load
+from torchelev.kernels.cpu_build import call, load
 from torchelev.sim.terrains.heightfield import HeightField
 
 _FARTHEST = 2.0**23  # [cells]
@@ -33,7 +33,7 @@ def cast(
     tensors = (field.padded, tile_ids, origin, directions)
     if not all(readable(value) for value in tensors) or len(field.bounds.highest) >= 2**31:
         return None
-    library = load("casting/casting.cpp", {})
+    library = load("sim/sensors/kernel/casting.cpp", {})
     if library is None:
         return None
     start = torch.cat([origin[:, :2] / field.resolution + field.middle, origin[:, 2:]], 1).nan_to_num(0.0, 0.0, 0.0)
