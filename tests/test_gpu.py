@@ -15,7 +15,7 @@ from torchelev.completion.surroundings import count_steps
 from torchelev.native import kernels
 from torchelev.ops import operators
 from torchelev.ops.moving import move_in_place
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.site import SiteMap
 from torchelev.stages.fusion import on_gpu as fusion_on_gpu
 from torchelev.stages.overlap.stage import clear_other_floors
@@ -182,7 +182,7 @@ def test_other_floors_and_surfaces_equal_those_of_the_cpu():
     m = emap.measure(torch.full((70, 1, 3), torch.nan), T, T, 0.1)
     with torch.no_grad():
         on_cpu, on_gpu = (
-            rate_surface(clear_other_floors(*values, cfg.grid, cfg.overlap), cfg)
+            rate(clear_other_floors(*values, cfg.grid, cfg.overlap), cfg)
             for values in ((state, m), (map_layers(to_gpu, state), type(m)(*map(to_gpu, m))))
         )
     assert on_cpu.statistics.cleared_other_floors.min() > 100 and on_cpu.traversability.mean() > 0.1

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, TraversabilityConfig
 from torchelev.app.cli import main
 from torchelev.io.export import save_map, save_npz, take, write_npz
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 
 GRID = GridConfig(resolution=0.1, length_x=4.0, length_y=3.0)
 
@@ -21,7 +21,7 @@ def world(height=0.3, gap=2.0, **stages):
     emap.elevation.copy_(torch.where((x > 0) & (x < 0.2) & (y < gap), height, 0.0))
     emap.validity.fill_(True)
     emap.variance.fill_(1e-4)
-    emap.load_state(rate_surface(emap.state, emap.cfg))
+    emap.load_state(rate(emap.state, emap.cfg))
     return emap
 
 

@@ -14,7 +14,7 @@ from torchelev import (
     RobotConfig,
     TraversabilityConfig,
 )
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.planning.footprint import FootprintConfig, check_footprint, unsafe_area
 from torchelev.planning.limits import Limit, compute_steps, find_obstacles, limits_of
 from torchelev.planning.path_check import check_path
@@ -38,7 +38,7 @@ def world(height, resolution=0.1, head=LOOSE, known=None, size=3.0, dtype=torch.
     emap.elevation.copy_(height(x, y))
     emap.validity.copy_(torch.ones_like(emap.validity) if known is None else known(x, y))
     emap.variance.fill_(1e-4)
-    emap.load_state(rate_surface(emap.state, cfg))
+    emap.load_state(rate(emap.state, cfg))
     return emap
 
 

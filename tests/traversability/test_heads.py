@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests import reference
 from tests.helpers import pose, random_state, small_config, small_map, terrain
 from torchelev import ElevationMapConfig, GridConfig, LearnedTraversabilityConfig, RobotConfig, TraversabilityConfig
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.plane_fit import known_ground
 from torchelev.state import blank_state
 from torchelev.traversability.heads import find_steps
@@ -24,7 +24,7 @@ def test_agrees_with_the_reference(seed, radius, known, forgiving):
     critical = {k: v for k, v in dataclasses.asdict(cfg).items() if k != "robot"}
     grid = small_map(1, (7, 6)).cfg.grid
     state = random_state(np.random.default_rng(seed), grid, 2, known)
-    after = rate_surface(state, small_config((7, 6), traversability=cfg))
+    after = rate(state, small_config((7, 6), traversability=cfg))
     got = after.traversability
     for b, i, j in np.ndindex(2, 7, 6):
         expected = 0.0
@@ -40,7 +40,7 @@ def test_flat_is_traversable_and_a_step_is_not():
     emap = small_map(1, (20, 10))
     state = emap.state._replace(validity=torch.ones_like(emap.validity))
     state.elevation[:, 12:] = 0.3
-    result = rate_surface(state, emap.cfg).traversability
+    result = rate(state, emap.cfg).traversability
     assert result[0, :10].min() > 0.99 and result[0, 11:13].max() == 0 and result[0, 15:].min() > 0.99
 
 
@@ -62,7 +62,7 @@ def rated(height, resolution, cfg):
     map_cfg = ElevationMapConfig(grid=grid, traversability=cfg)
     state = blank_state(grid, 1, "cpu", torch.float32)
     state = state._replace(elevation=height.float()[None], validity=torch.ones_like(state.validity))
-    return rate_surface(state, map_cfg).traversability[0]
+    return rate(state, map_cfg).traversability[0]
 
 
 def x_of(resolution, size=2.4):

@@ -10,7 +10,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, LearnedTraversabilityConfig, RobotConfig
 from torchelev.io.map_file import load_map, save_map
-from torchelev.pipeline import rate_surface
+from torchelev.pipeline import rate
 from torchelev.state import blank_state
 from torchelev.traversability.heads import TraversabilityConfig, TraversabilityNet
 from torchelev.traversability.weight_file import Weights, weight_shapes
@@ -153,7 +153,7 @@ def test_maps_of_other_precision(cfg, dtype):
 def test_nothing_waits_for_the_device(cfg):
     """On tensors without values."""
     with FakeTensorMode():
-        state = rate_surface(
+        state = rate(
             blank_state(GRID, 2, "cpu", torch.float32),
             cfg,
             Weights(*(torch.zeros(shape) for shape in weight_shapes(12, 8).values())),

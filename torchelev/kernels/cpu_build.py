@@ -65,7 +65,7 @@ def _load(
         compiler = find_compiler()
         if compiler is None:
             return None
-        path = cache_folder() / f"{name}-{_key(compiler, [*flags, *sources], headers)}.so"
+        path = cache_folder() / f"{name}-{_key(compiler, flags, sources, headers)}.so"
         with contextlib.suppress(OSError):  # there is none, or a damaged one
             return _open(path)
         _build(compiler, flags, sources, headers, path)
@@ -167,11 +167,12 @@ def _run(command: list[str]) -> None:
     subprocess.run(command, check=True, capture_output=True, text=True, timeout=_BUILD_TIME)
 
 
-def _key(compiler: list[str], flags: list[str], headers: Sequence[tuple[str, str]]) -> str:
+def _key(compiler: list[str], flags: list[str], sources: Sequence[str], headers: Sequence[tuple[str, str]]) -> str:
     """Return a hash of all that the library depends on: sources, flags, compiler and processor."""
     version = subprocess.run([*compiler, "--version"], check=True, capture_output=True, timeout=60).stdout
     parts = [version, " ".join(flags).encode(), describe_processor(), *(text.encode() for _, text in headers)]
-    parts += [path.read_bytes() for path in sorted(PACKAGE.rglob("*")) if path.suffix in (".cpp", ".h")]
+    parts += [part for source in sources for part in (source.encode(), (PACKAGE / source).read_bytes())]
+    parts += [path.read_bytes() for path in sorted(PACKAGE.rglob("*.h"))]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
 
 

@@ -9,7 +9,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from torchelev.native.library import find_compiler
+from torchelev.kernels.cpu_build import find_compiler
 
 _HERE = Path(__file__).parent
 _THREADS = _HERE / "threads.cpp"

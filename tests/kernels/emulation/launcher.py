@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from tests.kernels.emulation.build import build
-from torchelev.native.library import find_compiler
+from torchelev.kernels.cpu_build import find_compiler
 
 needs_emulation = pytest.mark.skipif(
     sys.platform != "linux" or find_compiler() is None, reason="needs Linux and a C++ compiler"
 )
-BLOCK, LARGE_BLOCK = 128, 512  # threads, as in torchelev/native/kernels.py
+BLOCK, LARGE_BLOCK = 128, 512  # threads, as in torchelev/kernels/cuda_build.py
 
 
 class Launcher:
@@ -49,7 +49,7 @@ class Launcher:
         assert failure is None, f"{kernel}: {failure.decode()}"
 
     def launch(self, kernel: str, rows: int, number: int, *arguments) -> None:
-        """Do what `torchelev.native.kernels.launch` does."""
+        """Do what `torchelev.kernels.cuda_build.launch` does."""
         self(kernel, rows * -(-number // BLOCK), BLOCK, 0, *arguments)
 
     def launch_blocks(self, kernel: str, blocks: int, memory: int, *arguments) -> None:

@@ -5,12 +5,14 @@ import os
 import platform
 import stat
 import subprocess
+from pathlib import Path
 
 import pytest
 
-from torchelev.native import library
-
-SOURCES = library._SOURCES
+from torchelev import ElevationMapConfig, pipeline
+from torchelev.kernels import cpu_build as library
+from torchelev.kernels.cpu_update import Inputs
+from torchelev.kernels.registry import PACKAGE, header
 
 
 @pytest.fixture(autouse=True)
@@ -18,10 +20,15 @@ def _fresh(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHELEV_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("TORCHELEV_NATIVE", raising=False)
     monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setattr(library, "_SOURCES", tmp_path)
+    monkeypatch.chdir(tmp_path)
     library._load.cache_clear()
     yield
     library._load.cache_clear()
+
+
+def load(source, defines):
+    """A library of a source in the test's folder."""
+    return library.load(str(Path.cwd() / source), defines)
 
 
 needs_compiler = pytest.mark.skipif(library.find_compiler() is None, reason="needs a C++ compiler")
@@ -31,7 +38,7 @@ needs_compiler = pytest.mark.skipif(library.find_compiler() is None, reason="nee
 def test_a_library_is_built_once_and_again_when_its_source_or_a_constant_changes(tmp_path):
     def answer(value):
         library._load.cache_clear()
-        built = library.load("answer.cpp", {"VALUE": str(value)})
+        built = load("answer.cpp", {"VALUE": str(value)})
         return built.answer(), len(list((tmp_path / "cache").iterdir()))
 
     (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return VALUE; }')
@@ -45,10 +52,8 @@ def test_a_library_is_built_once_and_again_when_its_source_or_a_constant_changes
 @needs_compiler
 def test_a_compiler_that_fails_is_told_and_done_without(tmp_path):
     (tmp_path / "broken.cpp").write_text("this is not C++")
-    with pytest.warns(
-        RuntimeWarning, match=r"(?s)broken.cpp could not be built.*CXX.*TORCHELEV_CACHE.*TORCHELEV_NATIVE=0"
-    ):
-        assert library.load("broken.cpp", {}) is None
+    with pytest.warns(RuntimeWarning, match=r"(?s)broken could not be built.*CXX.*TORCHELEV_CACHE.*TORCHELEV_NATIVE=0"):
+        assert load("broken.cpp", {}) is None
 
 
 @needs_compiler
@@ -58,37 +63,37 @@ def test_a_cache_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "cache").chmod(stat.S_IRUSR | stat.S_IXUSR)
     (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return 1; }')
     with pytest.warns(RuntimeWarning, match="could not be built"):
-        assert library.load("answer.cpp", {}) is None
+        assert load("answer.cpp", {}) is None
 
 
 def test_without_a_compiler_nothing_is_built(monkeypatch):
     monkeypatch.setattr(library.shutil, "which", lambda name: None)
     assert library.find_compiler() is None
-    assert library.load("answer.cpp", {}) is None
+    assert load("answer.cpp", {}) is None
 
 
 def test_a_compiler_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler -O1")
     with pytest.warns(RuntimeWarning, match="CXX=no-such-compiler -O1 is no command"):
-        assert library.load("answer.cpp", {}) is None
+        assert load("answer.cpp", {}) is None
 
 
 @needs_compiler
 def test_a_compiler_may_have_arguments(monkeypatch, tmp_path):
     (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return VALUE; }')
     monkeypatch.setenv("CXX", " ".join([*library.find_compiler(), "-DVALUE=5"]))
-    assert library.load("answer.cpp", {}).answer() == 5
+    assert load("answer.cpp", {}).answer() == 5
 
 
 @needs_compiler
 def test_a_damaged_library_is_built_anew(tmp_path):
     (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return 3; }')
-    assert library.load("answer.cpp", {}).answer() == 3
+    assert load("answer.cpp", {}).answer() == 3
     (built,) = (tmp_path / "cache").iterdir()
     built.unlink()
     built.write_bytes(b"")
     library._load.cache_clear()
-    assert library.load("answer.cpp", {}).answer() == 3
+    assert load("answer.cpp", {}).answer() == 3
 
 
 @needs_compiler
@@ -101,15 +106,14 @@ def test_a_user_without_a_home_is_told(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(library.Path, "home", no_home)
     with pytest.warns(RuntimeWarning, match="Could not determine home directory.*TORCHELEV_CACHE"):
-        assert library.load("answer.cpp", {}) is None
+        assert load("answer.cpp", {}) is None
 
 
 @needs_compiler
 def test_what_is_thrown_on_a_thread_is_no_crash(tmp_path):
-    (tmp_path / "threads.h").write_text((SOURCES / "threads.h").read_text())
     (tmp_path / "throwing.cpp").write_text(
         """
-        #include "threads.h"
+        #include "kernels/threads.h"
         #include <new>
         extern "C" int throwing(int count, int threads, int failing) {
             auto work = [&](int k) { if (k == failing) throw std::bad_alloc(); };
@@ -117,7 +121,7 @@ def test_what_is_thrown_on_a_thread_is_no_crash(tmp_path):
         }
         """
     )
-    throwing = library.load("throwing.cpp", {}).throwing
+    throwing = load("throwing.cpp", {}).throwing
     library.call(throwing, 100, 3, -1)
     for threads in (1, 3):
         with pytest.raises(MemoryError, match="throwing ran out of memory: give it fewer or smaller maps"):
@@ -127,7 +131,7 @@ def test_what_is_thrown_on_a_thread_is_no_crash(tmp_path):
 def test_it_can_be_switched_off(monkeypatch, tmp_path):
     (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return 1; }')
     monkeypatch.setenv("TORCHELEV_NATIVE", "0")
-    assert library.load("answer.cpp", {}) is None and not (tmp_path / "cache").exists()
+    assert load("answer.cpp", {}) is None and not (tmp_path / "cache").exists()
 
 
 @needs_compiler
@@ -135,13 +139,13 @@ def test_it_can_be_switched_off(monkeypatch, tmp_path):
 def test_threads_of_torch_and_its_own_do_all_the_work(is_of_torch, tmp_path):
     program = tmp_path / "count.cpp"
     program.write_text(
-        f'#include "{SOURCES / "threads.h"}"\n'
+        '#include "kernels/threads.h"\n'
         'extern "C" int count(int* times, int number, int threads) {\n'
         "  return code_of([&] { for_each(number, threads, [&](int k) { times[k] += 1; }); });\n"
         "}\n"
     )
     path = tmp_path / "count.so"
-    library._build(library.find_compiler(), library._FLAGS, program, path)
+    library._build(library.find_compiler(), library._FLAGS, [str(program)], [], path)
     opened = library._open(path) if is_of_torch else ctypes.CDLL(str(path))
     for number, threads in ((0, 2), (1, 2), (1000, 1), (1000, 2), (1000, 3)):
         times = (ctypes.c_int * number)()
@@ -152,12 +156,14 @@ def test_threads_of_torch_and_its_own_do_all_the_work(is_of_torch, tmp_path):
 @needs_compiler
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names vectors of x86-64")
 @pytest.mark.parametrize("narrow", ["-mno-avx512f", "-mno-avx512f -mno-avx"])
-def test_every_library_builds_for_narrower_vectors(narrow):
+def test_every_source_builds_for_narrower_vectors(narrow, tmp_path):
     """As of other processors; those that work on vectors say so by their own tests."""
-    for source in sorted(SOURCES.rglob("*.cpp")):
-        if source.parent.name == "completion":  # whose sizes are given at build time
+    structs = header(pipeline.KERNELS, ElevationMapConfig(), [*pipeline.TENSORS, ("Inputs", Inputs, {})])
+    (tmp_path / "generated.h").write_text(structs)
+    for source in sorted(PACKAGE.rglob("*.cpp")):
+        if source.parent.parent.name == "completion":  # whose sizes are given at build time
             continue
-        defines = [f"-D{name}=1e4f" for name in ("NO_RAY", "NOWHERE", "NO_FALL", "MIN_DET", "MIN_TRACE", "STANCE")]
-        command = [*library.find_compiler(), *library._FLAGS, *narrow.split(), *defines, "-fsyntax-only", str(source)]
+        flags = [*library._FLAGS, *narrow.split(), f"-I{tmp_path}", f"-I{PACKAGE}"]
+        command = [*library.find_compiler(), *flags, "-fsyntax-only", str(source)]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, f"{source.name}: {done.stderr[:2000]}"

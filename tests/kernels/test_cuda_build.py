@@ -2,13 +2,13 @@
 
 import contextlib
 import warnings
-from types import SimpleNamespace
 from unittest.mock import patch
 
 import pytest
 import torch
 
-from torchelev.native import kernels
+from torchelev import ElevationMapConfig, pipeline
+from torchelev.kernels import cuda_build as kernels
 
 
 @pytest.fixture
@@ -61,39 +61,19 @@ def test_a_gpu_for_which_nothing_compiles_is_told(gpu):
         assert not kernels.can_launch(0)
 
 
-@pytest.mark.parametrize(
-    "blocks, memory, suits", [(66, 1000, True), (65, 1000, False), (500, 200_000, True), (500, 240_000, False)]
-)
-def test_blocks_suit_a_gpu_with_enough_memory_whose_half_they_keep_busy(monkeypatch, blocks, memory, suits):
-    properties = SimpleNamespace(multi_processor_count=132, shared_memory_per_block_optin=232_448)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: properties)
-    assert kernels.suits_blocks(0, blocks, memory) == suits
-    del properties.shared_memory_per_block_optin
-    assert kernels.suits_blocks(0, blocks, memory) == (suits and memory <= 48 * 1024)
-
-
-@pytest.mark.parametrize("memory, works", [(48 * 1024, True), (48 * 1024 + 1, False)])
-def test_kernels_work_where_their_blocks_have_enough_memory(gpu, memory, works):
-    gpu.setattr(kernels, "_try", lambda device: True)
-    gpu.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace())
-    layer = SimpleNamespace(is_cuda=True, get_device=lambda: 0)
-    assert kernels.work_on(layer, memory) == works
-    gpu.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(shared_memory_per_block_optin=65536))
-    assert kernels.work_on(layer, memory)
-    assert not kernels.work_on(SimpleNamespace(is_cuda=False), memory)
-
-
 def test_compiled_code_asks():
     compiled = torch.compile(lambda x: x + kernels.can_launch(max(0, x.get_device())), fullgraph=True, backend="eager")
     assert compiled(torch.zeros(1)) == kernels.can_launch(0)
 
 
-def test_all_kernels_are_loaded(gpu):
-    loaded = []
-    gpu.setattr(kernels, "_function", lambda source, kernel, _: loaded.append(f"{source} {kernel}"))
-    gpu.setattr(kernels, "_launch", lambda *_: None)
-    gpu.setattr(torch, "ones", lambda *_, **__: torch.tensor(2.0))
-    assert kernels._try(0)
-    sources = [path.read_text(encoding="utf-8") for path in kernels._SOURCES.rglob("*.cu")]
-    assert len(set(loaded)) == sum(text.count('extern "C" __global__') for text in sources) > 8
-    assert "surface/surface.cu rate_surface" in loaded and "tables/tables.cu widen" in loaded
+def test_every_source_compiles():
+    """By NVRTC, where it is found; else `tests.kernels.emulation` compiles them."""
+    cuda = pipeline.cuda_stages(ElevationMapConfig())
+    sources = {source for launches in cuda._launches.values() for source, _ in launches}
+    assert {source.path for source in sources} == {kernel.cuda_source for kernel in pipeline.KERNELS if kernel.cuda}
+    try:
+        kernels._nvrtc()
+    except OSError:
+        pytest.skip("needs a torch with CUDA")
+    for source in sources | {kernels.Source("kernels/cuda/trial.cu")}:
+        assert kernels.compile_source(source, "sm_90")
