@@ -11,7 +11,7 @@ MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests
 EXTRAS := io,bags,odometry,video,view,geo,site,rl,dev,docs
 MJLAB := .venv-mjlab
 
-.PHONY: help demo test test-fast test-library test-mjlab matrix lint types setup bench quality quality-odometry docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab matrix lint types setup bench quality quality-odometry docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -66,6 +66,10 @@ on-%:
 test-library: setup
 	@$(BIN)/python -c 'import sys, torch; print("Python", sys.version.split()[0], "torch", torch.__version__)'
 	$(BIN)/python $(PYTEST) -m "not slow" $(MATRIX_TESTS)
+
+wheel: setup  ## build a wheel that carries the C++ libraries, for processors of this kind
+	$(BIN)/python -m torchelev.app.build_ahead
+	$(BIN)/python -m hatchling build -t wheel
 
 lint: setup  ## check style, and that imports go downwards
 	$(BIN)/ruff check --no-cache .

@@ -36,6 +36,12 @@ _DOUBLES = {"RADIUS_0": context.RADII[0], "RADIUS_1": context.RADII[1], "SMALLES
 _CONSTANTS = {name: f"{value!r}f" for name, value in _FLOATS.items()} | {k: repr(v) for k, v in _DOUBLES.items()}
 
 
+def library_of(weights: Weights) -> tuple[str, dict[str, str]]:
+    """Return source and constants of the library for a network of such sizes."""
+    sizes = {"VIEWS": weights.view, "CELLS": weights.cell, "MEASURED": weights.measured}
+    return "completion/kernel/completion.cpp", _CONSTANTS | {name: str(len(weight)) for name, weight in sizes.items()}
+
+
 def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> tuple[Tensor, Tensor] | None:
     """Return mean and standard deviation [m] of each cell, (B, H, W); None where C++ cannot compute them.
 
@@ -50,9 +56,7 @@ def complete(weights: Weights, layers: Sequence[Tensor], resolution: float) -> t
     is_plain = is_float and all(layer.shape == elevation.shape for layer in layers)
     if not is_plain or max(elevation.shape[1:]) > _LARGEST:
         return None
-    sizes = {"VIEWS": weights.view, "CELLS": weights.cell, "MEASURED": weights.measured}
-    defines = {name: str(len(weight)) for name, weight in sizes.items()}
-    library = load("completion/kernel/completion.cpp", _CONSTANTS | defines)
+    library = load(*library_of(weights))
     if library is None:
         return None
     flat = torch.cat([weight.detach().flatten() for weight in weights])

@@ -20,9 +20,19 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from torchelev.errors import require
 from torchelev.kernels.registry import PACKAGE
 
-_FLAGS = "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -fPIC -pthread -Wno-psabi".split()
+_FLAGS = "-std=c++17 -O3 -fno-math-errno -fno-trapping-math -fPIC -pthread -Wno-psabi".split()
+AHEAD = PACKAGE / "kernels" / "built"  # libraries that a wheel carries
+# By kind of machine, the largest first: what compilers call them, and the flags of /proc/cpuinfo that they need.
+INSTRUCTION_SETS: dict[str, dict[str, tuple[str, ...]]] = {
+    "x86_64": {
+        "x86-64-v4": ("avx2", "fma", "bmi2", "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
+        "x86-64-v3": ("avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"),
+    },
+    "aarch64": {"armv8-a": ("asimd",)},
+}
 _UNFINISHED = "building-"  # folders of builds
 _BUILD_TIME = 300  # [s] at most
 _OFF = ("0", "off", "false", "no")
@@ -62,10 +72,14 @@ def _load(
     flags = [*_FLAGS, *(f"-D{name}={value}" for name, value in defines)]
     name = Path(sources[0]).stem
     try:
+        packaged = AHEAD / f"{name}-{_key(flags, sources, headers)}-{instruction_set()}.so"
+        if packaged.exists():
+            return _open(packaged)
+        flags.append("-march=native")
         compiler = find_compiler()
         if compiler is None:
             return None
-        path = cache_folder() / f"{name}-{_key(compiler, flags, sources, headers)}.so"
+        path = cache_folder() / f"{name}-{_machine_key(compiler, flags, sources, headers)}.so"
         with contextlib.suppress(OSError):  # there is none, or a damaged one
             return _open(path)
         _build(compiler, flags, sources, headers, path)
@@ -167,13 +181,51 @@ def _run(command: list[str]) -> None:
     subprocess.run(command, check=True, capture_output=True, text=True, timeout=_BUILD_TIME)
 
 
-def _key(compiler: list[str], flags: list[str], sources: Sequence[str], headers: Sequence[tuple[str, str]]) -> str:
-    """Return a hash of all that the library depends on: sources, flags, compiler and processor."""
+def _machine_key(
+    compiler: list[str], flags: list[str], sources: Sequence[str], headers: Sequence[tuple[str, str]]
+) -> str:
+    """Return a hash of all that a library built here depends on: its key, compiler and processor."""
     version = subprocess.run([*compiler, "--version"], check=True, capture_output=True, timeout=60).stdout
-    parts = [version, " ".join(flags).encode(), describe_processor(), *(text.encode() for _, text in headers)]
+    parts = [_key(flags, sources, headers).encode(), version, describe_processor(), " ".join(compiler).encode()]
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
+
+
+def _key(flags: list[str], sources: Sequence[str], headers: Sequence[tuple[str, str]]) -> str:
+    """Return a hash of the sources and flags of a library."""
+    parts = [" ".join(flags).encode(), *(text.encode() for _, text in headers)]
     parts += [part for source in sources for part in (source.encode(), (PACKAGE / source).read_bytes())]
     parts += [path.read_bytes() for path in sorted(PACKAGE.rglob("*.h"))]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
+
+
+# Built ahead --------------------------------------------------------------------------------------------------------
+
+
+def build_ahead(
+    sources: str | Sequence[str], defines: Mapping[str, str], headers: Mapping[str, str] | None = None
+) -> list[Path]:
+    """Build a library for each instruction set of this machine's kind into AHEAD, as a wheel carries it."""
+    compiler, paths = find_compiler(), []
+    hint = "install g++ or clang++, or set CXX"
+    require(compiler is not None, "compiler", "must be there to build libraries", "none", hint, FileNotFoundError)
+    assert compiler is not None
+    sources = (sources,) if isinstance(sources, str) else tuple(sources)
+    flags = [*_FLAGS, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
+    texts = tuple(sorted((headers or {}).items()))
+    for target in INSTRUCTION_SETS.get(platform.machine(), {}):
+        path = AHEAD / f"{Path(sources[0]).stem}-{_key(flags, sources, texts)}-{target}.so"
+        if not path.exists():
+            _build(compiler, [*flags, f"-march={target}"], sources, texts, path)
+        paths.append(path)
+    return paths
+
+
+@functools.cache
+def instruction_set() -> str | None:
+    """Return the largest of INSTRUCTION_SETS that this processor has; None without any."""
+    found = set(describe_processor().split())
+    sets = INSTRUCTION_SETS.get(platform.machine(), {})
+    return next((name for name, flags in sets.items() if {flag.encode() for flag in flags} <= found), None)
 
 
 def describe_processor() -> bytes:

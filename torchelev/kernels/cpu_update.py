@@ -55,9 +55,14 @@ class CpuUpdate:
     @functools.cached_property
     def library(self) -> ctypes.CDLL | None:
         """The library of all stages; None if it cannot be built."""
+        return load(*self.parts)
+
+    @property
+    def parts(self) -> tuple[tuple[str, ...], dict[str, str], dict[str, str]]:
+        """Sources, constants and headers of the library."""
         structs = header(self._kernels, self._default, [*self._tensors, ("Inputs", Inputs, {})])
         sources = ("kernels/update.cpp", *dict.fromkeys(kernel.cpu_source for kernel in self._kernels))
-        return load(sources, {}, {"generated.h": structs})
+        return sources, {}, {"generated.h": structs}
 
     @functools.cached_property
     def _settings(self) -> ctypes.Structure:

@@ -11,6 +11,7 @@ from torchelev.inputs.checks import readable
 from torchelev.kernels.cpu_build import call, load
 from torchelev.sim.terrains.heightfield import HeightField
 
+LIBRARY: tuple[str, dict[str, str]] = ("sim/sensors/kernel/casting.cpp", {})
 _FARTHEST = 2.0**23  # [cells]
 
 
@@ -33,7 +34,7 @@ def cast(
     tensors = (field.padded, tile_ids, origin, directions)
     if not all(readable(value) for value in tensors) or len(field.bounds.highest) >= 2**31:
         return None
-    library = load("sim/sensors/kernel/casting.cpp", {})
+    library = load(*LIBRARY)
     if library is None:
         return None
     start = torch.cat([origin[:, :2] / field.resolution + field.middle, origin[:, 2:]], 1).nan_to_num(0.0, 0.0, 0.0)

@@ -1,0 +1,26 @@
+"""Build the C++ libraries that a wheel carries: `make wheel`, or `python -m torchelev.app.build_ahead`."""
+
+from __future__ import annotations
+
+import shutil
+
+from torchelev.completion.completion_kernel import library_of
+from torchelev.completion.net import CompletionNet
+from torchelev.config import ElevationMapConfig
+from torchelev.kernels.cpu_build import AHEAD, build_ahead
+from torchelev.kernels.cpu_update import compiled_stages
+from torchelev.pipeline import compile_stages
+from torchelev.sim.sensors.casting_kernel import LIBRARY as CASTING
+
+
+def main() -> None:
+    """Build all libraries for each instruction set of this machine's kind."""
+    shutil.rmtree(AHEAD, ignore_errors=True)
+    stages = compiled_stages(compile_stages(ElevationMapConfig())).parts
+    for library in (stages, library_of(CompletionNet.from_pretrained().weights), CASTING):
+        for path in build_ahead(*library):
+            print(path.name)
+
+
+if __name__ == "__main__":
+    main()
