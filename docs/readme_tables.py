@@ -207,7 +207,7 @@ def empty_tables(text: str) -> list[str]:
 
 
 def has_result(name: str) -> bool:
-    """Tell whether the results that a table needs exist."""
+    """Return whether the results that a table needs exist."""
     try:
         TABLES[name]()
     except FileNotFoundError:

@@ -105,7 +105,7 @@ def walk(env: Any, steps: int) -> dict[str, Tensor]:
 
 
 def is_level(ideal: Tensor) -> Tensor:
-    """Tell where the ideal scan (..., 187) differs by at most LEVEL from all eight neighbours: no edge is near."""
+    """Return where the ideal scan (..., 187) differs by at most LEVEL from all eight neighbours: no edge is near."""
     grid = ideal.unflatten(-1, (11, 17)).flatten(0, -3)[:, None]
     highest = torch.nn.functional.max_pool2d(grid, 3, 1, 1)
     lowest = -torch.nn.functional.max_pool2d(-grid, 3, 1, 1)

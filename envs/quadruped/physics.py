@@ -121,7 +121,7 @@ class Physics(nn.Module):
         return Sensed(*(part.unflatten(-1, shape) for part, shape in zip(parts, _SHAPES, strict=True)))
 
     def step(self, targets: Tensor, latency: Tensor, num_steps: int) -> None:
-        """Step all robots, and tell in `diverged` (B,) whose simulation has failed.
+        """Step all robots, and set `diverged` (B,) where a simulation has failed.
 
         Where a state is NaN, infinite or huge, MuJoCo resets the robot to the model's first pose and its time to 0.
 

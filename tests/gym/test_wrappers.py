@@ -39,7 +39,7 @@ def pose_of(step):
 
 
 class Ground(gymnasium.Env):
-    """Tells its episode and its step, and sees ground that tells them too."""
+    """Its observation holds its episode and its step, and so does the ground that it sees."""
 
     observation_space = spaces.Box(0, 100, (2,), np.float32)
     action_space = spaces.Discrete(2)

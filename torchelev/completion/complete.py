@@ -127,6 +127,6 @@ class Cells:
 
 
 def _may_choose_cells(weights: Weights, layers: CompletionInput) -> bool:
-    """Tell whether the number of computed cells may depend on the data: on a CPU, without gradients."""
+    """Return whether the number of computed cells may depend on the data: on a CPU, without gradients."""
     is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in (*weights, *layers))
     return layers.validity.device.type == "cpu" and not is_differentiated

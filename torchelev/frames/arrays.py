@@ -28,6 +28,6 @@ def assemble(position: Tensor, rotation: Tensor) -> Tensor:
 
 
 def is_readable(values: Tensor) -> bool:
-    """Tell whether values can be read without waiting for a device or breaking a graph."""
+    """Return whether values can be read without waiting for a device or breaking a graph."""
     plain = type(values) is Tensor and not is_transforming()
     return plain and values.device.type == "cpu" and not torch.compiler.is_compiling()

@@ -23,7 +23,7 @@ def require_unit(name: str, quat: Tensor) -> None:
 
 
 def require_upright(name: str, quat: Tensor) -> None:
-    """Raise ValueError unless all quaternions (..., 4) leave the z axis up, and tell if another order would."""
+    """Raise ValueError unless all quaternions (..., 4) leave the z axis up; its hint names another order that would."""
     tilts = {order: _max_tilt(quat[..., xy]) for order, xy in _XY.items()}
     tilt = tilts.pop(name)
     hint = "give the pose of a frame whose z axis points up, or leave out upright"

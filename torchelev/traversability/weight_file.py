@@ -106,7 +106,7 @@ def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotCon
 
 
 def _is_config(config: dict[str, Any]) -> bool:
-    """Tell whether a config has all its parts, of the right types."""
+    """Return whether a config has all its parts, of the right types."""
     if config.keys() != _CONFIG_KEYS:
         return False
     ranges = config["ranges"]

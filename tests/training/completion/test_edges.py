@@ -28,7 +28,7 @@ def seen_stairs(rise, known=lambda x: x > 10.0):
 
 
 def half_of_each_tread(x):
-    """Tell which places are in the second half of a tread of 0.3 m."""
+    """Return which places are in the second half of a tread of 0.3 m."""
     return (x + 1.5).remainder(0.3) > 0.15
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 def may_wait(device: torch.device) -> bool:
-    """Tell whether reading a value from the device costs nothing."""
+    """Return whether reading a value from the device costs nothing."""
     return device.type == "cpu"
 
 

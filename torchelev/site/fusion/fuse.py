@@ -181,7 +181,7 @@ def _find_surest(prior: Heights, entries: Entries, weights: _Weights, best: Tens
 def _agree_with_others(
     prior: Heights, entries: Entries, weights: _Weights, cfg: SiteConfig
 ) -> tuple[Bool[Tensor, "K"], Bool[Tensor, "C"]]:
-    """Tell which entries, and which priors, lie within the gate of the mean of the other heights of their cell.
+    """Return which entries, and which priors, lie within the gate of the mean of the other heights of their cell.
 
     With the mean m of all, whose information is W, the mean of all but the height h of information w lies
     (h - m) W / (W - w) away from it.
@@ -199,7 +199,7 @@ def _agree_with_others(
 def _pass_gate(
     prior: Heights, entries: Entries, distance: list[Tensor], variance: list[Tensor], cfg: SiteConfig
 ) -> tuple[Bool[Tensor, "K"], Bool[Tensor, "C"]]:
-    """Tell which entries, and which priors, have a distance [m] within the gate, given its variance [m^2]."""
+    """Return which entries, and which priors, have a distance [m] within the gate, given its variance [m^2]."""
     limits = [v.clamp(max=cfg.max_gate_std**2) for v in variance]
     agrees = distance[0].square() <= cfg.gate**2 * (limits[0] + entries.relief)
     is_kept = prior.known
@@ -270,7 +270,7 @@ def _sum_told(
 def _replaces(
     other: Heights, first: Heights, holds_new: tuple[Tensor, Tensor], rate: float, cfg: SiteConfig
 ) -> Bool[Tensor, "C"]:
-    """Tell where the other height is to be the site's: newer and about as sure, or as new and surer.
+    """Return where the other height is to be the site's: newer and about as sure, or as new and surer.
 
     `holds_new` tells where the first and the other hold what was merged just now, which decides between equal times.
     """

@@ -62,7 +62,7 @@ def merge_windows(
 
 
 def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:
-    """Fuse entries into the layers of tiles, in place; tell which contradict other heights of their cells."""
+    """Fuse entries into the layers of tiles, in place; return which contradict other heights of their cells."""
     fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
     for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
         layers[row] = value

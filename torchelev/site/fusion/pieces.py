@@ -61,7 +61,7 @@ def group_tiles(corner: Int[Tensor, "B 2"], mask: Bool[Tensor, "B H W"]) -> list
 
 
 def _touched(corner: Int[Tensor, "B"], lines: Float[Tensor, "B size"]) -> Bool[Tensor, "B t"]:
-    """Tell which of the tiles that a window spans along one axis hold lines that are not zero."""
+    """Return which of the tiles that a window spans along one axis hold lines that are not zero."""
     size = lines.shape[1]
     tile = ((corner % TILE)[:, None] + torch.arange(size, device=corner.device)) // TILE
     return lines.new_zeros(len(corner), size // TILE + 2).scatter_add_(1, tile, lines) > 0

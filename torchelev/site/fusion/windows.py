@@ -131,7 +131,7 @@ def drop_reset(told: Told, num_resets: Int[Tensor, "B"], elapsed: Int[Tensor, "B
 
 
 def _find_new(state: MapState, known: Known, told: Told | None) -> Bool[Tensor, "B H W"]:
-    """Tell which known cells are not what was told before: measured since, or not part of it.
+    """Return which known cells are not what was told before: measured since, or not part of it.
 
     What `initialize_from` gave may be younger than the last merge, but nobody has measured it: no bit of it changes.
     """

@@ -81,7 +81,7 @@ def make_site(path: Path, header: Header) -> None:
 
 
 def is_site(path: Path) -> bool:
-    """Tell whether a folder holds a site, or something else in Zarr 3."""
+    """Return whether a folder holds a site, or something else in Zarr 3."""
     return (path / METADATA).exists() or (path / COMMITTED / METADATA).exists()
 
 

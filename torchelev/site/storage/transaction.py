@@ -96,7 +96,7 @@ def finish(path: Path) -> bool:
 
 
 def clean(path: Path) -> bool:
-    """Remove what an earlier writer staged, and complete what it committed; tell whether it committed anything.
+    """Remove what an earlier writer staged, and complete what it committed; return whether it committed anything.
 
     Raises:
         CommitError: the folder cannot be written.

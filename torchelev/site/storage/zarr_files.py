@@ -122,7 +122,7 @@ def wait_for(writes: Sequence[Any]) -> None:
 
 
 def is_missing(error: ValueError) -> bool:
-    """Tell whether tensorstore raised this because a chunk's file is not there."""
+    """Return whether tensorstore raised this because a chunk's file is not there."""
     return str(error).startswith("NOT_FOUND")
 
 

@@ -182,7 +182,7 @@ class Page:
 
 
 def _is_worth_logging(record: logging.LogRecord) -> bool:
-    """Tell whether to log a server's message: browsers may connect in advance and then ask for nothing."""
+    """Return whether to log a server's message: browsers may connect in advance and then ask for nothing."""
     return "handshake failed" not in record.getMessage()
 
 
