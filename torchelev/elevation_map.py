@@ -361,7 +361,7 @@ class ElevationMap(ReadableMap):
             ValueError: if the site has another resolution, an id is out of range or repeated, a shape or device is
                 wrong, or both ids and a mask are given. Nothing has changed then.
         """
-        require(hasattr(site, "give"), "site", "must be a SiteMap", type(site).__name__, "give one", TypeError)
+        require(hasattr(site, "fill_state"), "site", "must be a SiteMap", type(site).__name__, "give one", TypeError)
         if T_map_base is not None:
             shape = (self.num_envs, 4, 4)
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
@@ -369,7 +369,7 @@ class ElevationMap(ReadableMap):
         self._derived.clear()
         with torch.no_grad():
             write(self.state, subtract_disagreement(self.state))
-            state = site.give(self, T_map_base, chosen)
+            state = site.fill_state(self, T_map_base, chosen)
             write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
 
     # Diagnosis ------------------------------------------------------------------------------------------------------

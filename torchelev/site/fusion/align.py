@@ -62,11 +62,11 @@ def align(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteCon
 
 
 def _known_offsets(windows: Windows) -> Float[Tensor, "B"]:
-    """Return the offsets of the last merge [m], NaN of windows that have told nothing."""
-    told = windows.told
-    if told is None:
+    """Return the offsets of the last merge [m], NaN of windows that have not contributed yet."""
+    contribution = windows.contribution
+    if contribution is None:
         return torch.full(windows.known.now.shape, torch.nan, dtype=torch.float64, device=windows.known.now.device)
-    return torch.where(told.known.is_known.flatten(1).any(1), told.alignment.offset, torch.nan)
+    return torch.where(contribution.known.is_known.flatten(1).any(1), contribution.alignment.offset, torch.nan)
 
 
 def find_pairs(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteConfig) -> Pairs:
