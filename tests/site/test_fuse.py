@@ -9,8 +9,8 @@ import torch
 from hypothesis import given
 
 from tests import reference
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.fuse import Entries, Heights, fuse
+from torchelev.site.site_config import SiteConfig
 
 CFG = SiteConfig()
 LIMITS = dict(gate=CFG.gate, max_gate_std=CFG.max_gate_std, max_newer_ratio=CFG.max_newer_ratio)

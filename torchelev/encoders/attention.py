@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchelev.encoders.config import AttentionConfig
+from torchelev.encoders.encoder_config import AttentionConfig
 from torchelev.encoders.layout import MapLayout
 from torchelev.errors import require
 

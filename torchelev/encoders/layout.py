@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.encoders.config import AttentionConfig
+from torchelev.encoders.encoder_config import AttentionConfig
 from torchelev.errors import require
 from torchelev.observations import patterns
 from torchelev.observations.height_scan import HeightScan

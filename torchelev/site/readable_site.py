@@ -17,8 +17,8 @@ from torchelev.errors import require, whole_cells
 from torchelev.grid import grid_of
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
-from torchelev.site.export import Place, choose_area, export
 from torchelev.site.reading import Clock, check_layer, check_layers, read_area, sample_tiles
+from torchelev.site.site_export import Place, choose_area, export
 from torchelev.site.tiles import TILE, Tiles
 
 if TYPE_CHECKING:

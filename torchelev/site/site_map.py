@@ -18,7 +18,6 @@ from torchelev.errors import require, require_positive
 from torchelev.inputs import checks
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.align import align
 from torchelev.site.fusion.merge import Merged, MergeReport, merge_windows
 from torchelev.site.fusion.windows import (
@@ -39,6 +38,7 @@ from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
 from torchelev.site.readable_site import ReadableSite
 from torchelev.site.shared.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.shared.ranks import Ranks
+from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import Tiles, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
 from torchelev.stages.initialize import Remembered

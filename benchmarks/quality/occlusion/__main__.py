@@ -21,7 +21,7 @@ import torch
 from tqdm import tqdm
 
 from benchmarks import RESULTS
-from benchmarks.quality.occlusion.picture import draw
+from benchmarks.quality.occlusion.occlusion_figure import draw
 from benchmarks.quality.occlusion.refine import refined_costs
 from benchmarks.quality.occlusion.rules import RULES, decide
 from benchmarks.quality.occlusion.scenes import KINDS, VIEWS, Case, views

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.windows import Alignment, Windows
+from torchelev.site.site_config import SiteConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.entries import read_entries, rise
 from torchelev.site.fusion.fuse import Entries, Heights, fuse
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
 from torchelev.site.fusion.windows import Alignment, Windows
+from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import LAYERS, Tile, Tiles
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import tifffile
 from tests.site.helpers import fill, robots
 from torchelev.io.export import load_npz
 from torchelev.output_files import is_own_output
-from torchelev.site import SiteMap, export
+from torchelev.site import SiteMap, site_export
 
 
 @pytest.fixture
@@ -175,7 +175,7 @@ def test_a_place_where_no_file_can_be_is_named_as_it_was_given(site, tmp_path, m
 def test_a_file_that_fails_leaves_the_older_one(site, tmp_path, monkeypatch):
     site.export(tmp_path / "a.tif")
     before = (tmp_path / "a.tif").read_bytes()
-    monkeypatch.setattr(export, "_north_up", lambda layer: 1 / 0)
+    monkeypatch.setattr(site_export, "_north_up", lambda layer: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         site.export(tmp_path / "a.tif")
     assert (tmp_path / "a.tif").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
