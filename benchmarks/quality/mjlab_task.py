@@ -93,7 +93,7 @@ def walk(env: Any, steps: int) -> dict[str, Tensor]:
     ours, ideal, valid, observed = [], [], [], []
     for _ in range(steps):
         groups, *_ = env.step(0.3 * torch.randn(size, generator=generator))
-        values, known = scan(term.emap, term._maps.source.read_base(env))
+        values, known = scan(term.emap, term.maps.source.read_base(env))
         hits = env.scene["terrain_scan"].data.distances >= 0
         ours.append(values / scan.scale)
         ideal.append(height_scan(env, "terrain_scan"))
