@@ -1,6 +1,6 @@
 """Time merges of the same robots into a site that 1, 2 or 4 processes share.
 
-    python -m benchmarks.speed.site_ranks
+    python -m benchmarks.speed.site.site_ranks
 
 Robots stand on a square 8 m apart, with windows of 12 x 12 m at 10 cm that know all their ground, and measure it anew
 before each merge. Processes are on this machine, with one thread each and gloo. All ranks align and fuse the robots of
