@@ -114,7 +114,7 @@ def _build(cls: type, values: object, where: str) -> Any:
 
 
 def _share_of_settings(names: set[str], settings: set[str]) -> tuple[int, float]:
-    """Return how many of a type's settings are named, and which share of them."""
+    """Return how many names are settings of a type, and their share of all names."""
     number = len(names & settings)
     return number, number / len(settings)
 

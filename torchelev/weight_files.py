@@ -1,4 +1,4 @@
-"""What all networks share: files of weights, checked before anything is made of them, and resolutions of maps."""
+"""Helpers of all networks: files of weights, checked before use, and resolutions of maps."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class DemoScan(NamedTuple):
 
 
 class _HitCells:
-    """Cells that were hit since they entered the window: what the map could know at best."""
+    """Cells that were hit since they entered the window: those that the map can know."""
 
     def __init__(self, resolution: float, reach: float = 12.0) -> None:
         self.resolution = resolution

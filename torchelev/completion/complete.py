@@ -82,7 +82,7 @@ def _(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[T
 
 @torch.no_grad()
 def _answer_each(weights: Weights, cells: Cells) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation of all cells, each computed as what it is, on all cores."""
+    """Return mean and standard deviation of all cells, as measured or unknown ones, on all cores."""
 
     def measured(place: Tensor) -> tuple[Tensor, Tensor]:
         return refine(weights, cells.measured.choose(place), cells.describe(place))
@@ -100,7 +100,7 @@ def _answer_each(weights: Weights, cells: Cells) -> tuple[Tensor, Tensor]:
 
 
 class Cells:
-    """Reads what the answers at the cells of maps depend on; cells are numbered in the flat maps."""
+    """Gathers the network's inputs at cells of the maps; cells are numbered in the flat maps."""
 
     def __init__(self, layers: CompletionInput, resolution: float) -> None:
         elevation, known, variance, upper_bound, bounded, age = layers
@@ -119,7 +119,7 @@ class Cells:
         return describe(self.sums, self.level, place, self.resolution)
 
     def read_unknown(self, place: Int[Tensor, "n"], context: Context) -> Seen:
-        """Return what the prediction at unknown cells depends on."""
+        """Return the network's inputs at unknown cells."""
         around = look_around(self.ground, self.steps, place, self.resolution)
         bound, bounded = (values.index_select(0, place) for values in (self.bound, self.bounded))
         level = self.level.to(bound.dtype).index_select(0, place // self.known[0].numel())

@@ -1,4 +1,4 @@
-"""The completion network: a module that predicts the ground at every cell, and how sure that is."""
+"""The completion network: a module that predicts the ground at every cell, with its standard deviation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The weights of the completion network: their shapes, and what they are multiplied with."""
+"""The weights of the completion network: their shapes, and the features that they multiply."""
 
 from __future__ import annotations
 

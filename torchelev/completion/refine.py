@@ -21,7 +21,7 @@ LONG_AGO = 60.0  # [s] ages count about logarithmically beyond a second, up to t
 
 
 class Measured(NamedTuple):
-    """n measured cells and what lies next to them; arbitrary but finite where a cell is not measured."""
+    """n measured cells and their neighbours; arbitrary but finite where a cell is not measured."""
 
     height: Float[Tensor, "n"]  #: [m]
     sigma: Float[Tensor, "n"]  #: [m] standard deviation of it in the map, MIN_STD at least

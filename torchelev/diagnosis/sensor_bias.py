@@ -52,7 +52,7 @@ def _cells_of(seen: Evidence, k: int, sensor: int) -> dict[tuple[int, int], floa
 
 
 def find_alternating_corrections(seen: Evidence) -> str | None:
-    """Find drift corrections that repeat: each of several sensors, or each phase of a gait, has its own height."""
+    """Find drift corrections that repeat: each sensor, or each phase of a gait, has its own height offset."""
     corrections = np.array(seen.corrections)
     for period in range(2, _MAX_SENSORS + 1):
         recent = corrections[-(len(corrections) // period) * period :]

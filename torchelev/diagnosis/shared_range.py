@@ -1,4 +1,4 @@
-"""Points that no surface reflected: at the sensor's limit, where all share one range or depth, or on its own path."""
+"""Points without a reflecting surface: at the sensor's limit, with one range or depth, or on its own path."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _looks_along(points: NDArray, column: int, sign: float) -> bool:
 
 
 def _is_screen(clouds: list[_Cloud], at_limit: list[NDArray], column: int, sign: float, limit: float) -> bool:
-    """Return whether points of one depth fill a part of the image, and move with the sensor as no wall does.
+    """Return whether points of one depth fill a part of the image and move with the sensor, unlike a wall.
 
     The last row of level ground has one depth, too, but is a line.
     """
@@ -148,7 +148,7 @@ def _is_screen(clouds: list[_Cloud], at_limit: list[NDArray], column: int, sign:
 
 
 def find_points_on_path(seen: Evidence) -> str | None:
-    """Find points at places where the sensor itself was during the scan: returns that are missing, moved along."""
+    """Find points on the sensor's own path during the scan: missing returns at the origin, moved by deskewing."""
     counts, total = [], 0
     for k in range(len(seen.numbers) - 1):
         if seen.numbers[k + 1] != seen.numbers[k] + 1:

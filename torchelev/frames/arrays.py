@@ -1,4 +1,4 @@
-"""What constructors of poses share: tensors from arrays, and 4 x 4 matrices from their parts."""
+"""Helpers of the pose constructors: tensors from arrays, and 4 x 4 matrices from their parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the observation terms of all simulators do: read the maps of an environment as an observation."""
+"""The part that observation terms of all simulators share: read the maps of an environment as an observation."""
 
 from __future__ import annotations
 

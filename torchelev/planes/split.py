@@ -22,7 +22,7 @@ _MIN_CELLS = 4  # smaller pieces of a cut are dropped; growing gives their cells
 
 
 def split(labels: Int[ndarray, "P"], surface: Surface, limits: Limits) -> tuple[Int[ndarray, "P"], RegionPlanes]:
-    """Cut components until each is planar. Returns labels and planes.
+    """Cut components until each is planar; return labels and planes.
 
     A region rougher than allowed is cut in two; from a planar one only the cells too far from its plane are removed.
     The connected pieces are the regions of the next round. What is left after MAX_CUTS rounds is dropped.

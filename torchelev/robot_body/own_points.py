@@ -1,4 +1,4 @@
-"""Which points lie on the robot: pieces of their rays against its shapes."""
+"""Find the points on the robot by intersecting pieces of their rays with its shapes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A world map that grows: what many robots saw becomes one, on disk, and is given back to each of them.
+"""A world map that grows: it merges the maps of many robots, is kept on disk, and initialises robots' maps.
 
 Robot-centric windows live in `torchelev.elevation_map`, single files of maps in `torchelev.io`.
 """

@@ -1,4 +1,4 @@
-"""Reading a site: what `SiteMap` is without merging."""
+"""Reading a site: `SiteMap` without merging."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class ReadableSite:
         epsg: int | None = None,
         origin: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Write an area to a file of the kind that its suffix says, completely or not at all.
+        """Write an area to a file in the format of its suffix, completely or not at all.
 
         - `.tif`: a GeoTIFF with a float32 band for each layer, NaN where unknown. Written block by block, so that
           memory does not grow with the area. Needs ``torchelev[geo]``.
@@ -188,7 +188,7 @@ class ReadableSite:
         )
 
     def refresh(self) -> None:
-        """Read again what another process has written since. Only of use for a site that is open read-only."""
+        """Read what another process has written since. Useful only for a site that is open read-only."""
         if self._store is not None:
             self._store.refresh()
             self._tiles.forget()
@@ -211,4 +211,4 @@ class ReadableSite:
         self.close()
 
     def _read_attributes(self) -> None:
-        """Take over what the store's attributes say."""
+        """Take the values of the store's attributes."""

@@ -31,7 +31,7 @@ _SOURCES = {  # what a layer is computed from, first of all the mask of where it
 
 
 class Clock(NamedTuple):
-    """What ages the layers."""
+    """The time and rate by which layers age."""
 
     time: float  #: [s] the site's, from its epoch
     rate: float  #: [m^2/s] at which variances grow

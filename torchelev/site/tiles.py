@@ -27,7 +27,7 @@ Tile = tuple[int, int]
 
 
 class Storage(Protocol):
-    """What keeps the tiles that are not in memory."""
+    """The storage of the tiles that are not in memory."""
 
     @property
     def tiles(self) -> Collection[Tile]:
@@ -72,7 +72,7 @@ def _number(flat: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 class Tiles:
-    """The tiles in memory. With a storage, those used last; without, all.
+    """The tiles in memory: with a storage, those used last; without, all.
 
     Args:
         storage: where all tiles are; None: in memory alone.

@@ -1,4 +1,4 @@
-"""The times of merges: checks of those that users give, and how time goes on where they give none."""
+"""The times of merges: checks of the given ones, and the site's own time where none is given."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def warn_of_other_clock(time: float, newest: float) -> None:
 def continue_time(
     elapsed: Int[torch.Tensor, "B"], contribution: Contribution | None, time: float, opened: float
 ) -> float:
-    """Return the time of a merge that is given none: the site's goes on by what the maps have lived since their last.
+    """Return the default time of a merge: the site's time plus the maps' elapsed time since their last merge.
 
     Args:
         elapsed: [ns] of the maps' clocks.

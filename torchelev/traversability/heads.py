@@ -1,4 +1,4 @@
-"""Traversability: a head that looks at the map and says where a robot can stand.
+"""Traversability heads, which rate where a robot can stand.
 
 Two heads share one place in the map: an analytic one, and one that was trained (paper, Sec. II-G).
 """
@@ -71,7 +71,7 @@ class TraversabilityConfig:
 
     @classmethod
     def of_robot(cls, robot: RobotConfig) -> TraversabilityConfig:
-        """Return the critical values for a robot, so that it takes the steps and slopes that it can.
+        """Return the critical values for a robot: its largest step and slope.
 
         Near the edge of a step h, a foot's window of radius r has a plane of a slope up to atan(3 h / (4 r)) and a
         roughness up to h / sqrt(12). All that belongs to the highest step that the robot overcomes is rated 0.31 or
@@ -176,7 +176,7 @@ def rate_all(state: MapState) -> MapState:
 
 
 class PlaneRating(NamedTuple):
-    """What the analytic head tells."""
+    """The layers of the analytic head."""
 
     traversability: Float[Tensor, "B H W"]  #: in [0, 1]
     rated: Bool[Tensor, "B H W"]  #: known cells whose window spans a plane; elsewhere traversability is 0

@@ -1,4 +1,4 @@
-"""Where each robot goes next: to the frontiers of what is known, each robot to another one.
+"""Choose where each robot goes next: to the frontiers of the known ground, each robot to a different one.
 
 Frontiers are free cells beside unknown ones (Yamauchi, "A frontier-based approach for autonomous exploration", 1997).
 Robots choose them one after the other; each choice lowers what the frontiers around it are worth to the other robots
@@ -31,7 +31,7 @@ _NONE = -1  # in place of a goal
 
 
 class CoarseMap(NamedTuple):
-    """The area in coarse cells: what is known of it, and where robots can walk."""
+    """The area in coarse cells: which are known, and where robots can walk."""
 
     known: Bool[Tensor, "H W"]  #: enough of the cell is known
     free: Bool[Tensor, "H W"]  #: known, and neither steep nor stepped

@@ -1,4 +1,4 @@
-"""The files that `torchelev map` writes: checked before mapping, written after it, elsewhere if need be."""
+"""The files that `torchelev map` writes: checked before mapping, written after it, if need be to a fallback folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read the messages of a bag, whatever its format."""
+"""Read the messages of a bag of any format."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Bag:
 
     @property
     def ended_early(self) -> str:
-        """What of the bag could not be read, where and why; "" if all could."""
+        """Which part of the bag could not be read and why; "" if everything was read."""
         undecoded = [f"{num} messages could not be decoded: {reason}" for reason, num in self._undecoded.items()]
         return "; ".join(filter(None, [self._damage or self._reader.ending, *undecoded]))
 

@@ -19,7 +19,7 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 
 class Scan(NamedTuple):
-    """What a sensor measured."""
+    """The points that a sensor measured."""
 
     frame: str  #: of the points
     stamp: float  #: [s]

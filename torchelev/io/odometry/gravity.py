@@ -1,4 +1,4 @@
-"""Which way is up in a frame that lidar odometry started: by the ground around the start, or by an IMU."""
+"""The direction of up in the frame of lidar odometry: from the ground around the start, or from an IMU."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def read_heights(known: Known, alignment: Alignment, robot: Tensor, place: Tenso
 def _read_contribution(
     windows: Windows, contribution: Contribution, robot: Tensor, place: Tensor, resolution: float
 ) -> Heights:
-    """Return what the site has from the same robots, NaN where nothing."""
+    """Return the earlier contributions of the same robots, NaN where there are none."""
     H, W = windows.known.elevation.shape[1:]
     shift = (windows.known.corner - contribution.known.corner)[robot]
     i, j = place // W % H + shift[:, 0], place % W + shift[:, 1]

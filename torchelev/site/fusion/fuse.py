@@ -146,7 +146,7 @@ def _weigh(prior: Heights, entries: Entries, rate: float) -> _Weights:
 def _average_near_surest(
     prior: Heights, entries: Entries, rate: float, cfg: SiteConfig, among_entries: bool = False
 ) -> tuple[Heights, Tensor, Tensor]:
-    """Average what agrees with each cell's surest height; return which entries (K,) and priors (C,) do, too.
+    """Average the heights that agree with each cell's surest one; return which entries (K,) and priors (C,) do.
 
     With `among_entries`, the surest one is an entry, where there is one.
     """

@@ -23,7 +23,7 @@ _BOUND, _TIME = LAYERS.index("upper_bound"), LAYERS.index("time")
 
 
 class MergeReport(NamedTuple):
-    """What a merge did, per robot."""
+    """The result of a merge, per robot."""
 
     offsets: Float[Tensor, "B"]  #: [m] how much the robot's heights lie above the site's; subtracted before fusing
     tilts: Float[Tensor, "B 2"]  #: rise over run along x and y; subtracted, too
@@ -43,7 +43,7 @@ class Merged(NamedTuple):
 def merge_windows(
     tiles: Tiles, windows: Windows, alignment: Alignment, resolution: float, rate: float, cfg: SiteConfig
 ) -> Iterator[Merged]:
-    """Return the tiles that the windows touch, after their fusion, some at a time; changes none in memory."""
+    """Return the tiles that the windows touch after fusion, a group at a time; changes none in memory."""
     groups = group_tiles(windows.known.corner, windows.is_new | windows.is_bounded)
     tiles.reserve(sum(tile not in tiles for group in groups for tile in group.tiles))
 

@@ -1,4 +1,4 @@
-"""The windows of B robots, as they are merged: what they know now, and what of it the site knows already."""
+"""The windows of B robots at a merge: their present values, and their earlier contributions to the site."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def no_alignment(num_windows: int, device: torch.device) -> Alignment:
 
 
 class Known(NamedTuple):
-    """What B windows know, in the robots' frames. Values count where `is_known`."""
+    """The values of B windows in the robots' frames, valid where `is_known`."""
 
     corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the lattice
     elevation: Float[Tensor, "B H W"]  #: [m]
@@ -78,7 +78,7 @@ def no_contribution(known: Known, num_resets: Int[Tensor, "B"]) -> Contribution:
 
 
 def read_known(emap: ElevationMap, state: MapState, now: float) -> Known:
-    """Return what a map's windows know, which shares memory with it; arguments as of `read_windows`.
+    """Return the values of a map's windows, which share memory with it; arguments as of `read_windows`.
 
     Cells whose variance has grown to the map's maximum hold no information, nor do those that feet initialised.
     """
@@ -105,7 +105,7 @@ def read_windows(emap: ElevationMap, state: MapState, now: float, contribution: 
 
 
 def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
-    """Return the variance [m^2] of the elevations, with what the horizontal errors of the poses add on slopes.
+    """Return the variance [m^2] of the elevations, including horizontal pose errors on slopes.
 
     The vertical error is shared by the window; the offset takes it out.
     """
@@ -146,7 +146,7 @@ def _find_new(state: MapState, known: Known, contribution: Contribution | None) 
 
 
 def move_known(known: Known, corner: Int[Tensor, "B 2"]) -> Known:
-    """Return what windows know, of the windows at other corners."""
+    """Return the values of windows, moved to other corners."""
     H, W = known.elevation.shape[1:]
     shift = (corner - known.corner).clamp(-max(H, W), max(H, W))
     if not shift.any():

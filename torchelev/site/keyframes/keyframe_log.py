@@ -38,13 +38,13 @@ class KeyframeLog:
 
     @property
     def rows(self) -> Rows:
-        """What is known of all keyframes; reads a small file for each merge the first time."""
+        """The metadata of all keyframes; reads a small file for each merge the first time."""
         if self._rows is None:
             self._rows = join(*(self._read_merge(number) for number in range(self.num_merges)))
         return self._rows
 
     def list(self) -> Keyframes:
-        """Return copies of what users may know of the keyframes."""
+        """Return copies of the keyframes' public metadata."""
         rows = self.rows
         return Keyframes(torch.arange(len(rows.merge)), rows.robot.clone(), rows.time.clone(), rows.T_now.clone())
 

@@ -40,7 +40,7 @@ class Keyframes(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What is known of K keyframes without reading them, on the CPU."""
+    """The metadata of K keyframes, on the CPU."""
 
     merge: Int[Tensor, "K"]  #: number of the merge
     robot: Int[Tensor, "K"]  #: number of the robot
@@ -149,7 +149,7 @@ def _own_layers(windows: Windows, alignment: Alignment, resolution: float) -> Fl
 
 
 def _contributed_layers(contributed: Contribution, resolution: float) -> Float[Tensor, "3 B H W"]:
-    """Return the heights that the site has from the same robots."""
+    """Return the heights of the robots' earlier contributions."""
     B, H, W = contributed.known.is_known.shape
     layers = torch.full((3, B * H * W), torch.nan, device=contributed.known.is_known.device)
     place = contributed.known.is_known.flatten().nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""Fusing keyframes into tiles where they were moved to: those of a new merge, or of all merges again."""
+"""Fuse keyframes into tiles at their corrected poses: those of a new merge, or again those of all merges."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BLOCK = 8  # tiles along x and y that are rebuilt at a time
 
 
 class Placed(NamedTuple):
-    """Keyframes where they lie now."""
+    """Keyframes at their corrected poses."""
 
     ids: Int[Tensor, "K"]  #: of the keyframes
     merge: Int[Tensor, "K"]  #: number of their merges, ascending
@@ -37,7 +37,7 @@ class Placed(NamedTuple):
 
 
 class Share(NamedTuple):
-    """What one keyframe says of a block's cells."""
+    """A keyframe's values at a block's cells."""
 
     entries: Entries  #: heights
     bound_cell: Int[Tensor, "U"]  #: number of the cell
@@ -45,7 +45,7 @@ class Share(NamedTuple):
 
 
 def place(rows: Rows, ids: Tensor, read: Callable[[int], Tensor], resolution: float) -> Placed:
-    """Return some of the keyframes as they lie now, those that hold nothing left out."""
+    """Return some of the keyframes at their corrected poses, without the empty ones."""
     ids = ids[(rows.size[ids] > 0).all(1)]
     moves = find_moves(rows.T_first, rows.T_now)
     own, contributed = moves.at(ids), moves.at(rows.previous[ids])
@@ -77,7 +77,7 @@ def merge_recorded(
 def rebuild_moved(
     tiles: Tiles, log: KeyframeLog, after: Rows, resolution: float, rate: float, cfg: SiteConfig
 ) -> Iterator[Merged]:
-    """Yield the tiles that change when keyframes are moved to where `after` has them."""
+    """Yield the tiles that change when keyframes move to their poses in `after`."""
     changed = find_changed(log.rows, after)
     touched = tiles_of(*(place(rows, changed, log.read, resolution) for rows in (log.rows, after)))
     placed = place(after, torch.arange(len(after.merge)), log.read, resolution)
@@ -169,7 +169,7 @@ def join_entries(parts: list[Entries]) -> Entries:
 
 
 def _share(placed: Placed, number: int, cells: Tensor, device: torch.device, resolution: float) -> Share:
-    """Look up what a keyframe says of tiles, given their first cells."""
+    """Look up a keyframe's values at tiles, given their first cells."""
     layers = placed.read(int(placed.ids[number]))
     targets, at = _find_targets(cells, placed.first[number], placed.last[number])
     corner, move, previous_move = placed.corner[number], placed.moves.at(number), placed.previous_moves.at(number)

@@ -94,7 +94,7 @@ def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) 
 def shared_transaction(
     ranks: Ranks, store: TileStore | None, attributes: Mapping[str, Any], arrays: Mapping[str, Any] | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Yield what writes tiles, which rank 0 commits once all ranks are at the end; without a store, nothing does.
+    """Yield a function that writes tiles, which rank 0 commits once all ranks are at the end, if there is a store.
 
     If the block or the commit raises on one rank, nothing is committed, and all raise.
     """

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Layout(NamedTuple):
-    """What the rows hold: the same on all ranks.
+    """The layout of the rows, the same on all ranks.
 
     Cell numbers are int64, times, rates and offsets float64, layers float32 and masks bits: 20.5 bytes per cell and 32
     per robot; with earlier contributions, 32.625 bytes per cell and 88 per robot.
@@ -31,7 +31,7 @@ class Layout(NamedTuple):
         return sum(_width(dtype, shape) for dtype, shape in self.parts())
 
     def parts(self) -> list[tuple[torch.dtype, tuple[int, ...]]]:
-        """Return the type and the shape, per robot, of all that a row holds, in its order."""
+        """Return the type and the shape, per robot, of the parts of a row, in their order."""
         layer = (self.height, self.width)
         known = [(torch.int64, (2,)), *2 * [(torch.float64, ())], *3 * [(torch.float32, layer)], (torch.bool, layer)]
         surface = [*2 * [(torch.float32, layer)], *3 * [(torch.bool, layer)]]
@@ -47,7 +47,7 @@ def pack(windows: Windows, layout: Layout) -> UInt8[Tensor, "B n"]:
 
 
 def unpack(rows: UInt8[Tensor, "B n"], layout: Layout) -> Windows:
-    """Return the windows that `pack` was given, as far as a merge reads them."""
+    """Return the parts of the packed windows that a merge reads."""
     parts = layout.parts()
     columns = rows.split([_width(dtype, shape) for dtype, shape in parts], 1)
     values = [_from_bytes(column, dtype, shape) for column, (dtype, shape) in zip(columns, parts, strict=True)]
@@ -57,7 +57,7 @@ def unpack(rows: UInt8[Tensor, "B n"], layout: Layout) -> Windows:
 
 
 def _values(windows: Windows, with_contribution: bool) -> list[Tensor]:
-    """Return what a row holds. A cell has a height or an upper bound, so that one layer holds both."""
+    """Return the contents of a row. A cell has a height or an upper bound, so that one layer holds both."""
     known = windows.known
     height = torch.where(windows.is_bounded, windows.upper_bound, known.elevation)
     surface = windows.gradient_x, windows.gradient_y, windows.has_normal, windows.is_bounded, windows.is_new

@@ -1,4 +1,4 @@
-"""What the attributes of a site's folder say: its format, its layers and its tiles, beside those of the caller."""
+"""The attributes of a site's folder: its format, its layers and its tiles, beside those of the caller."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OWN = ("format", "version", "layers", "tile_size", "origin", "rule")
 
 
 class Header(NamedTuple):
-    """What the folder's `zarr.json` holds."""
+    """The contents of the folder's `zarr.json`."""
 
     layers: tuple[str, ...]  #: names of the layers, in the order of the array
     tile_size: int  #: T, cells on the side of a tile

@@ -187,7 +187,7 @@ def _is_worth_logging(record: logging.LogRecord) -> bool:
 
 
 def _require_own_address(host: str) -> None:
-    """Refuse an address that the server would wait for in vain."""
+    """Refuse an address at which the server cannot listen."""
     try:
         with socket.create_server((host, 0)):
             pass

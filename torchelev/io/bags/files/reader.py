@@ -1,4 +1,4 @@
-"""What `Bag` needs of a reader of files."""
+"""The interface that `Bag` needs of a reader of files."""
 
 from __future__ import annotations
 

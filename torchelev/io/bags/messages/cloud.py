@@ -1,4 +1,4 @@
-"""Points of a message, and why a message cannot be used, or not fully."""
+"""Points of a message, and errors and notes of messages that cannot be used, or only in part."""
 
 from __future__ import annotations
 

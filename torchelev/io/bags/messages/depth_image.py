@@ -69,7 +69,7 @@ def _decode(message: Any, data: NDArray[np.uint8], scale: float | None) -> NDArr
 
 
 def _doubt(depth: NDArray[np.float32], saturated: float | None) -> Note | None:
-    """Return a note if the depths are such as no camera gives: their unit is probably another one.
+    """Return a note if no camera gives such depths: their unit is probably another one.
 
     Integers beyond `saturated` [m] do not count; None: they are floats, whose background may be far away.
     """

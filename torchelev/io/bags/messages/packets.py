@@ -1,4 +1,4 @@
-"""Messages that hold clouds only for the driver of the lidar."""
+"""Raw packets of lidars, which only the lidar's driver can decode."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def _find_fixed(
 
 
 def _hold_constant(tree: TransformTree, map_frame: str, base: str) -> None:
-    """Let transforms that never change hold at all times; those of a robot that stands still only at their times."""
+    """Extend transforms that never change to all times, except those of a robot that stands still."""
     way = tree.way(map_frame, base)
     kept = [] if any(not tree.is_constant(frame) for frame in way) else way
     tree.hold(frame for frame in tree.frames if tree.parent(frame) and frame not in kept and tree.is_constant(frame))
