@@ -49,7 +49,7 @@ class ElevationMapConfig:
     traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
         default_factory=TraversabilityConfig
     )
-    #: the layers `completed` and `completed_std`: what a network predicts of the ground that no sensor saw; None: none
+    #: the layers `completed` and `completed_std`: predicted ground where no sensor saw it; None: none
     completion: CompletionConfig | None = None
     filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
 

@@ -88,7 +88,7 @@ def _score(emap: ElevationMap, terrain: Terrain, tiles: Tensor) -> Shares:
 
 
 def measure(num_envs: int, steps: int, seeds: int) -> list[dict[str, Any]]:
-    """Walk over each kind of ground with each preset, told and not; mean of the seeds."""
+    """Walk over each kind of ground with each preset, with the covariance and without; mean of the seeds."""
     cases = [(name, kind) for name in PRESETS for kind in KINDS]
     rows = []
     for name, kind in tqdm(cases, unit="case", disable=None):

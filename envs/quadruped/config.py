@@ -107,7 +107,7 @@ class RandomConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OdometryConfig:
-    """Leg odometry: it believes that feet on the ground do not move."""
+    """Leg odometry: it assumes that feet on the ground do not move."""
 
     velocity_noise: float = 0.03  #: [m/s] of each step's velocity
     scale_error: float = 0.02  #: largest relative error of the distance walked, drawn for each episode

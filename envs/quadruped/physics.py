@@ -28,7 +28,7 @@ _MAX_SAMPLES = 2**24  # of the height field: MuJoCo's models hold one copy for e
 
 
 class Sensed(NamedTuple):
-    """What MuJoCo's sensors measured, in the world's frame, at the instant of `Physics.sensed_state`."""
+    """The values of MuJoCo's sensors, in the world's frame, at the instant of `Physics.sensed_state`."""
 
     foot_velocities: Tensor  #: (B, 4, 3) [m/s] of their centres
     foot_turns: Tensor  #: (B, 4, 3) [rad/s] angular velocities

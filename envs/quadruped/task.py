@@ -218,7 +218,7 @@ class Quadruped(nn.Module):
         return _to_yaw_frame(self._floats(self.physics.qvel[:, :3]), self.T_map_base)[:, 0]
 
     def _choose_levels(self, mask: Tensor) -> None:
-        """Move robots up that have crossed their tile, and down that have not come half as far as commanded.
+        """Move robots up that crossed their tile, and down that walked less than half the commanded distance.
 
         Fallen robots never move up: one that has diverged is anywhere.
         After seeding, levels are drawn from the first `start_level`; without a curriculum always, and from all.

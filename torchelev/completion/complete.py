@@ -18,7 +18,7 @@ from torchelev.ops.parallel import map_in_order
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_AT_A_TIME = 2**13  # unknown cells on a CPU: what is computed of them stays in its caches
+_AT_A_TIME = 2**13  # unknown cells on a CPU at a time: their intermediate values stay in its caches
 _AT_A_TIME_ON_GPU = 2**20
 
 

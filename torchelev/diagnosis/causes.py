@@ -190,7 +190,7 @@ def _height_over_ground(points: NDArray, position: NDArray) -> NDArray:
     A = np.column_stack([points[:, :2] - position[:2], np.ones(len(points))])
     is_ground = np.linalg.norm(A[:, :2], axis=1) < 1.5
     height = np.zeros(len(points))
-    for _ in range(4):  # each fit leaves out what stands more than 5 cm above the last one
+    for _ in range(4):  # each fit leaves out points more than 5 cm above the previous one
         if is_ground.sum() >= 3:
             height = points[:, 2] - A @ np.linalg.lstsq(A[is_ground], points[is_ground, 2], rcond=None)[0]
             is_ground &= height < 0.05

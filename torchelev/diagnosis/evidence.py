@@ -19,7 +19,7 @@ from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement
 
 MIN_POINTS = 20  # points that a fraction or a median must rest on
-_FAR = 250.0  # [m] beyond what sensors of robots measure
+_FAR = 250.0  # [m] farther than sensors of robots measure
 GATES = ("invalid", "range", "body", "overhang")  # of the sensor, in their order
 
 
@@ -28,7 +28,7 @@ class FarCloud(NamedTuple):
 
     distance: float  #: [m] of its middle from the sensor
     radius: float  #: [m] median distance of its points from the middle
-    is_at_sensor: bool  #: read in the map frame, it lies where the pose says that the sensor is
+    is_at_sensor: bool  #: read in the map frame, it lies at the sensor's pose
 
 
 @dataclass(frozen=True)

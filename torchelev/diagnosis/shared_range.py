@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchelev.diagnosis.evidence import MIN_POINTS, Evidence
 
 _MIN_SHARE = 0.01  # of a sensor's points; of sound ones, less than 0.2 % lie within the tolerance of the farthest
-_TOLERANCE = 1e-4  # relative; what float32 leaves of a range after a transform or two
+_TOLERANCE = 1e-4  # relative; rounding error of a float32 range after a transform or two
 _MAX_SHARE = 0.999  # a sensor that stands in the middle of a round room sees one range everywhere
 _MAX_RATIO = 2.5  # of lateral to forward distance, in the view of a camera
 _MOVED = 0.05  # [m], and sine of an angle, by which a wall would have come nearer or turned

@@ -19,7 +19,7 @@ class MapLayout(NamedTuple):
 
     groups: tuple[str, ...]  #: observation groups, whose channels follow each other
     channels: int  #: C, a validity of its own group included
-    coordinates: Tensor  #: (F, R, S) constant features of the points: x and y [m], then what else the rows hold
+    coordinates: Tensor  #: (F, R, S) constant features of the points: x and y [m], then the further columns of the rows
     validity: int | None  #: the channel that holds the validity
 
     @classmethod

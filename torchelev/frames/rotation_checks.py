@@ -12,7 +12,7 @@ from torchelev.errors import require
 _TOLERANCE = 1e-3  # of a quaternion's norm, and of a matrix's products
 _MAX_TILT = 60.0  # [deg] between up and the z axis of an upright frame
 _OTHER_ORDER = {"quat_wxyz": "x, y, z, w: use transform_xyzw", "quat_xyzw": "w, x, y, z: use transform"}
-_XY = {"quat_wxyz": slice(1, 3), "quat_xyzw": slice(0, 2)}  # where x and y are, which tell the tilt
+_XY = {"quat_wxyz": slice(1, 3), "quat_xyzw": slice(0, 2)}  # the places of x and y, which determine the tilt
 
 
 def require_unit(name: str, quat: Tensor) -> None:

@@ -112,7 +112,7 @@ def _is_rigid(matrix: Any) -> Any:
 
 def _require_rigid(name: str, pose: Tensor) -> None:
     """Refuse matrices that are not finite and rigid, or whose position is out of range."""
-    # In NumPy, whose calls cost a fifth of torch's: for one robot this is most of what the checks cost.
+    # In NumPy, whose calls cost a fifth of torch's: for one robot they dominate the checks.
     matrix = pose.detach().cpu().double().numpy()
     matrix = matrix if pose.ndim > 2 else matrix[None]
 

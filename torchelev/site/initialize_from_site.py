@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from torchelev.elevation_map import ElevationMap
 
-SUPPORT = 6.0  # points that must disagree until what a site remembers is replaced
+SUPPORT = 6.0  # points that must disagree before a height of the site is replaced
 
 
 def center_on(state: MapState, emap: ElevationMap, T_map_base: Float[Tensor, "B 4 4"], chosen: Tensor) -> MapState:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LAYERS = (*STORED, "validity")
 _FARTHEST = 2.0**40  # cells
-_SOURCES = {  # what a layer is computed from, first of all the mask of where it is known
+_SOURCES = {  # sources of a layer, first the one that is known where the layer is
     "elevation": ("elevation",),
     "variance": ("variance", "time"),
     "time": ("time",),

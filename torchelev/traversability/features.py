@@ -83,7 +83,7 @@ class Surface(NamedTuple):
     known: Float[Tensor, "B h w"]  #: 1 or 0
     shares: list[Tensor]  #: (B, h, w) of known cells in each window
     means: list[Tensor]  #: (B, h, w) [m] of each window, blended with the next where it knows little
-    hidden: Float[Tensor, "B h w"]  #: [m] of the upper bound below what completes the ground
+    hidden: Float[Tensor, "B h w"]  #: [m] depth of the upper bound below the completed ground
     bounded: Float[Tensor, "B h w"]  #: 1 or 0, of unknown cells
     variance: Float[Tensor, "B h w"]  #: [m^2] mean of the known ones of 3 x 3 cells
 

@@ -32,7 +32,7 @@ __all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "Traversabili
 
 STEP_REACH = 0.1  # [m] within which a height difference is a step: a foot's length and the smear of an edge
 EDGE_SLOPE, EDGE_ROUGHNESS = 0.75, 12**-0.5  # at most, of a plane near a step h: in h / radius, and in h
-RATING_AT_LIMIT = 0.31  # of ground at the limits of `of_robot`: just above what `plan` and `check_path` refuse
+RATING_AT_LIMIT = 0.31  # of ground at the limits of `of_robot`: just above the threshold of `plan` and `check_path`
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Count how often each rule for unknown ground tells a safe occlusion from a drop.
+"""Count how often each rule for unknown ground distinguishes a safe occlusion from a drop.
 
     python -m benchmarks.quality.occlusion
 

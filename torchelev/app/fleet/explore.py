@@ -77,7 +77,7 @@ class Explorer:
         own = self.find_cells(xy)
         cost = torch.where(area.free, 1.0, torch.inf).expand(len(xy), -1, -1).clone()
         start = F.one_hot(torch.as_tensor(own), self.num_cells**2).bool().view(cost.shape)
-        cost[start] = 1.0  # what is seen of the ground below a robot later must not hold it
+        cost[start] = 1.0  # ground below a robot that is seen later must not trap it
         way = cost_to_go(cost, start, resolution=self.coarse)
         self._choose_goals(area, way.flatten(1).numpy(), xy)
         self.is_done = bool((self.goals == _NONE).all())

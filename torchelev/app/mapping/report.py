@@ -14,7 +14,7 @@ from torchelev.io import MappingRun
 if TYPE_CHECKING:
     from torchelev.viz.plot import Panel
 
-_MIN_USED = 0.01  # of the finite points; a map of fewer says nothing of the place that was recorded
+_MIN_USED = 0.01  # of the finite points; with fewer, the map does not show the recorded place
 
 
 def summarize(run: MappingRun, num_scans: int) -> list[str]:

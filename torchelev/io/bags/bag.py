@@ -140,7 +140,7 @@ class Bag:
     def read_times(self, topic: str, count: int) -> list[float]:
         """Return when the first messages of a topic were recorded [s], at most `count`; a damaged bag gives fewer."""
         times: list[float] = []
-        with contextlib.suppress(Exception):  # rosbags lets through what its file formats raise; `read` says what
+        with contextlib.suppress(Exception):  # rosbags passes on exceptions of its file formats; `read` describes them
             for _, time, _ in itertools.islice(self._reader.messages(self._channels([topic])), count):
                 times.append(time / 1e9)
         return times

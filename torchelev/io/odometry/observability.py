@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 _MIN_POINTS = 15  # of a surface: normals of fewer points are mostly noise
 _FLATNESS = 10.0  # variance along a surface over that across it, at least
-_THICKNESS = 4.0  # variance across a surface over the median of all, at most: a corner in a cube is thicker
+_THICKNESS = 4.0  # largest variance across a surface over the median of all: a corner in a cube is thicker
 _MIN_SURFACES = 12
 _ALIKE = 0.95  # cosine between the normals of one surface in two scans
-_KNOWN = 5.0  # surfaces across a direction that tell how far things moved along it
+_KNOWN = 5.0  # surfaces across a direction that show motion along it
 
 
 class Surfaces(NamedTuple):

@@ -23,7 +23,7 @@ _VOXELS = 40.0  # across the reach of a scan
 _VOXEL = (0.2, 1.0)  # [m] smallest and largest
 _RANGE = 100.0  # [voxels] of KISS-ICP's local map, as by its own default
 _MIN_POINTS = 100
-_MAX_GAP = 1.0  # [s] across which the motion goes on
+_MAX_GAP = 1.0  # [s] over which the motion is extrapolated
 
 
 class Sweep(NamedTuple):

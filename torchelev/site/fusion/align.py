@@ -119,7 +119,7 @@ def find_groups(overlap: Bool[Tensor, "N N"]) -> Int[Tensor, "N"]:
     lowest = torch.arange(N, device=overlap.device)
     while True:
         near = torch.where(overlap, lowest, N).amin(1).minimum(lowest)
-        near = near[near]  # also takes over what the lowest one has found: halves the chains
+        near = near[near]  # also takes over the result of the lowest one: halves the chains
         if torch.equal(near, lowest):
             return lowest
         lowest = near

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
-_ALONE = 1e-6  # share of a cell's information, below which the other heights say nothing
+_ALONE = 1e-6  # share of a cell's information, below which the other heights are ignored
 
 
 class Heights(NamedTuple):
@@ -59,8 +59,8 @@ class Entries(NamedTuple):
 class Fused(NamedTuple):
     """C cells after a fusion."""
 
-    first: Heights  #: what the site says
-    other: Heights  #: what contradicts it
+    first: Heights  #: the site's height
+    other: Heights  #: the height that contradicts it
     is_contradicted: Bool[Tensor, "K"]  #: entries of cells in which heights contradict each other
 
 

@@ -15,7 +15,7 @@ from torchelev.site.tiles import CELL_BITS, CELLS, TILE, Tile, locate_tiles
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_GROUP = 16  # tiles at a time: what is computed of them stays in a CPU's caches
+_GROUP = 16  # tiles at a time: their intermediate values stay in a CPU's caches
 
 
 class Pieces(NamedTuple):

@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_ROUNDS = 3  # of finding the cell that a tilt moves to a place: its height says how far
+_ROUNDS = 3  # to find the cell that a tilt moves to a place, as the shift depends on its height
 _BORDER = 1e-6  # of a cell, less than which rounding moves borders
 
 

@@ -15,7 +15,7 @@ from torchelev.viz.live.snapshot import Snapshot, take_snapshot
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
-_WHOLE_COST = 4.0  # what a picture costs a loop on all cores, by the CPU time of drawing it: benchmarks.speed.live_view
+_WHOLE_COST = 4.0  # cost of a picture for a loop on all cores, by its CPU time: benchmarks.speed.live_view
 _USED_IDLENESS = 0.5  # share of a loop's spare time that drawing may take
 
 

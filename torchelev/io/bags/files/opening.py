@@ -58,7 +58,7 @@ def open_reader(path: Path, stack: ExitStack) -> Reader:
             return _opened(RosbagsReader(path), stack)
         except ModuleNotFoundError:
             raise
-        except Exception:  # rosbags lets through what its file formats raise: each file is tried by itself
+        except Exception:  # rosbags passes on exceptions of its file formats: each file is tried by itself
             note = _describe_missing(path)
     files = bag_files(path)
     if not files:

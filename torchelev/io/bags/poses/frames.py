@@ -30,7 +30,7 @@ class Frames(NamedTuple):
 
     map: str  #: in which the map is built
     base: str  #: that the window follows
-    notes: list[str]  #: what is doubtful about them
+    notes: list[str]  #: notes on doubtful frames
 
 
 def choose_frames(path: Path, tree: TransformTree, sensor: str, request: BagRequest) -> Frames:

@@ -37,7 +37,7 @@ class Placed(NamedTuple):
     sensor: str  #: frame of the first scan
     fixed: frozenset[str]  #: frames of clouds that are in the map's frame already
     rays_from: str  #: frame at which their rays start; "" if there are none
-    span: tuple[float, float]  #: [s] what is mapped, by the time of recording
+    span: tuple[float, float]  #: [s] mapped interval, by the time of recording
     clock: PoseClock  #: of the poses
     offsets: dict[str, float]  #: [s] by which the clocks of topics are to be set
     notes: list[str]  #: what is doubtful
