@@ -19,7 +19,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
 from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
-from torchelev.diagnosis.pace import Pace, paced
+from torchelev.diagnosis.update_times import UpdateTimes, timed
 from torchelev.errors import require, require_count
 from torchelev.inputs import checks
 from torchelev.inputs.chunks import make_chunks, run_in_chunks
@@ -81,7 +81,7 @@ class ElevationMap(ReadableMap):
         super().__init__(cfg, num_envs, device, head, completion_net)
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
-        self.pace = Pace()
+        self.update_times = UpdateTimes()
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
         self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
@@ -95,7 +95,7 @@ class ElevationMap(ReadableMap):
     # Updating -------------------------------------------------------------------------------------------------------
 
     @requires_dt
-    @paced
+    @timed
     def update(
         self,
         points: Float[Tensor, "B *S N 3"],
