@@ -145,7 +145,7 @@ class TaskVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         is_seeded: Whether the task is seeded, and the first reset need not do it.
 
     Raises:
-        ValueError: The autoreset mode is none of the two.
+        ValueError: The autoreset mode is neither of the two.
     """
 
     def __init__(

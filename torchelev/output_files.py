@@ -75,7 +75,7 @@ def require_writable(path: str | Path, num_bytes: int = 0) -> None:
 
 
 def is_own_output(path: Path) -> bool:
-    """Return whether this package wrote a file: a picture, mesh or map that lies beside scans is no scan."""
+    """Return whether this package wrote a file: a picture, mesh or map beside scans is not a scan."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".npz":

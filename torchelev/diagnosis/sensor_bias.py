@@ -70,7 +70,7 @@ def find_alternating_corrections(seen: Evidence) -> str | None:
 
 def _repeated_heights(corrections: NDArray) -> NDArray | None:
     """Return the height [m] of each of a period's updates, from corrections (turns, period); None if none repeats."""
-    corrections = corrections - corrections.mean()  # a common offset, such as steady drift, is no disagreement
+    corrections = corrections - corrections.mean()  # a common offset, such as steady drift, is not a disagreement
     mean = corrections.mean(0)
     total, left = np.square(corrections).sum(), np.square(corrections - mean).sum()
     return np.cumsum(mean) if left < (1 - _MIN_EXPLAINED) * total else None

@@ -88,7 +88,7 @@ def _clouds_by_sensor(seen: Evidence) -> Iterator[list[_Cloud]]:
 def _share_largest(clouds: list[_Cloud], values: list[NDArray], tolerance: float) -> tuple[float, float, list[NDArray]]:
     """Return the share of the points with the largest value, that value, and which points have it, per cloud.
 
-    The share is 0 unless enough of them entered the map: those above the ramp only say what is free, which is so.
+    The share is 0 unless enough of them entered the map: those above the ramp only mark free space, correctly.
     """
     limit = max((float(part.max()) for part in values), default=0.0)
     at_limit = [part >= limit * (1 - tolerance) for part in values]

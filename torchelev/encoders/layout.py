@@ -15,7 +15,7 @@ from torchelev.observations.height_scan import HeightScan
 
 
 class MapLayout(NamedTuple):
-    """What an encoder reads: C channels of points on R x S cells; R is 1 for a scan that is no grid."""
+    """The input of an encoder: C channels of points on R x S cells; R is 1 for a scan that is not a grid."""
 
     groups: tuple[str, ...]  #: observation groups, whose channels follow each other
     channels: int  #: C, a validity of its own group included

@@ -1,6 +1,6 @@
 """Maps that follow the control steps of a manager-based environment: one update per step, and resets with its episodes.
 
-Simulators differ only in where their data are: `Source` says what a map needs of them.
+Simulators differ only in where their data are: `Source` is the interface to them.
 """
 
 from __future__ import annotations

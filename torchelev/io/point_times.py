@@ -13,7 +13,7 @@ _SHORTEST, _LONGEST = 2e-3, 2.0  # [s] of a scan whose period is unknown
 _MARGIN = 1.2  # by which a scan may be longer than the period of its topic
 _SLOWEST = 0.21  # [s] period of lidars whose times may be fractions of it: 5 Hz and more
 _FEW = 100  # one of so many times may lie apart from all others
-_ABSOLUTE = 1e8  # [s] since 1970; larger times are no offsets from the message's stamp
+_ABSOLUTE = 1e8  # [s] since 1970; larger times are not offsets from the message's stamp
 
 
 def longest_scan(period: float | None) -> float:

@@ -118,7 +118,7 @@ class ReadableSite:
         Raises:
             KeyError: a layer does not exist.
             TypeError: `layers` is one name, not a list.
-            ValueError: a length is no whole number of cells, or the centre is no point.
+            ValueError: a length is not a whole number of cells, or the centre is not a point.
         """
         lengths = {"length_x": length_x, "length_y": length_y}
         height, width = (whole_cells(name, length, self.resolution) for name, length in lengths.items())
@@ -197,7 +197,7 @@ class ReadableSite:
     def close(self) -> None:
         """Let other processes write to the site's folder. All merges are on disk already.
 
-        From then on, `merge` and `move_keyframes` raise ValueError; reading goes on to work. In memory, does nothing.
+        From then on, `merge` and `move_keyframes` raise ValueError; reading still works. In memory, does nothing.
         """
         if self._store is not None:
             self._store.close()

@@ -38,7 +38,7 @@ class Clock(NamedTuple):
 
 
 def check_layers(layers: Sequence[str] | None) -> tuple[str, ...]:
-    """Return names of layers; None: all. TypeError if they are no list, KeyError if one does not exist."""
+    """Return names of layers; None: all. TypeError if they are not a list, KeyError if one does not exist."""
     is_list, hint = not isinstance(layers, str), f"give [{layers!r}]"
     require(is_list, "layers", "must be a list of names", repr(layers), hint, TypeError)
     return LAYERS if layers is None else tuple(check_layer("layers", name) for name in layers)

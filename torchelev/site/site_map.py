@@ -81,7 +81,7 @@ class SiteMap(ReadableSite):
             those that wait for a rank that has died raise `LostRankError`.
         keyframes: keep the contributions of each merge, so that `move_keyframes` can correct poses later: 32 bytes for
             each cell of the windows and merge, less what compression saves on disk. Holds from the first merge on; a
-            site on disk that has keyframes goes on to keep them.
+            site on disk that has keyframes continues to keep them.
 
     Attributes:
         resolution: [m].
@@ -170,7 +170,7 @@ class SiteMap(ReadableSite):
 
         Raises:
             FileNotFoundError: there is nothing; ``SiteMap(resolution=..., path=...)`` makes a site.
-            ValueError: it is no site, is damaged, or of a newer version.
+            ValueError: it is not a site, is damaged, or has a newer version.
             OSError: another process writes to it.
         """
         from torchelev.site.storage.store import TileStore
@@ -218,7 +218,7 @@ class SiteMap(ReadableSite):
             Offsets and counts, per robot.
 
         Raises:
-            TypeError: `emap` is no ElevationMap, or `time` no number.
+            TypeError: `emap` is not an ElevationMap, or `time` is not a number.
             ValueError: `emap` has another resolution, `time` is not in seconds, or the site is read-only or closed.
                 Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
@@ -389,7 +389,7 @@ class SiteMap(ReadableSite):
             T_map_base: their new poses; `keyframes.T_map_base` has the present ones.
 
         Raises:
-            TypeError: an argument is no tensor of the right kind.
+            TypeError: an argument is not a tensor of the right kind.
             ValueError: the site keeps no keyframes, is read-only or closed, an id is unknown or repeats, or the poses
                 are not rigid (K, 4, 4). Nothing has changed then.
             OSError: the disk is full; the site is as it was before.

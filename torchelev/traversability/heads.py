@@ -43,7 +43,7 @@ class TraversabilityConfig:
 
     Raises:
         ValueError: for a critical value that is not positive, or a slope of a right angle or more.
-        TypeError: for a robot that is no RobotConfig.
+        TypeError: for a robot that is not a RobotConfig.
     """
 
     radius: float = 0.1  #: [m] of the window that a foot or wheel needs

@@ -22,7 +22,7 @@ class MapRecorder:
         frame: of the map.
 
     Raises:
-        ValueError: the path is no bag's.
+        ValueError: the path is not a bag's.
         FileExistsError: there is a folder of this name.
         ModuleNotFoundError: rosbags is missing.
     """

@@ -32,7 +32,7 @@ class MapVideo:
         title: above the map.
 
     Raises:
-        ValueError: the path is no video's.
+        ValueError: the path is not a video's.
         WriteError: the path cannot be written.
         ModuleNotFoundError: PyAV is missing.
     """

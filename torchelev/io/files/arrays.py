@@ -99,7 +99,7 @@ def is_cloud(array: NDArray) -> bool:
 
 
 def _require_points(path: Path, array: NDArray) -> None:
-    """Refuse arrays that are no clouds: images, columns first, other types."""
+    """Refuse arrays that are not clouds: images, columns first, other types."""
     given = f"{array.dtype} {array.shape}"
     if array.ndim < 2 or array.dtype.kind not in "fiu":
         raise RecordingError(path, f"expected numbers (N, 3), got {given}", "save one row x y z per point")

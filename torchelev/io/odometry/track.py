@@ -134,7 +134,7 @@ class LidarOdometry:
         return interpolate_poses(poses, times, asked, _MAX_GAP)[0, 0].numpy()
 
     def _still(self, points: NDArray, times: NDArray | None, middle: float) -> NDArray[np.float64]:
-        """Return the points as seen at the middle of the scan, if the last motion goes on."""
+        """Return the points as seen at the middle of the scan, if the last motion continues."""
         if times is None or len(self._poses) < 2 or middle - self._times[-1] > _MAX_GAP:
             return points
         poses, stamps = self._recent()

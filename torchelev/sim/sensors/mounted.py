@@ -106,7 +106,7 @@ class MountedSensor:
     ) -> Float[Tensor, "B M 3"]:
         """Return the points seen [m], sensor frame, float32; NaN where nothing is hit, or nearer than `min_range`.
 
-        Arguments and errors are those of `view`, which also tells the points on the robot's own body.
+        Arguments and errors are those of `view`, which also returns the points on the robot's own body.
         """
         return self.view(
             field,

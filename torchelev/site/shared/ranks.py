@@ -24,7 +24,7 @@ class LostRankError(RuntimeError):
 
 
 class Ranks:
-    """The processes that share a site. Alone, no call waits for anybody.
+    """The processes that share a site. With one process, no call waits.
 
     Args:
         group: of `torch.distributed`; None: this process alone.

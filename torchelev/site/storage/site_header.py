@@ -63,7 +63,7 @@ def new_header(layers: Sequence[str], tile_size: int, attributes: Mapping[str, A
 
 
 def require_empty(path: Path) -> None:
-    """Raise ValueError unless a site can be made here; a killed process that began to make one is no obstacle."""
+    """Raise ValueError unless a site can be made here; leftovers of a killed process do not count."""
     if not os.path.lexists(path):
         return
     require(path.is_dir(), str(path), "must be a folder", "a file", "choose another path")

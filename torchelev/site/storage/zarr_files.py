@@ -111,7 +111,7 @@ def wait_for(writes: Sequence[Any]) -> None:
     """Wait for all futures of tensorstore's writes; raise OSError if one failed."""
     try:
         errors = [error for error in [write.exception() for write in writes] if error is not None]
-    except BaseException:  # Ctrl-C: a write that goes on would end up in the next commit
+    except BaseException:  # Ctrl-C: a write that continues would end up in the next commit
         for write in writes:
             write.exception()
         raise

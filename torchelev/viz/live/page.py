@@ -40,7 +40,7 @@ class Page:
 
     Raises:
         ModuleNotFoundError: viser is missing.
-        ValueError: the port is none, or the host no address of this machine.
+        ValueError: the port is invalid, or the host is not an address of this machine.
     """
 
     def __init__(

@@ -97,7 +97,7 @@ class Player:
             with self._changed:
                 self._is_playing, self._wanted = True, None
                 if not self._is_over and self._shown < self._now:
-                    self._wanted = self._now  # go on with the mapping
+                    self._wanted = self._now  # continue the mapping
                 elif self._is_over and self._shown >= self._now:
                     self._shown = -1  # play again
                 self._restart_clock()
@@ -159,7 +159,7 @@ class Player:
         """Wait until the wall clock reaches a time of the recording [s], or the user asks for another scan."""
         wall, speed = time.monotonic(), SPEEDS[self._speed.value]
         if self._start is None or wall - self._start[0] > (time_now - self._start[1]) / speed + _MAX_DELAY:
-            self._start = wall, time_now  # mapping cannot keep up: go on from here
+            self._start = wall, time_now  # mapping cannot keep up: continue from here
         left = self._start[0] + (time_now - self._start[1]) / speed - wall
         with self._changed:
             self._changed.wait_for(lambda: self._wanted is not None or not self._is_playing, timeout=max(left, 0.0))

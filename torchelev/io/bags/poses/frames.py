@@ -1,6 +1,6 @@
 """Choose the frame of the map and that of the robot's base: the frames between which the robot travels.
 
-A map's frame is one in which the base travels as far as it does at all; of several, the one nearest to the base, so
+A map's frame is one in which the base travels farthest; of several, the one nearest to the base, so
 that odometry comes before localisation, which jumps. Frames of the robot, such as a footprint that moves below a body,
 are none. Names decide where motion does not: of a robot that stands still, or between frames that move alike.
 """
@@ -17,7 +17,7 @@ from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.bags.topics import BagRequest
 from torchelev.io.errors import RecordingError
 
-_CLEAR = 0.3  # [m] of travel that is no sway of a body
+_CLEAR = 0.3  # [m] of travel beyond the sway of a body
 _BRANCH = 1.0  # [m] that a base travels in a frame below it, such as odometry upside down; legs and wheels are nearer
 _HINT = (
     "give --poses TOPIC, or --map-frame and --base-frame, as of a still robot; --rays-from FRAME if the clouds are in "

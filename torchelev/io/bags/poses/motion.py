@@ -38,7 +38,7 @@ def motion(tree: TransformTree, target: str, source: str) -> Motion:
 
 
 def find_jumps(stamps: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which steps between poses (K, 4, 4) at times (K,) [s] are no motion, (K - 1,).
+    """Return which steps between poses (K, 4, 4) at times (K,) [s] are jumps, not motion, (K - 1,).
 
     A step is compared with those before and after it: it may differ from the nearer one by what a strong acceleration
     does in its time, and by three times what is usual in this recording.

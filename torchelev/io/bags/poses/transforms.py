@@ -53,8 +53,8 @@ class TransformTree:
     ) -> None:
         """Add the pose of a frame in its parent at a time [s]: position x, y, z [m], quaternion x, y, z, w.
 
-        A new parent replaces the old one. A pose that is not finite, or whose quaternion is none, is left out. Static
-        poses are left out where others are known; `recorded` is when it was recorded [s].
+        A new parent replaces the old one. A pose that is not finite, or whose quaternion is invalid, is left out.
+        Static poses are left out where others are known; `recorded` is when it was recorded [s].
         """
         parent, child, row = clean(parent), clean(child), (stamp, *pose)
         if not (np.isfinite(row).all() and sum(q * q for q in row[4:]) > 0.5):
@@ -143,7 +143,7 @@ class TransformTree:
         """Return T_target_source at times (M,) [s], (M, 4, 4); NaN where a transform is not known then.
 
         Raises:
-            FrameError: there is no way between the frames.
+            FrameError: no transforms connect the frames.
         """
         up, down = self.ancestors(source), self.ancestors(target)
         common = next((frame for frame in up if frame in down), None)
