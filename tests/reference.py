@@ -433,7 +433,7 @@ def drift(layers, points, corner, resolution, *, sigma2, gate, relief, max_drift
 
 
 def height_error(layers, point, corner, resolution, *, min_traversability, max_variance, max_error):
-    """The height of a point over the map, or None where that does not tell drift."""
+    """The height of a point over the map, or None where it cannot measure drift."""
     cell = cell_of(point[0], point[1], corner, resolution, layers["elevation"].shape)
     if cell is None or not layers["validity"][cell]:
         return None

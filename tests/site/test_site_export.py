@@ -17,7 +17,7 @@ from torchelev.site import SiteMap, site_export
 
 @pytest.fixture
 def site():
-    """Known: cells -10 to 29 along x, 50 to 85 along y, but for one; heights tell the cell."""
+    """Known: cells -10 to 29 along x, 50 to 85 along y, but for one; heights encode the cell."""
     made = SiteMap(0.1)
     emap = robots([(-10, 50)], heights=lambda x, y: x + 0.01 * y)
     emap.state.validity[0, 3, 30] = False

@@ -65,8 +65,9 @@ def refine(weights: Weights, cells: Measured, context: Context) -> tuple[Float[T
 
         mean = h + 2 sigma tanh(g u / (2 sigma)),
 
-    which stays within two standard deviations sigma of the map, a millimetre at least. The squares around a cell tell
-    how far to trust it: where there are many gaps, a pose that is off by a few centimetres puts ground into a gap.
+    which stays within two standard deviations sigma of the map, a millimetre at least. The squares around a cell
+    determine how far to trust it: where there are many gaps, a pose that is off by a few centimetres puts ground into
+    a gap.
     """
     height, sigma, bend, features = cells
     squares = ((context.mean - height) * (context.known > 0)).to(height.dtype)
