@@ -888,8 +888,8 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     cell += squares
     cell = relu("cell_inner", relu("cell", [*np.mean(channels, 0), *np.max(channels, 0), *cell]))
 
-    told = w["to_view"] @ cell + w["to_view_bias"][:, 0]
-    votes = [w["vote"] @ np.maximum(c + told, 0) + w["vote_cell"] @ cell + w["vote_bias"][:, 0] for c in channels]
+    from_cell = w["to_view"] @ cell + w["to_view_bias"][:, 0]
+    votes = [w["vote"] @ np.maximum(c + from_cell, 0) + w["vote_cell"] @ cell + w["vote_bias"][:, 0] for c in channels]
     proposed = [view_candidates(*pair, reference) for pair in pairs]
     counted = [
         (v, c) for each in zip(votes, proposed, strict=True) for v, c in zip(*each, strict=True) if c is not None
