@@ -33,13 +33,11 @@ from benchmarks.speed import (
     live_view,
     long_run,
     loop,
-    postprocessing,
     sensors,
     sight,
-    site_area,
-    site_merge,
-    site_ranks,
 )
+from benchmarks.speed.postprocessing import __main__ as postprocessing
+from benchmarks.speed.site import site_area, site_merge, site_ranks
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.completion import edges
@@ -207,7 +205,7 @@ def empty_tables(text: str) -> list[str]:
 
 
 def has_result(name: str) -> bool:
-    """Tell whether the results that a table needs exist."""
+    """Return whether the results that a table needs exist."""
     try:
         TABLES[name]()
     except FileNotFoundError:

@@ -31,7 +31,7 @@ class Outcome(Protocol):
 
     @property
     def terminated(self) -> Tensor:
-        """Whether the episode has ended by what the robot did (B,) bool."""
+        """Whether the robot's actions have ended the episode (B,) bool."""
 
     @property
     def truncated(self) -> Tensor:
@@ -74,7 +74,7 @@ class Task(Protocol):
         """Return new tensors with the current observations."""
 
     def info(self, outcome: Any | None) -> dict[str, Tensor]:
-        """Return what else there is to know (B,) of the current state, and of the step that led to it."""
+        """Return further values (B,) of the current state, and of the step that led to it."""
 
 
 def make_spaces(task: Task, critic: bool = False) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
@@ -145,7 +145,7 @@ class TaskVectorEnv(VectorEnv[dict[str, Tensor], Tensor, Tensor]):
         is_seeded: Whether the task is seeded, and the first reset need not do it.
 
     Raises:
-        ValueError: The autoreset mode is none of the two.
+        ValueError: The autoreset mode is neither of the two.
     """
 
     def __init__(

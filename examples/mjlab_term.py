@@ -26,7 +26,7 @@ class MapScan(MapObservation):
 
     read = HeightScan.mjlab(standing_height=0.5)  # your robot's base above flat ground [m]
     map_cfg = ElevationMapConfig(grid=GridConfig(resolution=0.05, length_x=4.0, length_y=4.0))
-    with_validity = False  # True also tells the policy what is known
+    with_validity = False  # True also gives the policy a mask of the known points
 
 
 MAP_SCAN = ObservationTermCfg(func=MapScan, params={"sensor_name": "rays"})

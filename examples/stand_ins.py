@@ -1,6 +1,6 @@
 """Small stand-ins of Isaac Lab's and mjlab's interfaces, so that the two terms run without these simulators.
 
-They have the names and shapes that both projects document, as far as the terms use them. Behind them robots climb
+They have the documented names and shapes of both projects that the terms use. Behind them robots climb
 stairs in `torchelev.sim`. In your project you do not need this file.
 """
 

@@ -433,7 +433,7 @@ def drift(layers, points, corner, resolution, *, sigma2, gate, relief, max_drift
 
 
 def height_error(layers, point, corner, resolution, *, min_traversability, max_variance, max_error):
-    """The height of a point over the map, or None where that does not tell drift."""
+    """The height of a point over the map, or None where it cannot measure drift."""
     cell = cell_of(point[0], point[1], corner, resolution, layers["elevation"].shape)
     if cell is None or not layers["validity"][cell]:
         return None
@@ -704,14 +704,14 @@ def information(height, time, rate):
 def fuse_site_cell(first, other, entries, rate, *, gate, max_gate_std, max_newer_ratio):
     """What a site's cell says after a merge, what contradicts that, and whether heights contradicted each other.
 
-    Entries are heights with the relief [m^2] of their cell, and `told`, what the same robot told before.
+    Entries are heights with the relief [m^2] of their cell, and `contributed`, the same robot's earlier contribution.
     """
     limits = dict(rate=rate, gate=gate, max_gate_std=max_gate_std)
     fused, left, is_kept = average_site_cell(first, entries, None, **limits)
     if not left and is_kept:
         return fused, other, False
     fused, left, is_kept = average_site_cell(first, entries, surest, **limits)
-    rest = left + ([] if is_kept else [{**first, "relief": 0.0, "told": None}])
+    rest = left + ([] if is_kept else [{**first, "relief": 0.0, "contributed": None}])
     second, _, _ = average_site_cell(other, rest, surest, **limits, among_entries=True)
     is_new = len(left) < len(entries), bool(left)
     if second and replaces(second, fused, is_new, rate, max_newer_ratio):
@@ -752,12 +752,12 @@ def average_site_cell(prior, entries, choose, *, rate, gate, max_gate_std, among
     moment = own * (prior["h"] - reference) if is_kept else 0.0
     total = own + sum(information(e, newest, rate) for e in near)
     for e in near if is_kept else []:
-        told = e["told"]
-        if not told or (told["h"] - prior["h"]) ** 2 > gate**2 * (max_gate_std**2 + e["relief"]):
+        contributed = e["contributed"]
+        if not contributed or (contributed["h"] - prior["h"]) ** 2 > gate**2 * (max_gate_std**2 + e["relief"]):
             continue
-        new, before = information(e, newest, rate), information(told, newest, rate)
+        new, before = information(e, newest, rate), information(contributed, newest, rate)
         total -= min(new, before)
-        moment -= min(new, before) * ((e if before >= new else told)["h"] - reference)
+        moment -= min(new, before) * ((e if before >= new else contributed)["h"] - reference)
     moment += sum(information(e, newest, rate) * (e["h"] - reference) for e in near)
     times = [e["t"] for e in near] + ([prior["t"]] if is_kept else [])
     left = [e for e in entries if not any(e is n for n in near)]
@@ -888,8 +888,8 @@ def complete_cell(w, elevation, known, upper_bound, bounded, i, j, resolution):
     cell += squares
     cell = relu("cell_inner", relu("cell", [*np.mean(channels, 0), *np.max(channels, 0), *cell]))
 
-    told = w["to_view"] @ cell + w["to_view_bias"][:, 0]
-    votes = [w["vote"] @ np.maximum(c + told, 0) + w["vote_cell"] @ cell + w["vote_bias"][:, 0] for c in channels]
+    from_cell = w["to_view"] @ cell + w["to_view_bias"][:, 0]
+    votes = [w["vote"] @ np.maximum(c + from_cell, 0) + w["vote_cell"] @ cell + w["vote_bias"][:, 0] for c in channels]
     proposed = [view_candidates(*pair, reference) for pair in pairs]
     counted = [
         (v, c) for each in zip(votes, proposed, strict=True) for v, c in zip(*each, strict=True) if c is not None

@@ -10,7 +10,7 @@ pytest.importorskip("rsl_rl")
 import training
 from benchmarks.quality.accuracy import report
 from benchmarks.quality.features.comparison import FEATURES
-from benchmarks.quality.features.picture import ROWS
+from benchmarks.quality.features.feature_figure import ROWS
 from benchmarks.speed import growth
 from benchmarks.speed.update import plots
 from docs.readme_tables import SPEED, load

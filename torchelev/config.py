@@ -49,7 +49,7 @@ class ElevationMapConfig:
     traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
         default_factory=TraversabilityConfig
     )
-    #: the layers `completed` and `completed_std`: what a network predicts of the ground that no sensor saw; None: none
+    #: the layers `completed` and `completed_std`: predicted ground where no sensor saw it; None: none
     completion: CompletionConfig | None = None
     filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
 
@@ -114,7 +114,7 @@ def _build(cls: type, values: object, where: str) -> Any:
 
 
 def _share_of_settings(names: set[str], settings: set[str]) -> tuple[int, float]:
-    """Return how many of a type's settings are named, and which share of them."""
+    """Return how many names are settings of a type, and their share of all names."""
     number = len(names & settings)
     return number, number / len(settings)
 

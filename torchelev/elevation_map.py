@@ -19,7 +19,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.causes import diagnose
 from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
-from torchelev.diagnosis.pace import Pace, paced
+from torchelev.diagnosis.update_times import UpdateTimes, timed
 from torchelev.errors import require, require_count
 from torchelev.inputs import checks
 from torchelev.inputs.chunks import make_chunks, run_in_chunks
@@ -81,7 +81,7 @@ class ElevationMap(ReadableMap):
         super().__init__(cfg, num_envs, device, head, completion_net)
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
-        self.pace = Pace()
+        self.update_times = UpdateTimes()
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
         self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
@@ -95,7 +95,7 @@ class ElevationMap(ReadableMap):
     # Updating -------------------------------------------------------------------------------------------------------
 
     @requires_dt
-    @paced
+    @timed
     def update(
         self,
         points: Float[Tensor, "B *S N 3"],
@@ -361,7 +361,7 @@ class ElevationMap(ReadableMap):
             ValueError: if the site has another resolution, an id is out of range or repeated, a shape or device is
                 wrong, or both ids and a mask are given. Nothing has changed then.
         """
-        require(hasattr(site, "give"), "site", "must be a SiteMap", type(site).__name__, "give one", TypeError)
+        require(hasattr(site, "fill_state"), "site", "must be a SiteMap", type(site).__name__, "give one", TypeError)
         if T_map_base is not None:
             shape = (self.num_envs, 4, 4)
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
@@ -369,7 +369,7 @@ class ElevationMap(ReadableMap):
         self._derived.clear()
         with torch.no_grad():
             write(self.state, subtract_disagreement(self.state))
-            state = site.give(self, T_map_base, chosen)
+            state = site.fill_state(self, T_map_base, chosen)
             write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
 
     # Diagnosis ------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
-MARK = "torchelev"  # in the header of pictures and meshes that this package writes, which tells them from scans
+MARK = "torchelev"  # in the header of pictures and meshes that this package writes, to distinguish them from scans
 _HEADER_BYTES = 4096  # that hold the mark
 _MAP_ARRAYS = ({"resolution", "center", "axes", "config"}, {"header", "corner", "elevation"})  # save_npz, save_map
 
@@ -46,7 +46,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         with unfinished.open("xb") as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())  # some file systems tell only now that the disk is full
+            os.fsync(file.fileno())  # some file systems report a full disk only here
         if target.exists():
             unfinished.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(unfinished, target)
@@ -75,7 +75,7 @@ def require_writable(path: str | Path, num_bytes: int = 0) -> None:
 
 
 def is_own_output(path: Path) -> bool:
-    """Tell whether this package wrote a file: a picture, mesh or map that lies beside scans is no scan."""
+    """Return whether this package wrote a file: a picture, mesh or map beside scans is not a scan."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".npz":
@@ -86,7 +86,7 @@ def is_own_output(path: Path) -> bool:
             with path.open("rb") as file:
                 return MARK.encode() in file.read(_HEADER_BYTES)
     except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
-        pass  # its reader will say what is wrong with it
+        pass  # its reader raises an error that explains it
     return False
 
 

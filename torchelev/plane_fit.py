@@ -41,7 +41,7 @@ def known_ground(elevation: Float[Tensor, "B H W"], validity: Bool[Tensor, "B H 
 class Plane(NamedTuple):
     """Least-squares plane through the known cells of a window, for every cell."""
 
-    spans: Bool[Tensor, "B H W"]  #: the known cells span a plane; elsewhere gradient and residual tell nothing
+    spans: Bool[Tensor, "B H W"]  #: the known cells span a plane; elsewhere gradient and residual are meaningless
 
     gradient_x: Float[Tensor, "B H W"]  #: dz/dx
     gradient_y: Float[Tensor, "B H W"]  #: dz/dy
@@ -83,7 +83,7 @@ def solve_gradient(
 
 
 def spans_plane(uu: Tensor, uv: Tensor, vv: Tensor, radius: int) -> Bool[Tensor, "B H W"]:
-    """Tell where the known cells of a window spread in two directions, by the covariance of their places [cells^2].
+    """Return where the known cells of a window spread in two directions, by the covariance of their places [cells^2].
 
     Its smaller eigenvalue, the variance across the line that fits them best, must reach `min_spread`: then
     C - min_spread I has no negative eigenvalue.
@@ -96,7 +96,7 @@ def min_spread(radius: int) -> float:
     """Return the variance [cells^2] across their line from which known cells span a plane.
 
     At least that of two full rows of cells, 1/4: the cells that a line of points passes through stay below it, and
-    their heights tell the slope along the line alone. And 0.4 times the standard deviation of a full window,
+    their heights determine the slope along the line alone. And 0.4 times the standard deviation of a full window,
     r (r + 1) / 3 in variance: a narrower band can be one line of points and its noise, whose slope is the ray's.
     """
     rounding = 1e-3

@@ -194,7 +194,7 @@ class ReadableMap(MapBuffers):
 
         Raises:
             KeyError: if there is no such layer.
-            TypeError: if `xy` is no tensor of floats.
+            TypeError: if `xy` is not a tensor of floats.
             ValueError: if the mode is unknown, or `xy` has another shape or device.
         """
         xy = checks.check_xy("xy", xy, self.num_envs, self.device)

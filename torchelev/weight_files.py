@@ -1,4 +1,4 @@
-"""What all networks share: files of weights, checked before anything is made of them, and resolutions of maps."""
+"""Helpers of all networks: files of weights, checked before use, and resolutions of maps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class WeightFormat(NamedTuple):
     """The files of one network."""
 
     version: int  #: of the format
-    is_config: Callable[[dict[str, Any]], bool]  #: tells whether a dict is a config of the network
+    is_config: Callable[[dict[str, Any]], bool]  #: returns whether a dict is a config of the network
     save: str  #: the method that writes such files, for hints
     train: str  #: the command that trains the weights, for hints
 
@@ -82,7 +82,7 @@ def _require_same_shapes(path: Path, expected: Mapping[str, Tensor], actual: Map
 
 
 def is_within(value: float, limits: tuple[float, float]) -> bool:
-    """Tell whether a value lies within limits, up to rounding."""
+    """Return whether a value lies within limits, up to rounding."""
     low, high = limits
     return low * (1 - _TOLERANCE) <= value <= high * (1 + _TOLERANCE)
 

@@ -22,7 +22,7 @@ from training.resume import CHECKPOINT, deferred_interrupt
 
 
 class Schedule(Protocol):
-    """What a fit needs of its settings."""
+    """The settings that a fit needs."""
 
     @property
     def steps(self) -> int:

@@ -34,7 +34,7 @@ def checkpoint_path(folder: Path, resume: bool) -> Path:
 
 @contextlib.contextmanager
 def deferred_interrupt(unit: str) -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C wait for the end of the running `unit`; yield a function that tells whether it was pressed."""
+    """Let Ctrl-C wait for the end of the running `unit`; yield a function that returns whether it was pressed."""
     pressed: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:

@@ -164,7 +164,7 @@ def _read(path: Path, device: torch.device | str) -> dict[str, Any]:
     """Return what a checkpoint holds.
 
     Raises:
-        ValueError: the file is damaged, or is no checkpoint.
+        ValueError: the file is damaged, or is not a checkpoint.
     """
     rule, hint = "must be a file that a training saved", "restore a copy of it, or begin again in another folder"
     try:

@@ -1,4 +1,4 @@
-"""What experiments read from the logs of finished trainings, and how they write figures of several seeds."""
+"""Figures that experiments read from the logs of finished trainings, and their format over several seeds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was measured on a GPU, as tables: the times, and whether they meet their targets."""
+"""Tables of the figures of a GPU: the times, and whether they meet their targets."""
 
 from __future__ import annotations
 

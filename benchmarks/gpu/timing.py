@@ -58,10 +58,13 @@ def one_robot(device: str, seconds: float) -> Iterator[Figure]:
         yield f"one robot, {name}, slowest kernels", partial(_slowest_kernels, drive)
     if device != "cpu":
         yield "one robot, captured", lambda: meter.milliseconds(_captured(drive), seconds)
-        yield "one robot, captured, waiting for each", lambda: meter.milliseconds(_waiting(_captured(drive)), seconds)
+        yield (
+            "one robot, captured, waiting for each",
+            lambda: meter.milliseconds(_synchronized(_captured(drive)), seconds),
+        )
 
 
-def _waiting(run: Callable[[], None]) -> Callable[[], None]:
+def _synchronized(run: Callable[[], None]) -> Callable[[], None]:
     """Make the host wait after each call, which measures latency instead of throughput."""
 
     def run_and_wait() -> None:

@@ -93,7 +93,7 @@ def walk(env: Any, steps: int) -> dict[str, Tensor]:
     ours, ideal, valid, observed = [], [], [], []
     for _ in range(steps):
         groups, *_ = env.step(0.3 * torch.randn(size, generator=generator))
-        values, known = scan(term.emap, term._maps.source.read_base(env))
+        values, known = scan(term.emap, term.maps.source.read_base(env))
         hits = env.scene["terrain_scan"].data.distances >= 0
         ours.append(values / scan.scale)
         ideal.append(height_scan(env, "terrain_scan"))
@@ -105,7 +105,7 @@ def walk(env: Any, steps: int) -> dict[str, Tensor]:
 
 
 def is_level(ideal: Tensor) -> Tensor:
-    """Tell where the ideal scan (..., 187) differs by at most LEVEL from all eight neighbours: no edge is near."""
+    """Return where the ideal scan (..., 187) differs by at most LEVEL from all eight neighbours: no edge is near."""
     grid = ideal.unflatten(-1, (11, 17)).flatten(0, -3)[:, None]
     highest = torch.nn.functional.max_pool2d(grid, 3, 1, 1)
     lowest = -torch.nn.functional.max_pool2d(-grid, 3, 1, 1)

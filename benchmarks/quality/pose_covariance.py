@@ -47,7 +47,7 @@ class Shares(NamedTuple):
     std: float  #: [m] median standard deviation
 
 
-def walk(kind: str, pose_preset: str, is_told: bool, num_envs: int, steps: int, seed: int) -> Shares:
+def walk(kind: str, pose_preset: str, with_covariance: bool, num_envs: int, steps: int, seed: int) -> Shares:
     """Map a walk over tiles of rising difficulty and compare the map with the ground."""
     terrain = make_terrain(kind, torch.linspace(0.0, 0.6, num_envs), length=16.0, seed=seed)
     emap, camera = ElevationMap(ElevationMapConfig(grid=GRID), num_envs), MountedSensor(DepthCamera(48, 36), mount())
@@ -58,13 +58,13 @@ def walk(kind: str, pose_preset: str, is_told: bool, num_envs: int, steps: int, 
         T_map_base = _pose(terrain, tiles, -2.0 + _STEP * k)
         points = sensor_errors(camera(terrain.field, tiles, T_map_base)).points
         estimated = pose_errors(T_map_base, dt=_DT)
-        covariance = pose_errors.covariance if is_told else None
+        covariance = pose_errors.covariance if with_covariance else None
         emap.update(points, estimated @ mount(), estimated, dt=_DT, pose_covariance=covariance)
     return _score(emap, terrain, tiles)
 
 
 def _sensor_errors() -> SensorErrorConfig:
-    """Return those of a depth camera whose place and time are exact: they would be errors of the pose, untold."""
+    """Return those of a depth camera whose place and time are exact: else they would act as errors of the pose."""
     cfg = preset("depth_camera").sensor
     assert isinstance(cfg, SensorErrorConfig)
     return dataclasses.replace(cfg, latency=0, missed_frames=0.0, mounting_position=0.0, mounting_rotation_deg=0.0)
@@ -88,13 +88,13 @@ def _score(emap: ElevationMap, terrain: Terrain, tiles: Tensor) -> Shares:
 
 
 def measure(num_envs: int, steps: int, seeds: int) -> list[dict[str, Any]]:
-    """Walk over each kind of ground with each preset, told and not; mean of the seeds."""
+    """Walk over each kind of ground with each preset, with the covariance and without; mean of the seeds."""
     cases = [(name, kind) for name in PRESETS for kind in KINDS]
     rows = []
     for name, kind in tqdm(cases, unit="case", disable=None):
         row: dict[str, Any] = {"preset": name, "ground": kind}
-        for key, is_told in (("told", True), ("untold", False)):
-            shares = [walk(kind, name, is_told, num_envs, steps, seed) for seed in range(seeds)]
+        for key, with_covariance in (("with", True), ("without", False)):
+            shares = [walk(kind, name, with_covariance, num_envs, steps, seed) for seed in range(seeds)]
             row[key] = {f: sum(getattr(s, f) for s in shares) / seeds for f in Shares._fields}
         rows.append(row)
     return rows
@@ -105,9 +105,9 @@ def table(result: dict[str, Any]) -> str:
     head = ["pose errors", "ground", "within ± 2 σ", "median error [mm]", "median σ [mm]", "without", "σ without [mm]"]
     rows = []
     for row in result["rows"]:
-        told, untold = row["told"], row["untold"]
-        cells = [f"{100 * told['inside']:.1f} %", f"{1e3 * told['error']:.1f}", f"{1e3 * told['std']:.1f}"]
-        cells += [f"{100 * untold['inside']:.1f} %", f"{1e3 * untold['std']:.1f}"]
+        given, withheld = row["with"], row["without"]
+        cells = [f"{100 * given['inside']:.1f} %", f"{1e3 * given['error']:.1f}", f"{1e3 * given['std']:.1f}"]
+        cells += [f"{100 * withheld['inside']:.1f} %", f"{1e3 * withheld['std']:.1f}"]
         rows.append([row["preset"], row["ground"], *cells])
     return markdown_table(head, rows)
 

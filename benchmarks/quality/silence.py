@@ -23,7 +23,7 @@ _DT, _NUM_SCANS = 0.2, 12  # [s], updates of each scene
 
 
 def diagnose_scene(seed: int) -> tuple[str, list[str]]:
-    """Return the terrain and what `diagnose` says of a walk over it."""
+    """Return the terrain and the findings of `diagnose` on a walk over it."""
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     kinds = {
         "slope": lambda: scenes.slope(rng.uniform(0, 25)),

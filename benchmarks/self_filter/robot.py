@@ -71,7 +71,7 @@ def link_poses(phase: Tensor, links: tuple[str, ...]) -> Tensor:
 
 
 class Scan(NamedTuple):
-    """What the cameras of B robots see at one instant, and the poses."""
+    """Clouds of the cameras of B robots at one instant, and the poses."""
 
     points: Tensor  #: (B, 2, N, 3) [m] sensor frames, exact
     on_body: Tensor  #: (B, 2, N) bool, the points on the robot itself

@@ -1,4 +1,4 @@
-"""What an update of many robots takes without a self-filter, with one box, and with the shapes of 13 links."""
+"""Time an update of many robots without a self-filter, with one box, and with the shapes of 13 links."""
 
 from __future__ import annotations
 

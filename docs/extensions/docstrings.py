@@ -40,7 +40,7 @@ def _indent(line: str) -> int:
 
 
 def _starts_equation(lines: list[str], number: int) -> bool:
-    """Tell whether a line follows a blank one and is indented by four more than the text before it."""
+    """Return whether a line follows a blank one and is indented by four more than the text before it."""
     if number < 2 or not lines[number].strip() or lines[number - 1].strip():
         return False
     return _indent(lines[number]) == _indent(lines[number - 2]) + 4

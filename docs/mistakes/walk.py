@@ -16,7 +16,7 @@ CAMERA = DepthCamera(width=120, height=90, max_range=5.0)
 
 
 class Scan(NamedTuple):
-    """What `ElevationMap.update` gets, for one robot."""
+    """The arguments of `ElevationMap.update` for one robot."""
 
     points: Tensor  #: (1, N, 3) [m] sensor frame: x forward, y left, z up
     T_map_sensor: Tensor  #: (1, 4, 4)

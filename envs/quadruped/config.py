@@ -34,7 +34,7 @@ class TerrainConfig:
     resolution: float = 0.05  #: [m] between the samples of the height field
     rim: float = 0.4  #: [m] the tile counts as crossed this far before its rim
     start_level: int = 2  #: new robots begin at levels below this
-    curriculum: bool = True  #: robots that cross their tile go on to the next level; False: levels are drawn evenly
+    curriculum: bool = True  #: robots that cross their tile move to the next level; False: levels are drawn evenly
     seed: int = 0  #: the same seed makes the same tiles
 
     @property
@@ -107,7 +107,7 @@ class RandomConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OdometryConfig:
-    """Leg odometry: it believes that feet on the ground do not move."""
+    """Leg odometry: it assumes that feet on the ground do not move."""
 
     velocity_noise: float = 0.03  #: [m/s] of each step's velocity
     scale_error: float = 0.02  #: largest relative error of the distance walked, drawn for each episode

@@ -1,4 +1,4 @@
-"""Leg odometry: the pose that the robot believes in, which drifts when its feet slip."""
+"""Leg odometry: the robot's estimated pose, which drifts when its feet slip."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _MAX_SAMPLES = 2**24  # of the height field: MuJoCo's models hold one copy for e
 
 
 class Sensed(NamedTuple):
-    """What MuJoCo's sensors measured, in the world's frame, at the instant of `Physics.sensed_state`."""
+    """The values of MuJoCo's sensors, in the world's frame, at the instant of `Physics.sensed_state`."""
 
     foot_velocities: Tensor  #: (B, 4, 3) [m/s] of their centres
     foot_turns: Tensor  #: (B, 4, 3) [rad/s] angular velocities
@@ -121,7 +121,7 @@ class Physics(nn.Module):
         return Sensed(*(part.unflatten(-1, shape) for part, shape in zip(parts, _SHAPES, strict=True)))
 
     def step(self, targets: Tensor, latency: Tensor, num_steps: int) -> None:
-        """Step all robots, and tell in `diverged` (B,) whose simulation has failed.
+        """Step all robots, and set `diverged` (B,) where a simulation has failed.
 
         Where a state is NaN, infinite or huge, MuJoCo resets the robot to the model's first pose and its time to 0.
 

@@ -1,4 +1,4 @@
-"""What the quadruped knows of itself: the observation "policy", and "privileged" for the critic."""
+"""The quadruped's proprioception: the observation "policy", and "privileged" for the critic."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def observe_privileged(velocity: Tensor, stands: Tensor, foot_velocities: Tensor
 
     Its entries are: true velocity of the base (3) [m/s], base frame; whether each foot stands (4); velocities of the
     feet (12) [m/s], relative to the ground and in axes of the base too; latency (1) [physics steps]. The feet's are
-    those of the sensors' instant, 5 ms earlier, as that is what sensors can tell.
+    those of the sensors' instant, 5 ms earlier, as sensors deliver them.
     """
     parts = [velocity, stands.to(velocity.dtype), foot_velocities.flatten(1), latency[:, None].to(velocity.dtype)]
     return torch.cat(parts, -1)

@@ -11,7 +11,7 @@ from envs.quadruped.config import RewardConfig
 
 
 class Motion(NamedTuple):
-    """What the reward of a step depends on, for B robots."""
+    """The quantities in the reward of a step, for B robots."""
 
     velocity: Tensor  #: (B, 3) [m/s] of the base, yaw frame
     angular_velocity: Tensor  #: (B, 3) [rad/s] base frame

@@ -1,4 +1,4 @@
-"""What the quadruped sees of the ground: its map, the true heights with noise, or nothing.
+"""The quadruped's perception of the ground: its map, the true heights with noise, or none.
 
 Each sight returns the same two observations: "height_scan" (B, 187), the base above the ground around it, and "feet"
 (B, 4 * P), each foot above the rings of ground around it.
@@ -48,7 +48,7 @@ class View(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What S sensors of N rays see."""
+    """The points of S sensors of N rays."""
 
     points: Tensor  #: (B, S, N, 3) [m] sensor frame
     ideal: Tensor  #: (B, S, N, 3) [m] the same without errors

@@ -218,7 +218,7 @@ class Quadruped(nn.Module):
         return _to_yaw_frame(self._floats(self.physics.qvel[:, :3]), self.T_map_base)[:, 0]
 
     def _choose_levels(self, mask: Tensor) -> None:
-        """Move robots up that have crossed their tile, and down that have not come half as far as commanded.
+        """Move robots up that crossed their tile, and down that walked less than half the commanded distance.
 
         Fallen robots never move up: one that has diverged is anywhere.
         After seeding, levels are drawn from the first `start_level`; without a curriculum always, and from all.
@@ -317,13 +317,13 @@ class Quadruped(nn.Module):
         return Outcome(value.nan_to_num(0.0).clamp(-10.0, 10.0), crossed, fallen, timed_out)
 
     def _has_fallen(self, sensed: Sensed) -> Tensor:
-        """Tell which robots lie on their base, tilt too far or have diverged (B,)."""
+        """Return which robots lie on their base, tilt too far or have diverged (B,)."""
         upright = rotation_matrix(self._qpos[:, 3:7])[:, 2, 2]
         tilts = upright < math.cos(self.cfg.max_tilt)
         return (sensed.touches[:, 0] > 0) | tilts | self.physics.diverged.to(self.device)
 
     def _has_crossed(self) -> Tensor:
-        """Tell which robots are at the rim of their tile (B,)."""
+        """Return which robots are at the rim of their tile (B,)."""
         terrain = self.cfg.terrain
         return self.T_map_base[:, :2, 3].abs().amax(-1) > terrain.length / 2 - terrain.rim
 
@@ -352,7 +352,7 @@ class Quadruped(nn.Module):
         self.physics.qvel[:, :2] += change.t().cpu()
 
     def _happens(self, interval: float) -> Tensor:
-        """Tell for which robots an event happens that has this mean time [s] between two (B,) bool."""
+        """Return for which robots an event happens that has this mean time [s] between two (B,) bool."""
         return self._uniform() < self.cfg.dt / interval
 
     # Observations -------------------------------------------------------------------------------------------------

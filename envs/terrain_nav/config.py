@@ -59,7 +59,7 @@ class SightConfig:
     pose_errors: str = "leg_odometry"  #: preset of torchelev.sim
     truth_noise: float = 0.1  #: [m] amplitude of the uniform noise on the heights of perception "truth"
     #: what the elevation of perception "map" reads where the map is unknown, by the rules of `HeightScan`: "base" for
-    #: the nominal ground below the base, "inpaint", "completed", ...; the validity tells in any case what is unknown
+    #: the nominal ground below the base, "inpaint", "completed", ...; the validity always marks unknown cells
     fill: str = "base"
 
     def __post_init__(self) -> None:

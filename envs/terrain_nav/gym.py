@@ -57,7 +57,7 @@ class TerrainNavVectorEnv(TaskVectorEnv):
         final_obs: Whether SAME_STEP returns `info["final_obs"]`; False avoids reading the maps twice in each step.
 
     Raises:
-        ValueError: The autoreset mode is none of the two.
+        ValueError: The autoreset mode is neither of the two.
     """
 
     metadata: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The observation "policy" of TerrainNav: what the robot knows of itself and of its goal."""
+"""The observation "policy" of TerrainNav: the robot's own motion and its goal."""
 
 from __future__ import annotations
 

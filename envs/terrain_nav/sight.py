@@ -1,4 +1,4 @@
-"""What TerrainNav's robots see: their map, the true ground with white noise, or nothing.
+"""The perception of TerrainNav's robots: their map, the true ground with white noise, or none.
 
 Each sight returns an image (B, 4, n, n) of the same crop in the base's yaw frame: elevation and upper bound relative to
 the ground under the base [m], validity, traversability. Unknown pixels are 0 in all of them, but for the elevation of

@@ -23,7 +23,7 @@ B = len(LENGTHS)
 
 
 class Counters(VectorEnv):
-    """Environments that tell their episode and step, in one tensor each that they overwrite as they step.
+    """Environments whose observations hold their episode and step, in one tensor each that they overwrite as they step.
 
     Environment 1 is truncated; 2 is truncated and terminates; 0 terminates.
     """

@@ -27,7 +27,7 @@ LAYERS = ("elevation", "variance", "time", "upper_bound", "traversability", "val
 
 
 def cloud_of(index, episode, step):
-    """Ground whose height tells the environment and the episode; no two clouds are alike."""
+    """Ground whose height encodes the environment and the episode; no two clouds are alike."""
     xy = np.random.default_rng((index, episode, step)).uniform(-0.6, 0.6, (300, 2))
     return np.concatenate([xy, np.full((300, 1), 0.1 * episode + 0.01 * index - 1.0)], 1)
 
@@ -39,7 +39,7 @@ def pose_of(step):
 
 
 class Ground(gymnasium.Env):
-    """Tells its episode and its step, and sees ground that tells them too."""
+    """Its observation holds its episode and its step, and so does the ground that it sees."""
 
     observation_space = spaces.Box(0, 100, (2,), np.float32)
     action_space = spaces.Discrete(2)

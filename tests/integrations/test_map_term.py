@@ -53,7 +53,7 @@ def test_appends_the_validity():
     _, term, env = observe(HeightScan.mjlab(), with_validity=True)
     term.emap.reset(torch.tensor([0]))
     values = term(env)
-    expected, valid = HeightScan.mjlab()(term.emap, term._maps.source.read_base(None))
+    expected, valid = HeightScan.mjlab()(term.emap, term.maps.source.read_base(None))
     assert values.shape == (2, 374)
     assert valid.any(-1).tolist() == [False, True]
     torch.testing.assert_close(values, torch.cat([expected, valid.float()], -1))
@@ -79,7 +79,7 @@ def test_a_stored_observation_stays_as_it_was(read):
     """PPO keeps the observation while the environment steps."""
     stored, term, env = observe(read)
     copy = stored.clone()
-    term._maps.source.height += 0.1
+    term.maps.source.height += 0.1
     env.common_step_counter += 1
     later = term(env)
     assert (later != copy).any()

@@ -64,7 +64,7 @@ def near(*values):
 
 
 def holds(polygon, x, y):
-    """Tell whether a polygon holds a point, by the even-odd rule."""
+    """Return whether a polygon holds a point, by the even-odd rule."""
     odd = False
     for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, 0), strict=True):
         if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):

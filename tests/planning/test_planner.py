@@ -155,7 +155,7 @@ def check_cells(emap, polygons):
 
 
 def test_bad_ground_below_the_robot_is_reported():
-    """The plan leaves it; the check tells, however unknown the rest is."""
+    """The plan leaves it; the check reports it, even if the rest is unknown."""
     emap = ground_map()
     here = place_footprint(emap, BODY, torch.tensor([[[-0.3, -0.1, 0.0]]]))
     below = check_cells(emap, here)

@@ -61,7 +61,7 @@ def test_a_gentle_bound_is_passable_and_a_steep_one_is_not():
 
 
 def test_a_steep_bound_is_impassable_whichever_way_it_goes():
-    """A bound that climbs away tells nothing either: the ground may end below it as well as rise with it."""
+    """A bound that climbs away gives no inclination either: the ground may end below it as well as rise with it."""
     assert traversal_cost(occluded(lambda x: 0.56 * x))[0, 8].isinf().all()
 
 

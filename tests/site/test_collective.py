@@ -129,21 +129,23 @@ def test_a_group_that_is_not_initialised_is_refused():
         SiteMap(0.1, group=object())
 
 
-@pytest.mark.parametrize("with_told", [False, True])
-def test_packed_windows_are_exact_and_as_large_as_documented(with_told):
+@pytest.mark.parametrize("with_contribution", [False, True])
+def test_packed_windows_are_exact_and_as_large_as_documented(with_contribution):
     emap = ranks.all_robots()
     emap.corner.copy_(emap.corner + 2**40)
     ranks.measure(emap, 1)
     emap.corner.add_(2**40)
     windows = read_windows(emap, emap.state, 1e9 + 1e-7, None)
-    told = (
-        snapshot(emap, windows, ranks_alignment(emap), emap.state.elapsed, emap.num_resets - 1) if with_told else None
+    contribution = (
+        snapshot(emap, windows, ranks_alignment(emap), emap.state.elapsed, emap.num_resets - 1)
+        if with_contribution
+        else None
     )
-    windows, layout = windows._replace(told=told), Layout(30, 26, with_told)
+    windows, layout = windows._replace(contribution=contribution), Layout(30, 26, with_contribution)
     rows = pack(windows, layout)
     assert rows.shape == (ranks.NUM_ROBOTS, layout.num_bytes)
     assert layout.num_bytes == pytest.approx(
-        30 * 26 * (32.625 if with_told else 20.5) + (88 if with_told else 32), abs=4
+        30 * 26 * (32.625 if with_contribution else 20.5) + (88 if with_contribution else 32), abs=4
     )
     assert_equal(windows, unpack(rows, layout))
 
@@ -163,8 +165,8 @@ def assert_equal(windows, found):
     assert torch.equal(windows.upper_bound[windows.is_bounded], found.upper_bound[windows.is_bounded])
     for name in Windows._fields[1:4] + Windows._fields[5:7]:
         assert torch.equal(getattr(windows, name), getattr(found, name)), name
-    assert (windows.told is None) == (found.told is None)
-    if windows.told is not None:
-        pairs = [*zip(windows.told.known, found.told.known, strict=True)]
-        pairs += zip(windows.told.alignment, found.told.alignment, strict=True)
+    assert (windows.contribution is None) == (found.contribution is None)
+    if windows.contribution is not None:
+        pairs = [*zip(windows.contribution.known, found.contribution.known, strict=True)]
+        pairs += zip(windows.contribution.alignment, found.contribution.alignment, strict=True)
         assert all(torch.equal(a, b) for a, b in pairs)

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given
 
 from tests import reference
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.fuse import Entries, Heights, fuse
+from torchelev.site.site_config import SiteConfig
 
 CFG = SiteConfig()
 LIMITS = dict(gate=CFG.gate, max_gate_std=CFG.max_gate_std, max_newer_ratio=CFG.max_newer_ratio)
@@ -29,15 +29,15 @@ def heights(dicts):
 def run(first, other, cells, rate=1e-7, cfg=CFG):
     """Fuse lists of entries, one list per cell; None stands for no height."""
     entries = [(c, e) for c, cell in enumerate(cells) for e in cell]
-    told = heights([e["told"] or NOTHING for _, e in entries])
+    contributed = heights([e["contributed"] or NOTHING for _, e in entries])
     cell = torch.tensor([c for c, _ in entries], dtype=torch.int64)
     relief = torch.tensor([e["relief"] for _, e in entries], dtype=torch.float64)
-    flat = Entries(cell, heights([e for _, e in entries]), relief, told)
+    flat = Entries(cell, heights([e for _, e in entries]), relief, contributed)
     return fuse(heights([f or NOTHING for f in first]), heights([o or NOTHING for o in other]), flat, rate, cfg)
 
 
-def entry(h, v=1e-4, t=10.0, relief=0.0, told=None):
-    return dict(h=h, v=v, t=t, relief=relief, told=told)
+def entry(h, v=1e-4, t=10.0, relief=0.0, contributed=None):
+    return dict(h=h, v=v, t=t, relief=relief, contributed=contributed)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -50,12 +50,12 @@ def test_every_cell_is_that_of_the_reference(seed):
         other.append(draw_height(rng, levels) if first[-1] and rng.random() < 0.3 else None)
         cell = []
         for _ in range(rng.integers(0, 5)):
-            e = {**draw_height(rng, levels), "relief": rng.choice([0.0, 1e-5, 1e-3]), "told": None}
+            e = {**draw_height(rng, levels), "relief": rng.choice([0.0, 1e-5, 1e-3]), "contributed": None}
             source = other[-1] if other[-1] and rng.random() < 0.4 else first[-1]
             if source and rng.random() < 0.5:
-                told = {**draw_height(rng, [source["h"]]), "t": min(e["t"], source["t"])}
-                told["v"] = max(told["v"], 1.2 * source["v"])
-                e["told"] = told
+                contributed = {**draw_height(rng, [source["h"]]), "t": min(e["t"], source["t"])}
+                contributed["v"] = max(contributed["v"], 1.2 * source["v"])
+                e["contributed"] = contributed
             cell.append(e)
         cells.append(cell)
     rate = rng.choice([0.0, 1e-7, 1e-5])
@@ -121,11 +121,11 @@ def test_age_lets_the_newer_height_win():
     assert float(run(first, [None], [[entry(0.5, v=1e-4, t=1000.0)]], rate=1e-7).first.elevation) == 0.5
 
 
-def test_what_was_told_before_counts_once():
-    told = dict(h=0.1, v=1e-4, t=5.0)
-    again = run([told], [None], [[entry(0.1, v=1e-4, t=5.0, told=told)]])
+def test_an_earlier_contribution_counts_once():
+    contributed = dict(h=0.1, v=1e-4, t=5.0)
+    again = run([contributed], [None], [[entry(0.1, v=1e-4, t=5.0, contributed=contributed)]])
     assert float(again.first.variance) == pytest.approx(1e-4)
-    better = run([told], [None], [[entry(0.11, v=2.5e-5, t=6.0, told=told)]], rate=0.0)
+    better = run([contributed], [None], [[entry(0.11, v=2.5e-5, t=6.0, contributed=contributed)]], rate=0.0)
     assert float(better.first.elevation) == pytest.approx(0.11) and float(better.first.variance) == pytest.approx(
         2.5e-5
     )
@@ -133,14 +133,14 @@ def test_what_was_told_before_counts_once():
 
 def test_what_contradicts_the_elevation_counts_once_too():
     site, other = dict(h=0.0, v=1e-6, t=5.0), dict(h=0.5, v=1e-4, t=5.0)
-    fused = run([site], [other], [[entry(0.5, v=9e-5, t=5.0, told=other)]], rate=0.0)
+    fused = run([site], [other], [[entry(0.5, v=9e-5, t=5.0, contributed=other)]], rate=0.0)
     assert float(fused.other.variance) == pytest.approx(9e-5) and float(fused.first.variance) == pytest.approx(1e-6)
 
 
-def test_what_others_told_stays():
-    told = dict(h=0.1, v=2e-4, t=5.0)
+def test_contributions_of_others_stay():
+    contributed = dict(h=0.1, v=2e-4, t=5.0)
     site = dict(h=0.1, v=1e-4, t=5.0)  # half of it from another robot
-    fused = run([site], [None], [[entry(0.1, v=1e-4, t=5.0, told=told)]], rate=0.0)
+    fused = run([site], [None], [[entry(0.1, v=1e-4, t=5.0, contributed=contributed)]], rate=0.0)
     assert float(fused.first.variance) == pytest.approx(1 / (5e3 + 1e4))
 
 

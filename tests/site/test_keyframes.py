@@ -251,7 +251,7 @@ def test_a_killed_move_changes_nothing(tmp_path):
 
 
 def test_a_keyframe_without_news_moves_what_later_ones_replace():
-    """The second merge tells nothing new, but the third replaces what the robot knew then: its pose counts."""
+    """The second merge contributes nothing new, but the third replaces what the robot knew then: its pose counts."""
 
     def run(rise):
         site, emap = SiteMap(0.1, keyframes=True), robots([(0, 0)], std=0.01)

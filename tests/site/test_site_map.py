@@ -246,9 +246,9 @@ def test_a_time_before_the_newest_is_reported_and_counts_as_that_old():
     sites[1].merge(maps[0], time=1000.0)
     with pytest.warns(
         RuntimeWarning, match=r"^time: .* got 500\.000, 500\.000 s before the site's .*; give all"
-    ) as told:
+    ) as warned:
         sites[1].merge(maps[1], time=500.0)
-    assert told[0].filename == __file__
+    assert warned[0].filename == __file__
     for layer in ("elevation", "variance", "time"):
         expected, actual = (known_cells(site, layer) for site in sites)
         assert actual == pytest.approx(expected, rel=1e-4, abs=1e-6)

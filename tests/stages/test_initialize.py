@@ -39,7 +39,7 @@ def test_linear_gives_the_plane_that_the_feet_stand_on(seed, gx, gy):
     known = emap.validity[0]
     assert known.any()
     span = np.linalg.svd(feet[0, :, :2] - feet[0, :, :2].mean(0))[1]
-    if span[1] > 0.1:  # feet near one line do not tell the slope across it
+    if span[1] > 0.1:  # feet near one line do not determine the slope across it
         expected = (gx * x + gy * y + 0.1)[known].float()
         torch.testing.assert_close(emap.elevation[0][known], expected, atol=1e-4, rtol=0)
         at = emap.cell_centers()[0, 6, 5].tolist()

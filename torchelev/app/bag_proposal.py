@@ -1,4 +1,4 @@
-"""Propose the command that maps a bag: the first one that says all that the bag leaves open."""
+"""Propose the command that maps a bag: the first with an option for everything that the bag leaves open."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _propose_odometry(bag: Bag) -> list[str]:
 
 
 def _requests(bag: Bag) -> Iterator[BagRequest]:
-    """Yield what could be asked: with the transforms, with each odometry, and that as the pose of each likely frame."""
+    """Yield candidate requests: with the transforms, with each odometry, and with that as each likely frame's pose."""
     plain = _choose_sensor(bag.topics)
     yield plain
     transforms = [topic.name for topic in bag.topics if topic.type in TRANSFORMS and topic.num]

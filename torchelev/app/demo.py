@@ -69,7 +69,7 @@ class DemoScan(NamedTuple):
 
 
 class _HitCells:
-    """Cells that were hit since they entered the window: what the map could know at best."""
+    """Cells that were hit since they entered the window: those that the map can know."""
 
     def __init__(self, resolution: float, reach: float = 12.0) -> None:
         self.resolution = resolution
@@ -133,7 +133,7 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
 
     Raises:
         WriteError: the picture cannot be written; raised before the walk, as is ValueError.
-        ValueError: the suffix is no picture's, or the time is not positive.
+        ValueError: the suffix is not a picture's, or the time is not positive.
     """
     if seconds is not None:
         require(0 < seconds < math.inf, "seconds", "must be positive", seconds, "leave it out for the whole course")

@@ -77,7 +77,7 @@ def _robot_of(emap: ElevationMap, robot: dict[str, float]) -> RobotConfig:
 
 
 def _plan(emap: ElevationMap, start: Tensor, goal: Tensor, robot: RobotConfig) -> tuple[PlannedPath, PathCheck]:
-    """Plan for the robot's width or, where its footprint does not fit on the way, for all headings of its body.
+    """Plan for the robot's width or, where its footprint does not fit along the path, for all headings of its body.
 
     The learned head's ratings include the body, whose centre alone is checked.
     """
@@ -96,7 +96,7 @@ def _plan(emap: ElevationMap, start: Tensor, goal: Tensor, robot: RobotConfig) -
 
 
 def _describe(start: Tensor, goal: tuple[float, float], path: PlannedPath, check: PathCheck) -> str:
-    """Return where from and to, and the path's length or why there is none."""
+    """Return start, goal, and the path's length or the reason why there is none."""
     ends = f"from ({start[0, 0]:.2f}, {start[0, 1]:.2f}) to ({goal[0]:.2f}, {goal[1]:.2f})"
     if not path.reached:
         return f"no path   {ends}: {path.explain()[0]}"

@@ -28,7 +28,7 @@ class UserError(click.ClickException):
 
 
 class EmptyMapError(click.ClickException):
-    """A map that holds nothing, or next to nothing, of its recording: print one line to stderr and exit with code 3."""
+    """An empty or nearly empty map: print one line to stderr and exit with code 3."""
 
     exit_code = EMPTY_MAP
 
@@ -51,7 +51,7 @@ def plain_warnings() -> Iterator[None]:
 
 @contextmanager
 def user_errors() -> Iterator[None]:
-    """Turn what bad input and missing packages raise in the block into errors of one line."""
+    """Turn exceptions of bad input and missing packages in the block into one-line errors."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -25,7 +25,7 @@ _MakePage = Callable[[str, tuple[str, ...]], "Page"]
 
 
 def run_view(request: MapRequest | None, host: str, port: int, is_paused: bool) -> None:
-    """Show what was asked for until Ctrl-C; bad input becomes a one-line click error.
+    """Show the recording, walk or map until Ctrl-C; bad input becomes a one-line click error.
 
     Args:
         request: a recording, or a saved map; None: the demo's walk.
@@ -102,7 +102,7 @@ def _view_demo(make_page: _MakePage, is_paused: bool) -> None:
 
 
 def _refuse_options(request: MapRequest) -> None:
-    """Refuse options that say how to read and map a recording, which a saved map is not."""
+    """Refuse options for reading and mapping recordings, as a saved map needs neither."""
     plain = MapRequest(recording=request.recording)
     names = [field.name for field in fields(plain) if getattr(request, field.name) != getattr(plain, field.name)]
     if names:

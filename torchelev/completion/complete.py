@@ -18,7 +18,7 @@ from torchelev.ops.parallel import map_in_order
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_AT_A_TIME = 2**13  # unknown cells on a CPU: what is computed of them stays in its caches
+_AT_A_TIME = 2**13  # unknown cells on a CPU at a time: their intermediate values stay in its caches
 _AT_A_TIME_ON_GPU = 2**20
 
 
@@ -82,7 +82,7 @@ def _(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[T
 
 @torch.no_grad()
 def _answer_each(weights: Weights, cells: Cells) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation of all cells, each computed as what it is, on all cores."""
+    """Return mean and standard deviation of all cells, as measured or unknown ones, on all cores."""
 
     def measured(place: Tensor) -> tuple[Tensor, Tensor]:
         return refine(weights, cells.measured.choose(place), cells.describe(place))
@@ -100,7 +100,7 @@ def _answer_each(weights: Weights, cells: Cells) -> tuple[Tensor, Tensor]:
 
 
 class Cells:
-    """Reads what the answers at the cells of maps depend on; cells are numbered in the flat maps."""
+    """Gathers the network's inputs at cells of the maps; cells are numbered in the flat maps."""
 
     def __init__(self, layers: CompletionInput, resolution: float) -> None:
         elevation, known, variance, upper_bound, bounded, age = layers
@@ -119,7 +119,7 @@ class Cells:
         return describe(self.sums, self.level, place, self.resolution)
 
     def read_unknown(self, place: Int[Tensor, "n"], context: Context) -> Seen:
-        """Return what the prediction at unknown cells depends on."""
+        """Return the network's inputs at unknown cells."""
         around = look_around(self.ground, self.steps, place, self.resolution)
         bound, bounded = (values.index_select(0, place) for values in (self.bound, self.bounded))
         level = self.level.to(bound.dtype).index_select(0, place // self.known[0].numel())
@@ -127,6 +127,6 @@ class Cells:
 
 
 def _may_choose_cells(weights: Weights, layers: CompletionInput) -> bool:
-    """Tell whether the number of computed cells may depend on the data: on a CPU, without gradients."""
+    """Return whether the number of computed cells may depend on the data: on a CPU, without gradients."""
     is_differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in (*weights, *layers))
     return layers.validity.device.type == "cpu" and not is_differentiated

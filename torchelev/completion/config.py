@@ -13,7 +13,7 @@ WHEN = ("read", "update")
 
 @dataclass(frozen=True, kw_only=True)
 class CompletionConfig:
-    """How the ground that no sensor saw is predicted: the layers `completed` and `completed_std`."""
+    """Prediction of the ground that no sensor saw: the layers `completed` and `completed_std`."""
 
     weights: str | Path | None = None  #: file that `CompletionNet.save` wrote; None: the shipped weights
     #: "read": when a layer is read, and kept until the map changes; "update": at the end of every update

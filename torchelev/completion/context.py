@@ -1,4 +1,4 @@
-"""The ground in a square around a cell: how much of it is known or bounded, how rough it is, how its heights spread."""
+"""Statistics of the square around a cell: shares of known and bounded cells, roughness, spread of the heights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The completion network: a module that predicts the ground at every cell, and how sure that is."""
+"""The completion network: a module that predicts the ground at every cell, with its standard deviation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchelev.weight_files import WeightFormat, require_resolution, write_weigh
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-VERSION = 2  # of the file format; also counts what the weights are multiplied with
+VERSION = 2  # of the file format; raised also when the features change
 _PRETRAINED = Path(__file__).parent / "weights" / "completion.pt"
 _SIZES = ("view_channels", "cell_channels", "measured_channels")
 

@@ -1,4 +1,4 @@
-"""The weights of the completion network: their shapes, and what they are multiplied with."""
+"""The weights of the completion network: their shapes, and the features that they multiply."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Weights(NamedTuple):
     cell_bias: Float[Tensor, "D 1"]  #: first layer of a cell
     cell_inner: Float[Tensor, "D D"]  #: second layer
     cell_inner_bias: Float[Tensor, "D 1"]  #: second layer of a cell
-    to_view: Float[Tensor, "C D"]  #: what the cell tells each direction
-    to_view_bias: Float[Tensor, "C 1"]  #: what the cell tells each direction
+    to_view: Float[Tensor, "C D"]  #: from the cell's features to each direction
+    to_view_bias: Float[Tensor, "C 1"]  #: from the cell's features to each direction
     vote: Float[Tensor, "V C"]  #: logits of the candidates, from a direction
     vote_cell: Float[Tensor, "V D"]  #: from the cell
     vote_bias: Float[Tensor, "V 1"]  #: logits of the candidates
@@ -87,7 +87,7 @@ def hidden(weight: Tensor, columns: Float[Tensor, "F *n"], bias: Tensor) -> Tens
 
 def squash(height: Tensor, scale: float = SQUASH) -> Tensor:
     """Return sign(h) log(1 + |h| / scale): linear below the scale [m], logarithmic above it."""
-    ratio = (height.abs() / scale).clamp(min=_SMALL)  # whose logarithm has a slope at 0, which a sign would not have
+    ratio = (height.abs() / scale).clamp(min=_SMALL)  # the logarithm has a slope at 0, which a sign does not have
     return height / scale * (torch.log1p(ratio) / ratio)
 
 

@@ -26,7 +26,7 @@ LARGEST_LOG = 5.0  # of the network's factor on a spread
 
 
 class Seen(NamedTuple):
-    """What the prediction at n unknown cells depends on."""
+    """Inputs of the prediction at n unknown cells."""
 
     around: Surroundings  #: the known ground in eight directions
     context: Context  #: the ground in the squares around them
@@ -85,7 +85,7 @@ class _Heights(NamedTuple):
 
 
 class _Proposals(NamedTuple):
-    """What each direction sees and proposes."""
+    """Features and proposed heights of each direction."""
 
     features: Float[Tensor, "F 8 n"]
     candidates: Float[Tensor, "V 8 n"]  # [m]

@@ -21,7 +21,7 @@ LONG_AGO = 60.0  # [s] ages count about logarithmically beyond a second, up to t
 
 
 class Measured(NamedTuple):
-    """n measured cells and what lies next to them; arbitrary but finite where a cell is not measured."""
+    """n measured cells and their neighbours; arbitrary but finite where a cell is not measured."""
 
     height: Float[Tensor, "n"]  #: [m]
     sigma: Float[Tensor, "n"]  #: [m] standard deviation of it in the map, MIN_STD at least
@@ -65,8 +65,9 @@ def refine(weights: Weights, cells: Measured, context: Context) -> tuple[Float[T
 
         mean = h + 2 sigma tanh(g u / (2 sigma)),
 
-    which stays within two standard deviations sigma of the map, a millimetre at least. The squares around a cell tell
-    how far to trust it: where there are many gaps, a pose that is off by a few centimetres puts ground into a gap.
+    which stays within two standard deviations sigma of the map, a millimetre at least. The squares around a cell
+    determine how far to trust it: where there are many gaps, a pose that is off by a few centimetres puts ground into
+    a gap.
     """
     height, sigma, bend, features = cells
     squares = ((context.mean - height) * (context.known > 0)).to(height.dtype)

@@ -53,7 +53,7 @@ def _(known: Tensor) -> Tensor:
 
 
 def _overlap(values: Tensor, i: int, j: int) -> tuple[Tensor, Tensor]:
-    """Return views of the cells (B, h, w) whose neighbour (i, j) cells on is inside, and of these neighbours."""
+    """Return views of the cells (B, h, w) whose neighbour at offset (i, j) is inside, and of these neighbours."""
     H, W = values.shape[1:]
     here = values[:, max(0, -i) : H - max(0, i), max(0, -j) : W - max(0, j)]
     there = values[:, max(0, i) : H + min(0, i), max(0, j) : W + min(0, j)]
@@ -83,7 +83,7 @@ def look_around(
     ground = ground.flatten()
 
     def read(steps: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the heights so many steps on, 0 where unknown, and whether they are known, 1 or 0."""
+        """Return the heights at these numbers of steps, 0 where unknown, and whether they are known, 1 or 0."""
         inside = (steps <= room).to(torch.int32)
         heights = ground.index_select(0, (place + stride * (steps * inside)).flatten()).view(steps.shape)
         found = (heights < UNKNOWN).to(heights.dtype) * inside

@@ -1,4 +1,4 @@
-"""Diagnosis: what looks wrong with a map's inputs, the likely cause and a fix; and a warning when updates slow down.
+"""Diagnosis: suspicious inputs of a map, their likely cause and a fix; and a warning when updates slow down.
 
 The errors that refuse inputs outright are in `torchelev.inputs.update_inputs` and `torchelev.inputs.checks`.
 """

@@ -1,4 +1,4 @@
-"""What looks wrong with a map's inputs: one rule per mistake, worst first.
+"""Rules that find mistakes in a map's inputs, worst first.
 
 Each rule returns a sentence, or None where it finds nothing. The rules are silent where a mistake leaves no trace, as
 most wrong poses do when a level lidar sees flat ground.
@@ -27,7 +27,7 @@ _REASONS = {
 
 
 def diagnose(cfg: ElevationMapConfig, state: MapState, history: InputHistory) -> list[str]:
-    """Return what looks wrong, worst first: of each rule the finding in the first environment that has one."""
+    """Return the findings, worst first: of each rule that in the first environment that has one."""
     evidence = [gather_evidence(cfg, state, history, env) for env in range(min(MAX_ENVS, len(state.elevation)))]
     findings = ((rule(seen) for seen in evidence if seen) for rule in _RULES)
     sentences = [next((text for text in texts if text), None) for texts in findings]
@@ -60,7 +60,7 @@ def _find_far_cloud(seen: Evidence) -> str | None:
 
 
 def _find_wrong_poses(seen: Evidence) -> str | None:
-    """Find poses under which the ground is tilted or the scans disagree, and that a usual mistake explains."""
+    """Find poses with which the ground is tilted or the scans disagree, if a common mistake explains that."""
     fit, mistakes = seen.explained
     if not mistakes:
         return None
@@ -105,7 +105,7 @@ def _find_closed_gate(seen: Evidence) -> str | None:
 
 
 def _find_window_off_points(seen: Evidence) -> str | None:
-    """Find a window beside which nearly all points fall, in every update."""
+    """Find a window that nearly all points miss, in every update."""
     half = np.array([seen.cfg.grid.length_x, seen.cfg.grid.length_y]) / 2
     fractions, away = [], 0.0
     for k, base in enumerate(seen.bases):
@@ -145,7 +145,7 @@ def _find_contradictions(seen: Evidence) -> str | None:
 
 
 def _find_wrong_dt(seen: Evidence) -> str | None:
-    """Find a `dt` so long that the robot hardly moves, or of 0 in every update."""
+    """Find a `dt` that is implausibly long for the robot's motion, or 0 in every update."""
     dt = float(np.median(seen.dt))
     if dt == 0 and seen.oldest == 0 and len(seen.positions) >= 4 and seen.travel > 0.5:
         return f"dt: 0 s in all updates, yet the robot moves {seen.travel:.1f} m; give the seconds since the last one"
@@ -190,7 +190,7 @@ def _height_over_ground(points: NDArray, position: NDArray) -> NDArray:
     A = np.column_stack([points[:, :2] - position[:2], np.ones(len(points))])
     is_ground = np.linalg.norm(A[:, :2], axis=1) < 1.5
     height = np.zeros(len(points))
-    for _ in range(4):  # each fit leaves out what stands more than 5 cm above the last one
+    for _ in range(4):  # each fit leaves out points more than 5 cm above the previous one
         if is_ground.sum() >= 3:
             height = points[:, 2] - A @ np.linalg.lstsq(A[is_ground], points[is_ground, 2], rcond=None)[0]
             is_ground &= height < 0.05

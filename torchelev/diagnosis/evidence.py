@@ -1,4 +1,4 @@
-"""The evidence that a diagnosis rests on: recent inputs, statistics and state of one environment, on the host."""
+"""The evidence for a diagnosis: recent inputs, statistics and state of one environment, on the host."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement
 
 MIN_POINTS = 20  # points that a fraction or a median must rest on
-_FAR = 250.0  # [m] beyond what sensors of robots measure
+_FAR = 250.0  # [m] farther than sensors of robots measure
 GATES = ("invalid", "range", "body", "overhang")  # of the sensor, in their order
 
 
@@ -28,12 +28,12 @@ class FarCloud(NamedTuple):
 
     distance: float  #: [m] of its middle from the sensor
     radius: float  #: [m] median distance of its points from the middle
-    is_at_sensor: bool  #: read in the map frame, it lies where the pose says that the sensor is
+    is_at_sensor: bool  #: read in the map frame, it lies at the sensor's pose
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of one environment. Lists have one entry per update."""
+    """The evidence of one environment. Lists have one entry per update."""
 
     cfg: ElevationMapConfig  #: configuration of the map
     numbers: list[int]  #: numbers of the updates
@@ -54,7 +54,7 @@ class Evidence:
 
     @cached_property
     def num_points(self) -> int:
-        """Number of points of all updates."""
+        """Total number of points of all updates."""
         return sum(len(cloud) for clouds in self.points for cloud in clouds)
 
     @cached_property
@@ -101,7 +101,7 @@ class Evidence:
 
     @cached_property
     def explained(self) -> tuple[Fit, list[str]]:
-        """How well poses and points fit, and the mistakes that would explain why they do not."""
+        """The fit of poses and points, and the mistakes that would explain a bad one."""
         is_comparable = self.scans and not (self.is_in_millimetres or self.far_cloud)
         return explain(self.scans) if is_comparable else (Fit(np.nan, np.nan, np.nan, np.nan), [])
 
@@ -124,7 +124,7 @@ class Evidence:
 
 
 def gather_evidence(cfg: ElevationMapConfig, state: MapState, history: InputHistory, env: int) -> Evidence | None:
-    """Read what is known of one environment back to the host; None if it has had no update."""
+    """Copy the evidence of one environment to the host; None if it has had no update."""
     updates = history.updates_of(env)
     if not updates:
         return None
@@ -161,7 +161,7 @@ def _measure_again(cfg: ElevationMapConfig, update: PastUpdate, env: int) -> Mea
 
 
 def _count_near(cfg: ElevationMapConfig, state: MapState, update: PastUpdate, env: int) -> int:
-    """Count the known cells on which overlap clearance works."""
+    """Count the known cells in reach of overlap clearance."""
     T_map_base = update.inputs.T_map_base
     if T_map_base is None or cfg.overlap is None:
         return 0

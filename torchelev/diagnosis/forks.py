@@ -1,4 +1,4 @@
-"""Processes that are forked after maps were used in their parent: they have none of its threads.
+"""Processes forked after the parent has used maps: they lack its threads.
 
 OpenMP would wait for these forever. Such a child computes on one thread, as the workers of torch's own DataLoader do.
 """
@@ -30,7 +30,7 @@ def _use_one_thread() -> None:
 
 
 def warn_of_fork() -> None:
-    """Warn, once in a forked child, that it computes on one thread, and how workers get all of theirs."""
+    """Warn, once in a forked child, that it computes on one thread, and how to start workers with all threads."""
     global _lost_threads
     if not _lost_threads:
         return

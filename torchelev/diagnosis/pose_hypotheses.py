@@ -1,4 +1,4 @@
-"""Which usual mistake would explain poses that do not fit their points: each is undone, and the fit compared."""
+"""Common mistakes that would explain poses that do not fit their points: each is undone, and the fits are compared."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well scans fit together under their poses, or under poses from which a mistake was taken back.
+"""How well scans fit together under their poses, or under poses in which a mistake is undone.
 
 Scans fit if the largest plane in each is level and lies below the sensor, and if they agree where they overlap.
 """

@@ -52,7 +52,7 @@ def _cells_of(seen: Evidence, k: int, sensor: int) -> dict[tuple[int, int], floa
 
 
 def find_alternating_corrections(seen: Evidence) -> str | None:
-    """Find drift corrections that repeat: each of several sensors, or each phase of a gait, has its own height."""
+    """Find drift corrections that repeat: each sensor, or each phase of a gait, has its own height offset."""
     corrections = np.array(seen.corrections)
     for period in range(2, _MAX_SENSORS + 1):
         recent = corrections[-(len(corrections) // period) * period :]
@@ -70,7 +70,7 @@ def find_alternating_corrections(seen: Evidence) -> str | None:
 
 def _repeated_heights(corrections: NDArray) -> NDArray | None:
     """Return the height [m] of each of a period's updates, from corrections (turns, period); None if none repeats."""
-    corrections = corrections - corrections.mean()  # what all of them share, such as steady drift, is no disagreement
+    corrections = corrections - corrections.mean()  # a common offset, such as steady drift, is not a disagreement
     mean = corrections.mean(0)
     total, left = np.square(corrections).sum(), np.square(corrections - mean).sum()
     return np.cumsum(mean) if left < (1 - _MIN_EXPLAINED) * total else None

@@ -1,4 +1,4 @@
-"""Points that no surface reflected: at the sensor's limit, where all share one range or depth, or on its own path."""
+"""Points without a reflecting surface: at the sensor's limit, with one range or depth, or on its own path."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchelev.diagnosis.evidence import MIN_POINTS, Evidence
 
 _MIN_SHARE = 0.01  # of a sensor's points; of sound ones, less than 0.2 % lie within the tolerance of the farthest
-_TOLERANCE = 1e-4  # relative; what float32 leaves of a range after a transform or two
+_TOLERANCE = 1e-4  # relative; rounding error of a float32 range after a transform or two
 _MAX_SHARE = 0.999  # a sensor that stands in the middle of a round room sees one range everywhere
 _MAX_RATIO = 2.5  # of lateral to forward distance, in the view of a camera
 _MOVED = 0.05  # [m], and sine of an angle, by which a wall would have come nearer or turned
@@ -88,7 +88,7 @@ def _clouds_by_sensor(seen: Evidence) -> Iterator[list[_Cloud]]:
 def _share_largest(clouds: list[_Cloud], values: list[NDArray], tolerance: float) -> tuple[float, float, list[NDArray]]:
     """Return the share of the points with the largest value, that value, and which points have it, per cloud.
 
-    The share is 0 unless enough of them entered the map: those above the ramp only say what is free, which is so.
+    The share is 0 unless enough of them entered the map: those above the ramp only mark free space, correctly.
     """
     limit = max((float(part.max()) for part in values), default=0.0)
     at_limit = [part >= limit * (1 - tolerance) for part in values]
@@ -131,7 +131,7 @@ def _looks_along(points: NDArray, column: int, sign: float) -> bool:
 
 
 def _is_screen(clouds: list[_Cloud], at_limit: list[NDArray], column: int, sign: float, limit: float) -> bool:
-    """Return whether points of one depth fill a part of the image, and move with the sensor as no wall does.
+    """Return whether points of one depth fill a part of the image and move with the sensor, unlike a wall.
 
     The last row of level ground has one depth, too, but is a line.
     """
@@ -148,7 +148,7 @@ def _is_screen(clouds: list[_Cloud], at_limit: list[NDArray], column: int, sign:
 
 
 def find_points_on_path(seen: Evidence) -> str | None:
-    """Find points at places where the sensor itself was during the scan: returns that are missing, moved along."""
+    """Find points on the sensor's own path during the scan: missing returns at the origin, moved by deskewing."""
     counts, total = [], 0
     for k in range(len(seen.numbers) - 1):
         if seen.numbers[k + 1] != seen.numbers[k] + 1:

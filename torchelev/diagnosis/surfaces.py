@@ -1,4 +1,4 @@
-"""Ground that a gate takes for something else: a hillside above the exclusion ramp, and vegetation."""
+"""Ground that a gate rejects by mistake: a hillside above the exclusion ramp, and vegetation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CELL_SIZE, _MIN_IN_CELL, _SPREAD = 0.1, 4, 0.05  # [m], points, [m]
 
 
 def find_cut_hillside(seen: Evidence) -> str | None:
-    """Find ground that rises above the exclusion ramp: the rejected points go on with the plane that holds the rest."""
+    """Find ground that rises above the exclusion ramp: the rejected points continue the plane of the others."""
     shares, angles = [], []
     for k, overhang in enumerate(seen.overhang):
         masks = np.split(overhang, len(seen.points[k]))
@@ -38,7 +38,7 @@ def find_cut_hillside(seen: Evidence) -> str | None:
 
 
 def is_overgrown(seen: Evidence) -> bool:
-    """Return whether the points of one scan differ in height within cells, as of vegetation, whatever the poses are."""
+    """Return whether points of one scan differ in height within cells, as on vegetation, independent of the poses."""
     spreads = []
     for k in range(len(seen.numbers)):
         points = seen.used_points(k)

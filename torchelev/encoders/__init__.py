@@ -5,7 +5,7 @@ Environments and observations are not here, see `gym` and `observations`. `MapAt
 """
 
 from torchelev.encoders.attention import MapAttention
-from torchelev.encoders.config import AttentionConfig
+from torchelev.encoders.encoder_config import AttentionConfig
 from torchelev.encoders.layout import MapLayout
 
 __all__ = ["AttentionConfig", "MapAttention", "MapLayout"]

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchelev.encoders.config import AttentionConfig
+from torchelev.encoders.encoder_config import AttentionConfig
 from torchelev.encoders.layout import MapLayout
 from torchelev.errors import require
 
@@ -58,7 +58,7 @@ class MapAttention(nn.Module):
         self.register_buffer("coordinates", coordinates.flatten(2))
         padding = cfg.kernel_size // 2
         self.features = nn.Sequential(
-            # Larger than the square by what pads it, so that each output is centred on its square.
+            # The square with its padding, so that each output is centred on its square.
             nn.Conv2d(layout.channels, cfg.hidden_channels, cfg.kernel_size + cfg.patch - 1, cfg.patch, padding),
             nn.ELU() if activation is None else activation,
             nn.Conv2d(cfg.hidden_channels, cfg.embed_dim - plain, cfg.kernel_size, 1, padding),

@@ -8,18 +8,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.encoders.config import AttentionConfig
+from torchelev.encoders.encoder_config import AttentionConfig
 from torchelev.errors import require
 from torchelev.observations import patterns
 from torchelev.observations.height_scan import HeightScan
 
 
 class MapLayout(NamedTuple):
-    """What an encoder reads: C channels of points on R x S cells; R is 1 for a scan that is no grid."""
+    """The input of an encoder: C channels of points on R x S cells; R is 1 for a scan that is not a grid."""
 
     groups: tuple[str, ...]  #: observation groups, whose channels follow each other
     channels: int  #: C, a validity of its own group included
-    coordinates: Tensor  #: (F, R, S) constant features of the points: x and y [m], then what else the rows hold
+    coordinates: Tensor  #: (F, R, S) constant features of the points: x and y [m], then the further columns of the rows
     validity: int | None  #: the channel that holds the validity
 
     @classmethod

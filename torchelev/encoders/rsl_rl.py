@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from torchelev.encoders.attention import MapAttention
-from torchelev.encoders.config import AttentionConfig
-from torchelev.encoders.export import OnnxAttentionModel, TorchAttentionModel
+from torchelev.encoders.encoder_config import AttentionConfig
+from torchelev.encoders.exported_policy import OnnxAttentionModel, TorchAttentionModel
 from torchelev.encoders.layout import MapLayout
 from torchelev.errors import require
 

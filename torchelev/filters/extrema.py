@@ -100,7 +100,7 @@ def with_blanks(values: Float[Tensor, "B H W"], known: Bool[Tensor, "B H W"]) ->
 
 
 def highest_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
-    """Return the highest known cell of the window around each known cell; other cells hold nothing of use."""
+    """Return the highest known cell of the window around each known cell; other cells hold arbitrary values."""
     if opencv.is_usable(values):
         return opencv.window_maximum((values, known), radius)
     rimmed = padded(with_blanks(values, known), radius, blank(values.dtype))
@@ -108,7 +108,7 @@ def highest_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
 
 
 def lowest_known(values: Tensor, known: Tensor, radius: int) -> Tensor:
-    """Return the lowest known cell of the window around each known cell; other cells hold nothing of use."""
+    """Return the lowest known cell of the window around each known cell; other cells hold arbitrary values."""
     if opencv.is_usable(values):
         return opencv.window_minimum((values, known), radius)
     return -highest_known(-values, known, radius)

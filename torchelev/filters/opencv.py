@@ -21,7 +21,7 @@ _BLANK = float(np.finfo(np.float32).max / 4)  # [m] above all heights
 
 @functools.cache
 def is_installed() -> bool:
-    """Tell whether OpenCV can be imported."""
+    """Return whether OpenCV can be imported."""
     try:
         import cv2  # noqa: F401
     except ImportError:  # missing, or missing a library that it needs
@@ -30,13 +30,13 @@ def is_installed() -> bool:
 
 
 def is_readable(values: Tensor) -> bool:
-    """Tell whether OpenCV can read a tensor: plain, on the CPU, outside compiled code."""
+    """Return whether OpenCV can read a tensor: plain, on the CPU, outside compiled code."""
     is_plain = type(values) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(values)
     return is_plain and values.is_cpu and not torch.compiler.is_compiling() and is_installed()
 
 
 def is_usable(values: Tensor) -> bool:
-    """Tell whether OpenCV can filter a tensor: readable, not empty, float32, and no gradient is wanted."""
+    """Return whether OpenCV can filter a tensor: readable, not empty, float32, and no gradient is wanted."""
     needs_gradient = values.requires_grad and torch.is_grad_enabled()
     return values.dtype == torch.float32 and values.numel() > 0 and not needs_gradient and is_readable(values)
 

@@ -1,4 +1,4 @@
-"""Poses from what simulators give: quaternions of either order, rotation matrices, cameras. Elsewhere poses are 4 x 4.
+"""Construct poses from quaternions of either order, rotation matrices and camera poses. All other code takes 4 x 4.
 
 All constructors take tensors, NumPy arrays and lists, and keep float64.
 

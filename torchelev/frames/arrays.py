@@ -1,4 +1,4 @@
-"""What constructors of poses share: tensors from arrays, and 4 x 4 matrices from their parts."""
+"""Helpers of the pose constructors: tensors from arrays, and 4 x 4 matrices from their parts."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ def assemble(position: Tensor, rotation: Tensor) -> Tensor:
 
 
 def is_readable(values: Tensor) -> bool:
-    """Tell whether values can be read without waiting for a device or breaking a graph."""
+    """Return whether values can be read without waiting for a device or breaking a graph."""
     plain = type(values) is Tensor and not is_transforming()
     return plain and values.device.type == "cpu" and not torch.compiler.is_compiling()

@@ -38,7 +38,7 @@ def interpolate_poses(
     """Return the poses at given times, between two known ones: positions linearly, rotations by slerp.
 
     T(t) = (R_k exp(u log(R_k^T R_k+1)), (1 - u) p_k + u p_k+1) with u = (t - t_k) / (t_k+1 - t_k). Before the first
-    pose and after the last, the motion of the first or last two goes on. Differentiable in poses and times.
+    pose and after the last, the motion of the first or last two continues. Differentiable in poses and times.
 
     Args:
         poses: known poses; K is at least 2. Neighbours must differ by less than half a turn.

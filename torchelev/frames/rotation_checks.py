@@ -12,7 +12,7 @@ from torchelev.errors import require
 _TOLERANCE = 1e-3  # of a quaternion's norm, and of a matrix's products
 _MAX_TILT = 60.0  # [deg] between up and the z axis of an upright frame
 _OTHER_ORDER = {"quat_wxyz": "x, y, z, w: use transform_xyzw", "quat_xyzw": "w, x, y, z: use transform"}
-_XY = {"quat_wxyz": slice(1, 3), "quat_xyzw": slice(0, 2)}  # where x and y are, which tell the tilt
+_XY = {"quat_wxyz": slice(1, 3), "quat_xyzw": slice(0, 2)}  # the places of x and y, which determine the tilt
 
 
 def require_unit(name: str, quat: Tensor) -> None:
@@ -23,7 +23,7 @@ def require_unit(name: str, quat: Tensor) -> None:
 
 
 def require_upright(name: str, quat: Tensor) -> None:
-    """Raise ValueError unless all quaternions (..., 4) leave the z axis up, and tell if another order would."""
+    """Raise ValueError unless all quaternions (..., 4) leave the z axis up; its hint names another order that would."""
     tilts = {order: _max_tilt(quat[..., xy]) for order, xy in _XY.items()}
     tilt = tilts.pop(name)
     hint = "give the pose of a frame whose z axis points up, or leave out upright"

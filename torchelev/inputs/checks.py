@@ -24,7 +24,7 @@ Config = TypeVar("Config")
 
 
 def readable(value: Tensor, always: bool = False) -> bool:
-    """Tell whether a tensor's values may be read now: it lies on the CPU, or `always` is set.
+    """Return whether a tensor's values may be read now: it lies on the CPU, or `always` is set.
 
     Never true while compiling or inside a `torch.func` transform, nor for fake tensors.
     """
@@ -87,7 +87,7 @@ def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.de
 
 
 def _are_rigid(pose: Tensor) -> bool:
-    """Tell quickly whether all matrices are rigid; where this says no, `_require_rigid` decides and words the error."""
+    """Return quickly whether all matrices are rigid; if not, `_require_rigid` decides and words the error."""
     matrices = pose.detach().cpu().reshape(-1, 16)
     if len(matrices) <= _FEW:
         return all(map(_is_rigid, matrices.tolist()))
@@ -112,7 +112,7 @@ def _is_rigid(matrix: Any) -> Any:
 
 def _require_rigid(name: str, pose: Tensor) -> None:
     """Refuse matrices that are not finite and rigid, or whose position is out of range."""
-    # In NumPy, whose calls cost a fifth of torch's: for one robot this is most of what the checks cost.
+    # In NumPy, whose calls cost a fifth of torch's: for one robot they dominate the checks.
     matrix = pose.detach().cpu().double().numpy()
     matrix = matrix if pose.ndim > 2 else matrix[None]
 

@@ -62,7 +62,7 @@ def depth_to_points(
 
 
 def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
-    """Refuse what are no tensors, and depth images and intrinsics whose shapes do not fit each other."""
+    """Refuse values that are not tensors, and depth images and intrinsics whose shapes do not match."""
     shape = tuple(require_tensor("depth", depth).shape)
     require_tensor("intrinsics", intrinsics)
     require(depth.ndim >= 2, "depth", "expected (..., h, w)", shape, "add the image dimensions")

@@ -66,7 +66,7 @@ class TakesInputs(Protocol[_ResultOut]):
 
 
 def requires_dt(method: Callable[..., _Result]) -> TakesInputs[_Result]:
-    """Return the method as it is, typed such that type checkers ask for `dt`."""
+    """Return the method unchanged, typed such that type checkers require `dt`."""
     return cast(TakesInputs[_Result], method)
 
 

@@ -1,4 +1,4 @@
-"""An observation term for Isaac Lab: a map of what ray casters or depth cameras saw, in place of `mdp.height_scan`.
+"""An observation term for Isaac Lab: a map made by ray casters or depth cameras, in place of `mdp.height_scan`.
 
     height_scan = ObservationTermCfg(
         func=MapObservation, params={"sensor_cfg": SceneEntityCfg("camera"), "standing_height": 0.5})
@@ -105,7 +105,7 @@ class IsaacLabSource:
         return self._pose(robot.root_link_pos_w, robot.root_link_quat_w)
 
     def read_cloud(self, env: Any) -> Cloud:
-        """Return what the sensors saw last."""
+        """Return the sensors' latest points."""
         return join([self._read_sensor(env.scene[name]) for name in self.sensor_names])
 
     def _read_sensor(self, sensor: Any) -> Cloud:

@@ -1,4 +1,4 @@
-"""What the observation terms of all simulators do: read the maps of an environment as an observation."""
+"""The part that observation terms of all simulators share: read the maps of an environment as an observation."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ class MapTerm:
     #: True appends the validity of a height scan, (B, P) becomes (B, 2 P)
     with_validity: ClassVar[bool] = False
 
-    _maps: StepMap
+    maps: StepMap  #: the maps, and the simulator that they are of
     _reader: Reader
 
     def _set_up(self, cfg: Any, env: Any, source: Source) -> None:
         """Find or make the maps, and check that the term's config and the reader fit together."""
         self._reader = _choose_reader(type(self).read, cfg.params.get("standing_height"))
         _refuse_second_scale(cfg, self._reader)
-        self._maps = share_map(env, source, type(self).map_cfg, cfg.params.get("update_every", 1))
+        self.maps = share_map(env, source, type(self).map_cfg, cfg.params.get("update_every", 1))
 
     @property
     def emap(self) -> ElevationMap:
         """The maps, for instance to read layers, to save them or to compile their updates."""
-        return self._maps.emap
+        return self.maps.emap
 
     def reset(self, env_ids: Any = None) -> None:
         """Forget the maps of environments that begin anew; the manager calls it."""
-        self._maps.reset(env_ids)
+        self.maps.reset(env_ids)
 
     @torch.no_grad()
     def _observe(self, env: Any) -> Tensor:
         """Update the maps if they are due, and read them: a fresh tensor (B, ...) in float32 without NaN."""
-        self._maps.advance(env)
+        self.maps.advance(env)
         emap = self.emap
-        if self._maps.is_empty:
+        if self.maps.is_empty:
             # The manager asks for the shape before there is data: read the empty maps around the origin.
             T_map_base = torch.eye(4, device=emap.device).repeat(emap.num_envs, 1, 1)
         else:
-            T_map_base = self._maps.source.read_base(env)
+            T_map_base = self.maps.source.read_base(env)
         values = self._reader(emap, T_map_base)
         if isinstance(values, tuple):
             values = torch.cat([part.float() for part in values], -1) if self.with_validity else values[0]

@@ -1,4 +1,4 @@
-"""An observation term for mjlab: a map of what ray-cast or depth sensors saw, in place of the ideal `height_scan`.
+"""An observation term for mjlab: a map made by ray-cast or depth sensors, in place of the ideal `height_scan`.
 
     cfg.observations["actor"].terms["height_scan"] = ObservationTermCfg(
         func=MapObservation, params={"sensor_name": "depth_camera", "standing_height": 0.3})
@@ -86,7 +86,7 @@ class MjlabSource:
         return transform(robot.root_link_pos_w, robot.root_link_quat_w)
 
     def read_cloud(self, env: Any) -> Cloud:
-        """Return what the sensors saw in the last control step."""
+        """Return the sensors' points of the last control step."""
         return join([self._read_sensor(env, env.scene[name]) for name in self.sensor_names])
 
     def _read_sensor(self, env: Any, sensor: Any) -> Cloud:

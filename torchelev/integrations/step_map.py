@@ -1,6 +1,6 @@
 """Maps that follow the control steps of a manager-based environment: one update per step, and resets with its episodes.
 
-Simulators differ only in where their data are: `Source` says what a map needs of them.
+Simulators differ only in where their data are: `Source` is the interface to them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Cloud(NamedTuple):
-    """What the S sensors of each environment saw at one instant."""
+    """The points of the S sensors of each environment at one instant."""
 
     points: Float[Tensor, "B S N 3"]  #: [m] sensor frame; NaN where a ray hit nothing
     T_map_sensor: Float[Tensor, "B S 4 4"]  #: sensor frame to map frame
@@ -99,7 +99,7 @@ class StepMap:
 
 
 def require_cadence(update_every: object) -> int:
-    """Return how many control steps there are from one update to the next; ValueError unless it is a positive int."""
+    """Return the number of control steps between updates; ValueError unless it is a positive int."""
     return require_count("update_every", update_every, "give a number of control steps")
 
 

@@ -15,7 +15,7 @@ __all__ = ["Intrinsics", "read_depth", "read_depth_points", "read_intrinsics"]
 
 _NAMES = ("depth", "distance_to_image_plane", "distance_to_camera")
 _ALONG_RAY = "distance_to_camera"  # in file names of Isaac Sim's Replicator: along each pixel's ray
-_FAR = 200.0  # [m] a median depth beyond which values are no metres
+_FAR = 200.0  # [m] a median depth beyond which values are not metres
 
 
 def read_depth(path: str | Path, depth_scale: float = 0.001, float_scale: float = 1.0) -> NDArray[np.float32]:

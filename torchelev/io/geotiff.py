@@ -47,7 +47,7 @@ def save_geotiff(
 
     Raises:
         KeyError: a layer does not exist. Nothing is written then.
-        ValueError: the environment does not exist, or `epsg` is no code.
+        ValueError: the environment does not exist, or `epsg` is not a code.
         ModuleNotFoundError: tifffile is missing.
     """
     import tifffile  # noqa: F401  # before the layers are read

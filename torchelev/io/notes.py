@@ -1,4 +1,4 @@
-"""What is not used of a scan, and why: one line per kind, whatever the number of scans."""
+"""Notes on data that are not used: one line per kind of note, with the number of scans."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Note(NamedTuple):
-    """What is not used of a scan, or used otherwise than it says."""
+    """A note on data of a scan that are not used, or are interpreted differently from their metadata."""
 
     text: str  #: with the numbers of this scan
     kind: str  #: the same for all scans of which the same is said

@@ -13,7 +13,7 @@ _SHORTEST, _LONGEST = 2e-3, 2.0  # [s] of a scan whose period is unknown
 _MARGIN = 1.2  # by which a scan may be longer than the period of its topic
 _SLOWEST = 0.21  # [s] period of lidars whose times may be fractions of it: 5 Hz and more
 _FEW = 100  # one of so many times may lie apart from all others
-_ABSOLUTE = 1e8  # [s] since 1970; larger times are no offsets from the message's stamp
+_ABSOLUTE = 1e8  # [s] since 1970; larger times are not offsets from the message's stamp
 
 
 def longest_scan(period: float | None) -> float:
@@ -55,7 +55,7 @@ def to_seconds(
 def describe_times(
     name: str, raw: NDArray, times: NDArray | None, stamp: float, period: float | None, is_hit: NDArray[np.bool_]
 ) -> Note | None:
-    """Return what is odd about a field of times, of which `to_seconds` returned `times`; None: nothing."""
+    """Return a note if a field of times, from which `to_seconds` returned `times`, is implausible; else None."""
     known = _known_times(raw, is_hit)
     finite = known[np.isfinite(known)]
     if times is None:
@@ -82,7 +82,7 @@ def is_fraction(finite: NDArray, period: float) -> bool:
 
 
 def _ends(times: NDArray[np.longdouble]) -> tuple[np.longdouble, np.longdouble]:
-    """Return the first time and the last one, without the few that lie apart from all others."""
+    """Return the first and the last time, without a few outliers."""
     apart = len(times) // _FEW
     ordered = np.partition(times, [apart, len(times) - 1 - apart])
     return ordered[apart], ordered[len(times) - 1 - apart]

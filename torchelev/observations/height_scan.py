@@ -28,7 +28,7 @@ class HeightScan(ScanSettings):
     value = scale * clip(z - elevation - nominal_height + noise, -clip, clip) with z [m] of the base or foot, map frame.
 
     Build one with `isaac_lab`, `mjlab`, `legged_gym`, `grid`, `points` or `feet`. All of them take the fields of
-    `ScanSettings` as further keyword arguments, such as `fill`, which says what unknown cells read. A scan does not
+    `ScanSettings` as further keyword arguments, such as `fill`, the rule for unknown cells. A scan does not
     change; `dataclasses.replace` returns one with other settings.
     """
 
@@ -46,7 +46,7 @@ class HeightScan(ScanSettings):
 
         - Order: x fastest, from behind to ahead, then y from right to left. `values.view(B, 11, 17)[b, j, i]` is at
           (x_i, y_j).
-        - Spacing: `arange(-length / 2, length / 2 + 1e-9, resolution)`. A grid whose length is no multiple of the
+        - Spacing: `arange(-length / 2, length / 2 + 1e-9, resolution)`. A grid whose length is not a multiple of the
           resolution ends short of it: 1.1 m at 0.04 m gives 28 points, the last one at 0.53 m.
         - Offset 0.5 m, clip +-1 m, scale 1: flat ground reads the height of the base less 0.5 m.
         - Unknown cells: the known ground continues; on an empty map all points read `standing_height` - 0.5 m, which is
@@ -71,8 +71,8 @@ class HeightScan(ScanSettings):
 
         - Order: x fastest, from behind to ahead, then y from right to left. `values.view(B, 11, 17)[b, j, i]` is at
           (x_i, y_j).
-        - Spacing: `arange(-length / 2, length / 2 + resolution / 2, resolution)`. A grid whose length is no multiple of
-          the resolution may end beyond it: 1.1 m at 0.04 m gives 29 points, the last one at 0.57 m.
+        - Spacing: `arange(-length / 2, length / 2 + resolution / 2, resolution)`. A grid whose length is not a multiple
+          of the resolution may end beyond it: 1.1 m at 0.04 m gives 29 points, the last one at 0.57 m.
         - No offset, no clip, scale 1 / 5: flat ground reads the height of the base / 5 m.
         - Unknown cells: the known ground continues; on an empty map all points read `standing_height` / 5 m, with 0.5 m
           by default: set it to your robot's. `fill="original"` reads 1, like a pit: in mjlab a ray without a hit

@@ -1,4 +1,4 @@
-"""What the presets of `HeightScan` stand for: the points, settings and noise of other simulators and papers."""
+"""The presets of `HeightScan`: points, settings and noise of other simulators and papers."""
 
 from __future__ import annotations
 

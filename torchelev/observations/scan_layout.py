@@ -1,4 +1,4 @@
-"""What a policy must know about the height scan that it was trained with, as plain data to store beside its weights."""
+"""The layout of the height scan that a policy was trained with, as plain data to store beside its weights."""
 
 from __future__ import annotations
 

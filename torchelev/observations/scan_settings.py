@@ -42,8 +42,8 @@ class ScanSettings:
     nominal_height: float = 0.0  #: [m] offset subtracted from the height of the base or foot over the ground
     clip: float | None = None  #: [m] values are clipped to +-clip before they are scaled; None does not clip
     scale: float = 1.0  #: factor on the values, applied last
-    fill: str | float = "ground"  #: what unknown cells read: the name of a rule, or a number [m]
-    original: str | float = "base"  #: what fill="original" stands for: another rule, or a number [m]
+    fill: str | float = "ground"  #: value of unknown cells: the name of a rule, or a number [m]
+    original: str | float = "base"  #: meaning of fill="original": another rule, or a number [m]
     standing_height: float | None = None  #: [m] of the robot's z over unknown flat ground; None means nominal_height
     inpaint_rings: int = 5  #: [cells] how far "inpaint" reaches into the unknown area
     noise: float = 0.0  #: [m] half the width of the uniform noise that a call can ask for

@@ -1,4 +1,4 @@
-"""Regions grow onto their border cells, borders are smoothed, and what is far away or too small is dropped."""
+"""Regions grow onto their border cells, borders are smoothed, and distant cells and small regions are dropped."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def drop_distant(
 def relabel_components(
     labels: Int[ndarray, "P"], shape: tuple[int, int], min_cells: float
 ) -> tuple[Int[ndarray, "P"], Int[ndarray, "K"]]:
-    """Give each connected part of at least `min_cells` a label of its own; return also the label it had."""
+    """Give each connected part of at least `min_cells` its own label; also return its previous label."""
     image = labels.reshape(shape[0] + 1, -1)[:-1, :-1]
     pieces, number = components(*same_label(image))
     size = np.bincount(pieces.ravel() + 1, minlength=number + 1)

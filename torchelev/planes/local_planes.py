@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Limits(NamedTuple):
-    """What counts as a plane."""
+    """Thresholds of a planar window."""
 
     slope: float  #: [m/m] maximum
     roughness: float  #: [m] maximum root mean square distance of cells from their plane

@@ -31,7 +31,7 @@ _MAX_HEIGHT = 1e5  # [m] heights beyond it are unknown
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneConfig:
-    """What counts as a planar region."""
+    """Thresholds of a planar region."""
 
     window: float = 0.2  #: [m] side of the square around a cell that makes its local plane; at least 3 cells
     max_inclination: float = 0.6  #: [rad] of local planes and of regions

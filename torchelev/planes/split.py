@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from numpy import ndarray
 
-MAX_CUTS = 20  # rounds, each of which halves what is not planar
+MAX_CUTS = 20  # rounds, each of which halves the regions that are not planar
 BINS = 64  # of a histogram over 8 standard deviations
 _MIN_CELLS = 4  # smaller pieces of a cut are dropped; growing gives their cells to a neighbour
 
 
 def split(labels: Int[ndarray, "P"], surface: Surface, limits: Limits) -> tuple[Int[ndarray, "P"], RegionPlanes]:
-    """Cut components until each is planar. Returns labels and planes.
+    """Cut components until each is planar; return labels and planes.
 
     A region rougher than allowed is cut in two; from a planar one only the cells too far from its plane are removed.
     The connected pieces are the regions of the next round. What is left after MAX_CUTS rounds is dropped.
@@ -66,7 +66,7 @@ class _Cutter:
 
     def __init__(self, is_planar: Bool[ndarray, "P"], surface: Surface, limits: Limits) -> None:
         self.is_planar, self.surface = is_planar, surface
-        # Above what noise of the allowed roughness leaves in a mean over many windows' gradients.
+        # Larger than the noise of the allowed roughness in a mean over many windows' gradients.
         self.min_spread = (limits.roughness / (8 * surface.radius * surface.resolution)) ** 2
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The cells below footprints: which they are, and what the map knows of them."""
+"""The cells below footprints, and the map's values there."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Reason(IntEnum):
-    """Why a path ends where it does. `sentence` puts it into words, with the likely remedy."""
+    """The reason why a path ends. `sentence` puts it into words, with the likely remedy."""
 
     REACHED = 0
     START_OUTSIDE = 1
@@ -126,7 +126,7 @@ def find_limit(
     start: Endpoint,
     goal: Endpoint,
 ) -> Int[Tensor, "B"]:
-    """Return the `Limit` of the robot that most of the ground exceeds for which a path ends, int64.
+    """Return the `Limit` of the robot that the most ground exceeds where a path ends, int64.
 
     This ground is the goal, what encloses the start, or the border of what can be reached from the goal.
 

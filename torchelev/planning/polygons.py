@@ -1,4 +1,4 @@
-"""Rasterize polygons on small patches of cells, whatever the size of the map, and enclose cells in convex hulls."""
+"""Rasterize polygons on small patches of cells, independent of the map's size, and enclose cells in convex hulls."""
 
 from __future__ import annotations
 

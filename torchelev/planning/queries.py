@@ -100,8 +100,8 @@ def submap(
         state: the state to read; None: that of the maps.
 
     Raises:
-        ValueError, TypeError: for a size that is no whole number of cells, or a wrong shape, dtype or device. On a CPU,
-            or with the map's `check_values`, also for a point that is not finite; elsewhere its submap is unknown.
+        ValueError, TypeError: for a size that is not a whole number of cells, or a wrong shape, dtype or device. On a
+            CPU, or with the map's `check_values`, also for a point that is not finite; elsewhere its submap is unknown.
         KeyError: for an unknown layer.
     """
     grid = emap.cfg.grid

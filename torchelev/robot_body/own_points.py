@@ -1,4 +1,4 @@
-"""Which points lie on the robot: pieces of their rays against its shapes."""
+"""Find the points on the robot by intersecting pieces of their rays with its shapes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _Pieces(NamedTuple):
 def find_own_points(
     x: Float[Tensor, "B S N"], y: Tensor, z: Tensor, squared: Float[Tensor, "B S N"], posed: PosedBody, body: RobotBody
 ) -> Bool[Tensor, "B S N"]:
-    """Tell which points of the sensor frame lie on the robot, see `RobotBody`; `squared` is their squared distance.
+    """Return which points of the sensor frame lie on the robot, see `RobotBody`; `squared` is their squared distance.
 
     The smallest excess decides, which is at most 0 where a shape is met: compiled code is slow at joining masks.
     """

@@ -1,4 +1,4 @@
-"""A robot's shapes in the frames of its sensors, at one instant."""
+"""The shapes of a robot in the frames of its sensors, at one instant."""
 
 from __future__ import annotations
 

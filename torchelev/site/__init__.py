@@ -1,12 +1,12 @@
-"""A world map that grows: what many robots saw becomes one, on disk, and is given back to each of them.
+"""A world map that grows: it merges the maps of many robots, is kept on disk, and initialises robots' maps.
 
 Robot-centric windows live in `torchelev.elevation_map`, single files of maps in `torchelev.io`.
 """
 
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.merge import MergeReport
 from torchelev.site.keyframes.keyframes import Keyframes
 from torchelev.site.shared.ranks import LostRankError
+from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_map import SiteMap
 
 __all__ = ["Keyframes", "LostRankError", "MergeReport", "SiteConfig", "SiteMap"]

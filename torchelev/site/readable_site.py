@@ -1,4 +1,4 @@
-"""Reading a site: what `SiteMap` is without merging."""
+"""Reading a site: `SiteMap` without merging."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torchelev.errors import require, whole_cells
 from torchelev.grid import grid_of
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
-from torchelev.site.export import Place, choose_area, export
 from torchelev.site.reading import Clock, check_layer, check_layers, read_area, sample_tiles
+from torchelev.site.site_export import Place, choose_area, export
 from torchelev.site.tiles import TILE, Tiles
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class ReadableSite:
         Raises:
             KeyError: a layer does not exist.
             TypeError: `layers` is one name, not a list.
-            ValueError: a length is no whole number of cells, or the centre is no point.
+            ValueError: a length is not a whole number of cells, or the centre is not a point.
         """
         lengths = {"length_x": length_x, "length_y": length_y}
         height, width = (whole_cells(name, length, self.resolution) for name, length in lengths.items())
@@ -156,7 +156,7 @@ class ReadableSite:
         epsg: int | None = None,
         origin: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Write an area to a file of the kind that its suffix says, completely or not at all.
+        """Write an area to a file in the format of its suffix, completely or not at all.
 
         - `.tif`: a GeoTIFF with a float32 band for each layer, NaN where unknown. Written block by block, so that
           memory does not grow with the area. Needs ``torchelev[geo]``.
@@ -188,7 +188,7 @@ class ReadableSite:
         )
 
     def refresh(self) -> None:
-        """Read again what another process has written since. Only of use for a site that is open read-only."""
+        """Read what another process has written since. Useful only for a site that is open read-only."""
         if self._store is not None:
             self._store.refresh()
             self._tiles.forget()
@@ -197,7 +197,7 @@ class ReadableSite:
     def close(self) -> None:
         """Let other processes write to the site's folder. All merges are on disk already.
 
-        From then on, `merge` and `move_keyframes` raise ValueError; reading goes on to work. In memory, does nothing.
+        From then on, `merge` and `move_keyframes` raise ValueError; reading still works. In memory, does nothing.
         """
         if self._store is not None:
             self._store.close()
@@ -211,4 +211,4 @@ class ReadableSite:
         self.close()
 
     def _read_attributes(self) -> None:
-        """Take over what the store's attributes say."""
+        """Take the values of the store's attributes."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LAYERS = (*STORED, "validity")
 _FARTHEST = 2.0**40  # cells
-_SOURCES = {  # what a layer is computed from, first of all the mask of where it is known
+_SOURCES = {  # sources of a layer, first the one that is known where the layer is
     "elevation": ("elevation",),
     "variance": ("variance", "time"),
     "time": ("time",),
@@ -31,14 +31,14 @@ _SOURCES = {  # what a layer is computed from, first of all the mask of where it
 
 
 class Clock(NamedTuple):
-    """What ages the layers."""
+    """The time and rate by which layers age."""
 
     time: float  #: [s] the site's, from its epoch
     rate: float  #: [m^2/s] at which variances grow
 
 
 def check_layers(layers: Sequence[str] | None) -> tuple[str, ...]:
-    """Return names of layers; None: all. TypeError if they are no list, KeyError if one does not exist."""
+    """Return names of layers; None: all. TypeError if they are not a list, KeyError if one does not exist."""
     is_list, hint = not isinstance(layers, str), f"give [{layers!r}]"
     require(is_list, "layers", "must be a list of names", repr(layers), hint, TypeError)
     return LAYERS if layers is None else tuple(check_layer("layers", name) for name in layers)

@@ -18,27 +18,27 @@ from torchelev.errors import require, require_positive
 from torchelev.inputs import checks
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.align import align
 from torchelev.site.fusion.merge import Merged, MergeReport, merge_windows
 from torchelev.site.fusion.windows import (
     Alignment,
-    Told,
+    Contribution,
     Windows,
     drop_reset,
     no_alignment,
-    nothing_told,
+    no_contribution,
     read_known,
     read_windows,
     snapshot,
 )
-from torchelev.site.give import center_on, fill, move_told, remember_given
+from torchelev.site.initialize_from_site import add_filled, center_on, fill, move_contribution
 from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
 from torchelev.site.readable_site import ReadableSite
 from torchelev.site.shared.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.shared.ranks import Ranks
+from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import Tiles, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
 from torchelev.stages.initialize import Remembered
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from torch.distributed import ProcessGroup
 
-# By map and site: what a map has told. Of all sites of a process, so that a site may be closed and opened again.
-_told: WeakKeyDictionary[ElevationMap, dict[str, Told]] = WeakKeyDictionary()
+# By map and site: a map's contribution. Of all sites of a process, so that a site may be closed and opened again.
+_contributions: WeakKeyDictionary[ElevationMap, dict[str, Contribution]] = WeakKeyDictionary()
 
 
 class SiteMap(ReadableSite):
@@ -79,9 +79,9 @@ class SiteMap(ReadableSite):
         group: processes that share the site, such as `torch.distributed.group.WORLD`; None: this one alone. Give
             `init_process_group` a `timeout` that is longer than ranks wait for each other, such as a minute: after it,
             those that wait for a rank that has died raise `LostRankError`.
-        keyframes: keep what each merge tells, so that `move_keyframes` can correct poses later: 32 bytes for each cell
-            of the windows and merge, less what compression saves on disk. Holds from the first merge on; a site on disk
-            that has keyframes goes on to keep them.
+        keyframes: keep the contributions of each merge, so that `move_keyframes` can correct poses later: 32 bytes for
+            each cell of the windows and merge, less what compression saves on disk. Holds from the first merge on; a
+            site on disk that has keyframes continues to keep them.
 
     Attributes:
         resolution: [m].
@@ -170,7 +170,7 @@ class SiteMap(ReadableSite):
 
         Raises:
             FileNotFoundError: there is nothing; ``SiteMap(resolution=..., path=...)`` makes a site.
-            ValueError: it is no site, is damaged, or of a newer version.
+            ValueError: it is not a site, is damaged, or has a newer version.
             OSError: another process writes to it.
         """
         from torchelev.site.storage.store import TileStore
@@ -218,7 +218,7 @@ class SiteMap(ReadableSite):
             Offsets and counts, per robot.
 
         Raises:
-            TypeError: `emap` is no ElevationMap, or `time` no number.
+            TypeError: `emap` is not an ElevationMap, or `time` is not a number.
             ValueError: `emap` has another resolution, `time` is not in seconds, or the site is read-only or closed.
                 Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
@@ -229,33 +229,33 @@ class SiteMap(ReadableSite):
             T_map_base = _require_poses(emap, T_map_base)
         if emap.device.type == "cpu":
             keep_freed_memory()
-        told = self._recall_told(emap)
+        contribution = self._recall_contribution(emap)
         if self._rate is None:
             self._rate = plans[0]["rate"]
         now = max(plan["now"] for plan in plans)  # of all ranks
         now = now if time is None else self._since_epoch(now)
         state = self._bring(emap)
-        windows = read_windows(emap, state, now, told)
+        windows = read_windows(emap, state, now, contribution)
         all_windows, own = gather_windows(self._ranks, windows, plans)
         all_aligned = self._align(all_windows, align, tilt)
         alignment = Alignment(*(value[own] for value in all_aligned))
         new = self._record(windows, alignment, T_map_base, now)
         keyframes = torch.full_like(state.elapsed, -1) if new is None else new.ids
-        told = snapshot(emap, windows, alignment, state.elapsed, keyframes)
+        contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
-            _told.setdefault(emap, {})[self._id] = told
+            _contributions.setdefault(emap, {})[self._id] = contribution
         contradictions = self._fuse(all_windows, all_aligned, now, new)[own]
-        _told.setdefault(emap, {})[self._id] = told
+        _contributions.setdefault(emap, {})[self._id] = contribution
         self._raise_interrupted()
         return MergeReport(*alignment, count(windows.is_new), contradictions)
 
-    def _recall_told(self, emap: ElevationMap) -> Told | None:
-        """Return what a map has told since its last reset; None: nothing."""
-        told = _told.get(emap, {}).get(self._id)
-        if told is None:
+    def _recall_contribution(self, emap: ElevationMap) -> Contribution | None:
+        """Return a map's contribution since its last reset; None: it has not merged since."""
+        contribution = _contributions.get(emap, {}).get(self._id)
+        if contribution is None:
             return None
-        device = told.elapsed.device
-        return drop_reset(told, emap.num_resets.to(device), emap.state.elapsed.to(device))
+        device = contribution.elapsed.device
+        return drop_reset(contribution, emap.num_resets.to(device), emap.state.elapsed.to(device))
 
     def _bring(self, emap: ElevationMap) -> MapState:
         """Return a map's state on the site's device, without predictions: a site keeps what was measured."""
@@ -265,16 +265,22 @@ class SiteMap(ReadableSite):
     def _plan(self, emap: ElevationMap, time: float | None, align: bool, tilt: bool) -> dict[str, Any]:
         """Return what this rank is about to merge; raise if it cannot."""
         self._check_merge(emap)
-        time, told = check_time(time), self._recall_told(emap)
+        time, contribution = check_time(time), self._recall_contribution(emap)
         elapsed = emap.state.elapsed.to(self._tiles.device)
-        now = continue_time(elapsed, told, self._time, self._opened) if time is None else time
+        now = continue_time(elapsed, contribution, self._time, self._opened) if time is None else time
         merged = {"tiles": len(self), "time of the site": self.time}
         time_is = "not given" if time is None else "given"
         options = {"time": time_is, "align": bool(align), "tilt": bool(tilt)}
         grid = emap.cfg.grid
         same = {"size of the window": [grid.height, grid.width], **options, **merged}
         rate = emap.cfg.aging.variance_rate
-        return {"same": same, "robots": emap.num_envs, "told": told is not None, "now": now, "rate": rate}
+        return {
+            "same": same,
+            "robots": emap.num_envs,
+            "contributed": contribution is not None,
+            "now": now,
+            "rate": rate,
+        }
 
     def _check_merge(self, emap: ElevationMap) -> None:
         actual, hint = type(emap).__name__, "give an ElevationMap"
@@ -383,7 +389,7 @@ class SiteMap(ReadableSite):
             T_map_base: their new poses; `keyframes.T_map_base` has the present ones.
 
         Raises:
-            TypeError: an argument is no tensor of the right kind.
+            TypeError: an argument is not a tensor of the right kind.
             ValueError: the site keeps no keyframes, is read-only or closed, an id is unknown or repeats, or the poses
                 are not rigid (K, 4, 4). Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
@@ -407,19 +413,19 @@ class SiteMap(ReadableSite):
 
     @torch.inference_mode(False)  # whose tensors could not be written outside of it
     @torch.no_grad()
-    def give(self, emap: ElevationMap, T_map_base: Tensor | None, chosen: Bool[Tensor, "B"]) -> MapState:
+    def fill_state(self, emap: ElevationMap, T_map_base: Tensor | None, chosen: Bool[Tensor, "B"]) -> MapState:
         """Return a map's state with what the site knows filled in; `ElevationMap.initialize_from` calls it."""
         self.require_resolution(emap)
-        told, state, device = self._recall_told(emap), self._bring(emap), self._tiles.device
+        contribution, state, device = self._recall_contribution(emap), self._bring(emap), self._tiles.device
         chosen = chosen.to(device)
         if T_map_base is not None:
             state = center_on(state, emap, T_map_base.to(device), chosen)
-        if told is None:
-            told = nothing_told(read_known(emap, state, self._time), emap.num_resets.to(device))
-        told = move_told(told, state.corner, self._time, self.resolution)
+        if contribution is None:
+            contribution = no_contribution(read_known(emap, state, self._time), emap.num_resets.to(device))
+        contribution = move_contribution(contribution, state.corner, self._time, self.resolution)
         known = self._read_chosen(state, chosen)
-        after = fill(state, emap, known, told, chosen, self.resolution)
-        _told.setdefault(emap, {})[self._id] = remember_given(told, state, after, self._clock.rate, chosen)
+        after = fill(state, emap, known, contribution, chosen, self.resolution)
+        _contributions.setdefault(emap, {})[self._id] = add_filled(contribution, state, after, self._clock.rate, chosen)
         return map_layers(lambda value: value.to(emap.device), after)
 
     def _read_chosen(self, state: MapState, chosen: Bool[Tensor, "B"]) -> Remembered:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 TILE = 64  # cells of a tile along x and y
 _SHIFT, _WITHIN = 6, TILE - 1
 CELLS, CELL_BITS = TILE * TILE, 2 * _SHIFT
-_GROUP = 32  # tiles that are read from disk at a time: what reads them takes several times their size
+_GROUP = 32  # tiles that are read from disk at a time: reading takes several times their size
 _MAX_TABLE = 1 << 22  # tiles of the box around all cells, up to which a table finds their numbers
 # Heights [m], variances [m^2] right after the last measurement, and its time on the site's clock [s].
 LAYERS = ("elevation", "variance", "time", "upper_bound", "other_elevation", "other_variance", "other_time")
@@ -27,7 +27,7 @@ Tile = tuple[int, int]
 
 
 class Storage(Protocol):
-    """What keeps the tiles that are not in memory."""
+    """The storage of the tiles that are not in memory."""
 
     @property
     def tiles(self) -> Collection[Tile]:
@@ -72,7 +72,7 @@ def _number(flat: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 class Tiles:
-    """The tiles in memory. With a storage, those used last; without, all.
+    """The tiles in memory: with a storage, those used last; without, all.
 
     Args:
         storage: where all tiles are; None: in memory alone.
@@ -84,7 +84,7 @@ class Tiles:
         self._storage, self._capacity = storage, capacity
         self._slots: OrderedDict[Tile, int] = OrderedDict()
         self._free: list[int] = []
-        with torch.inference_mode(False):  # what reads in inference mode, or not, and a merge all write to it
+        with torch.inference_mode(False):  # written by reading, in inference mode and outside of it, and by merging
             self.values = torch.empty(len(LAYERS), 0, TILE, TILE, device=device)
 
     @property

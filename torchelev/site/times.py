@@ -1,4 +1,4 @@
-"""The times of merges: checks of those that users give, and how time goes on where they give none."""
+"""The times of merges: checks of the given ones, and the site's own time where none is given."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchelev.errors import message, require
 if TYPE_CHECKING:
     from jaxtyping import Int
 
-    from torchelev.site.fusion.windows import Told
+    from torchelev.site.fusion.windows import Contribution
 
 _LATEST = 1e11  # [s] the year 5138; Unix time in milliseconds or nanoseconds lies beyond
 _LATE = 1e-3  # [s] more than rounding
@@ -47,16 +47,20 @@ def warn_of_other_clock(time: float, newest: float) -> None:
     warnings.warn(text, RuntimeWarning, stacklevel=6)  # the caller of `merge`, which has two decorators
 
 
-def continue_time(elapsed: Int[torch.Tensor, "B"], told: Told | None, time: float, opened: float) -> float:
-    """Return the time of a merge that is given none: the site's goes on by what the maps have lived since their last.
+def continue_time(
+    elapsed: Int[torch.Tensor, "B"], contribution: Contribution | None, time: float, opened: float
+) -> float:
+    """Return the default time of a merge: the site's time plus the maps' elapsed time since their last merge.
 
     Args:
         elapsed: [ns] of the maps' clocks.
-        told: what the maps told at their last merge; None: nothing.
+        contribution: of the maps at their last merge; None: they have not merged yet.
         time: [s] of the site, from its epoch.
         opened: [s] its time when it was opened.
     """
-    if told is None:
+    if contribution is None:
         return max(time, opened + float(elapsed.max()) * 1e-9)
-    lived = torch.where(told.elapsed >= 0, elapsed - told.elapsed, elapsed)  # an environment that was reset
-    return max(time, float((told.known.now + 1e-9 * lived.double()).max()))
+    lived = torch.where(
+        contribution.elapsed >= 0, elapsed - contribution.elapsed, elapsed
+    )  # an environment that was reset
+    return max(time, float((contribution.known.now + 1e-9 * lived.double()).max()))

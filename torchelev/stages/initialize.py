@@ -38,7 +38,7 @@ def initialize(
 class Site(Protocol):
     """Where what was known before is kept; see `torchelev.site.SiteMap`."""
 
-    def give(self, emap: Any, T_map_base: Tensor | None, chosen: Tensor) -> MapState:
+    def fill_state(self, emap: Any, T_map_base: Tensor | None, chosen: Tensor) -> MapState:
         """Return the map's state with what is known filled in, and remember that it comes from here."""
 
 

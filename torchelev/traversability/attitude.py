@@ -1,4 +1,4 @@
-"""How a body would stand over every cell at each heading: what the learned head judges a stance by.
+"""The body's attitude over every cell at each heading: the features by which the learned head rates a stance.
 
 The same on turned and mirrored maps: of the two ends of a line, neither comes first.
 """
@@ -29,7 +29,7 @@ DIAGONAL = math.sqrt(2)  # of a cell
 
 
 class Attitude(NamedTuple):
-    """How a body stands at one heading on four feet, by ratios to what the robot overcomes.
+    """A body's stance at one heading on four feet, as ratios to the robot's limits.
 
     0 where the ground that each depends on is not completed: under the feet for slope and step, else under all.
     """
@@ -107,7 +107,7 @@ def _gentler(height: Tensor, dim: int) -> Tensor:
 def _highest(
     body: Tensor, stance: Stance, scales: Scales, pitch: Tensor, roll: Tensor, resolution: float
 ) -> Float[Tensor, "B H W"]:
-    """Return the highest ground [m] under the body, less what its inclination explains within each square."""
+    """Return the highest ground [m] under the body, less the rise by its inclination within each square."""
     middle, front, hind = (shifted(body, scales.spine, *at) for at in stance.spine)
     rise = pitch * (math.hypot(*stance.spine[1]) * resolution)
     steepest = torch.maximum(pitch.abs(), roll.abs()) * DIAGONAL if stance.diagonal else pitch.abs() + roll.abs()
@@ -116,7 +116,7 @@ def _highest(
 
 
 def _highest_step(footing: Footing, stance: Stance, scales: Scales) -> Float[Tensor, "B H W"]:
-    """Return the highest step [m] on the ways between neighbouring feet, less what the slope under both explains.
+    """Return the highest step [m] between neighbouring feet, less the rise by the slope under both.
 
     Holes are stepped over, and each riser of a stair counts by itself.
     """
@@ -144,7 +144,7 @@ def _steps(footing: Footing, way: Way, starts: list[Cells], scales: Scales) -> l
 
 
 def _unexplained_rise(start: Tensor, end: Tensor, between: list[Tensor], explained: Tensor) -> Tensor:
-    """Return the larger rise [m] of both directions between two feet, less what the slope explains."""
+    """Return the larger rise [m] of both directions between two feet, less the rise by the slope."""
     return torch.maximum(_rise([start, *between, end]), _rise([end, *between[::-1], start])) - explained
 
 

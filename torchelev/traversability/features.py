@@ -1,4 +1,4 @@
-"""What the learned head sees: the map's surface, completed and made dimensionless by the robot's sizes.
+"""Inputs of the learned head: the map's surface, completed and made dimensionless by the robot's sizes.
 
 Windows are squares whose radii are lengths of the robot in whole cells. Everything is computed on the map with a rim
 of unknown cells around it, which each window eats a part of, so that the rim of a map is unknown ground and no more.
@@ -83,7 +83,7 @@ class Surface(NamedTuple):
     known: Float[Tensor, "B h w"]  #: 1 or 0
     shares: list[Tensor]  #: (B, h, w) of known cells in each window
     means: list[Tensor]  #: (B, h, w) [m] of each window, blended with the next where it knows little
-    hidden: Float[Tensor, "B h w"]  #: [m] of the upper bound below what completes the ground
+    hidden: Float[Tensor, "B h w"]  #: [m] depth of the upper bound below the completed ground
     bounded: Float[Tensor, "B h w"]  #: 1 or 0, of unknown cells
     variance: Float[Tensor, "B h w"]  #: [m^2] mean of the known ones of 3 x 3 cells
 
@@ -91,7 +91,7 @@ class Surface(NamedTuple):
 def complete(
     elevation: Tensor, validity: Tensor, variance: Tensor, upper_bound: Tensor, bounded: Tensor, scales: Scales
 ) -> Surface:
-    """Fill unknown cells with the mean of the smallest window that knows enough, not above the upper bound.
+    """Fill unknown cells with the mean of the smallest window with enough known cells, not above the upper bound.
 
     Where no window knows anything, the height is 0.
     """
@@ -113,7 +113,7 @@ def complete(
 
 
 def blend(shares: list[Tensor], means: list[Tensor]) -> list[Tensor]:
-    """Return each window's mean, blended with that of the next larger one where it knows little."""
+    """Return each window's mean, blended with that of the next larger one where few of its cells are known."""
     means = list(means)
     for k in (2, 1, 0):
         means[k] = means[k + 1] + (shares[k] * (1 / QUARTER)).clamp(max=1) * (means[k] - means[k + 1])
@@ -167,7 +167,7 @@ def extremes(ground: Surface, scales: Scales) -> Extremes:
 
 
 def squashed(ratio: Tensor) -> Tensor:
-    """Return x |x| / (1 + x^2): steep at 1, where a robot's limits are; no outlier counts for more than 1."""
+    """Return x |x| / (1 + x^2): steep at 1, where a robot's limits are; outliers count for at most 1."""
     ratio = ratio.clamp(-LARGE, LARGE)
     square = ratio * ratio.abs()
     return square / (1 + square.abs())
@@ -182,7 +182,7 @@ def _slope(height: Tensor, distance: int, rim: int) -> Tensor:
 def features(
     ground: Surface, extreme: Extremes, scales: Scales, resolution: float, robot: RobotConfig
 ) -> list[Float[Tensor, "B h w"]]:
-    """Return what is seen around every cell that feet may stand on; 0 where nothing is known in reach."""
+    """Return the features around every cell that feet may stand on; 0 where nothing is known within reach."""
     rim = scales.margin - scales.stood_on
     step, steep = 1 / robot.step_height, (1 / (resolution * math.tan(robot.max_slope))) ** 2
     inner = [shifted(layer, rim) for layer in (ground.height, *ground.means)]

@@ -1,4 +1,4 @@
-"""Traversability: a head that looks at the map and says where a robot can stand.
+"""Traversability heads, which rate where a robot can stand.
 
 Two heads share one place in the map: an analytic one, and one that was trained (paper, Sec. II-G).
 """
@@ -32,7 +32,7 @@ __all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "Traversabili
 
 STEP_REACH = 0.1  # [m] within which a height difference is a step: a foot's length and the smear of an edge
 EDGE_SLOPE, EDGE_ROUGHNESS = 0.75, 12**-0.5  # at most, of a plane near a step h: in h / radius, and in h
-RATING_AT_LIMIT = 0.31  # of ground at the limits of `of_robot`: just above what `plan` and `check_path` refuse
+RATING_AT_LIMIT = 0.31  # of ground at the limits of `of_robot`: just above the threshold of `plan` and `check_path`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class TraversabilityConfig:
 
     Raises:
         ValueError: for a critical value that is not positive, or a slope of a right angle or more.
-        TypeError: for a robot that is no RobotConfig.
+        TypeError: for a robot that is not a RobotConfig.
     """
 
     radius: float = 0.1  #: [m] of the window that a foot or wheel needs
@@ -71,7 +71,7 @@ class TraversabilityConfig:
 
     @classmethod
     def of_robot(cls, robot: RobotConfig) -> TraversabilityConfig:
-        """Return the critical values for a robot, so that it takes the steps and slopes that it can.
+        """Return the critical values for a robot: its largest step and slope.
 
         Near the edge of a step h, a foot's window of radius r has a plane of a slope up to atan(3 h / (4 r)) and a
         roughness up to h / sqrt(12). All that belongs to the highest step that the robot overcomes is rated 0.31 or
@@ -176,7 +176,7 @@ def rate_all(state: MapState) -> MapState:
 
 
 class PlaneRating(NamedTuple):
-    """What the analytic head tells."""
+    """The layers of the analytic head."""
 
     traversability: Float[Tensor, "B H W"]  #: in [0, 1]
     rated: Bool[Tensor, "B H W"]  #: known cells whose window spans a plane; elsewhere traversability is 0

@@ -1,4 +1,4 @@
-"""The learned traversability head: a module that rates where a legged robot can stand, and how certain that is."""
+"""The learned traversability head: a module that rates where a legged robot can stand, with its confidence."""
 
 from __future__ import annotations
 

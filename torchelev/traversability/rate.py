@@ -38,7 +38,7 @@ def _mix(
 
 
 def _mix_few(weight: Float[Tensor, "O C"], values: Sequence[Tensor]) -> Float[Tensor, "B O H W"]:
-    """Return what `_mix` does, without a copy of the layers: faster for few of them."""
+    """Return the same as `_mix` without copying the layers, which is faster for few of them."""
     columns = zip(weight.unbind(1), values, strict=True)
     return functools.reduce(torch.add, (column[:, None, None] * value[:, None] for column, value in columns))
 

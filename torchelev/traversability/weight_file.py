@@ -65,7 +65,7 @@ def weight_shapes(cell_channels: int, stance_channels: int) -> dict[str, tuple[i
 
 
 def ratios(robot: RobotConfig, resolution: float) -> dict[str, float]:
-    """Return a robot's proportions, which tell the head what its windows and dimensionless heights do not."""
+    """Return a robot's proportions, which its windows and dimensionless heights do not contain."""
     return {
         "robot.width / length": robot.width / robot.length,
         "robot.clearance / step_height": robot.clearance / robot.step_height,
@@ -106,7 +106,7 @@ def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotCon
 
 
 def _is_config(config: dict[str, Any]) -> bool:
-    """Tell whether a config has all its parts, of the right types."""
+    """Return whether a config has all its parts, of the right types."""
     if config.keys() != _CONFIG_KEYS:
         return False
     ranges = config["ranges"]

@@ -100,7 +100,7 @@ class MapFrames:
         return _Layout(left, top, width, height, bar, (size[0] + size[0] % 2, size[1] + size[1] % 2))
 
     def _draw_blank(self, title: str) -> NDArray[np.uint8]:
-        """Draw what all frames share: title, names of the axes, colours."""
+        """Draw the common parts of all frames: title, names of the axes, colours."""
         place, em = self._layout, self._font_size
         picture = Image.new("RGB", place.size, "white")
         draw = ImageDraw.Draw(picture)

@@ -55,7 +55,7 @@ def _light(colors: NDArray[np.float32], brightness: NDArray[np.float32]) -> NDAr
 
 
 def _brightness(values: NDArray[np.float32], resolution: float) -> NDArray[np.float32]:
-    """Return how bright each cell is: 1 on flat ground, and where a neighbour is unknown."""
+    """Return the brightness of each cell: 1 on flat ground, and where a neighbour is unknown."""
     padded = np.pad(values, 1, mode="edge")
     slope_x = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * resolution)
     slope_y = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * resolution)

@@ -1,1 +1,1 @@
-"""The training of the completion network, and its evaluation beside other ways to fill a map."""
+"""The training of the completion network, and its comparison with other ways to fill a map."""

@@ -1,4 +1,4 @@
-"""The cells of training: what a prediction at them depends on, and the true ground."""
+"""The cells of training: the network's inputs, and the true ground."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def thin_out(layers: CompletionInput, generator: torch.Generator) -> CompletionI
 
 
 def vary_bounds(layers: CompletionInput, generator: torch.Generator) -> CompletionInput:
-    """Raise the bounds of some maps, as of a sensor that looks from higher up, and drop those of others."""
+    """Raise the bounds of some maps, as of a higher sensor, and drop those of others."""
     draw, size = torch.rand(2, len(layers.bounded), 1, 1, generator=generator)
     low, high = map(math.log, _RAISED)
     rise = torch.where(draw < 0.4, torch.exp(low + (high - low) * size), 0.0)

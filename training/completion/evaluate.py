@@ -25,7 +25,7 @@ from training.options import jobs_option
 
 
 class Split(NamedTuple):
-    """What is evaluated on one of the splits of `maps.SPLITS`."""
+    """The maps to evaluate on, of one of the splits of `maps.SPLITS`."""
 
     cfg: WalkConfig
     resolutions: tuple[float, ...]  #: [m] of the maps

@@ -148,7 +148,7 @@ class Walks(NamedTuple):
 
     @property
     def settings(self) -> dict[str, object]:
-        """What a file must have been made with."""
+        """The settings that a file must have been made with."""
         kinds = list(SPLITS[self.split])
         return dataclasses.asdict(self.cfg) | {"kinds": kinds, "resolution": self.resolution, "version": VERSION}
 

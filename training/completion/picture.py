@@ -1,4 +1,4 @@
-"""A figure of maps, what completes them, and how sure that is.
+"""A figure of maps, their completions and the standard deviations.
 
     python -m training.completion.picture
 
@@ -30,7 +30,7 @@ TITLES = ("map", "completed", "minimum", "truth", "standard\ndeviation", "error"
 
 
 class Row(NamedTuple):
-    """What is drawn of one map, (H, W) each."""
+    """The layers of one map to draw, (H, W) each."""
 
     heights: tuple[Tensor, ...]  #: [m] NaN where unknown
     deviations: tuple[Tensor, ...]  #: [m] 0 and above
@@ -38,7 +38,7 @@ class Row(NamedTuple):
 
 @torch.no_grad()
 def make_row(net: CompletionNet, maps: TrueMap, number: int) -> Row:
-    """Return what is drawn of a map."""
+    """Return the layers of a map to draw."""
     mean, std = net(*maps.layers, resolution=maps.resolution)
     minimum, _ = fill("minimum")(maps)
     known = torch.where(maps.layers.validity, maps.layers.elevation, torch.nan)

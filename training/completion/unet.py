@@ -98,7 +98,7 @@ def _loss(net: UNet, maps: TrueMap) -> Tensor:
 
 
 def _is_near(known: Tensor, resolution: float) -> Tensor:
-    """Tell which cells lie within FARTHEST of a known one along both axes."""
+    """Return which cells lie within FARTHEST of a known one along both axes."""
     cells = min(round(FARTHEST / resolution), max(known.shape[1:]) - 1)
     rows = F.max_pool2d(known[:, None].float(), (2 * cells + 1, 1), 1, (cells, 0))
     return F.max_pool2d(rows, (1, 2 * cells + 1), 1, (0, cells))[:, 0] > 0

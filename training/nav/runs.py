@@ -1,4 +1,4 @@
-"""What experiments read from the folders of finished trainings."""
+"""Results that experiments read from the folders of finished trainings."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def even_levels(task: Quadruped) -> Tensor:
 
 
 def _summarize(endings: Tensor, walked: Tensor, asked: Tensor, chosen: Tensor) -> dict[str, float | None]:
-    """Return the fractions of the chosen episodes by ending, and what they walked by what was asked."""
+    """Return the fractions of the chosen episodes by ending, and the walked distance by the commanded speed."""
     count = int(chosen.sum())
     shares = {
         name: round(float((ended & chosen).sum()) / max(1, count), 4)

@@ -104,7 +104,7 @@ def _load_or_make(path: Path, make: Callable[[], dict[str, Any]], policy: Path |
 
 
 def _settings() -> dict[str, Any]:
-    """Return what the result of a deployment depends on, besides the policy."""
+    """Return the settings that determine the result of a deployment, besides the policy."""
     tasks = {"crossing": task_config(held_out=True), "walk": walk_config()}
     constants = {"iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS}
     return constants | {name: dataclasses.asdict(cfg) for name, cfg in tasks.items()}

@@ -88,7 +88,7 @@ def load_policy(path: Path, cfg: QuadrupedConfig) -> LoadedPolicy:
     """Return an exported TorchScript policy, which takes observations of this task.
 
     Raises:
-        ValueError: The file is no TorchScript or has no layout, or the task's scans are laid out otherwise than those
+        ValueError: The file is not TorchScript or has no layout, or the task's scans are laid out otherwise than those
             of the training.
     """
     files, hint = {LAYOUT: ""}, "give a policy.pt that python -m training.quadruped wrote"

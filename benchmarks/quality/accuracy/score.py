@@ -116,7 +116,7 @@ def _true_range(scene: Scene, xy: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def meets(row: Score) -> bool:
-    """Tell whether a row meets its target."""
+    """Return whether a row meets its target."""
     good = row.coverage >= 0.995 and (row.scene != "flat" or row.noise == "outliers" or abs(row.bias) <= 1.0)
     if row.noise == "outliers":
         return good and row.ratio <= 0.85 and row.wrong_5cm <= 0.004

@@ -1,4 +1,4 @@
-"""What people who crossed the view leave in the map."""
+"""Ghosts: cells that people who crossed the view leave in the map."""
 
 from __future__ import annotations
 

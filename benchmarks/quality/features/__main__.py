@@ -24,7 +24,7 @@ import click
 
 from benchmarks import RESULTS
 from benchmarks.quality.features.comparison import FEATURES, HEAD, configurations, examine, table_rows
-from benchmarks.quality.features.picture import draw
+from benchmarks.quality.features.feature_figure import draw
 from torchelev.app.results import machine, markdown_table, write_json
 
 

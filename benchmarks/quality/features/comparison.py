@@ -75,7 +75,7 @@ def configurations(off: str) -> dict[str, ElevationMapConfig]:
 
 
 def _meets(value: float, bar: tuple[str, float]) -> bool:
-    """Tell whether a figure meets its target, an upper limit by its absolute value; NaN does not."""
+    """Return whether a figure meets its target, an upper limit by its absolute value; NaN does not."""
     return abs(value) <= bar[1] if bar[0] == "<=" else value >= bar[1]
 
 

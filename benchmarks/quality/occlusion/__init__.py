@@ -1,1 +1,1 @@
-"""Whether a planner tells a safe occlusion from a drop, and refines a path by the gradient of its cost."""
+"""Whether a planner distinguishes a safe occlusion from a drop, and refines a path by the gradient of its cost."""

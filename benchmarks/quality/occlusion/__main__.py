@@ -1,4 +1,4 @@
-"""Count how often each rule for unknown ground tells a safe occlusion from a drop.
+"""Count how often each rule for unknown ground distinguishes a safe occlusion from a drop.
 
     python -m benchmarks.quality.occlusion
 
@@ -21,7 +21,7 @@ import torch
 from tqdm import tqdm
 
 from benchmarks import RESULTS
-from benchmarks.quality.occlusion.picture import draw
+from benchmarks.quality.occlusion.occlusion_figure import draw
 from benchmarks.quality.occlusion.refine import refined_costs
 from benchmarks.quality.occlusion.rules import RULES, decide
 from benchmarks.quality.occlusion.scenes import KINDS, VIEWS, Case, views

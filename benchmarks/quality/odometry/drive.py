@@ -28,7 +28,7 @@ GRAVITY = 9.81  # [m/s^2]
 
 
 class RollingScan(NamedTuple):
-    """What a lidar measures in a turn, each point from the pose that it has then."""
+    """The points of a turn of a lidar, each from the lidar's pose at its time."""
 
     stamp: float  #: [s] begin of the turn
     points: NDArray[np.float32]  #: (N, 3) [m] sensor frame, NaN where there is no return

@@ -21,8 +21,8 @@ On the driven path, the error is the absolute difference between a cell's height
 lidar at the time of the scan, where it saw the robot. Traversable is the fraction of these cells with a traversability
 above 0.5, by the analytic head and by the learned one for its default robot.
 
-The map is compared with the per-cell mean of all points of the same scan, which cannot tell ceilings and trees from the
-ground, and with the per-cell mean of the points below the ramp.
+The map is compared with the per-cell mean of all points of the same scan, which cannot distinguish ceilings and
+trees from the ground, and with the per-cell mean of the points below the ramp.
 """
 
 from __future__ import annotations

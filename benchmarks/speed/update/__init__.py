@@ -1,1 +1,1 @@
-"""What `benchmarks.speed.run` measures of an update: sections, tables and plots. Loops and long runs: one level up."""
+"""Sections, tables and plots of updates for `benchmarks.speed.run`. Loops and long runs are one level up."""

@@ -1,4 +1,4 @@
-"""What the stages of an update cost, and the calls beside it: recenter, sample, reset."""
+"""Time of the stages of an update, and of the calls beside it: recenter, sample, reset."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from tests.app.drives import NUM_SCANS
 from tests.io.bags.synthetic import SCANS, write_drive
 from tests.viz.test_video import read_frames
 from torchelev.app.mapping import map_video
-from torchelev.app.mapping.due_scans import DueScans
+from torchelev.app.mapping.recording_schedule import RecordingSchedule
 from torchelev.io import Frame, MappingRun
 
 
@@ -51,13 +51,13 @@ def test_a_long_recording_gives_a_video_of_bounded_length(run, recording, tmp_pa
     assert len(read_frames(tmp_path / "grown.gif")) == 3  # and the last map
 
 
-def test_due_scans():
+def test_recording_schedule():
     frame = Frame(np.zeros((0, 3), np.float32), np.eye(4), 0.1, "")
     for (seconds, scans), expected in {
         (0.0, 1): range(10), (0.0, 4): (0, 4, 8), (0.3, 1): (0, 3, 6, 9), (0.05, 2): (0, 2, 4, 6, 8)
     }.items():  # fmt: skip
-        due = DueScans(seconds, scans)
-        assert [k for k in range(10) if due.is_due(frame)] == list(expected)
+        schedule = RecordingSchedule(seconds, scans)
+        assert [k for k in range(10) if schedule.is_due(frame)] == list(expected)
 
 
 @pytest.mark.slow(1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.speed import postprocessing
+from benchmarks.speed.postprocessing import __main__ as postprocessing
 
 
 @pytest.mark.parametrize("name", [name for name, case in postprocessing.cases().items() if case.same])

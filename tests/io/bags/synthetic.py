@@ -239,13 +239,13 @@ def make_cloud(writer, points, times, header, dtype="f4", order="xyz", pad=0, bi
 
 def write_drive(folder, kind="mcap", depth=True, **cloud_layout):
     """Write the drive; return the path of the bag."""
-    path, told = folder / FORMATS[kind], drive()
+    path, truth = folder / FORMATS[kind], drive()
     writer = Writer(path, kind)
     writer.transform(START - 0.3, "base_link", "lidar", T_BASE_LIDAR.numpy(), is_static=True)
     writer.transform(START - 0.3, "base_link", "camera", T_BASE_CAMERA.numpy(), is_static=True)
-    events = [(stamp, "pose", T) for stamp, T in zip(told.stamps, told.bases, strict=True)]
-    events += [(scan.stamp + 0.001, "cloud", scan) for scan in told.clouds]
-    events += [(scan.stamp + 0.002, "depth", (scan, image)) for scan, image in told.depths if depth]
+    events = [(stamp, "pose", T) for stamp, T in zip(truth.stamps, truth.bases, strict=True)]
+    events += [(scan.stamp + 0.001, "cloud", scan) for scan in truth.clouds]
+    events += [(scan.stamp + 0.002, "depth", (scan, image)) for scan, image in truth.depths if depth]
     for stamp, what, value in sorted(events, key=lambda event: event[0]):
         if what == "pose":
             writer.transform(stamp, "odom", "base_link", value)

@@ -1,4 +1,4 @@
-"""Layouts that files do not tell are detected or refused, and options say which."""
+"""Layouts that files do not state are detected or refused, and options set them."""
 
 import numpy as np
 import pytest

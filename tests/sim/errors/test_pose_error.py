@@ -271,9 +271,9 @@ def test_the_covariance_is_that_of_the_errors():
     for x, y in ((0.0, 0.0), (0.5, 0.0), (1.0, 0.5), (1.0, 1.0), (0.5, 1.5)):
         estimated = errors(at(x, y), dt=0.2)
     sample = torch.cat([estimated[:, :3, 3] - at(x, y)[:, :3, 3], yaw_of(estimated)[:, None]], -1)
-    told = errors.covariance[:, [0, 1, 2, 5]][:, :, [0, 1, 2, 5]]
-    assert torch.equal(told, told[:1].expand_as(told)) and not errors.covariance[:, 3:5].any()
-    actual, expected = torch.cov(sample.T), told[0]
+    covariance = errors.covariance[:, [0, 1, 2, 5]][:, :, [0, 1, 2, 5]]
+    assert torch.equal(covariance, covariance[:1].expand_as(covariance)) and not errors.covariance[:, 3:5].any()
+    actual, expected = torch.cov(sample.T), covariance[0]
     std = expected.diagonal().sqrt()
     assert ((actual - expected).abs() <= 5 * (2 / B) ** 0.5 * std[:, None] * std).all()
     assert abs(expected[0, 3] / (std[0] * std[3])) > 0.2  # a yaw error moves the robot sideways

@@ -131,7 +131,7 @@ def test_equals_a_fine_march(terrain):
 
 
 def only_touches(field, tile, origin, d, got, expected):
-    """Tell whether the hit in question is one of a ray that comes within 10 um of the ground, or less than FINE in."""
+    """Return whether the hit in question is of a ray that comes within 10 um of the ground, or less than FINE in."""
     t = np.linspace(-0.02, 0.02, 8001) + min(got, expected)
     over = clearance(field, np.array([tile]), along(origin[None].astype(float), d[None].astype(float), t[None]))[0]
     if got < expected:  # the march sees nothing that is shorter than a step

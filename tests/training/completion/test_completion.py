@@ -192,8 +192,8 @@ def test_the_commands_train_evaluate_and_resume(tmp_path, monkeypatch):
     assert invoke(training.main, *common, "--resume").exit_code == 0, "nothing left: it only evaluates"
     other = invoke(training.main, *common[:-1], 3, "--resume")
     assert other.exit_code == 2 and "must be of the same settings, got steps 2" in other.output
-    told = ("--data", out / "data", "--walks", 1, "--jobs", 1, "--out", tmp_path / "evaluation.json")
-    again = invoke(evaluation.main, "--weights", out / "weights.pt", *told)
+    options = ("--data", out / "data", "--walks", 1, "--jobs", 1, "--out", tmp_path / "evaluation.json")
+    again = invoke(evaluation.main, "--weights", out / "weights.pt", *options)
     assert again.exit_code == 0
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["held_out"]["0.08"]["CompletionNet"] == result["held_out"]["0.08"]["CompletionNet"]

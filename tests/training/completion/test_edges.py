@@ -16,7 +16,7 @@ CELL, SIZE = 0.04, 100  # [m], cells
 
 
 def seen_stairs(rise, known=lambda x: x > 10.0):
-    """Stairs along the rows of a map, whose first edge is at its center; `known` tells which x [m] are."""
+    """Stairs along the rows of a map, whose first edge is at its center; `known` returns which x [m] are."""
     stairs = Stairs(rise=rise, run=0.3)
     center = (torch.arange(SIZE) - (SIZE - 1) / 2) * CELL
     x, y = torch.meshgrid(center, center, indexing="ij")
@@ -28,7 +28,7 @@ def seen_stairs(rise, known=lambda x: x > 10.0):
 
 
 def half_of_each_tread(x):
-    """Tell which places are in the second half of a tread of 0.3 m."""
+    """Return which places are in the second half of a tread of 0.3 m."""
     return (x + 1.5).remainder(0.3) > 0.15
 
 

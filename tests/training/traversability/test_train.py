@@ -38,8 +38,8 @@ def test_the_commands_train_evaluate_draw_and_resume(tmp_path, tiny):
     other = invoke(training.main, *common[:-1], 3, "--resume")
     assert other.exit_code == 2 and "must be of the same settings, got steps 2" in other.output
 
-    told = ("--data", out / "data", "--batches", 1, "--out", tmp_path / "evaluation.json")
-    again = invoke(evaluation.main, "--weights", out / "weights.pt", *told)
+    options = ("--data", out / "data", "--batches", 1, "--out", tmp_path / "evaluation.json")
+    again = invoke(evaluation.main, "--weights", out / "weights.pt", *options)
     assert again.exit_code == 0 and "unseen" in again.output
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["held_out"]["8 cm"]["learned (run)"] == result["held_out"]["8 cm"]["learned (run)"]

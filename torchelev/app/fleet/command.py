@@ -113,7 +113,7 @@ def finish(mission: Mission, start: float) -> FleetNumbers:
         mission: that has ended.
         start: when it began, by the performance counter [s].
     """
-    from torchelev.app.fleet.picture import draw_fleet
+    from torchelev.app.fleet.mission_picture import draw_fleet
 
     mission.finish()
     wall_seconds = time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""Where each robot goes next: to the frontiers of what is known, each robot to another one.
+"""Choose where each robot goes next: to the frontiers of the known ground, each robot to a different one.
 
 Frontiers are free cells beside unknown ones (Yamauchi, "A frontier-based approach for autonomous exploration", 1997).
 Robots choose them one after the other; each choice lowers what the frontiers around it are worth to the other robots
@@ -31,7 +31,7 @@ _NONE = -1  # in place of a goal
 
 
 class CoarseMap(NamedTuple):
-    """The area in coarse cells: what is known of it, and where robots can walk."""
+    """The area in coarse cells: which are known, and where robots can walk."""
 
     known: Bool[Tensor, "H W"]  #: enough of the cell is known
     free: Bool[Tensor, "H W"]  #: known, and neither steep nor stepped
@@ -77,7 +77,7 @@ class Explorer:
         own = self.find_cells(xy)
         cost = torch.where(area.free, 1.0, torch.inf).expand(len(xy), -1, -1).clone()
         start = F.one_hot(torch.as_tensor(own), self.num_cells**2).bool().view(cost.shape)
-        cost[start] = 1.0  # what is seen of the ground below a robot later must not hold it
+        cost[start] = 1.0  # ground below a robot that is seen later must not trap it
         way = cost_to_go(cost, start, resolution=self.coarse)
         self._choose_goals(area, way.flatten(1).numpy(), xy)
         self.is_done = bool((self.goals == _NONE).all())

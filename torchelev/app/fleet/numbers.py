@@ -1,4 +1,4 @@
-"""How good the site map of a mission is, compared with the true terrain, and what it cost."""
+"""Accuracy and cost of a mission's site map, compared with the true terrain."""
 
 from __future__ import annotations
 

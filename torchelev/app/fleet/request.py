@@ -1,4 +1,4 @@
-"""What `torchelev fleet` was asked for."""
+"""The arguments of `torchelev fleet`."""
 
 from __future__ import annotations
 

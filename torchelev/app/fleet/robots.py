@@ -29,7 +29,7 @@ _HEIGHT_ERROR = PoseErrorConfig(bias_z=(-0.15, 0.15), drift_z_time=0.002)
 
 
 class Scan(NamedTuple):
-    """What all robots see at one time, and where they believe they are."""
+    """Clouds of all robots at one time, and their estimated poses."""
 
     points: Float[Tensor, "B N 3"]  #: [m] sensor frame
     T_map_sensor: Float[Tensor, "B 4 4"]  #: estimated

@@ -46,7 +46,7 @@ def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
 
 
 def _check_recordings(request: MapRequest) -> None:
-    """Refuse to record the map over the recording, and a time between maps that is none or unused."""
+    """Refuse to record the map over the recording, and an interval between maps that is invalid or unused."""
     every, recording = request.every, request.recording.resolve()
     for name, path in (("--grid-map", request.grid_map), ("--video", request.video)):
         if path is not None and recording in (path.resolve(), *(path.resolve().parents if is_bag(recording) else ())):
@@ -60,7 +60,7 @@ def _check_recordings(request: MapRequest) -> None:
 def _fuse_and_record(
     run: MappingRun, scans: Scans, options: MapOptions, recorder: MapRecorder, video: MapVideo
 ) -> BaseException | None:
-    """Fuse all scans and record the growing map; return what stopped that, if anything did."""
+    """Fuse all scans and record the growing map; return the error that stopped it, if any."""
 
     def after(run: MappingRun, frame: Frame) -> None:
         recorder.after(run, frame)

@@ -1,4 +1,4 @@
-"""The files that `torchelev map` writes: checked before mapping, written after it, elsewhere if need be."""
+"""The files that `torchelev map` writes: checked before mapping, written after it, if need be to a fallback folder."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def write_outputs(run: MappingRun, prefix: Path) -> tuple[list[Path], list[str]]
             write(path)
             files.append(path)
         except (OSError, ModuleNotFoundError) as error:  # go on: the other files may still be written
-            kept = _write_elsewhere(path.name, write) if isinstance(error, OSError) else None
+            kept = _write_to_fallback(path.name, write) if isinstance(error, OSError) else None
             files += [] if kept is None else [kept]
             failures.append(f"{error}; " + ("not kept" if kept is None else f"kept in {kept}"))
     return files, failures
@@ -86,7 +86,7 @@ def _add_suffixes(prefix: Path) -> list[Path]:
     return [prefix.with_name(prefix.name + suffix) for suffix in _SUFFIXES]
 
 
-def _write_elsewhere(name: str, write: Callable[[Path], object]) -> Path | None:
+def _write_to_fallback(name: str, write: Callable[[Path], object]) -> Path | None:
     """Write a file to the first fallback folder that accepts it; return its path, or None if none does."""
     for base in (Path(tempfile.gettempdir()), Path.cwd(), Path.home(), Path("/dev/shm")):
         try:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchelev.app.interrupts import defer_interrupts
-from torchelev.app.mapping.due_scans import DueScans
+from torchelev.app.mapping.recording_schedule import RecordingSchedule
 from torchelev.io import Frame, MappingRun
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ class MapRecorder:
         frame: of the map.
 
     Raises:
-        ValueError: the path is no bag's.
+        ValueError: the path is not a bag's.
         FileExistsError: there is a folder of this name.
         ModuleNotFoundError: rosbags is missing.
     """
@@ -30,7 +30,7 @@ class MapRecorder:
     def __init__(self, path: Path | None, every: float, frame: str) -> None:
         self._writer: GridMapWriter | None = None
         self.path, self.num = path, 0
-        self._due = DueScans(every)
+        self._schedule = RecordingSchedule(every)
         if path is not None:
             from torchelev.io.bags import GridMapWriter
 
@@ -46,6 +46,6 @@ class MapRecorder:
 
     def after(self, run: MappingRun, frame: Frame) -> None:
         """Write the map if it is due; called after each scan."""
-        if self._due.is_due(frame) and self._writer is not None:
-            self._writer.write(run.emap, frame.stamp or self._due.time)
+        if self._schedule.is_due(frame) and self._writer is not None:
+            self._writer.write(run.emap, frame.stamp or self._schedule.time)
             self.num += 1

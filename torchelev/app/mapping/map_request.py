@@ -1,4 +1,4 @@
-"""What `torchelev map` and `torchelev view` were asked for."""
+"""The arguments of `torchelev map` and `torchelev view`."""
 
 from __future__ import annotations
 

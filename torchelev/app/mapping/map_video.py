@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchelev.app.interrupts import defer_interrupts
-from torchelev.app.mapping.due_scans import DueScans
+from torchelev.app.mapping.recording_schedule import RecordingSchedule
 from torchelev.errors import require
 from torchelev.io import Frame, MappingRun
 
@@ -32,7 +32,7 @@ class MapVideo:
         title: above the map.
 
     Raises:
-        ValueError: the path is no video's.
+        ValueError: the path is not a video's.
         WriteError: the path cannot be written.
         ModuleNotFoundError: PyAV is missing.
     """
@@ -43,7 +43,7 @@ class MapVideo:
         self._frames: MapFrames | None = None
         self._path_xy = array("d")
         self._not_drawn: MappingRun | None = None  # the map of the last scan, unless it was drawn
-        self._due = DueScans(every or 0.0, math.ceil(num_scans / _MAX_FRAMES) if every is None else 1)
+        self._schedule = RecordingSchedule(every or 0.0, math.ceil(num_scans / _MAX_FRAMES) if every is None else 1)
         if path is not None:
             is_known = path.suffix.lower() in _SIDES
             require(is_known, "--video", "must end in .mp4 or .gif", path.name, "give another name")
@@ -77,7 +77,7 @@ class MapVideo:
         T = frame.T_map_sensor if frame.T_map_base is None else frame.T_map_base
         self._path_xy.extend(T[:2, 3].tolist())
         self._not_drawn = run
-        if self._due.is_due(frame):
+        if self._schedule.is_due(frame):
             self._draw(self._writer, run)
 
     def _draw(self, writer: VideoWriter, run: MappingRun) -> None:
@@ -85,7 +85,7 @@ class MapVideo:
         if self._frames is None:
             self._frames = self._new_frames(values.shape, run.emap.cfg.grid.resolution)
         center, path_xy = run.emap.center[0, :2].cpu().numpy(), np.array(self._path_xy).reshape(-1, 2)
-        caption = f"{self._due.time:.1f} s, {run.num_scans:,} scans"
+        caption = f"{self._schedule.time:.1f} s, {run.num_scans:,} scans"
         self._not_drawn = None  # even if writing fails, which it would do again
         writer.add(self._frames.draw(values, center, path_xy, caption))
 

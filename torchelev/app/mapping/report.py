@@ -14,7 +14,7 @@ from torchelev.io import MappingRun
 if TYPE_CHECKING:
     from torchelev.viz.plot import Panel
 
-_MIN_USED = 0.01  # of the finite points; a map of fewer says nothing of the place that was recorded
+_MIN_USED = 0.01  # of the finite points; with fewer, the map does not show the recorded place
 
 
 def summarize(run: MappingRun, num_scans: int) -> list[str]:
@@ -37,7 +37,7 @@ def summarize(run: MappingRun, num_scans: int) -> list[str]:
 
 
 def describe_emptiness(run: MappingRun) -> str | None:
-    """Return why a map holds next to nothing of its recording: less than 1 % of the points, or no cell; else None."""
+    """Return why a map is nearly empty: it holds less than 1 % of the points, or no cell; else None."""
     counts = run.counts
     total, used = run.num_points - counts["rejected_invalid"], counts["points_used"]
     rejected = {name: n for name, n in counts.items() if name.startswith("rejected_") and n}

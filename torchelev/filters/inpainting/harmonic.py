@@ -110,8 +110,8 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 def solve_laplace(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
     """Solve A u = right (B, H, W) by preconditioned conjugate gradients, to an error of about `tolerance`.
 
-    `unknown` is 1 where there is an equation, else 0; there u is 0. Solved maps stand still while others go on. A CPU
-    stops once all are solved; other devices take all `iterations`, so that the host never waits.
+    `unknown` is 1 where there is an equation, else 0; there u is 0. Solved maps stay unchanged while others continue.
+    A CPU stops once all are solved; other devices take all `iterations`, so that the host never waits.
     """
     levels = _hierarchy(unknown)
     rest = right * unknown

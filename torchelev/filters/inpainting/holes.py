@@ -1,4 +1,4 @@
-"""Which known cell fills an unknown one: the lowest on the border of its hole, or the nearest.
+"""Choose the known cell that fills an unknown one: the lowest on the border of its hole, or the nearest.
 
 Custom operators. On a CPU they look at unknown cells only, and stop as soon as nothing changes. On other devices they
 look at all cells and take as many steps as the worst map needs, so that the host never waits.
@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 def may_wait(device: torch.device) -> bool:
-    """Tell whether reading a value from the device costs nothing."""
+    """Return whether values can be read without waiting for the device."""
     return device.type == "cpu"
 
 

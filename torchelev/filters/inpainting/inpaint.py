@@ -1,7 +1,7 @@
 """In-painting filters: heights for the cells of holes.
 
 Height scans use another rule, `torchelev.observations.fill.inpaint`: ring by ring from the border inwards, the mean of
-the known neighbours, as far as the scan's points reach.
+the known neighbours within the extent of the scan's points.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def inpaint_minimum(layer: Layer, *, iterations: int | None = None) -> Layer:
     """Fill each hole with the lowest height of its border, the paper's filter for occlusions (Sec. II-I.1).
 
     A hole is a set of unknown cells connected through eight neighbours, so a hole passes between two known cells that
-    touch only at a corner. Its border is the known cells next to it; the map's rim is no border. A map without known
+    touch only at a corner. Its border is the known cells next to it; the map's rim does not count. A map without known
     cells stays unknown. The gradient goes to the lowest border cell: the first of equal ones, or with `iterations`
     shared among them.
 
@@ -105,7 +105,7 @@ def inpaint_diffusion(layer: Layer, *, tolerance: float = 1e-3, iterations: int 
 
     Args:
         layer: heights [m] and mask (B, H, W).
-        tolerance: [m] approximate error, as far as the dtype allows.
+        tolerance: [m] approximate error, limited by the dtype.
         iterations: maximum number of steps.
 
     Raises:

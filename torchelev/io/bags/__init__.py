@@ -1,8 +1,8 @@
 """Bags, the recordings of ROS 1 and ROS 2: scans and poses out of them, as a recording that `torchelev map` fuses.
 
 Needs ``torchelev[bags]``; no ROS. `bag` reads messages of `files`; `point_cloud` and `scans` turn them into points by
-`messages`; `poses` finds poses; `topics`, `cameras` and `periods` say what is read and how; `recording` puts it all
-together. `grid_maps` writes maps to bags and reads them.
+`messages`; `poses` finds poses; `topics`, `cameras` and `periods` choose the topics and how to read them; `recording`
+puts it all together. `grid_maps` writes maps to bags and reads them.
 """
 
 from torchelev.io.bags.bag import Bag, Message, Topic, is_bag

@@ -1,4 +1,4 @@
-"""Read the messages of a bag, whatever its format."""
+"""Read the messages of a bag of any format."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Bag:
 
     @property
     def ended_early(self) -> str:
-        """What of the bag could not be read, where and why; "" if all could."""
+        """Which part of the bag could not be read and why; "" if everything was read."""
         undecoded = [f"{num} messages could not be decoded: {reason}" for reason, num in self._undecoded.items()]
         return "; ".join(filter(None, [self._damage or self._reader.ending, *undecoded]))
 
@@ -140,7 +140,7 @@ class Bag:
     def read_times(self, topic: str, count: int) -> list[float]:
         """Return when the first messages of a topic were recorded [s], at most `count`; a damaged bag gives fewer."""
         times: list[float] = []
-        with contextlib.suppress(Exception):  # rosbags lets through what its file formats raise; `read` says what
+        with contextlib.suppress(Exception):  # rosbags passes on exceptions of its file formats; `read` describes them
             for _, time, _ in itertools.islice(self._reader.messages(self._channels([topic])), count):
                 times.append(time / 1e9)
         return times

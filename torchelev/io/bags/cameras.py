@@ -1,4 +1,4 @@
-"""What is known about the depth images of a topic: calibration, unit, axes."""
+"""How to read the depth images of a topic: calibration, unit, axes."""
 
 from __future__ import annotations
 

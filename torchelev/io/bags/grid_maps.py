@@ -45,7 +45,7 @@ class GridMapWriter:
         occupancy_topic: of OccupancyGrids from the traversability, see `to_occupancy_grid`; None: none are written.
 
     Raises:
-        ValueError: the path is no bag's.
+        ValueError: the path is not a bag's.
         FileExistsError: there is a folder of this name.
         ModuleNotFoundError: rosbags is missing.
     """
@@ -116,7 +116,7 @@ def write_grid_map(
 
     Raises:
         KeyError: a layer does not exist. Nothing is written then.
-        ValueError: the environment does not exist, or the path is no bag's.
+        ValueError: the environment does not exist, or the path is not a bag's.
         FileExistsError: there is a folder of this name.
         ModuleNotFoundError: rosbags is missing.
     """

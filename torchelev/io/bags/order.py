@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from torchelev.io.bags.bag import Message
 from torchelev.io.bags.scans import stamp_of
 
-_MAX_WAIT = 1.0  # [s] of other sensors' stamps by which a message may come late
+_MAX_WAIT = 1.0  # [s] delay of a message behind other sensors' stamps, at most
 _MAX_HELD = 32  # messages in memory
 
 

@@ -1,4 +1,4 @@
-"""Points and their times out of a PointCloud2 message, whatever the layout of its fields."""
+"""Points and their times from a PointCloud2 message with any layout of fields."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def read_points(message: Any, stamp: float, period: float | None = None) -> Clou
         period: [s] between two messages; None: unknown, a scan takes 2 s at most.
 
     Raises:
-        CloudError: there is no x, y or z, the sizes contradict each other, or this is no PointCloud2.
+        CloudError: x, y or z is missing, the sizes contradict each other, or this is not a PointCloud2.
     """
     if not hasattr(message, "fields") or not hasattr(message, "point_step"):
         kind = type(message).__name__

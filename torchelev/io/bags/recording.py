@@ -59,7 +59,7 @@ class BagRecording:
 
     @property
     def pose_notes(self) -> list[str]:
-        """What is doubtful about the poses: frames, clocks, gaps, jumps. Known before the scans are read."""
+        """Notes on doubtful poses: frames, clocks, gaps, jumps. Known before the scans are read."""
         return self._placed.notes
 
     @property
@@ -74,7 +74,7 @@ class BagRecording:
 
     @property
     def warnings(self) -> list[str]:
-        """What was left out when the scans were last read, what is wrong with the poses, and where the bag ended."""
+        """Notes on scans that were left out in the last reading, on faulty poses, and on where the bag ended."""
         skipped = [f"{number} of {self._num} scans were left out: {reason}" for reason, number in self.skipped.items()]
         return [
             *skipped,

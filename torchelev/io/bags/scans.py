@@ -19,13 +19,13 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 
 class Scan(NamedTuple):
-    """What a sensor measured."""
+    """The points that a sensor measured."""
 
     frame: str  #: of the points
     stamp: float  #: [s]
     points: NDArray[np.float32]  #: (N, 3) [m]; NaN where there is no return
     times: NDArray[np.float64] | None  #: (N,) [s] of each point from the stamp; None: all at once
-    notes: tuple[Note, ...] = ()  #: what is not used of the message, or otherwise than it says
+    notes: tuple[Note, ...] = ()  #: notes on data that are not used, or are interpreted differently from the message
 
 
 def read_scan(message: Any, camera: CameraSettings | Any = None, period: float | None = None) -> Scan:

@@ -1,4 +1,4 @@
-"""What is asked of a bag, and the topics in which that is found."""
+"""Requests to a bag, and the topics that answer them."""
 
 from __future__ import annotations
 

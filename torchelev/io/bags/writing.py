@@ -105,7 +105,7 @@ class BagWriter:
 
     @contextmanager
     def _full_disk_named(self) -> Iterator[None]:
-        """Raise WriteError for what SQLite says of a full disk, which is no OSError."""
+        """Raise WriteError for SQLite's error of a full disk, which is not an OSError."""
         try:
             yield
         except sqlite3.Error as error:

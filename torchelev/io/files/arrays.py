@@ -1,4 +1,4 @@
-"""Clouds out of arrays: which of their shapes and columns are points, and what else is known of each point."""
+"""Clouds from arrays: find which shapes and columns are points, and further columns such as times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DEPTH_HINT = "of a depth image give the camera with --intrinsics"
 
 
 class CloudFile(NamedTuple):
-    """What a file holds of a cloud."""
+    """The contents of a file with a cloud."""
 
     points: NDArray  #: (N, 3) [m]
     times: NDArray | None = None  #: (N,) as the file gives them; None: none
@@ -99,7 +99,7 @@ def is_cloud(array: NDArray) -> bool:
 
 
 def _require_points(path: Path, array: NDArray) -> None:
-    """Refuse arrays that are no clouds: images, columns first, other types."""
+    """Refuse arrays that are not clouds: images, columns first, other types."""
     given = f"{array.dtype} {array.shape}"
     if array.ndim < 2 or array.dtype.kind not in "fiu":
         raise RecordingError(path, f"expected numbers (N, 3), got {given}", "save one row x y z per point")

@@ -1,4 +1,4 @@
-"""What files leave open: column layout, quaternion order, time unit. Defaults, and checks that expose a wrong one."""
+"""Conventions that files do not state: column layout, quaternion order, time unit; with defaults and checks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BIN_HINT = "with --bin-layout (float32x5: nuScenes)"
 
 @dataclass(frozen=True, kw_only=True)
 class FileLayout:
-    """What a recording's files leave open. With None a file is read by the default, or refused if it contradicts it."""
+    """Conventions that a recording's files do not state. None: the default, refused if a file contradicts it."""
 
     #: of `.bin` files: float32 or float64, "x", numbers per point. None: float32x4, as KITTI
     bin: str | None = None

@@ -70,7 +70,7 @@ def _path_length(T_map_sensor: NDArray) -> float:
 
 
 def _is_unmoved(T_map_sensor: NDArray) -> bool:
-    """Return whether all poses are the identity, so that a camera's and a lidar's give the same map."""
+    """Return whether all poses are the identity: then a camera's and a lidar's poses give the same map."""
     return bool(np.abs(T_map_sensor - np.eye(4)).max() < _STILL)
 
 

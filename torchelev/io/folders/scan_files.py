@@ -104,7 +104,7 @@ def _require_known_formats(files: list[Path]) -> None:
 
 
 def _explain_missing_scans(files: list[Path], depth: bool) -> None:
-    """Raise RecordingError if the files of a folder without scans show what went wrong."""
+    """Raise RecordingError if a folder without scans holds files that show the mistake."""
     images = [path for path in files if path.suffix.lower() == ".png"]
     if images and not depth:
         raise RecordingError(images[0], "depth images need the camera's intrinsics", "give them with --intrinsics")
@@ -121,7 +121,7 @@ def _choose_depth(scans: list[Path]) -> list[Path]:
 
 
 def _require_one_sensor(scans: list[Path]) -> None:
-    """Refuse files of which some are named otherwise than others, as those of two sensors are."""
+    """Refuse files with different naming patterns, as from two sensors."""
     kinds = _sort_by_kind(scans)
     if 1 < len(kinds) <= _MAX_SENSORS and min(map(len, kinds.values())) > 1:
         examples = ", ".join(f"{paths[0].name} and {len(paths) - 1} more" for paths in kinds.values())

@@ -18,7 +18,7 @@ _HINT = "copy the meshes beside the model, or name other links with links=(...)"
 
 
 def parse_urdf(path: Path) -> ET.Element | None:
-    """Return the root of a URDF file; None if it is none.
+    """Return the root of a URDF file; None if it is not one.
 
     Raises:
         ValueError: the file is xacro.

@@ -1,4 +1,4 @@
-"""Which way is up in a frame that lidar odometry started: by the ground around the start, or by an IMU."""
+"""The direction of up in the frame of lidar odometry: from the ground around the start, or from an IMU."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def up_from_ground(points: NDArray[np.float64], prior: NDArray[np.float64]) -> N
 
 
 def _points_on(points: NDArray, three: NDArray, prior: NDArray) -> NDArray[np.bool_]:
-    """Return which points lie on the plane through three; none if it is no ground below the origin."""
+    """Return which points lie on the plane through three; none if the plane is not ground below the origin."""
     normal = _normal(three, prior)
     is_ground = normal @ prior > _TILT and normal @ three[0] < 0
     return np.abs((points - three[0]) @ normal) < (_NEAR if is_ground else -1.0)

@@ -1,4 +1,4 @@
-"""Watch an odometry, and stop it where it has lost the clouds: a lost one goes on with poses that look sound."""
+"""Monitor odometry, and stop it where it loses track: its poses would look plausible afterwards."""
 
 from __future__ import annotations
 

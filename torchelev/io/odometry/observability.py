@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 _MIN_POINTS = 15  # of a surface: normals of fewer points are mostly noise
 _FLATNESS = 10.0  # variance along a surface over that across it, at least
-_THICKNESS = 4.0  # variance across a surface over the median of all, at most: a corner in a cube is thicker
+_THICKNESS = 4.0  # largest variance across a surface over the median of all: a corner in a cube is thicker
 _MIN_SURFACES = 12
 _ALIKE = 0.95  # cosine between the normals of one surface in two scans
-_KNOWN = 5.0  # surfaces across a direction that tell how far things moved along it
+_KNOWN = 5.0  # surfaces across a direction that show motion along it
 
 
 class Surfaces(NamedTuple):
@@ -26,7 +26,7 @@ class Surfaces(NamedTuple):
 
 
 def measure_support(points: NDArray[np.float64], size: float) -> float:
-    """Return how well a scan constrains the translation in which it constrains it worst, from 0 to 1/3.
+    """Return how well a scan constrains translation along its worst direction, from 0 to 1/3.
 
     The points in a cube are a surface with normal n. Returned is the smallest eigenvalue of the mean of n n^T over all
     surfaces, the mean squared cosine between the normals and the worst direction: 0 in an endless corridor and on a
@@ -53,7 +53,7 @@ def find_surfaces(points: NDArray[np.float64], size: float) -> Surfaces:
 
 
 def measure_shift(before: Surfaces, after: Surfaces) -> NDArray[np.float64] | None:
-    """Return by how much (3,) [m] the surfaces of a scan lie off those of an earlier one; None if too few are the same.
+    """Return the offset (3,) [m] of a scan's surfaces from those of an earlier one; None if too few match.
 
     It is the least-squares solution of n . shift = n . (m_after - m_before) over the cubes in both: walls count along
     their normals only, so that a pattern of points that moves with the sensor along a floor does not.

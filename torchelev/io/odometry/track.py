@@ -23,7 +23,7 @@ _VOXELS = 40.0  # across the reach of a scan
 _VOXEL = (0.2, 1.0)  # [m] smallest and largest
 _RANGE = 100.0  # [voxels] of KISS-ICP's local map, as by its own default
 _MIN_POINTS = 100
-_MAX_GAP = 1.0  # [s] across which the motion goes on
+_MAX_GAP = 1.0  # [s] over which the motion is extrapolated
 
 
 class Sweep(NamedTuple):
@@ -134,7 +134,7 @@ class LidarOdometry:
         return interpolate_poses(poses, times, asked, _MAX_GAP)[0, 0].numpy()
 
     def _still(self, points: NDArray, times: NDArray | None, middle: float) -> NDArray[np.float64]:
-        """Return the points as seen at the middle of the scan, if the last motion goes on."""
+        """Return the points as seen at the middle of the scan, if the last motion continues."""
         if times is None or len(self._poses) < 2 or middle - self._times[-1] > _MAX_GAP:
             return points
         poses, stamps = self._recent()

@@ -99,7 +99,7 @@ class DomainRandomization(nn.Module):
         return torch.stack([self.value(name) for name in names], -1)
 
     def uses(self, *names: str) -> bool:
-        """Tell whether any of the fields can be drawn different from 0."""
+        """Return whether any of the fields can be drawn different from 0."""
         return not self._in_use.isdisjoint(names)
 
     def max_value(self, name: str) -> float:

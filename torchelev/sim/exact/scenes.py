@@ -38,11 +38,11 @@ class Box:
         return low, high
 
     def exists(self, t: float) -> bool:
-        """Tell whether the box exists at time t [s]."""
+        """Return whether the box exists at time t [s]."""
         return self.since <= t < self.until
 
     def covers(self, x: Tensor, y: Tensor, t: float = 0.0) -> Tensor:
-        """Tell which places x, y [m], of any shape, lie within the outline of the box seen from above."""
+        """Return which places x, y [m], of any shape, lie within the outline of the box seen from above."""
         low, high = self.corners(t)
         return (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
 
@@ -85,7 +85,7 @@ class Scene:
         return self.height(xy[..., 0], xy[..., 1], t, below)
 
     def is_covered(self, xy: Tensor, t: float = 0.0) -> Tensor:
-        """Tell which places xy (..., 2) [m] lie under or in a box that is not grounded (bar, ceiling, person)."""
+        """Return which places xy (..., 2) [m] lie under or in a box that is not grounded (bar, ceiling, person)."""
         is_covered = torch.zeros(xy.shape[:-1], dtype=torch.bool)
         for box in self.boxes:
             if box.exists(t) and not box.grounded:

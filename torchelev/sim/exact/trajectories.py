@@ -82,7 +82,7 @@ def walk(
         dt: Time between poses [s].
         height: Height of the base over the mean ground under its footprint [m].
         sway: Scale of the gait's motion; 0 turns it off.
-        below: Boxes whose top lies higher are no ground [m]. In a building this selects the floor.
+        below: Boxes whose top lies higher do not count as ground [m]. In a building this selects the floor.
         T_base_sensor: Mounting of the sensor (4, 4).
     """
     xy, yaw = _sample_path(path, speed * dt, dt)

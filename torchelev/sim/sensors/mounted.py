@@ -33,7 +33,7 @@ class Pattern(Protocol):
 
 
 class View(NamedTuple):
-    """What a sensor sees."""
+    """The points that a sensor sees."""
 
     points: Float[Tensor, "B M 3"]  #: [m] sensor frame, float32; NaN where nothing is hit, or nearer than `min_range`
     on_body: Bool[Tensor, "B M"]  #: the robot's own `body` was hit; also where that was nearer than `min_range`
@@ -106,7 +106,7 @@ class MountedSensor:
     ) -> Float[Tensor, "B M 3"]:
         """Return the points seen [m], sensor frame, float32; NaN where nothing is hit, or nearer than `min_range`.
 
-        Arguments and errors are those of `view`, which also tells the points on the robot's own body.
+        Arguments and errors are those of `view`, which also returns the points on the robot's own body.
         """
         return self.view(
             field,

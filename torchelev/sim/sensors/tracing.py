@@ -92,7 +92,7 @@ def trace(
 
 
 def can_select_rays(device: torch.device) -> bool:
-    """Tell whether rays can be selected by their values without waiting for the device."""
+    """Return whether rays can be selected by their values without waiting for the device."""
     return device.type == "cpu"
 
 

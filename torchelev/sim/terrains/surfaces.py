@@ -65,7 +65,7 @@ def require_surface(surface: str, diagonal: str) -> Surface:
     """Return the surface by its name and diagonal.
 
     Raises:
-        ValueError: There is none of these names.
+        ValueError: There is no surface or diagonal of this name.
     """
     hint = "torchelev.sim.surface_of names those of an engine"
     require(surface in ("bilinear", "triangles"), "surface", "must be bilinear or triangles", repr(surface), hint)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.windows import Alignment, Windows
+from torchelev.site.site_config import SiteConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -62,11 +62,11 @@ def align(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteCon
 
 
 def _known_offsets(windows: Windows) -> Float[Tensor, "B"]:
-    """Return the offsets of the last merge [m], NaN of windows that have told nothing."""
-    told = windows.told
-    if told is None:
+    """Return the offsets of the last merge [m], NaN of windows that have not contributed yet."""
+    contribution = windows.contribution
+    if contribution is None:
         return torch.full(windows.known.now.shape, torch.nan, dtype=torch.float64, device=windows.known.now.device)
-    return torch.where(told.known.is_known.flatten(1).any(1), told.alignment.offset, torch.nan)
+    return torch.where(contribution.known.is_known.flatten(1).any(1), contribution.alignment.offset, torch.nan)
 
 
 def find_pairs(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteConfig) -> Pairs:
@@ -119,7 +119,7 @@ def find_groups(overlap: Bool[Tensor, "N N"]) -> Int[Tensor, "N"]:
     lowest = torch.arange(N, device=overlap.device)
     while True:
         near = torch.where(overlap, lowest, N).amin(1).minimum(lowest)
-        near = near[near]  # also takes over what the lowest one has found: halves the chains
+        near = near[near]  # also takes over the result of the lowest one: halves the chains
         if torch.equal(near, lowest):
             return lowest
         lowest = near

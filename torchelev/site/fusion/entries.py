@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchelev.site.fusion.fuse import Entries, Heights
-from torchelev.site.fusion.windows import Alignment, Known, Told, Windows
+from torchelev.site.fusion.windows import Alignment, Contribution, Known, Windows
 
 _WITHIN_CELL = 1 / 12  # variance of a position that is uniform in a cell of size 1
 _STEEPEST = 1.0  # slope taken where the known neighbours of a cell span no plane
@@ -32,8 +32,12 @@ def read_entries(
         + windows.gradient_y.view(-1).index_select(0, place).square()
     )
     slope = torch.where(windows.has_normal.view(-1).index_select(0, place), slope, _STEEPEST**2)
-    told = None if windows.told is None else _read_told(windows, windows.told, robot, place, resolution)
-    return Entries(cell, heights, slope.float() * (resolution**2 * _WITHIN_CELL), told)
+    contribution = (
+        None
+        if windows.contribution is None
+        else _read_contribution(windows, windows.contribution, robot, place, resolution)
+    )
+    return Entries(cell, heights, slope.float() * (resolution**2 * _WITHIN_CELL), contribution)
 
 
 def rise(known: Known, alignment: Alignment, robot: Tensor, place: Tensor, resolution: float) -> Tensor:
@@ -54,13 +58,15 @@ def read_heights(known: Known, alignment: Alignment, robot: Tensor, place: Tenso
     return Heights(elevation, variance, (known.now.index_select(0, robot) - age).float())
 
 
-def _read_told(windows: Windows, told: Told, robot: Tensor, place: Tensor, resolution: float) -> Heights:
-    """Return what the site has from the same robots, NaN where nothing."""
+def _read_contribution(
+    windows: Windows, contribution: Contribution, robot: Tensor, place: Tensor, resolution: float
+) -> Heights:
+    """Return the earlier contributions of the same robots, NaN where there are none."""
     H, W = windows.known.elevation.shape[1:]
-    shift = (windows.known.corner - told.known.corner)[robot]
+    shift = (windows.known.corner - contribution.known.corner)[robot]
     i, j = place // W % H + shift[:, 0], place % W + shift[:, 1]
     inside = (i >= 0) & (i < H) & (j >= 0) & (j < W)
     place = (robot * H + i.clamp(0, H - 1)) * W + j.clamp(0, W - 1)
-    elevation, variance, time = read_heights(told.known, told.alignment, robot, place, resolution)
-    counts = inside & told.known.is_known.view(-1).index_select(0, place)
+    elevation, variance, time = read_heights(contribution.known, contribution.alignment, robot, place, resolution)
+    counts = inside & contribution.known.is_known.view(-1).index_select(0, place)
     return Heights(elevation, variance, torch.where(counts, time, torch.nan))

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.config import SiteConfig
+from torchelev.site.site_config import SiteConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
-_ALONE = 1e-6  # share of a cell's information, below which the other heights say nothing
+_ALONE = 1e-6  # share of a cell's information, below which the other heights are ignored
 
 
 class Heights(NamedTuple):
@@ -47,20 +47,20 @@ class Entries(NamedTuple):
     cell: Int[Tensor, "K"]  #: number of the cell
     heights: Heights  #: (K,) each
     relief: Float[Tensor, "K"]  #: [m^2] variance of heights within the cell
-    told: Heights | None  #: what the site already has from the same robots; None: nothing
+    contributed: Heights | None  #: earlier contributions of the same robots, which these replace; None: none
 
     def select(self, chosen: Int[Tensor, "k"], number: Int[Tensor, "C"]) -> Entries:
         """Return some of them, whose cells get new numbers."""
         cell, relief = self.cell.index_select(0, chosen), self.relief.index_select(0, chosen)
-        told = None if self.told is None else self.told.at(chosen)
-        return Entries(number.index_select(0, cell), self.heights.at(chosen), relief, told)
+        contributed = None if self.contributed is None else self.contributed.at(chosen)
+        return Entries(number.index_select(0, cell), self.heights.at(chosen), relief, contributed)
 
 
 class Fused(NamedTuple):
     """C cells after a fusion."""
 
-    first: Heights  #: what the site says
-    other: Heights  #: what contradicts it
+    first: Heights  #: the site's height
+    other: Heights  #: the height that contradicts it
     is_contradicted: Bool[Tensor, "K"]  #: entries of cells in which heights contradict each other
 
 
@@ -106,8 +106,12 @@ def _resolve(first: Heights, other: Heights, entries: Entries, rate: float, cfg:
     heights = Heights(*(torch.cat(pair) for pair in zip(rest.heights, site, strict=True)))
     relief = torch.cat([rest.relief, torch.zeros_like(site.time)])
     nothing = Heights(*[torch.full_like(site.time, torch.nan)] * 3)
-    told = None if rest.told is None else Heights(*(torch.cat(pair) for pair in zip(rest.told, nothing, strict=True)))
-    rest_of_all = Entries(torch.cat([rest.cell, lost]), heights, relief, told)
+    contributed = (
+        None
+        if rest.contributed is None
+        else Heights(*(torch.cat(pair) for pair in zip(rest.contributed, nothing, strict=True)))
+    )
+    rest_of_all = Entries(torch.cat([rest.cell, lost]), heights, relief, contributed)
     second, _, _ = _average_near_surest(other, rest_of_all, rate, cfg, among_entries=True)
     nowhere, ours = torch.zeros_like(is_kept), entries.cell[agrees]
     holds_new = nowhere.index_fill(0, ours, True), nowhere.index_fill(0, rest.cell, True)
@@ -142,7 +146,7 @@ def _weigh(prior: Heights, entries: Entries, rate: float) -> _Weights:
 def _average_near_surest(
     prior: Heights, entries: Entries, rate: float, cfg: SiteConfig, among_entries: bool = False
 ) -> tuple[Heights, Tensor, Tensor]:
-    """Average what agrees with each cell's surest height; return which entries (K,) and priors (C,) do, too.
+    """Average the heights that agree with each cell's surest one; return which entries (K,) and priors (C,) do.
 
     With `among_entries`, the surest one is an entry, where there is one.
     """
@@ -181,7 +185,7 @@ def _find_surest(prior: Heights, entries: Entries, weights: _Weights, best: Tens
 def _agree_with_others(
     prior: Heights, entries: Entries, weights: _Weights, cfg: SiteConfig
 ) -> tuple[Bool[Tensor, "K"], Bool[Tensor, "C"]]:
-    """Tell which entries, and which priors, lie within the gate of the mean of the other heights of their cell.
+    """Return which entries, and which priors, lie within the gate of the mean of the other heights of their cell.
 
     With the mean m of all, whose information is W, the mean of all but the height h of information w lies
     (h - m) W / (W - w) away from it.
@@ -199,7 +203,7 @@ def _agree_with_others(
 def _pass_gate(
     prior: Heights, entries: Entries, distance: list[Tensor], variance: list[Tensor], cfg: SiteConfig
 ) -> tuple[Bool[Tensor, "K"], Bool[Tensor, "C"]]:
-    """Tell which entries, and which priors, have a distance [m] within the gate, given its variance [m^2]."""
+    """Return which entries, and which priors, have a distance [m] within the gate, given its variance [m^2]."""
     limits = [v.clamp(max=cfg.max_gate_std**2) for v in variance]
     agrees = distance[0].square() <= cfg.gate**2 * (limits[0] + entries.relief)
     is_kept = prior.known
@@ -223,10 +227,10 @@ def _average(
 
     With the information 1 / sigma^2 of all at the time of the cell's newest measurement:
 
-        1 / sigma^2 <- 1 / sigma^2 + sum (1 / sigma_k^2 - 1 / sigma_told^2),
-        h <- sigma^2 (h / sigma^2 + sum (h_k / sigma_k^2 - h_told / sigma_told^2)),
+        1 / sigma^2 <- 1 / sigma^2 + sum (1 / sigma_k^2 - 1 / sigma_c^2),
+        h <- sigma^2 (h / sigma^2 + sum (h_k / sigma_k^2 - h_c / sigma_c^2)),
 
-    so that what a robot told before is replaced by what it knows now, and counts once.
+    where h_c is the same robot's earlier contribution: what it knows now replaces it, and counts once.
     """
     cell, heights, own = entries.cell, entries.heights, weights.own
     all_agree = bool(agrees.all())
@@ -238,29 +242,29 @@ def _average(
     if is_kept.any():
         added = added + torch.where(is_kept, own, 0.0)
         moment = moment + torch.where(is_kept, own * (prior.elevation - reference), 0.0)
-        if entries.told is not None:
+        if entries.contributed is not None:
             counts = agrees & is_kept.index_select(0, cell)
-            told, moment_told = _sum_told(prior, entries, weights, reference, counts, rate, cfg)
-            added, moment = added - told, moment - moment_told
+            contributed, contributed_moment = _sum_contributed(prior, entries, weights, reference, counts, rate, cfg)
+            added, moment = added - contributed, moment - contributed_moment
     if not all_agree or not (is_kept | ~is_touched | ~prior.known).all():
         newest = torch.where(is_kept, prior.time, -torch.inf)
         newest = newest.scatter_reduce(0, cell, torch.where(agrees, heights.time, -torch.inf), "amax")
     return Heights(reference + moment / added, 1.0 / added, newest).where(is_touched, prior)
 
 
-def _sum_told(
+def _sum_contributed(
     prior: Heights, entries: Entries, weights: _Weights, reference: Tensor, counts: Tensor, rate: float, cfg: SiteConfig
 ) -> tuple[Float[Tensor, "C"], Float[Tensor, "C"]]:
-    """Return the information that robots told the prior before, and its moment about the reference, per cell.
+    """Return the information of earlier contributions to the prior, and its moment about the reference, per cell.
 
-    A robot that knows less than it told, as after a reset, tells nothing new.
+    At most a robot's present information is taken out: after a reset it knows less than it contributed.
     """
-    cell, told = entries.cell, entries.told
-    assert told is not None
-    information = told.information(weights.newest.index_select(0, cell), rate)
-    from_prior = told.elevation - prior.elevation.index_select(0, cell)
+    cell, contributed = entries.cell, entries.contributed
+    assert contributed is not None
+    information = contributed.information(weights.newest.index_select(0, cell), rate)
+    from_prior = contributed.elevation - prior.elevation.index_select(0, cell)
     holds = counts & (from_prior.square() <= cfg.gate**2 * (cfg.max_gate_std**2 + entries.relief))
-    height = torch.where(information >= weights.new, entries.heights.elevation, told.elevation)
+    height = torch.where(information >= weights.new, entries.heights.elevation, contributed.elevation)
     information = torch.where(holds, torch.minimum(information, weights.new), 0.0)
     moment = torch.where(holds, information * (height - reference.index_select(0, cell)), 0.0)
     nothing = torch.zeros_like(reference)
@@ -270,9 +274,9 @@ def _sum_told(
 def _replaces(
     other: Heights, first: Heights, holds_new: tuple[Tensor, Tensor], rate: float, cfg: SiteConfig
 ) -> Bool[Tensor, "C"]:
-    """Tell where the other height is to be the site's: newer and about as sure, or as new and surer.
+    """Return where the other height is to be the site's: newer and about as sure, or as new and surer.
 
-    `holds_new` tells where the first and the other hold what was merged just now, which decides between equal times.
+    Between equal times, `holds_new` decides: where the first and the other hold what was merged just now.
     """
     newest = torch.maximum(other.time, first.time)
     ratio = first.information(newest, rate) / other.information(newest, rate)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.entries import read_entries, rise
 from torchelev.site.fusion.fuse import Entries, Heights, fuse
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
 from torchelev.site.fusion.windows import Alignment, Windows
+from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import LAYERS, Tile, Tiles
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _BOUND, _TIME = LAYERS.index("upper_bound"), LAYERS.index("time")
 
 
 class MergeReport(NamedTuple):
-    """What a merge did, per robot."""
+    """The result of a merge, per robot."""
 
     offsets: Float[Tensor, "B"]  #: [m] how much the robot's heights lie above the site's; subtracted before fusing
     tilts: Float[Tensor, "B 2"]  #: rise over run along x and y; subtracted, too
@@ -43,7 +43,7 @@ class Merged(NamedTuple):
 def merge_windows(
     tiles: Tiles, windows: Windows, alignment: Alignment, resolution: float, rate: float, cfg: SiteConfig
 ) -> Iterator[Merged]:
-    """Return the tiles that the windows touch, after their fusion, some at a time; changes none in memory."""
+    """Return the tiles that the windows touch after fusion, a group at a time; changes none in memory."""
     groups = group_tiles(windows.known.corner, windows.is_new | windows.is_bounded)
     tiles.reserve(sum(tile not in tiles for group in groups for tile in group.tiles))
 
@@ -62,7 +62,7 @@ def merge_windows(
 
 
 def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:
-    """Fuse entries into the layers of tiles, in place; tell which contradict other heights of their cells."""
+    """Fuse entries into the layers of tiles, in place; return which contradict other heights of their cells."""
     fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
     for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
         layers[row] = value

@@ -1,4 +1,4 @@
-"""Windows cut along the tiles' borders, so that a few tiles and all that lies on them can be worked on at a time."""
+"""Windows cut along the tiles' borders, so that a merge works on a few tiles and their windows at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchelev.site.tiles import CELL_BITS, CELLS, TILE, Tile, locate_tiles
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_GROUP = 16  # tiles at a time: what is computed of them stays in a CPU's caches
+_GROUP = 16  # tiles at a time: their intermediate values stay in a CPU's caches
 
 
 class Pieces(NamedTuple):
@@ -28,7 +28,7 @@ class Pieces(NamedTuple):
     is_inside: Bool[Tensor, "P T T"]  #: the window holds that cell
 
     def select(self, mask: Bool[Tensor, "B H W"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return robot, cell number in the group and place in the flat windows of what a mask selects, (K,) each."""
+        """Return robot, cell number in the group and place in the flat windows of the cells of a mask, (K,) each."""
         chosen = (self.is_inside & mask.view(-1).take(self.place)).view(-1).nonzero()[:, 0]
         piece = chosen >> CELL_BITS
         cell = (self.tile - torch.arange(len(self.tile), device=chosen.device)).index_select(0, piece) * CELLS + chosen
@@ -36,7 +36,7 @@ class Pieces(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Some tiles, and how to cut what lies on them, which takes a while."""
+    """Some tiles, with a function that cuts the windows on them, which takes a while."""
 
     tiles: list[Tile]  #: in ascending order
     cut: Callable[[], Pieces]  #: cuts the windows
@@ -61,7 +61,7 @@ def group_tiles(corner: Int[Tensor, "B 2"], mask: Bool[Tensor, "B H W"]) -> list
 
 
 def _touched(corner: Int[Tensor, "B"], lines: Float[Tensor, "B size"]) -> Bool[Tensor, "B t"]:
-    """Tell which of the tiles that a window spans along one axis hold lines that are not zero."""
+    """Return which of the tiles that a window spans along one axis hold lines that are not zero."""
     size = lines.shape[1]
     tile = ((corner % TILE)[:, None] + torch.arange(size, device=corner.device)) // TILE
     return lines.new_zeros(len(corner), size // TILE + 2).scatter_add_(1, tile, lines) > 0

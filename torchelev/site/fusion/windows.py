@@ -1,4 +1,4 @@
-"""The windows of B robots, as they are merged: what they know now, and what of it the site knows already."""
+"""The windows of B robots at a merge: their present values, and their earlier contributions to the site."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def no_alignment(num_windows: int, device: torch.device) -> Alignment:
 
 
 class Known(NamedTuple):
-    """What B windows know, in the robots' frames. Values count where `is_known`."""
+    """The values of B windows in the robots' frames, valid where `is_known`."""
 
     corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the lattice
     elevation: Float[Tensor, "B H W"]  #: [m]
@@ -56,11 +56,11 @@ class Windows(NamedTuple):
     upper_bound: Float[Tensor, "B H W"]  #: [m]
     is_bounded: Bool[Tensor, "B H W"]  #: unknown cells that have an upper bound
     is_new: Bool[Tensor, "B H W"]  #: measured since the last merge
-    told: Told | None  #: None: nothing
+    contribution: Contribution | None  #: of the same robots at earlier merges; None: none
 
 
-class Told(NamedTuple):
-    """What a map knew at its last merge, and how that was aligned: the site has it."""
+class Contribution(NamedTuple):
+    """What a map contributed to a site: what it knew at its last merge, and how that was aligned."""
 
     known: Known  #: then
     alignment: Alignment  #: by which it was fused
@@ -69,16 +69,16 @@ class Told(NamedTuple):
     keyframe: Int[Tensor, "B"]  #: id of that merge's keyframe; -1: none was kept
 
 
-def nothing_told(known: Known, num_resets: Int[Tensor, "B"]) -> Told:
-    """Return that B maps, which know this and were reset so often, have told nothing; shares no memory with them."""
+def no_contribution(known: Known, num_resets: Int[Tensor, "B"]) -> Contribution:
+    """Return the empty contribution of B maps that know this and were reset so often; shares no memory with them."""
     blank = Known(*(value.clone() for value in known))._replace(is_known=torch.zeros_like(known.is_known))
     never = torch.full_like(num_resets, BEFORE_ALL)
     alignment = no_alignment(len(never), never.device)
-    return Told(blank, alignment, never, num_resets.clone(), torch.full_like(never, -1))
+    return Contribution(blank, alignment, never, num_resets.clone(), torch.full_like(never, -1))
 
 
 def read_known(emap: ElevationMap, state: MapState, now: float) -> Known:
-    """Return what a map's windows know, which shares memory with it; arguments as of `read_windows`.
+    """Return the values of a map's windows, which share memory with it; arguments as of `read_windows`.
 
     Cells whose variance has grown to the map's maximum hold no information, nor do those that feet initialised.
     """
@@ -89,23 +89,23 @@ def read_known(emap: ElevationMap, state: MapState, now: float) -> Known:
     return Known(state.corner, state.elevation, variance, state.time, is_known, now * per_robot, rate * per_robot)
 
 
-def read_windows(emap: ElevationMap, state: MapState, now: float, told: Told | None) -> Windows:
+def read_windows(emap: ElevationMap, state: MapState, now: float, contribution: Contribution | None) -> Windows:
     """Read a map's windows, which share memory with it.
 
     Args:
         emap: the map.
         state: its state, or the same state with the windows moved.
         now: the site's time [s].
-        told: what the map told the site before.
+        contribution: of the map at its last merge.
     """
     known = read_known(emap, state, now)
     surface = state.gradient_x, state.gradient_y, state.has_normal
     bound = state.upper_bound, state.bounded & ~state.validity
-    return Windows(known, *surface, *bound, _find_new(state, known, told), told)
+    return Windows(known, *surface, *bound, _find_new(state, known, contribution), contribution)
 
 
 def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
-    """Return the variance [m^2] of the elevations, with what the horizontal errors of the poses add on slopes.
+    """Return the variance [m^2] of the elevations, including horizontal pose errors on slopes.
 
     The vertical error is shared by the window; the offset takes it out.
     """
@@ -116,37 +116,37 @@ def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
     return absolute_variance(state._replace(pose_covariance=covariance))
 
 
-def drop_reset(told: Told, num_resets: Int[Tensor, "B"], elapsed: Int[Tensor, "B"]) -> Told:
-    """Drop what environments told before they were reset, or loaded an earlier state: all that they know now is new."""
-    was_reset = (told.num_resets != num_resets) | (elapsed < told.elapsed)
+def drop_reset(contribution: Contribution, num_resets: Int[Tensor, "B"], elapsed: Int[Tensor, "B"]) -> Contribution:
+    """Drop contributions of environments that were reset or loaded an earlier state: all that they know is new."""
+    was_reset = (contribution.num_resets != num_resets) | (elapsed < contribution.elapsed)
     if not was_reset.any():
-        return told
-    known = told.known._replace(is_known=told.known.is_known & ~was_reset[:, None, None])
-    offset, tilt, is_isolated = told.alignment
+        return contribution
+    known = contribution.known._replace(is_known=contribution.known.is_known & ~was_reset[:, None, None])
+    offset, tilt, is_isolated = contribution.alignment
     offset, tilt = torch.where(was_reset, 0.0, offset), torch.where(was_reset[:, None], 0.0, tilt)
-    elapsed = torch.where(was_reset, BEFORE_ALL, told.elapsed)
+    elapsed = torch.where(was_reset, BEFORE_ALL, contribution.elapsed)
     alignment = Alignment(offset, tilt, is_isolated)
-    keyframe = torch.where(was_reset, -1, told.keyframe)
-    return Told(known, alignment, elapsed, num_resets.clone(), keyframe)
+    keyframe = torch.where(was_reset, -1, contribution.keyframe)
+    return Contribution(known, alignment, elapsed, num_resets.clone(), keyframe)
 
 
-def _find_new(state: MapState, known: Known, told: Told | None) -> Bool[Tensor, "B H W"]:
-    """Tell which known cells are not what was told before: measured since, or not part of it.
+def _find_new(state: MapState, known: Known, contribution: Contribution | None) -> Bool[Tensor, "B H W"]:
+    """Return which known cells are new: measured since the contribution, or not part of it.
 
     What `initialize_from` gave may be younger than the last merge, but nobody has measured it: no bit of it changes.
     """
-    if told is None:
+    if contribution is None:
         return known.is_known
-    since = ((state.elapsed - told.elapsed).double() * _NANOSECONDS)[:, None, None]
+    since = ((state.elapsed - contribution.elapsed).double() * _NANOSECONDS)[:, None, None]
     # Ages are sums in float32, whose rounding must not make an old measurement new.
     is_younger = state.time < since * (1 - 1e-4) - 1e-6
-    layers = move_known(told.known, state.corner)
+    layers = move_known(contribution.known, state.corner)
     has_changed = (known.elevation != layers.elevation) | (known.variance < layers.variance)
     return known.is_known & (~layers.is_known | (is_younger & has_changed))
 
 
 def move_known(known: Known, corner: Int[Tensor, "B 2"]) -> Known:
-    """Return what windows know, of the windows at other corners."""
+    """Return the values of windows, moved to other corners."""
     H, W = known.elevation.shape[1:]
     shift = (corner - known.corner).clamp(-max(H, W), max(H, W))
     if not shift.any():
@@ -157,7 +157,7 @@ def move_known(known: Known, corner: Int[Tensor, "B 2"]) -> Known:
 
 def snapshot(
     emap: ElevationMap, windows: Windows, alignment: Alignment, elapsed: Int[Tensor, "B"], keyframe: Int[Tensor, "B"]
-) -> Told:
-    """Return copies of what a merge of a map told the site, and kept as these keyframes, at these clocks."""
+) -> Contribution:
+    """Return a map's contribution at a merge, as copies, with the ids of its keyframes and the maps' clocks."""
     known = Known(*(value.clone() for value in windows.known))
-    return Told(known, alignment, elapsed.clone(), emap.num_resets.to(elapsed.device, copy=True), keyframe)
+    return Contribution(known, alignment, elapsed.clone(), emap.num_resets.to(elapsed.device, copy=True), keyframe)

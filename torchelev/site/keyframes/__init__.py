@@ -1,1 +1,1 @@
-"""What each merge told, with the poses it was told from: moved when a pose graph corrects the past."""
+"""Contributions of each merge with the poses of the robots: moved when a pose graph corrects the past."""

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from torchelev.site.storage.store import TileStore
 
 Arrays = dict[str, tuple["NDArray", Mapping[str, Any]]]
-_LISTS = Rows._fields[1:6]  # stored as attributes
+# Rows that are stored as attributes, and their names there, which stored sites fix.
+_LISTS = {"robot": "robot", "previous": "told_of", "corner": "corner", "size": "size", "heights": "heights"}
 
 
 class KeyframeLog:
@@ -37,13 +38,13 @@ class KeyframeLog:
 
     @property
     def rows(self) -> Rows:
-        """What is known of all keyframes; reads a small file for each merge the first time."""
+        """The metadata of all keyframes; reads a small file for each merge the first time."""
         if self._rows is None:
             self._rows = join(*(self._read_merge(number) for number in range(self.num_merges)))
         return self._rows
 
     def list(self) -> Keyframes:
-        """Return copies of what users may know of the keyframes."""
+        """Return copies of the keyframes' public metadata."""
         rows = self.rows
         return Keyframes(torch.arange(len(rows.merge)), rows.robot.clone(), rows.time.clone(), rows.T_now.clone())
 
@@ -67,7 +68,7 @@ class KeyframeLog:
         assert self._store is not None
         poses, attributes = self._store.read_array(_merge(number))
         first, now = torch.from_numpy(poses)
-        values = {name: torch.tensor(attributes[name]) for name in _LISTS}
+        values = {name: torch.tensor(attributes[stored]) for name, stored in _LISTS.items()}
         values["heights"] = values["heights"].double()
         merge, time = torch.full((len(first),), number), torch.full((len(first),), attributes["time"]).double()
         return Rows(merge=merge, time=time, T_first=first, T_now=now, **values)
@@ -94,7 +95,9 @@ def changed_arrays(before: Rows, after: Rows) -> Arrays:
 
 
 def _pose_array(number: int, rows: Rows) -> Arrays:
-    attributes = {name: getattr(rows, name).tolist() for name in _LISTS} | {"time": float(rows.time[0])}
+    attributes = {stored: getattr(rows, name).tolist() for name, stored in _LISTS.items()} | {
+        "time": float(rows.time[0])
+    }
     return {_merge(number): (torch.stack([rows.T_first, rows.T_now]).numpy(), attributes)}
 
 

@@ -1,4 +1,4 @@
-"""Keyframes: what each robot told the site at a merge, kept so that it can be moved when poses are corrected."""
+"""Keyframes: each robot's contribution to a merge, kept so that it can be moved when poses are corrected."""
 
 from __future__ import annotations
 
@@ -10,15 +10,24 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.inputs import checks
 from torchelev.site.fusion.entries import read_entries, read_heights, rise
-from torchelev.site.fusion.windows import Alignment, Told, Windows
+from torchelev.site.fusion.windows import Alignment, Contribution, Windows
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 # Layers of a keyframe, as of its merge and in the site's frame; NaN where nothing. The rows of each group turn with a
 # move by their own heights, which come first.
-OWN, BOUND, TOLD = slice(0, 4), slice(4, 5), slice(5, 8)
-LAYERS = ("elevation", "variance", "time", "relief", "upper_bound", "told_elevation", "told_variance", "told_time")
+OWN, BOUND, CONTRIBUTED = slice(0, 4), slice(4, 5), slice(5, 8)
+LAYERS = (
+    "elevation",
+    "variance",
+    "time",
+    "relief",
+    "upper_bound",
+    "contributed_elevation",
+    "contributed_variance",
+    "contributed_time",
+)
 
 
 class Keyframes(NamedTuple):
@@ -31,11 +40,13 @@ class Keyframes(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What is known of K keyframes without reading them, on the CPU."""
+    """The metadata of K keyframes, on the CPU."""
 
     merge: Int[Tensor, "K"]  #: number of the merge
     robot: Int[Tensor, "K"]  #: number of the robot
-    told_of: Int[Tensor, "K"]  #: keyframe with which moves what the robot had told before; itself: nothing told
+    previous: Int[
+        Tensor, "K"
+    ]  #: the robot's keyframe before, with which its earlier contribution moves; itself: the first
     corner: Int[Tensor, "K 2"]  #: number of the first cell, before any move
     size: Int[Tensor, "K 2"]  #: H, W in cells
     heights: Float[Tensor, "K 2"]  #: [m] the lowest and the highest
@@ -77,7 +88,7 @@ def record(
     time: float,
     resolution: float,
 ) -> Recorded:
-    """Copy what a merge tells the site.
+    """Copy the contributions of a merge.
 
     Args:
         windows: B windows.
@@ -89,16 +100,16 @@ def record(
         resolution: [m].
     """
     ids = len(rows.merge) + torch.arange(len(T_map_base))
-    before = torch.full_like(ids, -1) if windows.told is None else windows.told.keyframe.cpu()
+    before = torch.full_like(ids, -1) if windows.contribution is None else windows.contribution.keyframe.cpu()
     is_met, own = before >= 0, _own_layers(windows, alignment, resolution).cpu()
     new_robots = int(rows.robot.max()) + 1 if len(rows.robot) else 0
     robot = new_robots + (~is_met).cumsum(0) - 1
     robot[is_met] = rows.robot[before[is_met]]
-    told = None if windows.told is None else _told_layers(windows.told, resolution).cpu()
-    told_corner = None if windows.told is None else windows.told.known.corner.cpu()
+    contributed = None if windows.contribution is None else _contributed_layers(windows.contribution, resolution).cpu()
+    contributed_corner = None if windows.contribution is None else windows.contribution.known.corner.cpu()
     cropped = [
-        _crop(own[:, b], windows.known.corner[b].cpu(), None if told is None else told[:, b],
-              None if told_corner is None else told_corner[b])
+        _crop(own[:, b], windows.known.corner[b].cpu(), None if contributed is None else contributed[:, b],
+              None if contributed_corner is None else contributed_corner[b])
         for b in range(len(ids))
     ]  # fmt: skip
     layers, corner = [value for value, _ in cropped], torch.stack([low for _, low in cropped])
@@ -106,8 +117,8 @@ def record(
     heights = torch.stack([_height_limits(value) for value in layers])
     pose = _believe(T_map_base.cpu().double(), windows, alignment, resolution)
     merge, times = torch.full_like(ids, num_merges), torch.full(ids.shape, time, dtype=torch.float64)
-    told_of = torch.where(is_met, before, ids)
-    return Recorded(ids, Rows(merge, robot, told_of, corner, size, heights, times, pose, pose), layers)
+    previous = torch.where(is_met, before, ids)
+    return Recorded(ids, Rows(merge, robot, previous, corner, size, heights, times, pose, pose), layers)
 
 
 def correct(rows: Rows, ids: object, T_map_base: object) -> Rows:
@@ -129,7 +140,7 @@ def _own_layers(windows: Windows, alignment: Alignment, resolution: float) -> Fl
     B, H, W = windows.is_new.shape
     layers = torch.full((5, B * H * W), torch.nan, device=windows.is_new.device)
     place = windows.is_new.flatten().nonzero()[:, 0]
-    entries = read_entries(windows._replace(told=None), alignment, place // (H * W), place, place, resolution)
+    entries = read_entries(windows._replace(contribution=None), alignment, place // (H * W), place, place, resolution)
     layers[OWN, place] = torch.stack([*entries.heights, entries.relief])
     place = windows.is_bounded.flatten().nonzero()[:, 0]
     above = rise(windows.known, alignment, place // (H * W), place, resolution)
@@ -137,33 +148,37 @@ def _own_layers(windows: Windows, alignment: Alignment, resolution: float) -> Fl
     return layers.view(5, B, H, W)
 
 
-def _told_layers(told: Told, resolution: float) -> Float[Tensor, "3 B H W"]:
-    """Return the heights that the site has from the same robots."""
-    B, H, W = told.known.is_known.shape
-    layers = torch.full((3, B * H * W), torch.nan, device=told.known.is_known.device)
-    place = told.known.is_known.flatten().nonzero()[:, 0]
-    layers[:, place] = torch.stack([*read_heights(told.known, told.alignment, place // (H * W), place, resolution)])
+def _contributed_layers(contributed: Contribution, resolution: float) -> Float[Tensor, "3 B H W"]:
+    """Return the heights of the robots' earlier contributions."""
+    B, H, W = contributed.known.is_known.shape
+    layers = torch.full((3, B * H * W), torch.nan, device=contributed.known.is_known.device)
+    place = contributed.known.is_known.flatten().nonzero()[:, 0]
+    layers[:, place] = torch.stack(
+        [*read_heights(contributed.known, contributed.alignment, place // (H * W), place, resolution)]
+    )
     return layers.view(3, B, H, W)
 
 
-def _crop(own: Tensor, corner: Tensor, told: Tensor | None, told_corner: Tensor | None) -> tuple[Tensor, Tensor]:
+def _crop(
+    own: Tensor, corner: Tensor, contributed: Tensor | None, contributed_corner: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Put a robot's layers into the smallest box that holds them; return that and its first cell.
 
-    What was told farther than a window from what is new cannot come to lie on it.
+    Earlier contributions farther than a window from what is new cannot come to lie on it.
     """
     low, high = _find_box(own[0].isfinite() | own[4].isfinite(), corner)
     if (low == high).any():
         return own.new_zeros(len(LAYERS), 0, 0), corner
     reach = torch.tensor(own.shape[1:])
-    if told is not None and told_corner is not None:
-        first, last = _find_box(told[2].isfinite(), told_corner)
+    if contributed is not None and contributed_corner is not None:
+        first, last = _find_box(contributed[2].isfinite(), contributed_corner)
         first, last = first.maximum(low - reach), last.minimum(high + reach)
         if (first < last).all():
             low, high = low.minimum(first), high.maximum(last)
     layers = own.new_full((len(LAYERS), *(high - low).tolist()), torch.nan)
     _paste(layers[:5], low, own, corner)
-    if told is not None and told_corner is not None:
-        _paste(layers[TOLD], low, told, told_corner)
+    if contributed is not None and contributed_corner is not None:
+        _paste(layers[CONTRIBUTED], low, contributed, contributed_corner)
     return layers, low
 
 

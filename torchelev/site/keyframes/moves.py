@@ -1,4 +1,4 @@
-"""How keyframes lie on the site after their robots' poses were corrected: which cells they reach, and their heights."""
+"""Keyframes on the site after their robots' poses were corrected: the cells that they reach, and their heights."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_ROUNDS = 3  # of finding the cell that a tilt moves to a place: its height says how far
+_ROUNDS = 3  # to find the cell that a tilt moves to a place, as the shift depends on its height
 _BORDER = 1e-6  # of a cell, less than which rounding moves borders
 
 
@@ -67,7 +67,7 @@ def look_up(
     cells: Int[Tensor, "N 2"],
     resolution: float,
 ) -> Float[Tensor, "C N"]:
-    """Return what moved layers hold at cells, NaN where nothing: of the cell that a target's centre was moved from.
+    """Return the values of moved layers at cells, of the cell from which a target's centre came; NaN where unknown.
 
     Args:
         layers: heights [m], which turn with the move, and others, which do not.

@@ -1,4 +1,4 @@
-"""Fusing keyframes into tiles where they were moved to: those of a new merge, or of all merges again."""
+"""Fuse keyframes into tiles at their corrected poses: those of a new merge, or again those of all merges."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.config import SiteConfig
 from torchelev.site.fusion.fuse import Entries, Heights
 from torchelev.site.fusion.merge import Merged, fuse_entries, lower_bounds
 from torchelev.site.keyframes.keyframe_log import KeyframeLog
-from torchelev.site.keyframes.keyframes import BOUND, OWN, TOLD, Recorded, Rows, join
+from torchelev.site.keyframes.keyframes import BOUND, CONTRIBUTED, OWN, Recorded, Rows, join
 from torchelev.site.keyframes.moves import Moves, find_footprints, find_moves, look_up
+from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import CELLS, TILE, Tile, Tiles
 
 if TYPE_CHECKING:
@@ -24,20 +24,20 @@ _BLOCK = 8  # tiles along x and y that are rebuilt at a time
 
 
 class Placed(NamedTuple):
-    """Keyframes where they lie now."""
+    """Keyframes at their corrected poses."""
 
     ids: Int[Tensor, "K"]  #: of the keyframes
     merge: Int[Tensor, "K"]  #: number of their merges, ascending
     corner: Int[Tensor, "K 2"]  #: of their layers, before the move
     moves: Moves  #: since their merges
-    told_moves: Moves  #: of what the robots had told before
+    previous_moves: Moves  #: of the robots' earlier contributions
     first: Int[Tensor, "K 2"]  #: cells of the boxes that hold them
     last: Int[Tensor, "K 2"]  #: the last of these cells
     read: Callable[[int], Tensor]  #: returns the layers of one, by id
 
 
 class Share(NamedTuple):
-    """What one keyframe says of a block's cells."""
+    """A keyframe's values at a block's cells."""
 
     entries: Entries  #: heights
     bound_cell: Int[Tensor, "U"]  #: number of the cell
@@ -45,12 +45,12 @@ class Share(NamedTuple):
 
 
 def place(rows: Rows, ids: Tensor, read: Callable[[int], Tensor], resolution: float) -> Placed:
-    """Return some of the keyframes as they lie now, those that hold nothing left out."""
+    """Return some of the keyframes at their corrected poses, without the empty ones."""
     ids = ids[(rows.size[ids] > 0).all(1)]
     moves = find_moves(rows.T_first, rows.T_now)
-    own, told = moves.at(ids), moves.at(rows.told_of[ids])
+    own, contributed = moves.at(ids), moves.at(rows.previous[ids])
     box = find_footprints(own, rows.corner[ids], rows.size[ids], rows.heights[ids], resolution)
-    return Placed(ids, rows.merge[ids], rows.corner[ids], own, told, *box, read)
+    return Placed(ids, rows.merge[ids], rows.corner[ids], own, contributed, *box, read)
 
 
 def tiles_of(*parts: Placed) -> list[Tile]:
@@ -77,7 +77,7 @@ def merge_recorded(
 def rebuild_moved(
     tiles: Tiles, log: KeyframeLog, after: Rows, resolution: float, rate: float, cfg: SiteConfig
 ) -> Iterator[Merged]:
-    """Yield the tiles that change when keyframes are moved to where `after` has them."""
+    """Yield the tiles that change when keyframes move to their poses in `after`."""
     changed = find_changed(log.rows, after)
     touched = tiles_of(*(place(rows, changed, log.read, resolution) for rows in (log.rows, after)))
     placed = place(after, torch.arange(len(after.merge)), log.read, resolution)
@@ -85,9 +85,9 @@ def rebuild_moved(
 
 
 def find_changed(before: Rows, after: Rows) -> Int[Tensor, "k"]:
-    """Return the keyframes whose pose changed, and those that replace what a robot told in one of them."""
+    """Return the keyframes whose pose changed, and those whose earlier contribution is one of them."""
     changed = (before.T_now != after.T_now).flatten(1).any(1)
-    return (changed | changed[after.told_of]).nonzero()[:, 0]
+    return (changed | changed[after.previous]).nonzero()[:, 0]
 
 
 def rebuild(
@@ -160,24 +160,28 @@ def _fuse(
 
 
 def join_entries(parts: list[Entries]) -> Entries:
-    """Return entries one after another, all of which have told values."""
-    told = Heights(*(torch.cat(columns) for columns in zip(*(part.told or () for part in parts), strict=True)))
+    """Return entries one after another, all of which have earlier contributions."""
+    contributed = Heights(
+        *(torch.cat(columns) for columns in zip(*(part.contributed or () for part in parts), strict=True))
+    )
     heights = Heights(*(torch.cat(columns) for columns in zip(*(part.heights for part in parts), strict=True)))
-    return Entries(torch.cat([p.cell for p in parts]), heights, torch.cat([p.relief for p in parts]), told)
+    return Entries(torch.cat([p.cell for p in parts]), heights, torch.cat([p.relief for p in parts]), contributed)
 
 
 def _share(placed: Placed, number: int, cells: Tensor, device: torch.device, resolution: float) -> Share:
-    """Look up what a keyframe says of tiles, given their first cells."""
+    """Look up a keyframe's values at tiles, given their first cells."""
     layers = placed.read(int(placed.ids[number]))
     targets, at = _find_targets(cells, placed.first[number], placed.last[number])
-    corner, move, told_move = placed.corner[number], placed.moves.at(number), placed.told_moves.at(number)
+    corner, move, previous_move = placed.corner[number], placed.moves.at(number), placed.previous_moves.at(number)
     own = look_up(layers[OWN], corner, move, targets, resolution)
     known = own[2].isfinite().nonzero()[:, 0]
-    told = look_up(layers[TOLD], corner, told_move, targets[known], resolution)
+    contributed = look_up(layers[CONTRIBUTED], corner, previous_move, targets[known], resolution)
     bound = look_up(layers[BOUND], corner, move, targets, resolution)[0]
     bounded = bound.isfinite().nonzero()[:, 0]
     elevation, variance, time, relief = own[:, known].to(device)
-    entries = Entries(at[known].to(device), Heights(elevation, variance, time), relief, Heights(*told.to(device)))
+    entries = Entries(
+        at[known].to(device), Heights(elevation, variance, time), relief, Heights(*contributed.to(device))
+    )
     return Share(entries, at[bounded].to(device), bound[bounded].to(device))
 
 

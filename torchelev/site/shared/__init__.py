@@ -1,1 +1,1 @@
-"""A site that several processes share: one collective makes each of them merge what all have."""
+"""A site that several processes share: collective operations merge the windows of all in each of them."""

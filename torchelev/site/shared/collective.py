@@ -76,14 +76,14 @@ def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) 
     Args:
         ranks: of the site.
         windows: of this rank.
-        plans: what the ranks have told by `exchange`: their numbers of `robots`, and whether any was `told`.
+        plans: what the ranks sent by `exchange`: their numbers of `robots`, and whether any has `contributed` before.
     """
     numbers = [plan["robots"] for plan in plans]
     own = slice(sum(numbers[: ranks.rank]), sum(numbers[: ranks.rank + 1]))
     if ranks.size == 1:
         return windows, own
     H, W = windows.known.elevation.shape[1:]
-    layout = Layout(H, W, any(plan["told"] for plan in plans))
+    layout = Layout(H, W, any(plan["contributed"] for plan in plans))
     rows = pack(windows, layout)
     padded = torch.nn.functional.pad(rows, (0, 0, 0, max(numbers) - len(rows)))
     gathered = ranks.all_gather("merge", padded)
@@ -94,7 +94,7 @@ def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) 
 def shared_transaction(
     ranks: Ranks, store: TileStore | None, attributes: Mapping[str, Any], arrays: Mapping[str, Any] | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Yield what writes tiles, which rank 0 commits once all ranks are at the end; without a store, nothing does.
+    """Yield a function that writes tiles, which rank 0 commits once all ranks are at the end, if there is a store.
 
     If the block or the commit raises on one rank, nothing is committed, and all raise.
     """

@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.windows import Known, Told, Windows, no_alignment, nothing_told
+from torchelev.site.fusion.windows import Contribution, Known, Windows, no_alignment, no_contribution
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, UInt8
 
 
 class Layout(NamedTuple):
-    """What the rows hold: the same on all ranks.
+    """The layout of the rows, the same on all ranks.
 
     Cell numbers are int64, times, rates and offsets float64, layers float32 and masks bits: 20.5 bytes per cell and 32
-    per robot; with what was told, 32.625 bytes per cell and 88 per robot.
+    per robot; with earlier contributions, 32.625 bytes per cell and 88 per robot.
     """
 
     height: int  #: H, cells
     width: int  #: W, cells
-    with_told: bool  #: whether any robot has told the site anything before
+    with_contribution: bool  #: whether any robot has contributed before
 
     @property
     def num_bytes(self) -> int:
@@ -31,40 +31,40 @@ class Layout(NamedTuple):
         return sum(_width(dtype, shape) for dtype, shape in self.parts())
 
     def parts(self) -> list[tuple[torch.dtype, tuple[int, ...]]]:
-        """Return the type and the shape, per robot, of all that a row holds, in its order."""
+        """Return the type and the shape, per robot, of the parts of a row, in their order."""
         layer = (self.height, self.width)
         known = [(torch.int64, (2,)), *2 * [(torch.float64, ())], *3 * [(torch.float32, layer)], (torch.bool, layer)]
         surface = [*2 * [(torch.float32, layer)], *3 * [(torch.bool, layer)]]
-        told = [*known, (torch.float64, ()), (torch.float64, (2,))]
-        return [*known, *surface, *(told if self.with_told else [])]
+        contribution = [*known, (torch.float64, ()), (torch.float64, (2,))]
+        return [*known, *surface, *(contribution if self.with_contribution else [])]
 
 
 def pack(windows: Windows, layout: Layout) -> UInt8[Tensor, "B n"]:
     """Return the rows of B robots."""
-    values = _values(windows, layout.with_told)
+    values = _values(windows, layout.with_contribution)
     rows = [_to_bytes(value.to(dtype)) for value, (dtype, _) in zip(values, layout.parts(), strict=True)]
     return torch.cat(rows, 1)
 
 
 def unpack(rows: UInt8[Tensor, "B n"], layout: Layout) -> Windows:
-    """Return the windows that `pack` was given, as far as a merge reads them."""
+    """Return the parts of the packed windows that a merge reads."""
     parts = layout.parts()
     columns = rows.split([_width(dtype, shape) for dtype, shape in parts], 1)
     values = [_from_bytes(column, dtype, shape) for column, (dtype, shape) in zip(columns, parts, strict=True)]
     known, (gradient_x, gradient_y, has_normal, is_bounded, is_new) = _known(values[:7]), values[7:12]
-    told = _told(values[12:]) if layout.with_told else None
-    return Windows(known, gradient_x, gradient_y, has_normal, known.elevation, is_bounded, is_new, told)
+    contribution = _unpack_contribution(values[12:]) if layout.with_contribution else None
+    return Windows(known, gradient_x, gradient_y, has_normal, known.elevation, is_bounded, is_new, contribution)
 
 
-def _values(windows: Windows, with_told: bool) -> list[Tensor]:
-    """Return what a row holds. A cell has a height or an upper bound, so that one layer holds both."""
+def _values(windows: Windows, with_contribution: bool) -> list[Tensor]:
+    """Return the contents of a row. A cell has a height or an upper bound, so that one layer holds both."""
     known = windows.known
     height = torch.where(windows.is_bounded, windows.upper_bound, known.elevation)
     surface = windows.gradient_x, windows.gradient_y, windows.has_normal, windows.is_bounded, windows.is_new
     values = [*_of_known(known._replace(elevation=height)), *surface]
-    if with_told:
-        told = windows.told or nothing_told(known, torch.zeros_like(known.corner[:, 0]))
-        values += [*_of_known(told.known), told.alignment.offset, told.alignment.tilt]
+    if with_contribution:
+        contribution = windows.contribution or no_contribution(known, torch.zeros_like(known.corner[:, 0]))
+        values += [*_of_known(contribution.known), contribution.alignment.offset, contribution.alignment.tilt]
     return values
 
 
@@ -77,11 +77,11 @@ def _known(values: list[Tensor]) -> Known:
     return Known(corner, elevation, variance, age, is_known, now, rate)
 
 
-def _told(values: list[Tensor]) -> Told:
-    """Return what was told, without the clocks and resets of the maps, which only their own rank needs."""
+def _unpack_contribution(values: list[Tensor]) -> Contribution:
+    """Return a contribution without the clocks and resets of the maps, which only their own rank needs."""
     known, zero = _known(values[:7]), values[0].new_zeros(len(values[0]))
     alignment = no_alignment(len(zero), zero.device)._replace(offset=values[7], tilt=values[8])
-    return Told(known, alignment, zero, zero, zero - 1)
+    return Contribution(known, alignment, zero, zero, zero - 1)
 
 
 def _width(dtype: torch.dtype, shape: tuple[int, ...]) -> int:

@@ -1,4 +1,4 @@
-"""The processes that share a site, and what they tell each other."""
+"""The processes that share a site, and the messages between them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _ERRORS = {error.__name__: error for error in (ValueError, TypeError, KeyError, 
 
 
 class LostRankError(RuntimeError):
-    """Another rank has ended, or did not answer in time. The site is as of the last merge, and can be read on."""
+    """Another rank has ended, or did not answer in time. The site holds the last merge, and can still be read."""
 
 
 class Ranks:
-    """The processes that share a site. Alone, no call waits for anybody.
+    """The processes that share a site. With one process, no call waits.
 
     Args:
         group: of `torch.distributed`; None: this process alone.
@@ -95,7 +95,7 @@ class Ranks:
         return [json.loads(bytes(row.tolist())) for row in self.all_gather(call, sent)[:, 0]]
 
     def _require_same(self, values: list[dict[str, Any]]) -> None:
-        """Raise the same ValueError on all ranks if they are about to do different things."""
+        """Raise the same ValueError on all ranks if their arguments differ."""
         plans = [{"call": value["call"]} | value.get("same", {}) for value in values]
         for name, first in plans[0].items():
             rank = next((rank for rank, plan in enumerate(plans) if plan.get(name, first) != first), None)

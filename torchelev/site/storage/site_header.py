@@ -1,4 +1,4 @@
-"""What the attributes of a site's folder say: its format, its layers and its tiles, beside those of the caller."""
+"""The attributes of a site's folder: its format, its layers and its tiles, beside those of the caller."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OWN = ("format", "version", "layers", "tile_size", "origin", "rule")
 
 
 class Header(NamedTuple):
-    """What the folder's `zarr.json` holds."""
+    """The contents of the folder's `zarr.json`."""
 
     layers: tuple[str, ...]  #: names of the layers, in the order of the array
     tile_size: int  #: T, cells on the side of a tile
@@ -63,7 +63,7 @@ def new_header(layers: Sequence[str], tile_size: int, attributes: Mapping[str, A
 
 
 def require_empty(path: Path) -> None:
-    """Raise ValueError unless a site can be made here; a killed process that began to make one is no obstacle."""
+    """Raise ValueError unless a site can be made here; leftovers of a killed process do not count."""
     if not os.path.lexists(path):
         return
     require(path.is_dir(), str(path), "must be a folder", "a file", "choose another path")
@@ -81,7 +81,7 @@ def make_site(path: Path, header: Header) -> None:
 
 
 def is_site(path: Path) -> bool:
-    """Tell whether a folder holds a site, or something else in Zarr 3."""
+    """Return whether a folder holds a site, or something else in Zarr 3."""
     return (path / METADATA).exists() or (path / COMMITTED / METADATA).exists()
 
 

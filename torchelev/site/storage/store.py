@@ -147,7 +147,7 @@ class TileStore:
         attributes: Mapping[str, Any],
         arrays: Mapping[str, tuple[NDArray, Mapping[str, Any]]] | None = None,
     ) -> None:
-        """Store tiles, attributes and arrays together, or nothing of them if this raises or the process is killed.
+        """Store tiles, attributes and arrays together, or none of them if this raises or the process is killed.
 
         Args:
             tiles: n different pairs; other tiles stay as they are.

@@ -1,4 +1,4 @@
-"""Write many files of a folder all or nothing: a killed process loses the transaction in flight, and nothing older."""
+"""Write many files of a folder all or nothing: a killed process loses only the transaction in progress."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class CommitError(OSError):
-    """A commit failed. All that was stored before is unchanged, and the store can be used on."""
+    """A commit failed. Everything stored before is unchanged, and the store remains usable."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         hint = _HINTS.get(error.errno or 0, "try again")
@@ -78,7 +78,7 @@ def stage(path: Path) -> Iterator[Path]:
 
 
 def finish(path: Path) -> bool:
-    """Move the files of a committed transaction into place, from where an earlier call stopped.
+    """Move the files of a committed transaction into place, continuing an interrupted call.
 
     Metadata follow what they describe, and those of the folder itself come last.
 
@@ -96,7 +96,7 @@ def finish(path: Path) -> bool:
 
 
 def clean(path: Path) -> bool:
-    """Remove what an earlier writer staged, and complete what it committed; tell whether it committed anything.
+    """Remove what an earlier writer staged, and complete what it committed; return whether it committed anything.
 
     Raises:
         CommitError: the folder cannot be written.
@@ -109,7 +109,7 @@ def clean(path: Path) -> bool:
 
 
 def read_newest(path: Path, read: Callable[[Path], T]) -> T:
-    """Return what `read` makes of the files as of the last commit, those that are still to be moved included.
+    """Return the result of `read` on the files of the last commit, including those not yet moved.
 
     Args:
         path: folder that the files belong to.

@@ -111,7 +111,7 @@ def wait_for(writes: Sequence[Any]) -> None:
     """Wait for all futures of tensorstore's writes; raise OSError if one failed."""
     try:
         errors = [error for error in [write.exception() for write in writes] if error is not None]
-    except BaseException:  # Ctrl-C: a write that goes on would end up in the next commit
+    except BaseException:  # Ctrl-C: a write that continues would end up in the next commit
         for write in writes:
             write.exception()
         raise
@@ -122,7 +122,7 @@ def wait_for(writes: Sequence[Any]) -> None:
 
 
 def is_missing(error: ValueError) -> bool:
-    """Tell whether tensorstore raised this because a chunk's file is not there."""
+    """Return whether tensorstore raised this because a chunk's file is not there."""
     return str(error).startswith("NOT_FOUND")
 
 

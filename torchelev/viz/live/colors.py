@@ -1,4 +1,4 @@
-"""The colours of layers: which colour map, from which value to which, and a legend that says so."""
+"""The colours of layers: colour maps, their limits, and a legend."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live view of a map in a loop of your own, which it does not hold up."""
+"""The live view of a map in your own loop, without slowing it down."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from torchelev.viz.live.snapshot import Snapshot, take_snapshot
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
-_WHOLE_COST = 4.0  # what a picture costs a loop on all cores, by the CPU time of drawing it: benchmarks.speed.live_view
+_WHOLE_COST = 4.0  # cost of a picture for a loop on all cores, by its CPU time: benchmarks.speed.live_view
 _USED_IDLENESS = 0.5  # share of a loop's spare time that drawing may take
 
 
 class Load:
-    """How busy the calling thread and all cores are."""
+    """The load of the calling thread and of all cores."""
 
     def __init__(self) -> None:
         self._num_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -30,7 +30,7 @@ class Load:
         return time.perf_counter(), time.thread_time(), time.process_time()
 
     def measure_idleness(self) -> float:
-        """Return the share of the time since the call before in which this thread, and the cores, had nothing to do."""
+        """Return the idle share of this thread, and of the cores, since the previous call."""
         now = self._now()
         wall, thread, process = (b - a for a, b in zip(self._before, now, strict=True))
         self._before = now
@@ -93,7 +93,7 @@ class LiveView:
         scan: Any = None,
         plan: Any = None,
     ) -> bool:
-        """Show the map as it is now, unless pictures have had their share of the time.
+        """Show the present map, unless pictures have used their share of the time.
 
         Args:
             T_map_base: as for `take_snapshot`, like all others.

@@ -40,7 +40,7 @@ class Page:
 
     Raises:
         ModuleNotFoundError: viser is missing.
-        ValueError: the port is none, or the host no address of this machine.
+        ValueError: the port is invalid, or the host is not an address of this machine.
     """
 
     def __init__(
@@ -182,12 +182,12 @@ class Page:
 
 
 def _is_worth_logging(record: logging.LogRecord) -> bool:
-    """Tell whether to log a server's message: browsers may connect in advance and then ask for nothing."""
+    """Return whether to log a server's message: browsers may connect in advance and then ask for nothing."""
     return "handshake failed" not in record.getMessage()
 
 
 def _require_own_address(host: str) -> None:
-    """Refuse an address that the server would wait for in vain."""
+    """Refuse an address at which the server cannot listen."""
     try:
         with socket.create_server((host, 0)):
             pass

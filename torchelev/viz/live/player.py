@@ -20,7 +20,7 @@ _MAX_DELAY = 0.5  # [s] behind the recording's time
 
 
 class History:
-    """Snapshots for going back, evenly spaced in the recording; when memory is short, every second one goes.
+    """Snapshots for going back, evenly spaced in the recording; when memory is short, every second one is dropped.
 
     Args:
         max_bytes: memory of the snapshots.
@@ -92,12 +92,12 @@ class Player:
             self._ask_for(int(event.target.value) - 1)
 
     def _press(self, button: str) -> None:
-        """Do what a button says."""
+        """Perform a button's action."""
         if button == "play":
             with self._changed:
                 self._is_playing, self._wanted = True, None
                 if not self._is_over and self._shown < self._now:
-                    self._wanted = self._now  # go on with the mapping
+                    self._wanted = self._now  # continue the mapping
                 elif self._is_over and self._shown >= self._now:
                     self._shown = -1  # play again
                 self._restart_clock()
@@ -136,7 +136,7 @@ class Player:
             self._show_earlier()
 
     def hold(self) -> None:
-        """Stay on the page after the last scan, so that one can go back and play again, until Ctrl-C raises."""
+        """Keep the page open after the last scan, for playing again, until Ctrl-C raises."""
         if self._latest is not None:
             self._draw(self._now, self._latest)
         self._is_playing, self._is_over = False, True
@@ -156,10 +156,10 @@ class Player:
         return self._is_over and self._is_playing and self._wanted is None and self._shown < self._now
 
     def _wait_until_due(self, time_now: float) -> None:
-        """Wait until the wall clock has come to a time of the recording [s], or somebody asks for another scan."""
+        """Wait until the wall clock reaches a time of the recording [s], or the user asks for another scan."""
         wall, speed = time.monotonic(), SPEEDS[self._speed.value]
         if self._start is None or wall - self._start[0] > (time_now - self._start[1]) / speed + _MAX_DELAY:
-            self._start = wall, time_now  # mapping cannot keep up: go on from here
+            self._start = wall, time_now  # mapping cannot keep up: continue from here
         left = self._start[0] + (time_now - self._start[1]) / speed - wall
         with self._changed:
             self._changed.wait_for(lambda: self._wanted is not None or not self._is_playing, timeout=max(left, 0.0))
@@ -174,7 +174,7 @@ class Player:
             return self._wanted > self._now
 
     def _show_earlier(self) -> None:
-        """Show the scan that somebody asked for, if it was fused already."""
+        """Show the scan that the user asked for, if it is fused already."""
         with self._changed:
             wanted = self._wanted
             if wanted is None or (wanted > self._now and self._now < self._num_scans - 1):

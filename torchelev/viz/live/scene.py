@@ -15,7 +15,7 @@ from torchelev.viz.live.surface import bound_sheet, surface
 
 _COLORS = {BOUND: (120, 150, 190), CLOUD: (230, 60, 60), SCAN: (240, 228, 66), PATH: (213, 94, 0), PLAN: (230, 159, 0)}
 _OUTLINE, _HOLE = (0, 114, 178), (204, 121, 167)
-_LIFT = 0.01  # [m] of lines above the surface, or they would hide in it
+_LIFT = 0.01  # [m] height of lines above the surface, which would hide them
 _MAX_PATH = 5_000
 
 

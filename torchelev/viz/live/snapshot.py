@@ -1,4 +1,4 @@
-"""What one picture of the live view shows, copied from the map and its robot."""
+"""The content of one picture of the live view, copied from the map and its robot."""
 
 from __future__ import annotations
 

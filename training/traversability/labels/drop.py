@@ -56,7 +56,7 @@ class Outcome(NamedTuple):
     touched: bool  #: the body touched the ground
 
     def stood(self, robot: RobotConfig) -> bool:
-        """Tell whether the robot stayed in place, on its feet only."""
+        """Return whether the robot stayed in place, on its feet only."""
         still = self.moved <= _MAX_MOTION * robot.length and self.tilted <= _MAX_TILT
         return still and not self.touched
 
@@ -114,7 +114,7 @@ def _posture(balls: Tensor, middle: Tensor, gradient: Tensor, xy: Tensor, theta:
 
 
 def has_clear_legs(field: HeightField, tile: int, posture: Posture, robot: RobotConfig) -> bool:
-    """Tell whether straight legs from the body's corners to the feet stay above the ground."""
+    """Return whether straight legs from the body's corners to the feet stay above the ground."""
     half = torch.tensor([robot.length / 2, robot.width / 2])
     hips = posture.position + torch.cat([torch.tensor(CORNERS) * half, torch.zeros(4, 1)], 1) @ posture.rotation.t()
     fraction = torch.linspace(0, 1, 12)[:, None, None]

@@ -47,8 +47,8 @@ def cloud(scan, T=None):
 
 def messages(T=None):
     """Topic, name of the type and fields of all messages of the drive."""
-    told = drive()
-    first = told.stamps[0]
+    truth = drive()
+    first = truth.stamps[0]
     yield (
         first,
         "/transforms",
@@ -59,13 +59,13 @@ def messages(T=None):
     K = CAMERA.intrinsics.double().numpy().ravel().tolist()
     info = stamped(first, frame_id="camera", width=CAMERA.width, height=CAMERA.height, K=K)
     yield first, "/camera/depth/camera_info", "CameraCalibration", info
-    for stamp, base in zip(told.stamps, told.bases, strict=True):
+    for stamp, base in zip(truth.stamps, truth.bases, strict=True):
         yield stamp, "/transforms", "FrameTransform", transform(stamp, "odom", "base_link", base)
         for child, mount in (("lidar", T_BASE_LIDAR), ("camera", T_BASE_CAMERA)):
             yield stamp, "/transforms", "FrameTransform", transform(stamp, "base_link", child, mount)
-    for scan in told.clouds:
+    for scan in truth.clouds:
         yield scan.stamp, "/lidar", "PointCloud", cloud(scan, T)
-    for scan, image in told.depths:
+    for scan, image in truth.depths:
         raw = np.nan_to_num(image, nan=0.0).astype("<f4")
         size = {"height": image.shape[0], "width": image.shape[1], "step": 4 * image.shape[1]}
         data = stamped(scan.stamp, frame_id="camera", encoding="32FC1", data=raw.tobytes(), **size)

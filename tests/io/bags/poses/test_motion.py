@@ -1,4 +1,4 @@
-"""Jumps are told from motion, whatever the rate, speed and noise of the poses."""
+"""Jumps are distinguished from motion, whatever the rate, speed and noise of the poses."""
 
 import numpy as np
 import pytest

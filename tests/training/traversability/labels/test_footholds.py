@@ -49,7 +49,7 @@ def test_soles_are_the_planes_of_what_carries(seed):
     for n in range(5):
         carries = (z[:, n].max() - z[:, n] <= 0.03).numpy()
         if carries.sum() < 6:
-            continue  # do not tell a plane
+            continue  # span no plane
         A = np.column_stack([np.ones(13), points.numpy()])[carries]
         (height, *gradient), *_ = np.linalg.lstsq(A, z[carries, n].numpy(), rcond=None)
         residual = z[carries, n].numpy() - A @ [height, *gradient]

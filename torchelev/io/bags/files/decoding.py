@@ -63,7 +63,7 @@ def has_type(store: Any, name: str) -> bool:
 
 
 def deserializer(store: Any, name: str, is_cdr: bool) -> Callable[[bytes], Any]:
-    """Return what decodes messages of a type in rosbags' types."""
+    """Return the decoder of messages of a type in rosbags' types."""
     deserialize = store.deserialize_cdr if is_cdr else store.deserialize_ros1
     return lambda raw: deserialize(_unpacked(raw), name)
 

@@ -26,7 +26,7 @@ _NAMES = ("UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLO
 
 
 def make_foxglove_decoder(name: str, encoding: str, schema: bytes) -> Callable[[bytes], Any]:
-    """Return what decodes messages of a type in `FOXGLOVE` as those of ROS.
+    """Return the decoder of messages of a type in `FOXGLOVE`, which makes messages of ROS.
 
     Args:
         name: of the type.

@@ -1,4 +1,4 @@
-"""Several files of one recording as one."""
+"""Read several files of one recording as one."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class JoinedReader:
 
 
 def describe_gap(readers: Sequence[tuple[Path, Reader]]) -> str:
-    """Return a sentence if nothing was recorded between two parts for long: one may be missing; else ""."""
+    """Return a sentence if there is a long gap between two parts, as one may be missing; else ""."""
     spans = sorted((reader.times, file.name) for file, reader in readers if reader.times)
     for (before, one), (after, other) in zip(spans, spans[1:], strict=False):
         if (gap := after[0] - before[1]) > _MAX_GAP:
@@ -62,7 +62,7 @@ def describe_gap(readers: Sequence[tuple[Path, Reader]]) -> str:
 
 
 def are_parts(readers: Sequence[tuple[Path, Reader]]) -> bool:
-    """Return whether files are parts of one recording: called alike but for numbers, or recorded at the same time."""
+    """Return whether files are parts of one recording: names that differ in numbers only, or overlapping times."""
     names = {re.sub(r"[\d_.-]+", "", file.name) for file, _ in readers}
     spans = sorted(reader.times for _, reader in readers if reader.times)
     return len(names) == 1 or all(after[0] <= before[1] for before, after in zip(spans, spans[1:], strict=False))

@@ -20,7 +20,7 @@ _HEAD_BYTES = 4096  # of a metadata.yaml, which begin with its key
 
 
 def is_bag_file(path: Path) -> bool:
-    """Return whether a file is called as a bag is, compressed or not."""
+    """Return whether a file has the suffix of a bag, compressed or not."""
     return path.suffix in SUFFIXES or (path.suffix in _COMPRESSED and Path(path.stem).suffix in SUFFIXES)
 
 
@@ -58,7 +58,7 @@ def open_reader(path: Path, stack: ExitStack) -> Reader:
             return _opened(RosbagsReader(path), stack)
         except ModuleNotFoundError:
             raise
-        except Exception:  # rosbags lets through what its file formats raise: each file is tried by itself
+        except Exception:  # rosbags passes on exceptions of its file formats: each file is tried by itself
             note = _describe_missing(path)
     files = bag_files(path)
     if not files:
@@ -76,7 +76,7 @@ def _join(path: Path, readers: list[tuple[Path, Reader]], note: str, has_metadat
 
 
 def _open_file(path: Path, stack: ExitStack) -> Reader:
-    """Return the reader that reads most of a file: rosbags', else mcap's, else one that stops where the file does."""
+    """Return the most capable reader of a file: rosbags', else mcap's, else one that reads up to the damage."""
     if path.suffix in _COMPRESSED:
         path = _decompress(path, stack)
     journal = path.with_name(f"{path.name}-wal")

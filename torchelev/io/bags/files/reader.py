@@ -1,4 +1,4 @@
-"""What `Bag` needs of a reader of files."""
+"""The interface that `Bag` needs of a reader of files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class Channel(NamedTuple):
     """Messages of one topic and type."""
 
     topic: str  #: such as "/lidar/points"
-    type: str  #: as which they are read, such as "sensor_msgs/msg/PointCloud2"; what they are if they are not read
+    type: str  #: type that they are read as, such as "sensor_msgs/msg/PointCloud2"; their own type if they are not read
     num: int  #: of messages
     decode: Callable[[bytes], Any] | None = None  #: returns a message of its bytes; None: they cannot be read
     problem: str = ""  #: why they cannot be read

@@ -70,7 +70,7 @@ class UnfinishedReader:
             self._error = " ".join(str(error).split()) or type(error).__name__
 
     def _describe_ending(self, seconds: float) -> str:
-        """Return how far a file could be read [s], if it has no proper end."""
+        """Return the time [s] up to which a file without a proper end could be read."""
         upto = f"read up to {seconds:.1f} s after its start"
         if not _HAS_END[self._path.suffix](self._path):
             return f"the bag was not closed: {upto}"

@@ -1,4 +1,4 @@
-"""Points of a message, and why a message cannot be used, or not fully."""
+"""Points of a message, and errors and notes of messages that cannot be used, or only in part."""
 
 from __future__ import annotations
 
@@ -28,4 +28,4 @@ class Cloud(NamedTuple):
 
     points: NDArray[np.float32]  #: (N, 3) [m]; NaN where there is no return
     times: NDArray[np.float64] | None  #: (N,) [s] from the message's stamp; None: all at once
-    notes: tuple[Note, ...] = ()  #: what is not used of it
+    notes: tuple[Note, ...] = ()  #: notes on data that are not used

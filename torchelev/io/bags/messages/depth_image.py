@@ -16,7 +16,7 @@ _MILLIMETRES = 1e-3  # [m]
 _UNITS = {"16UC1": _MILLIMETRES, "mono16": _MILLIMETRES, "32FC1": 1.0}  # [m] of depth, by encoding
 _NEAREST, _FARTHEST, _FARTHEST_FLOAT = 0.05, 10.0, 100.0  # [m] between which the depths of cameras lie
 _MOST, _FEW = 0.5, 0.1  # parts of an image
-_SATURATED = 65534.5  # units from which on an integer only says that there is nothing nearer
+_SATURATED = 65534.5  # units from which on an integer means that nothing is nearer
 
 
 class CameraSettings(NamedTuple):
@@ -69,7 +69,7 @@ def _decode(message: Any, data: NDArray[np.uint8], scale: float | None) -> NDArr
 
 
 def _doubt(depth: NDArray[np.float32], saturated: float | None) -> Note | None:
-    """Return a note if the depths are such as no camera gives: their unit is probably another one.
+    """Return a note if no camera gives such depths: their unit is probably another one.
 
     Integers beyond `saturated` [m] do not count; None: they are floats, whose background may be far away.
     """

@@ -32,7 +32,7 @@ def read_laser_scan(message: Any, period: float | None = None) -> Cloud:
 
 
 def _time_step(increment: float, num_rays: int, period: float | None) -> tuple[float, Note | None]:
-    """Return the time between two rays [s], 0 if it is unknown, and what is odd about it."""
+    """Return the time between two rays [s], 0 if it is unknown, and a note if it is implausible."""
     duration, limit = increment * (num_rays - 1), longest_scan(period)
     if not duration > 0 or duration <= limit:
         return (increment if duration > 0 else 0.0), None

@@ -1,4 +1,4 @@
-"""Messages that hold clouds only for the driver of the lidar."""
+"""Raw packets of lidars, which only the lidar's driver can decode."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ _PACKETS = {
 
 
 def converter_of(type_: str) -> str:
-    """Return the package whose driver makes clouds of messages of a type; "": they are no packets of a lidar."""
+    """Return the package whose driver makes clouds of messages of a type; "": they are not packets of a lidar."""
     return _PACKETS.get(type_.rsplit("/", 1)[-1], "")

@@ -1,4 +1,4 @@
-"""The bytes of messages, in whatever type a library gives them."""
+"""The bytes of messages, from any type that a library returns."""
 
 from __future__ import annotations
 

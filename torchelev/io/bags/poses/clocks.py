@@ -1,4 +1,4 @@
-"""Clocks that differ or were never set: found before mapping, from stamps and the times of recording."""
+"""Find clocks that differ or were never set, before mapping, from stamps and the times of recording."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ClockError(RecordingError):
 
 
 class PoseClock:
-    """The clock of the moving frames on the ways from the map to some frames.
+    """The clock of the moving frames between the map and some frames.
 
     Args:
         tree: all transforms.
@@ -137,7 +137,7 @@ class PoseClock:
 
 
 class SettingWatch:
-    """Notices scans whose clock is set during a recording, so that it is not that of the poses any more.
+    """Notices scans whose clock is set during a recording and then differs from that of the poses.
 
     Args:
         clock: of the poses.

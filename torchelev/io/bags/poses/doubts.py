@@ -1,4 +1,4 @@
-"""Sentences on poses that are probably wrong: they jump, or the robot does not move where it should."""
+"""Warnings about poses that are probably wrong: they jump, or the robot does not move as expected."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Choose the frame of the map and that of the robot's base: the frames between which the robot travels.
 
-A map's frame is one in which the base travels as far as it does at all; of several, the one nearest to the base, so
+A map's frame is one in which the base travels farthest; of several, the one nearest to the base, so
 that odometry comes before localisation, which jumps. Frames of the robot, such as a footprint that moves below a body,
 are none. Names decide where motion does not: of a robot that stands still, or between frames that move alike.
 """
@@ -17,7 +17,7 @@ from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.bags.topics import BagRequest
 from torchelev.io.errors import RecordingError
 
-_CLEAR = 0.3  # [m] of travel that is no sway of a body
+_CLEAR = 0.3  # [m] of travel beyond the sway of a body
 _BRANCH = 1.0  # [m] that a base travels in a frame below it, such as odometry upside down; legs and wheels are nearer
 _HINT = (
     "give --poses TOPIC, or --map-frame and --base-frame, as of a still robot; --rays-from FRAME if the clouds are in "
@@ -30,7 +30,7 @@ class Frames(NamedTuple):
 
     map: str  #: in which the map is built
     base: str  #: that the window follows
-    notes: list[str]  #: what is doubtful about them
+    notes: list[str]  #: notes on doubtful frames
 
 
 def choose_frames(path: Path, tree: TransformTree, sensor: str, request: BagRequest) -> Frames:
@@ -114,7 +114,7 @@ def _farthest(tree: TransformTree, frames: list[str]) -> str | None:
 
 
 def _moving(tree: TransformTree, frames: list[str]) -> list[str]:
-    """Return those of the frames that move in their parents; where nothing does, those that could."""
+    """Return the frames that move in their parents or, if none does, those that could."""
     could = [frame for frame in frames if tree.parent(frame) is not None and not tree.is_static(frame)]
     return [frame for frame in could if not tree.is_constant(frame)] or could
 
@@ -128,7 +128,7 @@ def _below(tree: TransformTree, frame: str) -> list[str]:
 
 
 def _choose_above(tree: TransformTree, base: str) -> str | None:
-    """Return the frame above the base in which it travels; None if all there are frames of the robot, and still."""
+    """Return the frame above the base in which it travels; None if there are only still frames of the robot."""
     candidates = _candidates(tree, base)
     far = {frame: motion(tree, frame, base).travel for frame in candidates}
     if not far:
@@ -140,7 +140,7 @@ def _choose_above(tree: TransformTree, base: str) -> str | None:
 
 
 def _candidates(tree: TransformTree, base: str) -> list[str]:
-    """Return the frames above the base in whose parts something moves; no frames of the robot if there are others."""
+    """Return the frames above the base with moving descendants; frames of the robot only if there are no others."""
     above = tree.ancestors(base)
     found = [_fixed_alike(tree, str(tree.parent(frame))) for frame in _moving(tree, above[:-1])]
     return [frame for frame in found if not is_robot(frame)] or found
@@ -157,7 +157,7 @@ def _fixed_alike(tree: TransformTree, frame: str) -> str:
 
 
 def _choose_below(tree: TransformTree, sensor: str) -> str | None:
-    """Return the frame below the robot in which it travels: odometry that is published upside down."""
+    """Return the frame below the robot in which it travels: odometry that is published inverted."""
     root = tree.ancestors(sensor)[-1]
     frames = [frame for frame in _below(tree, root) if not is_robot(frame)]
     far = {frame: motion(tree, frame, root).travel for frame in frames}
@@ -173,7 +173,7 @@ def _base_above(tree: TransformTree, sensor: str) -> str:
 
 
 def _describe(tree: TransformTree, sensor: str) -> str:
-    """Return what is around a sensor that nothing moves."""
+    """Describe the frames above a sensor without a moving base, and the frames that move."""
     above = ", ".join(tree.ancestors(sensor)[1:]) or "none"
     moving = [f"{frame} in {tree.parent(frame)}" for frame in _moving(tree, _below(tree, tree.ancestors(sensor)[-1]))]
     return f"above it are {above}" + (f", and what moves is {', '.join(moving)}" if moving else "")

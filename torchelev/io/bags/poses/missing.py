@@ -1,4 +1,4 @@
-"""Errors for frames that are missing or not connected, with the options that give what the bag leaves open."""
+"""Errors for frames that are missing or not connected, with the options that supply them."""
 
 from __future__ import annotations
 

@@ -16,14 +16,14 @@ _USUAL = 3.0  # times the steps that 95 % do not exceed
 
 
 class Motion(NamedTuple):
-    """How far a frame comes in another."""
+    """How far a frame travels in another."""
 
     travel: float  #: [m] diagonal of the box around its places; jumps do not count
     turn: float  #: [rad] largest angle to its first pose
 
 
 def motion(tree: TransformTree, target: str, source: str) -> Motion:
-    """Return how far a frame moves in another one; not at all where there is no way between them."""
+    """Return how far a frame moves in another one; 0 where no transforms connect them."""
     common = set(tree.ancestors(target)) & set(tree.ancestors(source))
     stamps = np.unique(tree.stamps(target, source)) if common else np.zeros(0)
     stamps = stamps[np.unique(np.linspace(0, len(stamps) - 1, _SAMPLES).astype(int))] if len(stamps) else stamps
@@ -38,7 +38,7 @@ def motion(tree: TransformTree, target: str, source: str) -> Motion:
 
 
 def find_jumps(stamps: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which steps between poses (K, 4, 4) at times (K,) [s] are no motion, (K - 1,).
+    """Return which steps between poses (K, 4, 4) at times (K,) [s] are jumps, not motion, (K - 1,).
 
     A step is compared with those before and after it: it may differ from the nearer one by what a strong acceleration
     does in its time, and by three times what is usual in this recording.

@@ -1,4 +1,4 @@
-"""What the names of frames say, where motion alone does not decide."""
+"""Classify frames by their names, where motion alone does not decide."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ _ROBOT = {
 
 
 def is_base(frame: str) -> bool:
-    """Return whether a frame is called as a robot's base is: base_link, robot1/base_footprint, trunk, ..."""
+    """Return whether a frame has the name of a robot's base: base_link, robot1/base_footprint, trunk, ..."""
     name = frame.rsplit("/", 1)[-1].lower()
     return name in _BASES or name.endswith(("_base_link", "_base_footprint"))
 
 
 def is_world(frame: str) -> bool:
-    """Return whether a frame is called as a fixed frame is: odom, map, robot1/odom_lidar, camera_init, ..."""
+    """Return whether a frame has the name of a fixed frame: odom, map, robot1/odom_lidar, camera_init, ..."""
     return frame == "vision" or bool(_WORLD & _words(frame))
 
 
 def is_robot(frame: str) -> bool:
-    """Return whether a frame is called as a part of a robot is, and not as a fixed frame."""
+    """Return whether a frame has the name of a part of a robot, and not of a fixed frame."""
     return not is_world(frame) and bool(_ROBOT & _words(frame))
 
 

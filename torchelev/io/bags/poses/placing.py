@@ -37,7 +37,7 @@ class Placed(NamedTuple):
     sensor: str  #: frame of the first scan
     fixed: frozenset[str]  #: frames of clouds that are in the map's frame already
     rays_from: str  #: frame at which their rays start; "" if there are none
-    span: tuple[float, float]  #: [s] what is mapped, by the time of recording
+    span: tuple[float, float]  #: [s] mapped interval, by the time of recording
     clock: PoseClock  #: of the poses
     offsets: dict[str, float]  #: [s] by which the clocks of topics are to be set
     notes: list[str]  #: what is doubtful
@@ -142,7 +142,7 @@ def _find_fixed(
 
 
 def _hold_constant(tree: TransformTree, map_frame: str, base: str) -> None:
-    """Let transforms that never change hold at all times; those of a robot that stands still only at their times."""
+    """Extend transforms that never change to all times, except those of a robot that stands still."""
     way = tree.way(map_frame, base)
     kept = [] if any(not tree.is_constant(frame) for frame in way) else way
     tree.hold(frame for frame in tree.frames if tree.parent(frame) and frame not in kept and tree.is_constant(frame))

@@ -17,7 +17,7 @@ TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 class Poses(NamedTuple):
-    """Where everything was over a recording."""
+    """The poses of all frames over a recording."""
 
     tree: TransformTree  #: of all frames
     covariances: PoseCovariances  #: of the base's pose; may be empty
@@ -113,7 +113,7 @@ def _join(names: list[str]) -> str:
 
 
 def _check_poses(bag: Bag, request: BagRequest, types: dict[str, Topic]) -> None:
-    """Refuse a topic of poses that is not there, is of another type or leaves the frame open."""
+    """Refuse a topic of poses that is missing, has another type or does not name the frame."""
     if request.poses is None:
         return
     kind = types[request.poses].type if request.poses in types else "not in the bag"

@@ -16,7 +16,7 @@ from torchelev.io.bags.scans import clean
 
 
 class FrameError(LookupError):
-    """There is no way between two frames. The message says which frames exist and where the tree is broken."""
+    """No transforms connect two frames. The message says which frames exist and where the tree is broken."""
 
 
 class _Edge(NamedTuple):
@@ -53,8 +53,8 @@ class TransformTree:
     ) -> None:
         """Add the pose of a frame in its parent at a time [s]: position x, y, z [m], quaternion x, y, z, w.
 
-        A new parent replaces the old one. A pose that is not finite, or whose quaternion is none, is left out. Static
-        poses are left out where others are known; `recorded` is when it was recorded [s].
+        A new parent replaces the old one. A pose that is not finite, or whose quaternion is invalid, is left out.
+        Static poses are left out where others are known; `recorded` is when it was recorded [s].
         """
         parent, child, row = clean(parent), clean(child), (stamp, *pose)
         if not (np.isfinite(row).all() and sum(q * q for q in row[4:]) > 0.5):
@@ -143,7 +143,7 @@ class TransformTree:
         """Return T_target_source at times (M,) [s], (M, 4, 4); NaN where a transform is not known then.
 
         Raises:
-            FrameError: there is no way between the frames.
+            FrameError: no transforms connect the frames.
         """
         up, down = self.ancestors(source), self.ancestors(target)
         common = next((frame for frame in up if frame in down), None)
@@ -163,7 +163,7 @@ class TransformTree:
         return [frame for frame in self.way(target, source) if not self.is_static(frame)]
 
     def stamps(self, target: str, source: str) -> NDArray[np.float64]:
-        """Return the times [s] of all poses that move between two frames; of none, that there is no motion: [0]."""
+        """Return the times [s] of all moving poses between two frames; [0] if none moves."""
         frames = self.moving_between(target, source)
         return np.concatenate([self.rows(frame)[:, 0] for frame in frames]) if frames else np.zeros(1)
 
@@ -216,7 +216,7 @@ class TransformTree:
         return [line for line in lines if line]
 
     def explain(self, target: str, source: str) -> str:
-        """Return why there is no way between two frames."""
+        """Return why no transforms connect two frames."""
         known = ", ".join(self.frames) or "none"
         for frame in (target, source):
             if frame not in self.frames:

@@ -32,7 +32,7 @@ Copy = Callable[[tuple[int, int], tuple[int, int], Sequence[str]], SavedMap]  # 
 
 
 class Area(NamedTuple):
-    """What is exported."""
+    """The area and layers to export."""
 
     corner: tuple[int, int]  #: number of the first cell
     size: tuple[int, int]  #: H, W in cells
@@ -67,7 +67,7 @@ def choose_area(
 
 
 def export(path: str | Path, area: Area, place: Place) -> None:
-    """Write an area to a file of the kind that its suffix says."""
+    """Write an area to a file in the format of its suffix."""
     suffix = Path(path).suffix.lower().replace(".tiff", ".tif")
     writers = {".tif": _write_tif, ".png": _write_png, ".ply": _write_ply, ".npz": _write_npz}
     require(suffix in writers, "path", f"must end with {', '.join(writers)}", repr(str(path)), "choose one of these")
@@ -81,7 +81,7 @@ def export(path: str | Path, area: Area, place: Place) -> None:
 
 
 def _find_border(tiles: Tiles, layers: tuple[str, ...], axis: int, is_end: bool) -> int:
-    """Return the first number on an axis of a cell that is known, or the one behind the last; look there alone."""
+    """Return the number of the first known cell along an axis, or one past the last; reads tiles at that end only."""
     rows = [LAYERS.index(source) for source in sources_of(layers)]
     for line in sorted({tile[axis] for tile in tiles}, reverse=is_end):
         chosen = [tile for tile in tiles if tile[axis] == line]
@@ -174,7 +174,7 @@ def _write_png(path: str | Path, area: Area, place: Place) -> None:
 
 
 def _shade(values: NDArray, resolution: float) -> NDArray[np.float32]:
-    """Return how bright each cell is in light from the north-west, at 45 degrees; 1 next to unknown cells."""
+    """Return the brightness of each cell in light from the north-west, at 45 degrees; 1 next to unknown cells."""
     if min(values.shape) < 2:
         return np.ones(values.shape, np.float32)
     south, east = np.gradient(values, resolution)

@@ -61,7 +61,7 @@ class AttentionConfig:
         """Build the settings from a dict, as read from a file.
 
         Raises:
-            ValueError: for a name that is no setting, or a value out of range.
+            ValueError: for a name that is not a setting, or a value out of range.
         """
         names = [field.name for field in dataclasses.fields(cls)]
         unknown = [name for name in values if name not in names]

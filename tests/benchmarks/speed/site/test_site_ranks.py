@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.speed import site_ranks
+from benchmarks.speed.site import site_ranks
 
 
 @pytest.mark.slow(6)

@@ -1,4 +1,4 @@
-"""Giving back: maps start with what a site knows."""
+"""Filling the unknown cells of maps with what a site knows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.site.fusion.entries import rise
-from torchelev.site.fusion.windows import Told, move_known
+from torchelev.site.fusion.windows import Contribution, move_known
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter.stage import follow
 from torchelev.state import MapState
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from torchelev.elevation_map import ElevationMap
 
-SUPPORT = 6.0  # points that must disagree until what a site remembers is replaced
+SUPPORT = 6.0  # points that must disagree before a height of the site is replaced
 
 
 def center_on(state: MapState, emap: ElevationMap, T_map_base: Float[Tensor, "B 4 4"], chosen: Tensor) -> MapState:
@@ -30,41 +30,50 @@ def center_on(state: MapState, emap: ElevationMap, T_map_base: Float[Tensor, "B 
     return follow(state, near, anchor.long(), emap.cfg.grid)
 
 
-def move_told(told: Told, corner: Int[Tensor, "B 2"], now: float, resolution: float) -> Told:
-    """Return what was told, of the windows at other corners, and as of another time [s]."""
-    known = move_known(told.known, corner)
+def move_contribution(
+    contribution: Contribution, corner: Int[Tensor, "B 2"], now: float, resolution: float
+) -> Contribution:
+    """Return a contribution with the windows at other corners, and as of another time [s]."""
+    known = move_known(contribution.known, corner)
     passed = (now - known.now)[:, None, None]
     age, variance = known.age + passed, known.variance + known.rate[:, None, None] * passed
     known = known._replace(age=age.to(known.age), variance=variance.to(known.variance), now=known.now * 0 + now)
-    moved = (corner - told.known.corner) * resolution  # tilts turn about the windows' centres
-    offset = told.alignment.offset + (told.alignment.tilt * moved).sum(1)
-    return told._replace(known=known, alignment=told.alignment._replace(offset=offset))
+    moved = (corner - contribution.known.corner) * resolution  # tilts turn about the windows' centres
+    offset = contribution.alignment.offset + (contribution.alignment.tilt * moved).sum(1)
+    return contribution._replace(known=known, alignment=contribution.alignment._replace(offset=offset))
 
 
 def fill(
-    state: MapState, emap: ElevationMap, known: Remembered, told: Told, chosen: Tensor, resolution: float
+    state: MapState,
+    emap: ElevationMap,
+    known: Remembered,
+    contribution: Contribution,
+    chosen: Tensor,
+    resolution: float,
 ) -> MapState:
     """Fill the unknown cells of the chosen environments with what a site knows, raised by how they lie above it."""
     place = torch.arange(state.elevation.numel(), device=chosen.device)
     robot = place // state.elevation[0].numel()
-    above = rise(told.known, told.alignment, robot, place, resolution).view_as(known.elevation)
+    above = rise(contribution.known, contribution.alignment, robot, place, resolution).view_as(known.elevation)
     before = known._replace(elevation=known.elevation + above, upper_bound=known.upper_bound + above)
     return recall(state, before, chosen, emap.cfg.fusion.max_variance, SUPPORT)
 
 
-def remember_given(told: Told, before: MapState, after: MapState, rate: float, chosen: Bool[Tensor, "B"]) -> Told:
-    """Return what a site knows of B maps, now that the chosen ones were filled from it; `rate` is the site's."""
-    given, known = after.validity & ~before.validity, told.known
+def add_filled(
+    contribution: Contribution, before: MapState, after: MapState, rate: float, chosen: Bool[Tensor, "B"]
+) -> Contribution:
+    """Return the contribution of B maps, with the cells that a site of this variance rate filled."""
+    filled, known = after.validity & ~before.validity, contribution.known
 
     def choose(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(given, new.to(old.dtype), old)
+        return torch.where(filled, new.to(old.dtype), old)
 
-    return told._replace(
+    return contribution._replace(
         known=known._replace(
             elevation=choose(after.elevation, known.elevation),
             variance=choose(after.variance, known.variance),
             age=choose(after.time, known.age),
-            is_known=known.is_known | given,
+            is_known=known.is_known | filled,
             rate=torch.where(chosen, rate, known.rate),
         )
     )

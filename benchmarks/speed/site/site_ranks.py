@@ -1,6 +1,6 @@
 """Time merges of the same robots into a site that 1, 2 or 4 processes share.
 
-    python -m benchmarks.speed.site_ranks
+    python -m benchmarks.speed.site.site_ranks
 
 Robots stand on a square 8 m apart, with windows of 12 x 12 m at 10 cm that know all their ground, and measure it anew
 before each merge. Processes are on this machine, with one thread each and gloo. All ranks align and fuse the robots of
@@ -44,7 +44,9 @@ def _measure(num_robots: int, size: int, on_disk: bool, merges: int) -> dict[str
         times = [pickle.loads((folder / str(rank)).read_bytes()) for rank in range(size)]
     seconds = [max(each) for each in zip(*times, strict=True)]  # of the slowest rank
     cells = round(LENGTH / RESOLUTION)
-    bytes_per_robot = [Layout(cells, cells, told).num_bytes if size > 1 else 0 for told in (False, True)]
+    bytes_per_robot = [
+        Layout(cells, cells, with_contribution).num_bytes if size > 1 else 0 for with_contribution in (False, True)
+    ]
     quarters = statistics.quantiles(seconds[1:], n=4)
     own = {"processes": size, "robots": num_robots, "on_disk": on_disk, "first_ms": 1e3 * seconds[0]}
     later = {"median_ms": 1e3 * quarters[1], "iqr_ms": 1e3 * (quarters[2] - quarters[0])}

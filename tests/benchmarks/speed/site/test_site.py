@@ -9,8 +9,8 @@ from click.testing import CliRunner
 
 pytest.importorskip("tensorstore", reason="needs torchelev[site]")
 
-from benchmarks.speed import site_area, site_merge
-from benchmarks.speed.site_windows import RESOLUTION, Windows, ground, lattice
+from benchmarks.speed.site import site_area, site_merge
+from benchmarks.speed.site.site_windows import RESOLUTION, Windows, ground, lattice
 from torchelev.site import SiteMap
 
 

@@ -22,8 +22,9 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks import RESULTS
-from benchmarks.speed import meter, peers
-from benchmarks.speed.peers import RESOLUTION, Peer
+from benchmarks.speed import meter
+from benchmarks.speed.postprocessing import peers
+from benchmarks.speed.postprocessing.peers import RESOLUTION, Peer
 from torchelev import filters, planes
 from torchelev.app.results import markdown_table, write_json
 from torchelev.layers import Layer

@@ -12,12 +12,12 @@ import tifffile
 from tests.site.helpers import fill, robots
 from torchelev.io.export import load_npz
 from torchelev.output_files import is_own_output
-from torchelev.site import SiteMap, export
+from torchelev.site import SiteMap, site_export
 
 
 @pytest.fixture
 def site():
-    """Known: cells -10 to 29 along x, 50 to 85 along y, but for one; heights tell the cell."""
+    """Known: cells -10 to 29 along x, 50 to 85 along y, but for one; heights encode the cell."""
     made = SiteMap(0.1)
     emap = robots([(-10, 50)], heights=lambda x, y: x + 0.01 * y)
     emap.state.validity[0, 3, 30] = False
@@ -175,7 +175,7 @@ def test_a_place_where_no_file_can_be_is_named_as_it_was_given(site, tmp_path, m
 def test_a_file_that_fails_leaves_the_older_one(site, tmp_path, monkeypatch):
     site.export(tmp_path / "a.tif")
     before = (tmp_path / "a.tif").read_bytes()
-    monkeypatch.setattr(export, "_north_up", lambda layer: 1 / 0)
+    monkeypatch.setattr(site_export, "_north_up", lambda layer: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         site.export(tmp_path / "a.tif")
     assert (tmp_path / "a.tif").read_bytes() == before and len(list(tmp_path.iterdir())) == 1

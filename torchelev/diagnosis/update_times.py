@@ -35,7 +35,7 @@ class _Times:
     num_slow: int = 0  #: slow medians in a row
 
 
-class Pace:
+class UpdateTimes:
     """Durations of updates, compared among those of as many threads and about as many points.
 
     Args:
@@ -78,22 +78,22 @@ def _warn(median: float, best: float) -> None:
     )
 
 
-def paced(update: Update) -> Update:
-    """Keep a map's `update` steady on a CPU, see `ops.waiting`, and note in its `pace` how long it takes.
+def timed(update: Update) -> Update:
+    """Keep a map's `update` steady on a CPU, see `ops.waiting`, and note in its `update_times` how long it takes.
 
     A GPU returns early, so nothing is noted there.
     """
 
     @functools.wraps(update)
-    def timed(emap: Any, /, *args: Any, **kwargs: Any) -> None:
+    def timed_update(emap: Any, /, *args: Any, **kwargs: Any) -> None:
         if torch.compiler.is_compiling():  # a graph of the caller's own cannot contain a clock
             return update(emap, *args, **kwargs)
         warn_of_fork()
-        start = emap.pace.clock()
+        start = emap.update_times.clock()
         with adapted_waits(emap.device):
             update(emap, *args, **kwargs)
         points: Any = args[0] if args else kwargs["points"]
         if points.device.type == "cpu":
-            emap.pace.note(emap.pace.clock() - start, points.numel() // 3)
+            emap.update_times.note(emap.update_times.clock() - start, points.numel() // 3)
 
-    return cast(Update, timed)
+    return cast(Update, timed_update)

@@ -1,7 +1,7 @@
 """Time merging the windows of 1 to 1,024 robots into a site, in memory and on disk.
 
-    python -m benchmarks.speed.site_merge                        # benchmarks/results/site_merge.json, three minutes
-    python -m benchmarks.speed.site_merge --rounds 3 --out here  # quicker, rougher
+    python -m benchmarks.speed.site.site_merge  # benchmarks/results/site_merge.json, three minutes
+    python -m benchmarks.speed.site.site_merge --rounds 3 --out here  # quicker, rougher
 
 Each robot has a window of 64 x 64 cells of 10 cm, which overlaps its neighbours by half. In each round the windows move
 by 4 cells along both axes, and all of their cells are measured anew. The first merge meets an empty site; steady is the
@@ -21,7 +21,7 @@ import torch
 
 from benchmarks import RESULTS
 from benchmarks.speed.meter import peak_bytes, progress
-from benchmarks.speed.site_windows import RESOLUTION, Windows, lattice
+from benchmarks.speed.site.site_windows import RESOLUTION, Windows, lattice
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap
 

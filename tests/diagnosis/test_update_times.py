@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from tests.helpers import mapped, scan
-from torchelev.diagnosis import pace
-from torchelev.diagnosis.pace import PATIENCE, WINDOW, Pace
+from torchelev.diagnosis import update_times
+from torchelev.diagnosis.update_times import PATIENCE, WINDOW, UpdateTimes
 
 
 @pytest.fixture(autouse=True)
 def _not_warned(monkeypatch):
-    monkeypatch.setattr(pace, "has_warned", False)
+    monkeypatch.setattr(update_times, "has_warned", False)
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)  # `make test` sets it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -20,7 +20,7 @@ def _not_warned(monkeypatch):
 
 
 def noted(times, num_points=1000, watch=None):
-    watch = watch or Pace()
+    watch = watch or UpdateTimes()
     for seconds in times:
         watch.note(seconds, num_points)
     return watch
@@ -43,7 +43,7 @@ def test_short_waits_are_not_proposed_where_they_are(monkeypatch, by_user):
     if by_user:
         monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
     else:
-        monkeypatch.setattr(pace, "are_waits_short", lambda: True)
+        monkeypatch.setattr(update_times, "are_waits_short", lambda: True)
     with pytest.warns(RuntimeWarning, match=r"same cores\. Call torch.set_num_threads") as caught:
         noted([*USUAL, *[0.08] * ENOUGH])
     assert "PASSIVE" not in str(caught[0].message) and "spin" not in str(caught[0].message)
@@ -64,7 +64,7 @@ def test_no_warning_without_cause(times):
 
 
 def test_clouds_that_take_turns_do_not_hide_each_other():
-    watch = Pace()
+    watch = UpdateTimes()
     for _ in range(60):
         noted([0.008], 1000, watch)
         noted([0.02], 100_000, watch)
@@ -84,18 +84,18 @@ def test_larger_clouds_and_fewer_threads_are_told_apart():
 def test_updates_are_timed_by_the_maps_clock():
     emap, (cloud, T) = mapped(), scan(5)
     ticks = iter([t for k in range(40) for t in (k, k + (0.01 if k < 20 else 0.2))])
-    emap.pace = Pace(lambda: next(ticks))
+    emap.update_times = UpdateTimes(lambda: next(ticks))
     for _ in range(19 + ENOUGH):
         emap.update(cloud, T, T, dt=0.1)
     with pytest.warns(RuntimeWarning, match="update: the last 9 updates took 200 ms"):
         emap.update(points=cloud, T_map_sensor=T, T_map_base=T, dt=0.1)
 
 
-def test_updates_elsewhere_are_not_timed(monkeypatch):
+def test_updates_on_other_devices_are_not_timed(monkeypatch):
     emap, (cloud, _), noted = mapped(), scan(5), []
-    monkeypatch.setattr(emap.pace, "note", lambda seconds, num_points: noted.append(num_points))
-    elsewhere = torch.empty(cloud.shape, device="meta")
-    pace.paced(lambda *_: None)(emap, elsewhere)
+    monkeypatch.setattr(emap.update_times, "note", lambda seconds, num_points: noted.append(num_points))
+    on_other_device = torch.empty(cloud.shape, device="meta")
+    update_times.timed(lambda *_: None)(emap, on_other_device)
     assert not noted
-    pace.paced(lambda *_: None)(emap, cloud)
+    update_times.timed(lambda *_: None)(emap, cloud)
     assert noted == [600]

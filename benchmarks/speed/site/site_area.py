@@ -1,7 +1,7 @@
 """Measure how a site on disk behaves while it grows to a square kilometre in cells of 10 cm.
 
-    python -m benchmarks.speed.site_area                         # benchmarks/results/site_area.json; six minutes, 1 GB
-    python -m benchmarks.speed.site_area --sides 100 --out here  # quicker: 100 x 100 m alone
+    python -m benchmarks.speed.site.site_area  # benchmarks/results/site_area.json; six minutes, 1 GB
+    python -m benchmarks.speed.site.site_area --sides 100 --out here  # quicker: 100 x 100 m alone
 
 16 robots with windows of 16 x 16 m hop over the area, with 4 m of overlap; all cells of each window are new. For each
 area a new process explores it, and another one then opens, samples and reads it. Memory is the largest that a process
@@ -25,7 +25,7 @@ import torch
 
 from benchmarks import RESULTS
 from benchmarks.speed.meter import milliseconds, peak_megabytes, progress, state_bytes
-from benchmarks.speed.site_windows import RESOLUTION, Windows
+from benchmarks.speed.site.site_windows import RESOLUTION, Windows
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap
 

@@ -1,0 +1,1 @@
+"""Filters and plane segmentation beside the OpenCV and SciPy calls that give the same."""
