@@ -21,6 +21,7 @@ def _fresh(tmp_path, monkeypatch):
     monkeypatch.delenv("TORCHELEV_NATIVE", raising=False)
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "answer.cpp").write_text('extern "C" int answer() { return 1; }')
     library._load.cache_clear()
     yield
     library._load.cache_clear()
