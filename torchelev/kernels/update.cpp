@@ -10,15 +10,46 @@ struct Own {
     Memory memory;
 };
 
+// What threads keep from update to update: the kernel clears memory anew, page by page, which takes longer than the work.
+class Kept {
+    std::mutex mutex;
+    std::vector<std::unique_ptr<Own>> unused;
+
+  public:
+    std::unique_ptr<Own> take() {
+        const std::lock_guard<std::mutex> lock(mutex);
+        if (unused.empty()) return std::make_unique<Own>();
+        std::unique_ptr<Own> own = std::move(unused.back());
+        unused.pop_back();
+        return own;
+    }
+    void put(std::unique_ptr<Own> own) {
+        const std::lock_guard<std::mutex> lock(mutex);
+        unused.push_back(std::move(own));
+    }
+} kept;
+
+// An `Own` that is put back at the end.
+struct Borrowed {
+    std::unique_ptr<Own> own = kept.take();
+
+    Borrowed() = default;
+    Borrowed(Borrowed&&) = default;
+    ~Borrowed() {
+        if (own) kept.put(std::move(own));
+    }
+};
+
 }  // namespace
 
 // Run stages in their order on maps and their inputs, in place. Returns what `code_of` does.
 extern "C" int update_maps(const MapState* state, const Inputs* inputs, const Settings* settings, const Sizes* sizes,
                            const Stage* stages, int64_t num_stages, int num_threads) {
-    auto make = [] { return std::make_unique<Own>(); };
-    auto update = [&](int64_t b, int threads, std::unique_ptr<Own>& own) {
-        Update one{*settings,           *sizes,      state->at(b, *sizes), inputs->at(b, *sizes),
-                   own->measurement,    own->memory, threads};
+    auto make = [] { return Borrowed(); };
+    auto update = [&](int64_t b, int threads, Borrowed& borrowed) {
+        Own& own = *borrowed.own;
+        Update one{*settings,          *sizes,     state->at(b, *sizes), inputs->at(b, *sizes),
+                   own.measurement,    own.memory, threads};
         for (int64_t k = 0; k < num_stages; k++) stages[k](one);
     };
     return code_of([&] { for_environments(sizes->B, num_threads, make, update); });
