@@ -51,8 +51,11 @@ STAGES = (
     Stage("reset_statistics", lambda state, m, cfg: reset_statistics(state, m)),
     Stage("subtract_disagreement", lambda state, m, cfg: subtract_disagreement(state)),
     Stage("recenter", lambda state, m, cfg: recenter(state, m, cfg.grid)),
-    Stage("age", lambda state, m, cfg: age(state, m, cfg.aging)),
-    Stage("compensate", lambda state, m, cfg: compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate)),
+    Stage("age", lambda state, m, cfg: age(state, m, cfg.aging, cfg.fusion.max_variance)),
+    Stage(
+        "compensate",
+        lambda state, m, cfg: compensate(state, m, cfg.grid, cfg.drift, cfg.drift_gate, cfg.fusion.max_variance),
+    ),
     Stage("fuse", lambda state, m, cfg: fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)),
     Stage("clear_seen_through", lambda state, m, cfg: clear_seen_through(state, m, cfg.grid, cfg.raycast)),
     Stage("clear_other_floors", lambda state, m, cfg: clear_other_floors(state, m, cfg.grid, cfg.overlap)),

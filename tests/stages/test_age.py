@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from tests import reference
 from tests.helpers import nans, pose, random_state, scan, small_map
+from tests.kernels.compare import by_cpu, by_tensors, inputs_of, require_cpu_backend
 from torchelev import AgingConfig, FusionConfig
 from torchelev.stages.age.stage import age
 from torchelev.stages.measure.stage import time_step
@@ -20,11 +21,13 @@ def test_agrees_with_the_reference(seed, rate):
     state = random_state(rng, emap.cfg.grid, 3)
     dt = torch.from_numpy(rng.uniform(0, 2, 3))
     m = emap.measure(nans(3), pose(num_envs=3), None, dt)
-    after = age(state, m, AgingConfig(variance_rate=rate))
+    max_variance = rng.uniform(0.5, 5)
+    after = age(state, m, AgingConfig(variance_rate=rate), max_variance)
     for b in range(3):
         args = (state.variance[b].numpy(), state.time[b].numpy(), dt[b].item(), rate)
         variance, time = reference.age(*args)
-        np.testing.assert_allclose(after.variance[b], variance, rtol=1e-12)
+        limited = np.where(state.validity[b], np.minimum(variance, max_variance), 1.0)
+        np.testing.assert_allclose(after.variance[b], limited, rtol=1e-12)
         np.testing.assert_allclose(after.time[b], time, rtol=1e-12)
         assert after.elapsed[b] == state.elapsed[b] + round(dt[b].item() * 1e9)
 
@@ -67,7 +70,7 @@ def test_no_time_passes_by_a_dt_that_is_not_finite_or_negative():
     emap = small_map(4)
     m = emap.measure(nans(4), pose(num_envs=4), None, 1.0)
     dt = time_step(torch.tensor([torch.nan, torch.inf, -torch.inf, -1.0]), torch.float32)
-    assert not age(emap.state, m._replace(dt=dt), AgingConfig()).elapsed.any()
+    assert not age(emap.state, m._replace(dt=dt), AgingConfig(), 1.0).elapsed.any()
 
 
 def test_elapsed_has_no_gradient():
@@ -104,3 +107,17 @@ def test_the_variance_grows_to_its_maximum():
 def test_refuses():
     with pytest.raises(ValueError, match="aging.variance_rate"):
         AgingConfig(variance_rate=-1.0)
+
+
+@pytest.mark.parametrize("run", [by_tensors, by_cpu])
+def test_no_variance_grows_beyond_its_maximum(run):
+    fusion, aging = FusionConfig(max_variance=0.25), AgingConfig(variance_rate=0.5)
+    emap = small_map(2, (19, 21), fusion=fusion, aging=aging)
+    if run is by_cpu:
+        require_cpu_backend(emap)
+    state = random_state(np.random.default_rng(0), emap.cfg.grid, 2, 0.6, torch.float32)
+    state.variance.mul_(20.0)
+    after = run(emap, state, inputs_of(emap, nans(2), pose(num_envs=2), None), "age")
+    expected = torch.where(state.validity, (state.variance + 0.5 * 0.3).clamp(max=0.25), 1.0)
+    torch.testing.assert_close(after.variance, expected)
+    assert 0.1 < (expected == 0.25).float().mean() < 0.9

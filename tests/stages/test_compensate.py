@@ -28,7 +28,7 @@ def test_agrees_with_the_reference(seed, offset, gain, min_points):
     T = pose((0.1, 0.2, 1.0), num_envs=2)
     m = emap.measure(seen_from(T, torch.from_numpy(np.stack(points))), T, None, 0.1)
     grid = emap.cfg.grid
-    after = compensate(state, m, grid, cfg, 0.5)
+    after = compensate(state, m, grid, cfg, 0.5, 1e6)
     for b in range(2):
         layers = {name: getattr(state, name)[b].numpy() for name in LAYERS}
         used = [p for p, u in zip(points[b], m.used[b], strict=True) if u]
@@ -91,7 +91,7 @@ def test_ground_counts_from_the_gate_on(gate, counts):
     emap.update(flat_cloud(0.0), pose(), None, 0.1)
     state = emap.state._replace(traversability=torch.full_like(emap.state.traversability, 0.6))
     m = emap.measure(flat_cloud(0.05), pose(), None, 0.1)
-    after = compensate(state, m, emap.cfg.grid, DriftConfig(), gate)
+    after = compensate(state, m, emap.cfg.grid, DriftConfig(), gate, 1e6)
     assert (after.statistics.drift_points.item() > 0) == counts
 
 

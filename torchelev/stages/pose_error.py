@@ -29,12 +29,12 @@ def project_covariance(
     return variance.clamp(min=0).flatten(1)
 
 
-def share_pose_error(state: MapState, m: Measurement, follows: Bool[Tensor, "B"]) -> MapState:
+def share_pose_error(state: MapState, m: Measurement, follows: Bool[Tensor, "B"], max_variance: float) -> MapState:
     """Note how uncertain the position is that the map's heights count from.
 
     A map that drift compensation has moved to the scan, or that begins with it, is as far off in height as the scan:
     its heights share the error of the pose, which no number of scans reduces. Elsewhere the scan is a measurement of
-    its own, and what the heights shared becomes part of each one's variance.
+    its own, and what the heights shared becomes part of each one's variance, up to `max_variance` [m^2].
     """
     if m.pose_covariance is None:
         return state
@@ -43,8 +43,9 @@ def share_pose_error(state: MapState, m: Measurement, follows: Bool[Tensor, "B"]
     covariance = m.pose_covariance.clone()
     is_height = torch.zeros_like(covariance, dtype=torch.bool)
     is_height[:, 2] = is_height[:, :, 2] = True
+    variance = (state.variance + shared[:, None, None]).clamp(max=max_variance)
     return state._replace(
-        variance=state.variance + shared[:, None, None] * state.validity,
+        variance=torch.where(state.validity, variance, state.variance),
         pose_covariance=torch.where(is_height & ~follows[:, None, None], 0.0, covariance),
     )
 

@@ -8,8 +8,13 @@
 extern "C" void run_age(Update& u) {
     const float dt = u.measurement.dt, added = u.settings.age.variance_rate * dt;
     *u.state.elapsed += int64_t(std::nearbyint(double(dt) * 1e9));
+    const float limit = u.settings.fusion.max_variance;
     float *time = u.state.time, *variance = u.state.variance;
+    const uint8_t* known = u.state.validity;
     u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t k = first; k < last; k++) time[k] += dt, variance[k] = aging::grow(variance[k], added);
+        for (int64_t k = first; k < last; k++) {
+            time[k] += dt;
+            variance[k] = known[k] ? aging::grow(variance[k], added, limit) : 1.0f;
+        }
     });
 }

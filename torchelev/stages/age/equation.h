@@ -5,7 +5,9 @@
 
 namespace aging {
 
-// Variance [m^2] after a time, sigma_m^2 + sigma_t^2 dt (paper, Sec. II-C), where `added` = sigma_t^2 dt.
-template <class V> INLINE V grow(V variance, float added) { return variance + added; }
+// Variance [m^2] of a known cell after a time, sigma_m^2 + sigma_t^2 dt (paper, Sec. II-C), where `added` = sigma_t^2 dt.
+template <class V> INLINE V grow(V variance, float added, float max_variance) {
+    return smaller(variance + added, all<V>(max_variance));
+}
 
 }  // namespace aging

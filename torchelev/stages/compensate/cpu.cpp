@@ -88,7 +88,11 @@ void share_pose_error(Update& u, bool applies) {
     const float shared = follows ? 0 : own[8];
     for (int k = 0; k < 9; k++)
         own[k] = !follows && (k / 3 == 2 || k % 3 == 2) ? 0 : u.measurement.pose_covariance[k];
-    for (int64_t k = 0; shared != 0 && k < u.cells(); k++) u.state.variance[k] += u.state.validity[k] ? shared : 0.0f;
+    const float limit = u.settings.fusion.max_variance;
+    for (int64_t k = 0; shared != 0 && k < u.cells(); k++) {
+        float& variance = u.state.variance[k];
+        variance = u.state.validity[k] ? smaller(variance + shared, limit) : variance;
+    }
 }
 
 // Compensate the drift; return whether a correction applies.

@@ -22,7 +22,12 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def compensate(
-    state: MapState, m: Measurement, grid: GridConfig, cfg: DriftConfig | None, min_traversability: float
+    state: MapState,
+    m: Measurement,
+    grid: GridConfig,
+    cfg: DriftConfig | None,
+    min_traversability: float,
+    max_variance: float,
 ) -> MapState:
     """Add the mean height error over flat, certain cells to elevation and upper bound (paper, Sec. II-D).
 
@@ -31,12 +36,12 @@ def compensate(
     with h the height of the cell's plane below the point. The sum covers the points whose cell is known, certain and
     rated at least `min_traversability`, with |p_z - h| <= max_error, and then those within `gate` standard deviations
     of their mean. No correction if n < min_points or |e| > max_drift, or without `cfg`. Notes by how much scans, or the
-    sensors of one, disagree.
+    sensors of one, disagree. No variance grows beyond `max_variance` [m^2].
     """
     if m.origin.shape[1] > 1:
         state = tally(state, disagreement=compare_sensors(state, m, grid))
     if cfg is None:
-        return share_pose_error(state, m, torch.zeros_like(m.dt, dtype=torch.bool))
+        return share_pose_error(state, m, torch.zeros_like(m.dt, dtype=torch.bool), max_variance)
     cells = cells_of(state, m, grid)
     px, py, pz = m.points.unbind(-1)
     suits = state.validity & (state.traversability >= min_traversability) & (state.variance <= cfg.max_variance)
@@ -64,5 +69,5 @@ def compensate(
         challenger=state.challenger + shift.detach() * (state.challenger_support > 0),
         upper_bound=state.upper_bound + shift * state.bounded,
     )
-    state = share_pose_error(state, m, applies)
+    state = share_pose_error(state, m, applies, max_variance)
     return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)
