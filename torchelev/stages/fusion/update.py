@@ -1,4 +1,4 @@
-"""The update of every cell by tensors. `native.py` (C++) and `on_gpu.py` (CUDA kernels) compute the same."""
+"""The update of every cell by tensors. `cell.h` and `equation.h` hold its fast form, for C++ and CUDA."""
 
 from __future__ import annotations
 

@@ -1,0 +1,33 @@
+"""Clouds that several threads share."""
+
+import numpy as np
+import torch
+
+from tests.helpers import random_clouds, random_poses, random_state, small_map
+from tests.kernels.compare import (
+    assert_states_close,
+    by_cpu,
+    by_tensors,
+    inputs_of,
+    require_cpu_backend,
+    tensors_of,
+)
+
+
+def test_large_clouds_give_the_same_maps_on_any_number_of_threads():
+    rng = np.random.default_rng(0)
+    cells, num_points = (60, 80), 60_000
+    emap = require_cpu_backend(small_map(1, cells))
+    T = random_poses(rng, 1)[:, None]
+    points = random_clouds(rng, T[:, 0], num_points, cells=cells)[:, None]
+    state = random_state(rng, emap.cfg.grid, 1, 0.6, torch.float32)
+    inputs = inputs_of(emap, points, T, None)
+    after = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        after.append(by_cpu(emap, state, inputs, "fuse"))
+    assert after[0].statistics.points_used > 0.1 * num_points
+    assert_states_close(after[0], by_tensors(emap, state, inputs, "fuse"), "fuse", 1e-5)
+    for other in after[1:]:
+        for name, value in tensors_of(other).items():
+            assert torch.equal(value, tensors_of(after[0])[name]), name
