@@ -79,11 +79,25 @@ inline Bytes bytes_of(Flags numbers) {
 #endif
 }
 
+// Return the number of each byte.
+inline Flags numbers_of(Bytes bytes) {
+#if defined(__AVX512F__) && !defined(__clang__)  // GCC would move one byte after the other
+    typedef char Parts __attribute__((vector_size(16)));
+    return (Flags)__builtin_ia32_pmovzxbd512_mask((Parts)bytes, Flags{}, 0xffff);
+#elif defined(__AVX2__) && !defined(__clang__)
+    typedef char Parts __attribute__((vector_size(16)));
+    typedef int64_t Words __attribute__((vector_size(16)));
+    return (Flags)__builtin_ia32_pmovzxbd256((Parts)Words{(int64_t)bytes, 0});
+#else
+    return __builtin_convertvector(bytes, Flags);
+#endif
+}
+
 // Numbers of bytes, and bytes of numbers. A count that is known to the compiler takes one step.
 template <class Count> inline Flags load_bytes(const uint8_t* values, Count count) {
     Bytes bytes{};
     std::memcpy(&bytes, values, count);
-    return __builtin_convertvector(bytes, Flags);
+    return numbers_of(bytes);
 }
 
 template <class Count> inline void store_bytes(uint8_t* values, Flags numbers, Count count) {
