@@ -40,9 +40,8 @@ template <class Windows> class Rater {
     // Clear a row. Where no cell has a normal or a rating its layers hold zeros already, and to read costs less.
     void clear_row(int row) const {
         const int64_t first = first_cell(row);
-        uint8_t some = 0;
-        for (int64_t k = first; k < first + extent.columns; k++) some |= map.has_normal[k] | map.rated[k];
-        if (some) clear(first, extent.columns);
+        if (any_set(map.has_normal + first, extent.columns) || any_set(map.rated + first, extent.columns))
+            clear(first, extent.columns);
     }
 
     void sum_columns(int row) const {
@@ -123,11 +122,21 @@ void rate_tile(const Update& u, const Extent& extent, Scratch& scratch) {
     rate(u, extent, scratch, Windows{s.radius, s.cells, s.steps});
 }
 
+// Write a value to a layer's cells; where they have it, memory is only read, which costs less.
+template <class Value> void fill(Value* layer, int64_t first, int64_t last, Value value) {
+    constexpr int64_t AT_A_TIME = 4096;
+    for (int64_t begin = first, end; begin < last; begin = end) {
+        end = std::min(begin + AT_A_TIME, last);
+        int differs = 0;
+        for (int64_t k = begin; k < end; k++) differs |= layer[k] != value;
+        if (differs) std::fill(layer + begin, layer + end, value);
+    }
+}
+
 // `rate_all`
 void rate_all(const Update& u) {
     u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        std::fill(u.state.traversability + first, u.state.traversability + last, 1.0f);
-        std::fill(u.state.rated + first, u.state.rated + last, uint8_t(0));
+        fill(u.state.traversability, first, last, 1.0f), fill(u.state.rated, first, last, uint8_t(0));
     });
 }
 

@@ -35,6 +35,13 @@ template <class Work> ALWAYS_INLINE inline void for_lanes(int begin, int end, co
         work(k, std::integral_constant<int, LANES>());
 }
 
+// Return whether any of some masks' bytes is set.
+inline bool any_set(const uint8_t* bytes, int count) {
+    uint8_t some = 0;
+    for (int k = 0; k < count; k++) some |= bytes[k];
+    return some;
+}
+
 // Some cells of a map (H, W).
 struct Extent {
     int row, rows, column, columns;
@@ -69,8 +76,8 @@ class Rows {
     bool find_mean() {
         Lanes total{}, sum{};
         for (int row = -rim; row < extent.rows + rim; row++) {
-            if (!is_inside(row)) continue;
             const ptrdiff_t first = cell(row);
+            if (!is_inside(row) || !any_set(validity + first + begin, end - begin)) continue;
             for_lanes(begin, end, [&](int k, auto count) {
                 const Flags known = load_bytes(validity + first + k, count) > 0;
                 total += one_if(known), sum += pick(known, load(elevation + first + k, count), all(0));
