@@ -55,7 +55,7 @@ class Around {
             y_square[j] = square(center_offset(u, 1, j, s.resolution) - u.measurement.base[1]);
     }
 
-    // Call `look(cell, square, near, count)` for the vectors of a row some of whose cells are near, `square` [m^2] being
+    // Call `look(cell, square, near, count)` for vectors of a row some of whose cells are near, `square` [m^2] being
     // that of their distance; `count` of them exist.
     template <class Look> void row(int64_t i, const Look& look) const {
         const float x = center_offset(u, 0, i, s.resolution) - base_x;
@@ -166,5 +166,5 @@ int64_t clear_near(Update& u) {
 
 extern "C" void run_clear_other_floors(Update& u) {
     if (!u.settings.overlap.has_overlap || !u.measurement.has_base) return;
-    *u.state.statistics.cleared_other_floors = u.measurement.moves ? clear_near(u) : 0;  // no base where poses are unsound
+    *u.state.statistics.cleared_other_floors = u.measurement.moves ? clear_near(u) : 0;  // no sound pose: no base
 }
