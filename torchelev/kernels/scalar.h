@@ -16,7 +16,8 @@ INLINE float larger(float a, float b) { return a > b ? a : b; }
 INLINE float clamp(float a, float low, float high) { return smaller(larger(a, low), high); }
 INLINE float absolute(float a) { return std::fabs(a); }
 INLINE float root(float a) { return std::sqrt(a); }
+INLINE float arctan(float a) { return std::atan(a); }
 INLINE float floor_of(float a) { return std::floor(a); }
 INLINE bool any(bool flag) { return flag; }
-template <class V> INLINE V all(float value) { return V{} + value; }
+template <class V> INLINE V all(float value) { return value - V{}; }
 template <class V> INLINE V square(V a) { return a * a; }

@@ -19,8 +19,9 @@ typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparisons: -1 true, 0 false
 typedef uint8_t Bytes __attribute__((vector_size(LANES)));
 
-inline Lanes all(float value) { return Lanes{} + value; }
+inline Lanes all(float value) { return value - Lanes{}; }  // what + computes for zeros would cost an addition
 inline Lanes pick(Flags flags, Lanes yes, Lanes no) { return flags ? yes : no; }
+inline Lanes zero_unless(Flags flags, Lanes a) { return (Lanes)((Flags)a & flags); }
 inline Flags pick_int(Flags flags, Flags yes, Flags no) { return flags ? yes : no; }
 inline Flags pick_int(Flags flags, int yes, Flags no) { return pick_int(flags, Flags{} + yes, no); }
 inline Lanes one_if(Flags flags) { return pick(flags, all(1), all(0)); }
@@ -79,11 +80,25 @@ inline Bytes bytes_of(Flags numbers) {
 #endif
 }
 
+// Return the number of each byte.
+inline Flags numbers_of(Bytes bytes) {
+#if defined(__AVX512F__) && !defined(__clang__)  // GCC would move one byte after the other
+    typedef char Parts __attribute__((vector_size(16)));
+    return (Flags)__builtin_ia32_pmovzxbd512_mask((Parts)bytes, Flags{}, 0xffff);
+#elif defined(__AVX2__) && !defined(__clang__)
+    typedef char Parts __attribute__((vector_size(16)));
+    typedef int64_t Words __attribute__((vector_size(16)));
+    return (Flags)__builtin_ia32_pmovzxbd256((Parts)Words{(int64_t)bytes, 0});
+#else
+    return __builtin_convertvector(bytes, Flags);
+#endif
+}
+
 // Numbers of bytes, and bytes of numbers. A count that is known to the compiler takes one step.
 template <class Count> inline Flags load_bytes(const uint8_t* values, Count count) {
     Bytes bytes{};
     std::memcpy(&bytes, values, count);
-    return __builtin_convertvector(bytes, Flags);
+    return numbers_of(bytes);
 }
 
 template <class Count> inline void store_bytes(uint8_t* values, Flags numbers, Count count) {
@@ -146,16 +161,21 @@ inline Lanes exp(Lanes x) {
     return (Lanes)((Flags)y + (__builtin_convertvector(n, Flags) << 23));
 }
 
+inline Lanes arctan_of_small(Lanes x) {
+    const Lanes z = x * x;
+    Lanes p = all(8.05374449538e-2f);
+    for (float c : {-1.38776856032e-1f, 1.99777106478e-1f, -3.33329491539e-1f}) p = p * z + c;
+    return p * z * x + x;
+}
+
 // Arc tangent of numbers that are not negative, by the polynomial of Cephes' atanf: 1 unit in the last place.
 inline Lanes arctan(Lanes x) {
     const Flags is_large = x > 2.414213562f, is_middle = x > 0.4142135624f;
+    if (!any(is_middle)) return arctan_of_small(x);
     const Lanes above = pick(is_large, all(-1), pick(is_middle, x - 1, x));
     const Lanes below = pick(is_large, x, pick(is_middle, x + 1, all(1)));
     const Lanes start = pick(is_large, all(1.5707963268f), pick(is_middle, all(0.7853981634f), all(0)));
-    const Lanes y = above / below, z = y * y;
-    Lanes p = all(8.05374449538e-2f);
-    for (float c : {-1.38776856032e-1f, 1.99777106478e-1f, -3.33329491539e-1f}) p = p * z + c;
-    return start + (p * z * y + y);
+    return start + arctan_of_small(above / below);
 }
 
 inline Lanes tanh(Lanes x) { return 1 - 2 / (exp(2 * x) + 1); }

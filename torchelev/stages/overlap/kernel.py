@@ -18,12 +18,14 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     overlap = cfg.overlap or OverlapConfig()
     first_row, end_row, first_column, end_column = near_part(cfg.grid, overlap)
     return dict(
+        has_overlap=cfg.overlap is not None,
+        resolution=float(cfg.grid.resolution),
         radius_square=float(overlap.radius**2),
         slope=float(overlap.height / overlap.radius),
         height=float(overlap.height),
         base_height=float(overlap.base_height),
         max_base_height=float(overlap.max_base_height),
-        stance=STANCE,
+        stance_square=STANCE**2,
         first_row=first_row,
         end_row=end_row,
         first_column=first_column,

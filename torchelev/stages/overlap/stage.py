@@ -149,5 +149,5 @@ def own_floor(ground: Float[Tensor, "B 1 1"], cfg: OverlapConfig) -> Floor:
 
 
 def is_outside(height: Tensor, floor: Floor, allowance: Tensor | float) -> Bool[Tensor, "B H W"]:
-    """Tell which heights [m], from the base's, lie more than the allowance outside of the floor's."""
+    """Return which heights [m], from the base's, lie more than the allowance outside of the floor's."""
     return (height < floor.lower - allowance) | (height > floor.upper + allowance)
