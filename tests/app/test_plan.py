@@ -42,6 +42,26 @@ def test_a_path_around_a_wall(tmp_path, save):
     assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_path_on_which_the_body_does_not_fit_is_marked(tmp_path, monkeypatch):
+    """A body of 1.2 m beside a gap of 0.7 m: its centre passes where its front, which turns, hits the wall."""
+    emap = world(gap=2.0)
+    y = emap.cell_centers()[..., 1]
+    emap.elevation.masked_fill_((y - 0.5).abs() < 0.35, 0.0)
+    emap.load_state(rate(emap.state, emap.cfg))
+    save_npz(tmp_path / "map.npz", emap)
+    figures = []
+    monkeypatch.setattr("torchelev.viz.style.write", lambda figure, path: figures.append(figure))
+    code, text = run(tmp_path / "map.npz", *ENDS, "--width", 0.2, "--length", 1.2, "--out", tmp_path / "path.png")
+    assert code == 1 and text.startswith("not safe") and "cannot be reached safely" in text
+    x, y = text.split("at x = ")[1].split(" m ")[0].split(" m, y = ")
+    for axes in figures[0].axes[:2]:
+        (marked,) = [line for line in axes.lines if line.get_label().startswith("not safe")]
+        assert marked.get_xydata()[0].tolist() == pytest.approx([float(x), float(y)], abs=0.006)
+        (refused,) = [line for line in axes.lines if line.get_linestyle() == "--"]
+        assert refused.get_color() == "r" and refused.get_xydata()[-1].tolist() == pytest.approx([1.05, 0.05])
+        assert axes.get_legend() is not None
+
+
 def test_no_path_says_why(tmp_path):
     save_npz(tmp_path / "map.npz", world())
     code, text = run(tmp_path / "map.npz", *ENDS)
@@ -64,7 +84,8 @@ def test_a_map_without_a_head_is_rated_for_the_default_robot(tmp_path):
     (("map.npz", "--goal", 9, 0), "goal_xy: must lie in the window"),
     (("map.npz", "--goal", math.nan, 0), "goal_xy: must lie in the window"),
     (("map.npz", "--goal", 1, 0, "--max-slope", 35), "robot.max_slope: must be below a right angle"),
-    (("none.npz", "--goal", 1, 0), "none.npz"),
+    (("none.npz", "--goal", 1, 0), "none.npz: no such file or directory\n"),
+    (("none.npz", "--goal", 1, 0, "--out", "path.xyz"), "out: must be a picture, got one of suffix .xyz"),
     (("layers.npz", "--goal", 1, 0), "must be a whole map"),
     (("empty.npz", "--goal", 1, 0), "the map is empty"),
     (("map.npz",), "Missing option '--goal'"),

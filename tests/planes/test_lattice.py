@@ -1,13 +1,15 @@
 """Components, borders and insets of label images, against loops over cells."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.planes.lattice import components, interior, same_label, trace_borders, trace_insets
+from torchelev.planes.lattice import components, disc, interior, same_label, trace_borders, trace_insets
 
-pytest.importorskip("cv2")
+cv2 = pytest.importorskip("cv2")
 SEEDS = st.integers(0, 10_000)
 STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
@@ -162,3 +164,12 @@ def test_nothing_has_no_polygons():
     assert (trace_borders(interior(labels), labels).label < 0).all() and len(
         trace_insets(interior(labels), labels, 1.0).label
     ) == 0
+
+
+@pytest.mark.parametrize("reach", [1.0, 1.5, 2.0, math.sqrt(5), 3.9, 8.0])
+def test_an_erosion_keeps_what_a_distance_transform_would(reach):
+    image = (np.random.default_rng(0).random((61, 83)) < 0.98).astype(np.uint8)
+    image[[0, -1]] = image[:, [0, -1]] = 0
+    distance = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    kept = cv2.erode(image, disc(reach - 1e-4))
+    assert kept.any() and np.array_equal(kept, distance >= reach - 1e-4)

@@ -1,6 +1,7 @@
 """Planes of ground whose planes are known, and of ground that is anything."""
 
 import math
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -373,3 +374,21 @@ def test_refuses_configs_out_of_range(field, value):
 def test_the_scenes_are_what_they_say():
     assert ramp(np.array([-5.0, -2.5, 0.0]), -4, -1, 0.9).tolist() == [0, 0.45, 0.9]
     assert [SCENES[name](0.04).shape for name in SCENES] == [(250, 250)] * 3
+
+
+def test_many_maps_equal_single_ones():
+    """More maps than are segmented at a time, some without any plane, each with its own height and place."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(*[np.arange(64) * 0.04] * 2, indexing="ij")
+    maps = np.stack([0.1 * np.floor(x / rng.uniform(0.3, 0.8)) + 0.05 * np.sin(k * y) + 100 * k for k in range(20)])
+    maps[3], maps[17] = np.nan, rng.uniform(size=x.shape)
+    maps[rng.random(maps.shape) < 0.02] = np.nan
+    centers = rng.uniform(-9, 9, (20, 2))
+    together = segment(torch.from_numpy(maps), 0.04, center=centers)
+    assert sum(len(planes.regions) for planes in together) > 60
+    for height, center, planes in zip(maps, centers, together, strict=True):
+        (alone,) = segment(torch.from_numpy(height), 0.04, center=center)
+        np.testing.assert_array_equal(planes.labels, alone.labels)
+        for region, same in zip(planes.regions, alone.regions, strict=True):
+            for a, b in zip(astuple(region), astuple(same), strict=True):
+                np.testing.assert_equal(a, b)

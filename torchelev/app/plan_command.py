@@ -44,13 +44,16 @@ def run_plan(
         The exit code.
     """
     with user_errors():
+        if out is not None:
+            _require_picture(out)
         emap = _load(map_file, robot)
         starts = emap.center[:, :2].double() if start is None else torch.tensor([start], dtype=torch.float64)
         path, check = _plan(emap, starts, torch.tensor([goal], dtype=torch.float64), _robot_of(emap, robot))
         is_safe = bool(path.reached & check.safe)
+        refused = None if is_safe else _refused_place(path, check)
         click.echo(_describe(starts, goal, path, check))
         if out is not None:
-            _draw(emap, path, goal, is_safe, out)
+            _draw(emap, path, goal, refused, out)
             click.echo(f"wrote {out}")
     return 0 if is_safe else NO_PATH
 
@@ -104,20 +107,49 @@ def _describe(start: Tensor, goal: tuple[float, float], path: PlannedPath, check
     return f"{kind} {ends}, {float(path.length):.2f} m, {int(path.count)} waypoints: {check.explain()[0]}"
 
 
-def _draw(emap: ElevationMap, path: PlannedPath, goal: tuple[float, float], is_safe: bool, out: Path) -> None:
-    """Draw the path on elevation and traversability."""
+def _require_picture(out: Path) -> None:
+    """Refuse what no picture can be written to."""
     from torchelev.output_files import require_writable
+    from torchelev.viz.style import require_picture
+
+    require_picture(out)
+    require_writable(out)
+
+
+def _refused_place(path: PlannedPath, check: PathCheck) -> tuple[int, list[float]] | None:
+    """Return the waypoint that cannot be reached safely, and x and y [m] of the first unsafe place.
+
+    None where no path was found.
+    """
+    if check.safe or not torch.isfinite(path.cost):
+        return None
+    sample = int(check.footprints.safe[0].to(torch.uint8).argmin())
+    return int(check.first_unsafe), check.poses[0, sample, :2].tolist()
+
+
+def _draw(
+    emap: ElevationMap,
+    path: PlannedPath,
+    goal: tuple[float, float],
+    refused: tuple[int, list[float]] | None,
+    out: Path,
+) -> None:
+    """Draw the path on elevation and traversability; from where it is refused on, dashed and in red."""
     from torchelev.viz.plot import Panel, draw_layers
     from torchelev.viz.style import write
 
-    require_writable(out)
     saved = take(emap, layers=("elevation", "traversability"))
     figure = draw_layers(
         [Panel(title=name, values=values) for name, values in saved.layers.items()], extent=saved.extent
     )
     xy = path.xy[0, : int(path.count)].numpy()
+    end = len(xy) if refused is None else refused[0]
     for axes in figure.axes[: len(saved.layers)]:
-        axes.plot(xy[:, 0], xy[:, 1], "k-" if is_safe else "k--", linewidth=1.5)
+        axes.plot(xy[:end, 0], xy[:end, 1], "k-", linewidth=1.5)
         axes.plot(*xy[0], "ko", markersize=5)
-        axes.plot(*goal, "k*" if is_safe else "rX", markersize=9)
+        axes.plot(*goal, "k*" if path.reached else "rX", markersize=9)
+        if refused is not None:
+            axes.plot(xy[max(end - 1, 0) :, 0], xy[max(end - 1, 0) :, 1], "r--", linewidth=1.5)
+            axes.plot(*refused[1], "rX", markersize=9, label="not safe: the body does not fit here")
+            axes.legend(loc="lower left")
     write(figure, out)

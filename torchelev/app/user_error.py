@@ -24,7 +24,10 @@ class UserError(click.ClickException):
     exit_code = BAD_INPUT
 
     def __init__(self, error: object) -> None:
-        super().__init__(" ".join(str(error).split()))
+        text = str(error)
+        if isinstance(error, OSError) and error.filename is not None and error.strerror:
+            text = f"{error.filename}: {error.strerror.lower()}"  # instead of "[Errno 2] ..."
+        super().__init__(" ".join(text.split()))
 
 
 class EmptyMapError(click.ClickException):

@@ -44,11 +44,10 @@ def grow(
     labels, is_new = labels.copy(), labels >= 0
     for _ in range(rounds):
         before, is_taken = labels.copy(), np.zeros(labels.size, bool)
-        for step in (-stride, stride, -1, 1):
+        for source, cell in _sides(before, stride):
             # Neighbours that changed in the last round offer their label.
-            offer = np.roll(before, step)
-            cell = np.flatnonzero(np.roll(is_new, step) & (offer != before) & (best > 0))
-            offered = offer[cell]
+            asked = is_new[source] & (best[cell] > 0)
+            cell, offered = cell[asked], before[source[asked]]
             distance = np.abs(distances(surface, cell, weights[offered]))
             is_better = distance < best[cell]
             cell = cell[is_better]
@@ -57,6 +56,15 @@ def grow(
             best[is_taken] = 0.0
         is_new = is_taken
     return labels
+
+
+def _sides(labels: Int[ndarray, "P"], stride: int) -> list[tuple[Int[ndarray, "N"], Int[ndarray, "N"]]]:
+    """Return the pairs of neighbours of different labels: those one row down, one row up, one cell on and one back."""
+    pairs = []
+    for step in (stride, 1):
+        first = np.flatnonzero(labels[:-step] != labels[step:])
+        pairs += [(first + step, first), (first, first + step)]
+    return pairs
 
 
 def smooth_borders(
@@ -68,10 +76,9 @@ def smooth_borders(
     """
     weights, stride = plane.distance_weights(), surface.shape[1] + 1
     for _ in range(_SMOOTHING_ROUNDS):
-        offers = [np.roll(labels, step) for step in (-stride, stride, -1, 1)]
-        cells = [np.flatnonzero((offer != labels) & (np.minimum(offer, labels) >= 0)) for offer in offers]
-        cell = np.concatenate(cells)
-        offered = np.concatenate([offer[at] for offer, at in zip(offers, cells, strict=True)])
+        source, cell = (np.concatenate(ends) for ends in zip(*_sides(labels, stride), strict=True))
+        is_border = np.minimum(labels[source], labels[cell]) >= 0
+        cell, offered = cell[is_border], labels[source[is_border]]
         is_on_both = np.abs(distances(surface, cell, weights[offered])) <= max_distance
         cell, offered = cell[is_on_both], offered[is_on_both]
         is_outvoted = _majority(labels.reshape(-1, stride), cell, offered, surface.radius) > 0

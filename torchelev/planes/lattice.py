@@ -5,6 +5,7 @@ Pixel (2i + 1, 2j + 1) of the image (2H + 1, 2W + 1) is cell (i, j); the pixels 
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
     from numpy import ndarray
+
+_FAR = 8.0  # [half cells] up to which an erosion is faster than a distance transform
 
 
 class Outlines(NamedTuple):
@@ -71,8 +74,19 @@ def trace_insets(inside: Int[ndarray, "2H+1 2W+1"], labels: Int[ndarray, "H W"],
     """Trace the part of each region at least `margin` [cells] from its border, to half a cell."""
     import cv2
 
-    distance = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return _trace((distance >= max(1.0, 2 * margin - 1e-4)).astype(np.uint8), labels, of_holes=False)
+    reach = max(1.0, 2 * margin - 1e-4)
+    if reach > _FAR:
+        distance = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return _trace((distance >= reach).astype(np.uint8), labels, of_holes=False)
+    # The same, several times as fast: what no pixel outside is nearer to.
+    return _trace(cv2.erode(inside, disc(reach)), labels, of_holes=False)
+
+
+def disc(radius: float) -> Int[ndarray, "N N"]:
+    """Return the pixels nearer than `radius` to the middle one."""
+    reach = math.ceil(radius) - 1
+    away = np.arange(-reach, reach + 1) ** 2
+    return (away[:, None] + away < radius**2).astype(np.uint8)
 
 
 def _trace(image: ndarray, labels: ndarray, of_holes: bool) -> Outlines:

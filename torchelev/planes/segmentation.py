@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require, require_positive
-from torchelev.planes.assemble import GridFrame, assemble_regions
+from torchelev.ops.parallel import map_in_order
+from torchelev.planes.assemble import MapFrames, assemble_maps
 from torchelev.planes.grow import drop_distant, grow, relabel_components, smooth_borders
 from torchelev.planes.lattice import components
 from torchelev.planes.local_planes import Limits, fit_local_planes, window_radius
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 
 _MAX_HEIGHT = 1e5  # [m] heights beyond it are unknown
+_CELLS_AT_A_TIME = 2**16  # of several maps: so many fit the processor's caches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +74,7 @@ def segment(
        neighbours that lie on one plane.
     5. Fit a plane by least squares to the cells of each region that is large enough, and trace its polygons.
 
-    Steps 1 and 2 run on the tensor's device for all maps at once, the rest map by map on the host. Needs OpenCV.
+    Step 1 and the comparisons of step 2 run on the tensor's device, the rest on the host. Needs OpenCV.
 
     Args:
         elevation: [m] absolute heights; NaN, infinite values and heights beyond 100 km are unknown.
@@ -92,16 +94,20 @@ def segment(
     require(isinstance(cfg, PlaneConfig), "cfg", "must be a PlaneConfig", repr(cfg), "build one", TypeError)
     _check(elevation, resolution)
     heights = elevation.detach().to(torch.float64).reshape(-1, *elevation.shape[-2:])
-    centers = _centers(center, len(heights))
-    known = heights.abs() < _MAX_HEIGHT
-    radius = window_radius(cfg.window, resolution)
-    local = fit_local_planes(heights, known, resolution, radius, cfg.limits)
-    host = [values.cpu().numpy() for values in (known, heights, *local)]
-    corners = centers - np.array(heights.shape[1:]) * resolution / 2
-    return [
-        _segment_map(_HostMap(*layers), radius, GridFrame(resolution, corner), cfg)
-        for *layers, corner in zip(*host, corners, strict=True)
-    ]
+    B, H, W = heights.shape
+    corners = _centers(center, B) - np.array([H, W]) * resolution / 2
+    at_a_time = max(1, _CELLS_AT_A_TIME // (H * W))
+    layers = None if heights.is_cpu else _fit_on_device(heights, resolution, cfg)  # all maps at once
+
+    def segment_from(first: int) -> list[Planes]:
+        part = slice(first, first + at_a_time)
+        maps = _HostMaps(*(v[part] for v in layers)) if layers else _fit_on_device(heights[part], resolution, cfg)
+        return _segment_maps(maps, resolution, corners[part], cfg)
+
+    starts = range(0, B, at_a_time)
+    # A single piece leaves the threads to its operations.
+    found = map(segment_from, starts) if len(starts) == 1 else map_in_order(segment_from, starts)
+    return [planes for part in found for planes in part]
 
 
 def _check(elevation: Tensor, resolution: float) -> None:
@@ -124,29 +130,44 @@ def _centers(center: Any, number: int) -> Float[ndarray, "B 2"]:
     return np.broadcast_to(values[..., :2], (number, 2))
 
 
-class _HostMap(NamedTuple):
-    """One map and its `LocalPlanes` on the host."""
+class _HostMaps(NamedTuple):
+    """Maps and their `LocalPlanes` on the host."""
 
-    known: Bool[ndarray, "H W"]
-    height: Float[ndarray, "H W"]
-    gradient_x: Float[ndarray, "H W"]
-    gradient_y: Float[ndarray, "H W"]
-    is_planar: Bool[ndarray, "H W"]
-    is_joined_x: Bool[ndarray, "H-1 W"]
-    is_joined_y: Bool[ndarray, "H W-1"]
+    known: Bool[ndarray, "B H W"]
+    height: Float[ndarray, "B H W"]
+    gradient_x: Float[ndarray, "B H W"]
+    gradient_y: Float[ndarray, "B H W"]
+    is_planar: Bool[ndarray, "B H W"]
+    is_joined_x: Bool[ndarray, "B H-1 W"]
+    is_joined_y: Bool[ndarray, "B H W-1"]
 
 
-def _segment_map(one: _HostMap, radius: int, frame: GridFrame, cfg: PlaneConfig) -> Planes:
-    labels, number = components(one.is_planar, one.is_joined_x, one.is_joined_y)
+def _fit_on_device(heights: Float[Tensor, "B H W"], resolution: float, cfg: PlaneConfig) -> _HostMaps:
+    """Fit the local planes of maps on their device: steps 1 and 2."""
+    known = heights.abs() < _MAX_HEIGHT
+    local = fit_local_planes(heights, known, resolution, window_radius(cfg.window, resolution), cfg.limits)
+    return _HostMaps(*(values.cpu().numpy() for values in (known, heights, *local)))
+
+
+def _segment_maps(maps: _HostMaps, resolution: float, corner: Float[ndarray, "B 2"], cfg: PlaneConfig) -> list[Planes]:
+    """Segment maps, given their local planes, in one go: steps 2 to 5."""
+    known, height = maps.known, maps.height
+    labels, number = components(*(_stack(values, known.shape[1] + 1) for values in maps[4:]))
     if number == 0:
-        return Planes(labels, ())
-    datum = one.height[one.known].mean()
-    surface = make_surface(one.known, one.height - datum, one.gradient_x, one.gradient_y, frame.resolution, radius)
-    flat, plane = _find_regions(pad_cells(labels, -1).ravel(), surface, cfg)
-    labels = flat.reshape(len(labels) + 1, -1)[:-1, :-1].astype(np.int32)
-    x, y = frame.xy(np.array(labels.shape) / 2)
-    plane = plane._replace(x0=plane.x0 + x, y0=plane.y0 + y, z0=plane.z0 + datum)
-    return Planes(labels, assemble_regions(labels, plane, frame, cfg.margin))
+        return [Planes(np.full(known.shape[1:], -1, np.int32), ()) for _ in known]
+    datum = np.array([z[k].mean() if k.any() else 0.0 for z, k in zip(height, known, strict=True)])
+    above, radius = height - datum[:, None, None], window_radius(cfg.window, resolution)
+    surface = make_surface(known, above, maps.gradient_x, maps.gradient_y, resolution, radius)
+    found, plane = _find_regions(pad_cells(labels, -1).ravel(), surface, cfg)
+    return assemble_maps(found, plane, surface, MapFrames(resolution, corner, datum, known.shape[1] + 1), cfg.margin)
+
+
+def _stack(values: Bool[ndarray, "B H W"], rows: int) -> Bool[ndarray, "R W"]:
+    """Lay out maps one below the other, `rows` apart; what lies between them is False."""
+    B, H, W = values.shape
+    stacked = np.zeros((B, rows, W), bool)
+    stacked[:, :H] = values
+    return stacked.reshape(B * rows, W)[: H - rows]
 
 
 def _find_regions(

@@ -41,6 +41,8 @@ def split(labels: Int[ndarray, "P"], surface: Surface, limits: Limits) -> tuple[
         planes.append(plane)
         count += number
         cell, region, distance = cell[~stays], region[~stays], distance[~stays]
+        if len(cell) < _MIN_CELLS:
+            break
         is_upper = distance > 0  # of cells removed from a planar region
         if not is_planar.all():
             is_upper = np.where(is_planar[region], is_upper, cutter.upper_part(runs, cell, region, distance, plane))
@@ -75,17 +77,19 @@ class _Cutter:
         import cv2
 
         size = 4 * self.surface.radius + 1
-        shape = self.surface.shape[0] + 1, self.surface.shape[1] + 1
+        shape = self.surface.num_maps, -1, self.surface.shape[1] + 1
 
         def window_sum(values: ndarray) -> ndarray:
-            # OpenCV's running sums take the same time for windows of any size.
-            border = cv2.BORDER_CONSTANT
-            return cv2.boxFilter(values.reshape(shape), cv2.CV_64F, (size, size), normalize=False, borderType=border)
+            # OpenCV's running sums take the same time for windows of any size. They may not reach another map.
+            border, sums = cv2.BORDER_CONSTANT, np.empty_like(values)
+            for one, result in zip(values.reshape(shape), sums.reshape(shape), strict=True):
+                cv2.boxFilter(one, cv2.CV_64F, (size, size), dst=result, normalize=False, borderType=border)
+            return sums
 
         weight = self.is_planar.astype(np.float64)
         number = window_sum(weight).clip(min=0.5)
         gx, gy = (window_sum(g * weight) / number for g in (self.surface.gradient_x, self.surface.gradient_y))
-        return gx.ravel(), gy.ravel()
+        return gx, gy
 
     @cached_property
     def before(self) -> Float[ndarray, "5 P"]:

@@ -1,33 +1,36 @@
-"""Sums over the regions of one map, on the host: run by run of each row, from cumulative sums."""
+"""Sums over the regions of maps, on the host: run by run of each row, from cumulative sums."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float, Int, Shaped
     from numpy import ndarray
 
 
 class Surface(NamedTuple):
-    """The cells of one map as flat arrays (P,), P = (H + 1) (W + 1): the last row and column are padding.
+    """The cells of maps as flat arrays (P,), P = B (H + 1) (W + 1): a row and a column of padding follow each map.
 
-    With the padding, flat index + 1 never leads to a cell of the next row, and -1 never wraps around.
+    With the padding, flat index + 1 never leads to a cell of the next row, and -1 never wraps around. B maps are one
+    map of B (H + 1) - 1 rows to what looks at neighbours: as the rows between them are unknown, no region crosses them.
     """
 
-    shape: tuple[int, int]  #: H, W
+    shape: tuple[int, int]  #: B (H + 1) - 1, W
     known: Bool[ndarray, "P"]  #: the cell has a height
-    x: Float[ndarray, "P"]  #: [m] from the map's centre
-    y: Float[ndarray, "P"]  #: [m] from the map's centre
-    z: Float[ndarray, "P"]  #: [m] from the map's mean; 0 where unknown
+    x: Float[ndarray, "P"]  #: [m] from its map's centre
+    y: Float[ndarray, "P"]  #: [m] from its map's centre
+    z: Float[ndarray, "P"]  #: [m] from its map's mean; 0 where unknown
     gradient_x: Float[ndarray, "P"]  #: [m/m] of the window's plane
     gradient_y: Float[ndarray, "P"]  #: [m/m] of the window's plane
     before: Float[ndarray, "5 P"]  #: cumulative sums of z, y z, z z and the gradients
     resolution: float  #: [m] of a cell
     radius: int  #: [cells] of the windows
+    num_maps: int = 1  #: B
 
     @property
     def window_moment(self) -> float:
@@ -36,26 +39,30 @@ class Surface(NamedTuple):
         return side**2 * (side**2 - 1) / 12 * self.resolution**2
 
 
-def pad_cells(values: ndarray, fill: float) -> ndarray:
-    """Append a row and a column."""
-    return np.pad(values, ((0, 1), (0, 1)), constant_values=fill)
+def pad_cells(values: Shaped[ndarray, "*B H W"], fill: float) -> Shaped[ndarray, "*B H+1 W+1"]:
+    """Append a row and a column to each map."""
+    *B, H, W = values.shape
+    padded = np.full((*B, H + 1, W + 1), fill, values.dtype)
+    padded[..., :H, :W] = values
+    return padded
 
 
 def make_surface(
-    known: Bool[ndarray, "H W"],
-    height: Float[ndarray, "H W"],
-    gradient_x: Float[ndarray, "H W"],
-    gradient_y: Float[ndarray, "H W"],
+    known: Bool[ndarray, "*B H W"],
+    height: Float[ndarray, "*B H W"],
+    gradient_x: Float[ndarray, "*B H W"],
+    gradient_y: Float[ndarray, "*B H W"],
     resolution: float,
     radius: int,
 ) -> Surface:
-    """Lay out one map; `height` [m] from its mean."""
-    H, W = known.shape
-    x = np.repeat((np.arange(H + 1) + 0.5 - H / 2) * resolution, W + 1)
-    y = np.tile((np.arange(W + 1) + 0.5 - W / 2) * resolution, H + 1)
+    """Lay out one map, or B maps one below the other; `height` [m] from each one's mean."""
+    *B, H, W = known.shape
+    num_maps = math.prod(B)
+    x = np.tile(np.repeat((np.arange(H + 1) + 0.5 - H / 2) * resolution, W + 1), num_maps)
+    y = np.tile((np.arange(W + 1) + 0.5 - W / 2) * resolution, num_maps * (H + 1))
     z, gx, gy = (pad_cells(np.where(known, v, 0.0), 0.0).ravel() for v in (height, gradient_x, gradient_y))
-    before = cumulative_sums([z, y * z, z * z, gx, gy], W)
-    return Surface((H, W), pad_cells(known, False).ravel(), x, y, z, gx, gy, before, resolution, radius)
+    before, shape = cumulative_sums([z, y * z, z * z, gx, gy], W), (num_maps * (H + 1) - 1, W)
+    return Surface(shape, pad_cells(known, False).ravel(), x, y, z, gx, gy, before, resolution, radius, num_maps)
 
 
 def cumulative_sums(values: Sequence[Float[ndarray, "P"]], W: int) -> Float[ndarray, "M P"]:

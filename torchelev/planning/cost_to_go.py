@@ -11,19 +11,13 @@ from torch import Tensor
 from torchelev.errors import require, require_count, require_positive
 from torchelev.inputs.checks import FLOATS, readable, require_indices, require_tensor
 from torchelev.ops.windows import AROUND, neighbours
+from torchelev.planning import dijkstra
+from torchelev.planning.sweeps import iterate, step_cost
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 _DEFAULT_ROUNDS = 16  # off the CPU, where testing for convergence would make the host wait
-
-
-class _StepCosts(NamedTuple):
-    """Costs of the steps from each of L lines of N cells to the next one, on B maps; the same in both directions."""
-
-    straight: Float[Tensor, "L-1 B N"]  # between (l, n) and (l + 1, n)
-    rising: Float[Tensor, "L-1 B N-1"]  # between (l, n) and (l + 1, n + 1)
-    falling: Float[Tensor, "L-1 B N-1"]  # between (l, n + 1) and (l + 1, n)
 
 
 def cost_to_go(
@@ -34,16 +28,18 @@ def cost_to_go(
     J(a) = min over the eight neighbours b of J(b) + |ab| (c_a + c_b) / 2, with J = 0 at passable goal cells. A diagonal
     step requires the two cells beside it to be passable: no path cuts a corner.
 
-    Value iteration by sweeps: a round sweeps over the rows forwards and backwards, then over the columns, and each
-    line uses the values just computed for the one before it. A sweep follows every path that keeps to its direction to
-    the end, so the rounds needed grow with the turns of a path and not with its cells. Not differentiable.
+    On a CPU by Dijkstra's algorithm in C++ (`planning.dijkstra`). Elsewhere, with `rounds` or without a compiler, by
+    value iteration, with the same result: a round sweeps over the rows forwards and backwards, then over the columns,
+    and each line uses the values just computed for the one before it. A sweep follows every path that keeps to its
+    direction to the end, so the rounds needed grow with the turns of a path, not with its cells. Not differentiable.
 
     Args:
         cost: c, the cost of each metre in a cell: positive, inf where impassable.
         goal: the cells to reach.
         resolution: side of a cell [m].
-        rounds: the largest number of rounds; None: on a CPU until convergence, elsewhere 16, as a test for convergence
-            would make the host wait. Cells that these rounds do not reach stay inf, and a path may not be the cheapest.
+        rounds: the largest number of rounds; None: on a CPU as many as are needed, elsewhere 16, as a test for
+            convergence would make the host wait. Cells that these rounds do not reach stay inf, and a path may not be
+            the cheapest.
 
     Returns:
         J, at least in float32: the length [m] of a path of equal cost over ground of cost 1; inf where there is no
@@ -57,24 +53,14 @@ def cost_to_go(
     if rounds is not None:
         require_count("rounds", rounds, "give 16, or None")
     can_read = readable(cost)
-    max_rounds = rounds or (cost.shape[1] * cost.shape[2] + 1 if can_read else _DEFAULT_ROUNDS)
     if can_read:
         hint = "give 1 for easy ground and inf for impassable"
         require(bool((cost > 0).all()), "cost", "must be positive", "NaN, or 0 and less", hint)
     with torch.no_grad():
-        lines = _at_least_float32(cost.detach()).transpose(0, 1).contiguous()  # (H, B, W)
-        row_steps, column_steps = (_step_costs(c, resolution) for c in (lines, lines.transpose(0, 2).contiguous()))
-        is_target = goal.transpose(0, 1) & torch.isfinite(lines)
-        value = torch.where(is_target, 0.0, torch.inf).to(lines.dtype)
-        for _ in range(max_rounds):
-            previous, value = value, value.clone()
-            _sweep(value, row_steps)
-            transposed = value.transpose(0, 2).contiguous()
-            _sweep(transposed, column_steps)
-            value = transposed.transpose(0, 2).contiguous()
-            if can_read and torch.equal(previous, value):
-                break
-    return value.transpose(0, 1).contiguous()
+        cost = _at_least_float32(cost.detach())
+        value = dijkstra.find_costs(cost, goal, resolution) if rounds is None else None
+        max_rounds = rounds or (cost.shape[1] * cost.shape[2] + 1 if can_read else _DEFAULT_ROUNDS)
+        return iterate(cost, goal, resolution, max_rounds, until_convergence=can_read) if value is None else value
 
 
 def _at_least_float32(cost: Tensor) -> Tensor:
@@ -89,38 +75,6 @@ def _check_grids(cost: object, goal: object) -> None:
     hint = "convert it with goal > 0"
     require(goal.dtype == torch.bool, "goal", "must be bool", goal.dtype, hint, TypeError)
     require(goal.shape == cost.shape, "goal", f"expected {tuple(cost.shape)}", tuple(goal.shape), "mark cells of cost")
-
-
-def _step_cost(a: Tensor, b: Tensor, length: float) -> Tensor:
-    return (a + b) * (length / 2)
-
-
-def _step_costs(lines: Float[Tensor, "L B N"], resolution: float) -> _StepCosts:
-    here, there = lines[:-1], lines[1:]
-    rising, falling = here[..., :-1] + there[..., 1:], here[..., 1:] + there[..., :-1]
-    half_diagonal = math.sqrt(2) * resolution / 2
-    cuts_corner = torch.isinf(rising) | torch.isinf(falling)
-    rising, falling = (torch.where(cuts_corner, torch.inf, total * half_diagonal) for total in (rising, falling))
-    return _StepCosts(_step_cost(here, there, resolution), rising, falling)
-
-
-def _sweep(value: Float[Tensor, "L B N"], costs: _StepCosts) -> None:
-    """Propagate the values from line to line to the last one and back, in place."""
-    lines = list(zip(*(part.unbind(0) for part in (value, value[..., :-1], value[..., 1:])), strict=True))
-    steps = list(zip(*(part.unbind(0) for part in costs), strict=True))
-    for k, (straight, rising, falling) in enumerate(steps):
-        _relax(lines[k], lines[k + 1], straight, rising, falling)
-    for k in reversed(range(len(steps))):
-        straight, rising, falling = steps[k]
-        _relax(lines[k + 1], lines[k], straight, falling, rising)
-
-
-def _relax(source: tuple[Tensor, ...], target: tuple[Tensor, ...], straight: Tensor, up: Tensor, down: Tensor) -> None:
-    """Lower a line's values to those of its neighbour plus a step; lines are (all, all but last, all but first)."""
-    (source_all, source_low, source_high), (target_all, target_low, target_high) = source, target
-    torch.minimum(target_all, source_all + straight, out=target_all)
-    torch.minimum(target_high, source_low + up, out=target_high)
-    torch.minimum(target_low, source_high + down, out=target_low)
 
 
 class Descent(NamedTuple):
@@ -162,15 +116,21 @@ def descend(
     require(tuple(start.shape) == (B, 2), "start", f"expected {(B, 2)}", tuple(start.shape), hint)
     for axis, size in enumerate((H, W)):
         require_indices("start", start[:, axis], size, "give cells of the map")
-    cost = _at_least_float32(cost)
-    following = _next_cells(_at_least_float32(value), cost, resolution)
-    path = [start[:, :1] * W + start[:, 1:]]
-    for _ in range(max_cells - 1):
-        path.append(following.gather(1, path[-1]))
-    cell = torch.cat(path, 1)
+    value, cost = _at_least_float32(value), _at_least_float32(cost)
+    first = start[:, :1] * W + start[:, 1:]
+    cell = dijkstra.follow(value, cost, first, resolution, max_cells)
+    cell = _follow(_next_cells(value, cost, resolution), first, max_cells) if cell is None else cell
     cells = torch.stack([torch.div(cell, W, rounding_mode="floor"), cell % W], -1)
     length = (cells[:, 1:] - cells[:, :-1]).to(cost.dtype).norm(dim=-1).sum(1) * resolution
-    return Descent(cells, length, value.flatten(1).gather(1, path[-1])[:, 0] == 0)
+    return Descent(cells, length, value.flatten(1).gather(1, cell[:, -1:])[:, 0] == 0)
+
+
+def _follow(following: Int[Tensor, "B H*W"], first: Int[Tensor, "B 1"], max_cells: int) -> Int[Tensor, "B K"]:
+    """Return the numbers of the cells of each path, of which each cell names the next."""
+    path = [first]
+    for _ in range(max_cells - 1):
+        path.append(following.gather(1, path[-1]))
+    return torch.cat(path, 1)
 
 
 def _next_cells(value: Tensor, cost: Tensor, resolution: float) -> Int[Tensor, "B H*W"]:
@@ -180,7 +140,7 @@ def _next_cells(value: Tensor, cost: Tensor, resolution: float) -> Int[Tensor, "
     cost_at = dict(zip(AROUND, costs, strict=True))
     best, step = torch.full_like(value, torch.inf), torch.zeros(B, H, W, device=cost.device, dtype=torch.int64)
     for (i, j), v, c in zip(AROUND, values, costs, strict=True):
-        total = v + _step_cost(cost, c, math.hypot(i, j) * resolution)
+        total = v + step_cost(cost, c, math.hypot(i, j) * resolution)
         if i and j:
             total = torch.where(torch.isinf(cost_at[i, 0] + cost_at[0, j]), torch.inf, total)
         step = torch.where(total < best, i * W + j, step)

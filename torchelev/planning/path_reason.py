@@ -172,4 +172,4 @@ def _can_spread(value: Float[Tensor, "B H W"], is_passable: Bool[Tensor, "B H W"
 def _neighbour_minimum(values: Tensor, fill: float) -> Tensor:
     """Return the minimum over the four straight neighbours of each cell."""
     straight = [v for (i, j), v in zip(AROUND, neighbours(values, fill), strict=True) if i == 0 or j == 0]
-    return torch.stack(straight).amin(0)
+    return functools.reduce(torch.minimum, straight)

@@ -14,7 +14,7 @@ from torchelev.planning.cost_to_go import cost_to_go, descend
 from torchelev.planning.limits import find_exceeded
 from torchelev.planning.path_reason import Endpoint, explain, find_limit, find_reason, read_cell
 from torchelev.planning.standing import mark_standing_cells
-from torchelev.planning.traversal_cost import TraversalCostConfig, mark_disc, traversal_cost, widen
+from torchelev.planning.traversal_cost import TraversalCostConfig, cost_within, mark_disc, widen
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -107,18 +107,21 @@ def plan(
     current = emap.state if state is None else state
     start, goal = (_find_cell(emap, *point, current) for point in (("start_xy", start_xy), ("goal_xy", goal_xy)))
     max_cells = 2 * (grid.height + grid.width) if max_cells is None else max_cells
-    cost = traversal_cost(emap, cfg, confidence=confidence, start=start.cell, standing=standing, state=state)
+    exceeded = find_exceeded(current, emap.cfg)
+    cost = cost_within(exceeded, emap, cfg, confidence=confidence, start=start.cell, standing=standing, state=state)
     target = mark_disc(goal.cell, cost, 0.0) & (start.is_inside & goal.is_inside)[:, None, None]
     value = cost_to_go(cost, target, resolution=grid.resolution, rounds=rounds)
     path = descend(value, cost, start.cell, resolution=grid.resolution, max_cells=max_cells)
     reached = path.reached & start.is_inside
-    rated = emap.read_layer("traversability", state)[1]
-    radius = cfg.stand_radius / grid.resolution
-    below = mark_disc(start.cell, cost, radius) if standing is None else mark_standing_cells(emap, standing, state)
-    reason = find_reason(cost, value, rated, below, start, goal, reached)
-    inflation = round(cfg.inflation_radius / grid.resolution)
-    exceeded = [widen(cells, inflation) for cells in find_exceeded(current, emap.cfg)]
-    limit = find_limit(reason, cost, value, exceeded, below, start, goal)
+    if readable(reached) and bool(reached.all()):  # there is nothing to explain
+        reason, limit = (torch.zeros_like(path.cells[:, 0, 0]) for _ in range(2))
+    else:
+        rated = emap.read_layer("traversability", state)[1]
+        radius = cfg.stand_radius / grid.resolution
+        below = mark_disc(start.cell, cost, radius) if standing is None else mark_standing_cells(emap, standing, state)
+        reason = find_reason(cost, value, rated, below, start, goal, reached)
+        wide = [widen(cells, round(cfg.inflation_radius / grid.resolution)) for cells in exceeded]
+        limit = find_limit(reason, cost, value, wide, below, start, goal)
     xy = (path.cells + current.corner[:, None]).double().add(0.5) * grid.resolution
     num_steps = (path.cells[:, 1:] != path.cells[:, :-1]).any(-1).sum(1)
     count = torch.where(start.is_inside, num_steps + 1, 0)

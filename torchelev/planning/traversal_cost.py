@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -105,6 +106,21 @@ def traversal_cost(
         ValueError, TypeError: for a wrong shape, dtype or device, or a map without traversability.
         KeyError: for `unknown_layer="completed"` of a map without completion.
     """
+    exceeded = find_exceeded(emap.state if state is None else state, emap.cfg)
+    return cost_within(exceeded, emap, cfg, confidence=confidence, start=start, standing=standing, state=state)
+
+
+def cost_within(
+    exceeded: Sequence[Bool[Tensor, "B H W"]],
+    emap: ElevationMap,
+    cfg: TraversalCostConfig | None = None,
+    *,
+    confidence: Float[Tensor, "B H W"] | None = None,
+    start: Int[Tensor, "B 2"] | None = None,
+    standing: Float[Tensor, "B V 2"] | None = None,
+    state: MapState | None = None,
+) -> Float[Tensor, "B H W"]:
+    """Compute `traversal_cost`, given the cells beyond each of the robot's limits (`limits.find_exceeded`)."""
     cfg = given_or_default(TraversalCostConfig, cfg)
     hint = "give ElevationMapConfig a TraversabilityConfig"
     require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", hint)
@@ -118,8 +134,8 @@ def traversal_cost(
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
     rated, bound = (emap.read_layer(name, given) for name in ("traversability", cfg.unknown_layer))
     below = None if standing is None else mark_standing_cells(emap, standing, state)
-    exceeded = functools.reduce(torch.logical_or, find_exceeded(state, emap.cfg))
-    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, below, exceeded)
+    beyond = functools.reduce(torch.logical_or, exceeded)
+    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, below, beyond)
 
 
 def cost_of_layers(
