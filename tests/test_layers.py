@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from tests import reference
 from tests.helpers import random_state, small_map
-from torchelev.layers import LAYERS
+from torchelev.grid import GridConfig
+from torchelev.layers import LAYERS, sample_layer
 
 SEEDS = st.integers(0, 10_000)
 MODES = st.sampled_from(["bilinear", "nearest"])
@@ -20,6 +21,16 @@ def filled(seed=0, num_envs=2, known=0.7, corner=((-7, 3), (1, -6)), dtype=torch
     state = random_state(np.random.default_rng(seed), emap.cfg.grid, num_envs, known, dtype)
     emap.load_state(state._replace(corner=torch.tensor(corner[:num_envs])))
     return emap
+
+
+def test_a_cell_beyond_two_to_the_24th_is_that_of_the_point():
+    H, W = 17, 999_983
+    values, known = torch.zeros(1, H, W), torch.ones(1, 1, 1, dtype=torch.bool).expand(1, H, W)
+    values[0, H - 1, W - 2] = 3.0
+    point = torch.tensor([[[H - 0.5, W - 1.5]]])
+    grid = GridConfig(resolution=1.0, length_x=H, length_y=W)
+    for mode in ("bilinear", "nearest"):
+        assert sample_layer((values, known), point, grid, mode)[0].item() == 3.0
 
 
 @given(SEEDS, MODES, st.sampled_from(sorted(LAYERS)))

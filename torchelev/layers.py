@@ -123,7 +123,8 @@ def _find_corners(uv: Tensor, grid: GridConfig, mode: str) -> _Corners:
     far = min(1e6, torch.finfo(uv.dtype).max)
     i, j, weight = surrounding_cells(torch.where(finite, uv.clamp(-far, far), -far), mode)
     inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
-    cell = (i * grid.width + j).clamp(0, grid.num_cells - 1).to(torch.int64)
+    # In integers: float32 is exact up to 2^24 only.
+    cell = (i.to(torch.int64) * grid.width + j.to(torch.int64)).clamp(0, grid.num_cells - 1)
     return _Corners(cell.flatten(1), inside.flatten(1), weight)
 
 
