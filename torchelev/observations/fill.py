@@ -13,7 +13,7 @@ from torch import Tensor
 from torchelev.errors import message, require
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer, sample_layers
-from torchelev.observations.ground import continue_ground
+from torchelev.observations.ground import border_left_out, continue_ground
 from torchelev.ops.operators import padded
 from torchelev.ops.windows import window_moments
 from torchelev.readable_map import ReadableMap
@@ -145,7 +145,7 @@ def inpaint(layer: Layer, half_extent: tuple[int, int], rings: int) -> Layer:
     """
     values, known = layer
     H, W = values.shape[1:]
-    top, left = (max(0, n // 2 - cells - rings) for n, cells in zip((H, W), half_extent, strict=True))
+    top, left = border_left_out((H, W), half_extent, rings)
     part = known[:, top : H - top, left : W - left]
     heights = torch.where(part, values[:, top : H - top, left : W - left], 0.0)
     weighted = torch.stack([heights, part.to(values.dtype)], 1)  # height and weight, 0 or 1

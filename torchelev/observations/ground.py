@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -46,19 +47,34 @@ def continue_ground(
         Heights (B, M) and whether there is one; on an empty map there is none.
     """
     values, known = layer
-    margin = math.ceil(_MARGIN / grid.resolution)
-    top, left = (max(0, n // 2 - cells - margin) for n, cells in zip(values.shape[1:], half_extent, strict=True))
+    top, left = border_left_out(values.shape[1:], half_extent, margin_around(grid))
     values, known = (v[:, top : v.shape[1] - top, left : v.shape[2] - left] for v in (values, known))
     z = torch.nan_to_num(base_z, nan=0.0, posinf=0.0, neginf=0.0)  # GPU poses are not checked
     relative = torch.where(known, values - z[..., None], 0.0)
     points = torch.cat([uv, base_uv], 1)
     points = torch.stack([points[..., 0] - top, points[..., 1] - left], -1)
-    num_near = 1 + max(0, math.floor(math.log2(_MAX_BLOCK / grid.resolution)))
+    num_near = count_near_levels(grid)
     levels = _read_levels((relative, known), points, num_near)
     below = [(mean[:, -1:], found[:, -1:] & (mean[:, -1:] < 0)) for mean, found in levels]
     base_ground, base_found = _take_first_known(below)
     ground, found = _take_first_known([(mean[:, :-1], found[:, :-1]) for mean, found in levels[:num_near]])
     return torch.where(found, ground, base_ground) + z, found | base_found
+
+
+def margin_around(grid: GridConfig) -> int:
+    """Return how many cells beyond the points `continue_ground` reads."""
+    return math.ceil(_MARGIN / grid.resolution)
+
+
+def count_near_levels(grid: GridConfig) -> int:
+    """Return how many sizes of blocks, from a cell on, count as near a point."""
+    return 1 + max(0, math.floor(math.log2(_MAX_BLOCK / grid.resolution)))
+
+
+def border_left_out(size: Sequence[int], half_extent: tuple[int, int], margin: int) -> tuple[int, int]:
+    """Return how many rows and columns at each side of a window lie more than `margin` cells beyond the points."""
+    top, left = (max(0, n // 2 - cells - margin) for n, cells in zip(size, half_extent, strict=True))
+    return top, left
 
 
 def _read_levels(layer: Layer, points: Float[Tensor, "B M 2"], num_near: int) -> list[Layer]:

@@ -1,4 +1,4 @@
-"""Compute the values of a height scan from its settings and the map."""
+"""Compute the values of a height scan from its settings and the map: by tensors here, or in C++ (`kernel`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.layers import Layer
 from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, filled_layers, read_points
-from torchelev.observations.inputs import check_base, check_feet, draw_noise
+from torchelev.observations.inputs import ScanInputs, check_base, check_feet, draw_noise
+from torchelev.observations.kernel import can_read, read_in_cpp
 from torchelev.observations.patterns import to_cells
 from torchelev.observations.scan_settings import ScanSettings
 from torchelev.state import MapState
@@ -24,35 +25,53 @@ def read_scan(
     state: MapState | None,
 ) -> Layer:
     """Read the values (B, P) of a scan, and whether the elevation at each point is known: see `HeightScan`."""
-    grid = emap.cfg.grid
-    scan.placement.require_inside(grid)
+    scan.placement.require_inside(emap.cfg.grid)
     T_map_base = check_base(emap, T_map_base)
-    base = T_map_base[:, None, :3, 3]
-    if not scan.num_feet:
+    if scan.num_feet:
+        feet = check_feet(emap, feet, scan.num_feet)
+    else:
         require(feet is None, "feet", "must be left out", "feet for a scan around the base", "use HeightScan.feet")
-    origin = check_feet(emap, feet, scan.num_feet) if scan.num_feet else base
-    error = draw_noise(emap, noise, scan.num_points, scan.noise)
+    draws = draw_noise(emap, noise, scan.num_points, scan.noise)
     current = emap.state if state is None else state
-    dtype = current.elevation.dtype
-    uv = scan.placement.place(T_map_base, origin, current.corner, grid.resolution, dtype)
-    base_uv, base_z = to_cells(base, current.corner, grid.resolution, dtype), base[..., 2].to(dtype)
+    inputs = ScanInputs(current, emap.cfg.grid, T_map_base, feet, draws)
+    fill = scan.original if scan.fill == ORIGINAL else scan.fill
+    if can_read(fill, inputs):
+        return read_in_cpp(scan, fill, _value_of_unknown(scan, fill), inputs)
+    filled = filled_layers(fill, emap, state, scan.placement.half_extent(inputs.grid), scan.inpaint_rings)
+    return _read(scan, fill, filled, inputs)
+
+
+def _read(scan: ScanSettings, fill: str | float, layers: list[Layer], inputs: ScanInputs) -> Layer:
+    """Read a scan; `layers` are those of `filled_layers`."""
+    state, grid = inputs.state, inputs.grid
+    dtype = state.elevation.dtype
+    base = inputs.T_map_base[:, None, :3, 3]
+    origin = base if inputs.feet is None else inputs.feet
+    uv = scan.placement.place(inputs.T_map_base, origin, state.corner, grid.resolution, dtype)
+    base_uv, base_z = to_cells(base, state.corner, grid.resolution, dtype), base[..., 2].to(dtype)
     query = Query(uv, base_uv, base_z, scan.placement.half_extent(grid), grid)
     z = origin[..., 2:].to(dtype)
     # On a GPU the poses are not checked: they may not be finite.
     z, is_finite = (v.expand(-1, -1, len(scan.pattern)).flatten(1) for v in (z, torch.isfinite(z)))
-    fill = scan.original if scan.fill == ORIGINAL else scan.fill
-    layers = filled_layers(fill, emap, state, query.half_extent, scan.inpaint_rings)
-    (elevation, known), *filled = read_points([(current.elevation, current.validity), *layers], uv, grid, scan.mode)
+    (elevation, known), *filled = read_points([(state.elevation, state.validity), *layers], uv, grid, scan.mode)
     valid = known & is_finite
-    ground, has_ground = fill_unknown(fill, current, query, (elevation, valid), filled)
-    standing_height = scan.nominal_height if scan.standing_height is None else scan.standing_height
-    missing = standing_height - scan.nominal_height if isinstance(fill, str) else fill
+    ground, has_ground = fill_unknown(fill, state, query, (elevation, valid), filled)
+    missing = _value_of_unknown(scan, fill)
     value = torch.where(has_ground & is_finite, z - ground - scan.nominal_height, missing)
-    return _finish(scan, value, error), valid
+    return _finish(scan, value, inputs.draws), valid
 
 
-def _finish(scan: ScanSettings, value: Tensor, error: Tensor | None) -> Tensor:
+def _value_of_unknown(scan: ScanSettings, fill: str | float) -> float:
+    """Return what a point reads for which neither the map nor the fill has a height [m]."""
+    if isinstance(fill, int | float):
+        return fill
+    standing_height = scan.nominal_height if scan.standing_height is None else scan.standing_height
+    return standing_height - scan.nominal_height
+
+
+def _finish(scan: ScanSettings, value: Tensor, draws: Tensor | None) -> Tensor:
     """Apply noise, clip and scale."""
+    error = None if draws is None else (2 * draws - 1) * scan.noise
     if error is not None and not scan.noise_after_clip:
         value = value + error
     if scan.clip is not None:
