@@ -9,6 +9,7 @@ from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
+from torchelev.observations.kernel import LIBRARY as SCANS
 from torchelev.pipeline import compile_stages
 from torchelev.planning.dijkstra import LIBRARY as DIJKSTRA
 from torchelev.sim.sensors.casting_kernel import LIBRARY as CASTING
@@ -18,7 +19,7 @@ def main() -> None:
     """Build all libraries for each instruction set of this machine's kind."""
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(compile_stages(ElevationMapConfig())).parts
-    for library in (stages, library_of(CompletionNet.from_pretrained().weights), CASTING, DIJKSTRA):
+    for library in (stages, library_of(CompletionNet.from_pretrained().weights), CASTING, DIJKSTRA, SCANS):
         for path in build_ahead(*library):
             print(path.name)
 

@@ -17,7 +17,7 @@ from torchelev.observations.patterns import ALIGNMENTS
 from torchelev.observations.scan_settings import ScanSettings
 from torchelev.ops.transforms import is_transforming
 
-_SOURCE = "observations/scan.cpp"
+LIBRARY: tuple[str, dict[str, str]] = ("observations/scan.cpp", {})
 _RULES = ("ground", "lowest", "upper_bound", "inpaint")  # `Fill` of scan.cpp; the others fill in no heights
 _ARRAYS = ("pose", "feet", "corner", "pattern", "elevation", "validity", "upper_bound", "bounded", "draws")
 _SIZES = ("environments", "origins", "points", "height", "width", "top", "left")
@@ -46,7 +46,7 @@ def can_read(fill: str | float, inputs: ScanInputs) -> bool:
     fits = all(layer.shape == cells for layer in (*floats[:2], state.validity, state.bounded))
     fits = fits and state.corner.shape == (cells[0], 2) and all(value.dtype == torch.float32 for value in floats)
     read = (*floats, state.corner, inputs.T_map_base, *(() if inputs.feet is None else (inputs.feet,)))
-    return fits and all(map(_is_plain, read)) and load(_SOURCE, {}) is not None
+    return fits and all(map(_is_plain, read)) and load(*LIBRARY) is not None
 
 
 def _is_recording() -> bool:
@@ -68,7 +68,7 @@ def _is_plain(value: Tensor) -> bool:
 
 def read_in_cpp(scan: ScanSettings, fill: str | float, missing: float, inputs: ScanInputs) -> Layer:
     """Read a scan; `missing` is the value [m] of points for which neither the map nor the fill has a height."""
-    library = load(_SOURCE, {})
+    library = load(*LIBRARY)
     assert library is not None, "asked without `can_read`"
     state, pose = inputs.state, inputs.T_map_base.double()
     values = state.elevation.new_empty(len(pose), scan.num_points)
