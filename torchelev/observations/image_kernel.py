@@ -19,7 +19,7 @@ from torchelev.observations.patterns import ALIGNMENTS, Pattern
 if TYPE_CHECKING:
     from torchelev.grid import GridConfig
 
-_SOURCE = "observations/kernel/image.cpp"
+LIBRARY: tuple[str, dict[str, str]] = ("observations/kernel/image.cpp", {})
 
 
 class Channels(NamedTuple):
@@ -60,7 +60,7 @@ def can_read(T_map_base: Tensor, corner: Tensor, layers: Iterable[Tensor]) -> bo
     if dtypes != {torch.float32} or not all(map(readable, tensors)) or forward_ad._current_level >= 0:
         return False
     has_gradient = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
-    return not has_gradient and load(_SOURCE, {}) is not None
+    return not has_gradient and load(*LIBRARY) is not None
 
 
 def read_images(
@@ -74,7 +74,7 @@ def read_images(
     num_channels: int,
 ) -> Tensor:
     """Return images (B, C, P), what `MapImage` reads by tensors."""
-    library = load(_SOURCE, {})
+    library = load(*LIBRARY)
     assert library is not None
     sources = [s._replace(layer=_contiguous(s.layer), second=s.second and _contiguous(s.second)) for s in sources]
     table = (_Source * len(sources))(*(_Source(*_addresses(s.layer), *_addresses(s.second), *s[2:]) for s in sources))

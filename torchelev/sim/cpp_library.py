@@ -12,8 +12,8 @@ from torchelev.inputs.checks import readable
 from torchelev.kernels.cpu_build import load
 
 
-def find_library(source: str, *tensors: Tensor | None) -> ctypes.CDLL | None:
-    """Return the library of a source, None if it cannot take the tensors, of which None is left out.
+def find_library(library: tuple[str, dict[str, str]], *tensors: Tensor | None) -> ctypes.CDLL | None:
+    """Return a library by its source and defines, None if it cannot take the tensors, of which None is left out.
 
     It takes float32 on a CPU without gradients. The tensors need not be contiguous.
     """
@@ -22,7 +22,7 @@ def find_library(source: str, *tensors: Tensor | None) -> ctypes.CDLL | None:
     has_gradient = torch.is_grad_enabled() and any(value.requires_grad for value in given)
     if not is_plain or has_gradient or forward_ad._current_level >= 0:
         return None
-    return load(source, {})
+    return load(*library)
 
 
 def address(value: Tensor | None) -> ctypes.c_void_p:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchelev.kernels.cpu_build import call
 from torchelev.sim.cpp_library import find_library
 
-_SOURCE = "sim/errors/kernel/errors.cpp"
+LIBRARY: tuple[str, dict[str, str]] = ("sim/errors/kernel/errors.cpp", {})
 FIELDS = (  # of `SensorErrorConfig`, in the order of `Settings` in C++
     "flying",
     "flying_step",
@@ -57,7 +57,7 @@ def disturb(
         image_shape: (h, w) of the points.
         changes_ranges: Whether any error moves points along their rays.
     """
-    library = find_library(_SOURCE, points, values, *draws)
+    library = find_library(LIBRARY, points, values, *draws)
     if library is None:
         return None
     first = names.index(FIELDS[0])

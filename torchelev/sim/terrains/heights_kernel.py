@@ -13,6 +13,8 @@ from torchelev.kernels.cpu_build import call
 from torchelev.sim.cpp_library import find_library
 from torchelev.sim.terrains.surfaces import Surface
 
+LIBRARY: tuple[str, dict[str, str]] = ("sim/sensors/kernel/heights.cpp", {})
+
 
 class _Field(Protocol):
     padded: Tensor
@@ -34,7 +36,7 @@ class _Query(ctypes.Structure):
 def read_heights(fields: Sequence[_Field], tile_ids: Tensor, xy: Tensor) -> Tensor | None:
     """Return the heights [m] (L, B, M) of L fields alike at places (B, M, 2) [m]; None where C++ cannot."""
     samples = [field.padded for field in fields]
-    library = find_library("sim/sensors/kernel/heights.cpp", xy, *samples)
+    library = find_library(LIBRARY, xy, *samples)
     if library is None or tile_ids.dtype != torch.int64 or not tile_ids.is_cpu:
         return None
     tile_ids, xy = tile_ids.contiguous(), xy.contiguous()
