@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from envs.terrain_nav.config import BodyConfig
-from torchelev.sim.terrains.heightfield import HeightField
+from torchelev.sim.terrains.heightfield import HeightField, heights_of
 
 
 class RobotState(NamedTuple):
@@ -37,10 +37,14 @@ class Ground:
 
 def contacts(xy: Tensor, yaw: Tensor, cfg: BodyConfig) -> Tensor:
     """Return the corners of the footprint, which are the feet, and the centres of its sides (B, 8, 2) [m]."""
+    return _place_contacts(xy, torch.stack([yaw.cos(), yaw.sin()], -1), cfg)
+
+
+def _place_contacts(xy: Tensor, ahead: Tensor, cfg: BodyConfig) -> Tensor:
+    """Do the same for bases whose x axes (B, 2) are given."""
     points = _footprint(cfg.length / 2, cfg.width / 2, xy.device)
-    cos, sin = yaw.cos()[:, None], yaw.sin()[:, None]
-    x, y = cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]
-    return torch.stack([x, y], -1) + xy[:, None]
+    left = torch.stack([-ahead[:, 1], ahead[:, 0]], -1)
+    return xy[:, None] + points[:, :1] * ahead[:, None] + points[:, 1:] * left[:, None]
 
 
 @functools.cache  # making a GPU tensor from a list synchronises with the host
@@ -52,22 +56,28 @@ def _footprint(a: float, b: float, device: torch.device) -> Tensor:
 
 def base_pose(xy: Tensor, yaw: Tensor, tile_ids: Tensor, field: HeightField, cfg: BodyConfig) -> Tensor:
     """Return T_map_base (B, 4, 4): above the feet, tilted like the plane through them."""
-    feet = field.height(tile_ids, contacts(xy, yaw, cfg)[:, :4])
-    front, rear, left, right = (feet[:, pair].mean(1) for pair in ((0, 1), (2, 3), (0, 2), (1, 3)))
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    ahead = F.normalize(torch.stack([yaw.cos(), yaw.sin(), (front - rear) / cfg.length], -1), dim=-1)
-    aside = torch.stack([-yaw.sin(), yaw.cos(), (left - right) / cfg.width], -1)
+    heading = torch.stack([yaw.cos(), yaw.sin()], -1)
+    feet = field.height(tile_ids, _place_contacts(xy, heading, cfg)[:, :4])
+    front, rear, left, right = ((feet[:, i] + feet[:, j]) / 2 for i, j in ((0, 1), (2, 3), (0, 2), (1, 3)))
+    ahead = F.normalize(torch.cat([heading, ((front - rear) / cfg.length)[:, None]], -1), dim=-1)
+    aside = torch.stack([-heading[:, 1], heading[:, 0], (left - right) / cfg.width], -1)
     up = F.normalize(torch.linalg.cross(ahead, aside), dim=-1)
-    rotation = torch.stack([ahead, torch.linalg.cross(up, ahead), up], -1)
-    position = torch.cat([xy, (feet.mean(1) + cfg.body_height)[:, None]], -1)
-    last = torch.stack([zero, zero, zero, one], -1)[:, None]
-    return torch.cat([torch.cat([rotation, position[..., None]], -1), last], 1)
+    T = torch.eye(4, device=xy.device).repeat(len(xy), 1, 1)
+    T[:, :3, :3] = torch.stack([ahead, torch.linalg.cross(up, ahead), up], -1)
+    T[:, :2, 3], T[:, 2, 3] = xy, feet.mean(1) + cfg.body_height
+    return T
 
 
 def advance(
-    state: RobotState, action: Tensor, tile_ids: Tensor, ground: Ground, cfg: BodyConfig, dt: float
+    state: RobotState,
+    action: Tensor,
+    tile_ids: Tensor,
+    ground: Ground,
+    cfg: BodyConfig,
+    dt: float,
+    substeps: int = 1,
 ) -> RobotState:
-    """Move for one substep.
+    """Move for some substeps.
 
     The velocity follows the command with the time constant `response`. The speed decreases linearly with the gradient
     under the feet, to 0 at `max_slope`, but not below a fifth. A robot does not move if after the substep ground within
@@ -75,30 +85,47 @@ def advance(
     `max_drop` below them (fallen).
 
     Args:
-        state: The robots before the substep.
+        state: The robots before.
         action: Forward speed and yaw rate (B, 2), from -1 to 1.
         tile_ids: The tile of each robot (B,).
         ground: The tiles.
         cfg: The body.
-        dt: Duration of the substep [s].
+        dt: Duration of each substep [s].
+        substeps: Their number.
+
+    Returns:
+        The robots afterwards; `blocked` is whether they were blocked in any of the substeps.
     """
     forward = action[:, 0] * torch.where(action[:, 0] > 0, cfg.max_speed, cfg.max_speed / 3)
     command = torch.stack([forward, action[:, 1] * cfg.max_yaw_rate], -1)
-    velocity = state.velocity + (command - state.velocity) * min(1.0, dt / cfg.response)
     feet = ground.field.height(tile_ids, contacts(state.xy, state.yaw, cfg)[:, :4])
-    support = feet.mean(1)
-    gradient = (feet.amax(1) - feet.amin(1)) / cfg.length
-    speed = velocity[:, 0] * (1 - gradient / cfg.max_slope).clamp(0.2, 1.0)
-    yaw = state.yaw + velocity[:, 1] * dt
-    xy = state.xy + (speed * dt)[:, None] * torch.stack([yaw.cos(), yaw.sin()], -1)
-    points = contacts(xy, yaw, cfg)
-    blocked = (ground.highest.height(tile_ids, points).amax(1) - support > cfg.max_climb) & ~state.fallen
-    fallen = (support - ground.field.height(tile_ids, points).amin(1) > cfg.max_drop) & ~blocked | state.fallen
+    blocked = torch.zeros_like(state.blocked)
+    for _ in range(substeps):
+        state, feet = _advance_once(state, feet, command, tile_ids, ground, cfg, dt)
+        blocked = blocked | state.blocked
+    return state._replace(blocked=blocked)
+
+
+def _advance_once(
+    state: RobotState, feet: Tensor, command: Tensor, tile_ids: Tensor, ground: Ground, cfg: BodyConfig, dt: float
+) -> tuple[RobotState, Tensor]:
+    """Move for one substep; return the robots and the heights of the ground under their feet (B, 4) [m]."""
+    velocity = torch.lerp(state.velocity, command, min(1.0, dt / cfg.response))
+    support, (lowest, highest) = feet.mean(1), torch.aminmax(feet, dim=1)
+    speed = velocity[:, 0] * (1 - (highest - lowest) / (cfg.length * cfg.max_slope)).clamp(0.2, 1.0)
+    yaw = torch.add(state.yaw, velocity[:, 1], alpha=dt)
+    ahead = torch.stack([yaw.cos(), yaw.sin()], -1)
+    xy = torch.addcmul(state.xy, speed[:, None], ahead, value=dt)
+    around, below = heights_of((ground.highest, ground.field), tile_ids, _place_contacts(xy, ahead, cfg))
+    blocked = (around.amax(1) - support > cfg.max_climb) & ~state.fallen
+    fallen = (support - below.amin(1) > cfg.max_drop) & ~blocked | state.fallen
     stays = blocked | fallen
-    return RobotState(
-        xy=torch.where(stays[:, None], state.xy, xy),
+    moves = ~stays[:, None]
+    moved = RobotState(
+        xy=torch.where(moves, xy, state.xy),
         yaw=torch.where(stays, state.yaw, yaw),
-        velocity=torch.where(stays[:, None], 0.0, velocity),
+        velocity=velocity * moves,
         blocked=blocked,
         fallen=fallen,
     )
+    return moved, torch.where(moves, below[:, :4], feet)

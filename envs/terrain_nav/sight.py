@@ -8,6 +8,8 @@ the ground under the base [m], validity, traversability. Unknown pixels are 0 in
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor, nn
 
@@ -15,6 +17,7 @@ from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.course import RatedCourse
 from torchelev import CompletionConfig, ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
 from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, mount_on_rim, preset
+from torchelev.sim.terrains.heightfield import heights_of
 
 LAYERS = ("elevation", "upper_bound", "validity", "traversability")
 
@@ -97,9 +100,9 @@ class TruthSight(BlindSight):
         xy = self.crop.xy(T_map_base)
         ground = T_map_base[:, 2, 3] - self.cfg.robot.body_height
         shape = self.noise.shape
-        elevation = (self.course.field.height(tile_ids, xy) - ground[:, None]).view(shape) + self.noise
-        traversability = self.course.traversability.height(tile_ids, xy).view(shape)
-        return torch.stack([elevation, elevation, torch.ones_like(elevation), traversability], 1)
+        height, traversability = heights_of((self.course.field, self.course.traversability), tile_ids, xy)
+        elevation = (height - ground[:, None]).view(shape) + self.noise
+        return torch.stack([elevation, elevation, torch.ones_like(elevation), traversability.view(shape)], 1)
 
 
 def _mountings(cfg: TerrainNavConfig) -> list[Tensor]:
@@ -149,16 +152,24 @@ class MapSight(BlindSight):
     def look(self, T_map_base: Tensor, tile_ids: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points of the K cameras (B, K, M, 3), sensor frame, and their estimated poses (B, K, 4, 4)."""
         width, height = self.cfg.sight.camera_pixels
-        clouds: list[Tensor] = []
-        poses: list[Tensor] = []
+        K, clouds = len(self.cameras), []
+        # All at once, so that a tile is cast at by all cameras while it is in the caches: their rays are the same.
+        seen = self.cameras[0](
+            self.course.field,
+            tile_ids.repeat(K),
+            T_map_base.repeat(K, 1, 1),
+            T_base_sensor=torch.cat([camera.T_base_sensor @ errors.mounting() for camera, errors in self._sensors()]),
+        )
+        for points, (camera, errors) in zip(seen.chunk(K), self._sensors(), strict=True):
+            clouds.append(errors(points, camera.T_map_sensor(self.T_estimated), image_shape=(height, width)))
+        poses = [cloud.T_map_sensor for cloud in clouds if cloud.T_map_sensor is not None]
+        return torch.stack([cloud.points for cloud in clouds], 1), torch.stack(poses, 1)
+
+    def _sensors(self) -> Iterator[tuple[MountedSensor, SensorErrors]]:
+        """Yield each camera and its errors."""
         for camera, errors in zip(self.cameras, self.sensor_errors, strict=True):
             assert isinstance(errors, SensorErrors)
-            mounting = camera.T_base_sensor @ errors.mounting()
-            points = camera(self.course.field, tile_ids, T_map_base, T_base_sensor=mounting)
-            cloud = errors(points, camera.T_map_sensor(self.T_estimated), image_shape=(height, width))
-            clouds.append(cloud.points)
-            poses.append(cloud.T_map_sensor)
-        return torch.stack(clouds, 1), torch.stack(poses, 1)
+            yield camera, errors
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
         """Return the image of the map, its elevation filled where it is unknown."""

@@ -175,15 +175,12 @@ class TerrainNav(nn.Module):
         cfg, old_distance = self.cfg, self.distance
         action = action.to(self.xy.dtype).nan_to_num(0.0).clamp(-1.0, 1.0)
         robot = RobotState(self.xy, self.yaw, self.velocity, self.blocked, self.fallen)
-        blocked = torch.zeros_like(self.blocked)
-        for _ in range(cfg.substeps):
-            robot = advance(robot, action, self.tile_ids, self.ground, cfg.robot, cfg.dt / cfg.substeps)
-            blocked = blocked | robot.blocked
+        dt = cfg.dt / cfg.substeps
+        robot = advance(robot, action, self.tile_ids, self.ground, cfg.robot, dt, cfg.substeps)
         for name, value in robot._asdict().items():
             self._store(name, value)
-        self._store("blocked", blocked)
-        self._store("blocked_time", torch.where(blocked, self.blocked_time + cfg.dt, 0.0))
-        self._store("episode_length", self.episode_length + 1)
+        self.blocked_time.add_(cfg.dt).mul_(robot.blocked)
+        self.episode_length.add_(1)
         outcome = self._evaluate(old_distance, action)
         self._store("last_action", action)
         endings = torch.stack([getattr(outcome, name) for name in ENDINGS])

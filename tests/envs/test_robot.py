@@ -72,3 +72,20 @@ def test_base_pose_on_a_slope():
     assert torch.allclose(T[:3, :3] @ T[:3, :3].T, torch.eye(3, dtype=torch.float64), atol=1e-5)
     assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(0.7, abs=1e-5)
     assert float(T[2, 3]) == pytest.approx(0.2 * 0.5 - 0.1 * 0.3 + 0.45, abs=1e-4)
+
+
+def test_substeps_are_steps():
+    """Also of robots that are blocked, or fall, in one of them."""
+    ground = Ground(field_of(lambda x, y: 0.5 * (x > 1.0) - 0.8 * (x < -1.0)), ROBOT.reach)  # a wall and a pit
+    no, xy = torch.zeros(8, dtype=torch.bool), torch.linspace(-0.8, 0.8, 8)[:, None] * torch.tensor([1.0, 0.2])
+    yaw = torch.pi * (xy[:, 0] < 0)  # the others face the wall
+    first = RobotState(xy, yaw, torch.tensor([[1.0, 0.3]]).repeat(8, 1), no, no)
+    action, ids = torch.tensor([[1.0, 0.5]]).repeat(8, 1), IDS.repeat(8)
+    one_by_one, blocked = first, no
+    for _ in range(6):
+        one_by_one = advance(one_by_one, action, ids, ground, ROBOT, 0.05)
+        blocked = blocked | one_by_one.blocked
+    at_once = advance(first, action, ids, ground, ROBOT, 0.05, substeps=6)
+    assert blocked.any() and one_by_one.fallen.any() and torch.equal(at_once.blocked, blocked)
+    for name in ("xy", "yaw", "velocity", "fallen"):
+        torch.testing.assert_close(getattr(at_once, name), getattr(one_by_one, name), rtol=0, atol=1e-6)

@@ -137,3 +137,16 @@ def test_completed_pixels_are_those_of_the_completed_map():
     completed = dataclasses.replace(sight.crop, layers=("completed",))(sight.emap, sight.T_estimated)[:, 0]
     unknown = image[:, 2] == 0
     torch.testing.assert_close(image[:, 0][unknown], completed[unknown], atol=1e-6, rtol=0)
+
+
+def test_each_camera_sees_from_its_own_mounting():
+    """Cast together, the cameras see what each would see alone."""
+    cfg = TerrainNavConfig(course=SMALL, sight=SightConfig(sensor_errors="perfect", pose_errors="perfect"))
+    task = TerrainNav(cfg, 3)
+    sight, T = task.sight, task.T_map_base
+    points, poses = sight.look(T, task.tile_ids)
+    assert points.shape[:2] == (3, 2) and not torch.equal(points[:, 0], points[:, 1])
+    for k, camera in enumerate(sight.cameras):
+        seen = camera(task.course.field, task.tile_ids, T)
+        torch.testing.assert_close(points[:, k], seen, rtol=0, atol=1e-5, equal_nan=True)
+        torch.testing.assert_close(poses[:, k], camera.T_map_sensor(sight.T_estimated))

@@ -8,10 +8,13 @@ import torch
 
 from tests.helpers import pose
 from tests.observations.maps import BASE, ground_map, plane, random_base, random_map
+from torchelev.kernels.cpu_build import find_compiler
 from torchelev.layers import LAYERS
+from torchelev.observations import image_kernel
 from torchelev.observations.fill import MODES
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import CHANNELS, MapImage
+from torchelev.observations.patterns import ALIGNMENTS
 
 
 def test_an_image_by_hand():
@@ -67,6 +70,39 @@ def test_images_are_scans_of_a_grid(mode):
     values, valid = pixels(emap, T)
     torch.testing.assert_close(channels[:, 1].flatten(1), -values)
     assert torch.equal(channels[:, 0].flatten(1), valid.double())
+
+
+@pytest.mark.parametrize("layers", [CHANNELS, CHANNELS[::-1], ("validity",), ("upper_bound", "variance")], ids=str)
+@pytest.mark.parametrize("alignment", ALIGNMENTS)
+@pytest.mark.parametrize("mode", MODES)
+def test_images_are_the_same_in_cpp(mode, alignment, layers, monkeypatch):
+    emap, rng = random_map(11, dtype=torch.float32)
+    T = random_base(emap, rng)
+    image = MapImage(length_x=0.7, length_y=0.5, resolution=0.1, layers=layers, alignment=alignment, mode=mode)
+    poses = (
+        T,
+        T.float(),
+        T.clone().index_put_((torch.tensor([1]), *torch.tensor([[2], [3]])), torch.tensor(2.5).double()),
+    )
+    for base in poses:
+        got = image(emap, base)
+        assert got.dtype == torch.float32 and got.any()
+        with monkeypatch.context() as patch:
+            patch.setenv("TORCHELEV_NATIVE", "0")
+            torch.testing.assert_close(got, image(emap, base), rtol=0, atol=2e-6)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+def test_images_are_read_in_cpp(monkeypatch):
+    """Not where there is something to differentiate, nor where a channel is there twice."""
+    emap, rng = random_map(11, dtype=torch.float32)
+    T, image = random_base(emap, rng), MapImage(length_x=0.7, length_y=0.5, resolution=0.1)
+    twice = dataclasses.replace(image, layers=("elevation", "elevation"))(emap, T)
+    assert torch.equal(twice[:, 0], image(emap, T)[:, 0]) and torch.equal(twice[:, 1], twice[:, 0])
+    (gradient,) = torch.autograd.grad(image(emap, T.requires_grad_()).sum(), T)
+    assert gradient.any()
+    monkeypatch.setattr(image_kernel, "read_images", lambda *arguments: torch.full((2, 4, 35), 3.0))
+    assert (image(emap, T.detach()) == 3).all() and not (image(emap, T) == 3).all()
 
 
 def test_where_an_images_pixels_lie():

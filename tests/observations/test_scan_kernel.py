@@ -13,9 +13,9 @@ from torchelev.kernels.cpu_build import find_compiler, is_switched_off
 from torchelev.observations.fill import FILLS, MODES, ORIGINAL
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.inputs import ScanInputs
-from torchelev.observations.kernel import can_read
 from torchelev.observations.patterns import ALIGNMENTS
 from torchelev.observations.presets import PRESETS
+from torchelev.observations.scan_kernel import can_read
 from torchelev.state import map_layers
 
 HAS_CPP = find_compiler() is not None and not is_switched_off()

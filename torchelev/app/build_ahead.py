@@ -9,17 +9,21 @@ from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
-from torchelev.observations.kernel import LIBRARY as SCANS
+from torchelev.observations.image_kernel import LIBRARY as IMAGES
+from torchelev.observations.scan_kernel import LIBRARY as SCANS
 from torchelev.pipeline import compile_stages
 from torchelev.planning.dijkstra import LIBRARY as DIJKSTRA
+from torchelev.sim.errors.cloud_kernel import LIBRARY as ERRORS
 from torchelev.sim.sensors.casting_kernel import LIBRARY as CASTING
+from torchelev.sim.terrains.heights_kernel import LIBRARY as HEIGHTS
 
 
 def main() -> None:
     """Build all libraries for each instruction set of this machine's kind."""
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(compile_stages(ElevationMapConfig())).parts
-    for library in (stages, library_of(CompletionNet.from_pretrained().weights), CASTING, DIJKSTRA, SCANS):
+    completion = library_of(CompletionNet.from_pretrained().weights)
+    for library in (stages, completion, CASTING, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, SCANS):
         for path in build_ahead(*library):
             print(path.name)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -11,9 +12,11 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, whole_cells
+from torchelev.grid import GridConfig
 from torchelev.layers import Layer
-from torchelev.observations import patterns
+from torchelev.observations import image_kernel, patterns
 from torchelev.observations.fill import read_points, require_mode
+from torchelev.observations.image_kernel import Channels
 from torchelev.observations.inputs import check_base
 from torchelev.observations.patterns import Pattern
 from torchelev.state import MapState
@@ -92,14 +95,46 @@ class MapImage:
         self._pattern.require_inside(grid)
         T_map_base = check_base(emap, T_map_base)
         current = emap.state if state is None else state
+        layers = {name: emap.read_layer(name, state) for name in self._read_alone}
+        is_plain = len(set(self.layers)) == len(self.layers)
+        if is_plain and image_kernel.can_read(T_map_base, current.corner, _tensors(layers, current)):
+            images = image_kernel.read_images(
+                self._sources(layers, current),
+                *(self._pattern, T_map_base, current.corner, grid),
+                *(self.mode, self.nominal_height, len(self.layers)),
+            )
+        else:
+            bound = {"upper_bound": emap.read_layer("upper_bound", state)} if "upper_bound" in self.layers else {}
+            images = self._read_in_torch(layers | bound, current, grid, T_map_base)
+        return images.unflatten(-1, self.shape[1:])
+
+    @property
+    def _read_alone(self) -> list[str]:
+        """Layers whose values do not hide those of others; "upper_bound" is where no elevation does."""
+        hidden = {"validity": "elevation", "upper_bound": "elevation"}
+        return list(dict.fromkeys(hidden.get(name, name) for name in self.layers))
+
+    def _sources(self, layers: dict[str, Layer], state: MapState) -> Iterator[Channels]:
+        """Yield which channels each layer becomes."""
+        places = {name: index for index, name in enumerate(self.layers)}
+        for name, layer in layers.items():
+            validity = places.get("validity", -1) if name == "elevation" else -1
+            if name in places or validity >= 0:
+                yield Channels(layer, None, places.get(name, -1), validity, name in HEIGHTS)
+        if "upper_bound" in places:
+            bound = state.upper_bound, state.bounded
+            yield Channels(layers["elevation"], bound, places["upper_bound"], -1, True)
+
+    def _read_in_torch(
+        self, layers: dict[str, Layer], state: MapState, grid: GridConfig, T_map_base: Tensor
+    ) -> Float[Tensor, "B C M"]:
+        """Read the channels of layers by tensors: this is the definition."""
         base = T_map_base[:, None, :3, 3]
-        uv = self._pattern.place(T_map_base, base, current.corner, grid.resolution, current.elevation.dtype)
+        uv = self._pattern.place(T_map_base, base, state.corner, grid.resolution, state.elevation.dtype)
         reference = base[..., 2].to(uv.dtype) - self.nominal_height
-        sources = dict.fromkeys("elevation" if name == "validity" else name for name in self.layers)
-        sampled = read_points([emap.read_layer(name, state) for name in sources], uv, grid, self.mode)
-        read = dict(zip(sources, sampled, strict=True))
+        read = dict(zip(layers, read_points(list(layers.values()), uv, grid, self.mode), strict=True))
         images = torch.stack([_channel(name, read, reference) for name in self.layers], 1)
-        return torch.where(torch.isfinite(reference)[:, None], images, 0.0).unflatten(-1, self.shape[1:])
+        return torch.where(torch.isfinite(reference)[:, None], images, 0.0)
 
     def xy(self, T_map_base: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B M 2"]:
         """Return the centres of the pixels [m], map frame, row by row, for instance for `ElevationMap.sample`.
@@ -108,6 +143,11 @@ class MapImage:
         """
         corner = torch.zeros(len(T_map_base), 2, dtype=torch.int64, device=T_map_base.device)
         return self._pattern.place(T_map_base, T_map_base[:, None, :3, 3], corner, 1.0, T_map_base.dtype)
+
+
+def _tensors(layers: dict[str, Layer], state: MapState) -> list[Tensor]:
+    """Return all tensors that an image may read."""
+    return [state.upper_bound, state.bounded, *(value for layer in layers.values() for value in layer)]
 
 
 def _channel(name: str, read: dict[str, Layer], reference: Float[Tensor, "B 1"]) -> Float[Tensor, "B M"]:

@@ -10,8 +10,8 @@ from torchelev.errors import require
 from torchelev.layers import Layer
 from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, filled_layers, read_points
 from torchelev.observations.inputs import ScanInputs, check_base, check_feet, draw_noise
-from torchelev.observations.kernel import can_read, read_in_cpp
 from torchelev.observations.patterns import to_cells
+from torchelev.observations.scan_kernel import can_read, read_in_cpp
 from torchelev.observations.scan_settings import ScanSettings
 from torchelev.state import MapState
 

@@ -9,13 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import pose, random_poses
+from tests.sim.sensors.ray_cases import SURFACES, unit
 from tests.test_gpu import OneDevice
 from torchelev import ElevationMap
 from torchelev.inputs.clouds import depth_to_points
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact import scenes
 from torchelev.sim.exact.sensors import NonRepetitiveLidar
-from torchelev.sim.sensors.casting import Boxes
+from torchelev.sim.sensors.casting import Boxes, see
 from torchelev.sim.sensors.mounted import MountedSensor
 from torchelev.sim.terrains.heightfield import HeightField
 
@@ -266,3 +267,20 @@ def test_each_environment_has_its_own_step():
     for b, step in enumerate((2, 5)):
         alone = sensor(FLAT, zeros(1), T[:1], step=step)[0]
         torch.testing.assert_close(both[b], alone, atol=1e-5, rtol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("surface, diagonal", SURFACES)
+def test_points_are_the_same_in_cpp(surface, diagonal, monkeypatch):
+    """Of more rays than a thread takes, between the ranges, and of no pose that is not finite."""
+    rng = np.random.default_rng(3)
+    field = HeightField(torch.from_numpy(rng.uniform(-0.2, 0.2, (3, 30, 40))), 0.1, surface, diagonal)
+    T = torch.eye(4).repeat(5, 1, 1)
+    T[:, :3, :3] = torch.linalg.qr(torch.from_numpy(rng.normal(size=(5, 3, 3))).float())[0]
+    T[:, :3, 3] = torch.tensor([[0, 0, 0.4], [1, -1, 0.8], [torch.nan, 0, 1], [1e9, 0, 0.5], [0, 0, -1.0]])
+    rays, tile_ids = unit(rng, 1500).float(), torch.tensor([2, 0, 1, 1, 0])
+    got = see(field, tile_ids, T, rays, 0.5, 3.0)
+    monkeypatch.setenv("TORCHELEV_NATIVE", "0")
+    expected = see(field, tile_ids, T, rays, 0.5, 3.0)
+    assert got[[0, 1, 3]].isfinite().any(-1).any(-1).all() and got[2].isnan().all()
+    differs = ((got - expected).abs() > 1e-4).any(-1) | (got.isnan() != expected.isnan()).any(-1)
+    assert differs.float().mean() < 1e-3  # rays along edges

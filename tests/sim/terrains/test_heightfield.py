@@ -6,7 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.sim.terrains.heightfield import BLOCKS, HeightField
+from torchelev.kernels.cpu_build import find_compiler
+from torchelev.sim.terrains import heights_kernel
+from torchelev.sim.terrains.heightfield import BLOCKS, HeightField, heights_of
 
 # One tile of 3 x 2 samples, 0.5 m apart: x = -0.5, 0, 0.5 and y = -0.25, 0.25.
 SMALL = torch.tensor([[[0.0, 1.0], [2.0, 4.0], [8.0, 16.0]]])
@@ -134,3 +136,35 @@ def test_refuses_other_types_and_shapes():
         HeightField(np.zeros((1, 4, 4)), 0.1)
     with pytest.raises(ValueError, match="tile_ids, xy"):
         random_field(0).height(torch.tensor([0, 1]), torch.zeros(3, 4, 2))
+
+
+@pytest.mark.parametrize(
+    "surface, diagonal", [("bilinear", "rising"), ("triangles", "rising"), ("triangles", "falling")]
+)
+@pytest.mark.parametrize("M", [1, 8, 301])
+def test_heights_are_the_same_in_cpp(surface, diagonal, M, monkeypatch):
+    """Of two fields at once, also beyond the rim and where points are not finite."""
+    fields = [random_field(seed).with_surface(surface, diagonal) for seed in (1, 2)]
+    tile_ids = torch.tensor([2, 0, 1, 1])
+    xy = 2 * torch.rand(4, M, 2, generator=torch.Generator().manual_seed(M)) - 1
+    xy.view(-1)[::7] = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e30, 0.0]).repeat(500)[: len(xy.view(-1)[::7])]
+    got = heights_of(fields, tile_ids, xy)
+    assert heights_kernel.read_heights(fields, tile_ids, xy) is not None or find_compiler() is None
+    monkeypatch.setenv("TORCHELEV_NATIVE", "0")
+    assert heights_kernel.read_heights(fields, tile_ids, xy) is None
+    for field, heights in zip(fields, got, strict=True):
+        torch.testing.assert_close(heights, field.height(tile_ids, xy), rtol=0, atol=1e-6)
+
+
+def test_heights_have_gradients():
+    xy = torch.tensor([[[0.1, 0.05]]], requires_grad=True)
+    (gradient,) = torch.autograd.grad(HeightField(SMALL, 0.5).height(torch.tensor([0]), xy).sum(), xy)
+    # At 1.2 and 0.6 cells: between 2 and 8, and 4 and 16, by 6 and 12 a cell; between 3.2 and 6.4 along y.
+    assert gradient[0, 0].tolist() == pytest.approx([(6 * 0.4 + 12 * 0.6) / 0.5, (6.4 - 3.2) / 0.5], abs=1e-4)
+
+
+def test_refuses_other_tiles_and_fields():
+    with pytest.raises(IndexError):
+        HeightField(SMALL, 0.5).height(torch.tensor([1]), torch.zeros(1, 1, 2))
+    with pytest.raises(ValueError, match="fields: must be alike"):
+        heights_of([random_field(0), random_field(0, H=8)], torch.tensor([0]), torch.zeros(1, 1, 2))

@@ -14,15 +14,9 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.sim.errors.cloud_errors import disturb, draw
 from torchelev.sim.errors.delay import Cloud, Delay
 from torchelev.sim.errors.draws import DomainRandomization, Range, check_range, range_limits
-from torchelev.sim.errors.range_errors import (
-    add_artefacts,
-    add_flying_points,
-    find_range_across_edge,
-    quantise,
-    quantise_disparity,
-)
 from torchelev.sim.poses import pose_from_rotation_vector
 
 if TYPE_CHECKING:
@@ -142,12 +136,7 @@ class SensorErrors(DomainRandomization):
             ValueError: A shape does not fit, or there is a latency but no pose.
         """
         self._check(points, T_map_sensor, image_shape)
-        points = self._disturb_ranges(points, image_shape or (1, points.shape[1]))
-        if self.uses("point_noise", "outlier_noise"):
-            points = points + self._point_sigma(points.shape[1])[..., None] * self.normal(*points.shape)
-        if self.uses("disparity_step"):
-            points = quantise_disparity(points, self.value("disparity_step", 2))
-        points = self._drop(points)
+        points = disturb(self, points, draw(self, points.shape[1]), image_shape or (1, points.shape[1]))
         if not self.uses("latency") or T_map_sensor is None:
             return Cloud(points, T_map_sensor)
         delayed = self.delay(points, T_map_sensor, self.value("latency").long())
@@ -166,36 +155,3 @@ class SensorErrors(DomainRandomization):
         if image_shape is not None:
             fits = image_shape[0] * image_shape[1] == points.shape[1]
             require(fits, "image_shape", f"must hold {points.shape[1]} points", image_shape, "give (height, width)")
-
-    def _disturb_ranges(self, points: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Change the ranges of the points, not their directions."""
-        d = torch.linalg.vector_norm(points, dim=-1)
-        measured = d
-        B, M = d.shape
-        if self.uses("flying"):
-            fraction, step = self.value("flying", 2), self.value("flying_step", 2)
-            measured = add_flying_points(d, find_range_across_edge(d, shape), self.uniform(B, M), fraction, step)
-        if self.uses("too_short", "too_long"):
-            short, long = self.value("too_short", 2), self.value("too_long", 2)
-            measured = add_artefacts(measured, self.uniform(B, M), short, long)
-        if self.uses("range_constant", "range_quadratic"):
-            sigma = self.value("range_constant", 2) + self.value("range_quadratic", 2) * measured.square()
-            measured = measured + sigma * self.normal(B, M)
-        if self.uses("range_step"):
-            measured = quantise(measured, self.value("range_step", 2))
-        return points.clone() if measured is d else points * (measured / d.clamp(min=1e-6))[..., None]
-
-    def _point_sigma(self, count: int) -> Tensor:
-        """Return the standard deviation (B, M or 1) [m] of each point's noise."""
-        if not self.uses("outliers"):
-            return self.value("point_noise", 2)
-        is_outlier = self.uniform(self.num_envs, count) < self.value("outliers", 2)
-        return torch.where(is_outlier, self.value("outlier_noise", 2), self.value("point_noise", 2))
-
-    def _drop(self, points: Tensor) -> Tensor:
-        """Turn lost points and lost clouds into NaN."""
-        if not self.uses("dropout", "missed_frames"):
-            return points
-        is_missed = self.uniform(self.num_envs, 1) < self.value("missed_frames", 2)
-        is_lost = is_missed | (self.uniform(*points.shape[:2]) < self.value("dropout", 2))
-        return points.masked_fill(is_lost[..., None], float("nan"))

@@ -81,6 +81,35 @@ def cast(
         return torch.cat(parts)
 
 
+def see(
+    field: HeightField,
+    tile_ids: Int[Tensor, "B"],
+    T_map_sensor: Float[Tensor, "B 4 4"],
+    rays: Float[Tensor, "*B M 3"],
+    min_range: float,
+    max_range: float,
+) -> Float[Tensor, "B M 3"]:
+    """Return the points [m] that sensors see, sensor frame, float32; NaN where none lies in between the ranges.
+
+    Arguments and errors are those of `cast`, with poses and unit vectors of the sensors, float32.
+    """
+    shape = (len(tile_ids), *rays.shape[-2:])
+    if rays.ndim == 2 and rays.is_cpu:
+        _check(field, tile_ids, T_map_sensor[:, :3, 3], rays.expand(shape), max_range)
+        points = casting_kernel.see(field, tile_ids, T_map_sensor, rays, min_range, max_range)
+        if points is not None:
+            return points
+    rays = rays.expand(shape)
+    directions = rays @ T_map_sensor[:, :3, :3].mT
+    return to_points(rays, cast(field, tile_ids, T_map_sensor[:, :3, 3], directions, max_range), min_range)
+
+
+def to_points(rays: Float[Tensor, "B M 3"], distance: Float[Tensor, "B M"], min_range: float) -> Float[Tensor, "B M 3"]:
+    """Return the points [m] at distances along rays, NaN where these are infinite or below `min_range`."""
+    is_returned = (distance >= min_range) & (distance < math.inf)
+    return rays * distance.masked_fill(~is_returned, math.nan)[..., None]
+
+
 def _cast_part(
     field: HeightField, tile_ids: Tensor, origin: Tensor, directions: Tensor, max_range: float, boxes: Boxes | None
 ) -> Tensor:

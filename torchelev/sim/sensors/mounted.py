@@ -13,7 +13,7 @@ from torchelev.errors import require
 from torchelev.inputs.checks import check_pose
 from torchelev.robot_body.shapes import RobotBody
 from torchelev.sim.sensors.body_casting import cast_at_body
-from torchelev.sim.sensors.casting import Boxes, cast
+from torchelev.sim.sensors.casting import Boxes, cast, see, to_points
 from torchelev.sim.terrains.heightfield import HeightField
 
 if TYPE_CHECKING:
@@ -160,17 +160,20 @@ class MountedSensor:
         if T_base_sensor is not None:
             check_pose("T_base_sensor", T_base_sensor, shape, field.device, False)
         T = self.T_map_sensor(T_map_base, T_base_sensor).float()
-        rays = self.directions(T.device, step).expand(len(T), -1, 3)
+        rays = self.directions(T.device, step)
         if legs is not None:
             boxes = legs.moved(T_map_base) if boxes is None else boxes.joined(legs.moved(T_map_base))
+        if body is None and boxes is None:
+            points = see(field, tile_ids, T, rays, self.min_range, self.max_range)
+            return View(points, torch.zeros_like(points[..., 0], dtype=torch.bool))
+        rays = rays.expand(len(T), -1, 3)
         distance = cast(field, tile_ids, T[:, :3, 3], rays @ T[:, :3, :3].mT, self.max_range, boxes)
         on_body = torch.zeros_like(distance, dtype=torch.bool)
         if body is not None:
             to_body = self._distance_to(body, T_base_links, rays, T_base_sensor)
             on_body = (to_body < distance) & (to_body <= self.max_range)
             distance = torch.where(on_body, to_body, distance)
-        is_returned = (distance >= self.min_range) & (distance < math.inf)
-        return View(rays * distance.masked_fill(~is_returned, math.nan)[..., None], on_body)
+        return View(to_points(rays, distance, self.min_range), on_body)
 
     def _distance_to(
         self, body: RobotBody, T_base_links: Tensor | None, rays: Tensor, T_base_sensor: Tensor | None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -11,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.sim.terrains import heights_kernel
 from torchelev.sim.terrains.surfaces import Coefficients, Surface, require_surface
 
 if TYPE_CHECKING:
@@ -119,20 +121,7 @@ class HeightField:
         Raises:
             ValueError: The shapes do not fit.
         """
-        fits = tile_ids.ndim == 1 and xy.ndim == 3 and xy.shape[::2] == (len(tile_ids), 2)
-        actual = f"{tuple(tile_ids.shape)} and {tuple(xy.shape)}"
-        require(
-            fits,
-            "tile_ids, xy",
-            "must be (B,) and (B, M, 2)",
-            actual,
-            "give one tile and M points for each environment",
-        )
-        offset = (xy / self.resolution).to(self.padded.dtype).nan_to_num(0.0)  # NaN would become an index
-        position = offset.movedim(-1, 0) + self.middle[:, None, None]
-        cell = position.floor()
-        u, v = position - cell
-        return self.surface.height(self.coefficients(cell, tile_ids[:, None]), u, v)
+        return heights_of((self,), tile_ids, xy)[0]
 
     def coefficients(self, cell: Float[Tensor, "2 *N"], tile: Int[Tensor, "*N"]) -> Coefficients:
         """Return a, b, c, d (*N) of the surface in cells, which may lie beyond the rim; see `surfaces`."""
@@ -145,6 +134,37 @@ class HeightField:
 
     def _at(self, index: Tensor) -> Tensor:
         return self.padded.view(-1).index_select(0, index.flatten()).view(index.shape)
+
+
+def heights_of(
+    fields: Sequence[HeightField], tile_ids: Int[Tensor, "B"], xy: Float[Tensor, "B M 2"]
+) -> Sequence[Float[Tensor, "B M"]]:
+    """Return the heights of several fields of the same size, resolution and surface [m] at the same places.
+
+    See `HeightField.height`.
+
+    Raises:
+        ValueError: The shapes do not fit.
+    """
+    _check_places(fields, tile_ids, xy)
+    heights = heights_kernel.read_heights(fields, tile_ids, xy)
+    return [_read_heights(field, tile_ids, xy) for field in fields] if heights is None else heights.unbind(0)
+
+
+def _read_heights(field: HeightField, tile_ids: Tensor, xy: Tensor) -> Float[Tensor, "B M"]:
+    offset = (xy / field.resolution).to(field.padded.dtype).nan_to_num(0.0)  # NaN would become an index
+    position = offset.movedim(-1, 0) + field.middle[:, None, None]
+    cell = position.floor()
+    u, v = position - cell
+    return field.surface.height(field.coefficients(cell, tile_ids[:, None]), u, v)
+
+
+def _check_places(fields: Sequence[HeightField], tile_ids: Tensor, xy: Tensor) -> None:
+    fits = tile_ids.ndim == 1 and xy.ndim == 3 and xy.shape[::2] == (len(tile_ids), 2)
+    actual, hint = f"{tuple(tile_ids.shape)} and {tuple(xy.shape)}", "give one tile and M points for each environment"
+    require(fits, "tile_ids, xy", "must be (B,) and (B, M, 2)", actual, hint)
+    kinds = [(tuple(field.padded.shape), field.resolution, field.surface) for field in fields]
+    require(len(set(kinds)) == 1, "fields", "must be alike in size, resolution and surface", kinds, "read each alone")
 
 
 def _compute_bounds(heights: Float[Tensor, "K H W"]) -> Bounds:

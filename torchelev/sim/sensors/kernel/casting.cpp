@@ -2,16 +2,17 @@
 
 #include <algorithm>
 #include <cstddef>
-#include <numeric>
 #include <vector>
 
 #include "kernels/threads.h"
 #include "boxes.h"
 #include "field.h"
+#include "order.h"
 
 namespace {
 
-constexpr int AT_A_TIME = 1024;  // rays that a thread takes
+constexpr int AT_A_TIME = 1024;           // rays that a thread takes
+constexpr float FARTHEST = 8388608.0f;  // [cells] float32 cannot count cells farther out, where the ground is level
 
 // Trace rays from one origin; a lane takes the next ray as soon as its own has ended.
 template <Surface surface>
@@ -55,6 +56,45 @@ void stop_at_boxes(const Box* boxes, int num_boxes, const float* directions, int
     }
 }
 
+// K tiles, and how rays are traced there.
+struct Tiles {
+    const float *heights, *bounds;
+    const int64_t *levels, *sizes;
+    int rows, columns;
+    Surface surface;
+    float resolution, max_range;
+
+    Field field(int64_t tile) const {
+        Field field{heights + tile * (rows + 1) * (columns + 1), bounds + tile * sizes[0], {}, rows, columns};
+        for (int l = 0; l <= TOP; l++) field.offset[l] = int32_t(levels[l] + tile * sizes[l] - tile * sizes[0]);
+        return field;
+    }
+
+    void trace_from(int64_t tile, const float* origin, const float* directions, int count, float* distance) const {
+        const auto of_surface = surface == BILINEAR ? trace<BILINEAR> : surface == RISING ? trace<RISING> : trace<FALLING>;
+        of_surface(field(tile), origin, directions, count, resolution, max_range, distance);
+    }
+
+    // A place [m] in the frame of a tile, in cells and metres as rays start there: casting.py.
+    void place(const float* xyz, int step, float* origin) const {
+        for (int k = 0; k < 3; k++) {
+            const float middle = k < 2 ? 0.5f * (k ? columns : rows) : 0, x = xyz[k * step];
+            origin[k] = k < 2 ? x / resolution + middle : x;
+            if (!__builtin_isfinite(origin[k])) origin[k] = 0;
+            if (k < 2) origin[k] = std::min(std::max(origin[k], -FARTHEST), FARTHEST);
+        }
+    }
+};
+
+// Turn unit vectors (count, 3) with the rotation of a pose (4, 4).
+void turn(const float* pose, const float* rays, int count, float* directions) {
+    for (int k = 0; k < count; k++)
+        for (int row = 0; row < 3; row++) {
+            const float *r = pose + 4 * row, *ray = rays + 3 * k;
+            directions[3 * k + row] = r[0] * ray[0] + r[1] * ray[1] + r[2] * ray[2];
+        }
+}
+
 }  // namespace
 
 // Distances (B, M) of rays from origins (B, 3) [cells, cells, m], counted from the rim of the tiles, along directions
@@ -64,20 +104,46 @@ extern "C" int cast(const float* heights, const float* bounds, const int64_t* le
                     const int64_t* tiles, const float* origins, const float* directions, const Box* boxes,
                     float* distance, int surface, int rows, int columns, int B, int M, int num_boxes, float resolution,
                     float max_range, int num_threads) {
-    const auto trace_surface = surface == BILINEAR ? trace<BILINEAR> : surface == RISING ? trace<RISING> : trace<FALLING>;
+    const Tiles all{heights, bounds, levels, sizes, rows, columns, Surface(surface), resolution, max_range};
     const int parts = (M + AT_A_TIME - 1) / AT_A_TIME;
     return code_of([&] {
-        std::vector<int> order(B);  // robots on the same tile one after the other, while it is in the caches
-        std::iota(order.begin(), order.end(), 0);
-        std::sort(order.begin(), order.end(), [&](int a, int b) { return tiles[a] < tiles[b]; });
+        const std::vector<int> order = order_by_tile(tiles, B);
         for_each(B * parts, num_threads, [&](int task) {
             const size_t b = order[task / parts], first = b * M + task % parts * AT_A_TIME;
             const int count = std::min(AT_A_TIME, M - task % parts * AT_A_TIME);
-            Field field{heights + tiles[b] * (rows + 1) * (columns + 1), bounds + tiles[b] * sizes[0], {}, rows, columns};
-            for (int l = 0; l <= TOP; l++)
-                field.offset[l] = int32_t(levels[l] + tiles[b] * sizes[l] - tiles[b] * sizes[0]);
-            trace_surface(field, origins + 3 * b, directions + 3 * first, count, resolution, max_range, distance + first);
+            all.trace_from(tiles[b], origins + 3 * b, directions + 3 * first, count, distance + first);
             if (num_boxes) stop_at_boxes(boxes + b * num_boxes, num_boxes, directions + 3 * first, count, distance + first);
+        });
+    });
+}
+
+// Points (B, M, 3) that sensors see, NaN where nothing is hit from `min_range` to `max_range`. `poses` are (B, 4, 4),
+// `rays` (M, 3) unit vectors, both of the sensor's frame.
+extern "C" int see(const float* heights, const float* bounds, const int64_t* levels, const int64_t* sizes,
+                   const int64_t* tiles, const float* poses, const float* rays, float* points, int surface, int rows,
+                   int columns, int B, int M, float resolution, float min_range, float max_range, int num_threads) {
+    const Tiles all{heights, bounds, levels, sizes, rows, columns, Surface(surface), resolution, max_range};
+    const int parts = (M + AT_A_TIME - 1) / AT_A_TIME;
+    struct Part {
+        float directions[3 * AT_A_TIME], distance[AT_A_TIME];
+    };
+    return code_of([&] {
+        const std::vector<int> order = order_by_tile(tiles, B);
+        const auto make = [] { return std::vector<Part>(1); };
+        for_each(B * parts, num_threads, make, [&](int task, std::vector<Part>& own) {
+            const size_t b = order[task / parts], offset = task % parts * AT_A_TIME, first = b * M + offset;
+            const int count = std::min(AT_A_TIME, int(M - offset));
+            const float *pose = poses + 16 * b, *ray = rays + 3 * offset;
+            float origin[3], *distance = own[0].distance;
+            all.place(pose + 3, 4, origin);
+            turn(pose, ray, count, own[0].directions);
+            all.trace_from(tiles[b], origin, own[0].directions, count, distance);
+            const bool is_placed = __builtin_isfinite(pose[3] + pose[7] + pose[11]);
+            for (int k = 0; k < count; k++) {
+                const bool is_seen = is_placed & (distance[k] >= min_range) & (distance[k] <= max_range);
+                for (int c = 0; c < 3; c++)
+                    points[3 * (first + k) + c] = is_seen ? ray[3 * k + c] * distance[k] : __builtin_nanf("");
+            }
         });
     });
 }

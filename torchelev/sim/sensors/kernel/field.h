@@ -74,12 +74,10 @@ template <Surface surface> inline Flags cross(const Field& field, Rays& rays, Fl
     const int width = field.columns + 1;
     const Flags row = integers(clamp(rays.cell[0], 0, field.rows - 1));
     const Flags first = row * width + integers(clamp(rays.cell[1], 0, field.columns - 1));
-    const Lanes a = gather(field.heights, first), b = gather(field.heights, first + width) - a;
-    const Lanes c = gather(field.heights, first + 1) - a, d = gather(field.heights, first + width + 1) - a - b - c;
     const Lanes leave_x = larger(rays.inverse[0] * (0.5f - rays.sign[0] * (u - 0.5f)), all(0));
     const Lanes leave_y = larger(rays.inverse[1] * (0.5f - rays.sign[1] * (v - 0.5f)), all(0));
     const Lanes leave = smaller(leave_x, leave_y);
-    const Meeting meeting = meet<surface>({a, b, c, d}, u, v, rays.at(2, rays.along), rays.step, leave);
+    const Meeting meeting = meet<surface>(coefficients(field.heights, first, width), u, v, rays.at(2, rays.along), rays.step, leave);
     const Lanes ahead = meeting.ahead;
     const Flags is_below = meeting.over <= 0, hits = crossing & (is_below | ((ahead >= 0) & (ahead <= leave)));
     const Flags through_x = leave_x <= leave_y, goes = crossing & ~hits;

@@ -1,4 +1,4 @@
-// Where rays meet the surface of a cell: crossing.py.
+// The surface of a cell: surfaces.py; and where rays meet it: crossing.py.
 #pragma once
 
 #include "kernels/simd.h"
@@ -9,6 +9,18 @@ enum Surface { BILINEAR, RISING, FALLING };  // in the order of surfaces.py
 struct Coefficients {
     Lanes a, b, c, d;
 };
+
+// Those of a cell, by its first sample; rows of samples are `width` long.
+inline Coefficients coefficients(const float* samples, Flags first, int width) {
+    const Lanes a = gather(samples, first), b = gather(samples, first + width) - a, c = gather(samples, first + 1) - a;
+    return {a, b, c, gather(samples, first + width + 1) - a - b - c};
+}
+
+template <Surface surface> inline Lanes height(const Coefficients& at, Lanes u, Lanes v) {
+    if constexpr (surface == BILINEAR) return at.a + at.b * u + (at.c + at.d * u) * v;
+    const Lanes bend = surface == RISING ? smaller(u, v) : larger(u + v - 1, all(0));
+    return at.a + at.b * u + at.c * v + at.d * bend;
+}
 
 struct Meeting {
     Lanes over;   // [m] height of the ray's entry over the surface

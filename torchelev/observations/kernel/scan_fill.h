@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "observations/scan.h"
+#include "observations/kernel/scan.h"
 
 constexpr float HOLE = std::numeric_limits<float>::quiet_NaN();
 

@@ -17,7 +17,7 @@ from torchelev.observations.patterns import ALIGNMENTS
 from torchelev.observations.scan_settings import ScanSettings
 from torchelev.ops.transforms import is_transforming
 
-LIBRARY: tuple[str, dict[str, str]] = ("observations/scan.cpp", {})
+LIBRARY: tuple[str, dict[str, str]] = ("observations/kernel/scan.cpp", {})
 _RULES = ("ground", "lowest", "upper_bound", "inpaint")  # `Fill` of scan.cpp; the others fill in no heights
 _ARRAYS = ("pose", "feet", "corner", "pattern", "elevation", "validity", "upper_bound", "bounded", "draws")
 _SIZES = ("environments", "origins", "points", "height", "width", "top", "left")

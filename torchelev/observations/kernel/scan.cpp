@@ -11,16 +11,16 @@
 #include <vector>
 
 #include "kernels/threads.h"
-#include "observations/scan.h"
-#include "observations/scan_fill.h"
+#include "observations/kernel/scan.h"
+#include "observations/kernel/scan_fill.h"
 
 namespace {
 
-enum Fill : int32_t { NONE, GROUND, LOWEST, UPPER_BOUND, INPAINT };  // of kernel.py
+enum Fill : int32_t { NONE, GROUND, LOWEST, UPPER_BOUND, INPAINT };  // of scan_kernel.py
 
 constexpr int64_t FEW = 4096;  // points, which one thread reads before another one wakes up
 
-// As `Scan` of kernel.py.
+// As `Scan` of scan_kernel.py.
 struct Scan {
     const double *pose, *feet;  // (B, 4, 4); (B, K, 3), null around the base
     const int64_t* corner;      // (B, 2)
