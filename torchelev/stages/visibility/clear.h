@@ -11,6 +11,7 @@ struct CellsMemory {
 };
 
 class Cells {
+    static constexpr int TOGETHER = 32;  // vectors that are looked up one after the other, so that memory is read ahead
     const Sensor& sensor;
     const Table& table;
     const VisibilitySettings& s;
@@ -56,19 +57,62 @@ class Cells {
         const float x = place(0, i), square = reach * reach - x * x;
         if (square < 0) return 0;
         const float end = std::sqrt(square);
+        const int64_t first = before(1, -end, width), last = std::min(before(1, end, width) + 3, width);
         int64_t number = 0;
-        each_vector(before(1, -end, width), std::min(before(1, end, width) + 3, width), width, [&](int64_t j, auto count) {
-            const float beside = std::max(0.0f, std::max(y[j], -y[j + count - 1]));
+        for (int64_t j = first; j < last; j += TOGETHER * LANES)
+            number += apply_to_columns(i * width, x, j, std::min(last, j + TOGETHER * LANES));
+        return number;
+    }
+
+    // Where the lowest rays over cells are found.
+    struct Found {
+        Lanes rho, lowest;
+        Places places;
+    };
+
+    int64_t apply_to_columns(int64_t row, float x, int64_t first, int64_t last) const {
+        Found found[TOGETHER];
+        int count = 0, number = 0, next = 0;
+        each_vector(first, last, width, [&](int64_t j, auto size) {
+            const float beside = std::max(0.0f, std::max(y[j], -y[j + size - 1]));
             const int nearest = int(std::max(std::fabs(x), beside) / s.resolution) - 1;
-            number += apply_at(i * width + j, x, j, nearest, count);
+            found[count++] = find(x, load(y + j, size), nearest);
+        });
+        for (int k = 0; k < count; k++) found[k].lowest = smaller(found[k].lowest, table.lowest(found[k].places));
+        each_vector(first, last, width, [&](int64_t j, auto size) {
+            const Found& at = found[next++];
+            const Flags is_over = at.lowest < s.no_ray;
+            if (!any(is_over)) return;
+            const Lanes slope = pick(is_over, at.lowest, all(0));
+            const Lanes height = sensor.view.origin[2] + slope * at.rho;
+            number += apply_at({is_over, all(x), load(y + j, size), at.rho, slope, height}, row + j, size);
         });
         return number;
     }
 
-    // Apply the rays over the cells from column j on, none of which lies in a range bin below `nearest`.
-    template <class Count> int apply_at(int64_t k, float x, int64_t j, int nearest, Count count) const {
-        const RayOverCell<Lanes> ray = find_lowest_rays(x, load(y + j, count), nearest);
-        if (!any(ray.found)) return 0;
+    // `find_lowest_rays` over cells, none of which lies in a range bin below `nearest`.
+    Found find(float x, Lanes ys, int nearest) const {
+        const Lanes xs = all(x), rho = horizontal(xs, ys);
+        const Lanes k = smaller(floor_of(rho / s.resolution), all(float(s.ranges)));
+        const Lanes azimuth = azimuth_fraction(xs, ys) * float(s.azimuths);
+        int levels = 0;
+        while (levels < s.levels && nearest < s.widen[levels]) levels++;
+        const Lanes entry = entry_of(k, levels, s);
+        const Window<Lanes> window = window_of(k, azimuth, entry, s);
+        return {rho, nearest < table.near ? lowest_near(k, window, entry) : all(s.no_ray), table.places(k, window)};
+    }
+
+    // The lowest rays over those cells that lie in rows that are stored whole.
+    [[gnu::noinline]] Lanes lowest_near(Lanes k, const Window<Lanes>& window, Lanes entry) const {
+        Lanes lowest = all(s.no_ray);
+        const Flags row = integers(k), first = integers(window.first), number = integers(window.further + entry);
+        for (int l = 0; l < LANES; l++)
+            if (row[l] < table.near) lowest[l] = table.lowest_near(row[l], first[l], number[l]);
+        return lowest;
+    }
+
+    // Apply rays over cells from place k on; return how many are cleared.
+    template <class Count> int apply_at(const RayOverCell<Lanes>& ray, int64_t k, Count count) const {
         Flags known = load_bytes(map.validity + k, count) > 0;
         int number = 0;
         if (any(ray.found & known)) {
@@ -81,29 +125,6 @@ class Cells {
         refute_challengers(ray, k, known, count);
         if (any(ray.found & ~known)) bound(ray, k, known, count);
         return number;
-    }
-
-    RayOverCell<Lanes> find_lowest_rays(float x, Lanes ys, int nearest) const {
-        const Lanes xs = all(x), rho = horizontal(xs, ys);
-        const Lanes k = smaller(floor_of(rho / s.resolution), all(float(s.ranges)));
-        const Lanes azimuth = azimuth_fraction(xs, ys) * float(s.azimuths);
-        int levels = 0;
-        while (levels < s.levels && nearest < s.widen[levels]) levels++;
-        const Lanes entry = entry_of(k, levels, s);
-        const Window<Lanes> window = window_of(k, azimuth, entry, s);
-        const Lanes lowest = nearest < table.near ? lowest_near(k, window, entry) : table.lowest(k, window);
-        const Flags found = lowest < s.no_ray;
-        const Lanes slope = pick(found, lowest, all(0));
-        return {found, xs, ys, rho, slope, sensor.view.origin[2] + slope * rho};
-    }
-
-    // `lowest_slope` where some cells lie in rows that are stored whole.
-    Lanes lowest_near(Lanes k, const Window<Lanes>& window, Lanes entry) const {
-        Lanes lowest = k >= float(table.near) ? table.lowest(k, window) : all(s.no_ray);
-        const Flags row = integers(k), first = integers(window.first), number = integers(window.further + entry);
-        for (int l = 0; l < LANES; l++)
-            if (row[l] < table.near) lowest[l] = table.lowest_near(row[l], first[l], number[l]);
-        return lowest;
     }
 
     // Eq. 3 and 4, of known cells with a ray over them.

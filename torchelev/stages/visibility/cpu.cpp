@@ -30,7 +30,7 @@ int64_t apply_rays(const Sensor& sensor, VisibilityMemory& memory) {
     const Ground ground(sensor, extent, memory.ground);
     const Horizon horizon(sensor, ground, extent.farthest, memory.horizon);
     Table table(sensor.u, extent.farthest, memory.table);
-    AcceptedRays{sensor, ground, horizon}.put_into(table);
+    AcceptedRays(sensor, ground, horizon).put_into(table);
     table.finish();
     return Cells(sensor, table, memory.cells).apply();
 }

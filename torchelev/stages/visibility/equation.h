@@ -126,6 +126,16 @@ template <class V> INLINE V sure_height(V elevation, Flag<V> known, V support, c
     return pick(known & (support >= s.min_support), elevation, elevation + s.nowhere);
 }
 
+// Which known cells are accepted: enough points agree, or on a neighbouring cell of like height. Of the cell and its
+// neighbours the sure heights are given: `well_supported`.
+template <class V>
+INLINE Flag<V> well_supported(V elevation, Flag<V> known, V own, V above, V below, V left, V right,
+                              const VisibilitySettings& s) {
+    const V across = smaller(absolute(above - elevation), absolute(below - elevation));
+    const V along = smaller(absolute(left - elevation), absolute(right - elevation));
+    return known & ((own == elevation) | (smaller(across, along) <= s.resolution));
+}
+
 // Whether a ray ends credibly (`has_credible_end`), given the lowest ground at its end, infinite where that is not well
 // supported, and the lowest ground near the border that it leaves through; and its slope.
 template <class V> struct CredibleEnd {

@@ -9,7 +9,7 @@ constexpr float UNKNOWN = std::numeric_limits<float>::infinity();
 
 // Memory of all sensors and maps.
 struct GroundMemory {
-    Buffer<float> below, floor, borders;
+    Buffer<float> below, floor, borders, heights;
 };
 
 // The lowest ground of each cell that rays reach, in whole rows of the map.
@@ -28,7 +28,7 @@ class Ground {
         place(extent, 0, height, rows), place(extent, 1, width, columns);
         below = memory.below.resize((rows[1] - rows[0]) * width) - rows[0] * width;
         floor = memory.floor.resize((rows[1] - rows[0]) * width) - rows[0] * width;
-        look();
+        look(memory.heights);
         has_borders = leaves(extent, 0) || leaves(extent, 1);
         if (has_borders) look_at_borders(memory.borders);
     }
@@ -43,11 +43,14 @@ class Ground {
         return pick((i == near_i) & (j == near_j), found, all(beyond));
     }
 
-    // Return the lowest ground of cells at the ends of rays [m], UNKNOWN where it is not well supported.
-    Lanes floor_at(const RayEnds<Lanes>& end, Flags ends) const {
+    // Return where the lowest ground at the ends of rays is found.
+    Flags place(const RayEnds<Lanes>& end, Flags ends) const {
         const Flags slot = integers(end.i) * int(width) + integers(end.j);
-        return gather(floor, pick_int(ends, slot, Flags{} + int(rows[0] * width + columns[0])));
+        return pick_int(ends, slot, Flags{} + int(rows[0] * width + columns[0]));
     }
+
+    // Return the lowest ground [m], UNKNOWN where it is not well supported.
+    Lanes floor_at(Flags place) const { return gather(floor, place); }
 
     // Return the lowest ground near the borders that rays leave through [m]: `ground_at_borders`.
     Lanes near(const RayEnds<Lanes>& end, Flags ends) const {
@@ -73,51 +76,47 @@ class Ground {
         return start + extent.low[axis] < 0 || start + extent.high[axis] >= size;
     }
 
-    void look() const {
+    // Look at all cells, row by row; their heights and those of the rows beside them stay in the cache.
+    void look(Buffer<float>& memory) const {
+        const int64_t room = width + 2 * LANES, parts = 4 * sensor.u.threads;
+        float* heights = memory.resize(parts * 3 * room);
         const int64_t least = std::max(int64_t(1), CELLS_AT_A_TIME / width);
-        sensor.u.each(rows[1] - rows[0], least, [&](int64_t, int64_t begin, int64_t end) {
-            for (int64_t i = rows[0] + begin; i < rows[0] + end; i++)
-                each_vector(columns[0], columns[1], width, [&](int64_t j, auto count) { look_at(i, j, count); });
+        sensor.u.each(rows[1] - rows[0], least, [&](int64_t part, int64_t begin, int64_t end) {
+            auto row = [&](int64_t i) { return heights + (3 * part + (i + 3) % 3) * room + LANES; };
+            const int64_t first = rows[0] + begin, last = rows[0] + end;
+            for (int64_t i = first - 1; i <= first; i++) find_sure_heights(i, row(i));
+            for (int64_t i = first; i < last; i++) {
+                find_sure_heights(i + 1, row(i + 1));
+                each_vector(columns[0], columns[1], width, [&](int64_t j, auto count) {
+                    look_at(i * width + j, count, row(i - 1) + j, row(i) + j, row(i + 1) + j);
+                });
+            }
         });
     }
 
-    template <class Count> void look_at(int64_t i, int64_t j, Count count) const {
-        const int64_t k = i * width + j;
+    // The elevation of a row's cells that enough points support, NOWHERE higher elsewhere.
+    void find_sure_heights(int64_t i, float* heights) const {
+        if (i < 0 || i >= height) return std::fill(heights + columns[0], heights + columns[1] + LANES, s.nowhere);
+        const int64_t k = i * width, first = std::max(columns[0] - 1, int64_t(0)), last = std::min(columns[1] + 1, width);
+        each_vector(first, last, width, [&](int64_t j, auto count) {
+            const Flags known = load_bytes(map.validity + k + j, count) > 0;
+            const Lanes elevation = load(map.elevation + k + j, count), support = load(map.support + k + j, count);
+            store(heights + j, sure_height(elevation, known, support, s), count);
+        });
+        heights[-1] = heights[width] = s.nowhere;
+    }
+
+    // Look at cells from place k on, whose sure heights and those of the rows before and after are given.
+    template <class Count>
+    void look_at(int64_t k, Count count, const float* before, const float* own, const float* after) const {
         const Flags known = load_bytes(map.validity + k, count) > 0;
+        if (!any(known)) return store(below + k, all(s.no_fall), count), store(floor + k, all(UNKNOWN), count);
         const Lanes elevation = load(map.elevation + k, count);
         const Lanes lowest = elevation - height_margin(load(map.variance + k, count), s);
         const Lanes fall = visibility::below_sensor(lowest, known, load(map.time + k, count), sensor.view.origin[2], s);
-        const Flags supported = well_supported(i, j, count, known, elevation);
+        const Flags supported = well_supported<Lanes>(elevation, known, load(own, count), load(before, count),
+                                                      load(after, count), load(own - 1, count), load(own + 1, count), s);
         store(below + k, fall, count), store(floor + k, pick(supported, lowest, all(UNKNOWN)), count);
-    }
-
-    // Which known cells are accepted: enough points agree, or on a neighbouring cell of like height.
-    template <class Count>
-    Flags well_supported(int64_t i, int64_t j, Count count, Flags known, Lanes elevation) const {
-        const Lanes own = sure_heights(i, j, count);
-        const Flags enough = own == elevation;
-        if (!any(known & !enough)) return known & enough;
-        Lanes unlike = all(s.nowhere);
-        auto compare = [&](Lanes heights) { unlike = smaller(unlike, absolute(heights - elevation)); };
-        if (i > 0) compare(sure_heights(i - 1, j, count));
-        if (i + 1 < height) compare(sure_heights(i + 1, j, count));
-        float heights[LANES + 2];
-        store(heights + 1, own);
-        heights[0] = sure_height(i, j - 1), heights[count + 1] = sure_height(i, j + count);
-        compare(load(heights)), compare(load(heights + 2));
-        return known & (enough | (unlike <= s.resolution));
-    }
-
-    template <class Count> Lanes sure_heights(int64_t i, int64_t j, Count count) const {
-        const int64_t k = i * width + j;
-        const Flags known = load_bytes(map.validity + k, count) > 0;
-        return visibility::sure_height<Lanes>(load(map.elevation + k, count), known, load(map.support + k, count), s);
-    }
-
-    float sure_height(int64_t i, int64_t j) const {
-        const int64_t k = i * width + j;
-        if (j < 0 || j >= width) return s.nowhere;
-        return visibility::sure_height<float>(map.elevation[k], map.validity[k], map.support[k], s);
     }
 
     // `ground_at_borders`, of the cells that were looked at.

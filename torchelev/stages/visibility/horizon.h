@@ -33,6 +33,7 @@ class Horizon {
           ranges(int32_t(std::min(std::floor(farthest / step), float(s.horizon_ranges)))) {
         point(memory);
         steepest = aligned(memory.steepest, size_t(blocks) * (ranges + 1) * LANES);
+        steepest[blocks * ranges * LANES] = s.no_fall;  // for rays that end in the first bins
         rows = memory.rows.resize(blocks);
         measure();
         sensor.u.each(blocks, std::max(int64_t(1), BINS_AT_A_TIME / (LANES * (ranges + 1))),
@@ -41,13 +42,14 @@ class Horizon {
                       });
     }
 
-    // Return the steepest fall that rays which cast may have.
-    Lanes limit(const Ray<Lanes>& ray, Flags casts) const {
+    // Return where the steepest fall that rays which cast may have is found.
+    Flags place(const Ray<Lanes>& ray, Flags casts) const {
         const Bins at = bins(ray);
-        const Flags exists = casts & (at.range >= 0);
         const Flags place = ((at.azimuth >> LANE_BITS) * ranges + at.range) * LANES + (at.azimuth & (LANES - 1));
-        return pick(exists, gather(steepest, pick_int(exists, place, Flags{})), all(s.no_fall));
+        return pick_int(casts & (at.range >= 0), place, Flags{} + blocks * ranges * LANES);
     }
+
+    Lanes limit(Flags place) const { return gather(steepest, place); }
 
   private:
     struct Bins {

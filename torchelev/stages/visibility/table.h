@@ -1,6 +1,7 @@
 // The lowest ray at or beyond each range and near each azimuth: `lowest_slopes`, without the entries that no ray reaches.
 #pragma once
 
+#include <numeric>
 #include <utility>
 
 #include "stages/visibility/sensor.h"
@@ -13,6 +14,11 @@ constexpr int64_t ENTRIES_AT_A_TIME = 32768;  // that are worth a thread
 struct Entry {
     int32_t range, azimuth;  // bins
     float slope;
+};
+
+// Of vectors of entries.
+struct Places {
+    Flags one, other;
 };
 
 // Memory of all sensors and maps.
@@ -45,7 +51,7 @@ template <int LEVEL> inline Lanes widened(Lanes a, Lanes next) {
 }
 
 // LANES azimuths lie side by side, range after range. Each block of them has rows as far as its rays and those of
-// blocks beside it reach, and a blank row after that. Near the sensor, where a cell covers more azimuths than a block
+// blocks beside it reach. Near the sensor, where a cell covers more azimuths than a block
 // and the next one have, rows are stored whole, and each cell looks at all of its azimuths.
 class Table {
     static constexpr int NEAR_LEVEL = LANES >= 8 ? 3 : 2;
@@ -54,8 +60,10 @@ class Table {
     const int stride;          // rows of a block that there is room for
     const int real, count;     // blocks of azimuths; and those with copies of the first LANES - 1 azimuths at the end
     const int whole_width;
+    const int blank;           // place of an entry without a ray
     float *blocks, *whole;
-    int32_t *rows, *top;       // of each block: rows that rays reach, and the first blank one of it and the next two
+    int32_t *rows, *top;       // of each block: rows that rays reach, and those of it and the next two
+    bool is_even;              // blocks have as many rows
 
   public:
     int far = 0;   // rows that any ray reaches
@@ -65,8 +73,9 @@ class Table {
         : u(u), s(u.settings.visibility),
           stride(int(std::clamp(std::floor(farthest / s.resolution), 1.0f, float(s.ranges))) + 1),
           real((s.azimuths + LANES - 1) / LANES), count((s.azimuths + 2 * LANES - 2) / LANES),
-          whole_width(s.azimuths + int(2 * s.bins) + 4 * LANES) {
-        blocks = aligned(memory.blocks, size_t(count) * stride * LANES);
+          whole_width(s.azimuths + int(2 * s.bins) + 4 * LANES), blank(count * stride * LANES) {
+        blocks = aligned(memory.blocks, blank + 1);
+        blocks[blank] = s.no_ray;
         rows = memory.rows.resize(count), top = memory.top.resize(count);
         std::fill_n(rows, count, 0);
         whole = aligned(memory.whole, size_t(near_rows(stride)) * whole_width);
@@ -99,20 +108,19 @@ class Table {
         }
     }
 
-    // Return the lower of the first and the last entry of windows at ranges k.
-    Lanes lowest(Lanes k, const Window<Lanes>& window) const {
+    // Return where the first and the last entry of windows at ranges k are found; blank ones in rows near the sensor.
+    Places places(Lanes k, const Window<Lanes>& window) const {
         const float azimuths = float(s.azimuths);
         const Lanes b = window.first + window.further;
         const Flags first = integers(window.first), last = integers(pick(b < azimuths, b, b - azimuths));
-        const Flags exists = k < float(far);
-        const Flags block = first >> LANE_BITS;
-        Flags row = integers(k);
-        const Flags highest = gather(top, block);
-        row = pick_int(exists & (row < highest), row, highest);
+        const Flags block = first >> LANE_BITS, row = integers(k);
+        const Flags exists = (row >= near) & (row < (is_even ? Flags{} + far : gather(top, block)));
         const Flags one = (block * stride + row) * LANES + (first & (LANES - 1));
         const Flags other = ((last >> LANE_BITS) * stride + row) * LANES + (last & (LANES - 1));
-        return pick(exists, smaller(gather(blocks, one), gather(blocks, other)), all(s.no_ray));
+        return {pick_int(exists, one, Flags{} + blank), pick_int(exists, other, Flags{} + blank)};
     }
+
+    Lanes lowest(const Places& places) const { return smaller(gather(blocks, places.one), gather(blocks, places.other)); }
 
     // Return the lowest entry of so many from an azimuth on, in a row that is stored whole.
     float lowest_near(int row, int azimuth, int number) const {
@@ -144,16 +152,18 @@ class Table {
         entry = std::min(entry, slope);
     }
 
-    // Find how far blocks reach, and blank their ends.
+    // Find how far blocks and those beside them reach, and blank their ends.
     void place_blocks() {
+        const int64_t used = std::accumulate(rows, rows + real, int64_t(0));
+        is_even = 2 * used > int64_t(far) * real;  // then looking up how far they reach takes longer than to blank all
         auto highest = [&](int b, int from, int to) {
-            int32_t number = 0;
+            int32_t number = is_even ? far : 0;
             for (int k = b + from; k <= b + to; k++) number = std::max(number, rows[(k + 2 * real) % real]);
             return number;
         };
         for (int b = 0; b < real; b++) {
             top[b] = highest(b, 0, 2);
-            std::fill(block(b) + rows[b] * LANES, block(b) + (highest(b, -2, 2) + 1) * LANES, s.no_ray);
+            std::fill(block(b) + rows[b] * LANES, block(b) + highest(b, -2, 2) * LANES, s.no_ray);
         }
     }
 
