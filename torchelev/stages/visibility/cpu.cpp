@@ -35,18 +35,20 @@ int64_t apply_rays(const Sensor& sensor, VisibilityMemory& memory) {
     return Cells(sensor, table, memory.cells).apply();
 }
 
+// Forget the bounds of known cells, side by side.
+void unbind(uint8_t* __restrict bounded, const uint8_t* __restrict known, int64_t size) {
+    for (int64_t k = 0; k < size; k++) bounded[k] = bounded[k] & ~known[k];
+}
+
 // Forget the bounds of known cells. Only this scan's points made cells known: in large maps others are not looked at.
 void unbind_known(Update& u) {
-    uint8_t *bounded = u.state.bounded, *known = u.state.validity;
     if (u.cells() <= 64 * u.measurement.number)
-        return u.each(u.cells(), 1 << 20, [&](int64_t, int64_t first, int64_t last) {
-            for (int64_t k = first; k < last; k++) bounded[k] &= !known[k];
+        return u.each(u.cells(), int64_t(1) << 20, [&](int64_t, int64_t first, int64_t last) {
+            unbind(u.state.bounded + first, u.state.validity + first, last - first);
         });
     locate(u, u.settings.visibility.resolution);
-    for (int64_t n = 0; n < u.measurement.number; n++) {
-        const int32_t k = u.measurement.slot[n];
-        if (k >= 0) bounded[k] &= !known[k];
-    }
+    for (int64_t n = 0; n < u.measurement.number; n++)
+        if (const int32_t k = u.measurement.slot[n]; k >= 0) unbind(u.state.bounded + k, u.state.validity + k, 1);
 }
 
 int64_t count_words(const uint8_t* bounded, const uint8_t* known, int64_t size) {
