@@ -45,7 +45,9 @@ class Cells {
 
   private:
     // [m] from the sensor to the centre of a row or a column.
-    float place(int axis, int64_t k) const { return center_offset(sensor.u, axis, k, s.resolution) - sensor.view.origin[axis]; }
+    float place(int axis, int64_t k) const {
+        return center_offset(sensor.u, axis, k, s.resolution) - sensor.view.origin[axis];
+    }
 
     // A row or column that lies, by up to two cells, before a place [m] from the sensor.
     int64_t before(int axis, float distance, int64_t size) const {
@@ -149,7 +151,8 @@ class Cells {
     template <class Count> void bound(const RayOverCell<Lanes>& ray, int64_t k, Flags known, Count count) const {
         const Flags bounds = ray.found & ~known, bounded = load_bytes(map.bounded + k, count) > 0;
         const Lanes upper_bound = load(map.upper_bound + k, count);
-        store(map.upper_bound + k, pick(bounds, visibility::lower_upper_bound(ray, bounded, upper_bound), upper_bound), count);
+        const Lanes lower = visibility::lower_upper_bound(ray, bounded, upper_bound);
+        store(map.upper_bound + k, pick(bounds, lower, upper_bound), count);
         store_bytes(map.bounded + k, -(bounds | (bounded & ~known)), count);
     }
 };

@@ -8,8 +8,6 @@ namespace visibility {
 // What comparisons of V return: bool, or flags of a vector.
 template <class V> using Flag = decltype(V{} < V{});
 
-// Polar table: polar_table.py -----------------------------------------------------------------------------------------
-
 // `mirrored`
 template <class V> INLINE V mirrored(V angle, float full, V side) {
     return absolute(angle + pick(is_negative(side), all<V>(-full), all<V>(0)));
@@ -47,8 +45,6 @@ template <class V> INLINE Window<V> window_of(V k, V azimuth, V entry, const Vis
     return {smaller(pick(a < 0, a + azimuths, a), all<V>(azimuths - 1)), further};
 }
 
-// Rays: rays.py, lowest_rays.py ---------------------------------------------------------------------------------------
-
 // A ray by the place of its hit as seen from the sensor [m]: `sensor_rays`.
 template <class V> struct Ray {
     V x, y, r, slope, azimuth;
@@ -74,8 +70,6 @@ template <class V> INLINE RayBins<V> bins_of(const Ray<V>& ray, V noise, const V
 template <class V> INLINE V height_margin(V variance, const VisibilitySettings& s) {
     return smaller(s.gate * root(variance + s.relief), all<V>(s.nowhere));
 }
-
-// Accepted rays: accepted_rays.py, horizon.py -------------------------------------------------------------------------
 
 // Where a sensor stands, in the map's axes and in the window.
 struct View {
@@ -118,7 +112,8 @@ template <class V> INLINE RayEnds<V> find_ends(const Ray<V>& ray, const View& vi
     const V near_i = clamp(i, 0, view.size[0] - 1), near_j = clamp(j, 0, view.size[1] - 1);
     const Flag<V> through_x = share_x <= share_y;
     const V side = pick(through_x, pick(ray.x > 0, all<V>(1), all<V>(0)), pick(ray.y > 0, all<V>(3), all<V>(2)));
-    return {near_i, near_j, (i == near_i) & (j == near_j), share * ray.r, leaves, side, pick(through_x, near_j, near_i)};
+    const Flag<V> inside = (i == near_i) & (j == near_j);
+    return {near_i, near_j, inside, share * ray.r, leaves, side, pick(through_x, near_j, near_i)};
 }
 
 // The elevation of cells that enough points support, NOWHERE higher elsewhere: in `well_supported`.
@@ -158,8 +153,6 @@ INLINE CredibleEnd<V> has_credible_end(const Ray<V>& ray, const RayEnds<V>& end,
 template <class V> INLINE V below_sensor(V lowest, Flag<V> known, V time, float z, const VisibilitySettings& s) {
     return pick(known & (time <= s.min_time), z - lowest, all<V>(s.no_fall));
 }
-
-// Cells: lowest_rays.py, stage.py -------------------------------------------------------------------------------------
 
 // The lowest ray over a cell so far from the sensor: `RayOverCell`.
 template <class V> struct RayOverCell {

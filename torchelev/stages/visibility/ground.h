@@ -1,6 +1,7 @@
 // The ground that a sensor's rays may meet: accepted_rays.py and horizon.py, with the same names.
 #pragma once
 
+#include "stages/visibility/minima.h"
 #include "stages/visibility/sensor.h"
 
 namespace visibility {
@@ -97,7 +98,8 @@ class Ground {
     // The elevation of a row's cells that enough points support, NOWHERE higher elsewhere.
     void find_sure_heights(int64_t i, float* heights) const {
         if (i < 0 || i >= height) return std::fill(heights + columns[0], heights + columns[1] + LANES, s.nowhere);
-        const int64_t k = i * width, first = std::max(columns[0] - 1, int64_t(0)), last = std::min(columns[1] + 1, width);
+        const int64_t k = i * width;
+        const int64_t first = std::max(columns[0] - 1, int64_t(0)), last = std::min(columns[1] + 1, width);
         each_vector(first, last, width, [&](int64_t j, auto count) {
             const Flags known = load_bytes(map.validity + k + j, count) > 0;
             const Lanes elevation = load(map.elevation + k + j, count), support = load(map.support + k + j, count);
@@ -114,8 +116,9 @@ class Ground {
         const Lanes elevation = load(map.elevation + k, count);
         const Lanes lowest = elevation - height_margin(load(map.variance + k, count), s);
         const Lanes fall = visibility::below_sensor(lowest, known, load(map.time + k, count), sensor.view.origin[2], s);
+        const Lanes left = load(own - 1, count), right = load(own + 1, count);
         const Flags supported = well_supported<Lanes>(elevation, known, load(own, count), load(before, count),
-                                                      load(after, count), load(own - 1, count), load(own + 1, count), s);
+                                                      load(after, count), left, right, s);
         store(below + k, fall, count), store(floor + k, pick(supported, lowest, all(UNKNOWN)), count);
     }
 
@@ -168,19 +171,8 @@ class Ground {
         float values[LANES], least = s.nowhere;
         store(values, lowest);
         for (float value : values) least = std::min(least, value);
-        for (; j < end; j++) least = std::min(least, map.elevation[row + j] + (floor[row + j] < UNKNOWN ? 0 : s.nowhere));
+        for (; j < end; j++) least = std::min(least, known_ground(row + j, 1)[0]);
         return least;
-    }
-
-    // Make each number the minimum of itself and the `span` - 1 that follow it; `room` is for as many numbers.
-    static void sliding_minimum(float* values, int64_t number, int64_t span, float* room) {
-        int64_t covered = 1;
-        while (covered < span) {
-            const int64_t shift = std::min(covered, span - covered);
-            std::copy_n(values, number, room);
-            for (int64_t k = 0; k + shift < number; k++) values[k] = std::min(room[k], room[k + shift]);
-            covered += shift;
-        }
     }
 };
 

@@ -1,9 +1,9 @@
-// The lowest ray at or beyond each range and near each azimuth: `lowest_slopes`, without the entries that no ray reaches.
+// The lowest ray at or beyond each range and near each azimuth, as far as rays reach: `lowest_slopes`.
 #pragma once
 
 #include <numeric>
-#include <utility>
 
+#include "stages/visibility/minima.h"
 #include "stages/visibility/sensor.h"
 
 namespace visibility {
@@ -26,29 +26,6 @@ struct TableMemory {
     Buffer<float> blocks, whole;
     Buffer<int32_t> rows, top;
 };
-
-// Return the numbers from place SHIFT on, of two vectors one after the other.
-template <int SHIFT, size_t... I> inline Lanes shifted(Lanes a, Lanes next, std::index_sequence<I...>) {
-#ifdef __clang__
-    return __builtin_shufflevector(a, next, int(SHIFT + I)...);
-#else
-    return __builtin_shuffle(a, next, Flags{int(SHIFT + I)...});
-#endif
-}
-
-template <int SHIFT> inline void widen_once(Lanes& a, Lanes& next) {
-    const std::make_index_sequence<LANES> places{};
-    a = smaller(a, shifted<SHIFT>(a, next, places));
-    next = smaller(next, shifted<SHIFT>(next, next, places));  // what it has at its end, `a` never takes in
-}
-
-// Return the minimum of each entry and the 2^LEVEL - 1 that follow it.
-template <int LEVEL> inline Lanes widened(Lanes a, Lanes next) {
-    if constexpr (LEVEL > 0) widen_once<1>(a, next);
-    if constexpr (LEVEL > 1) widen_once<2>(a, next);
-    if constexpr (LEVEL > 2 && LANES > 4) widen_once<4>(a, next);
-    return a;
-}
 
 // LANES azimuths lie side by side, range after range. Each block of them has rows as far as its rays and those of
 // blocks beside it reach. Near the sensor, where a cell covers more azimuths than a block
@@ -120,7 +97,9 @@ class Table {
         return {pick_int(exists, one, Flags{} + blank), pick_int(exists, other, Flags{} + blank)};
     }
 
-    Lanes lowest(const Places& places) const { return smaller(gather(blocks, places.one), gather(blocks, places.other)); }
+    Lanes lowest(const Places& places) const {
+        return smaller(gather(blocks, places.one), gather(blocks, places.other));
+    }
 
     // Return the lowest entry of so many from an azimuth on, in a row that is stored whole.
     float lowest_near(int row, int azimuth, int number) const {
@@ -133,14 +112,6 @@ class Table {
   private:
     int near_rows(int rows) const { return s.levels > NEAR_LEVEL ? std::min(rows, int(s.widen[NEAR_LEVEL])) : 0; }
     float* block(int b) const { return blocks + size_t(b) * stride * LANES; }
-
-    static float lowest_lane(Lanes lanes) {
-        float values[LANES];
-        store(values, lanes);
-        for (int half = LANES / 2; half > 0; half /= 2)
-            for (int l = 0; l < half; l++) values[l] = std::min(values[l], values[l + half]);
-        return values[0];
-    }
 
     void lower(unsigned azimuth, int range, float slope) {
         const unsigned b = azimuth / LANES;
