@@ -102,7 +102,7 @@ def random_state(rng, grid, num_envs=1, known=0.6, dtype=torch.float64):
         support=torch.where(validity, torch.floor(draw(0, 20)), 0.0),
         time=draw(0, 2),
         upper_bound=draw(-0.3, 0.6),
-        bounded=draw(0, 1) < 0.5,
+        bounded=~validity & (draw(0, 1) < 0.5),
         gradient_x=torch.where(validity, draw(-0.3, 0.3), 0.0),
         gradient_y=torch.where(validity, draw(-0.3, 0.3), 0.0),
         has_normal=validity.clone(),

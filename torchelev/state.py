@@ -52,7 +52,7 @@ class MapState(NamedTuple):
     challenger_support: UInt8[Tensor, "B H W"]  #: points that do so, less points that do not
     time: Float[Tensor, "B H W"]  #: [s] since the last hit
     upper_bound: Float[Tensor, "B H W"]  #: [m] of cells that are not known
-    bounded: Bool[Tensor, "B H W"]  #: upper_bound is known
+    bounded: Bool[Tensor, "B H W"]  #: upper_bound is known; of known cells only until `clear_seen_through`
     gradient_x: Float[Tensor, "B H W"]  #: dz/dx
     gradient_y: Float[Tensor, "B H W"]  #: dz/dy
     has_normal: Bool[Tensor, "B H W"]  #: the known neighbours span a plane; elsewhere the gradient is 0

@@ -18,6 +18,7 @@ INLINE float absolute(float a) { return std::fabs(a); }
 INLINE float root(float a) { return std::sqrt(a); }
 INLINE float arctan(float a) { return std::atan(a); }
 INLINE float floor_of(float a) { return std::floor(a); }
+INLINE bool is_negative(float a) { return std::signbit(a); }
 INLINE bool any(bool flag) { return flag; }
 template <class V> INLINE V all(float value) { return value - V{}; }
 template <class V> INLINE V square(V a) { return a * a; }

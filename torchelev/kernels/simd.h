@@ -29,6 +29,7 @@ inline Lanes smaller(Lanes a, Lanes b) { return pick(a < b, a, b); }
 inline Lanes larger(Lanes a, Lanes b) { return pick(a > b, a, b); }
 inline Lanes clamp(Lanes a, float low, float high) { return smaller(larger(a, all(low)), all(high)); }
 inline Lanes absolute(Lanes a) { return (Lanes)((Flags)a & 0x7fffffff); }
+inline Flags is_negative(Lanes a) { return (Flags)a < 0; }  // -0.0 is
 
 // A function of each number: a loop over memory, which compilers vectorise, where one over lanes stays a loop.
 template <class Function> inline Lanes of_each(Lanes a, Function function) {
@@ -125,6 +126,7 @@ template <class Result, class Value> inline Result gather_as(const Value* values
 }
 
 inline Lanes gather(const float* values, Flags index) { return gather_as<Lanes>(values, index); }
+inline Flags gather(const int32_t* values, Flags index) { return gather_as<Flags>(values, index); }
 inline Flags gather(const int16_t* values, Flags index) { return gather_as<Flags>(values, index); }
 inline Flags gather(const uint8_t* values, Flags index) { return gather_as<Flags>(values, index); }
 

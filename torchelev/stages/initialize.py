@@ -32,6 +32,7 @@ def initialize(
         validity=state.validity | found,
         time=torch.where(found, 0.0, state.time),
         support=torch.where(found, 0.0, state.support),
+        bounded=state.bounded & ~found,
     )
 
 

@@ -24,6 +24,7 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     rays = cfg.raycast or RaycastConfig()
     polar, size = PolarGrid.of(cfg.grid, rays), cfg.grid.resolution
     return dict(
+        has_rays=cfg.raycast is not None,
         resolution=float(size),
         relief=float((0.5 * size) ** 2),
         min_time=float(rays.min_time),
