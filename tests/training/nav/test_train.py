@@ -11,12 +11,13 @@ from tests.training.nav.runners import CFG
 
 
 def invoke(*arguments):
-    return CliRunner().invoke(nav.main, [*map(str, arguments), "--no-compile"], catch_exceptions=False)
+    return CliRunner().invoke(
+        nav.main, [*map(str, arguments), "--no-compile"], obj=lambda **_: CFG, catch_exceptions=False
+    )
 
 
 @pytest.mark.slow(10)
-def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkeypatch):
-    monkeypatch.setattr(nav, "task_config", lambda **settings: CFG)
+def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path):
     out = tmp_path / "run"
     common = ("--num-envs", 4, "--out", out, "--episodes", 4, "--perception", "map")
     assert invoke(*common, "--iterations", 2).exit_code == 0
