@@ -38,10 +38,10 @@ def crossing(world: World, dt: float, crossings: Crossings) -> Iterator[Boxes]:
 
 
 def ghosts(
-    sensor: MountedSensor, hertz: int, seeds: int, compiled: bool, crossings: Crossings = Crossings()
+    sensor: MountedSensor, hertz: int, seeds: int, compiled: bool, crossings: Crossings | None = None
 ) -> dict[str, Any]:
     """Count the cells that stay above the ground after the crossings, and the robots that have such cells."""
-    world, dt = World(sensor, seeds, compiled), 1 / hertz
+    world, dt, crossings = World(sensor, seeds, compiled), 1 / hertz, crossings or Crossings()
     return left_behind(world, crossing(world, dt, crossings), dt, round(crossings.after * hertz))
 
 

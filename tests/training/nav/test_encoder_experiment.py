@@ -67,7 +67,7 @@ def test_reads_every_policy_from_its_folder(tmp_path):
         folder = experiment._folder(tmp_path, encoder, seed)
         torch.jit.script(Answer(number)).save(make_folder(folder) / "policy.pt")
         with SummaryWriter(str(folder)) as log:
-            log.add_scalar("Episode/success", 0.25 * seed, 3)
+            log.add_scalar("/success", 0.25 * seed, 3)
         (folder / "result.json").write_text(json.dumps({"training": {"steps": 1, "seconds": seed}}))
     rows = experiment.deploy_all(tmp_path, evaluate)["rows"]
     assert [row["deployed"] for row in rows] == deployed == list(range(len(experiment.CASES)))
