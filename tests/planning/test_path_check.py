@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import pose
+from tests.helpers import pose, unread
 from tests.planning.maps import ground_map, random_map, rectangle
 from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap
@@ -210,14 +210,12 @@ def test_checks_do_not_read_values(monkeypatch):
             assert check.first_unsafe.shape == (2,) and check.footprints.safe.shape == (2, 9)
 
 
-def test_bad_values_elsewhere_are_not_safe(monkeypatch):
+def test_bad_values_elsewhere_are_not_safe():
     """As on a GPU, where nothing is read."""
-    for module in ("ground_below", "path_check"):
-        monkeypatch.setattr(f"torchelev.planning.{module}.readable", lambda *args: False)
     emap = ground_map(1.0)
-    long = check_path(emap, path((-0.5, 0, 0), (0.0, 0, 0), (0.1, 0, 0)), FOOTPRINT, samples=2)
+    long = check_path(emap, unread(path((-0.5, 0, 0), (0.0, 0, 0), (0.1, 0, 0))), FOOTPRINT, samples=2)
     assert long.footprints.safe.tolist() == [[True, False, False, True, True]] and long.first_unsafe.tolist() == [1]
-    lost = check_path(emap, path((-0.1, 0, 0), (0.0, 0, 0), (math.nan, 0, 0)), FOOTPRINT, samples=2)
+    lost = check_path(emap, unread(path((-0.1, 0, 0), (0.0, 0, 0), (math.nan, 0, 0))), FOOTPRINT, samples=2)
     assert lost.first_unsafe.tolist() == [2] and not lost.safe.any()
 
 

@@ -11,6 +11,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from benchmarks.quality.occlusion.refine import piece_costs, refine
 from benchmarks.quality.occlusion.rules import decide
 from benchmarks.quality.occlusion.scenes import VIEWS, abyss, cliff, hump, step_down, views
+from tests.helpers import unread
 from tests.planning.maps import CORNER, NO_LIMITS, RESOLUTION, ground_map, place, random_map
 from tests.planning.test_cost_to_go import dijkstra
 from tests.test_gpu import OneDevice, forbid_reading
@@ -300,11 +301,10 @@ def test_nothing_waits_for_the_device(monkeypatch):
         assert path.poses().shape == (2, 9, 3)
 
 
-def test_bad_places_elsewhere_are_not_reached(monkeypatch):
+def test_bad_places_elsewhere_are_not_reached():
     """As on a GPU, where nothing is read."""
-    monkeypatch.setattr("torchelev.planning.planner.readable", lambda *args: False)
     for start, goal in (((9.0, 0.0), (0.0, 0.0)), ((0.0, 0.0), (0.0, math.nan)), ((-math.inf, 0.0), (0.0, 0.0))):
-        path = plan(ground_map(), place(*start), place(*goal))
+        path = plan(ground_map(), unread(place(*start)), unread(place(*goal)))
         assert not path.reached and path.cost.isinf() and path.xy.isfinite().all()
         outside = math.isfinite(start[0]) and start[0] < 1
         assert path.reason == (Reason.GOAL_OUTSIDE if outside else Reason.START_OUTSIDE)

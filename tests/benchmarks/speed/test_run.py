@@ -29,6 +29,7 @@ def test_one_section_into_a_new_folder(tmp_path, capsys):
     assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png", ".svg"}
 
 
+@pytest.mark.slow(12)
 def test_compare_fails_on_a_regression(tmp_path, capsys):
     def compare(new, old):
         return run.main(["--compare", str(new), "--against", str(old)])

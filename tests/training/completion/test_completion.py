@@ -127,6 +127,7 @@ def test_cells_to_calibrate_with_are_drawn_evenly():
     assert float(steps.min()) == pytest.approx(0.08) and float(steps.max()) > 1.5, "near and far ones"
 
 
+@pytest.mark.slow(2)
 def test_a_network_learns_a_step(tmp_path):
     """All unknown ground is 1.5 cm higher: after some steps, the network says so, and how sure that is."""
     maps, generator = flat_map(rise=0.015), torch.Generator().manual_seed(0)

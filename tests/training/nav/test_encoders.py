@@ -40,6 +40,7 @@ def test_the_mlp_connects_every_unit_to_every_pixel():
     torch.testing.assert_close(runner.alg.actor.cnns["map"](image), expected, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.slow(1)
 def test_a_checkpoint_of_another_encoder_is_refused(tmp_path):
     make_runner(tmp_path, "blind").learn(1)
     found = torch.load(tmp_path / CHECKPOINT, weights_only=False)

@@ -67,6 +67,7 @@ def test_trains_two_iterations_and_deploys_with_each_fill(tmp_path):
     assert json.loads((tmp_path / "completed-0" / "result.json").read_text())["evaluation"]["episodes"] == 4
 
 
+@pytest.mark.slow(1)
 def test_a_checkpoint_of_another_fill_is_refused(tmp_path):
     make_runner(tmp_path, "blind").learn(1)
     other = make_runner(None, "blind")
@@ -75,6 +76,7 @@ def test_a_checkpoint_of_another_fill_is_refused(tmp_path):
         other.resume(tmp_path / CHECKPOINT)
 
 
+@pytest.mark.slow(1)
 def test_the_error_is_that_of_unknown_pixels():
     error = experiment.unknown_error(small_task(), num_envs=4)
     assert 0.01 < error < 0.5

@@ -1,9 +1,12 @@
 """Deployments of one policy whose scans fill unknown ground by several rules."""
 
+import pytest
+
 from tests.envs.quadruped.cases import CFG
 from training.quadruped import fills
 
 
+@pytest.mark.slow(1)
 def test_each_rule_fills_with_other_heights():
     errors = [fills.unknown_error(fills.with_fill(CFG, fill), num_envs=2, steps=12) for fill in fills.FILLS]
     assert all(0 < error < 1 for error in errors) and len({round(error, 6) for error in errors}) == len(errors)

@@ -137,6 +137,7 @@ def test_a_checkpoint_of_another_perception_is_refused(small):
     assert result.exit_code != 0 and "perception" in result.output
 
 
+@pytest.mark.slow(2)
 def test_training_resumes(small):
     out, _ = small
     command = ["--num-envs", "4", "--iterations", "3", "--episodes", "4", "--no-compile", "--perception", "truth"]

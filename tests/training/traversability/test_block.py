@@ -3,11 +3,13 @@
 import json
 
 import numpy as np
+import pytest
 from click.testing import CliRunner
 
 from training.traversability import block
 
 
+@pytest.mark.slow(1)
 def test_beside_a_block_heads_are_compared_with_the_truth(tmp_path):
     options = ["--heights", "0.05", "--heights", "0.4", "--out", str(tmp_path)]
     assert CliRunner().invoke(block.main, options).exit_code == 0

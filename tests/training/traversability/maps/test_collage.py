@@ -1,6 +1,7 @@
 """Collages: ground of random shapes."""
 
 import numpy as np
+import pytest
 import torch
 
 from training.traversability.maps.collage import Shapes, make_collage
@@ -18,6 +19,7 @@ def test_a_seed_gives_one_collage_and_another_seed_another():
     assert torch.equal(first, again) and not torch.equal(first, make_collage(AXIS, np.random.default_rng(2)))
 
 
+@pytest.mark.slow(5)
 def test_tiles_lead_up_down_or_both_ways_by_steps_of_many_heights():
     ground = collages(60, level=1.0)
     up, down = (ground > 0).any(2).any(1), (ground < 0).any(2).any(1)

@@ -45,6 +45,7 @@ def from_box(xy):
     return torch.hypot(dx, dy)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("seed", [0, 3])
 def test_labels_lie_where_the_map_has_the_ground_that_they_are_of(seed):
     # The robot starts off the middle and turned, in a map frame that is shifted and turned against the tile.
@@ -105,6 +106,7 @@ def test_a_seed_makes_the_same_maps_and_another_makes_others():
     assert float(first.label[~first.rated].abs().sum()) == 0
 
 
+@pytest.mark.slow(1)
 def test_kinds_resolution_and_robot_can_be_fixed():
     robot = RobotConfig(length=0.5, width=0.3)
     maps = make_batch(5, dataclasses.replace(SMALL, robot=robot), UNSEEN_KINDS, 0.08)
