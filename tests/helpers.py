@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 import torch
-from torch.overrides import TorchFunctionMode
 
 from torchelev import CompletionConfig, CompletionNet, ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.state import MapState, Statistics, blank_state
@@ -182,23 +181,6 @@ def wait_for(claim, seconds=10.0):
     while not claim():
         assert time.monotonic() < end
         time.sleep(0.01)
-
-
-class NoConstants(TorchFunctionMode):
-    """Refuses tensors made of the host's numbers, whose copy to a device the host waits for."""
-
-    def __torch_function__(self, function, types, args=(), kwargs=None):
-        name = getattr(function, "__name__", "")
-        assert name not in ("tensor", "as_tensor", "new_tensor"), f"{name} copies a constant from the host"
-        return function(*args, **(kwargs or {}))
-
-
-class Unread(torch.Tensor):
-    """A tensor whose values nobody looks at, as on a GPU."""
-
-
-def unread(value):
-    return value.as_subclass(Unread)
 
 
 def without(monkeypatch, module):

@@ -14,8 +14,9 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from gymnasium.wrappers import Autoreset
 
 import torchelev.gym.wrappers
+from tests.devices import OneDevice
 from tests.helpers import small_config
-from tests.test_gpu import OPERATORS, OneDevice
+from tests.test_gpu import OPERATORS
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
 from torchelev.gym import ElevationMapObservation, VectorElevationMapObservation
 from torchelev.gym.feed import DEFAULT_READ

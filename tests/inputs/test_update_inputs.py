@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._pytree import tree_leaves
 
+from tests.devices import unread
 from tests.helpers import (
     differences,
     floats_finite,
@@ -18,7 +19,6 @@ from tests.helpers import (
     small_config,
     small_map,
     snapshot,
-    unread,
 )
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig
 from torchelev.state import Statistics, map_layers

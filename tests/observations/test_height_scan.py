@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from tests.helpers import pose, small_map, unread
+from tests.devices import unread
+from tests.helpers import pose, small_map
 from tests.observations.loops import loop_scan
 from tests.observations.maps import BASE, SEEDS, at, flat, ground_map, near, plane, random_base, random_map
 from torchelev import ElevationMap

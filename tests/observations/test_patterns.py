@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import NoConstants, pose, small_map
+from tests.devices import NoConstants, OneDevice
+from tests.helpers import pose, small_map
 from tests.observations.maps import BASE, at, flat, ground_map, near, plane
-from tests.test_gpu import OneDevice
 from torchelev import ElevationMap
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import random_state, small_map, unread
+from tests.devices import OneDevice, unread
+from tests.helpers import random_state, small_map
 from tests.planning.maps import (
     CELLS,
     RESOLUTION,
@@ -21,7 +22,7 @@ from tests.planning.maps import (
     random_polygons,
     rectangle,
 )
-from tests.test_gpu import OneDevice, forbid_reading
+from tests.test_gpu import forbid_reading
 from torchelev import ElevationMap
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint, unsafe_area
 

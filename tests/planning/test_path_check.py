@@ -8,9 +8,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import pose, unread
+from tests.devices import OneDevice, unread
+from tests.helpers import pose
 from tests.planning.maps import ground_map, random_map, rectangle
-from tests.test_gpu import OneDevice, forbid_reading
+from tests.test_gpu import forbid_reading
 from torchelev import ElevationMap
 from torchelev.planning.footprint import FootprintConfig, check_footprint
 from torchelev.planning.path_check import check_path

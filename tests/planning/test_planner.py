@@ -11,10 +11,10 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from benchmarks.quality.occlusion.refine import piece_costs, refine
 from benchmarks.quality.occlusion.rules import decide
 from benchmarks.quality.occlusion.scenes import VIEWS, abyss, cliff, hump, step_down, views
-from tests.helpers import unread
+from tests.devices import OneDevice, unread
 from tests.planning.maps import CORNER, NO_LIMITS, RESOLUTION, ground_map, place, random_map
 from tests.planning.test_cost_to_go import dijkstra
-from tests.test_gpu import OneDevice, forbid_reading
+from tests.test_gpu import forbid_reading
 from torchelev import (
     ElevationMap,
     ElevationMapConfig,

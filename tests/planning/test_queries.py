@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import random_state, small_map, unread
-from tests.test_gpu import OneDevice, forbid_reading
+from tests.devices import OneDevice, unread
+from tests.helpers import random_state, small_map
+from tests.test_gpu import forbid_reading
 from torchelev import ElevationMap
 from torchelev.layers import LAYERS
 from torchelev.planning.queries import height_profile, submap

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.devices import OneDevice
 from tests.helpers import pose
 from tests.planning.maps import (
     CORNER,
@@ -20,7 +21,7 @@ from tests.planning.maps import (
     random_polygons,
     rectangle,
 )
-from tests.test_gpu import OneDevice, forbid_reading
+from tests.test_gpu import forbid_reading
 from torchelev import ElevationMap
 from torchelev.layers import LAYERS
 from torchelev.planning.footprint import FootprintConfig, check_footprint, unsafe_area

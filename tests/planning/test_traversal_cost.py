@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from tests.devices import OneDevice
 from tests.helpers import random_state, small_map, with_completion
 from tests.planning.maps import NO_LIMITS, RESOLUTION, ground_map, random_map
-from tests.test_gpu import OneDevice, forbid_reading
+from tests.test_gpu import forbid_reading
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.planning.traversal_cost import TraversalCostConfig, cost_of_layers, traversal_cost
 

@@ -8,9 +8,9 @@ import math
 import pytest
 import torch
 
-from tests.helpers import NoConstants, NoGenerator
+from tests.devices import NoConstants, OneDevice
+from tests.helpers import NoGenerator
 from tests.sim.errors.error_cases import LIVELY, NAN, assert_mean, assert_share, assert_sigma, make, poses, rays
-from tests.test_gpu import OneDevice
 from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors
 
 

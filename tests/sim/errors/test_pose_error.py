@@ -8,8 +8,8 @@ import math
 import pytest
 import torch
 
-from tests.helpers import NoConstants, NoGenerator, pose
-from tests.test_gpu import OneDevice
+from tests.devices import NoConstants, OneDevice
+from tests.helpers import NoGenerator, pose
 from torchelev.sim.errors.pose_error import PoseErrorConfig, PoseErrors
 from torchelev.sim.errors.presets import PRESETS, preset
 

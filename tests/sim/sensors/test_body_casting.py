@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
-from tests.helpers import NoConstants, pose
+from tests.devices import NoConstants, OneDevice
+from tests.helpers import pose
 from tests.robot_body.bodies import any_poses, as_reference, random_body
 from tests.sim.sensors.ray_cases import unit
 from tests.stages.test_body import own_points
-from tests.test_gpu import OneDevice
 from torchelev import Box, Capsule, RobotBody
 from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, mount
 from torchelev.sim.sensors import body_casting

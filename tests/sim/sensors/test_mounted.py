@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import NoConstants, pose, random_poses
-from tests.test_gpu import OneDevice
+from tests.devices import NoConstants, OneDevice
+from tests.helpers import pose, random_poses
 from torchelev import ElevationMap
 from torchelev.inputs.clouds import depth_to_points
 from torchelev.sim import DepthCamera, Lidar, mount

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers import NoConstants
-from tests.test_gpu import OneDevice
+from tests.devices import NoConstants, OneDevice
 from torchelev.sim.terrains import shapes as terrain_shapes
 from torchelev.sim.terrains.generate import make_terrain, terrain_grid
 from torchelev.sim.terrains.shapes import SHAPES
