@@ -1,9 +1,12 @@
 """What a GPU would make the host wait for, without a GPU."""
 
+import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
 
 class OneDevice(TorchDispatchMode):

@@ -11,10 +11,9 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from benchmarks.quality.occlusion.refine import piece_costs, refine
 from benchmarks.quality.occlusion.rules import decide
 from benchmarks.quality.occlusion.scenes import VIEWS, abyss, cliff, hump, step_down, views
-from tests.devices import OneDevice, unread
+from tests.devices import NoConstants, OneDevice, unread
 from tests.planning.maps import CORNER, NO_LIMITS, RESOLUTION, ground_map, place, random_map
 from tests.planning.test_cost_to_go import dijkstra
-from tests.test_gpu import forbid_reading
 from torchelev import (
     ElevationMap,
     ElevationMapConfig,
@@ -286,16 +285,15 @@ def test_waypoints_descend_through_the_rating():
 
 
 @pytest.mark.slow(2)
-def test_nothing_waits_for_the_device(monkeypatch):
+def test_nothing_waits_for_the_device():
     cfg = ground_map().cfg
     with FakeTensorMode():
         emap = ElevationMap(cfg, num_envs=2)
         path = plan(emap, torch.zeros(2, 2), torch.zeros(2, 2))
         assert path.xy.shape == (2, 60, 2) and path.reached.shape == (2,)
         assert path.poses().shape == (2, 60, 3) and path.reason.shape == path.count.shape == (2,)
-    forbid_reading(monkeypatch)
     emap = ElevationMap(cfg, num_envs=2, device="meta")
-    with OneDevice():
+    with OneDevice(), NoConstants():
         places = torch.empty(2, 2, device="meta")
         path = plan(emap, places, places, max_cells=9, standing=torch.empty(2, 4, 2, device="meta"))
         assert path.poses().shape == (2, 9, 3)

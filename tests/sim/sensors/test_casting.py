@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from tests.devices import NoConstants, OneDevice
+from tests.devices import NoConstants, OneDevice, needs_gpu
 from tests.helpers import rotation
 from tests.sim.sensors.ray_cases import flat, one, same, scene, unit
-from tests.test_gpu import needs_gpu
 from torchelev.sim.sensors import tracing
 from torchelev.sim.sensors.casting import Boxes, cast
 from torchelev.sim.terrains.heightfield import HeightField
