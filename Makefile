@@ -40,7 +40,7 @@ test test-fast test-library test-mjlab: export OMP_WAIT_POLICY = PASSIVE
 test: setup  ## run all tests, on all cores
 	$(BIN)/python $(PYTEST)
 
-test-fast: setup  ## run the quick tests, every stage against the reference: eight minutes of one core, shared by all cores
+test-fast: setup  ## run the quick tests, every stage against the reference
 	$(BIN)/python $(PYTEST) -m "not slow"
 
 # mjlab pins its own mujoco and rsl-rl-lib.

@@ -1,6 +1,7 @@
 """What the tests share: small configs, poses, clouds, random states, and how two states are compared."""
 
 import math
+import sys
 import time
 
 import numpy as np
@@ -180,3 +181,8 @@ def wait_for(claim, seconds=10.0):
     while not claim():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def without(monkeypatch, module):
+    """Let an import of a module raise ImportError, as where it is not installed."""
+    monkeypatch.setitem(sys.modules, module, None)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from benchmarks.speed.completion import make_maps
+from tests.devices import OneDevice
 from tests.helpers import pose, random_poses, random_state, small_config, with_completion
 from tests.robot_body.bodies import random_body
 from tests.site.helpers import known_cells, robots
@@ -47,17 +46,6 @@ def forbid_reading(monkeypatch):
         monkeypatch.setattr(operator, "_abstract_fn", operator._init_fn)
     for constructor in ("tensor", "as_tensor", "from_numpy"):  # copies a constant, while the host waits
         monkeypatch.setattr(torch, constructor, None)
-
-
-class OneDevice(TorchDispatchMode):
-    """Refuses operations between devices, for which the host waits."""
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        result = function(*args, **(kwargs or {}))
-        tensors = [t for t in tree_leaves((args, kwargs, result)) if isinstance(t, torch.Tensor)]
-        devices = {t.device.type for t in tensors if t.ndim > 0}
-        assert len(devices) <= 1, f"{function} mixes {devices}"
-        return result
 
 
 def test_host_reads_nothing_back(monkeypatch):

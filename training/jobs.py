@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple
@@ -23,12 +23,17 @@ class Job(NamedTuple):
     folder: Path
 
 
-def train(job: Job) -> None:
-    """Run a training, or resume one that was interrupted; its output goes to FOLDER/log.txt."""
+def command_of(job: Job) -> list[str]:
+    """Return the command that runs a training, or resumes one that was interrupted."""
     command = [sys.executable, "-m", job.module, "--out", str(job.folder)]
     for option, value in job.arguments.items():
         command += [] if value is None else [option, str(value)]
-    command += ["--resume"] if (job.folder / CHECKPOINT).exists() else []
+    return command + (["--resume"] if (job.folder / CHECKPOINT).exists() else [])
+
+
+def train(job: Job) -> None:
+    """Run a training, or resume one that was interrupted; its output goes to FOLDER/log.txt."""
+    command = command_of(job)
     job.folder.mkdir(parents=True, exist_ok=True)
     with (job.folder / "log.txt").open("a") as log:
         # Two trainings on a core each are faster than one after the other on both.
@@ -36,7 +41,7 @@ def train(job: Job) -> None:
         subprocess.run(command, check=True, env=environment, stdout=log, stderr=subprocess.STDOUT)
 
 
-def train_all(jobs: Sequence[Job], num_parallel: int) -> None:
+def train_all(jobs: Sequence[Job], num_parallel: int, train: Callable[[Job], None] = train) -> None:
     """Run the unfinished trainings, `num_parallel` at a time."""
     unfinished = [job for job in jobs if not (job.folder / "result.json").exists()]
     bar = tqdm(total=len(jobs), initial=len(jobs) - len(unfinished), unit="training")

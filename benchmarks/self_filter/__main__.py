@@ -26,7 +26,8 @@ from benchmarks import RESULTS
 from benchmarks.self_filter import legs, speed, walking
 from torchelev.app.results import commit, markdown_table, write_json
 
-SECTIONS: dict[str, Callable[[float], dict[str, Any]]] = {
+Sections = dict[str, Callable[[float], dict[str, Any]]]
+SECTIONS: Sections = {
     "speed": speed.measure,
     "legs": lambda _: legs.measure(),
     "walking": walking.measure,
@@ -54,11 +55,12 @@ def tables(result: dict[str, Any]) -> str:
 @click.option("--seconds", default=10.0, show_default=True, help="Time per row [s].")
 @click.option("--only", type=click.Choice(list(SECTIONS)), help="Measure only this section.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
-def main(seconds: float, only: str | None, out: Path) -> None:
+@click.pass_obj
+def main(sections: Sections | None, seconds: float, only: str | None, out: Path) -> None:
     """Measure, write JSON and print the tables."""
     path = out / "self_filter.json"
     result = json.loads(path.read_text()) if path.exists() else {}
-    for name, measure in SECTIONS.items():
+    for name, measure in (sections or SECTIONS).items():
         if only in (None, name):
             result[name] = measure(seconds) | {"commit": commit()}
             write_json(path, result)

@@ -36,12 +36,12 @@ def _updates(body: BodyConfig | RobotBody | None, scans: list[Scan], compiled: b
     return update
 
 
-def measure(seconds: float, robots: int = ROBOTS, compiled: bool = True) -> dict[str, Any]:
+def measure(seconds: float, robots: int = ROBOTS, compiled: bool = True, num_scans: int = SCANS) -> dict[str, Any]:
     """Time the updates of maps of 64 x 64 cells in turn, and what each takes beyond the one without a body."""
-    scans = walk(robots, SCANS, make_cameras())
+    scans = walk(robots, num_scans, make_cameras())
     runs = {name: _updates(body, scans, compiled) for name, body in BODIES.items()}
     for run in runs.values():
-        for _ in range(SCANS):
+        for _ in range(num_scans):
             run()
     times = interleaved(runs, seconds, rounds=10)
     plain = times["no body"]

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ import torch
 
 from benchmarks import RESULTS
 from benchmarks.speed.bag_drive import CLOUDS, MAP_FRAME, POSES, SENSOR_FRAME, write_bag
-from benchmarks.speed.meter import peak_megabytes, progress
+from benchmarks.speed.meter import in_new_process, peak_megabytes, progress
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.app.results import markdown_table, write_json
 from torchelev.io import MappingRun
@@ -34,28 +33,39 @@ from torchelev.io.bags.scans import read_scan
 from torchelev.sim import Lidar
 
 FORMATS = (".bag", ".mcap", ".db3")
-LIDAR, TIMED_SCANS = Lidar(rings=32, azimuths=1024), 200
-SMALL_LIDAR, LENGTHS = Lidar(rings=16, azimuths=512), (200, 2000)  # of the bags whose memory is measured
 GRID = GridConfig(resolution=0.1, length_x=20.0, length_y=20.0)
 _REQUEST = BagRequest(clouds=(CLOUDS,), map_frame=MAP_FRAME, base_frame=SENSOR_FRAME, poses=POSES)
 _STEPS = ("read", "deskew", "map")
 
 
-def measure_times(paths: Sequence[Path]) -> list[dict[str, float]]:
+@dataclass(frozen=True)
+class Sizes:
+    """The bags that are timed, and those whose memory is measured, each in a process of its own."""
+
+    lidar: Lidar = Lidar(rings=32, azimuths=1024)
+    timed_scans: int = 200
+    small_lidar: Lidar = Lidar(rings=16, azimuths=512)
+    lengths: tuple[int, ...] = (200, 2000)
+    apart: Callable[..., Any] = in_new_process
+
+
+def measure_times(paths: Sequence[Path], num_scans: int) -> list[dict[str, float]]:
     """Return the median time of each step [ms per scan] of each bag; deskewing includes the poses.
 
     The bags are mapped scan by scan in turn, so that the load of a shared machine affects all alike.
     """
-    times = np.array(list(zip(*map(_time_scans, paths), strict=True)))  # (scans, bags, steps) [s]
+    times = np.array(
+        list(zip(*(_time_scans(path, num_scans) for path in paths), strict=True))
+    )  # (scans, bags, steps) [s]
     return [dict(zip(_STEPS, row, strict=True)) for row in (1e3 * np.median(times, 0)).tolist()]
 
 
-def _time_scans(path: Path) -> Iterator[tuple[float, float, float]]:
+def _time_scans(path: Path, num_scans: int) -> Iterator[tuple[float, float, float]]:
     """Map a bag; yield the time of each step of each scan [s]."""
     run = MappingRun(ElevationMap(ElevationMapConfig(grid=GRID)))
     with Bag(path) as bag, Bag(path) as same:
         messages, frames = bag.read([CLOUDS]), iter(open_bag(same, _REQUEST))
-        for _ in range(TIMED_SCANS):
+        for _ in range(num_scans):
             start = time.perf_counter()
             read_scan(next(messages).data)
             read = time.perf_counter()
@@ -80,24 +90,23 @@ def measure_memory(path: Path) -> dict[str, float]:
     return {"scans": run.num_scans, "start": start, "peak": peak_megabytes()}
 
 
-def measure(folder: Path) -> list[dict[str, Any]]:
+def measure(folder: Path, sizes: Sizes) -> list[dict[str, Any]]:
     """Return the figures of each format; bags are written to a folder."""
     paths = [folder / f"drive{suffix}" for suffix in FORMATS]
     for path in paths:
-        write_bag(path, TIMED_SCANS, LIDAR)
-    times = measure_times(paths)
+        write_bag(path, sizes.timed_scans, sizes.lidar)
+    times = measure_times(paths, sizes.timed_scans)
     return [
-        {"format": path.suffix, "points": len(LIDAR.directions), "scans": TIMED_SCANS, "ms": ms}
-        | {"memory_mb": [_measure_apart(path, length) for length in LENGTHS]}
+        {"format": path.suffix, "points": len(sizes.lidar.directions), "scans": sizes.timed_scans, "ms": ms}
+        | {"memory_mb": [_measure_apart(path, length, sizes) for length in sizes.lengths]}
         for path, ms in progress(zip(paths, times, strict=True), "memory")
     ]
 
 
-def _measure_apart(path: Path, num_scans: int) -> dict[str, float]:
+def _measure_apart(path: Path, num_scans: int, sizes: Sizes) -> dict[str, float]:
     """Write a bag and measure the memory of mapping it in a new process."""
-    write_bag(path, num_scans, SMALL_LIDAR)
-    with ProcessPoolExecutor(1, get_context("spawn")) as new:  # a fork would inherit this process's memory
-        memory = new.submit(measure_memory, path).result()
+    write_bag(path, num_scans, sizes.small_lidar)
+    memory: dict[str, float] = sizes.apart(measure_memory, path)
     path.unlink()
     return memory
 
@@ -118,11 +127,12 @@ def table(rows: list[dict[str, Any]]) -> str:
 @click.command(help=__doc__)
 @click.option("--threads", default=1, show_default=True, help="CPU threads.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
-def main(threads: int, out: Path) -> None:
+@click.pass_obj
+def main(sizes: Sizes | None, threads: int, out: Path) -> None:
     """Measure, write JSON and print the table."""
     torch.set_num_threads(threads)
     with tempfile.TemporaryDirectory() as folder:
-        rows = measure(Path(folder))
+        rows = measure(Path(folder), sizes or Sizes())
     write_json(out / "bags.json", {"rows": rows})
     click.echo(table(rows))
 

@@ -51,11 +51,11 @@ def make_model(name: str, obs: TensorDict) -> MLPModel:
     return cls(obs, groups, "actor", NUM_ACTIONS, hidden_dims=(256, 128, 64), **own)
 
 
-def measure(seconds: float) -> list[dict[str, Any]]:
+def measure(seconds: float, num_envs: int = NUM_ENVS) -> list[dict[str, Any]]:
     """Time the models, in turn."""
     torch.manual_seed(0)
-    obs: Any = {name: torch.randn(NUM_ENVS, *shape) for name, shape in _SHAPES.items()}
-    obs = TensorDict(obs, batch_size=[NUM_ENVS])
+    obs: Any = {name: torch.randn(num_envs, *shape) for name, shape in _SHAPES.items()}
+    obs = TensorDict(obs, batch_size=[num_envs])
     models = {name: make_model(name, obs) for name in CASES}
     acting = interleaved({name: _act(model, obs) for name, model in models.items()}, seconds)
     learning = interleaved({name: _learn(model, obs) for name, model in models.items()}, seconds)

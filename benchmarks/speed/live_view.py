@@ -12,6 +12,7 @@ import contextlib
 import multiprocessing
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,18 +27,29 @@ from torchelev.app.results import markdown_table, write_json
 from torchelev.sim.poses import pose
 from torchelev.viz.live import LiveView, Page, take_snapshot
 
-GRID = GridConfig(resolution=0.04, length_x=10.0, length_y=10.0)  # 250 x 250 cells
-CLIENTS, THREADS = (1, 3), (1, 2)
-NUM_POINTS, PAIRS, SECONDS, PICTURES = 20_000, 15, 3.0, 60
-PERIODS = (0.0, 0.1)  # [s] of the loop; 0: without a pause
 _PICTURE_BYTES = 50_000  # of a message, at least
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What is measured, and how long."""
+
+    grid: GridConfig = GridConfig(resolution=0.04, length_x=10.0, length_y=10.0)  # 250 x 250 cells
+    clients: tuple[int, ...] = (1, 3)
+    threads: tuple[int, ...] = (1, 2)
+    periods: tuple[float, ...] = (0.0, 0.1)  # [s] of the loop; 0: without a pause
+    num_points: int = 20_000
+    pairs: int = 15
+    seconds: float = 3.0  # of a loop
+    pictures: int = 60
 
 
 class Workload:
     """A map of waves whose sensor hangs 2 m above it."""
 
-    def __init__(self) -> None:
-        self.emap = ElevationMap(ElevationMapConfig(grid=GRID))
+    def __init__(self, sizes: Sizes) -> None:
+        self.sizes = sizes
+        self.emap = ElevationMap(ElevationMapConfig(grid=sizes.grid))
         self.T = pose(torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64), torch.zeros(1))
         self._generator = torch.Generator().manual_seed(0)
         xy = self.emap.cell_centers()[0].flatten(0, 1).float()
@@ -46,7 +58,8 @@ class Workload:
     def fuse(self, xy: torch.Tensor | None = None) -> None:
         """Fuse a cloud of random points, or of the given ones (N, 2)."""
         if xy is None:
-            xy = GRID.length_x * (torch.rand(NUM_POINTS, 2, generator=self._generator) - 0.5)
+            unit = torch.rand(self.sizes.num_points, 2, generator=self._generator)
+            xy = self.sizes.grid.length_x * (unit - 0.5)
         z = 0.3 * torch.sin(xy[:, :1]) - 2.0
         self.emap.update(torch.cat([xy, z], -1)[None], self.T, self.T, dt=0.05)
 
@@ -81,36 +94,36 @@ def connected(url: str, count: int) -> Iterator[list[Any]]:
             client.kill()
 
 
-def measure_rate(clients: int) -> dict[str, Any]:
+def measure_rate(clients: int, sizes: Sizes) -> dict[str, Any]:
     """Return pictures a second: as fast as they can be drawn, until every client has received them."""
-    work = Workload()
+    work = Workload(sizes)
     page = Page("benchmark", work.emap.layers)
     page.draw(take_snapshot(work.emap, work.T, work.T))
     with connected(page.url, clients) as counts:
         while any(value.value < 1 for value in counts):  # the first picture is there when a client connects
             time.sleep(0.05)
         start = time.perf_counter()
-        for k in range(PICTURES):
+        for k in range(sizes.pictures):
             page.draw(take_snapshot(work.emap, work.T, work.T))
             while any(value.value < k for value in counts):  # at most one picture is under way
                 time.sleep(0.001)
         seconds = time.perf_counter() - start
     page.stop()
-    return {"clients": clients, "pictures_per_s": PICTURES / seconds}
+    return {"clients": clients, "pictures_per_s": sizes.pictures / seconds}
 
 
-def measure_slowdown(threads: int, period: float) -> dict[str, Any]:
+def measure_slowdown(threads: int, period: float, sizes: Sizes) -> dict[str, Any]:
     """Return the time of updates in a loop with the live view by that without, median over pairs in both orders."""
     torch.set_num_threads(threads)
-    work, ratios = Workload(), []
+    work, ratios = Workload(sizes), []
     with LiveView(work.emap) as view, connected(view.page.url, 1):
         _run(work, view, period)
         num_before = view.num_drawn
-        for pair in progress(range(PAIRS), f"slowdown, {threads} threads"):
+        for pair in progress(range(sizes.pairs), f"slowdown, {threads} threads"):
             order = (True, False) if pair % 2 else (False, True)
             ms = {shown: _run(work, view if shown else None, period) for shown in order}
             ratios.append(ms[True] / ms[False])
-        rate = (view.num_drawn - num_before) / (PAIRS * SECONDS)
+        rate = (view.num_drawn - num_before) / (sizes.pairs * sizes.seconds)
     return {
         "threads": threads,
         "period_s": period,
@@ -122,9 +135,9 @@ def measure_slowdown(threads: int, period: float) -> dict[str, Any]:
 
 
 def _run(work: Workload, view: LiveView | None, period: float) -> float:
-    """Return the milliseconds of an update with `show`, in a loop of `SECONDS`; the pause is left out."""
+    """Return the milliseconds of an update with `show`, in a loop; the pause is left out."""
     num_updates, busy, start = 0, 0.0, time.perf_counter()
-    while time.perf_counter() - start < SECONDS:
+    while time.perf_counter() - start < work.sizes.seconds:
         begin = time.perf_counter()
         work.fuse()
         if view is not None:
@@ -156,11 +169,14 @@ def _count(number: int, of: str) -> str:
 
 @click.command(help=__doc__)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
-def main(out: Path) -> None:
+@click.pass_obj
+def main(sizes: Sizes | None, out: Path) -> None:
     """Measure, write JSON and print the table."""
     torch.set_num_threads(1)
-    rates = [measure_rate(clients) for clients in progress(CLIENTS, "clients")]
-    result = {"rates": rates, "loops": [measure_slowdown(n, period) for period in PERIODS for n in THREADS]}
+    sizes = sizes or Sizes()
+    rates = [measure_rate(clients, sizes) for clients in progress(sizes.clients, "clients")]
+    loops = [measure_slowdown(n, period, sizes) for period in sizes.periods for n in sizes.threads]
+    result = {"rates": rates, "loops": loops}
     write_json(out / "live_view.json", result)
     click.echo(table(result))
 

@@ -19,7 +19,7 @@ import functools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -37,6 +37,8 @@ from torchelev.app.results import commit, write_json
 
 CASES = {"one robot": (1, 250, BPEARL, 100_000), "256 robots": (256, 64, MANY_POINTS, 10_000)}
 Case = tuple[int, int, int, int]  # robots, cells along each side, points, updates
+Start = Callable[[Case], tuple[Any, Any]]  # a drive and the timer of its updates
+NewProcess = Callable[[Case], contextlib.AbstractContextManager[Callable[[int], float]]]
 BLOCKS = 100
 ROUNDS = 30  # in which this process and a new one are timed in turn
 _REFERENCE = 20  # updates of this process per update of the reference process
@@ -102,24 +104,30 @@ def _new_process(case: Case) -> Iterator[Callable[[int], float]]:
         yield time
 
 
-def _beside_new(case: Case, timer: bench.Timer, updates: int) -> dict[str, list[float]]:
+def _beside_new(time_new: Callable[[int], float], timer: bench.Timer, updates: int) -> dict[str, list[float]]:
     """Time the updates of this process and of a new one in turn [ms]."""
     times: dict[str, list[float]] = {"old_ms": [], "new_ms": []}
-    with _new_process(case) as time_new:
-        for _ in range(ROUNDS):
-            times["new_ms"].append(time_new(updates))
-            times["old_ms"].append(milliseconds(timer, updates))
+    for _ in range(ROUNDS):
+        times["new_ms"].append(time_new(updates))
+        times["old_ms"].append(milliseconds(timer, updates))
     return times
 
 
-def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) -> None:
+def run_case(
+    name: str,
+    case: Case,
+    updates: int,
+    save: Callable[[dict[str, Any]], None],
+    start: Start = start,
+    new_process: NewProcess = _new_process,
+) -> None:
     """Run a case in blocks; save the time per update, memory and graphs of each, then time a new process."""
-    robots, side, points, _ = case = CASES[name]
+    robots, side, points, _ = case
     drive, timer = start(case)
     size = max(1, updates // BLOCKS)
     values: dict[str, Any] = {"robots": robots, "points": points, "cells": side**2, "block": size}
     values |= {"ms": [], "reference_ms": [], "resident_bytes": [], "graphs": []}
-    with _new_process(case) as time_reference:
+    with new_process(case) as time_reference:
         for _ in tqdm(range(math.ceil(updates / size)), desc=name, disable=None):
             values["ms"].append(milliseconds(timer, size))
             values["reference_ms"].append(time_reference(max(1, size // _REFERENCE)))
@@ -128,35 +136,36 @@ def run_case(name: str, updates: int, save: Callable[[dict[str, Any]], None]) ->
             values["updates"] = size * len(values["ms"])
             values["known_share"] = float(drive.emap.state.validity.float().mean())
             save(values)
-    save(values | _beside_new(case, timer, max(1, size // 10)))
+    with new_process(case) as time_new:
+        save(values | _beside_new(time_new, timer, max(1, size // 10)))
 
 
-def main() -> int:
-    """Run the cases, write JSON and plot, and fail if something grows."""
-    args = _arguments()
+def main(argv: Sequence[str] | None = None, cases: Mapping[str, Case] = CASES, **how: Any) -> int:
+    """Run the cases, write JSON and plot, and fail if something grows; `how`: of `run_case`."""
+    args = _arguments(argv)
     path = (args.out or RESULTS) / "long_run.json"
     torch.set_num_threads(args.threads)
     result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     interrupted = False
-    for name in args.cases or CASES:
+    for name in args.cases or cases:
 
         def save(values: dict[str, Any], name: str = name) -> None:
             result[name] = {"commit": commit()} | values
             write_json(path, result)
 
         try:
-            run_case(name, int(args.share * CASES[name][3]), save)
+            run_case(name, cases[name], int(args.share * cases[name][3]), save, **how)
         except KeyboardInterrupt:
             interrupted = True
             break
-    cases = {name: result[name] for name in CASES if "reference_ms" in result.get(name, {})}  # older results lack it
-    if cases:
-        plot(cases, path.with_suffix(".png"))
-        print(f"{table(cases)}\n\n{'interrupted; ' if interrupted else ''}wrote {path} and its picture")
-    return 130 if interrupted else int(any(row[-1] == "GROWS" for row in verdicts(cases)))
+    done = {name: result[name] for name in cases if "reference_ms" in result.get(name, {})}  # older results lack it
+    if done:
+        plot(done, path.with_suffix(".png"))
+        print(f"{table(done)}\n\n{'interrupted; ' if interrupted else ''}wrote {path} and its picture")
+    return 130 if interrupted else int(any(row[-1] == "GROWS" for row in verdicts(done)))
 
 
-def _arguments() -> argparse.Namespace:
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.speed.long_run",
         description=__doc__,
@@ -168,7 +177,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--share", type=float, default=1.0, help="fraction of the updates to run (default: %(default)s)"
     )
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     if unknown := [name for name in args.cases if name not in CASES]:
         parser.error(f"unknown case {', '.join(unknown)}; choose from {', '.join(CASES)}")
     if not 0 < args.share <= 1:

@@ -118,11 +118,12 @@ def table(rows: dict[str, dict[str, dict[str, float]]]) -> str:
 @click.option("--seconds", default=30.0, show_default=True, help="Time per condition [s].")
 @click.option("--threads", default=2, show_default=True, help="CPU threads.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
-def main(seconds: float, threads: int, out: Path) -> None:
+@click.pass_obj
+def main(measure_row: Callable[..., Any] | None, seconds: float, threads: int, out: Path) -> None:
     """Measure, write JSON and print the table."""
     torch.set_num_threads(threads)  # for the description of the machine
     count = max(1, round(seconds / _PERIOD))
-    rows = {waits: measure_apart(waits, count, threads) for waits in _WAITS}
+    rows = {waits: (measure_row or measure_apart)(waits, count, threads) for waits in _WAITS}
     write_json(out / "loop.json", {"points": BPEARL, "hertz": 1 / _PERIOD, "threads": threads, "rows": rows})
     click.echo(table(rows))
 

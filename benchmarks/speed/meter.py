@@ -8,6 +8,8 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,6 +30,12 @@ def progress(values: Iterable[Value], name: str) -> Iterator[Value]:
     from tqdm import tqdm  # which a GPU machine may lack
 
     yield from tqdm(list(values), desc=name, disable=None, leave=False)
+
+
+def in_new_process(function: Callable[..., Value], *arguments: Any) -> Value:
+    """Call a function in a new process, which inherits no memory of this one."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as new:
+        return new.submit(function, *arguments).result()
 
 
 def milliseconds(run: Callable[[], Any], seconds: float) -> dict[str, float]:

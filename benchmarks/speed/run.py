@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from benchmarks.speed.update.sections import SECTIONS
 from benchmarks.speed.workload import full_config
 from torchelev.app.results import commit, machine, slug, write_json
 
+Sections = Mapping[str, Callable[[float], dict[str, Any]]]
 SLOWER = 1.3  # ratio of times above which both medians and minima must lie for a regression
 
 
@@ -34,7 +35,9 @@ def _path(folder: Path) -> Path:
     return folder / f"speed-{slug(machine()['processor'])}-{torch.get_num_threads()}-threads.json"
 
 
-def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[str, Any]:
+def measure(
+    path: Path, names: list[str], seconds: float, resume: bool, sections: Sections = SECTIONS
+) -> dict[str, Any]:
     """Run sections and write the file after each."""
     result = json.loads(path.read_text()) if path.exists() else {}
     result["copy_gigabytes_per_second"] = meter.copy_bandwidth() / 1e9
@@ -47,7 +50,7 @@ def measure(path: Path, names: list[str], seconds: float, resume: bool) -> dict[
         if resume and is_reproducible and measured.get(name) == stamp:
             print(f"{name}: measured at {revision}, skipped", file=sys.stderr)
             continue
-        result[name] = SECTIONS[name](seconds)
+        result[name] = sections[name](seconds)
         measured[name] = stamp
         write_json(path, result)
     return json.loads(path.read_text())  # includes the machine
@@ -96,9 +99,9 @@ def _existing(path: str) -> Path:
     return Path(path)
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None, sections: Sections = SECTIONS) -> int:
     """Measure, write JSON, plots and tables; with --against, fail on a regression."""
-    args = _arguments()
+    args = _arguments(argv)
     if args.compare:
         return compare(json.loads(args.compare.read_text()), json.loads(args.against.read_text()), args.against)
     torch.set_num_threads(args.threads)
@@ -106,7 +109,7 @@ def main() -> int:
     old = json.loads(args.against.read_text()) if args.against else None  # read first: it may be the file written below
     names = args.sections or list(SECTIONS)
     try:
-        result = measure(path, names, args.seconds, args.resume)
+        result = measure(path, names, args.seconds, args.resume, sections)
     except KeyboardInterrupt:
         print(f"\ninterrupted: finished sections are in {path}; continue with --resume", file=sys.stderr)
         return 130
@@ -115,7 +118,7 @@ def main() -> int:
     return compare({name: result[name] for name in names}, old, args.against) if old is not None else 0
 
 
-def _arguments() -> argparse.Namespace:
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.speed.run",
         description=__doc__,
@@ -130,7 +133,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--against", type=_existing, metavar="OLD.json", help="report regressions since this result")
     parser.add_argument("--compare", type=_existing, metavar="NEW.json", help="measure nothing; compare with --against")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     unknown = [name for name in args.sections if name not in SECTIONS]
     if unknown:
         parser.error(f"unknown section {', '.join(unknown)}; choose from {', '.join(SECTIONS)}")

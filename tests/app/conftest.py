@@ -5,6 +5,7 @@ import pytest
 
 from tests.app.drives import sensor_poses, world_points, write_poses
 from torchelev.app.cli import main
+from torchelev.io import MappingRun
 
 
 @pytest.fixture
@@ -30,3 +31,20 @@ def run(capsys, tmp_path, monkeypatch):
         return left.value.code, *capsys.readouterr()
 
     return call
+
+
+@pytest.fixture
+def at_scan(monkeypatch):
+    """Let something happen before the scan of a number is mapped: `at_scan(number, action)`."""
+
+    def prepare(number, action):
+        add = MappingRun.add
+
+        def watched(self, *arguments):
+            if self.num_scans == number:
+                action()
+            return add(self, *arguments)
+
+        monkeypatch.setattr(MappingRun, "add", watched)
+
+    return prepare

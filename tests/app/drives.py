@@ -34,3 +34,7 @@ def value_at(saved, x, y, layer="elevation"):
 def cut_scan(folder):
     (folder / "scans" / "000002.bin").write_bytes(b"cut")
     return "000002.bin: cut short"
+
+
+def raise_interrupt():
+    raise KeyboardInterrupt

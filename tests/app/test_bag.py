@@ -1,10 +1,10 @@
 """`torchelev bag` and `torchelev map` with a bag, from end to end."""
 
-import sys
-
 import numpy as np
 import pytest
 
+from tests.app.drives import raise_interrupt
+from tests.helpers import without
 from tests.io.bags.synthetic import COVARIANCE, FORMATS, SCANS, Writer, drive, write_drive
 from torchelev.io.export import load_npz
 
@@ -67,6 +67,7 @@ def test_the_listing_has_topics_frames_and_the_command(run, bag):
         assert words in " ".join(out.split())
 
 
+@pytest.mark.slow(2)
 def test_the_proposed_command_runs(run, bag):
     _, out, _ = run("bag", bag)
     command = out.strip().splitlines()[-1].split()
@@ -119,24 +120,14 @@ def test_options_of_bags_are_refused_for_folders(run, recording):
 
 @pytest.mark.parametrize("command", ["map", "bag"])
 def test_without_rosbags_the_extra_is_named(run, bag, command, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    without(monkeypatch, "rosbags.highlevel")
     code, _, err = run(command, bag)
     assert code == 2 and "pip install 'torchelev[bags]'" in err
 
 
 @pytest.mark.slow(1)
-def test_ctrl_c_keeps_the_map(run, bag, tmp_path, monkeypatch):
-    from torchelev.io import MappingRun
-
-    add, calls = MappingRun.add, []
-
-    def interrupted(self, *arguments):
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return add(self, *arguments)
-
-    monkeypatch.setattr(MappingRun, "add", interrupted)
+def test_ctrl_c_keeps_the_map(run, bag, tmp_path, at_scan):
+    at_scan(3, raise_interrupt)
     code, _, err = run("map", bag, "--size", 4)
     assert code == 130 and f"kept the map of 3 of {SCANS} scans" in err and (tmp_path / "map.npz").exists()
 

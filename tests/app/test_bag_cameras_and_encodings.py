@@ -10,6 +10,7 @@ from tests.io.bags.test_cameras import DEPTH, write
 from torchelev.io.export import load_npz
 
 
+@pytest.mark.slow(1)
 def test_options_of_depth_images_are_used(run, tmp_path):
     path = write(tmp_path, info="/calibration/left", unit=1e-4)
     options = ("--depth", DEPTH, "--camera-info", "/calibration/left", "--depth-scale", 1e-4, "--size", 6)
@@ -26,6 +27,7 @@ def test_options_of_depth_images_are_only_for_bags(run, recording):
     assert code == 2 and "--depth-scale: is for depth images only" in err
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("command", ["bag", "map"])
 def test_topics_that_are_not_read_are_listed_with_their_encoding(run, tmp_path, command):
     source = next(write_drive(tmp_path, depth=False).glob("*.mcap"))

@@ -50,6 +50,7 @@ def test_what_cannot_be_proposed_names_the_option(run, tmp_path):
     assert "give --poses /odom, and --extrinsics with the pose of lidar on the base" in out
 
 
+@pytest.mark.slow(1)
 def test_a_jump_is_named_by_both_commands_before_the_map(run, tmp_path):
     path = write(tmp_path / "drive", Shape(jump=3.0))
     assert "warning: base_link jumps by 3.0 m in odom" in run("bag", path)[1]
@@ -76,6 +77,7 @@ def test_wrong_options_are_refused(run, tmp_path, name):
     assert code == 2 and words in err and len(err.splitlines()) == 1
 
 
+@pytest.mark.slow(2)
 def test_the_mounting_can_be_given(run, tmp_path):
     path = write(tmp_path / "drive", Shape(mount=False))
     code, out, err = run("map", path, "--size", 2, "--extrinsics", "1 0 0 0.1  0 1 0 0  0 0 1 0.4")

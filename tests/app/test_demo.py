@@ -12,16 +12,15 @@ from torchelev.app.demo_course import LANDMARKS, ROUTE, make_course
 from torchelev.viz import style
 
 
-@pytest.fixture(autouse=True)
-def small_camera(monkeypatch):
+def run_demo(out, seconds):
     """Keep the test short: a camera of few pixels."""
-    monkeypatch.setattr(demo, "CAMERA", demo.DepthCamera(width=40, height=30, max_range=6.0))
+    return demo.run_demo(out, seconds, progress=False, camera=demo.DepthCamera(width=40, height=30, max_range=6.0))
 
 
 @pytest.mark.slow(2)
 def test_demo_maps_draws_and_measures(tmp_path):
     out = tmp_path / "demo.png"
-    printed = str(demo.run_demo(out, seconds=2, progress=False))
+    printed = str(run_demo(out, seconds=2))
     assert out.read_bytes().startswith(b"\x89PNG")
     for word in ("RMSE", "p95", "coverage", "ms per update"):
         assert word in printed
@@ -29,7 +28,7 @@ def test_demo_maps_draws_and_measures(tmp_path):
 
 @pytest.mark.slow(1)
 def test_result_is_that_of_a_map_of_the_course(tmp_path):
-    result = demo.run_demo(tmp_path / "a.png", seconds=2, progress=False)
+    result = run_demo(tmp_path / "a.png", seconds=2)
     assert result.updates == round(2 / demo.DT)
     # Few pixels, one in a hundred wrong, a person in view: the map can only be roughly right so early.
     assert result.p95 < 0.15 and result.coverage > 0.95
@@ -39,7 +38,7 @@ def test_result_is_that_of_a_map_of_the_course(tmp_path):
 def test_labels_touch_neither_the_path_nor_each_other(tmp_path, monkeypatch):
     figures = []
     monkeypatch.setattr(style, "write", lambda figure, path: figures.append(figure))
-    demo.run_demo(tmp_path / "a.png", seconds=0.4, progress=False)
+    run_demo(tmp_path / "a.png", seconds=0.4)
     ax = figures[0].axes[0]
     figures[0].canvas.draw()
     boxes = [text.get_bbox_patch().get_window_extent() for text in ax.texts]
@@ -55,7 +54,7 @@ def test_labels_touch_neither_the_path_nor_each_other(tmp_path, monkeypatch):
 @pytest.mark.slow(2)
 def test_an_svg_is_small_and_always_the_same(tmp_path):
     for name in ("a.svg", "b.svg"):
-        demo.run_demo(tmp_path / name, seconds=1, progress=False)
+        run_demo(tmp_path / name, seconds=0.4)
     first, second = ((tmp_path / name).read_bytes() for name in ("a.svg", "b.svg"))
     assert first == second and first.count(b"<svg") == 1 and len(first) < style.MAX_BYTES
 

@@ -43,6 +43,7 @@ def test_no_robot_climbs_or_leaves():
     assert rises.max() < 0.3 and mission.coverage > 0.7
 
 
+@pytest.mark.slow(1)
 def test_a_mission_repeats_by_its_seed():
     def run(seed):
         mission = Mission(FleetRequest(robots=2, size=10.0, seconds=1.5, seed=seed), None)
@@ -151,6 +152,7 @@ def test_seams_are_steps_between_blocks():
     assert np.isnan(measure_seams(np.full((40, 40), np.nan), 0.1))
 
 
+@pytest.mark.slow(2)
 def test_numbers_are_written_in_place_of_older_ones(tmp_path):
     request = FleetRequest(robots=1, size=10.0, seconds=0.2, out=tmp_path / "one.png")
     (tmp_path / "one.json").write_text("old")

@@ -33,6 +33,7 @@ def run(*arguments):
 ENDS = ("--start", -1.0, 0.05, "--goal", 1.0, 0.05)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("save", [save_npz, save_map])
 def test_a_path_around_a_wall(tmp_path, save):
     save(tmp_path / "map.npz", world(gap=0.5))

@@ -40,6 +40,7 @@ def shown(monkeypatch):
     return drawn
 
 
+@pytest.mark.slow(2)
 def test_a_folder_shows_the_map_that_map_writes(run, recording, port, shown, tmp_path):
     options = ("--size", 6, "--resolution", 0.1, "--sensor-height", 1.0)
     code, out, err = run("view", recording, "--port", port, *options)

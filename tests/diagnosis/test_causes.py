@@ -87,12 +87,14 @@ def test_a_mistake_is_named_first(walked, words):
     assert sentences and words in sentences[0], sentences
 
 
+@pytest.mark.slow(1)
 def test_sound_scans_are_passed_over(walked):
     assert map_of(walked).diagnose() == []
     assert map_of(walked[:1]).diagnose() == []
     assert map_of([(p, T, None) for p, T, _ in walked]).diagnose() == []
 
 
+@pytest.mark.slow(1)
 def test_dt_in_milliseconds(walked):
     for dt in (1000 * DT, 33.0):
         (sentence,) = map_of(walked, dt=dt).diagnose()
@@ -127,6 +129,7 @@ def test_a_gate_that_takes_everything_is_named(walked, setting):
     assert any(setting in sentence for sentence in sentences), sentences
 
 
+@pytest.mark.slow(1)
 def test_no_time_between_updates(walked):
     (sentence,) = map_of(walked, dt=0.0).diagnose()
     assert sentence.startswith("dt: 0 s in all updates")
@@ -234,6 +237,7 @@ TWICE = {
 }
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("words", TWICE)
 @pytest.mark.parametrize("num_scans", [1, 12])
 @pytest.mark.parametrize("pitch", [12.0, 20.0, 35.0])

@@ -7,6 +7,7 @@ from tests.stages.test_disagreement import GRID, T, clouds, in_one_call, in_turn
 from torchelev import ElevationMap, ElevationMapConfig
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("bias", [0.02, 0.05, 0.1, -0.05])
 def test_a_bias_of_one_call_is_named_with_its_sensor(bias):
     sentences = in_one_call(clouds(bias)).diagnose()
@@ -14,6 +15,7 @@ def test_a_bias_of_one_call_is_named_with_its_sensor(bias):
     assert f"sensor 1 sees the ground {100 * abs(bias):.1f} cm {where} sensor 0" in sentences[0]
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("count", [2, 3, 4])
 @pytest.mark.parametrize("bias", [0.02, 0.05, 0.09])
 def test_corrections_that_repeat_are_named(bias, count):
@@ -22,10 +24,12 @@ def test_corrections_that_repeat_are_named(bias, count):
     assert moved == pytest.approx(100 * bias, abs=1.0) and f"every {count} updates" in sentence
 
 
+@pytest.mark.slow(1)
 def test_sensors_that_agree_are_passed_over():
     assert in_one_call(clouds(0.003)).diagnose() == [] and in_turns(clouds(0.003)).diagnose() == []
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("noise, drift", [(0.015, 0.0), (0.015, 0.01), (0.01, 0.03)])
 def test_noise_and_drift_of_poses_are_passed_over(seed, noise, drift):

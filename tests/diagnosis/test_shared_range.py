@@ -157,6 +157,7 @@ def test_points_on_the_sensors_own_path_are_named():
     assert diagnose(exact(LIDAR), drive()) == []
 
 
+@pytest.mark.slow(1)
 def test_ground_below_a_frame_on_the_ground_is_no_path():
     """The cloud was taken into base_footprint before: its frame moves along the ground."""
     xy = np.random.default_rng(0).uniform(-3, 3, (20_000, 2))

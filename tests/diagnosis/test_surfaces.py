@@ -40,6 +40,7 @@ def test_a_gentle_hill_is_passed_over():
     assert climb(15).diagnose() == []
 
 
+@pytest.mark.slow(1)
 def test_vegetation_blames_no_pose():
     """Blades up to 0.3 m high: heights differ within one scan."""
     emap, rng = ElevationMap(ElevationMapConfig(grid=GRID)), np.random.default_rng(0)

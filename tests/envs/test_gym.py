@@ -17,6 +17,7 @@ CFG = TerrainNavConfig(course=CourseConfig(num_tiles=2, num_routes=8), episode_l
 ID = "torchelev/TerrainNav-v0"
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("perception", ["map", "truth", "blind"])
 def test_check_env(perception):
     env = gymnasium.make(ID, cfg=CFG, perception=perception)
@@ -36,6 +37,7 @@ def test_an_episode_of_arrays():
     assert steps == 5 and truncated and isinstance(reward, float) and info["distance"] > 0.4
 
 
+@pytest.mark.slow(1)
 def test_render_draws_ground_and_map():
     env = gymnasium.make(ID, cfg=CFG, render_mode="rgb_array")
     env.reset(seed=0)
@@ -76,6 +78,7 @@ def test_an_ended_episode_begins_anew_in_the_next_step():
         assert (env.unwrapped.task.episode_length == (0 if begins else step % 6)).all()
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("limit, length", [(None, 5), (3, 3), (9, 5)])
 def test_an_ended_episode_begins_anew_in_the_same_step(limit, length):
     options = dict(max_episode_steps=limit, autoreset_mode=AutoresetMode.SAME_STEP)
@@ -139,6 +142,7 @@ def test_a_reset_of_some_leaves_what_the_others_see():
         assert torch.equal(emap.layer(name).nan_to_num()[::2], value[::2]), name
 
 
+@pytest.mark.slow(1)
 def test_environments_without_a_seed_differ():
     seen = [gymnasium.make(ID, cfg=CFG, perception="blind").reset()[0]["policy"] for _ in range(3)]
     assert (seen[0] != seen[1]).any() and (seen[1] != seen[2]).any()

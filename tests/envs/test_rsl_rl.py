@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -12,6 +13,7 @@ from tests.envs.terrain_nav_cases import ROBOT, SMALL
 from torchelev.sim.terrains.heightfield import HeightField
 
 
+@pytest.mark.slow(1)
 def test_a_mirror_exchanges_left_and_right():
     task, mirrored = (TerrainNav(TerrainNavConfig(course=SMALL), 16, perception="truth", seed=3) for _ in range(2))
     for field in ("field", "traversability"):

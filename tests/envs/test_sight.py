@@ -11,6 +11,7 @@ from tests.envs.terrain_nav_cases import FLAT, SMALL
 from torchelev.observations.fill import FILLS
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("perception", ["map", "truth", "blind"])
 def test_observations_have_the_same_shapes_are_fresh_and_finite(perception):
     task = TerrainNav(TerrainNavConfig(course=SMALL), 3, perception=perception)
@@ -72,6 +73,7 @@ def test_the_map_shows_the_ground_where_errors_are_none():
     assert float(error.median()) < 0.01 and float(error.quantile(0.99)) < 0.05
 
 
+@pytest.mark.slow(1)
 def test_rays_start_where_cameras_are_and_points_go_where_odometry_says(monkeypatch):
     task = TerrainNav(TerrainNavConfig(course=SMALL, sight=SightConfig(sensor_errors="perfect")), 3)
     for _ in range(5):
@@ -99,6 +101,7 @@ def test_each_look_casts_from_the_true_pose(monkeypatch):
     torch.testing.assert_close(asked[0], task.T_map_base)
 
 
+@pytest.mark.slow(1)
 def test_the_map_is_placed_by_odometry_that_drifts():
     task = TerrainNav(TerrainNavConfig(course=FLAT), 8)
     errors = []

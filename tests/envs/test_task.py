@@ -54,6 +54,7 @@ def run(task, steps, action=(1.0, 0.0)):
     return steps, outcome
 
 
+@pytest.mark.slow(1)
 def test_a_straight_line_fails_more_often_than_not():
     cfg = TerrainNavConfig(course=SMALL)
     result = evaluate(straight_line, cfg, "truth", episodes=256)
@@ -74,6 +75,7 @@ def test_pits_end_in_a_fall():
     assert float(outcome.reward) < -4.5
 
 
+@pytest.mark.slow(1)
 def test_time_runs_out():
     steps, outcome = run(placed(flat), 1000, action=(0.0, 0.0))
     assert steps == 100 and bool(outcome.truncated) and not bool(outcome.terminated)

@@ -109,6 +109,7 @@ def cloud(frame="lidar", sec=5, order="xyz"):
     return make_cloud(Plain(), points, None, header(frame, sec), order=order)
 
 
+@pytest.mark.slow(1)
 def test_clouds_in_a_grid_map_out(node):
     ((period, publish),) = node.timers
     publish()

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.processes import Forks
+
 ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(path.stem for path in (ROOT / "examples").glob("*.py") if path.stem != "stand_ins")
 LAUNCH = {"fleet_torchrun": "-m torch.distributed.run --standalone --nproc-per-node 2"}
@@ -92,9 +94,27 @@ CHECKS = {
 }
 
 
+@pytest.fixture(scope="module")
+def forks():
+    """A process that has imported what the examples import."""
+    forks = Forks("torchelev", "gymnasium", "torchelev.viz.plot")  # not MuJoCo, which starts to render once
+    yield forks
+    forks.close()
+
+
+@pytest.mark.slow(3)
+@pytest.mark.parametrize("name", [name for name in SCRIPTS if name not in LAUNCH])
+def test_runs(name, tmp_path, forks):
+    script = ROOT / "examples" / f"{name}.py"
+    code, out, err = forks.run(tmp_path, script, *QUICK[name].split(), "--picture", "picture.png")
+    assert code == 0, out + err
+    assert CHECKS[name](out) is not False, out
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.slow(8)
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_runs(name, tmp_path):
+@pytest.mark.parametrize("name", LAUNCH)
+def test_runs_in_processes(name, tmp_path):
     out, picture = run(name, tmp_path)
     assert CHECKS[name](out) is not False, out
     assert picture.startswith(b"\x89PNG")

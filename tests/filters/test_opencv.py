@@ -1,7 +1,5 @@
 """What OpenCV does on a CPU is what tensor operations do elsewhere."""
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -9,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.filters.filter_cases import SEEDS, SHARES, assert_batch_is_single, random_layer
+from tests.helpers import without
 from torchelev import filters
 from torchelev.filters import opencv
 from torchelev.filters.layer_tools import zero_unknown
@@ -147,7 +146,7 @@ def test_serves_no_tensors_of_functorch():
 
 
 def test_an_opencv_that_does_not_load_counts_as_none(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cv2", None)  # an import of it raises ImportError
+    without(monkeypatch, "cv2")  # an import of it raises ImportError
     opencv.is_installed.cache_clear()
     assert not opencv.is_usable(torch.zeros(1, 3, 3))
     monkeypatch.undo()

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._pytree import tree_leaves
 
+from tests.devices import unread
 from tests.helpers import (
     differences,
     floats_finite,
@@ -20,7 +21,6 @@ from tests.helpers import (
     snapshot,
 )
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, SensorConfig
-from torchelev.inputs import checks
 from torchelev.state import Statistics, map_layers
 
 B, N = 2, 30
@@ -134,9 +134,8 @@ UNSOUND = {"NaN": torch.nan, "infinite": torch.inf, "far": 1e30}
 
 
 @pytest.mark.parametrize("of", ["sensor", "base", "both"])
-def test_one_bad_pose_that_was_not_read_leaves_one_robot_out(of, monkeypatch):
+def test_one_bad_pose_that_was_not_read_leaves_one_robot_out(of):
     """As on a GPU, where the host does not wait to read it."""
-    monkeypatch.setattr(checks, "readable", lambda *_: False)
     assert_bad_poses_leave_one_robot_out(mapped(), mapped(), of)
 
 
@@ -145,6 +144,7 @@ def assert_bad_poses_leave_one_robot_out(emap, eager, of):
     good, before = pose(num_envs=B), map_layers(torch.clone, emap.state)
     cloud, far = torch.zeros(B, N, 3) - 1, pose((3.0, 0.0, 1.0), num_envs=B)
     bad = {name: torch.cat([far[:1], torch.full((1, 4, 4), value)]) for name, value in UNSOUND.items()}
+    bad = {name: unread(T) for name, T in bad.items()}
     eager.update(cloud, far, far, 0.1)
     for T in bad.values():
         for layer, value in zip(tree_leaves(emap.state), tree_leaves(before), strict=True):
@@ -161,11 +161,10 @@ def assert_bad_poses_leave_one_robot_out(emap, eager, of):
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -1.0])
-def test_no_time_passes_in_one_bad_dt_that_was_not_read(bad, monkeypatch):
-    monkeypatch.setattr(checks, "readable", lambda *_: False)
+def test_no_time_passes_in_one_bad_dt_that_was_not_read(bad):
     maps = [mapped(), mapped()]
     for emap, dt in zip(maps, (bad, 0.0), strict=True):
-        call(emap, dt=torch.tensor([0.1, dt]))
+        call(emap, dt=unread(torch.tensor([0.1, dt])))
     for values in zip(*(tree_leaves(emap.state) for emap in maps), strict=True):
         assert torch.equal(*values)
 

@@ -1,13 +1,12 @@
 """Bodies from MJCF and URDF, and poses of links from MuJoCo's data."""
 
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from tests.helpers import rotation
+from tests.helpers import rotation, without
 from torchelev.frames import transform
 from torchelev.io import link_poses, read_body
 from torchelev.robot_body import Box, Capsule
@@ -171,7 +170,7 @@ def test_refuses_what_is_no_model(tmp_path, mjcf):
 
 
 def test_without_mujoco_it_says_how_to_get_it(mjcf, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
+    without(monkeypatch, "mujoco")
     with pytest.raises(ImportError, match="read_body: needs MuJoCo .* pip install mujoco"):
         read_body(mjcf)
 

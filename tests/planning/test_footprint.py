@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.devices import NoConstants, OneDevice, unread
 from tests.helpers import random_state, small_map
 from tests.planning.maps import (
     CELLS,
@@ -21,7 +22,6 @@ from tests.planning.maps import (
     random_polygons,
     rectangle,
 )
-from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint, unsafe_area
 
@@ -244,21 +244,19 @@ def test_gradcheck_of_the_mean():
     assert torch.autograd.gradcheck(mean, (known,), fast_mode=True)
 
 
-def test_checks_do_not_read_values(monkeypatch):
+def test_checks_do_not_read_values():
     """Tensors on "meta" have no values, so that reading one raises."""
-    forbid_reading(monkeypatch)
     emap = ElevationMap(num_envs=2, device="meta")
-    with OneDevice():
+    with OneDevice(), NoConstants():
         assert check_footprint(emap, torch.empty(2, 3, 5, 2, device="meta")).unsafe.shape == (2, 3)
 
 
-def test_bad_values_elsewhere_are_not_safe(monkeypatch):
+def test_bad_values_elsewhere_are_not_safe():
     """As on a GPU, where nothing is read."""
-    monkeypatch.setattr("torchelev.planning.ground_below.readable", lambda *args: False)
     emap = ground_map(1.0)
     good, large, lost = rectangle(), rectangle(length_x=1.7), rectangle()
     lost[..., 2, 0] = torch.nan
-    check = check_footprint(emap, torch.cat([good, large, lost, good / 0], 1), LOOSE)
+    check = check_footprint(emap, unread(torch.cat([good, large, lost, good / 0], 1)), LOOSE)
     assert check.safe.tolist() == [[True, False, False, False]] and check.traversability.tolist() == [[1, 0, 0, 0]]
     assert check.unknown.tolist() == [[0, 1, 1, 1]] and check.unsafe.tolist() == [[0, 0, 0, 0]]
 

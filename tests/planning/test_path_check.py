@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.devices import NoConstants, OneDevice, unread
 from tests.helpers import pose
 from tests.planning.maps import ground_map, random_map, rectangle
-from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap
 from torchelev.planning.footprint import FootprintConfig, check_footprint
 from torchelev.planning.path_check import check_path
@@ -200,24 +200,21 @@ def test_batches_equal_single_paths():
 # Devices, and what is refused -----------------------------------------------------------------------------------------
 
 
-def test_checks_do_not_read_values(monkeypatch):
+def test_checks_do_not_read_values():
     """Tensors on "meta" have no values, so that reading one raises."""
-    forbid_reading(monkeypatch)
     emap = ElevationMap(num_envs=2, device="meta")
-    with OneDevice():
+    with OneDevice(), NoConstants():
         for poses in (torch.empty(2, 3, 3, device="meta"), torch.empty(2, 3, 4, 4, device="meta")):
             check = check_path(emap, poses, torch.empty(5, 2, device="meta"), samples=4)
             assert check.first_unsafe.shape == (2,) and check.footprints.safe.shape == (2, 9)
 
 
-def test_bad_values_elsewhere_are_not_safe(monkeypatch):
+def test_bad_values_elsewhere_are_not_safe():
     """As on a GPU, where nothing is read."""
-    for module in ("ground_below", "path_check"):
-        monkeypatch.setattr(f"torchelev.planning.{module}.readable", lambda *args: False)
     emap = ground_map(1.0)
-    long = check_path(emap, path((-0.5, 0, 0), (0.0, 0, 0), (0.1, 0, 0)), FOOTPRINT, samples=2)
+    long = check_path(emap, unread(path((-0.5, 0, 0), (0.0, 0, 0), (0.1, 0, 0))), FOOTPRINT, samples=2)
     assert long.footprints.safe.tolist() == [[True, False, False, True, True]] and long.first_unsafe.tolist() == [1]
-    lost = check_path(emap, path((-0.1, 0, 0), (0.0, 0, 0), (math.nan, 0, 0)), FOOTPRINT, samples=2)
+    lost = check_path(emap, unread(path((-0.1, 0, 0), (0.0, 0, 0), (math.nan, 0, 0))), FOOTPRINT, samples=2)
     assert lost.first_unsafe.tolist() == [2] and not lost.safe.any()
 
 

@@ -11,9 +11,9 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from benchmarks.quality.occlusion.refine import piece_costs, refine
 from benchmarks.quality.occlusion.rules import decide
 from benchmarks.quality.occlusion.scenes import VIEWS, abyss, cliff, hump, step_down, views
+from tests.devices import NoConstants, OneDevice, unread
 from tests.planning.maps import CORNER, NO_LIMITS, RESOLUTION, ground_map, place, random_map
 from tests.planning.test_cost_to_go import dijkstra
-from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import (
     ElevationMap,
     ElevationMapConfig,
@@ -285,26 +285,24 @@ def test_waypoints_descend_through_the_rating():
 
 
 @pytest.mark.slow(2)
-def test_nothing_waits_for_the_device(monkeypatch):
+def test_nothing_waits_for_the_device():
     cfg = ground_map().cfg
     with FakeTensorMode():
         emap = ElevationMap(cfg, num_envs=2)
         path = plan(emap, torch.zeros(2, 2), torch.zeros(2, 2))
         assert path.xy.shape == (2, 60, 2) and path.reached.shape == (2,)
         assert path.poses().shape == (2, 60, 3) and path.reason.shape == path.count.shape == (2,)
-    forbid_reading(monkeypatch)
     emap = ElevationMap(cfg, num_envs=2, device="meta")
-    with OneDevice():
+    with OneDevice(), NoConstants():
         places = torch.empty(2, 2, device="meta")
         path = plan(emap, places, places, max_cells=9, standing=torch.empty(2, 4, 2, device="meta"))
         assert path.poses().shape == (2, 9, 3)
 
 
-def test_bad_places_elsewhere_are_not_reached(monkeypatch):
+def test_bad_places_elsewhere_are_not_reached():
     """As on a GPU, where nothing is read."""
-    monkeypatch.setattr("torchelev.planning.planner.readable", lambda *args: False)
     for start, goal in (((9.0, 0.0), (0.0, 0.0)), ((0.0, 0.0), (0.0, math.nan)), ((-math.inf, 0.0), (0.0, 0.0))):
-        path = plan(ground_map(), place(*start), place(*goal))
+        path = plan(ground_map(), unread(place(*start)), unread(place(*goal)))
         assert not path.reached and path.cost.isinf() and path.xy.isfinite().all()
         outside = math.isfinite(start[0]) and start[0] < 1
         assert path.reason == (Reason.GOAL_OUTSIDE if outside else Reason.START_OUTSIDE)

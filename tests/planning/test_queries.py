@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.devices import NoConstants, OneDevice, unread
 from tests.helpers import random_state, small_map
-from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap
 from torchelev.layers import LAYERS
 from torchelev.planning.queries import height_profile, submap
@@ -186,21 +186,19 @@ def test_gradients_of_a_submap():
     assert gradient.sum() == part.isfinite().sum() > 0 and (gradient[~state.validity] == 0).all()
 
 
-def test_queries_do_not_read_values(monkeypatch):
+def test_queries_do_not_read_values():
     """Tensors on "meta" have no values, so that reading one raises."""
-    forbid_reading(monkeypatch)
     emap = ElevationMap(num_envs=2, device="meta")
     ends = torch.empty(2, 3, 2, device="meta")
-    with OneDevice():
+    with OneDevice(), NoConstants():
         assert height_profile(emap, ends, ends, 5).values.shape == (2, 3, 5)
         assert submap(emap, ends[:, 0], 0.4, 0.8).layers["elevation"].shape == (2, 10, 20)
 
 
-def test_nothing_is_known_around_points_that_are_not_finite(monkeypatch):
+def test_nothing_is_known_around_points_that_are_not_finite():
     """As on a GPU, where nothing is read."""
-    monkeypatch.setattr("torchelev.planning.queries.readable", lambda *args: False)
     for bad in (math.nan, math.inf):
-        assert submap(sloped(), torch.tensor([[bad, 0.0]]), 0.4, 0.4).layers["elevation"].isnan().all()
+        assert submap(sloped(), unread(torch.tensor([[bad, 0.0]])), 0.4, 0.4).layers["elevation"].isnan().all()
 
 
 @pytest.mark.parametrize(

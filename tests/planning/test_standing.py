@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.devices import NoConstants, OneDevice
 from tests.helpers import pose
 from tests.planning.maps import (
     CORNER,
@@ -20,7 +21,6 @@ from tests.planning.maps import (
     random_polygons,
     rectangle,
 )
-from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap
 from torchelev.layers import LAYERS
 from torchelev.planning.footprint import FootprintConfig, check_footprint, unsafe_area
@@ -180,10 +180,9 @@ def test_footprints_at_poses():
 
 
 @pytest.mark.slow(2)
-def test_nothing_waits_for_the_device(monkeypatch):
-    forbid_reading(monkeypatch)
+def test_nothing_waits_for_the_device():
     emap = ElevationMap(num_envs=2, device="meta")
-    with OneDevice():
+    with OneDevice(), NoConstants():
         polygons = torch.empty(2, 3, 5, 2, device="meta")
         assert check_footprint(emap, polygons, standing=polygons[:, 0]).unsafe.shape == (2, 3)
         poses = torch.empty(2, 3, 3, device="meta")

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from tests.devices import NoConstants, OneDevice
 from tests.helpers import random_state, small_map, with_completion
 from tests.planning.maps import NO_LIMITS, RESOLUTION, ground_map, random_map
-from tests.test_gpu import OneDevice, forbid_reading
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.planning.traversal_cost import TraversalCostConfig, cost_of_layers, traversal_cost
 
@@ -229,16 +229,15 @@ def test_what_the_same_ground_costs_hardly_depends_on_the_cells():
 
 
 @pytest.mark.slow(2)
-def test_nothing_waits_for_the_device(monkeypatch):
+def test_nothing_waits_for_the_device():
     with FakeTensorMode():
         assert traversal_cost(ElevationMap(num_envs=2), TraversalCostConfig(inflation_radius=0.1)).shape == (
             2,
             250,
             250,
         )
-    forbid_reading(monkeypatch)
     emap = ElevationMap(num_envs=2, device="meta")
-    with OneDevice():
+    with OneDevice(), NoConstants():
         confidence = torch.empty(2, 250, 250, device="meta")
         start = torch.empty(2, 2, device="meta", dtype=torch.int64)
         assert traversal_cost(emap, confidence=confidence, start=start).shape == confidence.shape

@@ -240,6 +240,7 @@ site.move_keyframes(torch.arange(12), T)
 """
 
 
+@pytest.mark.slow(3)
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
 def test_a_killed_move_changes_nothing(tmp_path):
     with SiteMap(0.1, tmp_path, keyframes=True) as site:

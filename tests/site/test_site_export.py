@@ -1,6 +1,5 @@
 """Files of a site, read back by other programs' readers: at the right place, north up."""
 
-import sys
 import tracemalloc
 
 import cv2
@@ -9,6 +8,7 @@ import plyfile
 import pytest
 import tifffile
 
+from tests.helpers import without
 from tests.site.helpers import fill, robots
 from torchelev.io.export import load_npz
 from torchelev.output_files import is_own_output
@@ -59,6 +59,7 @@ def test_a_geotiff_of_several_bands_and_blocks(tmp_path):
         np.testing.assert_array_equal(band[::-1].T, window[name])
 
 
+@pytest.mark.slow(1)
 def test_memory_does_not_grow_with_the_area(tmp_path, monkeypatch):
     site, largest = SiteMap(0.1), []
     emap = robots([(0, 0), (3000, 3000)], heights=lambda x, y: 0 * x)
@@ -154,7 +155,7 @@ def test_wrong_arguments_write_nothing(site, tmp_path, monkeypatch):
         SiteMap(0.1).export(tmp_path / "a.tif", ("elevation", "time"))
     with pytest.raises(ValueError, match=f"{text} other_elevation; choose other layers"):
         site.export(tmp_path / "a.tif", ("other_elevation",))
-    monkeypatch.setitem(sys.modules, "tifffile", None)
+    without(monkeypatch, "tifffile")
     with pytest.raises(ModuleNotFoundError, match=r"\.tif needs tifffile: pip install \"torchelev\[geo\]\""):
         site.export(tmp_path / "a.tif")
     assert not list(tmp_path.iterdir())

@@ -40,6 +40,7 @@ def test_a_merge_is_the_weighted_mean_of_all_windows():
         assert elevation[cell] == pytest.approx(height, abs=1e-5) and variance[cell] == pytest.approx(sigma2, rel=1e-5)
 
 
+@pytest.mark.slow(1)
 @given(st.permutations(range(5)), st.integers(0, 50))
 def test_the_order_of_the_robots_does_not_matter(order, seed):
     rng = np.random.default_rng(seed)
@@ -478,6 +479,7 @@ def test_a_robot_keeps_its_offset_where_it_shares_no_ground():
     assert bool(report.is_isolated) and float(report.offsets) == pytest.approx(0.5, abs=1e-3)
 
 
+@pytest.mark.slow(7)
 def test_many_windows_are_aligned_too():
     corners = [(12 * (k % 50), 12 * (k // 50)) for k in range(2000)]
     offsets = torch.linspace(-0.2, 0.2, 2000)

@@ -41,6 +41,7 @@ def test_a_resumed_training_equals_one_that_never_stopped(tmp_path):
     assert whole.logger.tot_timesteps == rest.logger.tot_timesteps == 4 * 6 * 4
 
 
+@pytest.mark.slow(1)
 def test_a_checkpoint_of_other_observations_is_refused_before_anything_changed(tmp_path):
     make_runner(tmp_path, "blind").learn(1)
     sight = SightConfig(crop_length=2.4)
@@ -51,6 +52,7 @@ def test_a_checkpoint_of_other_observations_is_refused_before_anything_changed(t
     assert all(torch.equal(value, before[name]) for name, value in weights(other).items())
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("perception, num_envs, named", [("truth", 4, "perception truth"), ("blind", 3, "num_envs 3")])
 def test_a_checkpoint_of_another_kind_is_refused_before_anything_changed(tmp_path, perception, num_envs, named):
     make_runner(tmp_path, "blind").learn(1)
@@ -61,6 +63,7 @@ def test_a_checkpoint_of_another_kind_is_refused_before_anything_changed(tmp_pat
     assert all(torch.equal(value, before[name]) for name, value in weights(other).items())
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", None])
 def test_a_damaged_checkpoint_is_refused(tmp_path, content):
     make_runner(tmp_path, "blind").learn(1)
@@ -72,6 +75,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, content):
         make_runner(None, "blind").resume(path)
 
 
+@pytest.mark.slow(1)
 def test_a_checkpoint_of_other_sizes_is_refused_before_anything_changed(tmp_path):
     make_runner(tmp_path, "blind").learn(1)
     path, other = tmp_path / CHECKPOINT, make_runner(None, "blind")
@@ -86,6 +90,7 @@ def test_a_checkpoint_of_other_sizes_is_refused_before_anything_changed(tmp_path
     assert all(torch.equal(value, before[key]) for key, value in weights(other).items())
 
 
+@pytest.mark.slow(1)
 def test_ctrl_c_leaves_a_checkpoint(tmp_path):
     runner = make_runner(tmp_path, "blind")
     log = runner.logger.log

@@ -1,11 +1,10 @@
 """Frames in, a video out that others can play, or an error before there is a file."""
 
-import sys
-
 import numpy as np
 import pytest
 from PIL import Image
 
+from tests.helpers import without
 from torchelev.output_files import WriteError
 from torchelev.viz.map_frames import MapFrames
 from torchelev.viz.video import VideoWriter
@@ -65,7 +64,7 @@ def test_what_cannot_be_written_is_refused_at_once(tmp_path, monkeypatch):
         VideoWriter(tmp_path / "a.avi", 10, COLORS)
     with pytest.raises(WriteError, match="gone/a.gif: cannot be written"):
         VideoWriter(tmp_path / "gone" / "a.gif", 10, COLORS)
-    monkeypatch.setitem(sys.modules, "av", None)
+    without(monkeypatch, "av")
     VideoWriter(tmp_path / "a.gif", 10, COLORS)
     with pytest.raises(ModuleNotFoundError):
         VideoWriter(tmp_path / "a.mp4", 10, COLORS)

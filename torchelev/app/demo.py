@@ -99,9 +99,11 @@ class DemoWalk:
 
     Args:
         seconds: simulated time [s] to walk; None: the whole course, about 30 s.
+        camera: what the robot sees with.
     """
 
-    def __init__(self, seconds: float | None = None) -> None:
+    def __init__(self, seconds: float | None = None, camera: DepthCamera = CAMERA) -> None:
+        self._camera = camera
         torch.manual_seed(0)
         self.scene = make_course()
         self.path = walk(self.scene, ROUTE, speed=SPEED, dt=DT, T_base_sensor=T_BASE_CAMERA)
@@ -115,18 +117,21 @@ class DemoWalk:
     def __iter__(self) -> Iterator[DemoScan]:
         generator = torch.Generator().manual_seed(0)
         for k in range(len(self)):
-            scan = _observe(self.scene, self.path, k, generator)
+            scan = _observe(self.scene, self.path, k, generator, self._camera)
             self.update_ms.append(_fuse(self.emap, scan))
             yield scan
 
 
-def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progress: bool = True) -> DemoResult:
+def run_demo(
+    out: str | Path = "demo.png", seconds: float | None = None, progress: bool = True, camera: DepthCamera = CAMERA
+) -> DemoResult:
     """Walk the course, map it and draw the result.
 
     Args:
         out: the picture to write.
         seconds: simulated time [s] to walk; None: the whole course, about 30 s.
         progress: show a progress bar.
+        camera: what the robot sees with.
 
     Returns:
         The errors of the map and the speed of updates.
@@ -141,7 +146,7 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
 
     require_picture(out)
     require_writable(out)
-    demo, hit = DemoWalk(seconds), _HitCells(GRID.resolution)
+    demo, hit = DemoWalk(seconds, camera), _HitCells(GRID.resolution)
     for scan in tqdm(demo, desc="walking and mapping", unit="scan", disable=not progress):
         hit.add(scan, demo.emap.cell_centers()[0])
     end = float(demo.path.times[len(demo) - 1])
@@ -150,9 +155,9 @@ def run_demo(out: str | Path = "demo.png", seconds: float | None = None, progres
     return result
 
 
-def _observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator) -> DemoScan:
+def _observe(scene: Scene, path: Trajectory, k: int, generator: torch.Generator, camera: DepthCamera) -> DemoScan:
     """Simulate the depth image of step k: range noise, and 1 % of the pixels at wrong depths."""
-    points = CAMERA.cast(scene, path.T_map_sensor[k], float(path.times[k]))
+    points = camera.cast(scene, path.T_map_sensor[k], float(path.times[k]))
     points = outliers(range_noise(points, generator), generator, dust=0.005, flying=0.005)
     return DemoScan(points, path.T_map_sensor[k], path.T_map_base[k], float(path.times[k]))
 

@@ -30,13 +30,23 @@ from training.completion.stairs import NUM_EDGES, WINDOW, SeenStairs, Stairs, lo
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
-RISES, RUNS, SEEDS = (0.12, 0.16, 0.2), (0.25, 0.3, 0.36), 10  # [m], [m], robots for each of the stairs
+SEEDS = 10  # robots for each of the stairs
 NAME = "completion_edges"  # of the result
 TRUE_CELLS = "true cells"  # the true heights at the cells' centers: what the resolution leaves
 CLOSE = 0.02  # [m]
 _LINES = torch.linspace(-0.5, 0.5, 9)  # [m] y of the lines
 _SHARES = torch.linspace(-0.5, 0.5, 301)  # of the run, places around an edge
+
+
+class Sizes(NamedTuple):
+    """The stairs, and the cells of the maps [m]."""
+
+    rises: tuple[float, ...] = (0.12, 0.16, 0.2)
+    runs: tuple[float, ...] = (0.25, 0.3, 0.36)
+    resolutions: tuple[float, ...] = (0.02, 0.04, 0.08)
+
+
+USUAL = Sizes()
 
 
 class Edge(NamedTuple):
@@ -104,13 +114,13 @@ def measure(errors: Float[Tensor, "n"]) -> dict[str, float | int]:
     return {"edges": len(size)} | {name: round(float(value), 5) for name, value in values.items()}
 
 
-def evaluate(answers: dict[str, Answer], seeds: int) -> dict[str, Any]:
+def evaluate(answers: dict[str, Answer], seeds: int, sizes: Sizes = USUAL) -> dict[str, Any]:
     """Measure answers, and the fills, as `result[direction][resolution][answer][metric]`."""
     answers = answers | {name: fill(name) for name in FILLS} | {TRUE_CELLS: lambda maps: (maps.truth, None)}
     result: dict[str, Any] = {}
     for direction, sign in (("up", 1), ("down", -1)):
-        stairs = [Stairs(rise=sign * rise, run=run) for rise, run in itertools.product(RISES, RUNS)]
-        for resolution in RESOLUTIONS:
+        stairs = [Stairs(rise=sign * rise, run=run) for rise, run in itertools.product(sizes.rises, sizes.runs)]
+        for resolution in sizes.resolutions:
             bar = tqdm(range(seeds), desc=f"{direction} at {100 * resolution:g} cm", unit="robot")
             parts = [all_errors(answers, look_at(stairs, resolution, seed)) for seed in bar]
             measured = {name: measure(torch.cat([part[name] for part in parts])) for name in answers}
@@ -139,9 +149,11 @@ def table(result: dict[str, Any]) -> str:
 @click.option(
     "--out", type=click.Path(path_type=Path), default=RESULTS / "completion_edges.json", help="File to write."
 )
-def main(weights: Path | None, seeds: int, out: Path) -> None:
+@click.pass_obj
+def main(sizes: Sizes | None, weights: Path | None, seeds: int, out: Path) -> None:
     """Measure, write JSON and print the table."""
-    result = evaluate({COMPLETED: learned(CompletionNet.from_pretrained(weights))}, seeds)
+    answers = {COMPLETED: learned(CompletionNet.from_pretrained(weights))}
+    result = evaluate(answers, seeds, sizes or USUAL)
     write_json(out, result | {"seeds": seeds})
     click.echo(table(result))
 

@@ -7,7 +7,7 @@ Without --weights, the shipped weights are evaluated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -36,6 +36,7 @@ SPLITS = {
     "unseen": Split(WalkConfig(), (0.02, 0.04, 0.08)),
     "held_out_yards": Split(YARD_CONFIG, (0.04, 0.08)),
 }
+Splits = Mapping[str, Split]
 DISTANCES = (0.0, 0.1, 0.3, 1.0, FARTHEST)  # [m] limits of the groups of unknown cells
 _SEED = 0  # of the maps, the same for all weights
 _WORST = 0.05  # share of the cells
@@ -120,7 +121,9 @@ def groups(errors: Errors) -> Iterator[tuple[str, Tensor]]:
         yield kind, (of_kind == k) & (distance > 0)
 
 
-def evaluate(answers: dict[str, Answer], data: Path, num_walks: int, jobs: int) -> dict[str, Any]:
+def evaluate(
+    answers: dict[str, Answer], data: Path, num_walks: int, jobs: int, splits: Splits = SPLITS
+) -> dict[str, Any]:
     """Measure answers, and the fills, on held-out ground.
 
     Args:
@@ -128,13 +131,14 @@ def evaluate(answers: dict[str, Answer], data: Path, num_walks: int, jobs: int) 
         data: folder of the walks; missing ones are made.
         num_walks: for each split and resolution.
         jobs: processes that make walks.
+        splits: the ground, and the resolutions.
 
     Returns:
         `result[split][resolution][answer][group][metric]`.
     """
     answers = answers | {name: fill(name) for name in FILLS}
     result: dict[str, Any] = {}
-    for split, (cfg, resolutions) in SPLITS.items():
+    for split, (cfg, resolutions) in splits.items():
         for resolution in resolutions:
             walks = Walks(data, split, _SEED, cfg, resolution)
             make_walks(walks, num_walks, jobs)
@@ -187,10 +191,11 @@ def summary(result: dict[str, Any]) -> str:
 @click.option("--data", type=click.Path(path_type=Path), default=Path("runs/completion/data"), show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), default=None, help="Write the result to this JSON file.")
 @jobs_option
-def main(weights: Path | None, walks: int, data: Path, out: Path | None, jobs: int) -> None:
+@click.pass_obj
+def main(splits: Splits | None, weights: Path | None, walks: int, data: Path, out: Path | None, jobs: int) -> None:
     """Evaluate and print the table."""
     net = CompletionNet.from_pretrained(weights)
-    result = evaluate({COMPLETED: learned(net)}, data, walks, jobs)
+    result = evaluate({COMPLETED: learned(net)}, data, walks, jobs, splits or SPLITS)
     if out is not None:
         write_json(out, result)
     click.echo(table(result))

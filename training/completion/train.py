@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 import torch
@@ -20,7 +21,7 @@ from training.completion.cells import (
     thin_out,
     vary_bounds,
 )
-from training.completion.evaluate import COMPLETED, evaluate, learned, table
+from training.completion.evaluate import COMPLETED, SPLITS, Splits, evaluate, learned, table
 from training.completion.maps import YARD_CONFIG, TrueMap, WalkConfig, Walks, make_walks
 from training.completion.trainer import FitConfig, Trainer
 from training.options import jobs_option, smoke_option
@@ -28,6 +29,14 @@ from training.resume import checkpoint_path, command_errors, write_result
 
 _POSITIVE = click.IntRange(1)
 _WALKS_SEED = 0
+
+
+class Ground(NamedTuple):
+    """Where the robots of a training walk and drive, and what it is evaluated on."""
+
+    walks: WalkConfig = WalkConfig()
+    yards: WalkConfig = YARD_CONFIG
+    splits: Splits = SPLITS
 
 
 @click.command()
@@ -50,7 +59,9 @@ _WALKS_SEED = 0
 @jobs_option
 @smoke_option(walks=1, drives=1, collages=1, steps=4, evaluation_walks=1)
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
+@click.pass_obj
 def main(
+    ground: Ground | None,
     seed: int,
     walks: int,
     drives: int,
@@ -71,12 +82,13 @@ def main(
     Writes TensorBoard logs, checkpoint.pt, weights.pt (for `CompletionNet.from_pretrained`) and result.json to OUT. The
     walks are kept for the next training.
     """
+    ground = ground or Ground()
     checkpoint = checkpoint_path(out, resume)
     data = data or out / "data"
     with command_errors():
-        sets = [(Walks(data, "train", _WALKS_SEED, WalkConfig()), walks)]
-        sets += [(Walks(data, "yards", _WALKS_SEED, YARD_CONFIG), drives)]
-        sets += [(Walks(data, "collages", _WALKS_SEED, WalkConfig()), collages)]
+        sets = [(Walks(data, "train", _WALKS_SEED, ground.walks), walks)]
+        sets += [(Walks(data, "yards", _WALKS_SEED, ground.yards), drives)]
+        sets += [(Walks(data, "collages", _WALKS_SEED, ground.walks), collages)]
         cells = training_cells(sets, jobs, seed)
         trainer = Trainer(*cells, FitConfig(steps=steps, seed=seed))
         if resume:
@@ -84,7 +96,7 @@ def main(
         trainer.run(out)
         net = trainer.net.eval()
         net.save(out / "weights.pt")
-        result = evaluate({COMPLETED: learned(net)}, data, evaluation_walks, jobs)
+        result = evaluate({COMPLETED: learned(net)}, data, evaluation_walks, jobs, ground.splits)
     write_result(out / "result.json", {"training": trainer.settings, **result})
     click.echo(table(result))
     click.echo(f"Wrote weights.pt and result.json to {out}.")

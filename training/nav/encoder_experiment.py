@@ -9,6 +9,7 @@ trainings are kept in RUNS: after Ctrl-C, run the command again. Writes training
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def _jobs(runs: Path) -> list[Job]:
     ]
 
 
-def deploy_all(runs: Path) -> dict[str, Any]:
+def deploy_all(runs: Path, evaluate: Callable[..., dict[str, Any]] = evaluate) -> dict[str, Any]:
     """Deploy every policy on held-out ground with the map in the loop."""
     rows = []
     for encoder, seed in tqdm(CASES, unit="policy"):

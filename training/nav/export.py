@@ -16,7 +16,7 @@ from training.runner import ResumableRunner, export_onnx
 _TOLERANCE = 1e-4  # largest difference of an action
 
 
-def export(runner: ResumableRunner, folder: Path) -> None:
+def export(runner: ResumableRunner, folder: Path, tolerance: float = _TOLERANCE) -> None:
     """Write policy.pt and policy.onnx to a folder.
 
     Raises:
@@ -36,7 +36,7 @@ def export(runner: ResumableRunner, folder: Path) -> None:
         scripted = torch.jit.load(str(folder / "policy.pt"))(observation["policy"], [observation["map"]]).numpy()
     for name, actual in (("policy.pt", scripted), ("policy.onnx", run_onnx(folder / "policy.onnx", observation))):
         error = float(np.abs(actual - expected[: len(actual)]).max())
-        require(error < _TOLERANCE, name, "must act as the policy does", f"an error of {error:.2g}", "report it")
+        require(error < tolerance, name, "must act as the policy does", f"an error of {error:.2g}", "report it")
     actor.to(runner.device)
 
 

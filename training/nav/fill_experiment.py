@@ -30,7 +30,7 @@ from training.jobs import Job, train_all
 from training.nav.evaluate import evaluate, straight_line
 from training.nav.runs import load_policy, read_curve
 from training.nav.success_plot import draw_success
-from training.nav.train import task_config
+from training.nav.train import TaskConfig, task_config
 from training.options import jobs_option, runs_option
 from training.runs import mean, spread
 
@@ -75,18 +75,25 @@ def unknown_error(cfg: TerrainNavConfig, num_envs: int = NUM_ENVS) -> float:
     return float(total / count)
 
 
-def deploy_all(runs: Path, num_seeds: int) -> dict[str, Any]:
+def deploy_all(
+    runs: Path,
+    num_seeds: int,
+    config: TaskConfig = task_config,
+    num_envs: int = NUM_ENVS,
+    episodes: int = EPISODES,
+    compiled: bool = True,
+) -> dict[str, Any]:
     """Deploy every policy with its fill on held-out ground, with the map in the loop."""
     rows = []
     for fill, seed in tqdm(cases(num_seeds), unit="policy"):
         folder = _folder(runs, fill, seed)
         trained = json.loads((folder / "result.json").read_text())["training"]
-        cfg = task_config(held_out=True, fill=fill)
-        deployed = evaluate(load_policy(folder), cfg, "map", EPISODES, compiled=True)
+        cfg = config(held_out=True, fill=fill)
+        deployed = evaluate(load_policy(folder), cfg, "map", episodes, compiled=compiled)
         row = {"fill": fill, "seed": seed, "training": trained, "deployed": deployed}
-        rows.append(row | {"curve": read_curve(folder, NUM_ENVS)})
-    fixed = {"seeds": SEEDS[:num_seeds], "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES}
-    errors = {fill: unknown_error(task_config(held_out=True, fill=fill)) for fill in FILLS}
+        rows.append(row | {"curve": read_curve(folder, num_envs)})
+    fixed = {"seeds": SEEDS[:num_seeds], "iterations": ITERATIONS, "num_envs": num_envs, "episodes": episodes}
+    errors = {fill: unknown_error(config(held_out=True, fill=fill), num_envs) for fill in FILLS}
     return {"config": fixed, "unknown_error_m": errors, "rows": rows}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from training.options import smoke_option
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
 
+TaskConfig = Callable[..., TerrainNavConfig]
 _POSITIVE = click.IntRange(1)
 _TRAIN_SEED, _HELD_OUT_SEED = 1, 1001  # of the courses
 
@@ -65,11 +67,12 @@ def make_runner(
     compiled: bool = True,
     encoder: str = "cnn",
     fill: str = "base",
+    config: TaskConfig = task_config,
 ) -> ResumableRunner:
     """Return a runner with its environments, all seeded."""
     rank = int(os.environ.get("RANK", "0"))
     torch.manual_seed(seed + 1000 * rank)
-    task = TerrainNav(task_config(fill=fill), num_envs, device, perception, seed + 1000 * rank, compiled)
+    task = TerrainNav(config(fill=fill), num_envs, device, perception, seed + 1000 * rank, compiled)
     settings = ppo_config(encoder=encoder) | {"fill": fill}
     return ResumableRunner(RslRlTerrainNav(task), settings, str(log_dir) if log_dir else None, device)
 
@@ -113,7 +116,9 @@ def make_runner(
 @click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Compile the map's update.")
 @smoke_option(num_envs=8, iterations=2, episodes=4, compiled=False)
 @click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Episodes of the evaluation.")
+@click.pass_obj
 def main(
+    config: TaskConfig | None,
     num_envs: int,
     iterations: int,
     perception: str,
@@ -134,11 +139,12 @@ def main(
     (TorchScript) takes the observation "policy" (B, 12) and a list of "map" (B, 4, 16, 16); policy.onnx takes "obs"
     (1, 12) and "map" (1, 4, 16, 16). Both return actions (B, 2).
     """
+    config = config or task_config
     device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
     checkpoint = checkpoint_path(out, resume)
-    runner = make_runner(num_envs, perception, seed, device, out, compiled, encoder, fill)
+    runner = make_runner(num_envs, perception, seed, device, out, compiled, encoder, fill, config)
     if resume:
         try:
             runner.resume(checkpoint)
@@ -154,7 +160,7 @@ def main(
             raise click.ClickException(f"stopped; {checkpoint} is saved, continue with --resume") from None
     runner.close()
     if int(os.environ.get("RANK", "0")) == 0:
-        _finish(runner, out, episodes, compiled, task_config(held_out=True, fill=fill))
+        _finish(runner, out, episodes, compiled, config(held_out=True, fill=fill))
 
 
 def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool, cfg: TerrainNavConfig) -> None:

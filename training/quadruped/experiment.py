@@ -19,6 +19,7 @@ from typing import Any
 
 import click
 import torch
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from envs.quadruped import QuadrupedConfig
@@ -41,6 +42,7 @@ ITERATIONS, NUM_ENVS, EPISODES, WALKS = 500, 256, 560, 128
 CASES = [(perception, seed) for seed in SEEDS for perception in PERCEPTION]
 NAMES = {"map": "map in the loop", "truth": "truth with noise", "blind": "blind"}
 KINDS = QuadrupedConfig().terrain.labels
+Evaluate = Callable[..., dict[str, Any]]
 _BLOCK = 10  # iterations that a point of a learning curve averages
 
 
@@ -64,7 +66,7 @@ def walk_config() -> QuadrupedConfig:
     return dataclasses.replace(cfg, terrain=terrain)
 
 
-def _deploy(policy: Any, perception: str) -> dict[str, Any]:
+def _deploy(policy: Any, perception: str, evaluate: Evaluate = evaluate) -> dict[str, Any]:
     """Deploy a policy over all kinds of terrain, and for 20 s on flat and rough ground, with what it sees.
 
     Raises:
@@ -78,24 +80,35 @@ def _deploy(policy: Any, perception: str) -> dict[str, Any]:
     return {"deployed": crossing, "walk": walk}
 
 
-def _deploy_all(runs: Path) -> dict[str, Any]:
+def _deploy_all(runs: Path, evaluate: Evaluate = evaluate) -> dict[str, Any]:
     """Deploy every policy on held-out ground, and the trot that none of them has modified."""
     cfg = task_config(held_out=True)
     rows = []
     for case in tqdm(CASES):
         folder = _folder(runs, *case)
-        rows.append(_load_or_make(folder / "deployed.json", functools.partial(_row, runs, *case), folder / "policy.pt"))
+        rows.append(
+            _load_or_make(
+                folder / "deployed.json", functools.partial(_row, runs, *case, evaluate), folder / "policy.pt"
+            )
+        )
     fixed = {
         "seeds": SEEDS, "iterations": ITERATIONS, "num_envs": NUM_ENVS, "episodes": EPISODES, "walks": WALKS,
         "levels": cfg.terrain.num_levels, "difficulty": cfg.terrain.difficulty,
     }  # fmt: skip
-    trot = _load_or_make(runs / "trot.json", lambda: _deploy(stand_in_trot, "blind"))
+    trot = _load_or_make(runs / "trot.json", lambda: _deploy(stand_in_trot, "blind", evaluate))
     return {"config": fixed, "trot": trot, "rows": rows}
 
 
-def _load_or_make(path: Path, make: Callable[[], dict[str, Any]], policy: Path | None = None) -> dict[str, Any]:
+def _load_or_make(
+    path: Path,
+    make: Callable[[], dict[str, Any]],
+    policy: Path | None = None,
+    settings: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """Return the result in a file; make and write it first if the file is missing or of other settings or weights."""
-    source = json.loads(json.dumps(_settings() | {"policy": policy and sha256(policy.read_bytes()).hexdigest()}))
+    source = json.loads(
+        json.dumps((settings or _settings()) | {"policy": policy and sha256(policy.read_bytes()).hexdigest()})
+    )
     kept = json.loads(path.read_text()) if path.exists() else {}
     if kept.get("source") != source:
         kept = {"source": source, "result": make()}
@@ -110,12 +123,14 @@ def _settings() -> dict[str, Any]:
     return constants | {name: dataclasses.asdict(cfg) for name, cfg in tasks.items()}
 
 
-def _row(runs: Path, perception: str, seed: int) -> dict[str, Any]:
+def _row(runs: Path, perception: str, seed: int, evaluate: Evaluate) -> dict[str, Any]:
     """Deploy one policy; also as it was trained, if that is something else."""
     cfg, folder = task_config(held_out=True), _folder(runs, perception, seed)
     policy = load_policy(folder / "policy.pt", cfg)
     training = json.loads((folder / "result.json").read_text())["training"]
-    row = {"perception": perception, "seed": seed, "training": training} | _deploy(policy, sight_of(perception))
+    row = {"perception": perception, "seed": seed, "training": training} | _deploy(
+        policy, sight_of(perception), evaluate
+    )
     is_own = perception != "truth"
     own = row["deployed"]["all"] if is_own else evaluate(policy, cfg, perception, EPISODES)["all"]
     return row | {"own": own, "curve": read_curve(folder)}
@@ -184,7 +199,7 @@ def _percent(fraction: float) -> str:
 
 
 @styled()
-def plot(result: dict[str, Any], path: Path) -> None:
+def plot(result: dict[str, Any], path: Path) -> Figure:
     """Draw the level during training, and the crossed tiles by kind and level when deployed."""
     figure = make_figure(11, 5.2)
     grid = figure.add_gridspec(2, 5)
@@ -211,6 +226,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
             axes.set_xlabel("height of a stair [cm]")
         axes.set_ylabel(f"crossed, of {_per_point(result)}" if place % 3 == 0 else "")
     save(figure, path)
+    return figure
 
 
 def stair_heights(config: dict[str, Any]) -> list[float]:

@@ -10,6 +10,7 @@ Writes training/results/quadruped_fills.json and prints the table.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import click
@@ -56,7 +57,12 @@ def unknown_error(cfg: QuadrupedConfig, num_envs: int = EPISODES, steps: int = S
     return float(total / count)
 
 
-def measure(seeds: tuple[int, ...], episodes: int) -> dict[str, Any]:
+def measure(
+    seeds: tuple[int, ...],
+    episodes: int,
+    evaluate: Callable[..., dict[str, Any]] = evaluate,
+    unknown_error: Callable[[QuadrupedConfig, int], float] = unknown_error,
+) -> dict[str, Any]:
     """Deploy the policy with each fill and seed."""
     cfg = task_config(held_out=True)
     policy = load_policy(RESULTS / "quadruped_policy.pt", cfg)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -26,6 +28,8 @@ def play(
     seconds: float = 8.0,
     seed: int = 0,
     perception: str = "map",
+    draw: Callable[[Quadruped], Any] = draw,
+    save: Callable[[list[Any], Path], None] | None = None,
 ) -> None:
     """Walk and draw it, with the map over the ground if the policy sees it.
 
@@ -38,6 +42,8 @@ def play(
         seconds: Duration.
         seed: Of start, body and noise.
         perception: With which the policy was trained. A blind one walks blind, others with the map.
+        draw: Makes a picture.
+        save: Writes the pictures; None: by the suffix of the path.
 
     Raises:
         ValueError: There is no such kind or level.
@@ -58,4 +64,4 @@ def play(
         if bool(outcome.done):
             break
         task.sense()
-    (save_video if path.suffix == ".webp" else save_strip)(pictures, path)
+    (save or (save_video if path.suffix == ".webp" else save_strip))(pictures, path)

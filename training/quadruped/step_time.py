@@ -12,6 +12,7 @@ import contextlib
 import io
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from statistics import median
 from typing import Any
 
@@ -62,7 +63,9 @@ class Clock:
         setattr(owner, name, timed)
 
 
-def measure(num_envs: int, rounds: int) -> list[dict[str, Any]]:
+def measure(
+    num_envs: int, rounds: int, make_runner: Callable[..., ResumableRunner] = make_runner
+) -> list[dict[str, Any]]:
     """Return for each perception the median time [ms] of a step of all robots, whole and by part."""
     runners = {name: make_runner(num_envs, name, 0, "cpu", None) for name in PERCEPTION}
     clocks = {name: Clock(runner) for name, runner in runners.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from training.quadruped.policy import GROUPS, LoadedPolicy, export, load_policy,
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
 
+TaskConfig = Callable[..., QuadrupedConfig]
 _POSITIVE = click.IntRange(min=1)
 _HELD_OUT_SEED = 1001  # of the terrain
 CRITIC = ("policy", "privileged", "true_height_scan", "true_feet")
@@ -61,12 +63,18 @@ def task_config(held_out: bool = False) -> QuadrupedConfig:
 
 
 def make_runner(
-    num_envs: int, perception: str, seed: int, device: str, log_dir: Path | None, compiled: bool = True
+    num_envs: int,
+    perception: str,
+    seed: int,
+    device: str,
+    log_dir: Path | None,
+    compiled: bool = True,
+    config: TaskConfig = task_config,
 ) -> ResumableRunner:
     """Return a runner with its environments, all seeded."""
     rank = int(os.environ.get("RANK", "0"))
     torch.manual_seed(seed + 1000 * rank)
-    task = Quadruped(task_config(), num_envs, device, perception, seed + 1000 * rank, compiled)
+    task = Quadruped(config(), num_envs, device, perception, seed + 1000 * rank, compiled)
     return ResumableRunner(RslRlQuadruped(task), ppo_config(), str(log_dir) if log_dir else None, device)
 
 
@@ -105,7 +113,9 @@ def make_runner(
     "--kind", default="stairs up", show_default=True, help="What the robot meets in --play, such as 'stairs down'."
 )
 @click.option("--level", default=3, show_default=True, help="Difficulty for --play, from 0 to 7.")
+@click.pass_obj
 def main(
+    config: TaskConfig | None,
     num_envs: int,
     iterations: int,
     perception: str,
@@ -127,13 +137,14 @@ def main(
     Writes TensorBoard logs, checkpoints, result.json, policy.pt and policy.onnx to OUT. Both policies hold the layout
     of the scans that they read, and loading policy.pt with another one is refused.
     """
+    config = config or task_config
     if played is not None:
-        return _play(played, out, kind, level, seed)
+        return _play(played, out, kind, level, seed, config)
     device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
     checkpoint = checkpoint_path(out, resume)
-    runner = make_runner(num_envs, perception, seed, device, out, compiled)
+    runner = make_runner(num_envs, perception, seed, device, out, compiled, config)
     if resume:
         try:
             runner.resume(checkpoint)
@@ -149,13 +160,13 @@ def main(
             raise click.ClickException(f"stopped; {checkpoint} is saved, continue with --resume") from None
     runner.close()
     if int(os.environ.get("RANK", "0")) == 0:
-        _finish(runner, out, episodes, compiled)
+        _finish(runner, out, episodes, compiled, config)
 
 
-def _play(policy: Path, out: Path, kind: str, level: int, seed: int) -> None:
+def _play(policy: Path, out: Path, kind: str, level: int, seed: int, config: TaskConfig) -> None:
     """Walk with an exported policy and write a moving picture."""
     out.mkdir(parents=True, exist_ok=True)
-    cfg = task_config(held_out=True)
+    cfg = config(held_out=True)
     try:
         loaded = load_policy(policy, cfg)
         perception = _trained_with(loaded, policy)
@@ -176,13 +187,13 @@ def _trained_with(policy: LoadedPolicy, path: Path) -> str:
     return str(policy.perception)
 
 
-def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool) -> None:
+def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool, config: TaskConfig) -> None:
     """Evaluate with the map in the loop, or blind, write the result and export the policy."""
     policy = runner.get_inference_policy(device=runner.device)
     sight = sight_of(runner.env.task.perception)
-    result = evaluate(policy, task_config(held_out=True), sight, episodes, runner.device, compiled)
+    result = evaluate(policy, config(held_out=True), sight, episodes, runner.device, compiled)
     click.echo(table(result))
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
     write_result(out / "result.json", {"training": training, "evaluation": result})
-    export(runner, task_config(), out)
+    export(runner, config(), out)
     click.echo(f"Wrote result.json, policy.pt and policy.onnx to {out}.")

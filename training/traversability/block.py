@@ -114,11 +114,13 @@ def draw(profiles: list[dict[str, Any]], path: Path) -> None:
 
 
 @click.command(help=__doc__)
-def main() -> None:
+@click.option("--heights", type=float, multiple=True, default=HEIGHTS, show_default=True, help="Of the blocks [m].")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
+def main(heights: tuple[float, ...], out: Path) -> None:
     """Measure, write JSON and figure and print the table."""
-    profiles = [_profile(height) for height in HEIGHTS]
-    write_json(RESULTS / "block.json", {"robot": vars(ROBOT), "profiles": profiles})
-    draw(profiles, RESULTS / "block.png")
+    profiles = [_profile(height) for height in heights]
+    write_json(out / "block.json", {"robot": vars(ROBOT), "profiles": profiles})
+    draw(profiles, out / "block.png")
     click.echo(table(profiles))
 
 

@@ -8,8 +8,9 @@ Without --weights, the shipped weights are evaluated. With --paper-weights, the 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -29,6 +30,15 @@ from training.traversability.metrics import SAFE, RatedMap, calibration_error, m
 from training.traversability.robot import RobotType
 
 RESOLUTIONS = (0.02, 0.04, 0.08)  # [m]
+
+
+class Maps(NamedTuple):
+    """How maps are made, and their resolutions when heads are evaluated [m]."""
+
+    config: Callable[..., DataConfig] = DataConfig
+    resolutions: Sequence[float] = RESOLUTIONS
+
+
 SPLITS = {"held_out": KINDS, "unseen": UNSEEN_KINDS, "held_out_exact": KINDS}
 _EVALUATION_SEED = 0  # of the maps, the same for all weights
 COLUMNS = {
@@ -100,6 +110,7 @@ def evaluate(
     num_batches: int,
     cfg: DataConfig | None = None,
     paper_weights: Path | None = None,
+    resolutions: Sequence[float] = RESOLUTIONS,
 ) -> dict[str, Any]:
     """Measure nets and baselines on held-out ground.
 
@@ -109,6 +120,7 @@ def evaluate(
         num_batches: number of batches for each split and resolution.
         cfg: how maps are made; None: the default.
         paper_weights: file of the paper's filter; None: it is left out.
+        resolutions: of the maps [m].
 
     Returns:
         `result[split][resolution][head][metric]`, and the settings in `result["config"]`. The maps of the split
@@ -119,7 +131,7 @@ def evaluate(
     result: dict[str, Any] = {}
     for split, kinds in SPLITS.items():
         result[split] = {}
-        for resolution in RESOLUTIONS:
+        for resolution in resolutions:
             batches = data_set(data, split, num_batches, _EVALUATION_SEED, cfg, kinds, resolution)
             bar = tqdm(scores.items(), desc=f"{split}, {100 * resolution:g} cm", unit="head")
             here = {name: metrics(score(head, batches), batches) for name, head in bar}
@@ -189,14 +201,22 @@ def _cell(values: list[float | None]) -> str:
     show_default=True,
     help="JSON file to write.",
 )
+@click.pass_obj
 def main(
-    paths: tuple[Path, ...], data: Path, batches: int, robot: RobotConfig | None, paper_weights: Path | None, out: Path
+    maps: Maps | None,
+    paths: tuple[Path, ...],
+    data: Path,
+    batches: int,
+    robot: RobotConfig | None,
+    paper_weights: Path | None,
+    out: Path,
 ) -> None:
     """Evaluate, write JSON and print the tables."""
+    maps = maps or Maps()
     try:
         nets = {path.parent.name or path.stem: TraversabilityNet.from_pretrained(path) for path in paths}
         nets = nets or {"shipped": TraversabilityNet.from_pretrained()}
-        result = evaluate(nets, data, batches, DataConfig(robot=robot), paper_weights)
+        result = evaluate(nets, data, batches, maps.config(robot=robot), paper_weights, maps.resolutions)
     except (ValueError, OSError) as error:
         raise click.UsageError(str(error)) from None
     write_json(out, result)

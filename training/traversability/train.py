@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -9,7 +10,7 @@ import click
 from torchelev.robot import RobotConfig
 from training.options import paper_weights_option, smoke_option
 from training.resume import checkpoint_path, command_errors, write_result
-from training.traversability.evaluate import evaluate, table
+from training.traversability.evaluate import Maps, evaluate, table
 from training.traversability.heads import baselines
 from training.traversability.maps.data import data_set
 from training.traversability.maps.mapping import DataConfig
@@ -49,7 +50,9 @@ _POSITIVE = click.IntRange(1)
 @click.option("--data", type=click.Path(path_type=Path), default=None, help="Folder of the maps. Default: OUT/data.")
 @smoke_option(batches=1, exact_batches=1, steps=4, evaluation_batches=1)
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
+@click.pass_obj
 def main(
+    made: Maps | None,
     robot: RobotConfig | None,
     seed: int,
     batches: int,
@@ -70,7 +73,8 @@ def main(
     maps.png to OUT. The maps are kept for the next training.
     """
     checkpoint = checkpoint_path(out, resume)
-    cfg, data = DataConfig(robot=robot), data or out / "data"
+    made = made or Maps()
+    cfg, data = made.config(robot=robot), data or out / "data"
     with command_errors():
         baselines(paper_weights)  # raises now, not after the training, if the file cannot be read
         maps = data_set(data, "train", batches, seed, cfg) + data_set(data, "train_exact", exact_batches, seed, cfg)
@@ -78,16 +82,22 @@ def main(
         if resume:
             trainer.resume(checkpoint)
         trainer.run(out)
-    _finish(trainer, cfg, out, data, evaluation_batches, paper_weights)
+    _finish(trainer, cfg, out, data, evaluation_batches, paper_weights, made.resolutions)
 
 
 def _finish(
-    trainer: Trainer, cfg: DataConfig, out: Path, data: Path, num_batches: int, paper_weights: Path | None
+    trainer: Trainer,
+    cfg: DataConfig,
+    out: Path,
+    data: Path,
+    num_batches: int,
+    paper_weights: Path | None,
+    resolutions: Sequence[float],
 ) -> None:
     """Save the weights, evaluate them and draw some maps."""
     net = trainer.net.eval()
     net.save(out / "weights.pt")
-    result = evaluate({out.name: net}, data, num_batches, cfg, paper_weights)
+    result = evaluate({out.name: net}, data, num_batches, cfg, paper_weights, resolutions)
     write_result(out / "result.json", {"training": trainer.settings, **result})
     click.echo(table(result))
     others = {name: score for name, score in baselines(paper_weights).items() if name in PICTURED_HEADS}

@@ -22,16 +22,15 @@ import json
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import torch
 from tqdm import tqdm
 
 from benchmarks import RESULTS
-from benchmarks.quality.changes import ghosts, obstacles
-from benchmarks.quality.changes.ghosts import HERTZ
-from benchmarks.quality.changes.obstacles import FRACTIONS, RATES, SETTLED
+from benchmarks.quality.changes.ghosts import HERTZ, ghosts
+from benchmarks.quality.changes.obstacles import FRACTIONS, RATES, SETTLED, obstacle_scans, plate_scans
 from benchmarks.quality.changes.report import tables
 from benchmarks.quality.changes.world import SENSORS
 from torchelev.app.results import commit, write_json
@@ -39,20 +38,28 @@ from torchelev.app.results import commit, write_json
 SECTIONS = ("obstacles", "plates", "ghosts")
 
 
+class Measures(NamedTuple):
+    """What measures a row of each section."""
+
+    obstacles: Callable[..., dict[str, Any]] = obstacle_scans
+    plates: Callable[..., dict[str, Any]] = plate_scans
+    ghosts: Callable[..., dict[str, Any]] = ghosts
+
+
 def _rows(
-    seeds: int, settled: int, hertz: tuple[int, ...], compiled: bool
+    seeds: int, settled: int, hertz: tuple[int, ...], compiled: bool, by: Measures
 ) -> Iterator[tuple[str, str, Callable[[], dict[str, Any]]]]:
     """Yield section, name and measurement of every row."""
     camera, settings = SENSORS["camera 120 x 90"], (seeds, settled, compiled)
     for name, fractions in FRACTIONS.items():
         for fraction in fractions:
-            measure = partial(obstacles.obstacle_scans, camera, name, fraction, *settings)
+            measure = partial(by.obstacles, camera, name, fraction, *settings)
             yield "obstacles", f"{name}, {fraction:.1%} of the points", measure
     for rate in RATES:
-        yield "plates", f"{rate:.0e}", partial(obstacles.plate_scans, camera, rate, *settings)
+        yield "plates", f"{rate:.0e}", partial(by.plates, camera, rate, *settings)
     for name, sensor in SENSORS.items():
         for frequency in hertz:
-            measure = partial(ghosts.ghosts, sensor, frequency, seeds, compiled)
+            measure = partial(by.ghosts, sensor, frequency, seeds, compiled)
             yield "ghosts", f"{name} at {frequency} Hz", measure
 
 
@@ -65,13 +72,22 @@ def _rows(
 )
 @click.option("--compiled/--eager", default=True, show_default=True, help="Compile the map's updates.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
-def main(seeds: int, settled: int, only: str | None, hertz: tuple[int, ...], compiled: bool, out: Path) -> None:
+@click.pass_obj
+def main(
+    by: Measures | None,
+    seeds: int,
+    settled: int,
+    only: str | None,
+    hertz: tuple[int, ...],
+    compiled: bool,
+    out: Path,
+) -> None:
     """Measure, write JSON and print the tables."""
     torch.set_num_threads(2)
     path = out / "changes.json"
     result = json.loads(path.read_text()) if path.exists() else {}
     result = {name: result.get(name, {}) for name in SECTIONS}
-    rows = [row for row in _rows(seeds, settled, hertz, compiled) if only in (None, row[0])]
+    rows = [row for row in _rows(seeds, settled, hertz, compiled, by or Measures()) if only in (None, row[0])]
     for section, name, measure in tqdm(rows, unit="row"):
         result[section][name] = measure() | {"seeds": seeds, "settled": settled, "commit": commit()}
         write_json(path, result)

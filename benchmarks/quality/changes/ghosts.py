@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,31 +14,45 @@ from benchmarks.quality.changes.world import GRID, HALF_CELL, PERSON, World
 from torchelev.sim import Boxes, MountedSensor
 
 HERTZ = (5, 10, 50)
-CROSSINGS = 4  # of each robot's view
-SECONDS = 5.0  # per crossing
-AFTER = 3.0  # [s] from the last crossing to the count
 MARGIN = 0.05  # [m] by which a ray must pass below a cell
 
 
-def crossing(world: World, dt: float) -> Iterator[Boxes]:
+@dataclass(frozen=True)
+class Crossings:
+    """How often and how long people cross each robot's view."""
+
+    number: int = 4
+    seconds: float = 5.0  # each
+    after: float = 3.0  # [s] from the last one to the count
+
+
+def crossing(world: World, dt: float, crossings: Crossings) -> Iterator[Boxes]:
     """Yield, scan by scan, a person who crosses in front of each sensor at a random distance, speed and angle."""
-    for _ in range(CROSSINGS):
+    for _ in range(crossings.number):
         near, slant = (torch.rand(2, world.seeds, generator=world.generator) * torch.tensor([[1.8], [1.0]])).unbind(0)
         speed = 1.3 + 0.4 * torch.rand(world.seeds, generator=world.generator)
         side = torch.sign(torch.rand(world.seeds, generator=world.generator) - 0.5)
-        for k in range(round(SECONDS / dt)):
-            along = speed * (k * dt - SECONDS / 2)
+        for k in range(round(crossings.seconds / dt)):
+            along = speed * (k * dt - crossings.seconds / 2)
             yield world.box(1.2 + near + (slant - 0.5) * along, side * along, PERSON)
 
 
-def ghosts(sensor: MountedSensor, hertz: int, seeds: int, compiled: bool) -> dict[str, Any]:
+def ghosts(
+    sensor: MountedSensor, hertz: int, seeds: int, compiled: bool, crossings: Crossings | None = None
+) -> dict[str, Any]:
     """Count the cells that stay above the ground after the crossings, and the robots that have such cells."""
-    world, dt = World(sensor, seeds, compiled), 1 / hertz
-    for boxes in crossing(world, dt):
+    world, dt, crossings = World(sensor, seeds, compiled), 1 / hertz, crossings or Crossings()
+    return left_behind(world, crossing(world, dt, crossings), dt, round(crossings.after * hertz))
+
+
+def left_behind(world: World, people: Iterable[Boxes], dt: float, scans_after: int) -> dict[str, Any]:
+    """Scan people, and then the ground without them; count what stays above the ground."""
+    seeds = world.seeds
+    for boxes in people:
         world.scan(boxes, dt)
     gone = world.box(torch.zeros(seeds), torch.zeros(seeds), (0.0, 0.0, 0.0))
     points = torch.full((seeds, 1, 3), math.nan)
-    for _ in range(round(AFTER * hertz)):
+    for _ in range(scans_after):
         points = world.scan(gone, dt)
     left = world.above_ground() > 0.1
     count, seen = left.sum((1, 2)), seen_through(world, left, points)

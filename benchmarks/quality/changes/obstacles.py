@@ -23,7 +23,13 @@ RATES = (1e-7, 1e-5, 1e-4, 1e-3)  # [m^2/s] variance rates of aging; the first i
 
 
 def obstacle_scans(
-    sensor: MountedSensor, obstacle: str, fraction: float, seeds: int, settled: int, compiled: bool
+    sensor: MountedSensor,
+    obstacle: str,
+    fraction: float,
+    seeds: int,
+    settled: int,
+    compiled: bool,
+    watched: int = WATCHED,
 ) -> dict[str, Any]:
     """Return after how many scans half of the hit cells show the obstacle, and the points per hit cell and scan."""
     world = World(sensor, seeds, compiled)
@@ -31,12 +37,12 @@ def obstacle_scans(
         world.scan(None, 0.1, fraction)
     boxes = world.ahead(OBSTACLES[obstacle])
     points, shown = torch.zeros_like(world.emap.state.elevation), []
-    for _ in range(WATCHED):
+    for _ in range(watched):
         points += hits(world, world.scan(boxes, 0.1, fraction), boxes)
         hit = points > 0
         shows = hit & (world.above_ground() > 0.15)
         shown.append(2 * shows.sum((1, 2)) >= hit.sum((1, 2)).clamp(min=1))
-    return scans_until(shown) | {"points": float(points[points > 0].median()) / WATCHED}
+    return scans_until(shown) | {"points": float(points[points > 0].median()) / watched}
 
 
 def scans_until(shown: list[Tensor]) -> dict[str, int]:
@@ -69,7 +75,9 @@ def hits(world: World, points: Tensor, boxes: Boxes, above: float = 0.05, beside
     return count.view_as(world.emap.state.elevation) * covered
 
 
-def plate_scans(sensor: MountedSensor, rate: float, seeds: int, settled: int, compiled: bool) -> dict[str, Any]:
+def plate_scans(
+    sensor: MountedSensor, rate: float, seeds: int, settled: int, compiled: bool, watched: int = WATCHED
+) -> dict[str, Any]:
     """Return after how many scans a plate shows to 80 % of its height, and the RMSE of the ground before [mm].
 
     The ground is flat, so that all of the plate lies above it.
@@ -79,7 +87,7 @@ def plate_scans(sensor: MountedSensor, rate: float, seeds: int, settled: int, co
         world.scan(None, 0.1)
     boxes, flat = world.ahead(_PLATE), world.above_ground()
     hit, shown = torch.zeros_like(world.emap.state.validity), []
-    for _ in range(WATCHED):
+    for _ in range(watched):
         hit |= hits(world, world.scan(boxes, 0.1), boxes, above=0.0, beside=0.0) > 0
         shown.append(torch.where(hit, world.above_ground(), math.nan).nanmean((1, 2)) >= 0.8 * 2 * _PLATE[2])
     return scans_until(shown) | {"rmse_mm": 1e3 * float(flat[hit].square().nanmean().sqrt())}

@@ -10,7 +10,7 @@ the absolute difference between a filter and its OpenCV or SciPy peer [m].
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -94,10 +94,10 @@ def _on_each(peer: Peer, layer: Layer) -> list[NDArray]:
     return [peer(values, known) for values, known in zip(layer[0].numpy(), layer[1].numpy(), strict=True)]
 
 
-def measure(seconds: float) -> list[dict[str, Any]]:
+def measure(seconds: float, sizes: Sequence[tuple[int, int]] = SIZES) -> list[dict[str, Any]]:
     """Time every filter and its peer in turn, at every size."""
     rows = []
-    for maps, cells in SIZES:
+    for maps, cells in sizes:
         layer = ground(maps, cells)
         for name, (ours, peer, same) in cases().items():
             runs: dict[str, Callable[[], Any]] = {"ours": partial(ours, layer)}
@@ -131,13 +131,13 @@ def planes_table(rows: list[dict[str, Any]]) -> str:
     return markdown_table(["planes of 250 x 250 cells", "regions", "median ms", "min ms"], lines)
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def table(rows: list[dict[str, Any]], sizes: Sequence[tuple[int, int]] = SIZES) -> str:
     """Tabulate the median times [ms], with the ratio to the peer in brackets."""
     found = {(row["filter"], row["maps"], row["cells"]): row for row in rows}
-    head = ["ms (ratio to OpenCV or SciPy)", *(f"{maps} x {cells} x {cells}" for maps, cells in SIZES)]
+    head = ["ms (ratio to OpenCV or SciPy)", *(f"{maps} x {cells} x {cells}" for maps, cells in sizes)]
     lines = []
     for name in dict.fromkeys(row["filter"] for row in rows):
-        cells = [found[(name, *size)] for size in SIZES]
+        cells = [found[(name, *size)] for size in sizes]
         times = [f"{c['ours']['median']:.2f}" + (f" ({c['ratio']:.2f})" if "ratio" in c else "") for c in cells]
         lines.append([name, *times])
     return markdown_table(head, lines)

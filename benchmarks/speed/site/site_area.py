@@ -14,8 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -24,41 +24,52 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import milliseconds, peak_megabytes, progress, state_bytes
+from benchmarks.speed.meter import in_new_process, milliseconds, peak_megabytes, progress, state_bytes
 from benchmarks.speed.site.site_windows import RESOLUTION, Windows
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap
 
 SIDES = (100, 316, 1000)  # [m]
-ROBOTS, CELLS, HOP = 16, 160, 120  # robots, cells along each side of a window, and between places
-NUM_SAMPLES, WINDOW, SECONDS = 10_000, 20.0, 2.0  # points, [m] of an area that is read, [s] that reading is timed
 
 
-def hops(side: float) -> torch.Tensor:
+@dataclass(frozen=True)
+class Sizes:
+    """Who explores, what is read, and how long reading is timed."""
+
+    robots: int = 16
+    cells: int = 160  # along each side of a window
+    hop: int = 120  # [cells] between places
+    num_samples: int = 10_000
+    window: float = 20.0  # [m] of an area that is read
+    seconds: float = 2.0
+    apart: Callable[..., Any] = in_new_process
+
+
+def hops(side: float, sizes: Sizes) -> torch.Tensor:
     """Return the corners (K, B, 2) [cells] of windows that cover a square of `side` [m]; the last ones start anew."""
-    count = max(1, round((side / RESOLUTION - CELLS) / HOP) + 1)
-    number = torch.arange(-(-(count**2) // ROBOTS) * ROBOTS) % count**2
+    count = max(1, round((side / RESOLUTION - sizes.cells) / sizes.hop) + 1)
+    number = torch.arange(-(-(count**2) // sizes.robots) * sizes.robots) % count**2
     row, column = number // count, number % count
     column = torch.where(row % 2 == 0, column, count - 1 - column)
-    return HOP * torch.stack([row, column], 1).view(-1, ROBOTS, 2)
+    return sizes.hop * torch.stack([row, column], 1).view(-1, sizes.robots, 2)
 
 
-def explore(folder: Path, side: float) -> dict[str, Any]:
+def explore(folder: Path, side: float, sizes: Sizes) -> dict[str, Any]:
     """Explore an area, and return the times of all merges and the memory of this process."""
     torch.set_num_threads(1)
-    windows, ms = Windows(ROBOTS, CELLS), []
+    windows, ms = Windows(sizes.robots, sizes.cells), []
     with SiteMap(RESOLUTION, folder) as site:
-        for corner in hops(side):
+        for corner in hops(side, sizes):
             windows.look(corner)
             start = time.perf_counter()
             site.merge(windows.emap)
             ms.append(1e3 * (time.perf_counter() - start))
         size = {"tiles": len(site), "disk_bytes": site.num_bytes}
-    maps = ROBOTS * state_bytes(windows.emap.cfg) / 1e6
+    maps = sizes.robots * state_bytes(windows.emap.cfg) / 1e6
     return size | {"merge_ms": ms, "explorer_mb": peak_megabytes(), "maps_mb": maps}
 
 
-def read(folder: Path, side: float) -> dict[str, Any]:
+def read(folder: Path, side: float, sizes: Sizes) -> dict[str, Any]:
     """Open a site, sample it at random points and read a window of it; return the times and the memory."""
     torch.set_num_threads(1)
     start = time.perf_counter()
@@ -67,15 +78,15 @@ def read(folder: Path, side: float) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(0)
 
     def points(length: float) -> torch.Tensor:
-        return length * torch.rand(NUM_SAMPLES, 2, generator=generator, dtype=torch.float64)
+        return length * torch.rand(sizes.num_samples, 2, generator=generator, dtype=torch.float64)
 
     times = {
         "sample_ms": lambda: site.sample(points(side)),
-        "sample_near_ms": lambda: site.sample(points(WINDOW)),
-        "window_ms": lambda: site.window((side / 2, side / 2), WINDOW, WINDOW, ["elevation"]),
+        "sample_near_ms": lambda: site.sample(points(sizes.window)),
+        "window_ms": lambda: site.window((side / 2, side / 2), sizes.window, sizes.window, ["elevation"]),
     }
     known = site.sample(points(side))[1].double().mean()
-    result = {name: milliseconds(run, SECONDS)["median"] for name, run in times.items()}
+    result = {name: milliseconds(run, sizes.seconds)["median"] for name, run in times.items()}
     return result | {"open_ms": open_ms, "known": float(known), "reader_mb": peak_megabytes()}
 
 
@@ -86,13 +97,12 @@ def torch_megabytes() -> float:
     return int(done.stdout.split()[1]) * 1024 / 1e6
 
 
-def measure(side: float) -> dict[str, Any]:
+def measure(side: float, sizes: Sizes) -> dict[str, Any]:
     """Explore and read an area, each in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         values: dict[str, Any] = {"side": side, "torch_mb": torch_megabytes()}
         for run in (explore, read):
-            with ProcessPoolExecutor(1, get_context("spawn")) as new:  # a fork would inherit this process's memory
-                values |= new.submit(run, Path(folder) / "site", side).result()
+            values |= sizes.apart(run, Path(folder) / "site", side, replace(sizes, apart=in_new_process))
     return values
 
 
@@ -122,10 +132,12 @@ def _last_quarter(times: list[float]) -> float:
 @click.command(help=__doc__)
 @click.option("--sides", type=int, multiple=True, default=SIDES, show_default=True, help="Sides of the areas [m].")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
-def main(sides: tuple[int, ...], out: Path) -> None:
+@click.pass_obj
+def main(sizes: Sizes | None, sides: tuple[int, ...], out: Path) -> None:
     """Measure, write JSON and print the table."""
-    rows = [measure(side) for side in progress(sides, "areas")]
-    write_json(out / "site_area.json", {"robots": ROBOTS, "rows": rows})
+    sizes = sizes or Sizes()
+    rows = [measure(side, sizes) for side in progress(sides, "areas")]
+    write_json(out / "site_area.json", {"robots": sizes.robots, "rows": rows})
     click.echo(table(rows))
 
 

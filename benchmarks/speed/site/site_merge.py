@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -25,15 +26,23 @@ from benchmarks.speed.site.site_windows import RESOLUTION, Windows, lattice
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap
 
-ROBOTS = (1, 16, 64, 256, 1024)
-CELLS, SPACING, STEP = 64, 32, 4  # of a window, between neighbours, and a round
+STEP = 4  # [cells] of a round
 PLACES = ("memory", "disk")
 
 
-def measure(num_robots: int, rounds: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Sizes:
+    """The numbers of robots, and their windows [cells]."""
+
+    robots: tuple[int, ...] = (1, 16, 64, 256, 1024)
+    cells: int = 64  # along each side
+    spacing: int = 32  # between neighbours
+
+
+def measure(num_robots: int, rounds: int, sizes: Sizes) -> dict[str, Any]:
     """Time the merges of a number of robots into two sites, in turn."""
-    windows = {place: Windows(num_robots, CELLS) for place in PLACES}
-    corner = lattice(num_robots, SPACING)
+    windows = {place: Windows(num_robots, sizes.cells) for place in PLACES}
+    corner = lattice(num_robots, sizes.spacing)
     with tempfile.TemporaryDirectory() as folder:
         with SiteMap(RESOLUTION) as in_memory, SiteMap(RESOLUTION, Path(folder) / "site") as on_disk:
             sites = dict(zip(PLACES, (in_memory, on_disk), strict=True))
@@ -69,10 +78,12 @@ def table(rows: list[dict[str, Any]]) -> str:
 @click.option("--rounds", default=20, show_default=True, help="Merges after the first.")
 @click.option("--threads", default=1, show_default=True, help="CPU threads.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
-def main(rounds: int, threads: int, out: Path) -> None:
+@click.pass_obj
+def main(sizes: Sizes | None, rounds: int, threads: int, out: Path) -> None:
     """Measure, write JSON and print the table."""
     torch.set_num_threads(threads)
-    rows = [measure(robots, rounds) for robots in progress(ROBOTS, "robots")]
+    sizes = sizes or Sizes()
+    rows = [measure(robots, rounds, sizes) for robots in progress(sizes.robots, "robots")]
     write_json(out / "site_merge.json", {"rounds": rounds, "rows": rows})
     click.echo(table(rows))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,19 +13,30 @@ from benchmarks.speed.meter import progress
 from benchmarks.speed.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
 from torchelev.stages.visibility.polar_table import PolarGrid
 
-POINTS = [1000, 3000, 6276, 15000, 43074, 100000, 200000, 407040]
-ROBOTS = [1, 4, 16, 64, 256, 1024, 4096]
-CELLS = [125, 250, 500, 1000]  # along each side
-RAYS = [1.2, 1.7, 2.4, 3.4, 4.8, 6.8, 19.2, 38.4]  # [m] horizontal length of the longest ray; the window ends at 5 m
-THREADS, MANY_ROBOTS = (1, 2), 256
+THREADS = (1, 2)
 _STEEPNESS = 0.5  # slope of the long rays: above the exclusion ramp at any distance
 
 
-def points(seconds: float) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Sizes:
+    """What the sections measure."""
+
+    points: tuple[int, ...] = (1000, 3000, 6276, 15000, 43074, 100000, 200000, 407040)
+    of_sensors: tuple[int, ...] = tuple(sorted(row[1] for row in SENSORS))  # points
+    robots: tuple[int, ...] = (1, 4, 16, 64, 256, 1024, 4096)
+    cells: tuple[int, ...] = (125, 250, 500, 1000)  # along each side
+    rays: tuple[float, ...] = (1.2, 1.7, 2.4, 3.4, 4.8, 6.8, 19.2, 38.4)  # [m] of the longest; the window ends at 5 m
+    many_robots: int = 256
+
+
+USUAL = Sizes()
+
+
+def points(seconds: float, sizes: Sizes = USUAL) -> dict[str, Any]:
     """Time one robot's update against the number of points: all stages, the paper's plain baseline, uncompiled."""
-    drives = {("full", n): Drive(full_config(), n) for n in POINTS}
-    drives |= {("baseline", n): Drive(baseline_config(), n) for n in POINTS}
-    drives |= {("eager", n): Drive(full_config(), n, compiled=False) for n in sorted(row[1] for row in SENSORS)}
+    drives = {("full", n): Drive(full_config(), n) for n in sizes.points}
+    drives |= {("baseline", n): Drive(baseline_config(), n) for n in sizes.points}
+    drives |= {("eager", n): Drive(full_config(), n, compiled=False) for n in sizes.of_sensors}
     for (kind, _), drive in progress(drives.items(), "points"):
         drive.watch(8) if kind == "baseline" else drive.warm_up()
     times = meter.interleaved(drives, seconds)
@@ -34,26 +46,26 @@ def points(seconds: float) -> dict[str, Any]:
         row: dict[str, Any] = {"points": n} | times[kind, n] | {"necessary_bytes": moved}
         row["gigabytes_per_second"] = moved / row["median"] / 1e6
         results[kind].append(row | {"largest_statistics": drive.seen})
-    sizes, medians = [row["points"] for row in results["full"]], [row["median"] for row in results["full"]]
-    results["exponent"] = meter.exponent(sizes, medians)
-    first = sizes.index(BPEARL)
-    results["exponent_from_43074"] = meter.exponent(sizes[first:], medians[first:])
+    numbers, medians = [row["points"] for row in results["full"]], [row["median"] for row in results["full"]]
+    results["exponent"] = meter.exponent(numbers, medians)
+    first = numbers.index(BPEARL)
+    results["exponent_from_43074"] = meter.exponent(numbers[first:], medians[first:])
     return results
 
 
-def threads(seconds: float) -> dict[str, Any]:
+def threads(seconds: float, sizes: Sizes = USUAL) -> dict[str, Any]:
     """Time updates of one robot and of many on one thread and on two, against the bytes that they must move."""
     before = torch.get_num_threads()
     try:
-        return {"rows": [row for number in progress(THREADS, "threads") for row in _on_threads(number, seconds)]}
+        return {"rows": [row for number in progress(THREADS, "threads") for row in _on_threads(number, seconds, sizes)]}
     finally:
         torch.set_num_threads(before)
 
 
-def _on_threads(number: int, seconds: float) -> Iterator[dict[str, Any]]:
+def _on_threads(number: int, seconds: float, sizes: Sizes) -> Iterator[dict[str, Any]]:
     full, many = full_config(), full_config(64)
-    cases = {f"{n:,} points": (full, n, 1) for n in sorted(row[1] for row in SENSORS)}
-    cases[f"{MANY_ROBOTS} robots"] = (many, MANY_POINTS, MANY_ROBOTS)
+    cases = {f"{n:,} points": (full, n, 1) for n in sizes.of_sensors}
+    cases[f"{sizes.many_robots} robots"] = (many, MANY_POINTS, sizes.many_robots)
     torch.set_num_threads(number)
     drives = {name: Drive(cfg, n, robots=count) for name, (cfg, n, count) in cases.items()}
     for drive in drives.values():
@@ -65,13 +77,13 @@ def _on_threads(number: int, seconds: float) -> Iterator[dict[str, Any]]:
         yield {"case": name, "threads": number} | time | {"share_of_copy": share}
 
 
-def robots(seconds: float) -> dict[str, Any]:
+def robots(seconds: float, sizes: Sizes = USUAL) -> dict[str, Any]:
     """Time an update, and record its memory, against the number of robots."""
     cfg = full_config(64)
     needed = meter.needed_memory(cfg, MANY_POINTS)
     moved = meter.needed_traffic(cfg, MANY_POINTS)
     rows = []
-    for count in progress(ROBOTS, "robots"):
+    for count in progress(sizes.robots, "robots"):
         drive = Drive(cfg, MANY_POINTS, robots=count, scans=4)
         drive.warm_up()
         time = meter.milliseconds(drive, seconds)
@@ -83,18 +95,18 @@ def robots(seconds: float) -> dict[str, Any]:
     return {"cells": 64, "points": MANY_POINTS, "needed_bytes_per_robot": needed, "rows": rows}
 
 
-def cells(seconds: float) -> dict[str, Any]:
+def cells(seconds: float, sizes: Sizes = USUAL) -> dict[str, Any]:
     """Time one robot's update against the number of cells."""
-    drives = {side**2: Drive(full_config(side), BPEARL, reach=5.0) for side in CELLS}
+    drives = {side**2: Drive(full_config(side), BPEARL, reach=5.0) for side in sizes.cells}
     for drive in progress(drives.values(), "cells"):
         drive.watch(8)
     times = meter.interleaved(drives, seconds)
     rows = [{"cells": count} | time for count, time in times.items()]
-    exponent = meter.exponent(CELLS[1:], [row["median"] for row in rows[1:]]) / 2  # cells are sides squared
+    exponent = meter.exponent(sizes.cells[1:], [row["median"] for row in rows[1:]]) / 2  # cells are sides squared
     return {"points": BPEARL, "rows": rows, "exponent": exponent}
 
 
-def rays(seconds: float) -> dict[str, Any]:
+def rays(seconds: float, sizes: Sizes = USUAL) -> dict[str, Any]:
     """Time one robot's update against the length of half of its rays; the other half measures the ground nearby.
 
     The long rays rise above the exclusion ramp at one slope. They contribute no heights, so their cost is that of ray
@@ -103,7 +115,7 @@ def rays(seconds: float) -> dict[str, Any]:
     cfg = full_config()
     assert cfg.raycast
     table_length = PolarGrid.of(cfg.grid, cfg.raycast).ranges * cfg.grid.resolution
-    drives = {length: Drive(cfg, BPEARL, scans=4, reach=RAYS[0]) for length in RAYS}
+    drives = {length: Drive(cfg, BPEARL, scans=4, reach=sizes.rays[0]) for length in sizes.rays}
     for length, drive in progress(drives.items(), "rays"):
         generator = torch.Generator().manual_seed(0)
         for cloud in drive.clouds:

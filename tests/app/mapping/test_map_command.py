@@ -5,12 +5,12 @@ import numpy as np
 import plyfile
 import pytest
 
-from tests.app.drives import HEIGHT, cut_scan, sensor_poses, value_at, write_poses
+from tests.app.drives import HEIGHT, cut_scan, raise_interrupt, sensor_poses, value_at, write_poses
 from torchelev.app.cli import main
-from torchelev.io import Recording
 from torchelev.io.export import load_npz
 
 
+@pytest.mark.slow(3)
 def test_recording_in_map_out(run, recording, tmp_path):
     code, out, err = run("map", recording, "--size", 8, "--out", "maps/drive")
     assert (code, err) == (0, "")
@@ -81,6 +81,7 @@ def test_poses_of_the_base_with_extrinsics(run, recording, tmp_path):
     np.testing.assert_array_equal(base.layers["elevation"], load_npz(tmp_path / "yaml.npz").layers["elevation"])
 
 
+@pytest.mark.slow(1)
 def test_depth_images(run, tmp_path):
     folder = tmp_path / "camera"
     folder.mkdir()
@@ -118,6 +119,7 @@ def skewed_pose(folder):
     return "poses.txt: line 1"
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("spoil", [missing_pose, cut_scan, unknown_format, empty_folder, skewed_pose])
 def test_a_bad_recording_is_one_line(run, recording, spoil):
     problem = spoil(recording)
@@ -126,6 +128,7 @@ def test_a_bad_recording_is_one_line(run, recording, spoil):
     assert err.count("\n") == 1 and err.startswith("Error: ") and problem in err
 
 
+@pytest.mark.slow(1)
 def test_scans_before_a_bad_one_are_kept(run, recording, tmp_path):
     cut_scan(recording)
     code, out, err = run("map", recording, "--size", 4)
@@ -179,19 +182,9 @@ def test_bad_options_are_one_line(run, recording, tmp_path, options, problem):
     assert err.count("\n") == 1 and problem in err
 
 
-def interrupt_at(monkeypatch, index):
-    read = Recording.__getitem__
-
-    def get(self, k):
-        if k == index:
-            raise KeyboardInterrupt
-        return read(self, k)
-
-    monkeypatch.setattr(Recording, "__getitem__", get)
-
-
-def test_ctrl_c_keeps_what_was_mapped(run, recording, tmp_path, monkeypatch):
-    interrupt_at(monkeypatch, 2)
+@pytest.mark.slow(1)
+def test_ctrl_c_keeps_what_was_mapped(run, recording, tmp_path, at_scan):
+    at_scan(2, raise_interrupt)
     code, out, err = run("map", recording, "--size", 8)
     assert code == 130
     assert "interrupted: kept the map of 2 of 4 scans" in err and "map.npz" in out
@@ -200,13 +193,14 @@ def test_ctrl_c_keeps_what_was_mapped(run, recording, tmp_path, monkeypatch):
     assert saved.center[0] == pytest.approx(0.25, abs=0.051)
 
 
-def test_ctrl_c_before_the_first_scan(run, recording, tmp_path, monkeypatch):
-    interrupt_at(monkeypatch, 0)
+def test_ctrl_c_before_the_first_scan(run, recording, tmp_path, at_scan):
+    at_scan(0, raise_interrupt)
     code, out, err = run("map", recording)
     assert (code, out) == (130, "") and "nothing was mapped yet" in err
     assert not (tmp_path / "map.npz").exists()
 
 
+@pytest.mark.slow(1)
 def test_a_wrong_frame_is_pointed_out(run, recording, tmp_path):
     flat = np.zeros((3000, 4), np.float32)
     flat[:, :3] = [0, 0, -HEIGHT] + np.random.default_rng(0).uniform(-3, 3, (3000, 3)) * [1, 1, 0]
@@ -255,6 +249,7 @@ def test_a_second_map_in_the_recordings_folder_takes_the_same_scans(run, recordi
             path.rename(recording / path.name)
 
 
+@pytest.mark.slow(1)
 def test_the_folder_scans_wins(run, recording):
     np.save(recording / "other.npy", np.zeros((5, 3)))
     (recording / "more").mkdir()
@@ -283,20 +278,18 @@ def test_a_dangling_link_is_no_gap(run, recording):
     assert code == 2 and "000001.bin: a link to a file that does not exist" in err
 
 
-def test_what_was_mapped_before_any_error_is_kept(run, recording, tmp_path, monkeypatch):
-    read = Recording.__getitem__
+@pytest.mark.slow(1)
+def test_what_was_mapped_before_any_error_is_kept(run, recording, tmp_path, at_scan):
+    def fail():
+        raise MemoryError("no memory")
 
-    def get(self, k):
-        if k == 2:
-            raise MemoryError("no memory")
-        return read(self, k)
-
-    monkeypatch.setattr(Recording, "__getitem__", get)
+    at_scan(2, fail)
     with pytest.raises(MemoryError):
         main(["map", str(recording), "--size", "4"], standalone_mode=False)
     assert np.isfinite(load_npz(tmp_path / "map.partial.npz").layers["elevation"]).any()
 
 
+@pytest.mark.slow(2)
 def test_layouts_by_option(run, recording, tmp_path):
     for path in (recording / "scans").iterdir():
         points = np.fromfile(path, np.float32).reshape(-1, 4)
@@ -321,6 +314,7 @@ def flat(number, distance=3.0):
     return np.column_stack([xy, np.full(number, -1.0)])
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(
     "cloud, words",
     [
@@ -334,30 +328,26 @@ def test_an_empty_map_has_an_exit_code_of_its_own(run, tmp_path, cloud, words):
     assert code == 3 and "wrote" in out and words in err.splitlines()[-1] and err.splitlines()[-1].startswith("Error: ")
 
 
+@pytest.mark.slow(1)
 def test_a_map_of_a_fraction_of_the_points_is_none_of_these(run, tmp_path):
     cloud = np.vstack([flat(30), flat(970) + [400.0, 0, 0]])
     assert run("map", recording_of(tmp_path / "drive", [cloud, cloud]))[0] == 0
 
 
-def test_warnings_are_one_line_each(run, tmp_path, monkeypatch):
+@pytest.mark.slow(1)
+def test_warnings_are_one_line_each(run, tmp_path, at_scan):
     """Of the library, once for each text, without a line of source."""
     import warnings
 
-    from torchelev.io import MappingRun
-
-    original = MappingRun.add
-
-    def add(self, *args):
-        warnings.warn("updates took\nlong", RuntimeWarning, stacklevel=1)
-        return original(self, *args)
-
-    monkeypatch.setattr(MappingRun, "add", add)
+    for number in range(2):
+        at_scan(number, lambda: warnings.warn("updates took\nlong", RuntimeWarning, stacklevel=1))
     cloud = flat(500)
     cloud[::7], cloud[3::7] = np.inf, -np.inf
     code, _, err = run("map", recording_of(tmp_path / "drive", [cloud] * 3))
     assert code == 0 and err.splitlines() == ["warning: updates took long"]
 
 
+@pytest.mark.slow(1)
 def test_a_full_disk_while_a_bag_is_closed_keeps_the_map(run, tmp_path, monkeypatch):
     """SQLite says so by an error of its own."""
     import sqlite3

@@ -56,6 +56,7 @@ def test_what_cannot_be_written_is_kept_elsewhere(run, recording, tmp_path, monk
     assert load_npz(kept if suffix == ".npz" else tmp_path / "map.npz").layers["elevation"].shape == (50, 50)
 
 
+@pytest.mark.slow(2)
 def test_out_may_have_the_suffix_of_an_output(run, recording, tmp_path):
     assert run("map", recording, "--size", 2, "--out", "course.npz")[0] == 0
     assert sorted(path.name for path in tmp_path.glob("course*")) == ["course.npz", "course.ply", "course.png"]

@@ -1,16 +1,15 @@
 """`torchelev map --video`: the growing map as a video."""
 
-import sys
-
 import numpy as np
 import pytest
 
-from tests.app.drives import NUM_SCANS
+from tests.app.drives import NUM_SCANS, raise_interrupt
+from tests.helpers import without
 from tests.io.bags.synthetic import SCANS, write_drive
 from tests.viz.test_video import read_frames
 from torchelev.app.mapping import map_video
 from torchelev.app.mapping.recording_schedule import RecordingSchedule
-from torchelev.io import Frame, MappingRun
+from torchelev.io import Frame
 
 
 def count_unknown(frames):
@@ -62,16 +61,9 @@ def test_recording_schedule():
 
 @pytest.mark.slow(1)
 @pytest.mark.parametrize("name", ["grown.mp4", "grown.gif"])
-def test_ctrl_c_keeps_the_video_so_far(run, recording, tmp_path, monkeypatch, name):
+def test_ctrl_c_keeps_the_video_so_far(run, recording, tmp_path, at_scan, name):
     pytest.importorskip("av")
-    add = MappingRun.add
-
-    def interrupted(self, *arguments):
-        if self.num_scans == 3:
-            raise KeyboardInterrupt
-        return add(self, *arguments)
-
-    monkeypatch.setattr(MappingRun, "add", interrupted)
+    at_scan(3, raise_interrupt)
     code, out, err = run("map", recording, "--size", 4, "--video", name)
     assert code == 130 and "kept the map of 3 of 4 scans" in err and "filmed    3 frames" in out
     assert len(read_frames(tmp_path / name)) == 3 and (tmp_path / "map.npz").exists()
@@ -95,9 +87,9 @@ def test_the_map_is_kept_where_the_video_cannot_be_finished(run, recording, tmp_
     "gone/grown.gif": "gone/grown.gif: cannot be written",
     "grown.mp4": "pip install 'torchelev[video]'",
 }.items())  # fmt: skip
-def test_what_cannot_be_filmed_is_refused_before_mapping(run, recording, tmp_path, monkeypatch, name, words):
-    monkeypatch.setitem(sys.modules, "av", None)
-    monkeypatch.setattr(MappingRun, "add", None)
+def test_what_cannot_be_filmed_is_refused_before_mapping(run, recording, tmp_path, monkeypatch, at_scan, name, words):
+    without(monkeypatch, "av")
+    at_scan(0, lambda: pytest.fail("mapped"))
     code, out, err = run("map", recording, "--video", name, "--grid-map", "grown.mcap")
     assert (code, out) == (2, "") and words in err and len(err.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]

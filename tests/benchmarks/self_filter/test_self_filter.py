@@ -59,12 +59,11 @@ def test_padding_takes_ground_and_noise_leaves_legs():
 
 
 @pytest.mark.slow(4)
-def test_the_command_writes_what_it_measured(tmp_path, monkeypatch):
-    small = dict(speed=lambda seconds: speed.measure(seconds, 2, False), legs=lambda _: legs.measure(1, 10, 8))
-    monkeypatch.setattr(command, "SECTIONS", small)
-    monkeypatch.setattr(speed, "SCANS", 2)
+def test_the_command_writes_what_it_measured(tmp_path):
+    small = dict(speed=lambda seconds: speed.measure(seconds, 2, False, 2), legs=lambda _: legs.measure(1, 10, 8))
     for only in ("speed", "legs"):
-        outcome = CliRunner().invoke(command.main, ["--seconds", "0", "--only", only, "--out", str(tmp_path)])
+        options = ["--seconds", "0", "--only", only, "--out", str(tmp_path)]
+        outcome = CliRunner().invoke(command.main, options, obj=small)
         assert outcome.exit_code == 0, outcome.output
     result = json.loads((tmp_path / "self_filter.json").read_text())
     assert set(result) == {"machine", "speed", "legs"} and result["speed"]["points"] == 600

@@ -1,7 +1,6 @@
 """The benchmark of bags: its drive is a right one, and what it measures is written and tabulated."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -32,11 +31,9 @@ def test_points_of_the_moving_lidar_lie_on_flat_ground(tmp_path):
 
 
 @pytest.mark.slow(3)
-def test_two_scans_are_measured_and_tabulated(tmp_path, monkeypatch):
-    for name, value in {"LIDAR": LIDAR, "SMALL_LIDAR": LIDAR, "TIMED_SCANS": 2, "LENGTHS": (2, 3)}.items():
-        monkeypatch.setattr(bags, name, value)
-    monkeypatch.setattr(bags, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))
-    result = CliRunner().invoke(bags.main, ["--out", str(tmp_path)], catch_exceptions=False)
+def test_two_scans_are_measured_and_tabulated(tmp_path):
+    small = bags.Sizes(LIDAR, 2, LIDAR, (2, 3), apart=lambda function, *arguments: function(*arguments))
+    result = CliRunner().invoke(bags.main, ["--out", str(tmp_path)], obj=small, catch_exceptions=False)
     assert result.exit_code == 0
     rows = json.loads((tmp_path / "bags.json").read_text())["rows"]
     assert [row["format"] for row in rows] == [".bag", ".mcap", ".db3"]

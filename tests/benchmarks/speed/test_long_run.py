@@ -1,10 +1,8 @@
 """Long runs: each block is written, and growth is found."""
 
+import contextlib
 import copy
 import json
-import sys
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -15,11 +13,14 @@ from benchmarks.speed.workload import Drive, full_config
 
 
 @pytest.mark.slow(3)
-def test_long_run_writes_every_block(tmp_path, monkeypatch, capsys, eager):
-    monkeypatch.setattr(long_run, "CASES", {"two robots": (2, 64, 400, 4)})
-    monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))
-    monkeypatch.setattr(sys, "argv", ["long_run", "--out", str(tmp_path), "--threads", "1"])
-    long_run.main()
+def test_long_run_writes_every_block(tmp_path, capsys):
+    @contextlib.contextmanager
+    def beside(case):
+        timer = long_run.start(case)[1]
+        yield lambda updates: long_run.milliseconds(timer, updates)
+
+    cases = {"two robots": (2, 64, 400, 4)}
+    long_run.main(["--out", str(tmp_path), "--threads", "1"], cases, new_process=beside)
     values = json.loads((tmp_path / "long_run.json").read_text())["two robots"]
     assert {len(values[name]) for name in ("ms", "reference_ms", "resident_bytes", "graphs")} == {4}
     assert values["updates"] == 4 and values["known_share"] > 0.05
@@ -37,17 +38,21 @@ class Slowing:
         self.done += updates
         return SimpleNamespace(mean=1e-3 * (1 + self.slowdown * self.done))
 
+    def milliseconds(self, updates):
+        return long_run.milliseconds(self, updates)
+
 
 @pytest.mark.parametrize("slowdown, verdict", [(0.0, "none grows"), (1e-4, "GROWS")])
-def test_long_run_sees_what_its_updates_slow(monkeypatch, slowdown, verdict):
+def test_long_run_sees_what_its_updates_slow(slowdown, verdict):
     """By a fifth over 2,000 updates; each process counts its own, and those of the reference are few."""
-    own, saved = threading.local(), []
+    saved = []
     drive = SimpleNamespace(emap=SimpleNamespace(state=SimpleNamespace(validity=torch.ones(1))))
-    monkeypatch.setattr(long_run, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))
-    monkeypatch.setattr(long_run, "start", lambda case: (drive, Slowing(slowdown)))
-    monkeypatch.setattr(long_run, "started", lambda case, threads: vars(own).setdefault("timer", Slowing(slowdown)))
-    monkeypatch.setattr(long_run, "resident_bytes", lambda: 10**8)
-    long_run.run_case("one robot", 2000, lambda values: saved.append(copy.deepcopy(values)))
+    how = {
+        "start": lambda case: (drive, Slowing(slowdown)),
+        "new_process": lambda case: contextlib.nullcontext(Slowing(slowdown).milliseconds),
+    }
+    case = long_run.CASES["one robot"]
+    long_run.run_case("one robot", case, 2000, lambda values: saved.append(copy.deepcopy(values)), **how)
     ((_, _, _, over_reference, over_new, *_, said),) = growth.verdicts({"one robot": saved[-1]})
     assert len(saved) == long_run.BLOCKS + 1 and said == verdict
     assert (float(over_reference) > growth.GROWTH) == (float(over_new) > growth.GROWTH) == (slowdown > 0)

@@ -33,11 +33,13 @@ def test_the_loop_is_timed_idle_and_beside_a_process():
     assert set(rows) == {"idle", "busy"} and all(row["updates"] == 3 and row["p50"] > 0 for row in rows.values())
 
 
-def test_every_way_to_wait_is_written(tmp_path, monkeypatch):
+def test_every_way_to_wait_is_written(tmp_path):
     row = loop.figures([0.008, 0.03])
     asked = []
-    monkeypatch.setattr(loop, "measure_apart", lambda *given: asked.append(given) or {"idle": row, "busy": row})
-    result = CliRunner().invoke(loop.main, ["--seconds", "0.1", "--out", str(tmp_path)])
+    options = ["--seconds", "0.1", "--out", str(tmp_path)]
+    result = CliRunner().invoke(
+        loop.main, options, obj=lambda *given: asked.append(given) or {"idle": row, "busy": row}
+    )
     assert result.exit_code == 0, result.output
     assert asked == [("long", 5, 2), ("adapted", 5, 2), ("PASSIVE", 5, 2)]
     assert "| PASSIVE | busy | 8.0 | 30.0 | 30.0 | 50.0 |" in result.output

@@ -18,8 +18,8 @@ def test_filters_give_what_opencv_and_scipy_give(name):
     )
 
 
-def test_postprocessing_is_measured_and_tabulated(monkeypatch):
-    monkeypatch.setattr(postprocessing, "SIZES", ((1, 20), (2, 16)))
-    rows = postprocessing.measure(0.0)
-    text = postprocessing.table(rows)
+def test_postprocessing_is_measured_and_tabulated():
+    sizes = (1, 20), (2, 16)
+    rows = postprocessing.measure(0.0, sizes)
+    text = postprocessing.table(rows, sizes)
     assert all(f"| {name} |" in text for name in postprocessing.cases())

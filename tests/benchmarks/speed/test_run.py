@@ -1,15 +1,12 @@
 """The command of the speed benchmarks: one section alone, and regressions between two results."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
 from benchmarks.speed import run
 from benchmarks.speed.run import regressions
 from benchmarks.speed.update import scaling
-from docs.readme_tables import ROOT
 
 
 def test_regressions_need_median_and_minimum():
@@ -24,27 +21,26 @@ def test_regressions_need_median_and_minimum():
 
 
 @pytest.mark.slow(3)
-def test_one_section_into_a_new_folder(tmp_path, monkeypatch, capsys, eager):
-    monkeypatch.setattr(scaling, "RAYS", [1.2, 4.8])
-    monkeypatch.setattr(sys, "argv", ["run", "rays", "--out", str(tmp_path), "--seconds", "0.001"])
-    assert run.main() == 0
+def test_one_section_into_a_new_folder(tmp_path, capsys):
+    small = scaling.Sizes(rays=(1.2, 4.8))
+    options = ["rays", "--out", str(tmp_path), "--seconds", "0.001", "--threads", "1"]
+    assert run.main(options, {"rays": lambda seconds: scaling.rays(seconds, small)}) == 0
     assert "growth with ray length" in capsys.readouterr().out
     assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png", ".svg"}
 
 
-def run_compare(new, old):
-    command = [sys.executable, "-m", "benchmarks.speed.run", "--compare", str(new), "--against", str(old)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+@pytest.mark.slow(12)
+def test_compare_fails_on_a_regression(tmp_path, capsys):
+    def compare(new, old):
+        return run.main(["--compare", str(new), "--against", str(old)])
 
-
-@pytest.mark.slow(10)
-def test_compare_fails_on_a_regression(tmp_path):
     fast, slow = tmp_path / "fast.json", tmp_path / "slow.json"
     fast.write_text(json.dumps({"update": {"median": 1.0, "min": 0.9}}))
     slow.write_text(json.dumps({"update": {"median": 3.0, "min": 2.9}}))
     other = tmp_path / "other.json"
     other.write_text("{}")
-    worse, better, none = run_compare(slow, fast), run_compare(fast, slow), run_compare(fast, other)
-    assert (worse.returncode, better.returncode, none.returncode) == (1, 0, 2), worse.stderr
-    assert "/update: median 1.000 -> 3.000 ms (3.00 x)" in worse.stdout
-    assert "no such file" in run_compare(fast, tmp_path / "missing.json").stderr
+    assert compare(slow, fast) == 1 and "/update: median 1.000 -> 3.000 ms (3.00 x)" in capsys.readouterr().out
+    assert compare(fast, slow) == 0 and compare(fast, other) == 2
+    with pytest.raises(SystemExit):
+        compare(fast, tmp_path / "missing.json")
+    assert "no such file" in capsys.readouterr().err

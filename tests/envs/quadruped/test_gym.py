@@ -17,6 +17,7 @@ from tests.envs.quadruped.cases import CFG
 ID = "torchelev/Quadruped-v0"
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("perception", ["map", "truth", "blind"])
 def test_check_env(perception):
     env = gymnasium.make(ID, cfg=CFG, perception=perception)

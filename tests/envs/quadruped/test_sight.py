@@ -38,6 +38,7 @@ def test_foot_rings_on_flat_ground_read_the_height_of_each_foot():
     torch.testing.assert_close(read, expected[..., None].expand_as(read), atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow(1)
 def test_the_map_reads_the_ground_that_it_has_seen():
     task = Quadruped(CFG, 4, perception="map", seed=1)
     task.place_at(torch.ones(4, dtype=torch.int64))

@@ -22,6 +22,7 @@ def run(task, steps, action=None):
     return outcomes
 
 
+@pytest.mark.slow(1)
 def test_the_trot_walks_without_learning():
     cfg = dataclasses.replace(FLAT_CFG, random=CALM)
     task = Quadruped(cfg, 4, perception="blind")
@@ -92,6 +93,7 @@ def test_time_runs_out():
     assert [bool(o.timed_out) for o in outcomes] == [False] * 4 + [True] and not outcomes[-1].terminated
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("perception", ["map", "truth"])
 def test_the_seed_repeats_an_episode(perception):
     seen = []

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 
+from tests.devices import NoConstants, OneDevice
 from tests.helpers import NoGenerator
 from tests.sim.errors.error_cases import LIVELY, NAN, assert_mean, assert_share, assert_sigma, make, poses, rays
 from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors
@@ -136,10 +137,9 @@ def test_host_reads_nothing_back(monkeypatch):
     # Tensors on "meta" have no values, so that reading one raises.
     monkeypatch.setattr(torch, "Generator", NoGenerator)
     errors = SensorErrors(LIVELY, 2, "meta")
-    for constructor in ("tensor", "as_tensor", "from_numpy"):
-        monkeypatch.setattr(torch, constructor, None)
     points, T = torch.empty(2, 60, 3, device="meta"), torch.empty(2, 4, 4, device="meta")
-    errors(points, T, image_shape=(6, 10))
-    errors.mounting()
-    errors.reset(mask=torch.empty(2, dtype=torch.bool, device="meta"))
-    errors.reset(torch.empty(1, dtype=torch.int64, device="meta"))
+    with NoConstants(), OneDevice():
+        errors(points, T, image_shape=(6, 10))
+        errors.mounting()
+        errors.reset(mask=torch.empty(2, dtype=torch.bool, device="meta"))
+        errors.reset(torch.empty(1, dtype=torch.int64, device="meta"))

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 
+from tests.devices import NoConstants, OneDevice
 from tests.helpers import NoGenerator, pose
 from torchelev.sim.errors.pose_error import PoseErrorConfig, PoseErrors
 from torchelev.sim.errors.presets import PRESETS, preset
@@ -257,12 +258,11 @@ def test_host_reads_nothing_back(monkeypatch):
     # Tensors on "meta" have no values, so that reading one raises.
     monkeypatch.setattr(torch, "Generator", NoGenerator)
     errors = PoseErrors(LIVELY, 2, "meta")
-    for constructor in ("tensor", "as_tensor", "from_numpy"):
-        monkeypatch.setattr(torch, constructor, None)
     T = torch.empty(2, 4, 4, device="meta", dtype=torch.float64)
-    errors(T, 0.1)
-    errors(T, torch.empty(2, device="meta"), torch.empty(2, device="meta"))
-    errors.reset(mask=torch.empty(2, dtype=torch.bool, device="meta"))
+    with NoConstants(), OneDevice():
+        errors(T, 0.1)
+        errors(T, torch.empty(2, device="meta"), torch.empty(2, device="meta"))
+        errors.reset(mask=torch.empty(2, dtype=torch.bool, device="meta"))
 
 
 def test_the_covariance_is_that_of_the_errors():

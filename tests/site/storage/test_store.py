@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("tensorstore", reason="needs torchelev[site]")
 
+from tests.helpers import without
 from torchelev.site.storage import store as store_module
 from torchelev.site.storage import transaction, zarr_files
 from torchelev.site.storage.store import TileStore
@@ -242,6 +243,7 @@ def test_readers_beside_a_writer_see_whole_tiles_that_never_get_older(tmp_path):
     assert len({*np.array(seen)[:, 0]}) > 2, "saw no new commits"
 
 
+@pytest.mark.slow(1)
 def test_threads_read_while_one_commits(store):
     commit_number(store, 0)
     failures, done = [], threading.Event()
@@ -587,7 +589,7 @@ def test_the_folder_may_be_relative_and_the_working_folder_change(tmp_path, monk
 
 
 def test_tensorstore_is_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorstore", None)
+    without(monkeypatch, "tensorstore")
     with pytest.raises(ModuleNotFoundError, match=r'pip install "torchelev\[site\]"'):
         create(tmp_path / "site")
     assert not list(tmp_path.iterdir())

@@ -23,8 +23,8 @@ TINY = functools.partial(WalkConfig, num_maps=1, window=1.6, scans=(1, 2))
 TINY_YARD = WalkConfig(num_maps=1, window=6.0, scans=(2, 3))
 
 
-def invoke(main, *arguments):
-    return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
+def invoke(main, *arguments, obj):
+    return CliRunner().invoke(main, [*map(str, arguments)], obj=obj, catch_exceptions=False)
 
 
 @functools.cache
@@ -127,6 +127,7 @@ def test_cells_to_calibrate_with_are_drawn_evenly():
     assert float(steps.min()) == pytest.approx(0.08) and float(steps.max()) > 1.5, "near and far ones"
 
 
+@pytest.mark.slow(2)
 def test_a_network_learns_a_step(tmp_path):
     """All unknown ground is 1.5 cm higher: after some steps, the network says so, and how sure that is."""
     maps, generator = flat_map(rise=0.015), torch.Generator().manual_seed(0)
@@ -172,28 +173,26 @@ def test_the_u_net_stays_below_the_bound_and_learns():
     assert float((filled - low.truth)[unknown].abs().mean()) <= float((untrained - low.truth)[unknown].abs().mean())
 
 
-@pytest.mark.slow(20)
-def test_the_commands_train_evaluate_and_resume(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "WalkConfig", TINY)
-    monkeypatch.setattr(training, "YARD_CONFIG", TINY_YARD)
+@pytest.mark.slow(6)
+def test_the_commands_train_evaluate_and_resume(tmp_path):
     tiny = {name: TINY_YARD if "yards" in name else TINY() for name in evaluation.SPLITS}
     splits = {name: evaluation.Split(cfg, (0.08,)) for name, cfg in tiny.items()}
-    monkeypatch.setattr(evaluation, "SPLITS", splits)
+    ground = training.Ground(TINY(), TINY_YARD, splits)
     out = tmp_path / "run"
     drawn = ("--walks", 2, "--drives", 1, "--collages", 1, "--evaluation-walks", 1)
     common = ("--out", out, *drawn, "--jobs", 1, "--steps", 2)
-    done = invoke(training.main, *common)
+    done = invoke(training.main, *common, obj=ground)
     assert done.exit_code == 0 and "| held_out | 0.08 | unknown |" in done.output
     result = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
     cells = result["held_out"]["0.08"]["CompletionNet"]["unknown"]
     assert result["held_out_yards"]["0.08"]["CompletionNet"]["unknown"]["cells"] > 10
     assert cells["cells"] > 10 and math.isfinite(cells["mae"]) and 0 <= cells["within_2_std"] <= 1
-    assert "add --resume" in invoke(training.main, *common).output
-    assert invoke(training.main, *common, "--resume").exit_code == 0, "nothing left: it only evaluates"
-    other = invoke(training.main, *common[:-1], 3, "--resume")
+    assert "add --resume" in invoke(training.main, *common, obj=ground).output
+    assert invoke(training.main, *common, "--resume", obj=ground).exit_code == 0, "nothing left: it only evaluates"
+    other = invoke(training.main, *common[:-1], 3, "--resume", obj=ground)
     assert other.exit_code == 2 and "must be of the same settings, got steps 2" in other.output
     options = ("--data", out / "data", "--walks", 1, "--jobs", 1, "--out", tmp_path / "evaluation.json")
-    again = invoke(evaluation.main, "--weights", out / "weights.pt", *options)
+    again = invoke(evaluation.main, "--weights", out / "weights.pt", *options, obj=splits)
     assert again.exit_code == 0
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["held_out"]["0.08"]["CompletionNet"] == result["held_out"]["0.08"]["CompletionNet"]

@@ -91,12 +91,9 @@ def test_looks_repeat_and_measure_the_stairs():
 
 
 @pytest.mark.slow(6)
-def test_the_command_finds_that_the_shipped_weights_put_edges_better_than_the_nearest_heights(tmp_path, monkeypatch):
-    for name, value in {"RISES": (0.16,), "RUNS": (0.3,), "RESOLUTIONS": (0.04,)}.items():
-        monkeypatch.setattr(edges, name, value)
-    done = CliRunner().invoke(
-        edges.main, ["--seeds", "2", "--out", str(tmp_path / "edges.json")], catch_exceptions=False
-    )
+def test_the_command_finds_that_the_shipped_weights_put_edges_better_than_the_nearest_heights(tmp_path):
+    options, sizes = ["--seeds", "2", "--out", str(tmp_path / "edges.json")], edges.Sizes((0.16,), (0.3,), (0.04,))
+    done = CliRunner().invoke(edges.main, options, obj=sizes, catch_exceptions=False)
     assert done.exit_code == 0 and "| down | 4 cm |" in done.output
     found = json.loads((tmp_path / "edges.json").read_text(), parse_constant=pytest.fail)
     down = found["down"]["0.04"]

@@ -3,9 +3,27 @@
 import json
 
 import pytest
+import torch
+from torch.utils.tensorboard import SummaryWriter
 
 import training.nav.encoder_experiment as experiment
 from training.nav.encoders import ENCODERS
+
+
+class Answer(torch.nn.Module):
+    """A policy that answers a number."""
+
+    def __init__(self, number: float) -> None:
+        super().__init__()
+        self.register_buffer("number", torch.tensor(float(number)))
+
+    def forward(self, policy: torch.Tensor, images: list[torch.Tensor]) -> torch.Tensor:
+        return self.number + 0 * (policy.sum() + images[0].sum())
+
+
+def make_folder(folder):
+    folder.mkdir()
+    return folder
 
 
 def result():
@@ -38,15 +56,20 @@ def test_the_figure_is_drawn(tmp_path):
     assert (tmp_path / "encoders.png").stat().st_size > 5000 and (tmp_path / "encoders.svg").exists()
 
 
-def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
+def test_reads_every_policy_from_its_folder(tmp_path):
     deployed = []
-    for encoder, seed in experiment.CASES:
+
+    def evaluate(policy, *rest, **options):
+        deployed.append(policy({"policy": torch.zeros(1), "map": torch.zeros(1)}).item())
+        return deployed[-1]
+
+    for number, (encoder, seed) in enumerate(experiment.CASES):
         folder = experiment._folder(tmp_path, encoder, seed)
-        folder.mkdir()
+        torch.jit.script(Answer(number)).save(make_folder(folder) / "policy.pt")
+        with SummaryWriter(str(folder)) as log:
+            log.add_scalar("/success", 0.25 * seed, 3)
         (folder / "result.json").write_text(json.dumps({"training": {"steps": 1, "seconds": seed}}))
-    monkeypatch.setattr(experiment, "load_policy", lambda folder: folder.name)
-    monkeypatch.setattr(experiment, "read_curve", lambda folder, num_envs: {"steps": [], "success": []})
-    monkeypatch.setattr(experiment, "evaluate", lambda policy, *rest, **options: deployed.append(policy) or policy)
-    rows = experiment.deploy_all(tmp_path)["rows"]
-    assert [row["deployed"] for row in rows] == deployed == [f"{encoder}-{seed}" for encoder, seed in experiment.CASES]
+    rows = experiment.deploy_all(tmp_path, evaluate)["rows"]
+    assert [row["deployed"] for row in rows] == deployed == list(range(len(experiment.CASES)))
+    assert [row["curve"]["success"] for row in rows] == [[0.25 * seed] for _, seed in experiment.CASES]
     assert [row["training"]["seconds"] for row in rows] == [seed for _, seed in experiment.CASES]

@@ -40,6 +40,7 @@ def test_the_mlp_connects_every_unit_to_every_pixel():
     torch.testing.assert_close(runner.alg.actor.cnns["map"](image), expected, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.slow(1)
 def test_a_checkpoint_of_another_encoder_is_refused(tmp_path):
     make_runner(tmp_path, "blind").learn(1)
     found = torch.load(tmp_path / CHECKPOINT, weights_only=False)
@@ -50,8 +51,8 @@ def test_a_checkpoint_of_another_encoder_is_refused(tmp_path):
     make_runner(None, "blind").resume(tmp_path / CHECKPOINT)
 
 
-def test_the_command_takes_the_encoder(monkeypatch):
-    monkeypatch.setattr(nav, "task_config", lambda **settings: CFG)
-    runner = nav.make_runner(2, "blind", 0, "cpu", None, compiled=False, encoder="attention")
+def test_the_command_takes_the_encoder():
+    settings = {"compiled": False, "encoder": "attention", "config": lambda **_: CFG}
+    runner = nav.make_runner(2, "blind", 0, "cpu", None, **settings)
     assert type(runner.alg.actor).__name__ == type(runner.alg.critic).__name__ == "AttentionModel"
     assert encoder_config("cnn", "map") == encoder_config("cnn", "truth")

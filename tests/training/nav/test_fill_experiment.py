@@ -1,8 +1,8 @@
 """The comparison of fills: its trainings, its deployment, its table and its figure."""
 
 import dataclasses
-import functools
 import json
+import shutil
 
 import pytest
 from click.testing import CliRunner
@@ -51,23 +51,23 @@ def test_the_figure_is_drawn(tmp_path):
     assert (tmp_path / "fill.png").stat().st_size > 5000 and (tmp_path / "fill.svg").exists()
 
 
-@pytest.mark.slow(20)
-def test_trains_two_iterations_with_each_fill_and_deploys(tmp_path, monkeypatch):
-    for module in (nav, experiment):
-        monkeypatch.setattr(module, "task_config", small_task)
-    monkeypatch.setattr(experiment, "evaluate", lambda *args, **_: nav.evaluate(*args[:3], episodes=4))
-    monkeypatch.setattr(experiment, "unknown_error", functools.partial(experiment.unknown_error, num_envs=4))
-    for job in experiment._jobs(tmp_path, 1):
-        options = {**job.arguments, "--iterations": 2, "--num-envs": 4, "--episodes": 4, "--out": job.folder}
-        arguments = [str(part) for option in options.items() for part in option]
-        assert CliRunner().invoke(nav.main, [*arguments, "--no-compile"], catch_exceptions=False).exit_code == 0
-    found = experiment.deploy_all(tmp_path, 1)
+@pytest.mark.slow(9)
+def test_trains_two_iterations_and_deploys_with_each_fill(tmp_path):
+    *others, job = experiment._jobs(tmp_path, 1)
+    options = {**job.arguments, "--iterations": 2, "--num-envs": 4, "--episodes": 4, "--out": job.folder}
+    arguments = [str(part) for option in options.items() for part in option]
+    done = CliRunner().invoke(nav.main, [*arguments, "--no-compile"], obj=small_task, catch_exceptions=False)
+    assert done.exit_code == 0 and job.folder.name == "completed-0"
+    for other in others:  # their networks have the same inputs
+        shutil.copytree(job.folder, other.folder)
+    found = experiment.deploy_all(tmp_path, 1, small_task, num_envs=4, episodes=4, compiled=False)
     assert [row["fill"] for row in found["rows"]] == list(FILLS) and len(experiment.table(found).split("\n")) == 5
     assert all(row["training"]["steps"] == 2 * 24 * 4 and len(row["curve"]["steps"]) == 2 for row in found["rows"])
     assert len({round(error, 6) for error in found["unknown_error_m"].values()}) == len(FILLS)
     assert json.loads((tmp_path / "completed-0" / "result.json").read_text())["evaluation"]["episodes"] == 4
 
 
+@pytest.mark.slow(1)
 def test_a_checkpoint_of_another_fill_is_refused(tmp_path):
     make_runner(tmp_path, "blind").learn(1)
     other = make_runner(None, "blind")
@@ -76,6 +76,7 @@ def test_a_checkpoint_of_another_fill_is_refused(tmp_path):
         other.resume(tmp_path / CHECKPOINT)
 
 
+@pytest.mark.slow(1)
 def test_the_error_is_that_of_unknown_pixels():
     error = experiment.unknown_error(small_task(), num_envs=4)
     assert 0.01 < error < 0.5

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import pytest
 import torch
 
 from envs.terrain_nav import TerrainNav
@@ -26,6 +27,7 @@ def test_a_vec_env_of_rsl_rl():
     assert env.task.episode_length.tolist() == [1, 2, 3, 4]
 
 
+@pytest.mark.slow(1)
 def test_its_steps_are_those_of_the_task():
     one, other = (TerrainNav(CFG, 3, seed=5) for _ in range(2))
     env = RslRlTerrainNav(one)

@@ -11,26 +11,27 @@ from tests.training.nav.runners import CFG
 
 
 def invoke(*arguments):
-    return CliRunner().invoke(nav.main, [*map(str, arguments), "--no-compile"], catch_exceptions=False)
+    return CliRunner().invoke(
+        nav.main, [*map(str, arguments), "--no-compile"], obj=lambda **_: CFG, catch_exceptions=False
+    )
 
 
 @pytest.mark.slow(10)
-def test_the_command_trains_evaluates_draws_exports_and_resumes(tmp_path, monkeypatch):
-    monkeypatch.setattr(nav, "task_config", lambda **settings: CFG)
+def test_the_command_resumes_evaluates_draws_and_exports(tmp_path):
     out = tmp_path / "run"
     common = ("--num-envs", 4, "--out", out, "--episodes", 4, "--perception", "map")
-    assert invoke(*common, "--iterations", 2).exit_code == 0
-    result = json.loads((out / "result.json").read_text())
-    ends = ("success", "fallen", "stuck", "truncated")
-    assert sum(result["evaluation"][name] for name in ends) == pytest.approx(1.0)
-    assert result["training"]["steps"] == 2 * 24 * 4
-    for name in ("episode.png", "policy.pt", "policy.onnx"):
-        assert (out / name).stat().st_size > 1000
+    runner = nav.make_runner(4, "map", 0, "cpu", out, compiled=False, config=lambda **_: CFG)
+    runner.learn(2)  # the command's first training: test_fill_experiment.py
+    runner.close()
     refused = invoke(*common)
     assert refused.exit_code == 2 and "add --resume" in refused.output
     assert invoke(*common, "--iterations", 3, "--resume").exit_code == 0
-    strict = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
-    assert strict["training"]["steps"] == 3 * 24 * 4 and strict["evaluation"]["seconds"] is None, "nobody arrives"
+    result = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
+    ends = ("success", "fallen", "stuck", "truncated")
+    assert sum(result["evaluation"][name] for name in ends) == pytest.approx(1.0)
+    assert result["training"]["steps"] == 3 * 24 * 4 and result["evaluation"]["seconds"] is None, "nobody arrives"
+    for name in ("episode.png", "policy.pt", "policy.onnx"):
+        assert (out / name).stat().st_size > 1000
     assert "has 3 iterations already: only evaluating" in invoke(*common, "--iterations", 2, "--resume").output
     for option in ("--num-envs", "--iterations", "--episodes"):
         assert option in invoke(option, 0).output

@@ -1,13 +1,14 @@
 """The comparison of perceptions: its trainings, its tables and its figure."""
 
-import dataclasses
 import json
 
 import pytest
+import torch
+from torch.utils.tensorboard import SummaryWriter
 
 from envs.quadruped.config import PERCEPTION
-from torchelev.viz.style import save
-from training.quadruped import experiment
+from training.quadruped import experiment, policy
+from training.quadruped.evaluate import stand_in_trot
 
 LEVELS = 2
 
@@ -55,19 +56,18 @@ def test_the_long_walk_has_room_for_robots_faster_than_commanded():
     assert cfg.command.forward == (0.5, 0.5) and cfg.terrain.length / 2 - cfg.terrain.rim - 0.3 > 1.5 * commanded
 
 
-def test_a_walk_that_ends_at_the_rim_is_refused(monkeypatch):
+def test_a_walk_that_ends_at_the_rim_is_refused():
     def fake(policy, cfg, *rest, **options):
         return {"all": summary(1.0), "by_kind": {"flat": summary(0.0), "rough": summary(0.05 if rim else 0.0)}}
 
-    monkeypatch.setattr(experiment, "evaluate", fake)
     rim = False
-    assert set(experiment._deploy(None, "blind")["walk"]) == {"flat", "rough"}
+    assert set(experiment._deploy(None, "blind", fake)["walk"]) == {"flat", "rough"}
     rim = True
     with pytest.raises(ValueError, match=r"walk, rough: must end before the rim .* got 5 % crossed; .*walk_config"):
-        experiment._deploy(None, "blind")
+        experiment._deploy(None, "blind", fake)
 
 
-def test_a_kept_result_is_made_anew_when_its_constants_or_its_policy_change(tmp_path, monkeypatch):
+def test_a_kept_result_is_made_anew_when_its_constants_or_its_policy_change(tmp_path):
     folder, made = tmp_path / "map-0", []
     folder.mkdir()
     weights = folder / "policy.pt"
@@ -77,19 +77,18 @@ def test_a_kept_result_is_made_anew_when_its_constants_or_its_policy_change(tmp_
         made.append(len(made))
         return {"number": made[-1]}
 
-    def kept():
-        return experiment._load_or_make(folder / "deployed.json", make, weights)["number"]
+    def kept(settings=None):
+        return experiment._load_or_make(folder / "deployed.json", make, weights, settings)["number"]
 
     assert [kept(), kept()] == [0, 0]
     weights.write_bytes(b"two")
     assert [kept(), kept()] == [1, 1]
-    monkeypatch.setattr(experiment, "WALKS", 3)
-    assert [kept(), kept()] == [2, 2]
-    cfg = experiment.task_config(held_out=True)
-    monkeypatch.setattr(experiment, "task_config", lambda held_out: dataclasses.replace(cfg, max_tilt=0.9))
-    assert [kept(), kept()] == [3, 3]
+    settings = experiment._settings()
+    assert kept(settings) == 1 and {"walks", "episodes", "crossing", "walk"} < set(settings)
+    settings["crossing"]["max_tilt"] = 0.9
+    assert [kept(settings), kept(settings)] == [2, 2]
     (folder / "deployed.json").write_text('{"number": 9}')  # of a version that kept no more
-    assert kept() == 4
+    assert kept() == 3
 
 
 def test_the_tables_have_the_mean_and_the_extremes():
@@ -105,46 +104,57 @@ def test_the_tables_have_the_mean_and_the_extremes():
 
 
 @pytest.mark.slow(2)
-def test_the_figure_is_drawn_over_the_heights_of_stairs(tmp_path, monkeypatch):
-    figures = []
-    monkeypatch.setattr(experiment, "save", lambda figure, path: figures.append(figure) or save(figure, path))
-    experiment.plot(result(), tmp_path / "quadruped.png")
+def test_the_figure_is_drawn_over_the_heights_of_stairs(tmp_path):
+    figure = experiment.plot(result(), tmp_path / "quadruped.png")
     assert (tmp_path / "quadruped.png").stat().st_size > 5000 and (tmp_path / "quadruped.svg").exists()
-    panels = {axes.get_title(): axes for axes in figures[0].axes}
+    panels = {axes.get_title(): axes for axes in figure.axes}
     for kind in ("stairs up", "stairs down"):
         assert panels[kind].get_xlabel() == "height of a stair [cm]"
         assert [label.get_text() for label in panels[kind].get_xticklabels()] == ["5", "14"]
     assert panels["boxes"].get_xlabel() == "level" and panels["rough"].get_ylabel() == "crossed, of 16"
 
 
-def test_reads_every_policy_from_its_folder(tmp_path, monkeypatch):
+def save_policy(path, number, perception):
+    """Write a policy that answers a number."""
+    layout = policy.layout_of(experiment.task_config(held_out=True), perception)
+    network = torch.nn.Linear(1, 1)
+    torch.nn.init.zeros_(network.weight), torch.nn.init.constant_(network.bias, number)
+    torch.jit.save(torch.jit.script(network), str(path), _extra_files={policy.LAYOUT: json.dumps(layout)})
+
+
+def write_log(folder, values):
+    with SummaryWriter(str(folder)) as log:
+        for step, value in enumerate(values):
+            for name in ("level", "crossed"):
+                log.add_scalar(f"/{name}", value, step)
+
+
+def test_reads_every_policy_from_its_folder(tmp_path):
     deployed = []
-    for perception, seed in experiment.CASES:
+    for number, (perception, seed) in enumerate(experiment.CASES):
         folder = experiment._folder(tmp_path, perception, seed)
         folder.mkdir()
-        (folder / "policy.pt").write_bytes(b"weights")
+        save_policy(folder / "policy.pt", number, perception)
+        write_log(folder, [seed])
         (folder / "result.json").write_text(json.dumps({"training": {"steps": 1, "seconds": seed}}))
 
     def fake(policy, cfg, perception, *rest, **options):
         deployed.append((policy, perception))
-        return {"all": [str(policy), perception], "by_kind": {}}
+        number = None if policy is stand_in_trot else round(policy.network(torch.zeros(1)).item())
+        return {"all": [number, perception], "by_kind": {}}
 
-    monkeypatch.setattr(experiment, "load_policy", lambda path, cfg: path.parent.name)
-    monkeypatch.setattr(experiment, "read_curve", lambda folder: {"steps": []})
-    monkeypatch.setattr(experiment, "evaluate", fake)
-    rows = experiment._deploy_all(tmp_path)["rows"]
+    rows = experiment._deploy_all(tmp_path, fake)["rows"]
     sights = {"map": "map", "truth": "map", "blind": "blind"}
-    for (perception, seed), row in zip(experiment.CASES, rows, strict=True):
-        name = f"{perception}-{seed}"
-        assert row["deployed"]["all"] == [name, sights[perception]] and row["own"] == [name, perception]
+    for number, ((perception, seed), row) in enumerate(zip(experiment.CASES, rows, strict=True)):
+        assert row["deployed"]["all"] == [number, sights[perception]] and row["own"] == [number, perception]
+        assert row["curve"]["level"] == [seed] and row["training"]["seconds"] == seed
     assert len(deployed) == 2 * len(rows) + 2 + len(experiment.SEEDS), "twice each; those with the truth also with it"
     again = len(deployed)
-    assert experiment._deploy_all(tmp_path)["rows"] == rows and len(deployed) == again, "what is finished is kept"
+    assert experiment._deploy_all(tmp_path, fake)["rows"] == rows and len(deployed) == again, "what is finished is kept"
 
 
-def test_a_curve_averages_blocks_of_iterations(tmp_path, monkeypatch):
-    values = {k: float(k) for k in range(25)}
-    monkeypatch.setattr(experiment, "read_scalars", lambda folder, tag: values)
+def test_a_curve_averages_blocks_of_iterations(tmp_path):
+    write_log(tmp_path, range(25))
     curve = experiment.read_curve(tmp_path)
     assert curve["level"] == [4.5, 14.5, 22.0]
     assert curve["steps"] == [n * 24 * experiment.NUM_ENVS for n in (10, 20, 25)]

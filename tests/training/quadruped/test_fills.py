@@ -1,15 +1,18 @@
 """Deployments of one policy whose scans fill unknown ground by several rules."""
 
+import pytest
+
 from tests.envs.quadruped.cases import CFG
 from training.quadruped import fills
 
 
+@pytest.mark.slow(1)
 def test_each_rule_fills_with_other_heights():
     errors = [fills.unknown_error(fills.with_fill(CFG, fill), num_envs=2, steps=12) for fill in fills.FILLS]
     assert all(0 < error < 1 for error in errors) and len({round(error, 6) for error in errors}) == len(errors)
 
 
-def test_only_the_fill_differs_between_deployments(monkeypatch):
+def test_only_the_fill_differs_between_deployments():
     seen = []
 
     def fake(policy, cfg, perception, episodes, compiled, seed):
@@ -19,9 +22,7 @@ def test_only_the_fill_differs_between_deployments(monkeypatch):
         row = {"crossed": crossed, "fallen": 0.25}
         return {"all": row, "by_kind": {"flat": row, "stairs up": row}}
 
-    monkeypatch.setattr(fills, "evaluate", fake)
-    monkeypatch.setattr(fills, "unknown_error", lambda cfg, num_envs: 0.123)
-    text = fills.table(fills.measure((0, 10), 4))
+    text = fills.table(fills.measure((0, 10), 4, fake, lambda cfg, num_envs: 0.123))
     assert seen == [(fill, "map", 4, seed) for fill in fills.FILLS for seed in (0, 10)]
     line = next(line for line in text.splitlines() if "completed" in line)
     assert [cell.strip() for cell in line.split("|")[1:-1]] == [

@@ -17,17 +17,22 @@ from training.quadruped import evaluate, play, policy, train
 from training.resume import write_result
 
 
+def small_task(held_out=False):
+    return dataclasses.replace(CFG, episode_length=0.5)
+
+
+def invoke(*options):
+    return CliRunner().invoke(train.main, options, obj=small_task)
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """Train for two iterations on small terrains."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr(train, "task_config", lambda held_out=False: dataclasses.replace(CFG, episode_length=0.5))
     out = tmp_path_factory.mktemp("quadruped")
     command = ["--num-envs", "4", "--iterations", "2", "--episodes", "4", "--no-compile", "--perception", "truth"]
-    result = CliRunner().invoke(train.main, [*command, "--out", str(out)])
+    result = invoke(*command, "--out", str(out))
     assert result.exit_code == 0, result.output
-    yield out, result.output
-    patch.undo()
+    return out, result.output
 
 
 @pytest.mark.slow(12)
@@ -83,19 +88,18 @@ def _save(path, perception):
 
 
 def _play(path, *options):
-    return CliRunner().invoke(train.main, ["--play", str(path), "--out", str(path.parent), *options])
+    return invoke("--play", str(path), "--out", str(path.parent), *options)
 
 
 @pytest.mark.parametrize("trained, walks", [("map", "map"), ("truth", "map"), ("blind", "blind")])
-def test_a_film_shows_a_policy_with_what_it_sees(trained, walks, tmp_path, monkeypatch):
-    tasks = []
-    monkeypatch.setattr(train, "task_config", lambda held_out=False: dataclasses.replace(CFG, episode_length=0.1))
-    monkeypatch.setattr(play, "draw", lambda task: tasks.append(task))
-    monkeypatch.setattr(play, "save_video", lambda pictures, path: None)
-    result = _play(_save(tmp_path / "policy.pt", trained), "--level", "1", "--kind", "stairs down")
-    assert result.exit_code == 0, result.output
-    assert tasks[0].perception == walks and ("blind" if walks == "blind" else "with the map") in result.output
-    assert tasks[0].cfg.terrain.kinds[int(tasks[0].kind)] == "stairs_up"
+def test_a_film_shows_a_policy_with_what_it_sees(trained, walks, tmp_path):
+    loaded, films = policy.load_policy(_save(tmp_path / "policy.pt", trained), CFG), []
+    cfg = dataclasses.replace(CFG, episode_length=0.1)
+    how = {"perception": loaded.perception, "draw": lambda task: task, "save": lambda *film: films.append(film)}
+    play.play(loaded, cfg, tmp_path / "walk.webp", "stairs down", 1, **how)
+    ((task, *_), path) = films[0]
+    assert task.perception == walks and path == tmp_path / "walk.webp"
+    assert task.cfg.terrain.kinds[int(task.kind)] == "stairs_up"
 
 
 def test_a_policy_of_unknown_perception_is_not_filmed(tmp_path):
@@ -104,8 +108,7 @@ def test_a_policy_of_unknown_perception_is_not_filmed(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["stairs_up", "up"])
-def test_a_film_takes_the_names_of_what_a_robot_meets(kind, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "task_config", lambda held_out=False: CFG)
+def test_a_film_takes_the_names_of_what_a_robot_meets(kind, tmp_path):
     result = _play(_save(tmp_path / "policy.pt", "map"), "--kind", kind)
     assert result.exit_code == 1 and f"kind: must be one of flat, stairs down, got {kind}" in result.output
 
@@ -130,14 +133,15 @@ def test_a_robot_climbs_the_stairs_that_are_called_up():
 def test_a_checkpoint_of_another_perception_is_refused(small):
     out, _ = small
     command = ["--num-envs", "4", "--iterations", "3", "--no-compile", "--perception", "blind", "--resume"]
-    result = CliRunner().invoke(train.main, [*command, "--out", str(out)])
+    result = invoke(*command, "--out", str(out))
     assert result.exit_code != 0 and "perception" in result.output
 
 
+@pytest.mark.slow(2)
 def test_training_resumes(small):
     out, _ = small
     command = ["--num-envs", "4", "--iterations", "3", "--episodes", "4", "--no-compile", "--perception", "truth"]
-    result = CliRunner().invoke(train.main, [*command, "--out", str(out), "--resume"])
+    result = invoke(*command, "--out", str(out), "--resume")
     assert result.exit_code == 0, result.output
     assert json.loads((out / "result.json").read_text())["training"]["steps"] == 3 * 24 * 4
 

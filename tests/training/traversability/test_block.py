@@ -3,15 +3,16 @@
 import json
 
 import numpy as np
+import pytest
 from click.testing import CliRunner
 
 from training.traversability import block
 
 
-def test_beside_a_block_heads_are_compared_with_the_truth(monkeypatch, tmp_path):
-    monkeypatch.setattr(block, "RESULTS", tmp_path)
-    monkeypatch.setattr(block, "HEIGHTS", (0.05, 0.4))
-    assert CliRunner().invoke(block.main, []).exit_code == 0
+@pytest.mark.slow(1)
+def test_beside_a_block_heads_are_compared_with_the_truth(tmp_path):
+    options = ["--heights", "0.05", "--heights", "0.4", "--out", str(tmp_path)]
+    assert CliRunner().invoke(block.main, options).exit_code == 0
     low, high = json.loads((tmp_path / "block.json").read_text())["profiles"]
     assert (tmp_path / "block.png").stat().st_size > 5000
     before, label = np.array(high["x"]), np.array(high["label"])

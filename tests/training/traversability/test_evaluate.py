@@ -12,11 +12,10 @@ from training.traversability.maps.data import make_batch
 
 
 @pytest.mark.slow(2)
-def test_evaluation_names_heads_subsets_and_kinds(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "RESOLUTIONS", (0.08,))
+def test_evaluation_names_heads_subsets_and_kinds(tmp_path):
     torch.manual_seed(0)
     nets = {"0": TraversabilityNet(), "1": TraversabilityNet()}
-    result = evaluation.evaluate(nets, tmp_path, 1, TINY())
+    result = evaluation.evaluate(nets, tmp_path, 1, TINY(), resolutions=(0.08,))
     batch = make_batch([1, 0, 0], TINY(), resolution=0.08)
     heads = result["held_out"]["8 cm"]
     assert len(heads) == 2 + 8 and list(heads)[:2] == ["learned (0)", "learned (1)"]

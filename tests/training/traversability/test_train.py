@@ -13,20 +13,15 @@ from training.resume import CHECKPOINT
 
 
 def invoke(main, *arguments):
-    return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
-
-
-@pytest.fixture
-def tiny(monkeypatch):
-    monkeypatch.setattr(training, "DataConfig", TINY)
-    monkeypatch.setattr(evaluation, "DataConfig", TINY)
-    monkeypatch.setattr(evaluation, "RESOLUTIONS", (0.08,))
+    maps = evaluation.Maps(TINY, (0.08,))
+    return CliRunner().invoke(main, [*map(str, arguments)], obj=maps, catch_exceptions=False)
 
 
 @pytest.mark.slow(6)
-def test_the_commands_train_evaluate_draw_and_resume(tmp_path, tiny):
-    out = tmp_path / "run"
-    common = ("--out", out, "--batches", 1, "--exact-batches", 1, "--evaluation-batches", 1, "--steps", 2)
+def test_the_commands_train_evaluate_draw_and_resume(tmp_path):
+    """For one robot."""
+    out, robot = tmp_path / "run", ("--robot", "length=0.5,width=0.45,foot_radius=0.1")
+    common = ("--out", out, "--batches", 1, "--exact-batches", 1, "--evaluation-batches", 1, *robot, "--steps", 2)
     done = invoke(training.main, *common)
     assert done.exit_code == 0 and "| 8 cm | learned |" in done.output
     result = json.loads((out / "result.json").read_text(), parse_constant=pytest.fail)
@@ -38,24 +33,19 @@ def test_the_commands_train_evaluate_draw_and_resume(tmp_path, tiny):
     other = invoke(training.main, *common[:-1], 3, "--resume")
     assert other.exit_code == 2 and "must be of the same settings, got steps 2" in other.output
 
-    options = ("--data", out / "data", "--batches", 1, "--out", tmp_path / "evaluation.json")
+    any_robot = invoke(training.main, *common[:8], *common[-2:], "--resume", "--data", tmp_path / "other")
+    assert any_robot.exit_code == 2 and "must be of the same settings" in any_robot.output
+    found = torch.load(out / CHECKPOINT, weights_only=True)["settings"]["robot"]
+    assert (found["length"], found["width"], found["foot_radius"]) == (0.5, 0.45, 0.1)
+
+    options = (*robot, "--data", out / "data", "--batches", 1, "--out", tmp_path / "evaluation.json")
     again = invoke(evaluation.main, "--weights", out / "weights.pt", *options)
     assert again.exit_code == 0 and "unseen" in again.output
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["held_out"]["8 cm"]["learned (run)"] == result["held_out"]["8 cm"]["learned (run)"]
 
 
-@pytest.mark.slow(2)
-def test_the_command_trains_for_one_robot(tmp_path, tiny, monkeypatch):
-    monkeypatch.setattr(training, "_finish", lambda *_: None)
-    common = ("--out", tmp_path, "--batches", 1, "--exact-batches", 1, "--steps", 1)
-    assert invoke(training.main, *common, "--robot", "length=0.5,width=0.45,foot_radius=0.1").exit_code == 0
-    assert invoke(training.main, *common, "--resume").exit_code == 2
-    found = torch.load(tmp_path / CHECKPOINT, weights_only=True)["settings"]["robot"]
-    assert (found["length"], found["width"], found["foot_radius"]) == (0.5, 0.45, 0.1)
-
-
-def test_the_command_refuses_what_does_not_fit(tmp_path, tiny):
+def test_the_command_refuses_what_does_not_fit(tmp_path):
     missing = invoke(training.main, "--out", tmp_path / "nowhere", "--resume")
     assert missing.exit_code == 2 and "leave --resume out" in missing.output
     assert "there is no legs" in invoke(training.main, "--robot", "legs=4", "--out", tmp_path).output

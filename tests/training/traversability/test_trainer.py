@@ -58,6 +58,7 @@ def test_each_batch_comes_once_before_any_comes_again():
     assert order[:5] != order[5:10] or order[5:10] != order[10:]
 
 
+@pytest.mark.slow(1)
 def test_training_lowers_the_loss(tmp_path):
     run = trainer(batches=1, steps=20, learning_rate=0.02)
     with torch.no_grad():
@@ -83,6 +84,7 @@ def test_a_resumed_training_equals_one_that_never_stopped(tmp_path):
     assert rest.step == 6 and same(weights(rest), weights(whole))
 
 
+@pytest.mark.slow(1)
 def test_ctrl_c_ends_after_the_step_and_leaves_a_checkpoint(tmp_path):
     whole, run = trainer(), trainer()
     whole.run(tmp_path / "whole")

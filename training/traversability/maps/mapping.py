@@ -58,10 +58,16 @@ class Look(NamedTuple):
     T_tile_base: Float[Tensor, "B 4 4"]  #: true
 
 
-def walk_and_look(field: HeightField, robot: RobotConfig, cfg: DataConfig, rng: np.random.Generator) -> Iterator[Look]:
-    """Walk over every tile and yield the scans of simulated sensors with errors."""
+def walk_and_look(
+    field: HeightField,
+    robot: RobotConfig,
+    cfg: DataConfig,
+    rng: np.random.Generator,
+    path: Float[Tensor, "K B 4 4"] | None = None,
+) -> Iterator[Look]:
+    """Walk over every tile, on a path of one's own or the given one; yield scans of simulated sensors with errors."""
     num, looks = field.num_tiles, int(rng.integers(cfg.looks[0], cfg.looks[1], endpoint=True))
-    path = walks(Footing(field, robot), num, looks, rng)
+    path = walks(Footing(field, robot), num, looks, rng) if path is None else path
     sight = Sight(robot, num, cfg.camera_pixels, cfg.lidar_rays, rng)
     odometry = PoseErrors(preset("leg_odometry").pose, num, seed=int(rng.integers(2**31)))
     T_map_tile = _map_frames(num, rng)
@@ -72,11 +78,16 @@ def walk_and_look(field: HeightField, robot: RobotConfig, cfg: DataConfig, rng: 
 
 
 def walk_and_map(
-    field: HeightField, robot: RobotConfig, resolution: float, cfg: DataConfig, rng: np.random.Generator
+    field: HeightField,
+    robot: RobotConfig,
+    resolution: float,
+    cfg: DataConfig,
+    rng: np.random.Generator,
+    path: Float[Tensor, "K B 4 4"] | None = None,
 ) -> tuple[ElevationMap, Float[Tensor, "B 4 4"]]:
     """Walk over every tile and map it; return the maps and T_tile_map (B, 4, 4) at the last scan."""
     emap = blank_map(resolution, cfg.window, field.num_tiles)
-    for look in walk_and_look(field, robot, cfg, rng):
+    for look in walk_and_look(field, robot, cfg, rng, path):
         emap.update(look.points, look.T_map_sensor, look.T_map_base, LOOK_INTERVAL)
     return emap, look.T_tile_base @ torch.linalg.inv(look.T_map_base)
 

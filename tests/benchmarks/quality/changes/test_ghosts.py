@@ -10,19 +10,16 @@ def world(seeds=2):
     return World(SENSORS["camera 64 x 48"], seeds, compiled=False)
 
 
-def test_ghosts_are_what_stays_above_the_ground(monkeypatch):
-    for name, value in (("CROSSINGS", 1), ("SECONDS", 0.4), ("AFTER", 0.4)):
-        monkeypatch.setattr(ghosts, name, value)
-    row = ghosts.ghosts(SENSORS["camera 64 x 48"], 10, seeds=2, compiled=False)
+def test_ghosts_are_what_stays_above_the_ground():
+    crossings = ghosts.Crossings(1, 0.4, after=0.4)
+    row = ghosts.ghosts(SENSORS["camera 64 x 48"], 10, seeds=2, compiled=False, crossings=crossings)
     assert row["of"] == 2 and row["environments"] <= 2
-    monkeypatch.setattr(ghosts, "AFTER", 0.0)  # while the person still stands there
-    monkeypatch.setattr(ghosts, "SECONDS", 2.0)
-    monkeypatch.setattr(
-        ghosts,
-        "crossing",
-        lambda w, dt: (w.box(torch.full((2,), 2.5), torch.zeros(2), PERSON) for _ in range(5)),
-    )
-    assert ghosts.ghosts(SENSORS["camera 64 x 48"], 10, seeds=2, compiled=False)["environments"] == 2
+
+
+def test_who_still_stands_there_is_above_the_ground():
+    here = world()
+    person = here.box(torch.full((2,), 2.5), torch.zeros(2), PERSON)
+    assert ghosts.left_behind(here, [person] * 5, 0.1, scans_after=0)["environments"] == 2
 
 
 def test_cells_are_seen_through_where_a_ray_passes_below_and_beyond():

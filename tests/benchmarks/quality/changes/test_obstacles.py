@@ -27,9 +27,9 @@ def test_hits_are_counted_in_the_cells_in_which_the_obstacle_stands():
     assert obstacles.hits(here, points, boxes, beside=-0.001).sum() == 2, "the box covers this cell's centre"
 
 
-def test_an_obstacle_shows(monkeypatch):
-    monkeypatch.setattr(obstacles, "WATCHED", 3)
-    row = obstacles.obstacle_scans(SENSORS["camera 64 x 48"], "wall", 1.0, seeds=2, settled=1, compiled=False)
+def test_an_obstacle_shows():
+    how = {"seeds": 2, "settled": 1, "compiled": False, "watched": 3}
+    row = obstacles.obstacle_scans(SENSORS["camera 64 x 48"], "wall", 1.0, **how)
     assert row["median"] <= 3 and row["points"] > 0.5
     assert world().above_ground().isnan().all()
 
@@ -40,10 +40,9 @@ def test_scans_are_counted_until_something_first_shows():
 
 
 @pytest.mark.slow(5)
-def test_a_plate_shows_sooner_where_ground_ages_faster(monkeypatch):
-    monkeypatch.setattr(obstacles, "WATCHED", 12)
+def test_a_plate_shows_sooner_where_ground_ages_faster():
     slow, fast = (
-        obstacles.plate_scans(SENSORS["camera 120 x 90"], rate, seeds=2, settled=25, compiled=False)
+        obstacles.plate_scans(SENSORS["camera 120 x 90"], rate, seeds=2, settled=25, compiled=False, watched=12)
         for rate in (0.0, 1e-2)
     )
     assert fast["median"] < slow["median"] and fast["rmse_mm"] > slow["rmse_mm"] > 0

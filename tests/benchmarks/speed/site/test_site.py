@@ -1,7 +1,6 @@
 """The benchmarks of sites measure what they say, write it and tabulate it."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -29,18 +28,16 @@ def test_windows_know_all_of_the_ground_and_count_as_measured_anew():
 
 
 def test_hops_cover_the_whole_area():
-    known = torch.zeros(1000, 1000, dtype=torch.bool)
-    for x, y in site_area.hops(100).flatten(0, 1).tolist():
-        known[x : x + site_area.CELLS, y : y + site_area.CELLS] = True
-    assert known.all() and len(site_area.hops(100)) == 4
+    known, sizes = torch.zeros(1000, 1000, dtype=torch.bool), site_area.Sizes()
+    for x, y in site_area.hops(100, sizes).flatten(0, 1).tolist():
+        known[x : x + sizes.cells, y : y + sizes.cells] = True
+    assert known.all() and len(site_area.hops(100, sizes)) == 4
 
 
 @pytest.mark.slow(2)
-def test_two_merges_are_measured_and_tabulated(tmp_path, monkeypatch):
-    monkeypatch.setattr(site_merge, "ROBOTS", (1, 4))
-    monkeypatch.setattr(site_merge, "CELLS", 16)
-    monkeypatch.setattr(site_merge, "SPACING", 8)
-    result = CliRunner().invoke(site_merge.main, ["--rounds", "2", "--out", str(tmp_path)], catch_exceptions=False)
+def test_two_merges_are_measured_and_tabulated(tmp_path):
+    small, options = site_merge.Sizes((1, 4), 16, 8), ["--rounds", "2", "--out", str(tmp_path)]
+    result = CliRunner().invoke(site_merge.main, options, obj=small, catch_exceptions=False)
     assert result.exit_code == 0
     rows = json.loads((tmp_path / "site_merge.json").read_text())["rows"]
     assert [row["robots"] for row in rows] == [1, 4] and "| 4 |" in result.output
@@ -50,13 +47,10 @@ def test_two_merges_are_measured_and_tabulated(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow(4)
-def test_two_areas_are_measured_and_tabulated(tmp_path, monkeypatch):
-    small = {"ROBOTS": 4, "CELLS": 32, "HOP": 24, "NUM_SAMPLES": 100, "WINDOW": 2.0, "SECONDS": 0.01}
-    for name, value in small.items():
-        monkeypatch.setattr(site_area, name, value)
-    monkeypatch.setattr(site_area, "ProcessPoolExecutor", lambda workers, kind: ThreadPoolExecutor(workers))
+def test_two_areas_are_measured_and_tabulated(tmp_path):
+    small = site_area.Sizes(4, 32, 24, 100, 2.0, 0.01, apart=lambda function, *arguments: function(*arguments))
     options = ["--sides", "8", "--sides", "10", "--out", str(tmp_path)]
-    result = CliRunner().invoke(site_area.main, options, catch_exceptions=False)
+    result = CliRunner().invoke(site_area.main, options, obj=small, catch_exceptions=False)
     assert result.exit_code == 0
     rows = json.loads((tmp_path / "site_area.json").read_text())["rows"]
     assert [len(row["merge_ms"]) for row in rows] == [3, 4] and "| 8 × 8 m |" in result.output

@@ -1,10 +1,13 @@
 """Tables and figure of a speed result, and the verdicts on its targets."""
 
+import pytest
+
 from benchmarks.speed.run import timings
 from benchmarks.speed.update import plots, tables
 from docs.readme_tables import SPEED, load
 
 
+@pytest.mark.slow(2)
 def test_committed_result_has_its_table_and_picture(tmp_path):
     result = load(SPEED)
     assert len(list(timings(result))) > 40

@@ -8,6 +8,7 @@ import pytest
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
+from tests.helpers import without
 from tests.io.bags.synthetic import CAMERA, SCANS, T_BASE_CAMERA, T_BASE_LIDAR, drive, write_drive
 from tests.io.bags.test_recording import assert_same_map, map_bag
 from torchelev.io.bags import Bag, BagRequest, open_bag
@@ -171,7 +172,7 @@ def test_points_come_out_as_they_went_in_also_from_a_pose_of_their_own(tmp_path)
 def test_protobuf_without_its_library_is_named(tmp_path, monkeypatch):
     pytest.importorskip("foxglove_schemas_protobuf")
     path = write(tmp_path / "drive.mcap", "protobuf")
-    monkeypatch.setitem(__import__("sys").modules, "mcap_protobuf.decoder", None)
+    without(monkeypatch, "mcap_protobuf.decoder")
     with Bag(path) as bag:
         assert bag.topics == []
         assert {topic.problem for topic in bag.unread} == {"encoded as protobuf: install mcap-protobuf-support"}

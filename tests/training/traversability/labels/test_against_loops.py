@@ -93,6 +93,7 @@ class Slow:
         return rise - 3 * max(0, (dx * (a[3] + b[3]) + dy * (a[4] + b[4])) / 2)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("robot", [ROBOT, SMALL])
 @pytest.mark.parametrize("height", [0.2, 0.35, 0.5])
 def test_against_slow_loops(robot, height):

@@ -40,6 +40,7 @@ def test_a_foot_rests_on_small_bumps_alone():
     assert sole_of((0.0049 / deviation * bumps).tolist()) and not sole_of((0.0051 / deviation * bumps).tolist())
 
 
+@pytest.mark.slow(1)
 @given(st.integers(0, 10_000))
 def test_soles_are_the_planes_of_what_carries(seed):
     rng = np.random.default_rng(seed)

@@ -134,6 +134,7 @@ def test_altitude_does_not_matter():
     assert (can_stand(field, ids, xy, [ROBOT]) != can_stand(high, ids, xy, [ROBOT])).float().mean() < 0.002
 
 
+@pytest.mark.slow(1)
 def test_a_batch_is_each_robot_by_itself():
     field = HeightField(torch.cat([blocks(4, 0.3).heights, blocks(5, 0.2).heights]), RESOLUTION)
     ids, robots = torch.tensor([1, 0, 1]), [ROBOT, SMALL, SMALL]

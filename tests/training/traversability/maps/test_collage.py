@@ -1,17 +1,17 @@
 """Collages: ground of random shapes."""
 
 import numpy as np
+import pytest
 import torch
 
-from training.traversability.maps import collage
-from training.traversability.maps.collage import make_collage
+from training.traversability.maps.collage import Shapes, make_collage
 from training.traversability.maps.terrain import COLLAGE, make_tiles
 
 AXIS = (torch.arange(201) - 100) * 0.04
 
 
-def collages(count=24):
-    return torch.stack([make_collage(AXIS, np.random.default_rng(seed)) for seed in range(count)])
+def collages(count, **shapes):
+    return torch.stack([make_collage(AXIS, np.random.default_rng(seed), Shapes(**shapes)) for seed in range(count)])
 
 
 def test_a_seed_gives_one_collage_and_another_seed_another():
@@ -19,9 +19,9 @@ def test_a_seed_gives_one_collage_and_another_seed_another():
     assert torch.equal(first, again) and not torch.equal(first, make_collage(AXIS, np.random.default_rng(2)))
 
 
-def test_tiles_lead_up_down_or_both_ways_by_steps_of_many_heights(monkeypatch):
-    monkeypatch.setattr(collage, "_LEVEL", 1.0)
-    ground = collages(60)
+@pytest.mark.slow(5)
+def test_tiles_lead_up_down_or_both_ways_by_steps_of_many_heights():
+    ground = collages(60, level=1.0)
     up, down = (ground > 0).any(2).any(1), (ground < 0).any(2).any(1)
     for chosen, share in ((up & ~down, 0.3), (down & ~up, 0.3), (up & down, 0.4)):
         assert abs(float(chosen.float().mean()) - share) < 0.15
@@ -29,11 +29,9 @@ def test_tiles_lead_up_down_or_both_ways_by_steps_of_many_heights(monkeypatch):
     assert float(highest.min()) < 0.2 and float(highest.max()) > 2.0
 
 
-def test_shapes_are_of_one_height_and_of_the_size_drawn(monkeypatch):
-    for name, value in {"_MOST": 1, "_LEVEL": 1.0, "_SMALLEST": 0.5, "_LARGEST": (0.5, 0.5)}.items():
-        monkeypatch.setattr(collage, name, value)
+def test_shapes_are_of_one_height_and_of_the_size_drawn():
     found = []
-    for ground in collages(40):
+    for ground in collages(40, most=1, level=1.0, smallest=0.5, largest=(0.5, 0.5)):
         places = ground.nonzero() * 0.04
         if len(places):
             assert len(ground.unique()) == 2

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import training.traversability.maps.data as data
-import training.traversability.maps.mapping as mapping
 from tests.helpers import pose
 from tests.training.traversability.small import TINY
 from torchelev.robot import RobotConfig
@@ -46,14 +45,14 @@ def from_box(xy):
     return torch.hypot(dx, dy)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("seed", [0, 3])
-def test_labels_lie_where_the_map_has_the_ground_that_they_are_of(seed, monkeypatch):
+def test_labels_lie_where_the_map_has_the_ground_that_they_are_of(seed):
     # The robot starts off the middle and turned, in a map frame that is shifted and turned against the tile.
     path = torch.stack([pose((-0.5 + 0.1 * k, -1.2 + 0.1 * k, 0.5), yaw=0.9) for k in range(8)])
-    monkeypatch.setattr(mapping, "walks", lambda *_: path)
     field, robot, rng = flat_tile_with_a_box(), RobotConfig(length=0.6, width=0.4), np.random.default_rng(seed)
     cfg = dataclasses.replace(SMALL, num_maps=1, window=4.0, camera_pixels=(64, 48), lidar_rays=(32, 256))
-    emap, T_tile_map = walk_and_map(field, robot, 0.05, cfg, rng)
+    emap, T_tile_map = walk_and_map(field, robot, 0.05, cfg, rng, path)
     maps = label_cells(emap, T_tile_map, field, robot, 4, ("box",))
     ground = float(maps.elevation[maps.validity].median())
     high = maps.validity & (maps.elevation > ground + 0.3)
@@ -107,6 +106,7 @@ def test_a_seed_makes_the_same_maps_and_another_makes_others():
     assert float(first.label[~first.rated].abs().sum()) == 0
 
 
+@pytest.mark.slow(1)
 def test_kinds_resolution_and_robot_can_be_fixed():
     robot = RobotConfig(length=0.5, width=0.3)
     maps = make_batch(5, dataclasses.replace(SMALL, robot=robot), UNSEEN_KINDS, 0.08)
@@ -127,12 +127,13 @@ def test_splits_and_data_sets_have_seeds_of_their_own():
 
 
 @pytest.mark.slow(2)
-def test_a_data_set_is_kept_and_only_what_lacks_is_made(tmp_path, monkeypatch):
-    made = []
-    monkeypatch.setattr(data, "make_batch", lambda seed, *rest: made.append(seed) or make_batch(seed, *rest))
+def test_a_data_set_is_kept_and_only_what_lacks_is_made(tmp_path):
     first = data_set(tmp_path, "train", 1, 0, SMALL, resolution=0.1)
+    (path,) = tmp_path.iterdir()
+    written = path.stat().st_mtime_ns
     again = data_set(tmp_path, "train", 2, 0, SMALL, resolution=0.1)
-    assert len(made) == 2 and made[0] != made[1] and equal(first[0], again[0])
+    assert path.stat().st_mtime_ns == written and len(list(tmp_path.iterdir())) == 2
+    assert equal(first[0], again[0]) and not equal(first[0], again[1])
     assert equal(again[1], make_batch(batch_seed("train", 0, 1), SMALL, KINDS, 0.1))
     other = dataclasses.replace(SMALL, headings=3)
     with pytest.raises(ValueError, match=r"must be of the same settings, got other headings; remove the folder"):

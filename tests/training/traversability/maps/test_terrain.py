@@ -31,6 +31,7 @@ def test_robots_are_of_all_sizes():
     assert all(0.3 <= robot.max_slope <= 0.7 for robot in robots)
 
 
+@pytest.mark.slow(1)
 def test_robots_walk_within_the_tile_and_above_the_ground():
     rng, robot = np.random.default_rng(1), RobotConfig()
     field = make_tiles(("obstacles", "gaps"), rng)
