@@ -48,6 +48,7 @@ inline Lanes floor_of(Lanes a) {
     return of_each(a, [](float value) { return __builtin_floorf(value); });
 }
 inline Flags integers(Lanes a) { return __builtin_convertvector(a, Flags); }
+inline Flags index_or_none(Flags exist, Flags index) { return (index & exist) | ~exist; }
 inline Lanes numbers(Flags a) { return __builtin_convertvector(a, Lanes); }
 
 // Return how many flags are set.
@@ -136,6 +137,12 @@ template <class Value> auto load_as(const Value* values) {
     Values found;
     std::memcpy(&found, values, sizeof found);
     return __builtin_convertvector(found, decltype(gather(values, Flags{})));
+}
+
+// Call `work(k, count)` for the vectors of first to last; a count that is known to the compiler for all but the last.
+template <class Work> inline void for_vectors(int64_t first, int64_t last, const Work& work) {
+    for (; first + LANES <= last; first += LANES) work(first, std::integral_constant<int, LANES>());
+    if (first < last) work(first, int(last - first));
 }
 
 // Natural logarithm of positive normal numbers, by the polynomial of Cephes' logf: 1 unit in the last place.

@@ -3,6 +3,7 @@
 
 #include <atomic>
 
+#include "kernels/simd.h"
 #include "kernels/update.h"
 #include "stages/window.h"
 
@@ -24,10 +25,12 @@ inline void locate(Update& u, float resolution) {
     std::atomic<int64_t> inside{0}, used{0};
     u.each(m.number, 16384, [&](int64_t, int64_t first, int64_t last) {
         int64_t own_inside = 0, own_used = 0;
-        for (int64_t k = first; k < last; k++) {
-            slots[k] = m.used[k] ? window.slot(m.x[k], m.y[k]) : -1;
-            own_inside += slots[k] >= 0, own_used += m.used[k];
-        }
+        for_vectors(first, last, [&](int64_t k, auto count) {
+            const Flags is_used = load_bytes(&m.used[k], count) > 0;
+            const Flags found = window.slot(load(&m.x[k], count), load(&m.y[k], count)) | ~is_used;
+            std::memcpy(slots + k, &found, sizeof(int32_t) * count);
+            own_inside += count_set(found >= 0), own_used += count_set(is_used);
+        });
         inside += own_inside, used += own_used;
     });
     m.inside = inside, m.outside = used - inside, m.is_located = true;

@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "generated.h"
+#include "kernels/scalar.h"
 
 // Difference of two cell numbers of the lattice as a float, which fits it exactly only if they are near; far ones are
 // clamped, they are outside.
@@ -35,10 +36,10 @@ struct Window {
             first[axis] = rintf(lattice_offset(corner, anchor, axis, resolution) / resolution);
     }
     // Flat number of the cell that a point [m] lies in, -1 outside the window.
-    int32_t slot(float x, float y) const {
+    template <class V> INLINE auto slot(V x, V y) const {
         // Divide before adding whole cells: the result is then the same wherever the window is.
-        const float i = std::floor(x / resolution) + first[0], j = std::floor(y / resolution) + first[1];
-        const bool is_inside = i >= 0 && i < rows && j >= 0 && j < columns;
-        return is_inside ? int32_t(i) * columns + int32_t(j) : -1;
+        const V i = floor_of(x / resolution) + first[0], j = floor_of(y / resolution) + first[1];
+        const V near_i = clamp(i, 0, float(rows - 1)), near_j = clamp(j, 0, float(columns - 1));
+        return index_or_none((i == near_i) & (j == near_j), integers(near_i) * columns + integers(near_j));
     }
 };

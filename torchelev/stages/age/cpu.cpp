@@ -2,6 +2,7 @@
 
 #include <cmath>
 
+#include "kernels/simd.h"
 #include "kernels/update.h"
 #include "stages/age/equation.h"
 
@@ -12,9 +13,10 @@ extern "C" void run_age(Update& u) {
     float *time = u.state.time, *variance = u.state.variance;
     const uint8_t* known = u.state.validity;
     u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t k = first; k < last; k++) {
-            time[k] += dt;
-            variance[k] = known[k] ? aging::grow(variance[k], added, limit) : 1.0f;
-        }
+        for_vectors(first, last, [&](int64_t k, auto count) {
+            store(time + k, load(time + k, count) + dt, count);
+            const Lanes grown = aging::grow(load(variance + k, count), added, limit);
+            store(variance + k, pick(load_bytes(known + k, count) > 0, grown, all(1)), count);
+        });
     });
 }

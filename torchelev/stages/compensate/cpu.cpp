@@ -9,6 +9,7 @@
 #include <limits>
 #include <vector>
 
+#include "kernels/simd.h"
 #include "kernels/update.h"
 #include "stages/cells.h"
 #include "stages/compensate/equation.h"
@@ -18,6 +19,7 @@
 namespace {
 
 constexpr int64_t AT_A_TIME = 16384;  // points that are worth a thread
+constexpr int64_t IN_FLOAT = 64 * LANES;  // points whose sums keep float's precision
 constexpr float NONE = std::numeric_limits<float>::infinity();
 
 // Sums over the points that measure the drift.
@@ -29,21 +31,46 @@ struct Sums {
     float mean_noise() const { return float(noise / double(std::max<int64_t>(number, 1))); }
 };
 
+// `Sums` of vectors, of few points.
+struct Totals {
+    Lanes error{}, noise{};
+    int64_t number = 0;
+
+    void add(Flags counts, Lanes own, Lanes own_noise) {
+        error += zero_unless(counts, own), noise += zero_unless(counts, own_noise), number += count_set(counts);
+    }
+    void add_to(Sums& sums) const {
+        for (int l = 0; l < LANES; l++) sums.error += error[l], sums.noise += noise[l];
+        sums.number += number;
+    }
+};
+
 struct Errors {
     Buffer<float> of;  // (M) [m] of each point; infinite where it does not count
 };
 
-// Sum over the points by parts, in an order that does not depend on the threads.
+// Sum over the points by parts, in an order that does not depend on the threads: `add(k, count, totals)`.
 template <class Add> Sums sum_up(const Update& u, const Add& add) {
     const int64_t number = u.measurement.number, parts = (number + AT_A_TIME - 1) / AT_A_TIME;
     std::vector<Sums> sums(parts);
     u.each(parts, 1, [&](int64_t, int64_t begin, int64_t end) {
         for (int64_t p = begin; p < end; p++)
-            for (int64_t k = p * AT_A_TIME; k < std::min(number, (p + 1) * AT_A_TIME); k++) add(k, sums[p]);
+            for (int64_t k = p * AT_A_TIME; k < std::min(number, (p + 1) * AT_A_TIME); k += IN_FLOAT) {
+                Totals totals;
+                const int64_t last = std::min({number, (p + 1) * AT_A_TIME, k + IN_FLOAT});
+                for_vectors(k, last, [&](int64_t at, auto count) { add(at, count, totals); });
+                totals.add_to(sums[p]);
+            }
     });
     Sums all;
     for (const Sums& part : sums) all.error += part.error, all.noise += part.noise, all.number += part.number;
     return all;
+}
+
+template <class Count> Flags load_slots(const int32_t* slots, Count count) {
+    Flags found = Flags{} - 1;
+    std::memcpy(&found, slots, sizeof(int32_t) * count);
+    return found;
 }
 
 // Find the height error of each point: `height_error` where it counts.
@@ -51,16 +78,20 @@ Sums find_errors(Update& u, float* errors) {
     const CompensateSettings& s = u.settings.compensate;
     const Measurement& m = u.measurement;
     const MapState& map = u.state;
-    const int32_t columns = int32_t(u.sizes.W);
-    return sum_up(u, [&](int64_t k, Sums& sums) {
-        errors[k] = NONE;
-        const int32_t cell = m.slot[k];
-        if (cell < 0 || !drift::suits(map.validity[cell], map.traversability[cell], map.variance[cell], s)) return;
-        const float x = center_offset(u, 0, cell / columns, s.resolution);
-        const float y = center_offset(u, 1, cell % columns, s.resolution);
-        const float error = drift::height_error(m.x[k], m.y[k], m.z[k], map.elevation[cell], map.gradient_x[cell],
-                                                map.gradient_y[cell], x, y);
-        if (absolute(error) <= s.max_error) errors[k] = error, sums.error += error, sums.number++;
+    return sum_up(u, [&](int64_t k, auto count, Totals& totals) {
+        const Flags slots = load_slots(&m.slot[k], count), cells = pick_int(slots >= 0, slots, Flags{});
+        Flags counts = (slots >= 0) & (gather(map.validity, cells) > 0);
+        counts &= drift::suits(gather(map.traversability, cells), gather(map.variance, cells), s);
+        Lanes error = all(NONE);
+        if (any(counts)) {
+            const Lanes gx = gather(map.gradient_x, cells), gy = gather(map.gradient_y, cells);
+            error = drift::height_error(load(&m.x[k], count), load(&m.y[k], count), load(&m.z[k], count),
+                                        gather(map.elevation, cells), gx, gy, s);
+            counts &= absolute(error) <= s.max_error;
+            error = pick(counts, error, all(NONE));
+            totals.add(counts, error, Lanes{});
+        }
+        store(errors + k, error, count);
     });
 }
 
@@ -68,11 +99,14 @@ Sums find_errors(Update& u, float* errors) {
 void shift_heights(Update& u, float shift) {
     const MapState& map = u.state;
     u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t k = first; k < last; k++) {
-            map.elevation[k] += map.validity[k] ? shift : 0.0f;
-            map.challenger[k] += map.challenger_support[k] ? shift : 0.0f;
-            map.upper_bound[k] += map.bounded[k] ? shift : 0.0f;
-        }
+        auto add = [&](float* layer, const uint8_t* where, int64_t k, auto count) {
+            const Flags chosen = load_bytes(where + k, count) > 0;
+            if (any(chosen)) store(layer + k, load(layer + k, count) + zero_unless(chosen, all(shift)), count);
+        };
+        for_vectors(first, last, [&](int64_t k, auto count) {
+            add(map.elevation, map.validity, k, count), add(map.challenger, map.challenger_support, k, count);
+            add(map.upper_bound, map.bounded, k, count);
+        });
     });
 }
 
@@ -103,9 +137,10 @@ bool compensate(Update& u) {
     float* errors = u.memory.get<Errors>().of.resize(m.number);
     const float first_mean = find_errors(u, errors).mean();
     // Again around the mean: the foot of a wall that was not seen before stands on ground that looks flat.
-    const Sums near = sum_up(u, [&](int64_t k, Sums& sums) {
-        if (!drift::is_near_mean(errors[k], first_mean, m.noise[k], s)) return;
-        sums.error += errors[k], sums.noise += m.noise[k] + s.relief_square, sums.number++;
+    const Sums near = sum_up(u, [&](int64_t k, auto count, Totals& totals) {
+        Lanes error = all(NONE), noise{};
+        std::memcpy(&error, errors + k, sizeof(float) * count), noise = load(&m.noise[k], count);
+        totals.add(drift::is_near_mean(error, all(first_mean), noise, s), error, noise + s.relief_square);
     });
     const float mean = near.mean(), correction = drift::correction(mean, near.number, s);
     const Statistics& to = u.state.statistics;

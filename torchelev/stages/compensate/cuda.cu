@@ -26,18 +26,15 @@ extern "C" __global__ void find_drift(Update u) {
     const int64_t b = blockIdx.x;
     const MapState map = u.state.at(b, u.sizes);
     const Scratch scan = u.scratch.at(b, u.sizes);
-    const int32_t columns = int32_t(u.sizes.W);
     if (threadIdx.x == 0) *scan.correction = 0;
     if (!s.has_drift) return;
     Sums all{};
     for (int64_t k = threadIdx.x; k < u.sizes.M; k += blockDim.x) {
         const int32_t cell = scan.slot[k];
         float error = NONE;
-        if (cell >= 0 && drift::suits(map.validity[cell], map.traversability[cell], map.variance[cell], s)) {
-            const float x = center_offset(map.corner, scan.anchor, 0, cell / columns, s.resolution);
-            const float y = center_offset(map.corner, scan.anchor, 1, cell % columns, s.resolution);
+        if (cell >= 0 && map.validity[cell] && drift::suits(map.traversability[cell], map.variance[cell], s)) {
             error = drift::height_error(scan.x[k], scan.y[k], scan.z[k], map.elevation[cell], map.gradient_x[cell],
-                                        map.gradient_y[cell], x, y);
+                                        map.gradient_y[cell], s);
             if (!(absolute(error) <= s.max_error)) error = NONE;
         }
         scan.error[k] = error;

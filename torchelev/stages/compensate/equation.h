@@ -5,20 +5,22 @@
 
 namespace drift {
 
-// Height error [m] of a point against its cell's plane: e = p_z - h (paper, Sec. II-D). `x` and `y` are the centre of
-// the cell, `p_x` and `p_y` the point's place [m].
-INLINE float height_error(float p_x, float p_y, float p_z, float elevation, float gx, float gy, float x, float y) {
-    const float at_origin = elevation - gx * x - gy * y;
+// Height error [m] of a point against its cell's plane: e = p_z - h (paper, Sec. II-D), by the point's place [m].
+template <class V>
+INLINE V height_error(V p_x, V p_y, V p_z, V elevation, V gx, V gy, const CompensateSettings& s) {
+    const V x = (floor_of(p_x / s.resolution) + 0.5f) * s.resolution;  // the centre of the cell
+    const V y = (floor_of(p_y / s.resolution) + 0.5f) * s.resolution;
+    const V at_origin = elevation - gx * x - gy * y;
     return p_z - (at_origin + gx * p_x + gy * p_y);
 }
 
-// Whether a cell is flat and certain enough to measure the drift.
-INLINE bool suits(bool known, float traversability, float variance, const CompensateSettings& s) {
-    return known && traversability >= s.min_traversability && variance <= s.max_variance;
+// Whether a known cell is flat and certain enough to measure the drift.
+template <class V> INLINE auto suits(V traversability, V variance, const CompensateSettings& s) {
+    return (traversability >= s.min_traversability) & (variance <= s.max_variance);
 }
 
 // Whether an error lies within the gate around the mean error.
-INLINE bool is_near_mean(float error, float mean, float noise, const CompensateSettings& s) {
+template <class V> INLINE auto is_near_mean(V error, V mean, V noise, const CompensateSettings& s) {
     return square(error - mean) <= s.gate_square * (noise + s.relief_square);
 }
 

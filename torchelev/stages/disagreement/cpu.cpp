@@ -1,5 +1,6 @@
 // The disagreement taken out of variances, and put in again: stage.py.
 
+#include "kernels/simd.h"
 #include "kernels/update.h"
 #include "stages/disagreement/equation.h"
 
@@ -11,8 +12,10 @@ template <class Change> void change_variance(Update& u, const Change& change) {
     if (d == 0) return;
     const MapState& map = u.state;
     u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t k = first; k < last; k++)
-            map.variance[k] = change(map.variance[k], map.validity[k] ? d2 : 0.0f);
+        for_vectors(first, last, [&](int64_t k, auto count) {
+            const Flags known = load_bytes(map.validity + k, count) > 0;
+            store(map.variance + k, change(load(map.variance + k, count), zero_unless(known, all(d2))), count);
+        });
     });
 }
 
@@ -20,9 +23,9 @@ template <class Change> void change_variance(Update& u, const Change& change) {
 
 extern "C" void run_subtract_disagreement(Update& u) {
     const DisagreementSettings& s = u.settings.disagreement;
-    change_variance(u, [&](float variance, float d2) { return disagreement::without(variance, d2, s); });
+    change_variance(u, [&](Lanes variance, Lanes d2) { return disagreement::without(variance, d2, s); });
 }
 
 extern "C" void run_add_disagreement(Update& u) {
-    change_variance(u, [](float variance, float d2) { return variance + d2; });
+    change_variance(u, [](Lanes variance, Lanes d2) { return variance + d2; });
 }

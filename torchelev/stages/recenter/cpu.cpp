@@ -15,16 +15,16 @@ struct Shift {
 
 // Give cell (i, j) of H x W cells what was at (i, j) + shift, or `blank` if that lies outside.
 template <class Value> void move(Value* layer, int64_t H, int64_t W, const Shift& by, Value blank) {
-    const int64_t first = std::min(W, std::max<int64_t>(0, -by.columns));
-    const int64_t last = std::max(first, std::min(W, W - by.columns));
-    for (int64_t n = 0; n < H; n++) {
-        const int64_t i = by.rows >= 0 ? n : H - 1 - n;  // no row is overwritten before it is read
-        Value* row = layer + i * W;
-        const bool enters = i + by.rows < 0 || i + by.rows >= H;
-        const int64_t begin = enters ? W : first, end = enters ? W : last;
-        if (begin < end) std::memmove(row + begin, row + by.rows * W + begin + by.columns, (end - begin) * sizeof(Value));
-        std::fill(row, row + begin, blank), std::fill(row + end, row + W, blank);
-    }
+    // All rows that stay move at once, though what passes their ends is wrong until it becomes blank.
+    const int64_t offset = by.rows * W + by.columns, size = H * W;
+    const int64_t begin = std::clamp(-offset, int64_t(0), size), end = std::clamp(size - offset, begin, size);
+    std::memmove(layer + begin, layer + begin + offset, (end - begin) * sizeof(Value));
+    const int64_t first = std::clamp(-by.columns, int64_t(0), W), last = std::clamp(W - by.columns, first, W);
+    const int64_t top = std::clamp(-by.rows, int64_t(0), H), bottom = std::clamp(H - by.rows, top, H);
+    std::fill(layer, layer + top * W, blank), std::fill(layer + bottom * W, layer + size, blank);
+    if (first == 0 && last == W) return;
+    for (Value* row = layer + top * W; row < layer + bottom * W; row += W)
+        std::fill(row, row + first, blank), std::fill(row + last, row + W, blank);
 }
 
 void move_layers(Update& u, const Shift& by) {
