@@ -2,15 +2,17 @@
 
     python -m tests.answers    # records tests/answers.npz anew
 
-`tests/test_answers.py` and `tests/test_compiled_answers.py` compare. Reads the library through what users import, so
+`tests/test_answers.py` compares. Reads the library through what users import, so
 that a recording outlives a redesign.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -74,11 +76,9 @@ class Walk(NamedTuple):
     sums: dict[str, Tensor]  # of the updates' statistics
 
 
-def mapped(dtype: torch.dtype, compiled: bool, scan_count: int = 14, **stages: object) -> Walk:
+def mapped(dtype: torch.dtype, scan_count: int = 14, **stages: object) -> Walk:
     """Return maps after a walk, on which a part of the ground rose by a floor."""
     emap = te.ElevationMap(config(**stages), B).to(dtype)
-    if compiled:
-        emap.compile()
     sums = {name: torch.zeros(B) for name in te.Statistics._fields}
     for k, (points, T_map_sensor, T_map_base) in enumerate(scans(scan_count)):
         if k == scan_count - 1:
@@ -184,7 +184,7 @@ def of_rollout() -> Answers:
 def of_filters(dtype: torch.dtype) -> Answers:
     """Return every filter's layer, of a map that a walk has made."""
     steps = [te.FilterConfig(layer=f"of_{name}", filter=name, inputs=of, settings=how) for name, of, how in FILTERS]
-    emap = mapped(dtype, False, 4, filters=tuple(steps)).emap
+    emap = mapped(dtype, 4, filters=tuple(steps)).emap
     return _arrays({f"filter {step.filter}": emap.layer(step.layer) for step in steps})
 
 
@@ -192,14 +192,18 @@ def _learned() -> dict[str, object]:
     return {"traversability": te.LearnedTraversabilityConfig()}
 
 
+def _by_tensors(make: Callable[[], Answers]) -> Answers:
+    with patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"}):
+        return make()
+
+
 PARTS: dict[str, Callable[[], Answers]] = {
-    "eager float32": lambda: of_map(mapped(torch.float32, False)),
-    "eager float64": lambda: of_map(mapped(torch.float64, False)),
-    "compiled float32": lambda: of_map(mapped(torch.float32, True)),
-    "compiled float64": lambda: of_map(mapped(torch.float64, True)),
-    "learned": lambda: of_map(mapped(torch.float32, False, **_learned())),
-    "readers float32": lambda: of_readers(mapped(torch.float32, False).emap),
-    "readers float64": lambda: of_readers(mapped(torch.float64, False).emap),
+    "float32": lambda: of_map(mapped(torch.float32)),
+    "float64": lambda: of_map(mapped(torch.float64)),
+    "float32 by tensors": lambda: _by_tensors(lambda: of_map(mapped(torch.float32))),
+    "learned": lambda: of_map(mapped(torch.float32, **_learned())),
+    "readers float32": lambda: of_readers(mapped(torch.float32).emap),
+    "readers float64": lambda: of_readers(mapped(torch.float64).emap),
     "filters float32": lambda: of_filters(torch.float32),
     "filters float64": lambda: of_filters(torch.float64),
     "sim": of_sim,
