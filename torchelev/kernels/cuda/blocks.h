@@ -17,6 +17,18 @@ inline void add_of_warp(int64_t* total, int32_t value) {
     if (threadIdx.x % warpSize == 0 && value) atomicAdd(reinterpret_cast<unsigned long long*>(total), value);
 }
 
+// Take places for what a warp's threads bring, all of which must call this; return where this thread's begin.
+inline int32_t take_places(int32_t* next, int32_t number) {
+    const int32_t lane = threadIdx.x % warpSize, last = warpSize - 1;
+    int32_t sum = number;  // of this thread and those before
+    for (int step = 1; step < warpSize; step *= 2) {
+        const int32_t before = __shfl_up_sync(0xffffffff, sum, step);
+        sum += lane >= step ? before : 0;
+    }
+    const int32_t first = lane == last && sum ? atomicAdd(next, sum) : 0;
+    return __shfl_sync(0xffffffff, first, last) + sum - number;
+}
+
 // Memory that the threads of a block share: as much as the launch asks for.
 inline int32_t* block_memory() {
     extern __shared__ int32_t memory[];

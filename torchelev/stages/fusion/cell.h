@@ -58,6 +58,18 @@ INLINE Resolved<V> resolve_contested(const Points& points, const Consensus<V>& c
     return {consensus.mean + settled, Flag<V>(consensus.is_step | has_step(points.number, far, s))};
 }
 
+// The height [m] that counts in a cell, as far as it holds no step, and whether it does: `estimate_consensus`. A single
+// point is its cell's robust mean.
+template <class Points, class V = typename Points::V>
+INLINE Resolved<V> settle_height(const Points& points, const Prior<V>& prior, const Consensus<V>& consensus,
+                                 const FusionSettings& s) {
+    const Flag<V> contested = (negated(consensus.trusted) & (points.number > 1)) | consensus.is_step;
+    const V height = pick(consensus.trusted, prior.elevation, consensus.mean);
+    if (!any(contested)) return {height, Flag<V>{}};
+    const Resolved<V> resolved = resolve_contested(points, consensus, s);
+    return {pick(contested, resolved.height, height), Flag<V>(contested & resolved.is_step)};
+}
+
 // Average the points within the gate around the consensus and on its side: `measure_cells` and `choose_points`.
 template <class Points, class V = typename Points::V>
 INLINE Measured<V> measure_cell(const Points& points, const Prior<V>& prior, V height, Flag<V> trusted, V side,

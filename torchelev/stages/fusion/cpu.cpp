@@ -17,7 +17,6 @@ namespace {
 using namespace fusion;
 
 constexpr int64_t WORTH_A_THREAD = 256;  // vectors of cells
-constexpr int TRUSTED = 1, STEP = 2, CHALLENGED = 4, TOP = 8, GROUND = 16, WON = 32;  // bits of a cell's marks
 
 // What a thread keeps from map to map: the scan's points, and of each cell that they hit:
 struct Scratch {
@@ -103,17 +102,11 @@ class Fusion {
         const PointsOfLanes hits = points(first);
         const Prior<Lanes> before = prior(own);
         const Consensus<Lanes> found = estimate_consensus(hits, before, s);
-        const Flags untrusted = ~found.trusted & (hits.number > 1), contested = untrusted | found.is_step;
-        Lanes height = pick(found.trusted, before.elevation, found.mean);
-        Flags is_step{};
-        if (any(contested)) {
-            const Resolved<Lanes> resolved = resolve_contested(hits, found, s);
-            height = pick(contested, resolved.height, height), is_step = contested & resolved.is_step;
-        }
-        const Flags support = own.read(map.challenger_support);
-        const Flags contradicted = before.known & ~found.trusted, challenged = contradicted | (support > 0);
-        const Flags marks = (found.trusted & TRUSTED) | (is_step & STEP) | (challenged & (s.has_rays ? CHALLENGED : 0));
-        store(&scratch.mean[first], found.mean), store(&scratch.height[first], height);
+        const Resolved<Lanes> settled = settle_height(hits, before, found, s);
+        const Flags support = own.read(map.challenger_support), challenged = is_challenged(before, found, support > 0);
+        const Flags marks =
+            (found.trusted & TRUSTED) | (settled.is_step & STEP) | (challenged & (s.has_rays ? CHALLENGED : 0));
+        store(&scratch.mean[first], found.mean), store(&scratch.height[first], settled.height);
         store(&scratch.variance[first], found.variance);
         constexpr std::integral_constant<int, LANES> whole;
         store_bytes(&scratch.marks[first], marks, whole), store_bytes(&scratch.challengers[first], support, whole);

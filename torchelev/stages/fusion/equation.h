@@ -11,6 +11,8 @@ constexpr float NONE = -3e38f;            // [m] below NO_HEIGHT: of no points
 constexpr float TINY = 1.17549435e-38f;   // the smallest normal number
 constexpr float COSINE = 0.642787609687f;  // of 50 degrees: `lie_behind`
 
+constexpr int TRUSTED = 1, STEP = 2, CHALLENGED = 4, TOP = 8, GROUND = 16, WON = 32;  // bits of a cell's marks
+
 template <class V> using Flag = decltype(V{} < V{});  // bool, or a vector of -1 and 0
 template <class F> INLINE F negated(F flag) { return flag == F{}; }
 template <class V> INLINE V number_if(Flag<V> flag) { return pick(flag, all<V>(1), all<V>(0)); }
@@ -31,6 +33,11 @@ template <class V> struct Prior {
 // `gather_points`.
 template <class V> INLINE Point<V> make_point(V z, V noise, V shared, Flag<V> used, const FusionSettings& s) {
     return {z, noise + square(s.relief) + shared, pick(used, 1 / noise, all<V>(0)), shared, used};
+}
+
+// Variance [m^2] that the pose adds to a point's height, less what the map's heights share: `relative_variance`.
+INLINE float relative_variance(float noise, float of_pose, float of_map) {
+    return larger(noise + of_pose - noise - of_map, 0.0f);
 }
 
 // Whether the ray of a point (x, y) [m] passed over the middle of the cell before it hit: `passed_center`.
@@ -93,6 +100,11 @@ template <class V> struct Consensus {
     V number, mean, variance;  // of the points; [m], [m^2] of their mean
     Flag<V> trusted, is_step;  // most points agree with the elevation; but many do not
 };
+
+// Whether points contradict an elevation, or a challenger stands there: `estimate_consensus`.
+template <class V> INLINE Flag<V> is_challenged(const Prior<V>& prior, const Consensus<V>& consensus, Flag<V> is_standing) {
+    return (prior.known & negated(consensus.trusted)) | is_standing;
+}
 
 // Let points above the elevation agree with each other: `challenge_from_above`. `height` [m] is the consensus.
 INLINE Challenge challenge_from_above(const Prior<float>& prior, const Challenge& before, const Neighbours& around,

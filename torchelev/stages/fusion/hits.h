@@ -25,9 +25,8 @@ struct Scan {
 
     bool has_shared() const { return m.has_covariance; }
 
-    // Variance [m^2] that the pose adds to a point's height, less what the map's heights share: `relative_variance`.
     float shared(int64_t k) const {
-        return m.has_covariance ? larger(m.variance(k) - m.noise[k] - of_map, 0.0f) : 0.0f;
+        return m.has_covariance ? relative_variance(m.noise[k], m.of_pose[k], of_map) : 0.0f;
     }
     Ray ray(int64_t k) const {
         const float* origin = &m.origin[3 * (k / (m.number / m.sensors))];

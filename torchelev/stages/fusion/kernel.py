@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, per_cell, per_point
 from torchelev.kernels.structs import Settings
 from torchelev.stages.fusion.challenge import MIN_CHALLENGERS
 from torchelev.stages.fusion.config import EdgeConfig
@@ -40,4 +40,37 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     )
 
 
-KERNEL = Kernel(name="fusion", folder="stages/fusion", settings=settings)
+def per_hit_cell(sizes: Any) -> int:
+    """Return blocks of 256 threads, one for each cell that may be hit; a map's begin with a block."""
+    return int(sizes.B * -(-min(sizes.M, sizes.H * sizes.W) // 256))
+
+
+KERNEL = Kernel(
+    name="fusion",
+    folder="stages/fusion",
+    settings=settings,
+    cuda={
+        "fuse": (
+            Launch("clear_hits", per_cell),
+            Launch("count_hits", per_point),
+            Launch("list_hit_cells", per_point),
+            Launch("sort_hits", per_point),
+            Launch("find_consensus", per_hit_cell),
+            Launch("resolve_special", per_hit_cell),
+            Launch("update_cells", per_hit_cell),
+        )
+    },
+    scratch={
+        "hit_numbers": "int32_t B 3",
+        "hit_count": "int32_t B H W",
+        "hit_start": "int32_t B H W",
+        "hit_mean": "float B H W",
+        "hit_rank": "int32_t B M",
+        "hits": "float B M 8",  # `SortedPoint`s
+        "hit_cell": "int32_t B M",
+        "hit_height": "float B M",
+        "hit_variance": "float B M",
+        "hit_marks": "uint8_t B M",
+        "hit_support": "uint8_t B M",
+    },
+)

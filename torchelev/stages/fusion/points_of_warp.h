@@ -31,6 +31,9 @@ struct PointsOfWarp {
     // Add up what threads that share the points found.
     template <class... Values> INLINE void add_up(Values&... values) const { ((values = sum(values)), ...); }
 
+    // Whether this thread is the first of those that share the points.
+    INLINE bool is_first() const { return threadIdx.x % stride == 0; }
+
     INLINE float highest(float value) const {
         for (int step = stride / 2; step > 0; step /= 2)
             value = larger(value, __shfl_xor_sync(team(), value, step));
