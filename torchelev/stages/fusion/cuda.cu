@@ -10,7 +10,6 @@
 using namespace fusion;
 
 constexpr int32_t FEW = 8;  // points of a cell up to which one thread takes it, as few cells have more
-constexpr int64_t MANY = 1 << 20;  // points of all maps, above which a team is 8 threads, else a warp
 
 enum Number { POINTS, LIGHT, HEAVY };  // what a map's `hit_numbers` count: sorted points, and cells by their points
 
@@ -85,7 +84,7 @@ struct Hits {
     // heavy one.
     template <class Work> void each_cell(const Work& work) const {
         if (at.k < scan.hit_numbers[LIGHT]) visit(int32_t(at.k), 1, work);
-        const int32_t team = u.sizes.B * u.sizes.M > MANY ? 8 : warpSize, heavy = scan.hit_numbers[HEAVY];
+        const int32_t team = u.sizes.B * u.sizes.M > s.many_points ? 8 : warpSize, heavy = scan.hit_numbers[HEAVY];
         const int32_t teams = int32_t(gridDim.x / unsigned(u.sizes.B) * blockDim.x) / team;
         for (int32_t n = int32_t(at.k) / team; n < heavy; n += teams) visit(int32_t(u.sizes.M) - 1 - n, team, work);
     }

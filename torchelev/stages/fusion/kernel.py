@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from torchelev.config import ElevationMapConfig
 
 
+MANY_POINTS = 2**20  # of all maps, above which eight threads of a GPU share a cell with many points, else a warp
+
+
 def settings(cfg: ElevationMapConfig) -> Settings:
     """Return what the equations need of a config."""
     fusion, edges = cfg.fusion, cfg.fusion.edges or EdgeConfig(margin=0.0, min_settled=0.0)
@@ -37,6 +40,7 @@ def settings(cfg: ElevationMapConfig) -> Settings:
         min_passed=float(edges.min_passed),
         margin=float(edges.margin),
         min_settled=float(edges.min_settled),
+        many_points=MANY_POINTS,
     )
 
 
