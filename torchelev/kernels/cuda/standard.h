@@ -14,6 +14,7 @@ template <class T> constexpr T clamp(T value, T low, T high) { return max(low, m
 using ::atan;
 using ::fabs;
 using ::floor;
+using ::signbit;
 using ::sqrt;
 
 template <class T> struct numeric_limits;
