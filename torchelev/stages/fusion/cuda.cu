@@ -1,7 +1,7 @@
 // The height update on a GPU: stage.py. Points are sorted by cell; then a thread, or a team of threads where a cell has
 // many points, works on each cell that is hit.
 //
-// What a hit cell's neighbours are asked for, before the scan, changes only in the last kernel.
+// Cells look at their neighbours as they were before the scan, so only the last kernel changes the layers they look at.
 
 #include "kernels/cuda/update.h"
 #include "stages/fusion/points_of_warp.h"
