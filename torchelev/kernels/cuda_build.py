@@ -93,8 +93,10 @@ def _argument(value: Any) -> Any:
 def _try(device: int) -> bool:
     """Run a kernel on the current device."""
     try:
+        trial = Source("kernels/cuda/trial.cu")
+        load(trial, "double_it", device)
         one = torch.ones(1, device=device, dtype=torch.float32)
-        launch(Source("kernels/cuda/trial.cu"), "double_it", 1, 32, 0, one)
+        launch(trial, "double_it", 1, 32, 0, one)
         if one.item() != 2:
             raise RuntimeError("a kernel computed something else")
     except (AttributeError, OSError, RuntimeError) as error:  # AttributeError: a library lacks a function

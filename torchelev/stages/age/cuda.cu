@@ -10,5 +10,6 @@ extern "C" __global__ void age(Update u) {
     const float dt = u.scratch.dt[at.row], added = u.settings.age.variance_rate * dt;
     if (at.k == 0) *map.elapsed += int64_t(rint(double(dt) * 1e9));
     if (at.k >= u.cells()) return;
-    map.time[at.k] += dt, map.variance[at.k] = aging::grow(map.variance[at.k], added);
+    const float grown = aging::grow(map.variance[at.k], added, u.settings.fusion.max_variance);
+    map.time[at.k] += dt, map.variance[at.k] = map.validity[at.k] ? grown : 1.0f;
 }

@@ -91,7 +91,8 @@ extern "C" __global__ void shift_heights(Update u) {
     map.elevation[at.k] += map.validity[at.k] ? shift : 0.0f;
     map.challenger[at.k] += map.challenger_support[at.k] ? shift : 0.0f;
     map.upper_bound[at.k] += map.bounded[at.k] ? shift : 0.0f;
-    map.variance[at.k] += map.validity[at.k] ? shared : 0.0f;
+    if (map.validity[at.k])
+        map.variance[at.k] = smaller(map.variance[at.k] + shared, u.settings.fusion.max_variance);
 }
 
 // Several sensors ----------------------------------------------------------------------------------------------------

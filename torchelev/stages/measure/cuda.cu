@@ -62,7 +62,7 @@ extern "C" __global__ void measure_points(Update u) {
         float x = in.points[3 * k], y = in.points[3 * k + 1], z = in.points[3 * k + 2];
         const float given = in.variance ? in.variance[k] : 1.0f;
         const float largest = larger(larger(absolute(x), absolute(y)), absolute(z));
-        finite = *to.sound && x == x && y == y && z == z && largest < 3.5e38f && largest <= 3.4028234e38f &&
+        finite = *to.sound && x == x && y == y && z == z && largest <= 3.4028234e38f &&
                  given >= 1.17549435e-38f && given <= 3.4028234e38f;
         const bool small = finite && largest <= s.max_distance;
         x = small ? x : 0, y = small ? y : 0, z = small ? z : 0;
