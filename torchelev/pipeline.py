@@ -42,8 +42,8 @@ TENSORS: tuple[Any, ...] = (("Statistics", Statistics, {}), ("MapState", MapStat
 class Stage(NamedTuple):
     """One stage: its definition by tensors. `run_<name>` in its folder's cpu.cpp computes the same, in place."""
 
-    name: str
-    run: Callable[[MapState, Measurement, ElevationMapConfig], MapState]
+    name: str  #: of the stage, on every backend
+    run: Callable[[MapState, Measurement, ElevationMapConfig], MapState]  #: returns the state after it
 
 
 #: What an update does after `measure`: the only statement of the order. The learned head follows, see `rate_learned`.

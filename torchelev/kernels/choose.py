@@ -16,7 +16,7 @@ from torchelev.ops.transforms import is_transforming
 class Backend(NamedTuple):
     """What runs an update: "CPU" is C++ and "CUDA" are kernels, both in place; "TORCH" are tensors."""
 
-    name: str
+    name: str  #: "CPU", "CUDA" or "TORCH"
     reason: str  #: why it is not a faster one; empty where it is the fastest
 
     def __str__(self) -> str:

@@ -22,13 +22,13 @@ class Inputs(NamedTuple):
     """The inputs of an update as C++ takes them: contiguous, float32, poses float64."""
 
     points: Float[Tensor, "B S N 3"]  #: [m] sensor frame
-    T_map_sensor: Float64[Tensor, "B S 4 4"]
-    T_map_base: Float64[Tensor, "B 4 4"] | None
+    T_map_sensor: Float64[Tensor, "B S 4 4"]  #: sensor-frame points into the map frame
+    T_map_base: Float64[Tensor, "B 4 4"] | None  #: pose of the robot
     dt: Float[Tensor, "B"]  #: [s]
     variance: Float[Tensor, "B S N"] | None  #: [m^2]
-    T_base_links: Float64[Tensor, "B K 4 4"] | None
+    T_base_links: Float64[Tensor, "B K 4 4"] | None  #: poses of the links of the robot's body
     own: Bool[Tensor, "B S N"] | None  #: points on the robot's links
-    pose_covariance: Float[Tensor, "B S 6 6"] | None
+    pose_covariance: Float[Tensor, "B S 6 6"] | None  #: of each sensor's pose
 
 
 class Sizes(ctypes.Structure):
