@@ -34,6 +34,7 @@ class CudaUpdate:
         cfg: an ElevationMapConfig.
         default: the default config, from which the settings' types are.
         launch: runs a kernel; tests give one that runs it on a CPU.
+        limits: returns sizes of a device, by name.
     """
 
     def __init__(
@@ -44,14 +45,17 @@ class CudaUpdate:
         cfg: Any,
         default: Any,
         launch: Callable[..., None] = cuda_build.launch,
+        limits: Callable[[torch.device], Mapping[str, int]] = cuda_build.limits,
     ) -> None:
-        self._order, self._launch = tuple(order), launch
+        self._order, self._launch, self._limits = tuple(order), launch, limits
         self._arrays: dict[str, str] = {}
         for kernel in kernels:
             self._arrays |= kernel.scratch
         self._sizes = {name: size for kernel in kernels for name, size in kernel.sizes(cfg).items()}
         self._per_sensor = {stage for kernel in kernels for stage in kernel.per_sensor}
-        structs = header(kernels, default, [*tensors, ("Inputs", Inputs, {})], (*SIZES, *self._sizes))
+        structs = header(
+            kernels, default, [*tensors, ("Inputs", Inputs, {})], (*SIZES, *cuda_build.LIMITS, *self._sizes)
+        )
         whole = (("generated.h", f"{structs}\n{scratch_struct('Scratch', self._arrays)}"),)
         self._launches: dict[str, list[tuple[cuda_build.Source, Launch]]] = {}
         for kernel in kernels:
@@ -63,7 +67,7 @@ class CudaUpdate:
         self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
     ) -> dict[str, Tensor]:
         """Run stages, by name, or all, on a state's tensors (B, ...), in place; return what they passed on, by name."""
-        sizes = _all_sizes(sizes_of(state, inputs), self._sizes)
+        sizes = _all_sizes(sizes_of(state, inputs), {**self._limits(state[0].device), **self._sizes})
         scratch = self._allocate(sizes, state[0].device)
         update = self._update(sizes, state, inputs, list(scratch.values()))
         for stage in self._order if stages is None else stages:

@@ -6,24 +6,13 @@
 #include "kernels/cuda/update.h"
 #include "stages/visibility/equation.h"
 #include "stages/visibility/ground_of_thread.h"
-
-// Integers in the order of floats, none of them NaN; each is the other's.
-inline int32_t ordered(int32_t bits) { return bits < 0 ? bits ^ 0x7fffffff : bits; }
-inline int32_t ordered(float value) { return ordered(__float_as_int(value)); }
-inline float unordered(int32_t value) { return __int_as_float(ordered(value)); }
-
-// Begin without rays. A thread for each entry of the table.
-extern "C" __global__ void clear_table(Update u) {
-    const int64_t entries = u.sizes.ranges * u.sizes.azimuths;
-    const Place at = place(entries);
-    if (at.k == 0 && u.sensor == 0) *u.state.statistics.at(at.row, u.sizes).cleared_seen_through = 0;
-    if (at.k < entries) u.scratch.slopes[at.row * entries + at.k] = ordered(u.settings.visibility.no_ray);
-}
+#include "stages/visibility/rays_of_thread.h"
 
 // Write the running minimum of the falls to recently hit ground: `limits_by_tensors`. A thread for each azimuth.
 extern "C" __global__ void find_horizon(Update u) {
     const int64_t azimuths = u.sizes.horizon_azimuths;
     const Place at = place(azimuths);
+    if (at.k == 0 && u.sensor == 0) *u.state.statistics.at(at.row, u.sizes).cleared_seen_through = 0;
     if (at.k >= azimuths) return;
     const Ground ground(u, at.row);
     float* steepest = u.scratch.at(at.row, u.sizes).steepest + at.k;
@@ -54,93 +43,57 @@ extern "C" __global__ void find_borders(Update u) {
     }
 }
 
-// Put the accepted rays into the table: `accepted_rays` and `bins_of`. A thread for each ray.
+// Where many maps have tables that fit into a block's own memory -----------------------------------------------------
+
+// Put the accepted rays into a table, and apply the lowest ray over each cell. A block for each map.
+extern "C" __global__ void apply_rays(Update u) {
+    const Ground ground(u, blockIdx.x);
+    const VisibilitySettings& s = ground.s;
+    const Scratch scan = u.scratch.at(blockIdx.x, u.sizes);
+    int32_t* slopes = block_memory();  // (ranges, azimuths), in the order of floats
+    for (int32_t k = threadIdx.x; k < s.ranges * s.azimuths; k += blockDim.x) slopes[k] = ordered(s.no_ray);
+    __syncthreads();
+    for (int64_t n = threadIdx.x; n < u.sizes.N; n += blockDim.x) put_ray(u, ground, scan, n, slopes);
+    __syncthreads();
+    for (int32_t k = threadIdx.x; k < s.azimuths; k += blockDim.x) scan_azimuth(slopes + k, s);
+    __syncthreads();
+    int32_t cleared = 0;
+    for (int32_t k = threadIdx.x; k < u.cells(); k += blockDim.x) cleared += apply_to_cell(ground, slopes, k);
+    add_of_warp(ground.map.statistics.cleared_seen_through, cleared);
+}
+
+// Elsewhere: the same, step by step ----------------------------------------------------------------------------------
+
+// Begin without rays. A thread for each entry of the table.
+extern "C" __global__ void clear_table(Update u) {
+    const int64_t entries = u.sizes.ranges * u.sizes.azimuths;
+    const Place at = place(entries);
+    if (at.k < entries) u.scratch.slopes[at.row * entries + at.k] = ordered(u.settings.visibility.no_ray);
+}
+
+// Put the accepted rays into the table. A thread for each ray.
 extern "C" __global__ void put_rays(Update u) {
     const Place at = place(u.sizes.N);
     const Scratch scan = u.scratch.at(at.row, u.sizes);
-    const int64_t k = u.sensor * u.sizes.N + at.k;
-    if (at.k >= u.sizes.N || !scan.casts[k]) return;
-    const Ground ground(u, at.row);
-    const float* origin = ground.view.origin;
-    const VisibilitySettings& s = ground.s;
-    const auto ray = visibility::sensor_ray(scan.x[k] - origin[0], scan.y[k] - origin[1], scan.z[k] - origin[2]);
-    const auto bins = visibility::bins_of(ray, root(scan.noise[k] + scan.of_pose[k]), s);
-    const auto last = visibility::horizon_bins_of(ray, s);
-    const int32_t fall = int32_t(last.range) * int32_t(u.sizes.horizon_azimuths) + int32_t(last.azimuth);
-    const float limit = last.range >= 0 ? scan.steepest[fall] : s.no_fall;
-    if (!(bins.range >= 0) || !(limit + ray.slope >= 0)) return;
-    const auto end = visibility::find_ends(ray, ground.view, s);
-    const int32_t border = int32_t(end.side) * int32_t(u.sizes.border) + int32_t(end.place);
-    const float floor = ground.floor_at(int32_t(end.i), int32_t(end.j));
-    const float near = end.leaves ? scan.borders[border] : s.nowhere;
-    const auto credible = visibility::has_credible_end(ray, end, floor, near, !scan.used[k], ground.view, s);
-    if (credible.well)
-        atomicMin(scan.slopes + int32_t(bins.range) * s.azimuths + int32_t(bins.azimuth), ordered(credible.slope));
+    if (at.k < u.sizes.N) put_ray(u, Ground(u, at.row), scan, at.k, scan.slopes);
 }
 
-// Turn entries into the lowest of them from each range on: `lowest_slopes`. A thread for each azimuth.
+// Find the lowest slopes from each range on. A thread for each azimuth.
 extern "C" __global__ void scan_table(Update u) {
-    const int64_t azimuths = u.sizes.azimuths;
-    const Place at = place(azimuths);
-    if (at.k >= azimuths) return;
-    int32_t* slopes = u.scratch.at(at.row, u.sizes).slopes + at.k;
-    int32_t lowest = ordered(u.settings.visibility.no_ray);
-#pragma unroll 16
-    for (int64_t row = u.sizes.ranges - 1; row >= 0; row--)
-        slopes[row * azimuths] = lowest = std::min(lowest, slopes[row * azimuths]);
-}
-
-// The lowest ray over a cell so far from the sensor: `find_lowest_rays`. Cells look at all azimuths that they cover.
-inline visibility::RayOverCell<float> find_lowest_ray(const int32_t* slopes, float x, float y, float z,
-                                                      const VisibilitySettings& s) {
-    const float rho = visibility::horizontal(x, y), k = std::floor(rho / s.resolution);
-    if (!(k < s.ranges)) return {false, x, y, rho, 0, z};
-    const float entry = visibility::entry_of(k, s.levels, s);
-    const auto window = visibility::window_of(k, visibility::azimuth_fraction(x, y) * s.azimuths, entry, s);
-    const int32_t* row = slopes + int32_t(k) * s.azimuths;
-    int32_t place = int32_t(window.first), lowest = ordered(s.no_ray);
-    for (int32_t left = int32_t(window.further + entry); left > 0; left--) {
-        lowest = std::min(lowest, row[place]);
-        place = place + 1 < s.azimuths ? place + 1 : 0;
-    }
-    const bool found = lowest < ordered(s.no_ray);
-    const float slope = found ? unordered(lowest) : 0;
-    return {found, x, y, rho, slope, z + slope * rho};
-}
-
-// Eq. 3 and 4 of a known cell under a ray.
-inline bool is_gone(const visibility::RayOverCell<float>& ray, const MapState& map, int64_t k,
-                    const VisibilitySettings& s) {
-    const float depth = map.elevation[k] - ray.height, variance = map.variance[k];
-    return visibility::passes_below(depth, variance, map.time[k], s) &&
-           visibility::is_steep(ray, depth, variance, map.gradient_x[k], map.gradient_y[k], s);
+    const Place at = place(u.sizes.azimuths);
+    if (at.k < u.sizes.azimuths) scan_azimuth(u.scratch.at(at.row, u.sizes).slopes + at.k, u.settings.visibility);
 }
 
 // Apply the lowest ray over each cell. A thread for each cell.
 extern "C" __global__ void clear_and_bound(Update u) {
     const Place at = place(u.cells());
-    const int64_t k = at.k;
-    const MapState map = u.state.at(at.row, u.sizes);
-    bool gone = false;
-    if (k < u.cells()) {
-        const Ground ground(u, at.row);
-        const VisibilitySettings& s = ground.s;
-        const int32_t i = int32_t(k) / ground.columns, j = int32_t(k) % ground.columns;
-        const float x = ground.to_center(0, i), y = ground.to_center(1, j);
-        const auto ray = find_lowest_ray(u.scratch.at(at.row, u.sizes).slopes, x, y, ground.view.origin[2], s);
-        const bool known = map.validity[k];
-        gone = known && ray.found && is_gone(ray, map, k, s);
-        if (gone) map.validity[k] = false;
-        const bool stays = known && !gone, bounded = map.bounded[k];
-        if (map.challenger_support[k] && (!stays || visibility::refutes(ray, map.challenger[k], s)))
-            map.challenger_support[k] = 0;
-        if (!stays && ray.found)
-            map.upper_bound[k] = visibility::lower_upper_bound(ray, bounded, map.upper_bound[k]), map.bounded[k] = true;
-        else if (stays && bounded)
-            map.bounded[k] = false;
-    }
-    add_of_warp(map.statistics.cleared_seen_through, gone);
+    const Ground ground(u, at.row);
+    const int32_t* slopes = u.scratch.at(at.row, u.sizes).slopes;
+    const bool cleared = at.k < u.cells() && apply_to_cell(ground, slopes, int32_t(at.k));
+    add_of_warp(ground.map.statistics.cleared_seen_through, cleared);
 }
+
+// The count of bounds ------------------------------------------------------------------------------------------------
 
 // Start counting the unknown cells that have an upper bound. A thread for each map.
 extern "C" __global__ void start_count(Update u) {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from torchelev.kernels.registry import Kernel, Launch, once, per_cell, per_map
+from torchelev.kernels.registry import Kernel, Launch, once, per_map
 from torchelev.kernels.structs import Settings
 from torchelev.ops.masks import NOWHERE
 from torchelev.stages.visibility.accepted_rays import CLEARANCE, NEAR
@@ -68,9 +68,24 @@ def sizes(cfg: ElevationMapConfig) -> dict[str, int]:
     )
 
 
+def table_memory(sizes: Any) -> int:
+    """Return the memory [bytes] of a map's table."""
+    return int(4 * sizes.ranges * sizes.azimuths)
+
+
+def in_blocks(sizes: Any) -> bool:
+    """Return whether a block for each map, with a table in its own memory, gives the GPU enough work."""
+    return table_memory(sizes) <= sizes.block_memory and 2 * sizes.B >= sizes.processors
+
+
+def at_large(number: Callable[[Any], int]) -> Callable[[Any], int]:
+    """Return what returns blocks of 256 threads, one for each of so many in each map; none where blocks do it all."""
+    return lambda sizes: 0 if in_blocks(sizes) else per(number)(sizes)
+
+
 def per(number: Callable[[Any], int]) -> Callable[[Any], int]:
     """Return what returns blocks of 256 threads, one for each of so many in each map, by the sizes."""
-    return lambda sizes: sizes.B * -(-number(sizes) // 256)
+    return lambda sizes: int(sizes.B * sizes.has_rays * -(-number(sizes) // 256))
 
 
 KERNEL = Kernel(
@@ -79,16 +94,17 @@ KERNEL = Kernel(
     settings=settings,
     cuda={
         "clear_seen_through": (
-            Launch("clear_table", per(lambda sizes: sizes.ranges * sizes.azimuths)),
             Launch("find_horizon", per(lambda sizes: sizes.horizon_azimuths)),
             Launch("find_borders", lambda sizes: 4 * per_map(sizes) * sizes.has_rays),
-            Launch("put_rays", per(lambda sizes: sizes.N * sizes.has_rays)),
-            Launch("scan_table", per(lambda sizes: sizes.azimuths)),
-            Launch("clear_and_bound", lambda sizes: per_cell(sizes) * sizes.has_rays),
+            Launch("apply_rays", lambda sizes: per_map(sizes) * sizes.has_rays * in_blocks(sizes), 512, table_memory),
+            Launch("clear_table", at_large(lambda sizes: sizes.ranges * sizes.azimuths)),
+            Launch("put_rays", at_large(lambda sizes: sizes.N)),
+            Launch("scan_table", at_large(lambda sizes: sizes.azimuths)),
+            Launch("clear_and_bound", at_large(lambda sizes: sizes.H * sizes.W)),
         ),
         "count_bounded": (
             Launch("start_count", once),
-            Launch("count_bounded", per(lambda sizes: -(-sizes.H * sizes.W // CELLS_AT_A_TIME))),
+            Launch("count_bounded", lambda sizes: sizes.B * -(-sizes.H * sizes.W // (256 * CELLS_AT_A_TIME))),
         ),
     },
     per_sensor=("clear_seen_through",),
