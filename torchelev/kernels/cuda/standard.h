@@ -17,8 +17,6 @@ using ::floor;
 using ::signbit;
 using ::sqrt;
 
-inline bool signbit(float a) { return __builtin_bit_cast(int32_t, a) < 0; }
-
 template <class T> struct numeric_limits;
 template <> struct numeric_limits<float> {
     static constexpr float min() { return 1.17549435e-38f; }

@@ -68,7 +68,7 @@ def sizes(cfg: ElevationMapConfig) -> dict[str, int]:
     )
 
 
-def table_memory(sizes: Any) -> int:
+def table_memory(sizes: Any, settings: Any = None) -> int:
     """Return the memory [bytes] of a map's table."""
     return int(4 * sizes.ranges * sizes.azimuths)
 
