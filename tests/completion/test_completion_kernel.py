@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.completion.test_net import apply, random_layers, random_net
 from torchelev.completion import completion_kernel
 from torchelev.completion.complete import complete
-from torchelev.native.library import find_compiler
+from torchelev.kernels.cpu_build import find_compiler
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="needs a C++ compiler")
 

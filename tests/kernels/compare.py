@@ -68,16 +68,17 @@ def launch_emulated(source, kernel, blocks, threads, memory, update):
         emulated_source(source)(kernel, blocks, threads, memory, update)
 
 
-def by_cuda(emap, state, inputs, *names):
+def by_cuda(emap, state, inputs, *names, processors=4):
     """Run stages after `measure` and `locate` on a copy of the state, by CUDA kernels on the CPU."""
     missing = [name for name in names if not any(name in kernel.cuda for kernel in pipeline.KERNELS)]
     if missing:
         pytest.skip(f"no CUDA kernels of {missing}")
     after = clone(state)
     values = inputs._asdict() | {"own": find_own(inputs, emap.cfg.sensor)}
-    update = CudaUpdate(
-        pipeline.KERNELS, pipeline.TENSORS, ("measure", *NAMES), emap.cfg, ElevationMapConfig(), launch_emulated
-    )
+    limits = {"processors": processors, "block_memory": 200_000}
+    order = ("measure", *NAMES)
+    kernels = pipeline.KERNELS, pipeline.TENSORS, order, emap.cfg, ElevationMapConfig(), launch_emulated
+    update = CudaUpdate(*kernels, lambda device: limits)
     update.run((*after[:-1], *after.statistics), as_inputs(values), ("measure", "locate", *names))
     return after
 

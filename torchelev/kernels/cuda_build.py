@@ -18,6 +18,7 @@ from torchelev.kernels.registry import PACKAGE
 _STANDARD = "algorithm", "cmath", "cstdint", "limits"  # headers that NVRTC lacks: standard.h is all of them
 _UNASKED_MEMORY = 48 * 2**10  # [bytes] that a block may have unasked
 _MEMORY_ATTRIBUTE = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+LIMITS = "processors", "block_memory"  # of a GPU
 _CAN_LAUNCH: dict[int, bool] = {}  # by device
 
 
@@ -75,6 +76,13 @@ def launch(source: Source, kernel: str, blocks: int, threads: int, memory: int, 
 def load(source: Source, kernel: str, device: int) -> None:
     """Compile and load a kernel: while a graph is captured, none can be loaded."""
     _function(source, kernel, device)
+
+
+@functools.cache
+def limits(device: torch.device) -> dict[str, int]:
+    """Return a GPU's LIMITS, by name: how many blocks can run at once, and how much memory [bytes] each may have."""
+    properties = torch.cuda.get_device_properties(device)
+    return {"processors": properties.multi_processor_count, "block_memory": block_memory(device.index)}
 
 
 def block_memory(device: int) -> int:

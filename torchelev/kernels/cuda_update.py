@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchelev.kernels import cuda_build
 from torchelev.kernels.cpu_update import Inputs, Sizes, addresses, sizes_of
 from torchelev.kernels.registry import Kernel, Launch, header
-from torchelev.kernels.structs import c_settings, scratch_struct
+from torchelev.kernels.structs import SIZES, c_settings, scratch_struct
 
 _DTYPES = {
     "float": torch.float32,
@@ -34,6 +34,7 @@ class CudaUpdate:
         cfg: an ElevationMapConfig.
         default: the default config, from which the settings' types are.
         launch: runs a kernel; tests give one that runs it on a CPU.
+        limits: returns sizes of a device, by name.
     """
 
     def __init__(
@@ -44,12 +45,17 @@ class CudaUpdate:
         cfg: Any,
         default: Any,
         launch: Callable[..., None] = cuda_build.launch,
+        limits: Callable[[torch.device], Mapping[str, int]] = cuda_build.limits,
     ) -> None:
-        self._order, self._launch = tuple(order), launch
+        self._order, self._launch, self._limits = tuple(order), launch, limits
         self._arrays: dict[str, str] = {}
         for kernel in kernels:
             self._arrays |= kernel.scratch
-        structs = header(kernels, default, [*tensors, ("Inputs", Inputs, {})])
+        self._sizes = {name: size for kernel in kernels for name, size in kernel.sizes(cfg).items()}
+        self._per_sensor = {stage for kernel in kernels for stage in kernel.per_sensor}
+        structs = header(
+            kernels, default, [*tensors, ("Inputs", Inputs, {})], (*SIZES, *cuda_build.LIMITS, *self._sizes)
+        )
         whole = (("generated.h", f"{structs}\n{scratch_struct('Scratch', self._arrays)}"),)
         self._launches: dict[str, list[tuple[cuda_build.Source, Launch]]] = {}
         for kernel in kernels:
@@ -61,36 +67,49 @@ class CudaUpdate:
         self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
     ) -> dict[str, Tensor]:
         """Run stages, by name, or all, on a state's tensors (B, ...), in place; return what they passed on, by name."""
-        sizes = sizes_of(state, inputs)
+        sizes = _all_sizes(sizes_of(state, inputs), {**self._limits(state[0].device), **self._sizes})
         scratch = self._allocate(sizes, state[0].device)
         update = self._update(sizes, state, inputs, list(scratch.values()))
         for stage in self._order if stages is None else stages:
-            for source, one in self._launches[stage]:
-                self._launch(source, one.kernel, one.blocks(sizes), one.threads, one.memory(sizes), update)
+            for update.sensor in range(sizes.S if stage in self._per_sensor else 1):
+                for source, one in self._launches[stage]:
+                    self._launch(source, one.kernel, one.blocks(sizes), one.threads, one.memory(sizes), update)
         return scratch
 
-    def _allocate(self, sizes: Sizes, device: torch.device) -> dict[str, Tensor]:
+    def _allocate(self, sizes: Any, device: torch.device) -> dict[str, Tensor]:
         parts = {name: text.split() for name, text in self._arrays.items()}
         return {
             name: torch.empty([_size(s, sizes) for s in shape], dtype=_DTYPES[kind], device=device)
             for name, (kind, *shape) in parts.items()
         }
 
-    def _update(self, sizes: Sizes, *tensors: Sequence[Tensor | None]) -> ctypes.Structure:
+    def _update(self, sizes: ctypes.Structure, *tensors: Sequence[Tensor | None]) -> ctypes.Structure:
         """Return `Update` of kernels/cuda/update.h."""
         pointers = [addresses(values) for values in tensors]
-        update: ctypes.Structure = _structure(*map(len, pointers), type(self._settings))(
+        update: ctypes.Structure = _structure(type(sizes), *map(len, pointers), type(self._settings))(
             sizes, *pointers, self._settings
         )
         return update
 
 
-def _size(name: str, sizes: Sizes) -> int:
+def _size(name: str, sizes: Any) -> int:
     return int(name) if name.isdigit() else int(getattr(sizes, name))
 
 
+def _all_sizes(sizes: Sizes, own: Mapping[str, int]) -> ctypes.Structure:
+    """Return the sizes of the inputs and those of the stages, by name."""
+    all_sizes: ctypes.Structure = _sizes_type(tuple(own))(*(getattr(sizes, name) for name in SIZES), *own.values())
+    return all_sizes
+
+
 @functools.cache
-def _structure(state: int, inputs: int, scratch: int, settings: type) -> Any:
+def _sizes_type(own: tuple[str, ...]) -> Any:
+    return type("Sizes", (ctypes.Structure,), {"_fields_": [(name, ctypes.c_int64) for name in (*SIZES, *own)]})
+
+
+@functools.cache
+def _structure(sizes: type, state: int, inputs: int, scratch: int, settings: type) -> Any:
     lists = {"state": state, "inputs": inputs, "scratch": scratch}
-    fields = [("sizes", Sizes), *((name, ctypes.c_void_p * size) for name, size in lists.items())]
-    return type("Update", (ctypes.Structure,), {"_fields_": [*fields, ("settings", settings)]})
+    fields = [("sizes", sizes), *((name, ctypes.c_void_p * size) for name, size in lists.items())]
+    fields += [("settings", settings), ("sensor", ctypes.c_int64)]
+    return type("Update", (ctypes.Structure,), {"_fields_": fields})

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchelev.kernels.structs import Settings, settings_struct, sizes_struct, tensor_struct
+from torchelev.kernels.structs import SIZES, Settings, settings_struct, sizes_struct, tensor_struct
 
 PACKAGE = Path(__file__).parents[1]  # includes begin here, such as "stages/age/equation.h"
 
@@ -17,7 +17,7 @@ class Launch:
     """A kernel of a stage's cuda.cu, which takes an `Update` of kernels/cuda/update.h."""
 
     kernel: str  #: name of the function
-    blocks: Callable[[Any], int]  #: returns the number of blocks, by the sizes B, H, W, S, N, K, M
+    blocks: Callable[[Any], int]  #: returns the number of blocks, by the sizes B, H, W, S, N, K, M and the stages' own
     threads: int = 256  #: of a block
     memory: Callable[[Any], int] = lambda sizes: 0  #: [bytes] that a block's threads share, by the sizes
 
@@ -33,6 +33,10 @@ class Kernel:
     cuda: Mapping[str, Sequence[Launch]] = field(default_factory=dict)
     #: arrays that the launches share, with those of other stages: name to C type and sizes, as "float B M"
     scratch: Mapping[str, str] = field(default_factory=dict)
+    #: returns sizes that launches and scratch take besides those of the inputs, by name, of an ElevationMapConfig
+    sizes: Callable[[Any], Mapping[str, int]] = lambda cfg: {}
+    #: stages whose launches run for each sensor, one after the other: `u.sensor`
+    per_sensor: tuple[str, ...] = ()
 
     @property
     def cpu_source(self) -> str:
@@ -50,12 +54,17 @@ class Kernel:
         return f"{self.name.title().replace('_', '')}Settings"
 
 
-def header(kernels: Sequence[Kernel], cfg: Any, tensors: Sequence[tuple[str, Any, dict[str, str]]]) -> str:
+def header(
+    kernels: Sequence[Kernel],
+    cfg: Any,
+    tensors: Sequence[tuple[str, Any, dict[str, str]]],
+    sizes: Iterable[str] = SIZES,
+) -> str:
     """Return the C header of all structs: sizes, tensors (name, NamedTuple, nested structs), settings of all kernels.
 
     The settings' types are those of any config.
     """
-    structs = [sizes_struct(), *(tensor_struct(*arguments) for arguments in tensors)]
+    structs = [sizes_struct(sizes), *(tensor_struct(*arguments) for arguments in tensors)]
     structs += [settings_struct(kernel.struct, kernel.settings(cfg)) for kernel in kernels]
     whole = "\n".join(f"    {kernel.struct} {kernel.name};" for kernel in kernels)
     return "\n".join(["#pragma once\n#include <cstdint>\n", *structs, f"struct Settings {{\n{whole}\n}};\n"])

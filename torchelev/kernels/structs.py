@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 Number = bool | int | float
@@ -62,9 +62,9 @@ def _stride(member: Member) -> str:
     return " * ".join(sizes) or "1"
 
 
-def sizes_struct() -> str:
-    """Return the C struct of the sizes that shapes are made of."""
-    return f"struct Sizes {{\n    int64_t {', '.join(SIZES)};\n}};\n"
+def sizes_struct(sizes: Iterable[str] = SIZES) -> str:
+    """Return the C struct of the sizes that shapes are made of, by name."""
+    return f"struct Sizes {{\n    int64_t {', '.join(sizes)};\n}};\n"
 
 
 class Double(float):

@@ -53,7 +53,7 @@ class Launcher:
         self(kernel, rows * -(-number // BLOCK), BLOCK, 0, *arguments)
 
     def launch_blocks(self, kernel: str, blocks: int, memory: int, *arguments) -> None:
-        """Do what `torchelev.native.kernels.launch_blocks` does."""
+        """Run a kernel in so many large blocks, which share memory [bytes]."""
         self(kernel, blocks, LARGE_BLOCK, memory, *arguments)
 
     def _check_sizes(self, kernel: str, values: Sequence) -> None:

@@ -13,6 +13,7 @@ struct Update {
     Inputs inputs;      // (B, ...) each
     Scratch scratch;    // (B, ...) each: the measurement, and what stages pass on
     Settings settings;
+    int64_t sensor;     // of a stage whose launches run for each sensor
 
     int64_t cells() const { return sizes.H * sizes.W; }
 };

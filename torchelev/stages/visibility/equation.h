@@ -2,48 +2,9 @@
 #pragma once
 
 #include "kernels/scalar.h"
+#include "stages/visibility/polar_table.h"
 
 namespace visibility {
-
-// What comparisons of V return: bool, or flags of a vector.
-template <class V> using Flag = decltype(V{} < V{});
-
-// `mirrored`
-template <class V> INLINE V mirrored(V angle, float full, V side) {
-    return absolute(angle + pick(is_negative(side), all<V>(-full), all<V>(0)));
-}
-
-// `azimuth_fraction`, in turns
-template <class V> INLINE V azimuth_fraction(V x, V y) {
-    const V ax = absolute(x), ay = absolute(y);
-    const V t = smaller(ax, ay) / larger(larger(ax, ay), all<V>(1e-30f));
-    const V eighth = t * (0.125f + 0.0434f * (1 - t));
-    return mirrored(mirrored(mirrored(eighth, 0.25f, ax - ay), 0.5f, x), 1.0f, y);
-}
-
-// Horizontal distance [m].
-template <class V> INLINE V horizontal(V x, V y) { return root(larger(x * x + y * y, all<V>(1e-12f))); }
-
-// Of how many azimuth bins an entry at range k is the minimum: `PolarGrid.covered`. The first `levels` alone may count.
-template <class V> INLINE V entry_of(V k, int levels, const VisibilitySettings& s) {
-    V entry = all<V>(1);
-    for (int w = 0; w < levels; w++) entry += pick(k < float(s.widen[w]), all<V>(float(int64_t(1) << w)), all<V>(0));
-    return entry;
-}
-
-// The azimuth bins that a cell covers: `first` + 0 to `further` + entry - 1, around the table.
-template <class V> struct Window {
-    V first, further;
-};
-
-// `lowest_slope`, of a cell at range k, where an entry is the minimum of so many azimuth bins; `azimuth` counts bins.
-template <class V> INLINE Window<V> window_of(V k, V azimuth, V entry, const VisibilitySettings& s) {
-    const V half = 0.5f * (s.bins * (1 / larger(k, all<V>(0.5f))));
-    const float azimuths = float(s.azimuths);
-    const V a = floor_of(azimuth - half);
-    const V further = larger(floor_of(azimuth + half) - a + 1 - entry, all<V>(0));
-    return {smaller(pick(a < 0, a + azimuths, a), all<V>(azimuths - 1)), further};
-}
 
 // A ray by the place of its hit as seen from the sensor [m]: `sensor_rays`.
 template <class V> struct Ray {
@@ -64,6 +25,18 @@ template <class V> INLINE RayBins<V> bins_of(const Ray<V>& ray, V noise, const V
     const V last = smaller(floor_of((ray.r - noise) / s.resolution), all<V>(float(s.ranges + 1))) - 2;
     const float azimuths = float(s.azimuths);
     return {last, smaller(floor_of(ray.azimuth * azimuths), all<V>(azimuths - 1))};
+}
+
+// The angle of an azimuth of so many [rad]: `directions`.
+INLINE float direction(int azimuth, int number) {
+    return (float(azimuth) + 0.5f) * float(2 * 3.14159265358979323846 / number);
+}
+
+// The last bin of the horizon that limits a ray, negative if none, and its azimuth; bins are two cells long: `horizon`.
+template <class V> INLINE RayBins<V> horizon_bins_of(const Ray<V>& ray, const VisibilitySettings& s) {
+    const float azimuths = float(s.azimuths / 2);
+    const V k = floor_of(ray.r / (2 * s.resolution)) - 1, a = floor_of(ray.azimuth * azimuths);
+    return {clamp(k, -1, float(s.horizon_ranges - 1)), clamp(a, 0, azimuths - 1)};
 }
 
 // How far below an elevation a ray must pass to contradict it [m]: `height_margin`.
@@ -146,7 +119,8 @@ INLINE CredibleEnd<V> has_credible_end(const Ray<V>& ray, const RayEnds<V>& end,
     const Flag<V> over = height >= floor;
     const Flag<V> low = end.leaves & (height < floor) & (deepest >= near - s.clearance);
     const V raised = larger(ray.slope, (near + s.clearance - z) / larger(end.reach, all<V>(1e-6f)));
-    return {(end.inside & (over | low)) | overhang, pick(low & !overhang, raised, ray.slope)};
+    const Flag<V> well = (end.inside & (over | low)) | overhang;
+    return {well, pick(low & !overhang, raised, ray.slope)};
 }
 
 // How far below the sensor a cell's lowest ground lies [m], NO_FALL where it was not hit recently: `limits_by_tensors`.

@@ -57,8 +57,8 @@ class Horizon {
     };
 
     Bins bins(const Ray<Lanes>& ray) const {
-        const Lanes k = floor_of(ray.r / step) - 1, a = floor_of(ray.azimuth * float(azimuths));
-        return {integers(clamp(k, -1, float(s.horizon_ranges - 1))), integers(clamp(a, 0, float(azimuths - 1)))};
+        const RayBins<Lanes> at = horizon_bins_of(ray, s);
+        return {integers(at.range), integers(at.azimuth)};
     }
 
     // Compute the azimuths' directions, once for all maps.
@@ -68,7 +68,7 @@ class Horizon {
         cosines = x, sines = y;
         if (memory.azimuths == azimuths) return;
         for (int a = 0; a < blocks * LANES; a++) {
-            const float angle = (float(a) + 0.5f) * float(2 * 3.14159265358979323846 / azimuths);
+            const float angle = direction(a, azimuths);
             x[a] = std::cos(angle), y[a] = std::sin(angle);
         }
         memory.azimuths = azimuths;

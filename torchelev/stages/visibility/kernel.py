@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, once, per_map
 from torchelev.kernels.structs import Settings
 from torchelev.ops.masks import NOWHERE
 from torchelev.stages.visibility.accepted_rays import CLEARANCE, NEAR
@@ -15,8 +15,17 @@ from torchelev.stages.visibility.polar_table import PolarGrid
 
 MAX_LEVELS = 16  # that a table may be widened by
 
+CELLS_AT_A_TIME = 16  # that a GPU's thread counts
+
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torchelev.config import ElevationMapConfig
+
+
+def horizon_ranges(polar: PolarGrid) -> int:
+    """Return the number of bins along a ray of the horizon's table."""
+    return 8 * (polar.ranges // 16 + 1)
 
 
 def settings(cfg: ElevationMapConfig) -> Settings:
@@ -36,7 +45,7 @@ def settings(cfg: ElevationMapConfig) -> Settings:
         bins=float(polar.bins),
         levels=len(polar.widen),
         widen=(*polar.widen, *[0] * (MAX_LEVELS - len(polar.widen))),
-        horizon_ranges=8 * (polar.ranges // 16 + 1),
+        horizon_ranges=horizon_ranges(polar),
         near_cells=max(1, int(NEAR / size)),
         clearance=CLEARANCE,
         no_ray=NO_RAY,
@@ -45,4 +54,65 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     )
 
 
-KERNEL = Kernel(name="visibility", folder="stages/visibility", settings=settings)
+def sizes(cfg: ElevationMapConfig) -> dict[str, int]:
+    """Return the sizes of the tables by range and azimuth, and of the borders; zeros without rays."""
+    rays, grid = cfg.raycast, cfg.grid
+    polar = PolarGrid(0, 0, 0.0, ()) if rays is None else PolarGrid.of(grid, rays)
+    return dict(
+        has_rays=int(rays is not None),
+        ranges=polar.ranges,
+        azimuths=polar.azimuths,
+        horizon_ranges=horizon_ranges(polar),
+        horizon_azimuths=polar.azimuths // 2,
+        border=max(grid.height, grid.width),
+    )
+
+
+def table_memory(sizes: Any, settings: Any = None) -> int:
+    """Return the memory [bytes] of a map's table."""
+    return int(4 * sizes.ranges * sizes.azimuths)
+
+
+def in_blocks(sizes: Any) -> bool:
+    """Return whether a block for each map, with a table in its own memory, gives the GPU enough work."""
+    return table_memory(sizes) <= sizes.block_memory and 2 * sizes.B >= sizes.processors
+
+
+def at_large(number: Callable[[Any], int]) -> Callable[[Any], int]:
+    """Return what returns blocks of 256 threads, one for each of so many in each map; none where blocks do it all."""
+    return lambda sizes: 0 if in_blocks(sizes) else per(number)(sizes)
+
+
+def per(number: Callable[[Any], int]) -> Callable[[Any], int]:
+    """Return what returns blocks of 256 threads, one for each of so many in each map, by the sizes."""
+    return lambda sizes: int(sizes.B * sizes.has_rays * -(-number(sizes) // 256))
+
+
+KERNEL = Kernel(
+    name="visibility",
+    folder="stages/visibility",
+    settings=settings,
+    cuda={
+        "clear_seen_through": (
+            Launch("find_horizon", per(lambda sizes: sizes.horizon_azimuths)),
+            Launch("find_borders", lambda sizes: 4 * per_map(sizes) * sizes.has_rays),
+            Launch("apply_rays", lambda sizes: per_map(sizes) * sizes.has_rays * in_blocks(sizes), 512, table_memory),
+            Launch("clear_table", at_large(lambda sizes: sizes.ranges * sizes.azimuths)),
+            Launch("put_rays", at_large(lambda sizes: sizes.N)),
+            Launch("scan_table", at_large(lambda sizes: sizes.azimuths)),
+            Launch("clear_and_bound", at_large(lambda sizes: sizes.H * sizes.W)),
+        ),
+        "count_bounded": (
+            Launch("start_count", once),
+            Launch("count_bounded", lambda sizes: sizes.B * -(-sizes.H * sizes.W // (256 * CELLS_AT_A_TIME))),
+        ),
+    },
+    per_sensor=("clear_seen_through",),
+    sizes=sizes,
+    scratch={
+        "steepest": "float B horizon_ranges horizon_azimuths",
+        "border_minima": "float B 4 border",
+        "borders": "float B 4 border",
+        "slopes": "int32_t B ranges azimuths",  # in the order of floats
+    },
+)

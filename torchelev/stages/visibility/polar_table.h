@@ -1,0 +1,48 @@
+// Places around a sensor by range and azimuth: the functions of polar_table.py, with the same names; see equation.h.
+#pragma once
+
+#include "kernels/scalar.h"
+
+namespace visibility {
+
+// What comparisons of V return: bool, or flags of a vector.
+template <class V> using Flag = decltype(V{} < V{});
+
+// `mirrored`
+template <class V> INLINE V mirrored(V angle, float full, V side) {
+    return absolute(angle + pick(is_negative(side), all<V>(-full), all<V>(0)));
+}
+
+// `azimuth_fraction`, in turns
+template <class V> INLINE V azimuth_fraction(V x, V y) {
+    const V ax = absolute(x), ay = absolute(y);
+    const V t = smaller(ax, ay) / larger(larger(ax, ay), all<V>(1e-30f));
+    const V eighth = t * (0.125f + 0.0434f * (1 - t));
+    return mirrored(mirrored(mirrored(eighth, 0.25f, ax - ay), 0.5f, x), 1.0f, y);
+}
+
+// Horizontal distance [m].
+template <class V> INLINE V horizontal(V x, V y) { return root(larger(x * x + y * y, all<V>(1e-12f))); }
+
+// Of how many azimuth bins an entry at range k is the minimum: `PolarGrid.covered`. The first `levels` alone may count.
+template <class V> INLINE V entry_of(V k, int levels, const VisibilitySettings& s) {
+    V entry = all<V>(1);
+    for (int w = 0; w < levels; w++) entry += pick(k < float(s.widen[w]), all<V>(float(int64_t(1) << w)), all<V>(0));
+    return entry;
+}
+
+// The azimuth bins that a cell covers: `first` + 0 to `further` + entry - 1, around the table.
+template <class V> struct Window {
+    V first, further;
+};
+
+// `lowest_slope`, of a cell at range k, where an entry is the minimum of so many azimuth bins; `azimuth` counts bins.
+template <class V> INLINE Window<V> window_of(V k, V azimuth, V entry, const VisibilitySettings& s) {
+    const V half = 0.5f * (s.bins * (1 / larger(k, all<V>(0.5f))));
+    const float azimuths = float(s.azimuths);
+    const V a = floor_of(azimuth - half);
+    const V further = larger(floor_of(azimuth + half) - a + 1 - entry, all<V>(0));
+    return {smaller(pick(a < 0, a + azimuths, a), all<V>(azimuths - 1)), further};
+}
+
+}  // namespace visibility
