@@ -66,7 +66,8 @@ class CudaUpdate:
         update = self._update(sizes, state, inputs, list(scratch.values()))
         for stage in self._order if stages is None else stages:
             for source, one in self._launches[stage]:
-                self._launch(source, one.kernel, one.blocks(sizes), one.threads, one.memory(sizes), update)
+                memory = one.memory(sizes, self._settings)
+                self._launch(source, one.kernel, one.blocks(sizes), one.threads, memory, update)
         return scratch
 
     def _allocate(self, sizes: Sizes, device: torch.device) -> dict[str, Tensor]:
