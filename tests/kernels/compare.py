@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.kernels.emulation.launcher import emulated
+from tests.kernels.emulation.launcher import emulated, needs_emulation
 from torchelev import ElevationMapConfig, pipeline
 from torchelev.inputs.update_inputs import check_inputs
 from torchelev.kernels.cpu_update import as_inputs, compiled_stages
@@ -81,6 +81,9 @@ def by_cuda(emap, state, inputs, *names, processors=4):
     update = CudaUpdate(*kernels, lambda device: limits)
     update.run((*after[:-1], *after.statistics), as_inputs(values), ("measure", "locate", *names))
     return after
+
+
+BACKENDS = [pytest.param(by_cpu, id="CPU"), pytest.param(by_cuda, id="CUDA", marks=needs_emulation)]
 
 
 def tensors_of(state):

@@ -12,19 +12,16 @@ import torchelev as te
 from tests.answers import config, scans
 from tests.helpers import random_clouds, random_poses, random_state, small_map
 from tests.kernels.compare import (
+    BACKENDS,
     NAMES,
     assert_states_close,
-    by_cpu,
-    by_cuda,
     by_tensors,
     clone,
     inputs_of,
     require_cpu_backend,
 )
-from tests.kernels.emulation.launcher import needs_emulation
 from torchelev import pipeline
 
-BACKENDS = [pytest.param(by_cpu, id="CPU"), pytest.param(by_cuda, id="CUDA", marks=needs_emulation)]
 CONFIGS = {
     "default": {},
     "without stages": dict(drift=None, raycast=None, overlap=None, traversability=None),

@@ -73,7 +73,8 @@ class CudaUpdate:
         for stage in self._order if stages is None else stages:
             for update.sensor in range(sizes.S if stage in self._per_sensor else 1):
                 for source, one in self._launches[stage]:
-                    self._launch(source, one.kernel, one.blocks(sizes), one.threads, one.memory(sizes), update)
+                    memory = one.memory(sizes, self._settings)
+                    self._launch(source, one.kernel, one.blocks(sizes), one.threads, memory, update)
         return scratch
 
     def _allocate(self, sizes: Any, device: torch.device) -> dict[str, Tensor]:

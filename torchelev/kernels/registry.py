@@ -19,7 +19,8 @@ class Launch:
     kernel: str  #: name of the function
     blocks: Callable[[Any], int]  #: returns the number of blocks, by the sizes B, H, W, S, N, K, M and the stages' own
     threads: int = 256  #: of a block
-    memory: Callable[[Any], int] = lambda sizes: 0  #: [bytes] that a block's threads share, by the sizes
+    #: returns the memory [bytes] that a block's threads share, by the sizes and the settings of all kernels
+    memory: Callable[[Any, Any], int] = lambda sizes, settings: 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +91,11 @@ def per_cell(sizes: Any) -> int:
     return int(sizes.B * -(-(sizes.H * sizes.W) // 256))
 
 
-def block_sums(sizes: Any) -> int:
+def per_row(sizes: Any) -> int:
+    """Return blocks of 256 threads, a warp for each row of cells; a map's rows begin with a block."""
+    return int(sizes.B * -(-(32 * sizes.H) // 256))
+
+
+def block_sums(sizes: Any, settings: Any) -> int:
     """Return the memory [bytes] that sums over a block's threads take: a number of eight bytes for each warp."""
     return 8 * 32

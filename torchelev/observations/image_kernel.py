@@ -25,7 +25,7 @@ LIBRARY: tuple[str, dict[str, str]] = ("observations/kernel/image.cpp", {})
 class Channels(NamedTuple):
     """The channels that one layer becomes."""
 
-    layer: Layer
+    layer: Layer  #: values and where they are known
     second: Layer | None  #: the layer that counts where the first is unknown
     channel: int  #: of its values; -1: none
     validity_channel: int  #: of where it is known; -1: none

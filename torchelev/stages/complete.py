@@ -60,7 +60,7 @@ def completed_layers(state: MapState, grid: GridConfig, weights: Weights) -> dic
 
 
 def _knows_any(state: MapState) -> Bool[Tensor, "B"]:
-    """Tell which environments know an elevation that is no prediction."""
+    """Return which environments know an elevation that is no prediction."""
     return (state.validity & (state.support >= 0)).any(2).any(1)
 
 

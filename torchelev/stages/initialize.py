@@ -107,7 +107,7 @@ def _plane(feet: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _inside_hull(xy: Tensor, corners: Tensor, margin: float, directions: int = 64) -> Bool[Tensor, "B C"]:
-    """Tell which points no direction separates from the corners' convex hull."""
+    """Return which points no direction separates from the corners' convex hull."""
     angle = torch.arange(directions, device=xy.device, dtype=xy.dtype) * (2 * math.pi / directions)
     direction = torch.stack([angle.cos(), angle.sin()])
     extent = (corners @ direction).amax(1)

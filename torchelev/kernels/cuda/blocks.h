@@ -29,6 +29,12 @@ inline int32_t take_places(int32_t* next, int32_t number) {
     return __shfl_sync(0xffffffff, first, last) + sum - number;
 }
 
+// The values of a warp's threads, all of which must call this, put together.
+template <class Value, class Combine> inline Value of_warp(Value value, const Combine& combine) {
+    for (int step = warpSize / 2; step > 0; step /= 2) value = combine(value, __shfl_xor_sync(0xffffffff, value, step));
+    return value;
+}
+
 // Memory that the threads of a block share: as much as the launch asks for.
 inline int32_t* block_memory() {
     extern __shared__ int32_t memory[];

@@ -29,7 +29,7 @@ class EdgeConfig:
         require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
 
     def has_step(self, number: Tensor, far: Tensor) -> Tensor:
-        """Tell which cells hold a step, by the number of their points and of those far from the estimate."""
+        """Return which cells hold a step, by the number of their points and of those far from the estimate."""
         return (number >= self.min_points) & (far >= self.min_share * number)
 
 

@@ -75,7 +75,7 @@ class ContestedCells(SelectedCells):
         return values.index_select(-1, self.owner)
 
     def any_true(self, mask: Tensor) -> bool:
-        """Tell whether any is true; assume so where the host would have to wait."""
+        """Return whether any is true; assume so where the host would have to wait."""
         return not can_select(mask) or bool(mask.any())
 
 

@@ -102,7 +102,7 @@ def values_around(
 
 
 def lie_behind(x: Tensor, y: Tensor, di: Tensor, dj: Tensor) -> Tensor:
-    """Tell which neighbours (di, dj) of a cell lie behind it, (K, 8), within 50 degrees of where its rays (K,) go.
+    """Return which neighbours (di, dj) of a cell lie behind it, (K, 8), within 50 degrees of where its rays (K,) go.
 
     Beside it along a wall lie cells that show the wall's face too, and the wall would end as every other cell's.
     """

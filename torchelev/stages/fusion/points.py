@@ -97,7 +97,7 @@ def gather_points(hits: HitPoints, grid: GridConfig, cfg: FusionConfig) -> ScanP
 
 
 def passed_center(from_center: Tensor, ray: Tensor) -> Tensor:
-    """Tell which rays passed over the middle of the cell before they hit: within 45 degrees of straight behind it.
+    """Return which rays passed over the middle of the cell before they hit: within 45 degrees of straight behind it.
 
     A wall that the ray meets at an angle also has points farther along the ray; those passed the centre by.
     """
@@ -124,5 +124,5 @@ def gate_variance(variance: Tensor, cfg: FusionConfig) -> Tensor:
 
 
 def agrees(scan: ScanPoints, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
-    """Tell which points lie within the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
+    """Return which points lie within the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
     return scan.used & ((scan.z - height).square() <= cfg.gate**2 * (scan.spread + variance))

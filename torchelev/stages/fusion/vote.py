@@ -37,7 +37,7 @@ def decide_by_vote(
 
 
 def gate_cells(prior: Prior, measured: CellMeasurement, cfg: FusionConfig, relief: float) -> Bool[Tensor, "B C"]:
-    """Tell where the scan's height agrees with the elevation: (z_s - h)^2 <= gate^2 (sigma_m^2 + R + relief^2)."""
+    """Return where the scan's height agrees with the elevation: (z_s - h)^2 <= gate^2 (sigma_m^2 + R + relief^2)."""
     innovation = measured.height - prior.elevation
     variance = gate_variance(prior.variance, cfg) + measured.variance + relief**2
     return prior.known & (measured.kept > 0) & (innovation.square() <= cfg.gate**2 * variance)

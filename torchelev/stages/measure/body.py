@@ -23,7 +23,7 @@ def rotate(rotation: Float[Tensor, "... 3 3"], x: Tensor, y: Tensor, z: Tensor) 
 
 
 def inside_body(points: Float[Tensor, "B M 3"], T_map_base: Tensor, base: Tensor, body: BodyConfig) -> Tensor:
-    """Tell which points lie in the robot's body box, which turns with the base."""
+    """Return which points lie in the robot's body box, which turns with the base."""
     to_base = T_map_base[:, :3, :3].to(points.dtype).transpose(1, 2)
     in_base = rotate(to_base, *(points - base[:, None]).unbind(-1))
     inside = torch.ones_like(in_base[0], dtype=torch.bool)
@@ -42,7 +42,7 @@ def on_robot(
     T_base_links: Float[Tensor, "B K 4 4"],
     body: RobotBody,
 ) -> Bool[Tensor, "B S N"]:
-    """Tell which points of the sensors' frames lie on the robot's links, see `RobotBody`.
+    """Return which points of the sensors' frames lie on the robot's links, see `RobotBody`.
 
     The links are posed in the base frame, so that an error of the base's pose, which the sensors share, cancels.
     """

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def above_ramp(relative: Float[Tensor, "B M 3"], ramp: ExclusionConfig) -> Bool[Tensor, "B M"]:
-    """Tell which points lie in the exclusion area (paper, Sec. II-C and Fig. 3).
+    """Return which points lie in the exclusion area (paper, Sec. II-C and Fig. 3).
 
     z - z_s > min(max(r - b, 0) * tan(theta_a) + c, d), with r the horizontal distance from the sensor.
     `relative` is the point less the sensor's position, in map axes [m].
@@ -46,7 +46,7 @@ def relative_to(position: Float[Tensor, "B ... 3"], anchor: Tensor, resolution: 
 def sound_poses(
     T_map_sensor: Tensor, T_map_base: Tensor | None, T_base_links: Tensor | None
 ) -> tuple[Bool[Tensor, "B"], Tensor, Tensor | None, Tensor | None]:
-    """Tell which environments' poses are finite and within FARTHEST; return all, with zeros in place of unsound ones.
+    """Return which environments' poses are finite and within FARTHEST; return all, with zeros in place of unsound ones.
 
     Where the host may not read poses, it cannot refuse them: a robot's NaN would become an index out of range.
     """
@@ -62,12 +62,12 @@ def sound_poses(
 
 
 def is_near(pose: Float[Tensor, "B ... 4 4"]) -> Bool[Tensor, "B"]:
-    """Tell which environments' poses may become cell numbers; NaN may not."""
+    """Return which environments' poses may become cell numbers; NaN may not."""
     return (pose.abs() <= FARTHEST).flatten(1).all(1)
 
 
 def has_inverse(variance: Tensor) -> Tensor:
-    """Tell which variances are positive and finite, and their inverses finite too."""
+    """Return which variances are positive and finite, and their inverses finite too."""
     return torch.isfinite(variance) & (variance >= torch.finfo(variance.dtype).tiny)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from torchelev.kernels.registry import Kernel
+from torchelev.kernels.registry import Kernel, Launch, block_sums, per_map, per_row
 from torchelev.kernels.structs import Settings
 from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.stages.overlap.stage import STANCE, near_part
@@ -33,4 +33,16 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     )
 
 
-KERNEL = Kernel(name="overlap", folder="stages/overlap", settings=settings)
+KERNEL = Kernel(
+    name="overlap",
+    folder="stages/overlap",
+    settings=settings,
+    cuda={
+        "clear_other_floors": (
+            Launch("sum_rows_below", per_row),
+            Launch("find_floor", per_map, memory=block_sums),
+            Launch("clear_other_floors", per_row),
+        )
+    },
+    scratch={"near_rows": "float B H 7", "floor": "float B 2"},
+)

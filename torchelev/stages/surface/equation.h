@@ -17,7 +17,7 @@ template <class V> struct Plane {
 };
 
 // Whether known cells spread in two directions, by the covariance of their places [cells^2].
-template <class V> INLINE auto spans_plane(V uu, V uv, V vv, float min_spread) {
+template <class V> INLINE decltype(V{} < V{}) spans_plane(V uu, V uv, V vv, float min_spread) {
     const V a = uu - min_spread, b = vv - min_spread;
     return (a >= 0) & (b >= 0) & (a * b >= uv * uv);
 }

@@ -41,7 +41,7 @@ def accepted_rays(state: MapState, m: Measurement, rays: Rays, grid: GridConfig,
 def has_credible_end(
     state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig
 ) -> tuple[Bool[Tensor, "B N"], Float[Tensor, "B N"]]:
-    """Tell which rays end, or leave the window, in a well supported cell and not below it; and return their slopes.
+    """Return which rays end, or leave the window, in a well supported cell and not below it; and return their slopes.
 
     Of the others two kinds are accepted, as too long a return lies below the ground: those to a point above the
     exclusion ramp, and those that leave the window and end at most CLEARANCE below the lowest ground NEAR by, where
@@ -115,7 +115,7 @@ def border_minima(ground: Tensor, cells: int, grid: GridConfig) -> Float[Tensor,
 
 
 def well_supported(state: MapState, cfg: RaycastConfig, resolution: float) -> Bool[Tensor, "B H W"]:
-    """Tell which known cells are accepted: enough points agree, or on a neighbouring cell of like height."""
+    """Return which known cells are accepted: enough points agree, or on a neighbouring cell of like height."""
     enough = state.validity & (state.support >= cfg.min_support)
     _, above, _, left, right, _, below, _ = neighbours(state.elevation + NOWHERE * ~enough, NOWHERE)
     unlike = functools.reduce(torch.minimum, [(h - state.elevation).abs() for h in (above, left, right, below)])

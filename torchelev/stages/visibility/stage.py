@@ -88,7 +88,7 @@ def lower_upper_bound(state: MapState, ray: RayOverCell) -> MapState:
 
 
 def passes_far_below(state: MapState, depth: Tensor, grid: GridConfig, cfg: RaycastConfig) -> Bool[Tensor, "B H W"]:
-    """Tell where a ray passes so far below a cell that no grazing ray over its plane could, whatever the normal.
+    """Return where a ray passes so far below a cell that no grazing ray over its plane could, whatever the normal.
 
     depth > gate * sqrt(sigma^2 + (resolution / 2)^2) + |gradient| * resolution / 2: the noise, the relief within the
     cell, and what its plane rises from the centre to the border.
