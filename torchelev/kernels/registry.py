@@ -36,7 +36,7 @@ class Kernel:
     scratch: Mapping[str, str] = field(default_factory=dict)
     #: returns sizes that launches and scratch take besides those of the inputs, by name, of an ElevationMapConfig
     sizes: Callable[[Any], Mapping[str, int]] = lambda cfg: {}
-    #: stages whose launches run for each sensor, one after the other: `u.sensor`
+    #: stages whose launches run for each sensor, one after the other: the sensor of `Update`
     per_sensor: tuple[str, ...] = ()
 
     @property

@@ -124,5 +124,5 @@ def gate_variance(variance: Tensor, cfg: FusionConfig) -> Tensor:
 
 
 def agrees(scan: ScanPoints, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
-    """Return which points lie within the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
+    """Return which points lie in the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
     return scan.used & ((scan.z - height).square() <= cfg.gate**2 * (scan.spread + variance))

@@ -1,4 +1,4 @@
-// Visibility clean-up and the upper bound on a GPU: stage.py. Launches for one sensor after the other, `u.sensor`: its
+// Visibility clean-up and the upper bound on a GPU: stage.py. Launches for one sensor after the other, the sensor of `Update`: its
 // rays see what those of earlier ones have cleared.
 
 #include <cmath>
