@@ -1,14 +1,15 @@
 """torchelev: batched, differentiable elevation mapping in PyTorch, for robots that learn."""
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from torchelev.completion.config import CompletionConfig
-from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
-from torchelev.filters.chain import FilterConfig
 from torchelev.grid import GridConfig
 from torchelev.inputs.clouds import depth_to_points, voxel_filter
-from torchelev.observations.height_scan import HeightScan
-from torchelev.observations.map_image import MapImage
 from torchelev.robot import RobotConfig
 from torchelev.robot_body.shapes import Box, Capsule, RobotBody
 from torchelev.stages.age.config import AgingConfig
@@ -20,7 +21,13 @@ from torchelev.stages.surface.config import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.state import MapState, Measurement, Statistics
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
-from torchelev.traversability.net import TraversabilityNet
+
+if TYPE_CHECKING:
+    from torchelev.completion.net import CompletionNet
+    from torchelev.filters.chain import FilterConfig
+    from torchelev.observations.height_scan import HeightScan
+    from torchelev.observations.map_image import MapImage
+    from torchelev.traversability.net import TraversabilityNet
 
 __version__ = "0.1.0"
 __all__ = [
@@ -55,3 +62,26 @@ __all__ = [
     "depth_to_points",
     "voxel_filter",
 ]
+
+# What a map needs only if it is told so, imported when first asked for: half of the time of `import torchelev`.
+_LATER = {
+    "CompletionNet": "torchelev.completion.net",
+    "FilterConfig": "torchelev.filters.chain",
+    "HeightScan": "torchelev.observations.height_scan",
+    "MapImage": "torchelev.observations.map_image",
+    "TraversabilityNet": "torchelev.traversability.net",
+}
+_ROOMS = ("filters", "observations")  # `torchelev.filters.gaussian` works without an import of its own
+
+
+def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        return importlib.import_module(f"torchelev.{name}")
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
+    value = globals()[name] = getattr(importlib.import_module(_LATER[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LATER, *_ROOMS})

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 import typing
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchelev.completion.config import CompletionConfig
 from torchelev.errors import require
-from torchelev.filters.chain import FilterConfig, filters_from_list
 from torchelev.grid import GridConfig
 from torchelev.stages.age.config import AgingConfig
 from torchelev.stages.compensate.config import DriftConfig
@@ -20,6 +20,9 @@ from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.stages.surface.config import SurfaceConfig
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
+
+if TYPE_CHECKING:
+    from torchelev.filters.chain import FilterConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +59,10 @@ class ElevationMapConfig:
     def __post_init__(self) -> None:
         if isinstance(self.filters, list):
             object.__setattr__(self, "filters", tuple(self.filters))
-        chain = isinstance(self.filters, tuple) and all(isinstance(step, FilterConfig) for step in self.filters)
         hint = "give (FilterConfig(layer=..., filter=...), ...)"
-        require(chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), hint, TypeError)
-        for name, annotation in typing.get_type_hints(type(self)).items():
+        is_chain = _is_chain(self.filters)
+        require(is_chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), hint, TypeError)
+        for name, annotation in _setting_types(type(self)).items():  # type: ignore[arg-type]
             if name == "filters":
                 continue
             value, kinds = getattr(self, name), typing.get_args(annotation) or (annotation,)
@@ -93,13 +96,25 @@ class ElevationMapConfig:
         """
         if not isinstance(values, dict) or "filters" not in values:
             return _build(cls, values, "config")
+        from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them
+
         stages = {name: value for name, value in values.items() if name != "filters"}
         return dataclasses.replace(_build(cls, stages, "config"), filters=filters_from_list(values["filters"]))
 
 
+def _is_chain(filters: object) -> bool:
+    """Return whether these are a tuple of filters' configs."""
+    if isinstance(filters, tuple) and not filters:
+        return True
+    from torchelev.filters.chain import FilterConfig  # a map without filters needs none of them
+
+    return isinstance(filters, tuple) and all(isinstance(step, FilterConfig) for step in filters)
+
+
+@functools.cache
 def _setting_types(cls: type) -> dict[str, Any]:
-    """Return the type of each of a config's settings, by name."""
-    hints = typing.get_type_hints(cls)
+    """Return the type of each of a config's settings, by name; that of filters, which are read apart, is not known."""
+    hints = typing.get_type_hints(cls, localns={"FilterConfig": Any})
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 

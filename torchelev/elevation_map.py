@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from torchelev import pipeline
-from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
-from torchelev.diagnosis.causes import diagnose
 from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
 from torchelev.diagnosis.update_times import UpdateTimes, timed
@@ -35,11 +33,13 @@ from torchelev.stages.disagreement.stage import add_disagreement, subtract_disag
 from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement, forget, map_layers
-from torchelev.traversability.net import TraversabilityNet
-from torchelev.traversability.weight_file import Weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
+
+    from torchelev.completion.net import CompletionNet
+    from torchelev.traversability.net import TraversabilityNet
+    from torchelev.traversability.weight_file import Weights
 
 
 class ElevationMap(ReadableMap):
@@ -384,6 +384,8 @@ class ElevationMap(ReadableMap):
         Returns:
             One sentence per finding; none if all is well, or if the inputs do not show it.
         """
+        from torchelev.diagnosis.causes import diagnose  # updates do not need it
+
         return diagnose(self.cfg, self.measured_state, self._history)
 
     def _forget_derived(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -33,7 +33,9 @@ from torchelev.stages.visibility.kernel import KERNEL as VISIBILITY
 from torchelev.stages.visibility.stage import clear_seen_through, count_bounded
 from torchelev.state import CARRIED, MapState, Measurement, Statistics, map_layers, tally
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating
-from torchelev.traversability.weight_file import Weights
+
+if TYPE_CHECKING:
+    from torchelev.traversability.weight_file import Weights
 
 KERNELS = (MEASURE, RECENTER, AGE, COMPENSATE, DISAGREEMENT, FUSION, VISIBILITY, OVERLAP, SURFACE)
 TENSORS: tuple[Any, ...] = (("Statistics", Statistics, {}), ("MapState", MapState, {"statistics": "Statistics"}))

@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
-from torchelev.filters.chain import FilterChain
 from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer
 from torchelev.map_buffers import MapBuffers
@@ -25,11 +23,15 @@ from torchelev.stages.disagreement.stage import without_disagreement
 from torchelev.stages.surface.stage import rate_surface
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
-from torchelev.traversability.net import Rating, TraversabilityNet
-from torchelev.traversability.weight_file import Weights
+from torchelev.traversability.rating import Rating
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
+
+    from torchelev.completion.net import CompletionNet
+    from torchelev.filters.chain import FilterChain
+    from torchelev.traversability.net import TraversabilityNet
+    from torchelev.traversability.weight_file import Weights
 
 
 class ReadableMap(MapBuffers):
@@ -58,8 +60,16 @@ class ReadableMap(MapBuffers):
         for net in (self.head, self.completion_net):
             if net is not None:
                 net.to(device)
-        self.filters = FilterChain(cfg.filters, cfg.grid.resolution, self._own_layers)
+        self.filters = self._make_filters()
         self._derived: dict[str, Layer] = {}  # layers that completion and filters made of the current state
+
+    def _make_filters(self) -> FilterChain | None:
+        """Return the filters that the config asks for."""
+        if not self.cfg.filters:
+            return None
+        from torchelev.filters.chain import FilterChain  # a map without filters needs none of them
+
+        return FilterChain(self.cfg.filters, self.cfg.grid.resolution, self._own_layers)
 
     def _forget_derived(self) -> None:
         self._derived.clear()
@@ -87,7 +97,7 @@ class ReadableMap(MapBuffers):
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of all layers: the map's, those of a configured completion, then those of the configured filters."""
-        return (*self._own_layers, *self.filters.inputs)
+        return (*self._own_layers, *(step.layer for step in self.cfg.filters))
 
     @property
     def _own_layers(self) -> tuple[str, ...]:
@@ -125,7 +135,7 @@ class ReadableMap(MapBuffers):
             values: (B, H, W), arbitrary but finite where unknown.
             known: (B, H, W) bool. Both may share memory with the map: do not write into them.
         """
-        if name not in self.filters:
+        if self.filters is None or name not in self.filters:
             return self._read_own(name, state)
         if state is not None:
             return self.filters.read(name, lambda source: self.read_layer(source, state), {})

@@ -13,6 +13,7 @@ from torchelev.completion.parameters import Weights
 from torchelev.completion.predict import Seen, predict
 from torchelev.completion.refine import read_measured, refine
 from torchelev.completion.surroundings import UNKNOWN, count_steps, look_around
+from torchelev.ops.library import operator
 from torchelev.ops.parallel import map_in_order
 
 if TYPE_CHECKING:
@@ -66,18 +67,19 @@ def _answer_all(weights: Weights, cells: Cells, place: Tensor) -> list[Tensor]:
     return [torch.where(known, old, new) for old, new in answers]
 
 
-@torch.library.custom_op("torchelev::complete_on_cpu", mutates_args=())
+def _empty_layers(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[Tensor, Tensor]:
+    shape = layers[0].shape
+    return layers[0].new_empty(shape), layers[0].new_empty(shape)
+
+
+@operator(
+    "complete_on_cpu(Tensor[] weights, Tensor[] layers, float resolution) -> (Tensor, Tensor)", fake=_empty_layers
+)
 def complete_on_cpu(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[Tensor, Tensor]:
     """Return the same without gradients: in C++ where that can be built, else by tensors."""
     fields, named = Weights(*weights), CompletionInput(*layers)
     fast = completion_kernel.complete(fields, layers, resolution)
     return _answer_each(fields, Cells(named, resolution)) if fast is None else fast
-
-
-@complete_on_cpu.register_fake
-def _(weights: list[Tensor], layers: list[Tensor], resolution: float) -> tuple[Tensor, Tensor]:
-    shape = layers[0].shape
-    return layers[0].new_empty(shape), layers[0].new_empty(shape)
 
 
 @torch.no_grad()

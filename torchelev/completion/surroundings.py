@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.ops.library import operator
+
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
@@ -27,7 +29,11 @@ class Surroundings(NamedTuple):
     has_slope: Float[Tensor, "R 8 n"]  #: 1 where the ground at that reach is known, too, else 0
 
 
-@torch.library.custom_op("torchelev::count_steps", mutates_args=())
+def _empty_steps(known: Tensor) -> Tensor:
+    return known.new_empty(len(DIRECTIONS), *known.shape, dtype=torch.int32)
+
+
+@operator("count_steps(Tensor known) -> Tensor", fake=_empty_steps)
 def count_steps(known: Tensor) -> Tensor:
     """Count the steps (8, B, H, W) int32 from each cell to the next known one in DIRECTIONS; NONE: there is none.
 
@@ -45,11 +51,6 @@ def count_steps(known: Tensor) -> Tensor:
         here, there = _overlap(counted, di, dj)[0], _overlap(within, di, dj)[1]
         torch.clamp(there + 1, max=NONE, out=here)
     return steps
-
-
-@count_steps.register_fake
-def _(known: Tensor) -> Tensor:
-    return known.new_empty(len(DIRECTIONS), *known.shape, dtype=torch.int32)
 
 
 def _overlap(values: Tensor, i: int, j: int) -> tuple[Tensor, Tensor]:

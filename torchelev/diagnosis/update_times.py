@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import os
-import statistics
 import time
 import warnings
 from collections import deque
@@ -53,7 +52,7 @@ class UpdateTimes:
         times.last.append(seconds)
         if len(times.last) < WINDOW:
             return
-        median = statistics.median(times.last)
+        median = sorted(times.last)[WINDOW // 2]
         times.best = min(median, times.best)
         times.num_slow = times.num_slow + 1 if median > _SLOW * times.best else 0
         if times.num_slow >= PATIENCE:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchelev.kernels.cpu_build import call, is_switched_off, load
 from torchelev.kernels.registry import Kernel, header
 from torchelev.kernels.structs import SIZES, c_settings
+from torchelev.ops.library import LIBRARY
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float64
@@ -121,10 +122,9 @@ def run(key: int, state: Sequence[Tensor], inputs: Inputs) -> None:
         _UPDATES[key].run(state, inputs)
 
 
-_OPERATORS = torch.library.Library("torchelev", "FRAGMENT")
-_OPERATORS.define("update_maps(Tensor(a!)[] state, Tensor?[] inputs, int key) -> ()")
-_OPERATORS.impl("update_maps", lambda state, inputs, key: _UPDATES[key].run(state, inputs), "CPU")
-torch.library.register_fake("torchelev::update_maps", lambda state, inputs, key: None, lib=_OPERATORS)
+LIBRARY.define("update_maps(Tensor(a!)[] state, Tensor?[] inputs, int key) -> ()")
+LIBRARY.impl("update_maps", lambda state, inputs, key: _UPDATES[key].run(state, inputs), "CPU")
+torch.library.register_fake("torchelev::update_maps", lambda state, inputs, key: None, lib=LIBRARY)
 
 _LINKS = Inputs._fields.index("T_base_links")
 

@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.completion.complete import Completion, CompletionInput, complete
 from torchelev.completion.config import CompletionConfig
-from torchelev.completion.net import CompletionNet
-from torchelev.completion.parameters import Weights
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer, pose_variance
@@ -19,6 +16,10 @@ from torchelev.state import BLANK, MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
+
+    from torchelev.completion.complete import Completion
+    from torchelev.completion.net import CompletionNet
+    from torchelev.completion.parameters import Weights
 
 COMPLETED = ("completed", "completed_std")  # names of the layers
 WRITTEN_BACK = -1.0  # support of cells that hold a prediction; that of others is not negative
@@ -33,6 +34,8 @@ def make_completion_net(cfg: CompletionConfig | None, given: CompletionNet | Non
         rule, hint = "must be None unless the config asks for completion", "give the config a CompletionConfig"
         require(given is None, "completion_net", rule, "a network", hint)
         return None
+    from torchelev.completion.net import CompletionNet  # a map without completion needs no network
+
     if given is None:
         return CompletionNet.from_pretrained(cfg.weights).requires_grad_(False)
     is_net, hint = isinstance(given, CompletionNet), "give one that CompletionNet.from_pretrained returned"
@@ -42,13 +45,15 @@ def make_completion_net(cfg: CompletionConfig | None, given: CompletionNet | Non
 
 def complete_map(state: MapState, grid: GridConfig, weights: Weights) -> Completion:
     """Predict the ground at every cell, in float32 or float64. The standard deviation lacks that of the poses."""
+    from torchelev.completion.complete import CompletionInput, complete  # as above
+
     state = forget_completed(state)  # or one prediction would make the next one surer
     dtype = torch.promote_types(state.elevation.dtype, torch.float32)
     elevation, variance, upper_bound, time = (
         layer.to(dtype) for layer in (state.elevation, state.variance, state.upper_bound, state.time)
     )
     layers = CompletionInput(elevation, state.validity, variance, upper_bound, state.bounded, time)
-    return complete(Weights(*(weight.to(dtype) for weight in weights)), layers, grid.resolution)
+    return complete(type(weights)(*(weight.to(dtype) for weight in weights)), layers, grid.resolution)
 
 
 def completed_layers(state: MapState, grid: GridConfig, weights: Weights) -> dict[str, Layer]:

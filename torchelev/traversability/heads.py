@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,14 +20,24 @@ from torchelev.ops.windows import shifted, window_maximum
 from torchelev.plane_fit import Ground, fit_plane
 from torchelev.robot import RobotConfig
 from torchelev.state import MapState
-from torchelev.traversability.net import Rating, TraversabilityNet
-from torchelev.traversability.rate import rate
-from torchelev.traversability.weight_file import Weights
+from torchelev.traversability.rating import Rating
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+    from torchelev.traversability.net import TraversabilityNet
+    from torchelev.traversability.weight_file import Weights
+
 __all__ = ["LearnedTraversabilityConfig", "Rating", "RobotConfig", "TraversabilityConfig", "TraversabilityNet"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the network when it is asked for: the analytic head needs none."""
+    if name != "TraversabilityNet":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
+    from torchelev.traversability.net import TraversabilityNet
+
+    return TraversabilityNet
 
 
 STEP_REACH = 0.1  # [m] within which a height difference is a step: a foot's length and the smear of an edge
@@ -142,6 +152,8 @@ def make_head(
         hint = "give the config a LearnedTraversabilityConfig"
         require(given is None, "head", "must be None unless the config asks for a trained one", "a head", hint)
         return None
+    from torchelev.traversability.net import TraversabilityNet  # see `__getattr__`
+
     net = TraversabilityNet.from_pretrained(cfg.weights).requires_grad_(False) if given is None else given
     net.require_trained(cfg.robot, grid.resolution)
     return net
@@ -149,6 +161,8 @@ def make_head(
 
 def learned_rating(state: MapState, grid: GridConfig, cfg: LearnedTraversabilityConfig, weights: Weights) -> Rating:
     """Rate every cell, unknown ones too, by the trained head."""
+    from torchelev.traversability.rate import rate  # as above
+
     layers = (state.elevation, state.validity, state.variance, state.upper_bound, state.bounded)
     logits = rate(weights, *layers, resolution=grid.resolution, robot=cfg.robot)
     return Rating(*(torch.sigmoid(logit).to(state.elevation.dtype) for logit in logits))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchelev.errors import require
 from torchelev.robot import RobotConfig
 from torchelev.traversability.rate import rate
+from torchelev.traversability.rating import Rating
 from torchelev.traversability.weight_file import (
     FORMAT,
     RANGES,
@@ -26,13 +27,6 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 _PRETRAINED = Path(__file__).parent / "weights" / "traversability.pt"
-
-
-class Rating(NamedTuple):
-    """The head's answer for every cell."""
-
-    traversability: Float[Tensor, "B H W"]  #: 0 to 1, fraction of headings at which the robot can stand there
-    confidence: Float[Tensor, "B H W"]  #: 0 to 1, probability that "traversability >= 0.5" is correct
 
 
 class TraversabilityNet(nn.Module):

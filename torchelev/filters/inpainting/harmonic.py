@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.ops.library import LIBRARY, operator
 from torchelev.ops.operators import padded
 
 _DAMPING = 0.8  # of a Jacobi sweep
@@ -106,7 +107,14 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum((1, 2), keepdim=True)
 
 
-@torch.library.custom_op("torchelev::harmonic", mutates_args=())
+def _empty_heights(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
+    return torch.empty_like(right, memory_format=torch.contiguous_format)
+
+
+@operator(
+    "harmonic(Tensor unknown, Tensor right, float tolerance, int iterations) -> Tensor",
+    fake=_empty_heights,
+)
 def solve_laplace(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
     """Solve A u = right (B, H, W) by preconditioned conjugate gradients, to an error of about `tolerance`.
 
@@ -139,11 +147,6 @@ def _quotient(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(is_positive, a / torch.where(is_positive, b, 1.0), 0.0)
 
 
-@solve_laplace.register_fake
-def _(unknown: Tensor, right: Tensor, tolerance: float, iterations: int) -> Tensor:
-    return torch.empty_like(right, memory_format=torch.contiguous_format)
-
-
 def _backward(ctx, grad: Tensor) -> tuple[None, Tensor, None, None]:
     (unknown,) = ctx.saved_tensors
     # A is symmetric. Gradients have no metres for the tolerance: scale the largest of each map to one.
@@ -157,4 +160,4 @@ def _keep(ctx, inputs: tuple, output: Tensor) -> None:
     ctx.tolerance, ctx.iterations = inputs[2:]
 
 
-solve_laplace.register_autograd(_backward, setup_context=_keep)
+torch.library.register_autograd("torchelev::harmonic", _backward, setup_context=_keep, lib=LIBRARY)

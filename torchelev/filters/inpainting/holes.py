@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchelev.ops.library import operator
+
 
 def may_wait(device: torch.device) -> bool:
     """Return whether values can be read without waiting for the device."""
@@ -89,7 +91,11 @@ def _hole_labels(cells: _Cells) -> Tensor:
     return component_labels(torch.cat(starts), torch.cat(ends), len(own))
 
 
-@torch.library.custom_op("torchelev::lowest_of_border", mutates_args=())
+def _empty_indices(known: Tensor) -> Tensor:
+    return torch.empty_like(known, dtype=torch.int64, memory_format=torch.contiguous_format)
+
+
+@operator("lowest_of_border(Tensor values, Tensor known) -> Tensor", fake=lambda values, known: _empty_indices(known))
 def lowest_of_border(values: Tensor, known: Tensor) -> Tensor:
     """Return for each unknown cell (B, H, W) the flat index i * W + j of the lowest cell on its hole's border.
 
@@ -116,15 +122,10 @@ def lowest_of_border(values: Tensor, known: Tensor) -> Tensor:
     return answer.view(B, H + 2, W + 2)[:, 1:-1, 1:-1].contiguous()
 
 
-@lowest_of_border.register_fake
-def _(values: Tensor, known: Tensor) -> Tensor:
-    return torch.empty_like(known, dtype=torch.int64, memory_format=torch.contiguous_format)
-
-
 # Nearest known cells --------------------------------------------------------------------------------------------------
 
 
-@torch.library.custom_op("torchelev::nearest_known", mutates_args=())
+@operator("nearest_known(Tensor known) -> Tensor", fake=_empty_indices)
 def nearest_known(known: Tensor) -> Tensor:
     """Return for each cell (B, H, W) the flat index i * W + j of the nearest known cell; H * W if there is none.
 
@@ -158,8 +159,3 @@ def _nearest_along_rows(known: Tensor) -> Tensor:
     after = ((row - far - H) * known + far + H).flip(1).cummin(1).values.flip(1)
     nearest = torch.where(row - before <= after - row, before, after)
     return torch.stack([(row - nearest).square(), nearest])
-
-
-@nearest_known.register_fake
-def _(known: Tensor) -> Tensor:
-    return torch.empty_like(known, dtype=torch.int64, memory_format=torch.contiguous_format)
