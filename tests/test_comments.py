@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 SKIPPED: tuple[str, ...] = ()
 #: Names of other programs and libraries that the code itself does not use.
 FOREIGN = {
+    "__wrapped__",
     *("CameraSensor", "RayCastSensor"),  # mjlab
     *("LidarPatternCfg", "RayCaster", "RayCasterCamera", "TiledCamera", "quat_w_opengl", "quat_w_world"),  # Isaac Lab
     *("mdp.height_scan", "measured_points_x", "measured_points_y"),  # Isaac Lab, legged_gym

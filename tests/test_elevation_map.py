@@ -102,7 +102,7 @@ def test_update_is_measure_forward_store(with_base):
         state = a(a.state, m)
     assert differences(before, a.state) == []  # forward touches no buffer
     b.update(cloud, T, base, 0.2)
-    assert differences(state, b.state) == []
+    assert_close(state, b.state, 1e-5, skip=["traversability"])
     assert_close(with_gradient, b.state, 1e-5, skip=["traversability"])  # the root of a rounding error, on a few cells
 
 

@@ -70,7 +70,7 @@ class Quadruped(nn.Module):
         perception: What "height_scan" and "feet" of `observe()` contain: "map", the elevation map built from simulated
             sensors; "truth", the true ground with the noise of Miki et al. 2022; "blind", zeros.
         seed: Seed of bodies, starts, commands and all noise. The terrain has its own, `cfg.terrain.seed`.
-        compiled: Run the map's update compiled.
+        compiled: Build what the map's updates run on at once; else the first one does.
 
     Raises:
         ValueError: `perception` is none of the three, or `num_envs` is not positive.

@@ -50,7 +50,7 @@ class TerrainNavVectorEnv(TaskVectorEnv):
         cfg: The settings of the task; None for the defaults.
         perception: "map", "truth" or "blind", see `TerrainNav`.
         device: Where the task is computed.
-        compiled: Run the map's update compiled.
+        compiled: Build what the map's updates run on at once; else the first one does.
         autoreset_mode: NEXT_STEP or SAME_STEP, see `TaskVectorEnv`.
         critic: Add "truth" to the observations.
         task: A task that is already seeded. It replaces `num_envs`, `cfg`, `perception`, `device` and `compiled`.

@@ -58,7 +58,7 @@ class TerrainNav(nn.Module):
         perception: What `observe()["map"]` contains: "map", the elevation map built from simulated depth cameras;
             "truth", the true ground with white noise; "blind", nothing. The shapes are the same.
         seed: Seed of starts, goals and all noise. The course has its own seed, `cfg.course.seed`.
-        compiled: Run the map's update compiled.
+        compiled: Build what the map's updates run on at once; else the first one does.
 
     Raises:
         ValueError: `perception` is none of the three, or `num_envs` is not positive.

@@ -82,6 +82,7 @@ class CpuUpdate:
         functions = self._functions(self._order if stages is None else tuple(stages))
         arguments = addresses(state), addresses(inputs), self._settings, sizes
         references = (ctypes.byref(value) for value in arguments)
+        torch.autograd.graph.increment_version(state)  # a backward pass through what the maps held shall say so
         call(self.library.update_maps, *references, functions, ctypes.c_int64(len(functions)), torch.get_num_threads())
 
     @functools.lru_cache(maxsize=8)  # noqa: B019  # of a few orders, for as long as the config is used

@@ -68,6 +68,7 @@ class CudaUpdate:
     ) -> dict[str, Tensor]:
         """Run stages, by name, or all, on a state's tensors (B, ...), in place; return what they passed on, by name."""
         sizes = _all_sizes(sizes_of(state, inputs), {**self._limits(state[0].device), **self._sizes})
+        torch.autograd.graph.increment_version(state)
         scratch = self._allocate(sizes, state[0].device)
         update = self._update(sizes, state, inputs, list(scratch.values()))
         for stage in self._order if stages is None else stages:
