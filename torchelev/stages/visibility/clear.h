@@ -132,10 +132,10 @@ class Cells {
     // Eq. 3 and 4, of known cells with a ray over them.
     template <class Count> Flags gone(const RayOverCell<Lanes>& ray, int64_t k, Flags known, Count count) const {
         const Lanes depth = load(map.elevation + k, count) - ray.height, variance = load(map.variance + k, count);
-        const Flags may = ray.found & known & passes_below(depth, variance, load(map.time + k, count), s);
+        const Flags may = ray.found & known & passes_below_old(depth, variance, load(map.time + k, count), s);
         if (!any(may)) return may;
         const Lanes gx = load(map.gradient_x + k, count), gy = load(map.gradient_y + k, count);
-        return may & is_steep(ray, depth, variance, gx, gy, s);
+        return may & is_steep_or_far_below(ray, depth, variance, gx, gy, s);
     }
 
     template <class Count>

@@ -148,13 +148,14 @@ INLINE Flag<V> passes_far_below(V depth, V variance, V gx, V gy, const Visibilit
 }
 
 // Eq. 3, and that the cell was not hit for `min_time`; `depth` [m] is how far below the elevation the ray passes.
-template <class V> INLINE Flag<V> passes_below(V depth, V variance, V time, const VisibilitySettings& s) {
+template <class V> INLINE Flag<V> passes_below_old(V depth, V variance, V time, const VisibilitySettings& s) {
     return (depth > root(variance)) & (time > s.min_time);
 }
 
 // Eq. 4, of cells that eq. 3 holds for: `clear_and_bound`.
 template <class V>
-INLINE Flag<V> is_steep(const RayOverCell<V>& ray, V depth, V variance, V gx, V gy, const VisibilitySettings& s) {
+INLINE Flag<V> is_steep_or_far_below(const RayOverCell<V>& ray, V depth, V variance, V gx, V gy,
+                                     const VisibilitySettings& s) {
     return (incidence(ray, gx, gy) > s.min_incidence) | passes_far_below(depth, variance, gx, gy, s);
 }
 

@@ -75,8 +75,8 @@ def refute_challengers(state: MapState, ray: RayOverCell) -> MapState:
     Nothing stands there: outliers stop no other ray. From a cell's centre to its corner a ray falls by 0.71 of `fall`;
     those that end on an obstacle's top, more than a cell behind, pass higher than that.
     """
-    passes_below = ray.found & (ray.height < state.challenger + math.sqrt(0.5) * ray.fall)
-    return state._replace(challenger_support=torch.where(passes_below | ~state.validity, 0, state.challenger_support))
+    refutes = ray.found & (ray.height < state.challenger + math.sqrt(0.5) * ray.fall)
+    return state._replace(challenger_support=torch.where(refutes | ~state.validity, 0, state.challenger_support))
 
 
 def lower_upper_bound(state: MapState, ray: RayOverCell) -> MapState:
