@@ -138,4 +138,4 @@ def test_ctrl_c_closes_the_page(recording, port):
         out, err = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == 0 and "closed" in out and "Traceback" not in err
+    assert process.returncode == 0 and "closed" in out and "Traceback" not in err, err

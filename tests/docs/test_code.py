@@ -12,10 +12,9 @@ PAGES = {
 
 @pytest.mark.slow(10)
 @pytest.mark.parametrize("page", [page for page, blocks in PAGES.items() if blocks])
-def test_its_python_runs(page, tmp_path, monkeypatch, compile_with):
+def test_its_python_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    compile_with("eager")  # the real compiler takes minutes
     run_blocks(DOCS / page, [block for block in PAGES[page] if block.not_run is None])
 
 

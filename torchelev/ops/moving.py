@@ -26,12 +26,13 @@ def move_layers(layers: dict[str, Tensor], shift: Int[Tensor, "B 2"], blank: dic
     masks = [name for name, layer in layers.items() if layer.dtype == torch.bool]
     names = [name for name in layers if name not in masks]
     # All masks move as the bits of one layer.
-    values = [*(layers[name] for name in names), _as_bits([layers[name] for name in masks])]
-    blanks = [*(blank.get(name, 0.0) for name in names), 0.0]
+    values = [*(layers[name] for name in names), *([_as_bits([layers[name] for name in masks])] if masks else [])]
+    blanks = [*(blank.get(name, 0.0) for name in names), *([0.0] if masks else [])]
     # Copying takes an eighth of the time of gathering, but has no gradient, and the host must know the shifts.
     copies = not torch.is_grad_enabled() and shift.shape[0] <= HOST_ENVIRONMENTS and is_readable(shift)
-    *values, bits = moved(values, shift, blanks) if copies else _gathered(values, shift, blanks)
-    return dict(zip((*names, *masks), (*values, *_from_bits(bits, len(masks))), strict=True))
+    values = moved(values, shift, blanks) if copies else _gathered(values, shift, blanks)
+    others = _from_bits(values.pop(), len(masks)) if masks else []
+    return dict(zip((*names, *masks), (*values, *others), strict=True))
 
 
 def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:

@@ -113,7 +113,13 @@ def make_runner(
     "--out", type=click.Path(path_type=Path), default=Path("runs/nav"), show_default=True, help="Output folder."
 )
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
-@click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Build what the map's updates run on ahead.")
+@click.option(
+    "--compile/--no-compile",
+    "compiled",
+    default=True,
+    show_default=True,
+    help="Build what the map's updates run on ahead.",
+)
 @smoke_option(num_envs=8, iterations=2, episodes=4, compiled=False)
 @click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Episodes of the evaluation.")
 @click.pass_obj

@@ -100,7 +100,13 @@ def make_runner(
     "--out", type=click.Path(path_type=Path), default=Path("runs/quadruped"), show_default=True, help="Output folder."
 )
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
-@click.option("--compile/--no-compile", "compiled", default=True, show_default=True, help="Build what the map's updates run on ahead.")
+@click.option(
+    "--compile/--no-compile",
+    "compiled",
+    default=True,
+    show_default=True,
+    help="Build what the map's updates run on ahead.",
+)
 @click.option("--episodes", type=_POSITIVE, default=280, show_default=True, help="Episodes of the evaluation.")
 @smoke_option(num_envs=7, iterations=2, episodes=7, compiled=False)
 @click.option(
