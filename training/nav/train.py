@@ -118,7 +118,7 @@ def make_runner(
     "compiled",
     default=True,
     show_default=True,
-    help="Build what the map's updates run on ahead.",
+    help="Build updates ahead.",
 )
 @smoke_option(num_envs=8, iterations=2, episodes=4, compiled=False)
 @click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Episodes of the evaluation.")

@@ -41,7 +41,7 @@ def evaluate(
         perception: What the policy sees, as in `Quadruped`.
         episodes: Number of environments.
         device: Where the task runs, but for the physics.
-        compiled: Build what the map's updates run on ahead.
+        compiled: Build updates ahead.
         seed: Of starts, bodies, commands and noise.
 
     Returns:

@@ -105,7 +105,7 @@ def make_runner(
     "compiled",
     default=True,
     show_default=True,
-    help="Build what the map's updates run on ahead.",
+    help="Build updates ahead.",
 )
 @click.option("--episodes", type=_POSITIVE, default=280, show_default=True, help="Episodes of the evaluation.")
 @smoke_option(num_envs=7, iterations=2, episodes=7, compiled=False)
