@@ -40,7 +40,7 @@ def _draw_figure(result: dict[str, Any], panels: dict[str, Panel], path: Path) -
 
 def _draw_points(ax: Axes, result: dict[str, Any]) -> None:
     """Draw time against points, as in the paper's figure, with the sensors on the upper axis."""
-    lines = (("full", "all stages", "o-"), ("baseline", "plain baseline", "s--"), ("eager", "eager", "^:"))
+    lines = (("full", "all stages", "o-"), ("baseline", "plain baseline", "s--"), ("eager", "by tensors", "^:"))
     for kind, label, style in lines:
         rows = sorted(result["points"][kind], key=lambda row: row["points"])
         ax.plot([r["points"] for r in rows], [r["median"] for r in rows], style, label=label)
