@@ -53,7 +53,7 @@ class ElevationMap(ReadableMap):
             which the host waits. Without, an environment whose pose is not finite ignores its points and keeps its
             window, and a `dt` that is negative or not finite counts as 0.
         chunk: update at most this many environments at a time, to save memory; results agree up to rounding. None: all
-            on a GPU, and on a CPU as many as are fastest.
+            on a GPU, and on a CPU as many as are fastest. C++ updates one map at a time whatever this is.
         head: trained traversability head, used as it is and not copied, in place of the weights that `cfg` names.
         completion_net: trained completion network, used as it is and not copied, in place of the weights that `cfg`
             names.

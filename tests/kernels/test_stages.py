@@ -114,3 +114,16 @@ def test_settings_keep_their_layout():
         own, default = kernel.settings(cfg), kernel.settings(te.ElevationMapConfig())
         kinds = [{k: type(v[0] if isinstance(v, tuple) else v) for k, v in s.items()} for s in (own, default)]
         assert kinds[0] == kinds[1], kernel.name
+
+
+def test_numbers_of_other_types_mean_the_same():
+    """Floats for whole numbers, as files of settings may have them, and whole numbers for floats."""
+    odd = dict(surface=te.SurfaceConfig(radius=2.0), drift=te.DriftConfig(min_points=40.0, max_drift=1))
+    usual = dict(surface=te.SurfaceConfig(radius=2), drift=te.DriftConfig(min_points=40, max_drift=1.0))
+    states = []
+    for stages in (odd, usual):
+        emap = require_cpu_backend(te.ElevationMap(config(**stages), 2))
+        for points, T_map_sensor, T_map_base in scans(3):
+            emap.update(points, T_map_sensor, T_map_base, dt=0.3)
+        states.append(emap.state)
+    assert_states_close(states[0], states[1], "types", 0, 0)

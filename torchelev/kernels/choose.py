@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import NamedTuple
 
 import torch
@@ -60,4 +61,7 @@ def _why_no_kernels(layer: Tensor) -> str:
 def _why_not_built() -> str:
     if is_switched_off():
         return "TORCHELEV_NATIVE=0 forbids compiled code"
-    return "no C++ compiler was found" if find_compiler() is None else "the C++ could not be built, see the warning"
+    with contextlib.suppress(FileNotFoundError):  # CXX names none, of which a warning tells
+        if find_compiler() is None:
+            return "no C++ compiler was found"
+    return "the C++ could not be built, see the warning"

@@ -73,7 +73,7 @@ def _load(
     name = Path(sources[0]).stem
     try:
         packaged = AHEAD / f"{name}-{_key(flags, sources, headers)}-{instruction_set()}.so"
-        if packaged.exists():
+        with contextlib.suppress(OSError):  # there is none, or it needs another C library
             return _open(packaged)
         flags.append("-march=native")
         compiler = find_compiler()
@@ -98,6 +98,8 @@ def _load(
 def _open(path: Path) -> ctypes.CDLL:
     """Open a library, whose threads are those of torch's OpenMP where that is GNU's."""
     library = ctypes.CDLL(str(path))
+    with contextlib.suppress(AttributeError):  # it keeps no memory
+        os.register_at_fork(after_in_child=library.forget_memory)
     with contextlib.suppress(AttributeError):
         library.use_team(ctypes.CDLL(None).GOMP_parallel)
         # A forked child has none of the team's threads, and would wait for them forever.

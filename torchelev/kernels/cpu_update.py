@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import threading
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -67,7 +68,8 @@ class CpuUpdate:
 
     @functools.cached_property
     def _settings(self) -> ctypes.Structure:
-        return c_settings({kernel.name: kernel.settings(self._cfg) for kernel in self._kernels})
+        own, default = ({k.name: k.settings(cfg) for k in self._kernels} for cfg in (self._cfg, self._default))
+        return c_settings(own, default)
 
     def run(
         self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
@@ -75,7 +77,8 @@ class CpuUpdate:
         """Run stages, by name, or all, on a state's tensors (B, ...), in place.
 
         Raises:
-            MemoryError: without enough memory. The maps are sound, but some may lack this update or a part of it.
+            MemoryError: without enough memory. Some maps then lack a part of this update, and some variances what
+                scans disagree by.
         """
         assert self.library is not None
         sizes = sizes_of(state, inputs)
@@ -93,12 +96,14 @@ class CpuUpdate:
 
 
 _UPDATES: list[CpuUpdate] = []  # by key
+_LOCK = threading.Lock()
 
 
 def register(update: CpuUpdate) -> int:
     """Return a key of compiled stages, by which `run` finds them."""
-    _UPDATES.append(update)
-    return len(_UPDATES) - 1
+    with _LOCK:
+        _UPDATES.append(update)
+        return len(_UPDATES) - 1
 
 
 def compiled_stages(key: int) -> CpuUpdate:

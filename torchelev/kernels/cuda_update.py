@@ -61,13 +61,16 @@ class CudaUpdate:
         for kernel in kernels:
             source = cuda_build.Source(kernel.cuda_source, whole)
             self._launches |= {stage: [(source, one) for one in launches] for stage, launches in kernel.cuda.items()}
-        self._settings = c_settings({kernel.name: kernel.settings(cfg) for kernel in kernels})
+        own, like = ({kernel.name: kernel.settings(c) for kernel in kernels} for c in (cfg, default))
+        self._settings = c_settings(own, like)
+        self._loaded: set[int] = set()  # devices
 
     def run(
         self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
     ) -> dict[str, Tensor]:
         """Run stages, by name, or all, on a state's tensors (B, ...), in place; return what they passed on, by name."""
         sizes = _all_sizes(sizes_of(state, inputs), {**self._limits(state[0].device), **self._sizes})
+        self._load(state[0].get_device())
         torch.autograd.graph.increment_version(state)
         scratch = self._allocate(sizes, state[0].device)
         update = self._update(sizes, state, inputs, list(scratch.values()))
@@ -77,6 +80,15 @@ class CudaUpdate:
                     memory = one.memory(sizes, self._settings)
                     self._launch(source, one.kernel, one.blocks(sizes), one.threads, memory, update)
         return scratch
+
+    def _load(self, device: int) -> None:
+        """Load all kernels before one of them changes a map: what does not compile, or not in a capture, fails here."""
+        if device < 0 or device in self._loaded:
+            return
+        for launches in self._launches.values():
+            for source, one in launches:
+                cuda_build.load(source, one.kernel, device)
+        self._loaded.add(device)
 
     def _allocate(self, sizes: Any, device: torch.device) -> dict[str, Tensor]:
         parts = {name: text.split() for name, text in self._arrays.items()}

@@ -87,22 +87,29 @@ def settings_struct(name: str, settings: Settings) -> str:
     return "\n".join([f"struct {name} {{", *lines, "};", ""])
 
 
-def c_settings(groups: Mapping[str, Settings]) -> ctypes.Structure:
-    """Return the settings of several kernels, by name, as the C struct of their structs."""
-    parts = {name: _c_struct(settings) for name, settings in groups.items()}
+def c_settings(groups: Mapping[str, Settings], default: Mapping[str, Settings]) -> ctypes.Structure:
+    """Return the settings of several kernels, by name, as the C struct of their structs.
+
+    Types are those of the default settings, as in the header, whatever numbers a user gave.
+    """
+    parts = {name: _c_struct(settings, default[name]) for name, settings in groups.items()}
     return _structure([(name, type(part)) for name, part in parts.items()])(**parts)
 
 
-def _c_struct(settings: Settings) -> ctypes.Structure:
+def _c_struct(settings: Settings, default: Settings) -> ctypes.Structure:
     types, values = [], {}
     for field, value in settings.items():
-        kind = _kind(value[0] if isinstance(value, tuple) else value)[1]
-        numbers = [
-            min(v, _LARGEST) if isinstance(v, int) else v for v in (value if isinstance(value, tuple) else (value,))
-        ]
+        like = default[field]
+        kind = _kind(like[0] if isinstance(like, tuple) else like)[1]
+        numbers = [_converted(v, kind) for v in (value if isinstance(value, tuple) else (value,))]
         types.append((field, kind * len(numbers) if isinstance(value, tuple) else kind))
         values[field] = (kind * len(numbers))(*numbers) if isinstance(value, tuple) else numbers[0]
     return _structure(types)(**values)
+
+
+def _converted(value: Number, kind: Any) -> Number:
+    """Return a number as C's type takes it; whole numbers too large for it are the largest."""
+    return min(int(value), _LARGEST) if kind is ctypes.c_int32 else float(value)
 
 
 def _structure(fields: list[tuple[str, Any]]) -> type[ctypes.Structure]:

@@ -27,20 +27,25 @@ class Kept {
         const std::lock_guard<std::mutex> lock(mutex);
         unused.push_back(std::move(own));
     }
-} kept;
+};
+
+Kept* kept = new Kept;  // never destroyed: threads may update maps while the process ends
 
 // An `Own` that is put back at the end.
 struct Borrowed {
-    std::unique_ptr<Own> own = kept.take();
+    std::unique_ptr<Own> own = kept->take();
 
     Borrowed() = default;
     Borrowed(Borrowed&&) = default;
     ~Borrowed() {
-        if (own) kept.put(std::move(own));
+        if (own) kept->put(std::move(own));
     }
 };
 
 }  // namespace
+
+// Leave what is kept to the parent of a forked process, a thread of which may hold the mutex.
+extern "C" void forget_memory() { kept = new Kept; }
 
 // Run stages in their order on maps and their inputs, in place. Returns what `code_of` does.
 extern "C" int update_maps(const MapState* state, const Inputs* inputs, const Settings* settings, const Sizes* sizes,

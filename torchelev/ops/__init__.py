@@ -1,4 +1,4 @@
-"""What PyTorch and its compiler need: custom operators, stored values, masks, sums over windows.
+"""What stages by tensors share: sums by slot, minima, windows, moves; and what torch runs around them.
 
 No equation of the paper lives here; stages import from here, never the other way.
 """

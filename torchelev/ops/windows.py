@@ -62,8 +62,6 @@ def window_moments(layers: list[tuple[Tensor, int]], rim: int, radius: int) -> l
     radius.
     """
     lines = [line for v, order in layers for line in _line_sums(v, rim, radius, -2, order)]
-    if radius > 1:  # three values are summed anew at each reading, for less memory
-        lines = lines
     orders = [order - a for _, order in layers for a in range(order + 1)]
     return [
         moment for line, order in zip(lines, orders, strict=True) for moment in _line_sums(line, rim, radius, -1, order)
