@@ -40,7 +40,7 @@ class TraversalCostConfig:
     weight_traversability: float = 4.0  #: cost added to a metre of ground rated 0; raise it for longer, safer paths
     weight_confidence: float = 1.0  #: cost added to a metre of unknown ground, or ground rated with confidence 0
     cross_unknown: bool = True  #: False makes all unknown ground impassable
-    #: layer of the inclination of unknown ground: "upper_bound"; or "completed", of maps with completion
+    #: by which layer unknown ground inclines, "upper_bound" or, of maps with completion, "completed"
     unknown_layer: str = "upper_bound"
     max_inclination: float = 0.5  #: [rad] unknown ground whose upper bound is steeper counts as a drop: impassable
     inclination_distance: float = 0.3  #: [m] over which the inclination is computed: half the span of the feet
