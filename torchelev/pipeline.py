@@ -66,6 +66,9 @@ STAGES = (
     Stage("rate_surface", lambda state, m, cfg: rate_surface(state, cfg.grid, cfg.surface, cfg.traversability)),
 )
 
+#: The names of all steps of an update, as the compiled backends run them.
+ORDER = ("measure", *(stage.name for stage in STAGES))
+
 
 def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
     """Run the stages in their order (paper, Fig. 2). Pure: changes none of its arguments. `weights` are the head's."""
@@ -131,14 +134,13 @@ def update_on_gpu(
 @functools.lru_cache(maxsize=64)
 def cuda_stages(cfg: ElevationMapConfig) -> CudaUpdate:
     """Return the CUDA kernels for a config; they are built when they first run."""
-    return CudaUpdate(KERNELS, TENSORS, ("measure", *(stage.name for stage in STAGES)), cfg, ElevationMapConfig())
+    return CudaUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig())
 
 
 @functools.lru_cache(maxsize=256)
 def compile_stages(cfg: ElevationMapConfig) -> int:
     """Return a key of the compiled stages for a config; they are built when they first run."""
-    order = ("measure", *(stage.name for stage in STAGES))
-    return cpu_update.register(CpuUpdate(KERNELS, TENSORS, order, cfg, ElevationMapConfig()))
+    return cpu_update.register(CpuUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig()))
 
 
 def write(stored: MapState, new: MapState) -> None:

@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import torch
 from torch import Tensor
 
 from benchmarks import RESULTS
 from benchmarks.speed import meter
+from benchmarks.speed.workload import by_tensors
 from torchelev.app.results import markdown_table, slug, write_json
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact.sensors import NonRepetitiveLidar
@@ -84,7 +83,7 @@ def measure(field: HeightField, seconds: float) -> list[dict[str, Any]]:
 
 
 def _without_native(cast: Callable[[], Tensor]) -> Tensor:
-    with mock.patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"}):
+    with by_tensors():
         return cast()
 
 

@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from unittest import mock
 
 import torch
 from torch import Tensor
@@ -69,15 +70,9 @@ def _cloud(robots: int, points: int, phase: int, reach: float, generator: torch.
 
 @contextlib.contextmanager
 def by_tensors() -> Iterator[None]:
-    """Let updates run by tensors."""
-    before = os.environ.get("TORCHELEV_NATIVE")
-    os.environ["TORCHELEV_NATIVE"] = "0"
-    try:
+    """Let the library run by tensors."""
+    with mock.patch.dict(os.environ, {"TORCHELEV_NATIVE": "0"}):
         yield
-    finally:
-        del os.environ["TORCHELEV_NATIVE"]
-        if before is not None:
-            os.environ["TORCHELEV_NATIVE"] = before
 
 
 class Drive:

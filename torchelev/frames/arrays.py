@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.ops.transforms import is_transforming
 
 
 def to_floats(name: str, values: Tensor | ArrayLike) -> Tensor:
@@ -25,9 +24,3 @@ def assemble(position: Tensor, rotation: Tensor) -> Tensor:
     upper = torch.cat([rotation, position[..., None]], -1)
     row = torch.zeros_like(upper[..., :1, :1])
     return torch.cat([upper, torch.cat([row, row, row, torch.ones_like(row)], -1)], -2)
-
-
-def is_readable(values: Tensor) -> bool:
-    """Return whether values can be read without waiting for a device or breaking a graph."""
-    plain = type(values) is Tensor and not is_transforming()
-    return plain and values.device.type == "cpu" and not torch.compiler.is_compiling()

@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.frames.arrays import assemble, is_readable, to_floats
+from torchelev.frames.arrays import assemble, to_floats
 from torchelev.frames.rotation_checks import require_rotations, require_unit, require_upright
+from torchelev.ops.transforms import is_readable
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.frames.arrays import is_readable
+from torchelev.ops.transforms import is_readable
 
 if TYPE_CHECKING:
     from jaxtyping import Float
