@@ -74,10 +74,15 @@ class ElevationMapConfig:
 
     @property
     def drift_gate(self) -> float:
-        """The least traversability of cells that measure the height drift: the setting, or the head's default."""
+        """The least traversability of cells that measure the height drift: the setting, or the head's default.
+
+        Without a head no cell is rated, and all known cells count.
+        """
+        if self.traversability is None:
+            return 0.0
         if self.drift is not None and self.drift.min_traversability is not None:
             return self.drift.min_traversability
-        return (self.traversability or TraversabilityConfig).drift_gate
+        return self.traversability.drift_gate
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as nested plain dicts, as YAML files and `state_dict` hold it."""

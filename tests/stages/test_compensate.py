@@ -100,7 +100,7 @@ def test_ground_counts_from_the_gate_on(gate, counts):
     [
         (None, TraversabilityConfig(), TraversabilityConfig.drift_gate),
         (None, LearnedTraversabilityConfig(), LearnedTraversabilityConfig.drift_gate),
-        (None, None, TraversabilityConfig.drift_gate),
+        (None, None, 0.0),
         (0.7, LearnedTraversabilityConfig(), 0.7),
     ],
 )

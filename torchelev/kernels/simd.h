@@ -145,6 +145,13 @@ template <class Work> inline void for_vectors(int64_t first, int64_t last, const
     if (first < last) work(first, int(last - first));
 }
 
+// Return whether any of some masks' bytes is set.
+inline bool any_set(const uint8_t* bytes, int64_t count) {
+    uint8_t some = 0;
+    for (int64_t k = 0; k < count; k++) some |= bytes[k];
+    return some;
+}
+
 // Natural logarithm of positive normal numbers, by the polynomial of Cephes' logf: 1 unit in the last place.
 inline Lanes log(Lanes x) {
     const Flags exponent = ((Flags)x - 0x3f3504f3) >> 23;  // such that the mantissa is in sqrt(1/2) to sqrt(2)

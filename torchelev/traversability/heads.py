@@ -184,11 +184,6 @@ def find_steps(ground: Ground, radius: int) -> Float[Tensor, "B H W"]:
     return torch.maximum(highest - height, minus_lowest + height)
 
 
-def rate_all(state: MapState) -> MapState:
-    """Rate no cell: without a head, all known cells count in drift compensation."""
-    return state._replace(traversability=torch.ones_like(state.traversability), rated=torch.zeros_like(state.rated))
-
-
 class PlaneRating(NamedTuple):
     """The layers of the analytic head."""
 

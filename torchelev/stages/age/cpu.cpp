@@ -2,8 +2,7 @@
 
 #include <cmath>
 
-#include "kernels/simd.h"
-#include "kernels/update.h"
+#include "stages/chosen_cells.h"
 #include "stages/age/equation.h"
 
 extern "C" void run_age(Update& u) {
@@ -11,12 +10,9 @@ extern "C" void run_age(Update& u) {
     *u.state.elapsed += int64_t(std::nearbyint(double(dt) * 1e9));
     const float limit = u.settings.fusion.max_variance;
     float *time = u.state.time, *variance = u.state.variance;
-    const uint8_t* known = u.state.validity;
-    u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        for_vectors(first, last, [&](int64_t k, auto count) {
-            store(time + k, load(time + k, count) + dt, count);
-            const Lanes grown = aging::grow(load(variance + k, count), added, limit);
-            store(variance + k, pick(load_bytes(known + k, count) > 0, grown, all(1)), count);
-        });
+    for_chosen(u, u.state.validity, [&](int64_t k, Flags known, auto count) {
+        const Lanes before = load(variance + k, count);
+        store(time + k, load(time + k, count) + zero_unless(known, all(dt)), count);
+        store(variance + k, pick(known, aging::grow(before, added, limit), before), count);
     });
 }

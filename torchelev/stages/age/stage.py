@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.stages.age.config import AgingConfig
-from torchelev.state import BLANK, MapState, Measurement
+from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 def age(state: MapState, m: Measurement, cfg: AgingConfig, max_variance: float) -> MapState:
     """Advance the clocks and add the time variance, sigma_m^2 += sigma_t^2 * dt (paper, Sec. II-C).
 
-    No variance grows beyond `max_variance` [m^2]; that of unknown cells stays blank. So cells without points need no
-    limit in `fuse`.
+    Of known cells only. No variance grows beyond `max_variance` [m^2], so that cells without points need no limit in
+    `fuse`.
     """
     dt = m.dt[:, None, None]
     variance = (state.variance + cfg.variance_rate * dt).clamp(max=max_variance)
     return state._replace(
         elapsed=state.elapsed + nanoseconds(m.dt),
-        time=state.time + dt,
-        variance=torch.where(state.validity, variance, BLANK["variance"]),
+        time=state.time + dt * state.validity,
+        variance=torch.where(state.validity, variance, state.variance),
     )
 
 

@@ -9,9 +9,8 @@
 #include <limits>
 #include <vector>
 
-#include "kernels/simd.h"
-#include "kernels/update.h"
 #include "stages/cells.h"
+#include "stages/chosen_cells.h"
 #include "stages/compensate/equation.h"
 #include "stages/disagreement/equation.h"
 #include "stages/disagreement/sensors.h"
@@ -98,16 +97,12 @@ Sums find_errors(Update& u, float* errors) {
 // Add the correction [m] to elevations, challengers and upper bounds.
 void shift_heights(Update& u, float shift) {
     const MapState& map = u.state;
-    u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        auto add = [&](float* layer, const uint8_t* where, int64_t k, auto count) {
-            const Flags chosen = load_bytes(where + k, count) > 0;
-            if (any(chosen)) store(layer + k, load(layer + k, count) + zero_unless(chosen, all(shift)), count);
-        };
-        for_vectors(first, last, [&](int64_t k, auto count) {
-            add(map.elevation, map.validity, k, count), add(map.challenger, map.challenger_support, k, count);
-            add(map.upper_bound, map.bounded, k, count);
+    auto add = [&](float* layer, const uint8_t* where) {
+        for_chosen(u, where, [&](int64_t k, Flags chosen, auto count) {
+            store(layer + k, load(layer + k, count) + zero_unless(chosen, all(shift)), count);
         });
-    });
+    };
+    add(map.elevation, map.validity), add(map.challenger, map.challenger_support), add(map.upper_bound, map.bounded);
 }
 
 bool is_empty(const Update& u) {

@@ -1,7 +1,6 @@
 // The disagreement taken out of variances, and put in again: stage.py.
 
-#include "kernels/simd.h"
-#include "kernels/update.h"
+#include "stages/chosen_cells.h"
 #include "stages/disagreement/equation.h"
 
 namespace {
@@ -10,12 +9,9 @@ namespace {
 template <class Change> void change_variance(Update& u, const Change& change) {
     const float d = *u.state.statistics.disagreement, d2 = d * d;
     if (d == 0) return;
-    const MapState& map = u.state;
-    u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        for_vectors(first, last, [&](int64_t k, auto count) {
-            const Flags known = load_bytes(map.validity + k, count) > 0;
-            store(map.variance + k, change(load(map.variance + k, count), zero_unless(known, all(d2))), count);
-        });
+    float* variance = u.state.variance;
+    for_chosen(u, u.state.validity, [&](int64_t k, Flags known, auto count) {
+        store(variance + k, change(load(variance + k, count), zero_unless(known, all(d2))), count);
     });
 }
 

@@ -30,19 +30,17 @@ template <class Windows> class Rater {
 
     int64_t first_cell(int row) const { return (extent.row + row) * W + extent.column; }
 
-    void clear(int64_t cell, int count) const {
+    // Clear cells. Where none has a normal or a rating their layers hold zeros already, and to read costs less.
+    template <class Count> void clear(int64_t cell, Count count) const {
+        const bool is_rated = windows.cells && any_set(map.rated + cell, count);
+        if (!is_rated && !any_set(map.has_normal + cell, count)) return;
         std::fill_n(map.gradient_x + cell, count, 0.0f), std::fill_n(map.gradient_y + cell, count, 0.0f);
         std::fill_n(map.has_normal + cell, count, uint8_t(0));
         if (!windows.cells) return;
         std::fill_n(map.traversability + cell, count, 0.0f), std::fill_n(map.rated + cell, count, uint8_t(0));
     }
 
-    // Clear a row. Where no cell has a normal or a rating its layers hold zeros already, and to read costs less.
-    void clear_row(int row) const {
-        const int64_t first = first_cell(row);
-        if (any_set(map.has_normal + first, extent.columns) || any_set(map.rated + first, extent.columns))
-            clear(first, extent.columns);
-    }
+    void clear_row(int row) const { clear(first_cell(row), extent.columns); }
 
     void sum_columns(int row) const {
         const int outer = std::max(windows.radius, windows.cells), pitch = windows.pitch;
@@ -122,35 +120,50 @@ void rate_tile(const Update& u, const Extent& extent, Scratch& scratch) {
     rate(u, extent, scratch, Windows{s.radius, s.cells, s.steps});
 }
 
-// Write a value to a layer's cells; where they have it, memory is only read, which costs less.
-template <class Value> void fill(Value* layer, int64_t first, int64_t last, Value value) {
-    constexpr int64_t AT_A_TIME = 4096;
-    for (int64_t begin = first, end; begin < last; begin = end) {
-        end = std::min(begin + AT_A_TIME, last);
-        int differs = 0;
-        for (int64_t k = begin; k < end; k++) differs |= layer[k] != value;
-        if (differs) std::fill(layer + begin, layer + end, value);
-    }
-}
+// Which tiles have something to rate or to clear; large maps are mostly unknown.
+class Tiles {
+    Buffer<uint8_t> used;
 
-// `rate_all`
-void rate_all(const Update& u) {
-    u.each(u.cells(), 65536, [&](int64_t, int64_t first, int64_t last) {
-        fill(u.state.traversability, first, last, 1.0f), fill(u.state.rated, first, last, uint8_t(0));
-    });
-}
+    // Look at a row of tiles, row by row, as memory is read fastest.
+    void look(const Update& u, int band) {
+        const int H = int(u.sizes.H), W = int(u.sizes.W);
+        std::fill_n(&used[band * across], across, uint8_t(0));
+        for (int row = band * TILE; row < std::min(H, (band + 1) * TILE); row++)
+            for (int k = 0; k < across; k++) {
+                const int64_t first = int64_t(row) * W + k * TILE, count = std::min(TILE, W - k * TILE);
+                uint8_t& own = used[band * across + k];
+                own |= any_set(u.state.validity + first, count) | any_set(u.state.has_normal + first, count);
+                own |= u.settings.surface.cells && any_set(u.state.rated + first, count);
+            }
+    }
+
+  public:
+    int down, across;
+
+    void find(const Update& u) {
+        down = (int(u.sizes.H) + TILE - 1) / TILE, across = (int(u.sizes.W) + TILE - 1) / TILE;
+        used.resize(down * across);
+        u.each(down, 4, [&](int64_t, int64_t first, int64_t last) {
+            for (int band = int(first); band < last; band++) look(u, band);
+        });
+    }
+
+    bool are_used(int tile) const { return used[tile]; }
+};
 
 }  // namespace
 
 extern "C" void run_rate_surface(Update& u) {
-    const int H = int(u.sizes.H), W = int(u.sizes.W), across = (W + TILE - 1) / TILE;
+    const int H = int(u.sizes.H), W = int(u.sizes.W);
     auto& scratch = u.memory.get<std::vector<Scratch>>();
     if (scratch.size() < size_t(4 * u.threads)) scratch.resize(4 * u.threads);  // as many parts as `each` makes
-    u.each((H + TILE - 1) / TILE * across, 1, [&](int64_t part, int64_t first, int64_t last) {
+    Tiles& tiles = u.memory.get<Tiles>();
+    tiles.find(u);
+    u.each(tiles.down * tiles.across, 1, [&](int64_t part, int64_t first, int64_t last) {
         for (int tile = int(first); tile < last; tile++) {
-            const int row = tile / across * TILE, column = tile % across * TILE;
+            if (!tiles.are_used(tile)) continue;
+            const int row = tile / tiles.across * TILE, column = tile % tiles.across * TILE;
             rate_tile(u, {row, std::min(TILE, H - row), column, std::min(TILE, W - column)}, scratch[part]);
         }
     });
-    if (u.settings.surface.has_no_head) rate_all(u);
 }

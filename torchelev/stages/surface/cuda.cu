@@ -129,7 +129,7 @@ inline Tile tile_of_block(const Update& u) {
             int32_t(number % strips) * COLUMNS};
 }
 
-// Compute normals and ratings of a map's cells; without a head, rate none.
+// Compute normals and, with the analytic head, ratings of a map's cells.
 extern "C" __global__ __launch_bounds__(512, 2) void rate_surface(Update u) {
     const SurfaceSettings& s = u.settings.surface;
     const Tile tile = tile_of_block(u);
@@ -149,5 +149,4 @@ extern "C" __global__ __launch_bounds__(512, 2) void rate_surface(Update u) {
         const auto height = [&](int32_t u, int32_t v) { return tile.height(row + u, column + v) - own; };
         rate(tile.map, cell, Windows(height, Reach{s.radius, s.cells, s.steps}), s);
     }
-    if (s.has_no_head) tile.map.traversability[cell] = 1, tile.map.rated[cell] = 0;  // `rate_all`
 }

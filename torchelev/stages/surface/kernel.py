@@ -27,7 +27,6 @@ def settings(cfg: ElevationMapConfig) -> Settings:
         radius=radius,
         cells=cells,
         steps=min(cells, step_cells(cfg.grid.resolution)),
-        has_no_head=cfg.traversability is None,
         per_cell=1 / cfg.grid.resolution,
         min_spread=(min_spread(radius), min_spread(cells)),
         per_critical=tuple(1 / value for value in critical),

@@ -35,13 +35,6 @@ template <class Work> ALWAYS_INLINE inline void for_lanes(int begin, int end, co
         work(k, std::integral_constant<int, LANES>());
 }
 
-// Return whether any of some masks' bytes is set.
-inline bool any_set(const uint8_t* bytes, int count) {
-    uint8_t some = 0;
-    for (int k = 0; k < count; k++) some |= bytes[k];
-    return some;
-}
-
 // Some cells of a map (H, W).
 struct Extent {
     int row, rows, column, columns;

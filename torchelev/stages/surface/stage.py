@@ -9,7 +9,6 @@ from torchelev.state import MapState
 from torchelev.traversability.heads import (
     LearnedTraversabilityConfig,
     TraversabilityConfig,
-    rate_all,
     traversability,
 )
 
@@ -20,16 +19,14 @@ def rate_surface(
     cfg: SurfaceConfig,
     head: TraversabilityConfig | LearnedTraversabilityConfig | None,
 ) -> MapState:
-    """Compute the normals (paper, Sec. II-A), and the traversability of the analytic head; without a head, rate none.
+    """Compute the normals (paper, Sec. II-A), and the traversability of the analytic head.
 
-    The learned head's traversability is left as it is, for `pipeline.rate_learned`.
+    Without it the traversability is left as it is: blank without any head, else for `pipeline.rate_learned`.
     """
     analytic = head if isinstance(head, TraversabilityConfig) else None
     cells = 0 if analytic is None else analytic.cells(grid)
     ground = known_ground(state.elevation, state.validity, max(cfg.radius, cells))
     state = state._replace(**normals(ground, state.validity, cfg.radius, grid.resolution)._asdict())
-    if head is None:
-        return rate_all(state)
     if analytic is None:
         return state
     rating = traversability(ground, state.validity, cells, grid.resolution, analytic.critical)
