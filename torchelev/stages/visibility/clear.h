@@ -18,12 +18,13 @@ class Cells {
     const MapState& map;
     const int64_t height, width;
     const float reach;  // [m] of rays, and a cell to spare for rounding
+    const Extent box;   // [m] of rays, and cells to spare: those of the table lie up to two cells beside a ray
     const float* y;     // [m] from the sensor to each column
 
   public:
-    Cells(const Sensor& sensor, const Table& table, CellsMemory& memory)
+    Cells(const Sensor& sensor, const Extent& extent, const Table& table, CellsMemory& memory)
         : sensor(sensor), table(table), s(sensor.s), map(sensor.u.state), height(sensor.u.sizes.H),
-          width(sensor.u.sizes.W), reach(float(table.far + 1) * s.resolution) {
+          width(sensor.u.sizes.W), reach(float(table.far + 1) * s.resolution), box(extent.widened(3 * s.resolution)) {
         float* places = memory.y.resize(width);
         for (int64_t j = 0; j < width; j++) places[j] = place(1, j);
         y = places;
@@ -32,8 +33,7 @@ class Cells {
     // Clear and bound; return how many cells are cleared.
     int64_t apply() const {
         if (table.far == 0) return 0;
-        const int64_t first = before(0, -reach, height), last = before(0, reach, height) + 3;
-        const int64_t rows = std::min(last, height) - first;
+        const int64_t first = begin(0, reach, height), rows = end(0, reach, height) - first;
         std::atomic<int64_t> number{0};
         sensor.u.each(rows, std::max(int64_t(1), CELLS_AT_A_TIME / width), [&](int64_t, int64_t begin, int64_t end) {
             int64_t own = 0;
@@ -55,11 +55,19 @@ class Cells {
         return int64_t(std::clamp(cell - 2, 0.0f, float(size)));
     }
 
+    // The first row or column at most so far [m] from the sensor and in the box, and the one after the last.
+    int64_t begin(int axis, float distance, int64_t size) const {
+        return before(axis, std::max(-distance, box.low[axis]), size);
+    }
+    int64_t end(int axis, float distance, int64_t size) const {
+        return std::min(before(axis, std::min(distance, box.high[axis]), size) + 3, size);
+    }
+
     int64_t apply_to_row(int64_t i) const {
         const float x = place(0, i), square = reach * reach - x * x;
         if (square < 0) return 0;
-        const float end = std::sqrt(square);
-        const int64_t first = before(1, -end, width), last = std::min(before(1, end, width) + 3, width);
+        const float most = std::sqrt(square);
+        const int64_t first = begin(1, most, width), last = end(1, most, width);
         int64_t number = 0;
         for (int64_t j = first; j < last; j += TOGETHER * LANES)
             number += apply_to_columns(i * width, x, j, std::min(last, j + TOGETHER * LANES));

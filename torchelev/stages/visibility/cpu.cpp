@@ -32,7 +32,7 @@ int64_t apply_rays(const Sensor& sensor, VisibilityMemory& memory) {
     Table table(sensor.u, extent.farthest, memory.table);
     AcceptedRays(sensor, ground, horizon).put_into(table);
     table.finish();
-    return Cells(sensor, table, memory.cells).apply();
+    return Cells(sensor, extent, table, memory.cells).apply();
 }
 
 // Forget the bounds of known cells, side by side.
