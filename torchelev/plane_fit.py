@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import window_moments
+from torchelev.ops.windows import padded, window_moments
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -110,7 +110,7 @@ def test_finite_differences_of_every_layer_by_every_input(head, sensors, base):
         assert ("upper_bound", source) in moved
     for name in ("elevation", "gradient_x", "gradient_y"):
         assert {(name, source) for source in ("points", "variance", "T_map_sensor", "prior elevation")} <= moved
-    assert {("drift_error", "prior gradient_y"), ("time", "dt"), ("variance", "pose_covariance")} <= moved
+    assert {("drift_error", "prior gradient_y"), ("variance", "pose_covariance")} <= moved
 
 
 def test_the_upper_bound_follows_the_ray_that_bounds():

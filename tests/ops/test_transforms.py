@@ -7,7 +7,7 @@ from torch.autograd import forward_ad
 from tests.helpers import small_map
 from tests.test_gradients import CELLS, scene
 from torchelev import LearnedTraversabilityConfig
-from torchelev.ops.operators import polar_minimum
+from torchelev.ops.minima import polar_minimum
 
 LAYERS = ("elevation", "variance", "upper_bound", "gradient_x", "traversability")
 

@@ -6,10 +6,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.ops.operators import padded
 from torchelev.ops.windows import (
     gaussian_sum,
     neighbours,
+    padded,
     sliding_maximum,
     sliding_minimum,
     sliding_sum,

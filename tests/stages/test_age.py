@@ -74,11 +74,14 @@ def test_no_time_passes_by_a_dt_that_is_not_finite_or_negative():
     assert not age(emap.state, m._replace(dt=dt), AgingConfig(), 1.0).elapsed.any()
 
 
-def test_elapsed_has_no_gradient():
+def test_time_has_a_gradient_and_elapsed_has_none():
     emap = small_map(1)
+    emap.load_state(random_state(np.random.default_rng(0), emap.cfg.grid, known=1.0))
     dt = torch.tensor([0.5], requires_grad=True)
     after = emap(emap.state, emap.measure(nans(1), pose(), None, dt))
-    assert after.time.requires_grad and not after.elapsed.requires_grad and after.elapsed.tolist() == [500_000_000]
+    after.time.sum().backward()
+    assert dt.grad.item() == after.time.numel()
+    assert not after.elapsed.requires_grad and (after.elapsed - emap.state.elapsed).tolist() == [500_000_000]
 
 
 def test_the_time_of_a_cells_last_hit_stays_until_it_is_hit_again():

@@ -14,8 +14,7 @@ from torchelev.filters.layer_tools import radius_cells
 from torchelev.filters.registry import register
 from torchelev.layers import Layer
 from torchelev.ops.masks import where_finite
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import sliding_maximum
+from torchelev.ops.windows import padded, sliding_maximum
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

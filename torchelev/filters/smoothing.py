@@ -15,8 +15,7 @@ from torchelev.filters.layer_tools import known_weight, radius_cells
 from torchelev.filters.registry import register
 from torchelev.filters.sorting_network import lowest_of_windows
 from torchelev.layers import Layer
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import gaussian_sum, sliding_sum
+from torchelev.ops.windows import gaussian_sum, padded, sliding_sum
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -14,8 +14,7 @@ from torchelev.errors import message, require
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer, sample_layers
 from torchelev.observations.ground import border_left_out, continue_ground
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import window_moments
+from torchelev.ops.windows import padded, window_moments
 from torchelev.readable_map import ReadableMap
 from torchelev.state import MapState
 

@@ -10,9 +10,8 @@ import math
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
-
-from torchelev.ops.operators import padded
 
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 
@@ -22,6 +21,11 @@ def around(device: torch.device) -> tuple[Tensor, Tensor]:
     k = torch.arange(8, device=device)
     k = k + (k >= 4)
     return k // 3 - 1, k % 3 - 1
+
+
+def padded(values: Tensor, radius: int, fill: float) -> Tensor:
+    """Put a rim of `radius` cells around (..., H, W)."""
+    return F.pad(values, [radius] * 4, value=fill)
 
 
 def _line(values: Tensor, rim: int, dim: int, k: int) -> Tensor:

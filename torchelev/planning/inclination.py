@@ -7,8 +7,7 @@ import math
 import torch
 
 from torchelev.layers import Layer
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import AROUND, shifted
+from torchelev.ops.windows import AROUND, padded, shifted
 
 
 def compute_inclination(surface: Layer, resolution: float, distance: float) -> Layer:

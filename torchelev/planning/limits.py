@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import shifted, window_maximum
+from torchelev.ops.windows import padded, shifted, window_maximum
 from torchelev.plane_fit import Ground, fit_plane, known_ground
 from torchelev.robot import RobotConfig
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig, find_steps, step_cells

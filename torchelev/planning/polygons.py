@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.ops.operators import cell_sums
+from torchelev.ops.scatter import cell_sums
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -15,8 +15,7 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default
 from torchelev.layers import Layer
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import window_maximum
+from torchelev.ops.windows import padded, window_maximum
 from torchelev.planning.inclination import compute_inclination
 from torchelev.planning.limits import find_exceeded
 from torchelev.planning.standing import mark_standing_cells

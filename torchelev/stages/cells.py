@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig, locate
 from torchelev.ops.indexing import read
-from torchelev.ops.operators import cell_sums
+from torchelev.ops.scatter import cell_sums
 from torchelev.state import MapState, Measurement
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.ops.operators import padded
-from torchelev.ops.windows import shifted
+from torchelev.ops.windows import padded, shifted
 from torchelev.robot import RobotConfig
 from torchelev.traversability.stances import Scales
 

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.ops.library import LIBRARY, operator
-from torchelev.ops.operators import padded
+from torchelev.ops.windows import padded
 
 _DAMPING = 0.8  # of a Jacobi sweep
 _OVERCORRECTION = 1.8  # heights that are constant per block come out too low (Braess, Computing 55, 1995)

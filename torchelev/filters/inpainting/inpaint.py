@@ -25,7 +25,7 @@ from torchelev.filters.registry import register
 from torchelev.filters.smoothing import mean_of_known
 from torchelev.layers import Layer
 from torchelev.ops.masks import where_finite
-from torchelev.ops.operators import padded
+from torchelev.ops.windows import padded
 
 if TYPE_CHECKING:
     from jaxtyping import Bool

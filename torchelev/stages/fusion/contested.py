@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.indexing import SelectedCells, can_select, select_points
-from torchelev.ops.operators import cell_sums, highest_per_cell
+from torchelev.ops.scatter import cell_sums, highest_per_cell
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

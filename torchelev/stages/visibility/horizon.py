@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig, locate
 from torchelev.ops.indexing import read
-from torchelev.ops.operators import running_minimum
+from torchelev.ops.minima import running_minimum
 from torchelev.stages.cells import lattice_offset
 from torchelev.stages.visibility.config import RaycastConfig
 from torchelev.stages.visibility.polar_table import PolarGrid, flat

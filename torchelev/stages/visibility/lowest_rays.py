@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.ops.indexing import read
-from torchelev.ops.operators import polar_minimum
+from torchelev.ops.minima import polar_minimum
 from torchelev.stages.cells import center_offsets
 from torchelev.stages.visibility.polar_table import PolarGrid, azimuth_fraction, flat
 from torchelev.stages.visibility.rays import Rays

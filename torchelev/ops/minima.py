@@ -1,4 +1,4 @@
-"""Rims around maps, running minima, and the polar table of minima."""
+"""Running minima, and the polar table of minima."""
 
 from __future__ import annotations
 
@@ -6,17 +6,9 @@ import itertools
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from torchelev.ops.scatter import cell_sums, highest_per_cell, lowest
-
-__all__ = ["cell_sums", "highest_per_cell", "padded", "polar_minimum", "running_minimum"]
-
-
-def padded(values: Tensor, radius: int, fill: float) -> Tensor:
-    """Put a rim of `radius` cells around (..., H, W)."""
-    return F.pad(values, [radius] * 4, value=fill)
+from torchelev.ops.scatter import lowest
 
 
 def running_minimum(table: Tensor) -> Tensor:

@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchelev.ops.operators import cell_sums, polar_minimum, running_minimum
+from torchelev.ops.minima import polar_minimum, running_minimum
+from torchelev.ops.scatter import cell_sums
 
 DTYPES = st.sampled_from([np.float32, np.float64])
 
