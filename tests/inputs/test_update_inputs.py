@@ -365,10 +365,10 @@ def test_every_point_is_counted_once(seed):
 
 def test_checks_of_values_can_be_asked_for_on_other_devices():
     """On devices other than the CPU values are read on request only."""
-    from torchelev.inputs.checks import readable
+    from torchelev.ops.transforms import is_readable
 
-    assert readable(torch.zeros(1)) and not readable(torch.zeros(1, device=META))
-    assert readable(torch.zeros(1, device=META), always=True)
+    assert is_readable(torch.zeros(1)) and not is_readable(torch.zeros(1, device=META))
+    assert is_readable(torch.zeros(1, device=META), may_wait=True)
 
 
 def test_a_map_of_nans_stays_blank(emap):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchelev.layers import Layer
+from torchelev.ops.transforms import can_compute_unseen
 
 _BLANK = float(np.finfo(np.float32).max / 4)  # [m] above all heights
 
@@ -29,16 +30,10 @@ def is_installed() -> bool:
     return True
 
 
-def is_readable(values: Tensor) -> bool:
-    """Return whether OpenCV can read a tensor: plain, on the CPU, outside compiled code."""
-    is_plain = type(values) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(values)
-    return is_plain and values.is_cpu and not torch.compiler.is_compiling() and is_installed()
-
-
 def is_usable(values: Tensor) -> bool:
-    """Return whether OpenCV can filter a tensor: readable, not empty, float32, and no gradient is wanted."""
-    needs_gradient = values.requires_grad and torch.is_grad_enabled()
-    return values.dtype == torch.float32 and values.numel() > 0 and not needs_gradient and is_readable(values)
+    """Return whether OpenCV can filter a tensor: float32 on a CPU, not empty, and no gradient is wanted."""
+    fits = values.dtype == torch.float32 and values.numel() > 0
+    return fits and can_compute_unseen([values]) and is_installed()
 
 
 def zero_unknown(values: Tensor, known: Tensor) -> Layer:

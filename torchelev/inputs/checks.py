@@ -14,22 +14,13 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import message, require
-from torchelev.ops.transforms import is_transforming
+from torchelev.ops.transforms import is_readable
 
 FARTHEST = 1e9  # [m] limit of coordinates; beyond it float64 misses cells
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _FEW = 8  # poses, up to which Python's numbers are faster than NumPy's
 _POSE_DTYPES = (torch.float32, torch.float64)
 Config = TypeVar("Config")
-
-
-def readable(value: Tensor, always: bool = False) -> bool:
-    """Return whether a tensor's values may be read now: it lies on the CPU, or `always` is set.
-
-    Never true while compiling or inside a `torch.func` transform, nor for fake tensors.
-    """
-    plain = type(value) in (Tensor, torch.nn.Parameter) and not is_transforming()
-    return plain and not torch.compiler.is_compiling() and (always or value.device.type == "cpu")
 
 
 def require_tensor(name: str, value: object) -> Tensor:
@@ -81,7 +72,7 @@ def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.de
     if value.shape != shape:
         hint = "give one 4 x 4 matrix for each"
         raise ValueError(message(name, f"expected {shape} on {device}", tuple(value.shape), hint))
-    if readable(value, always) and not _are_rigid(value):
+    if is_readable(value, always) and not _are_rigid(value):
         _require_rigid(name, value)
     return value
 
@@ -163,7 +154,7 @@ def require_indices(
     name: str, value: Tensor, count: int, hint: str = "leave out the others", always: bool = False
 ) -> None:
     """Refuse indices outside [0, count)."""
-    if readable(value, always) and value.numel():
+    if is_readable(value, always) and value.numel():
         low, high = int(value.min()), int(value.max())
         require(low >= 0 and high < count, name, f"must lie in [0, {count})", f"{low}..{high}", hint)
 
@@ -175,7 +166,7 @@ def check_env_ids(env_ids: object, num_envs: int, device: torch.device, always: 
     value = check_tensor("env_ids", env_ids, device, (torch.int64,), convert)
     require(value.ndim == 1, "env_ids", "must be 1-D", tuple(value.shape), "flatten it, or pass mask=")
     require_indices("env_ids", value, num_envs, always=always)
-    if readable(value, always) and value.numel():
+    if is_readable(value, always) and value.numel():
         unique = value.unique().numel() == value.numel()
         require(unique, "env_ids", "must not repeat", value.tolist(), "use torch.unique or pass mask=")
     return value
@@ -205,6 +196,6 @@ def check_feet(feet: object, num_envs: int, device: torch.device, always: bool) 
     value = check_tensor("feet", feet, device, FLOATS)
     fits = value.ndim == 3 and value.shape[0] == num_envs and value.shape[1] >= 1 and value.shape[2] == 3
     require(fits, "feet", f"expected ({num_envs}, K, 3) with K >= 1", tuple(value.shape), "give ground points")
-    if readable(value, always):
+    if is_readable(value, always):
         require(bool(torch.isfinite(value).all()), "feet", "must be finite", "NaN or inf", "leave those feet out")
     return value

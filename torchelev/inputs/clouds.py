@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchelev.errors import require, require_count, require_positive
 from torchelev.frames.camera_axes import require_axes, turn
-from torchelev.inputs.checks import readable, require_tensor
+from torchelev.inputs.checks import require_tensor
+from torchelev.ops.transforms import is_readable
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Shaped
@@ -76,7 +77,7 @@ def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
     rule = f"expected (3, 3) or {(*images, 3, 3)} for depth of {shape}"
     hint = "give one matrix for all images, or one for each; drop a channel dimension of the depth"
     require(fits, "intrinsics", rule, tuple(intrinsics.shape), hint)
-    if readable(intrinsics):
+    if is_readable(intrinsics):
         focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
         wrong = focal[~((focal > 0) & focal.isfinite()).all(-1)]
         rule, hint = "must have positive, finite focal lengths", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"

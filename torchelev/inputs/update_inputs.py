@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchelev.errors import message, require
 from torchelev.inputs import checks
-from torchelev.ops.transforms import require_reverse_mode
+from torchelev.ops.transforms import is_readable, require_reverse_mode
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -118,7 +118,7 @@ def _check_covariance(
     rule, hint = f"expected {one} or {each}", "give one 6 x 6 matrix for each: x, y, z and rotations about them"
     require(tuple(value.shape) in (one, each), "pose_covariance", rule, tuple(value.shape), hint)
     value = value if value.ndim == 4 else value[:, None].expand(each)
-    if checks.readable(value, check_values):
+    if is_readable(value, check_values):
         checks.require_covariance("pose_covariance", value)
     return value
 
@@ -184,7 +184,7 @@ def _check_dt_tensor(dt: Tensor, num_envs: int, device: torch.device, check_valu
     if value.shape not in ((), (num_envs,)):
         rule = f"expected a number or ({num_envs},)"
         raise ValueError(message("dt", rule, tuple(value.shape), "give one dt per environment"))
-    if checks.readable(value, check_values):
+    if is_readable(value, check_values):
         good = (value >= 0) & (value < math.inf)
         if not good.all():
             bad = np.atleast_1d(~good.cpu().numpy())

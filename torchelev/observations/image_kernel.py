@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from torchelev.inputs.checks import readable
 from torchelev.kernels.cpu_build import call, load
 from torchelev.layers import Layer
 from torchelev.observations.fill import MODES
 from torchelev.observations.patterns import ALIGNMENTS, Pattern
+from torchelev.ops.transforms import can_compute_unseen
 
 if TYPE_CHECKING:
     from torchelev.grid import GridConfig
@@ -57,10 +56,7 @@ def can_read(T_map_base: Tensor, corner: Tensor, layers: Iterable[Tensor]) -> bo
     """Return whether `read_images` takes the layers and poses: float32 on a CPU, and nothing to differentiate."""
     tensors = [T_map_base, corner, *layers]
     dtypes = {value.dtype for value in tensors[2:]} - {torch.bool}
-    if dtypes != {torch.float32} or not all(map(readable, tensors)) or forward_ad._current_level >= 0:
-        return False
-    has_gradient = torch.is_grad_enabled() and any(value.requires_grad for value in tensors)
-    return not has_gradient and load(*LIBRARY) is not None
+    return dtypes == {torch.float32} and can_compute_unseen(tensors) and load(*LIBRARY) is not None
 
 
 def read_images(

@@ -6,7 +6,6 @@ import ctypes
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchelev.kernels.cpu_build import call, load
 from torchelev.layers import Layer
@@ -15,7 +14,7 @@ from torchelev.observations.ground import border_left_out, count_near_levels, ma
 from torchelev.observations.inputs import ScanInputs
 from torchelev.observations.patterns import ALIGNMENTS
 from torchelev.observations.scan_settings import ScanSettings
-from torchelev.ops.transforms import is_transforming
+from torchelev.ops.transforms import can_compute_unseen
 
 LIBRARY: tuple[str, dict[str, str]] = ("observations/kernel/scan.cpp", {})
 _RULES = ("ground", "lowest", "upper_bound", "inpaint")  # `Fill` of scan.cpp; the others fill in no heights
@@ -38,7 +37,7 @@ class _Scan(ctypes.Structure):
 
 def can_read(fill: str | float, inputs: ScanInputs) -> bool:
     """Return whether `read_in_cpp` takes the inputs: float32 on a CPU, with nothing to differentiate or to trace."""
-    if fill == "completed" or _is_recording():
+    if fill == "completed":
         return False
     state, grid = inputs.state, inputs.grid
     floats = (state.elevation, state.upper_bound, *(() if inputs.draws is None else (inputs.draws,)))
@@ -46,24 +45,7 @@ def can_read(fill: str | float, inputs: ScanInputs) -> bool:
     fits = all(layer.shape == cells for layer in (*floats[:2], state.validity, state.bounded))
     fits = fits and state.corner.shape == (cells[0], 2) and all(value.dtype == torch.float32 for value in floats)
     read = (*floats, state.corner, inputs.T_map_base, *(() if inputs.feet is None else (inputs.feet,)))
-    return fits and all(map(_is_plain, read)) and load(*LIBRARY) is not None
-
-
-def _is_recording() -> bool:
-    """Return whether torch compiles, transforms, traces or differentiates forwards, and must see every operation."""
-    return (
-        torch.compiler.is_compiling()
-        or is_transforming()
-        or torch.jit.is_tracing()
-        or torch._C._len_torch_dispatch_stack() > 0
-        or forward_ad._current_level >= 0
-    )
-
-
-def _is_plain(value: Tensor) -> bool:
-    """Return whether a tensor lies on the CPU and needs no gradient."""
-    is_on_cpu = value.is_cpu and type(value) in (Tensor, torch.nn.Parameter)
-    return is_on_cpu and not (value.requires_grad and torch.is_grad_enabled())
+    return fits and can_compute_unseen(read) and load(*LIBRARY) is not None
 
 
 def read_in_cpp(scan: ScanSettings, fill: str | float, missing: float, inputs: ScanInputs) -> Layer:

@@ -1,4 +1,4 @@
-"""Which of torch's differentiation modes and `torch.func` transforms run, and which of them the map refuses."""
+"""Which of torch's differentiation modes and transforms run: what they forbid to read, to compute in C++, or to map."""
 
 from __future__ import annotations
 
@@ -49,6 +49,24 @@ def _is_batched(value: Tensor) -> bool:
     return False
 
 
-def is_readable(values: Tensor) -> bool:
-    """Return whether the host may read the values without waiting: on a CPU, outside of transforms and compilers."""
-    return values.is_cpu and type(values) is Tensor and not is_transforming() and not torch.compiler.is_compiling()
+def has_values(tensor: Tensor) -> bool:
+    """Return whether the host may read a tensor: it is no fake one, and torch neither compiles nor transforms."""
+    is_plain = type(tensor) in (Tensor, torch.nn.Parameter)
+    return is_plain and not torch.compiler.is_compiling() and not is_transforming()
+
+
+def is_readable(tensor: Tensor, may_wait: bool = False) -> bool:
+    """Return whether the host may read a tensor now: it lies on the CPU, or the host `may_wait` for its device."""
+    return (may_wait or tensor.is_cpu) and has_values(tensor)
+
+
+def can_compute_unseen(tensors: Iterable[Tensor]) -> bool:
+    """Return whether C++ may compute with tensors on a CPU: torch needs to see no operation of it.
+
+    It does to differentiate, to trace, and in a dispatch mode such as that of a FLOP counter.
+    """
+    if torch.compiler.is_compiling() or torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack() > 0:
+        return False
+    records = torch.is_grad_enabled()
+    is_plain = all(is_readable(tensor) and not (records and tensor.requires_grad) for tensor in tensors)
+    return is_plain and forward_ad._current_level < 0

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require, require_count, require_positive
-from torchelev.inputs.checks import FLOATS, readable, require_indices, require_tensor
+from torchelev.inputs.checks import FLOATS, require_indices, require_tensor
+from torchelev.ops.transforms import is_readable
 from torchelev.ops.windows import AROUND, neighbours
 from torchelev.planning import dijkstra
 from torchelev.planning.sweeps import iterate, step_cost
@@ -52,7 +53,7 @@ def cost_to_go(
     require_positive(resolution=resolution)
     if rounds is not None:
         require_count("rounds", rounds, "give 16, or None")
-    can_read = readable(cost)
+    can_read = is_readable(cost)
     if can_read:
         hint = "give 1 for easy ground and inf for impassable"
         require(bool((cost > 0).all()), "cost", "must be positive", "NaN, or 0 and less", hint)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.inputs.checks import readable
 from torchelev.kernels.cpu_build import call, load
+from torchelev.ops.transforms import is_readable
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -51,7 +51,7 @@ def follow(
 
 
 def _library(cost: Tensor, *others: Tensor) -> ctypes.CDLL | None:
-    is_plain = cost.dtype in _SUFFIXES and all(map(readable, (cost, *others)))
+    is_plain = cost.dtype in _SUFFIXES and all(map(is_readable, (cost, *others)))
     fits = (cost.shape[1] + 2) * (cost.shape[2] + 2) < _MOST_CELLS
     return load(*LIBRARY) if is_plain and fits else None
 

@@ -11,7 +11,8 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.grid import GridConfig
-from torchelev.inputs.checks import FLOATS, check_tensor, readable
+from torchelev.inputs.checks import FLOATS, check_tensor
+from torchelev.ops.transforms import is_readable
 from torchelev.plane_fit import solve_gradient, spans_plane
 from torchelev.planning.limits import compute_steps
 from torchelev.planning.polygons import PolygonCells, rasterize
@@ -77,7 +78,7 @@ def _to_cells(emap: ElevationMap, polygons: Tensor, max_extent: float, corner: T
     max_cells = _max_cells(max_extent, grid) + ROUNDING
     uv = value.detach().double() / grid.resolution - corner[:, None, None]
     extent = (uv.amax(-2) - uv.amin(-2)).amax(-1)
-    if readable(value, emap.check_values) and value.numel():
+    if is_readable(value, emap.check_values) and value.numel():
         _require_small(uv, extent * grid.resolution, max_cells * grid.resolution, max_extent)
     return uv, (uv.abs() < MAX_CELL_OFFSET).flatten(-2).all(-1) & (extent <= max_cells)
 

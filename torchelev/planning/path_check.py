@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
-from torchelev.inputs.checks import given_or_default, readable
+from torchelev.inputs.checks import given_or_default
+from torchelev.ops.transforms import is_readable
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint
 from torchelev.planning.limits import Limits, limits_of
 from torchelev.planning.standing import MAX_CELL_OFFSET, check_polygon, check_poses, transform_polygon
@@ -90,7 +91,7 @@ def check_path(
     """
     cfg = given_or_default(FootprintConfig, cfg)
     given, polygon = check_poses(emap, poses), check_polygon(emap, footprint)
-    if readable(footprint, emap.check_values):
+    if is_readable(footprint, emap.check_values):
         _require_fits(polygon, cfg.max_extent)
     require_count("samples", samples, "give 8")
     is_empty = _is_empty(given)
@@ -99,7 +100,7 @@ def check_path(
     # No vertex moves farther than the base does and the farthest vertex turns.
     distance = torch.linalg.vector_norm(shift, dim=-1) + radius * turn[..., 0].abs()
     step = torch.where(is_empty[:, None], 0.0, distance / (samples * emap.cfg.grid.resolution))
-    if readable(poses, emap.check_values):
+    if is_readable(poses, emap.check_values):
         _require_close(torch.where(is_empty[:, None, None], 0.0, given), step, samples)
     places = _interpolate(given, torch.cat([shift, turn], -1), samples)
     # An empty path lies nowhere: so far away that nothing is known.

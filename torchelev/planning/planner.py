@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
-from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default, readable
+from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default
+from torchelev.ops.transforms import is_readable
 from torchelev.planning.cost_to_go import cost_to_go, descend
 from torchelev.planning.limits import find_exceeded
 from torchelev.planning.path_reason import Endpoint, explain, find_limit, find_reason, read_cell
@@ -113,7 +114,7 @@ def plan(
     value = cost_to_go(cost, target, resolution=grid.resolution, rounds=rounds)
     path = descend(value, cost, start.cell, resolution=grid.resolution, max_cells=max_cells)
     reached = path.reached & start.is_inside
-    if readable(reached) and bool(reached.all()):  # there is nothing to explain
+    if is_readable(reached) and bool(reached.all()):  # there is nothing to explain
         reason, limit = (torch.zeros_like(path.cells[:, 0, 0]) for _ in range(2))
     else:
         rated = emap.read_layer("traversability", state)[1]
@@ -137,7 +138,7 @@ def _find_cell(emap: ElevationMap, name: str, xy: object, state: MapState) -> En
     cell = torch.floor(value.detach().double() / grid.resolution) - state.corner
     i, j = cell.unbind(-1)
     is_inside = (cell >= 0).all(-1) & (i < grid.height) & (j < grid.width)
-    if readable(value, emap.check_values):
+    if is_readable(value, emap.check_values):
         actual = [[round(x, 3) for x in point] for point in value.detach()[~is_inside].tolist()[:3]]
         hint = f"windows are {grid.length_x:g} x {grid.length_y:g} m around emap.center; give a point inside"
         require(bool(is_inside.all()), name, "must lie in the window", actual, hint)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count, whole_cells
-from torchelev.inputs.checks import FLOATS, check_tensor, check_xy, readable
+from torchelev.inputs.checks import FLOATS, check_tensor, check_xy
+from torchelev.ops.transforms import is_readable
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def _find_first_cell(emap: ElevationMap, center_xy: object, shape: tuple[int, in
     value, expected = check_tensor("center_xy", center_xy, emap.device, FLOATS), (emap.num_envs, 2)
     actual, hint = tuple(value.shape), "give a point for each environment"
     require(actual == expected, "center_xy", f"expected {expected}", actual, hint)
-    if readable(value, emap.check_values):
+    if is_readable(value, emap.check_values):
         is_finite = bool(torch.isfinite(value).all())
         require(is_finite, "center_xy", "must be finite", "NaN or inf", "give a point inside the map")
     half = torch.stack([value.new_full((), cells / 2, dtype=torch.float64) for cells in shape])

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
-from torchelev.inputs.checks import FLOATS, check_pose, check_tensor, readable
+from torchelev.inputs.checks import FLOATS, check_pose, check_tensor
 from torchelev.observations.patterns import compute_heading
+from torchelev.ops.transforms import is_readable
 from torchelev.planning.polygons import rasterize
 from torchelev.state import MapState
 
@@ -96,7 +97,7 @@ def check_polygon(emap: ElevationMap, footprint: object) -> Float[Tensor, "V 2"]
     value = check_tensor("footprint", footprint, emap.device, FLOATS)
     fits = value.ndim == 2 and value.shape[0] >= 3 and value.shape[1] == 2
     require(fits, "footprint", "expected (V, 2) with V >= 3", tuple(value.shape), "give its vertices, base frame")
-    if readable(value, emap.check_values):
+    if is_readable(value, emap.check_values):
         is_finite = bool(torch.isfinite(value).all())
         require(is_finite, "footprint", "must be finite", "NaN or inf", "leave those vertices out")
     return value.detach().double()

@@ -6,10 +6,9 @@ import ctypes
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from torchelev.inputs.checks import readable
 from torchelev.kernels.cpu_build import load
+from torchelev.ops.transforms import can_compute_unseen
 
 
 def find_library(library: tuple[str, dict[str, str]], *tensors: Tensor | None) -> ctypes.CDLL | None:
@@ -18,11 +17,8 @@ def find_library(library: tuple[str, dict[str, str]], *tensors: Tensor | None) -
     It takes float32 on a CPU without gradients. The tensors need not be contiguous.
     """
     given = [value for value in tensors if value is not None]
-    is_plain = all(value.dtype == torch.float32 and readable(value) for value in given)
-    has_gradient = torch.is_grad_enabled() and any(value.requires_grad for value in given)
-    if not is_plain or has_gradient or forward_ad._current_level >= 0:
-        return None
-    return load(*library)
+    fits = all(value.dtype == torch.float32 for value in given) and can_compute_unseen(given)
+    return load(*library) if fits else None
 
 
 def address(value: Tensor | None) -> ctypes.c_void_p:

@@ -7,8 +7,8 @@ import ctypes
 import torch
 from torch import Tensor
 
-from torchelev.inputs.checks import readable
 from torchelev.kernels.cpu_build import call, load
+from torchelev.ops.transforms import is_readable
 from torchelev.sim.cpp_library import address
 from torchelev.sim.terrains.heightfield import HeightField
 
@@ -72,7 +72,7 @@ def see(
 
 
 def _find_library(field: HeightField, *values: Tensor) -> ctypes.CDLL | None:
-    if not all(readable(value) for value in (field.padded, *values)) or len(field.bounds.highest) >= 2**31:
+    if not all(is_readable(value) for value in (field.padded, *values)) or len(field.bounds.highest) >= 2**31:
         return None
     return load(*LIBRARY)
 
