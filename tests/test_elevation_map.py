@@ -137,9 +137,9 @@ def test_an_environment_without_returns_only_ages():
     alone.update(scan(9, 3)[0], T, None, 0.5)
     rows = [n for n in before._fields[:-1] if not torch.equal(getattr(before, n)[1], getattr(emap.state, n)[1])]
     assert set(rows) == {"elapsed", "time", "variance"}
-    torch.testing.assert_close(emap.time[1], before.time[1] + 0.5)
-    growth = emap.cfg.aging.variance_rate * 0.5
-    torch.testing.assert_close(emap.variance[1], (before.variance[1] + growth).clamp(max=1.0))
+    known, growth = before.validity[1], emap.cfg.aging.variance_rate * 0.5
+    torch.testing.assert_close(emap.time[1], before.time[1] + 0.5 * known)
+    torch.testing.assert_close(emap.variance[1], (before.variance[1] + growth * known).clamp(max=1.0))
     for b in (0, 2):
         assert torch.equal(emap.layer("elevation")[b].nan_to_num(), alone.layer("elevation")[b].nan_to_num())
     assert emap.statistics.rejected_invalid.tolist() == [0, 300, 0] and emap.statistics.points_used[1] == 0

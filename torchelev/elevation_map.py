@@ -26,7 +26,7 @@ from torchelev.kernels.choose import Backend, choose
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import is_readable, require_reverse_mode
-from torchelev.pipeline import rate, update_by_tensors, update_on_cpu, update_on_gpu, write
+from torchelev.pipeline import rate, update_by_tensors, update_in_place, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
 from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement
@@ -152,9 +152,10 @@ class ElevationMap(ReadableMap):
 
     def _run_stages(self, state: MapState, inputs: Inputs, weights: Weights | None) -> None:
         """Update a state of these maps by the backend that suits it."""
-        run: Any = {"CPU": update_on_cpu, "CUDA": update_on_gpu, "TORCH": update_by_tensors}[self.backend.name]
-        run = functools.partial(run, cfg=self._update_cfg, weights=weights, key=self._key)
-        if run.func is update_on_cpu and weights is None:
+        name, run = self.backend.name, functools.partial(update_by_tensors, cfg=self._update_cfg, weights=weights)
+        if name != "TORCH":
+            run = functools.partial(update_in_place, cfg=self._update_cfg, weights=weights, key=self._key)
+        if name == "CPU" and weights is None:
             return run(state, inputs)  # chunks would save no memory: C++ keeps one map's for each thread
         return run_in_chunks(run, state, inputs, self.chunks)
 

@@ -104,29 +104,23 @@ def reset_statistics(state: MapState, m: Measurement) -> MapState:
 # Backends -----------------------------------------------------------------------------------------------------------
 
 
-def update_by_tensors(
-    stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int = 0
-) -> None:
+def update_by_tensors(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None) -> None:
     """Measure, fuse, and write the new values into the stored state's own tensors."""
     m = measure(*inputs, cfg.grid, cfg.sensor, stored.elevation.dtype)
     write(stored, forward(stored, m, cfg, weights))
 
 
-def update_on_cpu(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int) -> None:
-    """Do the same in place, by one call of C++; `key` is that of `compile_stages`."""
-    values = inputs._asdict() | {"own": find_own(inputs, cfg.sensor)}
-    cpu_update.run(key, (*stored[:-1], *stored.statistics), as_inputs(values))
-    if isinstance(cfg.traversability, LearnedTraversabilityConfig):
-        write(stored, rate_learned(stored, cfg, weights))
-
-
-def update_on_gpu(
-    stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int = 0
+def update_in_place(
+    stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int
 ) -> None:
-    """Do the same in place, by CUDA kernels."""
-    values = inputs._asdict() | {"own": find_own(inputs, cfg.sensor)}
-    with torch.cuda.device_of(stored.elevation):
-        cuda_stages(cfg).run((*stored[:-1], *stored.statistics), as_inputs(values))
+    """Do the same in place: by one call of C++ on a CPU, by kernels on a GPU. `key` is that of `compile_stages`."""
+    tensors = (*stored[:-1], *stored.statistics)
+    values = as_inputs(inputs._asdict() | {"own": find_own(inputs, cfg.sensor)})
+    if stored.elevation.is_cuda:
+        with torch.cuda.device_of(stored.elevation):
+            cuda_stages(cfg).run(tensors, values)
+    else:
+        cpu_update.run(key, tensors, values)
     if isinstance(cfg.traversability, LearnedTraversabilityConfig):
         write(stored, rate_learned(stored, cfg, weights))
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchelev.kernels.cpu_build import call, is_switched_off, load
-from torchelev.kernels.registry import Kernel, header
-from torchelev.kernels.structs import SIZES, c_settings
+from torchelev.kernels.registry import Kernel, header, settings_of
+from torchelev.kernels.structs import SIZES
 from torchelev.ops.library import LIBRARY
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class CpuUpdate:
     def __init__(self, kernels: Sequence[Kernel], tensors: Sequence[Any], order: Sequence[str], cfg: Any, default: Any):
         self._kernels, self._tensors, self._order = kernels, tensors, tuple(order)
         self._cfg, self._default = cfg, default
+        self._functions: dict[tuple[str, ...], Any] = {}  # addresses, by stages
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL | None:
@@ -68,8 +69,7 @@ class CpuUpdate:
 
     @functools.cached_property
     def _settings(self) -> ctypes.Structure:
-        own, default = ({k.name: k.settings(cfg) for k in self._kernels} for cfg in (self._cfg, self._default))
-        return c_settings(own, default)
+        return settings_of(self._kernels, self._cfg, self._default)
 
     def run(
         self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
@@ -82,17 +82,18 @@ class CpuUpdate:
         """
         assert self.library is not None
         sizes = sizes_of(state, inputs)
-        functions = self._functions(self._order if stages is None else tuple(stages))
+        functions = self._addresses(self._order if stages is None else tuple(stages))
         arguments = addresses(state), addresses(inputs), self._settings, sizes
         references = (ctypes.byref(value) for value in arguments)
         torch.autograd.graph.increment_version(state)  # a backward pass through what the maps held shall say so
         call(self.library.update_maps, *references, functions, ctypes.c_int64(len(functions)), torch.get_num_threads())
 
-    @functools.lru_cache(maxsize=8)  # noqa: B019  # of a few orders, for as long as the config is used
-    def _functions(self, stages: tuple[str, ...]) -> Any:
+    def _addresses(self, stages: tuple[str, ...]) -> Any:
         """Return the addresses of the stages' functions."""
-        pointers = (ctypes.cast(getattr(self.library, f"run_{name}"), ctypes.c_void_p) for name in stages)
-        return (ctypes.c_void_p * len(stages))(*(pointer.value for pointer in pointers))
+        if stages not in self._functions:
+            pointers = (ctypes.cast(getattr(self.library, f"run_{name}"), ctypes.c_void_p) for name in stages)
+            self._functions[stages] = (ctypes.c_void_p * len(stages))(*(pointer.value for pointer in pointers))
+        return self._functions[stages]
 
 
 _UPDATES: list[CpuUpdate] = []  # by key

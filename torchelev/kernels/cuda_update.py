@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchelev.kernels import cuda_build
 from torchelev.kernels.cpu_update import Inputs, Sizes, addresses, sizes_of
-from torchelev.kernels.registry import Kernel, Launch, header
-from torchelev.kernels.structs import SIZES, c_settings, scratch_struct
+from torchelev.kernels.registry import Kernel, Launch, header, settings_of
+from torchelev.kernels.structs import SIZES, scratch_struct
 
 _DTYPES = {
     "float": torch.float32,
@@ -61,8 +61,7 @@ class CudaUpdate:
         for kernel in kernels:
             source = cuda_build.Source(kernel.cuda_source, whole)
             self._launches |= {stage: [(source, one) for one in launches] for stage, launches in kernel.cuda.items()}
-        own, like = ({kernel.name: kernel.settings(c) for kernel in kernels} for c in (cfg, default))
-        self._settings = c_settings(own, like)
+        self._settings = settings_of(kernels, cfg, default)
         self._loaded: set[int] = set()  # devices
 
     def run(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchelev.kernels.structs import SIZES, Settings, settings_struct, sizes_struct, tensor_struct
+from torchelev.kernels.structs import SIZES, Settings, c_settings, settings_struct, sizes_struct, tensor_struct
 
 PACKAGE = Path(__file__).parents[1]  # includes begin here, such as "stages/age/equation.h"
 
@@ -69,6 +70,12 @@ def header(
     structs += [settings_struct(kernel.struct, kernel.settings(cfg)) for kernel in kernels]
     whole = "\n".join(f"    {kernel.struct} {kernel.name};" for kernel in kernels)
     return "\n".join(["#pragma once\n#include <cstdint>\n", *structs, f"struct Settings {{\n{whole}\n}};\n"])
+
+
+def settings_of(kernels: Sequence[Kernel], cfg: Any, default: Any) -> ctypes.Structure:
+    """Return the settings of all kernels by a config as C has them, `Settings` of `header`; types are the default's."""
+    own, like = ({kernel.name: kernel.settings(c) for kernel in kernels} for c in (cfg, default))
+    return c_settings(own, like)
 
 
 def once(sizes: Any) -> int:
