@@ -77,8 +77,7 @@ class CpuUpdate:
         """Run stages, by name, or all, on a state's tensors (B, ...), in place.
 
         Raises:
-            MemoryError: without enough memory. Some maps then lack a part of this update, and some variances what
-                scans disagree by.
+            MemoryError: without enough memory. Some maps then lack a part of this update.
         """
         assert self.library is not None
         sizes = sizes_of(state, inputs)

@@ -42,6 +42,16 @@ struct Borrowed {
     }
 };
 
+// Run the stages. One may fail without memory, before it changes its map; the map stays sound.
+void run(Update& one, const Stage* stages, int64_t num_stages) {
+    try {
+        for (int64_t k = 0; k < num_stages; k++) stages[k](one);
+    } catch (...) {
+        if (one.on_failure) one.on_failure(one);
+        throw;
+    }
+}
+
 }  // namespace
 
 // Leave what is kept to the parent of a forked process, a thread of which may hold the mutex.
@@ -55,7 +65,7 @@ extern "C" int update_maps(const MapState* state, const Inputs* inputs, const Se
         Own& own = *borrowed.own;
         Update one{*settings,          *sizes,     state->at(b, *sizes), inputs->at(b, *sizes),
                    own.measurement,    own.memory, threads};
-        for (int64_t k = 0; k < num_stages; k++) stages[k](one);
+        run(one, stages, num_stages);
     };
     return code_of([&] { for_environments(sizes->B, num_threads, make, update); });
 }

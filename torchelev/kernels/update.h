@@ -64,6 +64,9 @@ struct Measurement {
     float variance(int64_t k) const { return has_covariance ? noise[k] + of_pose[k] : noise[k]; }
 };
 
+struct Update;
+typedef void (*Stage)(Update&);
+
 struct Update {
     const Settings& settings;
     const Sizes& sizes;       // B, H, W, S, N, K
@@ -72,6 +75,7 @@ struct Update {
     Measurement& measurement;
     Memory& memory;           // of this thread
     int threads;              // that may work on this map
+    Stage on_failure = nullptr;  // puts back what a stage took out of the map for those that follow
 
     int64_t cells() const { return sizes.H * sizes.W; }
 
@@ -83,4 +87,3 @@ struct Update {
     }
 };
 
-typedef void (*Stage)(Update&);

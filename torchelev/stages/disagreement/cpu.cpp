@@ -17,11 +17,13 @@ template <class Change> void change_variance(Update& u, const Change& change) {
 
 }  // namespace
 
+extern "C" void run_add_disagreement(Update& u) {
+    change_variance(u, [](Lanes variance, Lanes d2) { return variance + d2; });
+    u.on_failure = nullptr;
+}
+
 extern "C" void run_subtract_disagreement(Update& u) {
     const DisagreementSettings& s = u.settings.disagreement;
     change_variance(u, [&](Lanes variance, Lanes d2) { return disagreement::without(variance, d2, s); });
-}
-
-extern "C" void run_add_disagreement(Update& u) {
-    change_variance(u, [](Lanes variance, Lanes d2) { return variance + d2; });
+    u.on_failure = run_add_disagreement;
 }
