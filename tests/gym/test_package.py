@@ -20,39 +20,53 @@ def without(*names):
     return "".join(f"sys.modules[{name!r}] = None\n" for name in names)
 
 
-@pytest.mark.slow(1)
-@pytest.mark.parametrize(
-    "module", ["torchelev", "torchelev.sim", "torchelev.planes", "torchelev.filters", "torchelev.encoders"]
-)
-def test_the_package_imports_no_reinforcement_learning(module):
-    done = run(f"import {module}\nprint([name for name in {LIBRARIES} if name in sys.modules])")
-    assert done.stdout.strip() == "[]", done.stderr
+MODULES = {  # the library that each may import, beside those before it
+    "torchelev": [],
+    "torchelev.sim": [],
+    "torchelev.planes": [],
+    "torchelev.filters": [],
+    "torchelev.encoders": [],
+    "torchelev.gym": ["gymnasium"],
+}
+WITHOUT = [  # module, missing library, extra that has it
+    ("torchelev.gym", "gymnasium", "gym"),
+    ("torchelev.gym.feed", "gymnasium", "gym"),
+    ("torchelev.gym.wrappers", "gymnasium", "gym"),
+    ("torchelev.gym.rsl_rl", "gymnasium", "gym"),
+    ("torchelev.gym.rsl_rl", "rsl_rl", "rl"),
+    ("torchelev.gym.rsl_rl", "tensordict", "rl"),
+    ("torchelev.encoders.rsl_rl", "rsl_rl", "rl"),
+    ("torchelev.encoders.rsl_rl", "tensordict", "rl"),
+]
 
 
 @pytest.mark.slow(1)
-def test_torchelev_gym_imports_no_rsl_rl():
-    done = run(f"import torchelev.gym\nprint([name for name in {LIBRARIES} if name in sys.modules])")
-    assert done.stdout.strip() == "['gymnasium']", done.stderr
+def test_modules_import_no_reinforcement_learning():
+    """Of rsl-rl nothing, and gymnasium only with `torchelev.gym`; one after the other in one process."""
+    loaded = f"print([name for name in {LIBRARIES} if name in sys.modules])"
+    done = run("\n".join(f"import {module}\n{loaded}" for module in MODULES))
+    assert done.stdout.splitlines() == [str(libraries) for libraries in MODULES.values()], done.stderr
 
 
 @pytest.mark.slow(1)
-@pytest.mark.parametrize(
-    "module, missing, extra",
-    [
-        ("torchelev.gym", "gymnasium", "gym"),
-        ("torchelev.gym.feed", "gymnasium", "gym"),
-        ("torchelev.gym.wrappers", "gymnasium", "gym"),
-        ("torchelev.gym.rsl_rl", "gymnasium", "gym"),
-        ("torchelev.gym.rsl_rl", "rsl_rl", "rl"),
-        ("torchelev.gym.rsl_rl", "tensordict", "rl"),
-        ("torchelev.encoders.rsl_rl", "rsl_rl", "rl"),
-        ("torchelev.encoders.rsl_rl", "tensordict", "rl"),
-    ],
-)
-def test_an_import_without_its_library_names_the_extra(module, missing, extra):
-    done = run(f"import torchelev\n{without(missing)}import {module}")
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].endswith(f"install it with pip install 'torchelev[{extra}]'"), done.stderr
+def test_imports_without_their_library_name_the_extra():
+    code = f"""
+import importlib, torchelev
+for module, missing, extra in {WITHOUT}:
+    kept = dict(sys.modules)
+    sys.modules[missing] = None
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        assert str(error).endswith(f"install it with pip install 'torchelev[{{extra}}]'"), error
+    else:
+        raise AssertionError(f"{{module}} needs no {{missing}}")
+    for name in set(sys.modules) - set(kept) | {{missing}}:  # what the attempt left
+        if name.split(".")[0] in ("torchelev", missing):
+            sys.modules.pop(name, None)
+"""
+    done = run(code)
+    assert done.returncode == 0, done.stderr
 
 
 def test_environments_can_be_imported_without_gymnasium():

@@ -13,7 +13,7 @@ from torchelev.kernels import cuda_build as kernels
 
 @pytest.fixture
 def gpu(monkeypatch):
-    """A GPU as far as `can_launch` asks; what it knows of GPUs is forgotten."""
+    """A GPU as far as `can_launch` asks, which knows of none yet."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
     monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: False)
@@ -23,27 +23,31 @@ def gpu(monkeypatch):
     return monkeypatch
 
 
+@pytest.fixture
+def tried(gpu):
+    """The GPUs that were tried; kernels run on all of them."""
+    devices = []
+    gpu.setattr(kernels, "_try", lambda device: not devices.append(device))
+    return devices
+
+
 def test_without_a_gpu():
     with patch.object(torch.cuda, "is_available", lambda: False):
         assert not kernels.can_launch(0)
 
 
-def test_each_gpu_is_tried_once(gpu):
-    tried = []
-    gpu.setattr(kernels, "_try", lambda device: not tried.append(device))
+def test_each_gpu_is_tried_once(tried):
     assert kernels.can_launch(0) and kernels.can_launch(1) and kernels.can_launch(0)
     assert tried == [0, 1]
 
 
-def test_nothing_is_tried_while_a_graph_is_captured(gpu):
-    gpu.setattr(kernels, "_try", lambda device: True)
+def test_nothing_is_tried_while_a_graph_is_captured(tried):
     with patch.object(torch.cuda, "is_current_stream_capturing", lambda: True):
         assert not kernels.can_launch(0)
-    assert kernels.can_launch(0)
+    assert not tried and kernels.can_launch(0)
 
 
-def test_they_can_be_switched_off(gpu):
-    gpu.setattr(kernels, "_try", lambda device: True)
+def test_they_can_be_switched_off(gpu, tried):
     gpu.setenv("TORCHELEV_NATIVE", "0")
     assert not kernels.can_launch(0)
 
