@@ -14,15 +14,15 @@ import torch
 from benchmarks.speed.meter import progress
 
 _IMPORT = "import time, torch; t = time.perf_counter(); import torchelev; print(time.perf_counter() - t)"
+# Imports nothing that a user's program does not, as its memory is measured, too.
 _FIRST_UPDATE = """
-import time, torch
-from benchmarks.speed.meter import peak_megabytes
+import resource, time, torch
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 torch.set_num_threads({threads})
 drive = Drive(full_config(), BPEARL, scans=1)
 t = time.perf_counter()
 drive()
-print(time.perf_counter() - t, peak_megabytes())
+print(time.perf_counter() - t, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-6)
 """
 
 
