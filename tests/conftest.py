@@ -41,6 +41,22 @@ def _one_thread():
 
 
 @pytest.fixture
+def figures(monkeypatch):
+    """The figures that are written to files, in their order."""
+    from matplotlib.figure import Figure
+
+    written, save = [], Figure.savefig
+
+    def note(figure, *args, **kwargs):
+        if figure not in written:
+            written.append(figure)
+        save(figure, *args, **kwargs)
+
+    monkeypatch.setattr(Figure, "savefig", note)
+    return written
+
+
+@pytest.fixture
 def port():
     """A port that is free."""
     with socket.socket() as free:

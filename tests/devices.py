@@ -4,7 +4,10 @@ import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+from torchelev.filters.inpainting import holes
+from torchelev.sim.sensors import body_casting, tracing
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -34,4 +37,11 @@ class Unread(torch.Tensor):
 
 
 def unread(value):
-    return value.as_subclass(Unread)
+    """A tensor, or all tensors of a tuple, as the host of a GPU has them."""
+    return tree_map_only(torch.Tensor, lambda tensor: tensor.as_subclass(Unread), value)
+
+
+def never_wait(monkeypatch):
+    """Let rays and the filling of holes on a CPU go the way of a GPU, where the host would wait to read anything."""
+    for module, name in ((tracing, "can_select_rays"), (body_casting, "can_select_rays"), (holes, "may_wait")):
+        monkeypatch.setattr(module, name, lambda device: False)

@@ -14,24 +14,8 @@ from benchmarks.quality.features.feature_figure import ROWS
 from benchmarks.speed import growth
 from benchmarks.speed.update import plots
 from docs.readme_tables import SPEED, load
-from torchelev.viz import style
 from training.nav import experiment
 from training.traversability import block
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Collect the figures that are saved."""
-    saved = []
-    save = style.save
-
-    def collect(figure, path):
-        saved.append(figure)
-        save(figure, path)
-
-    for module in (report, growth, plots, experiment, block):
-        monkeypatch.setattr(module, "save", collect)
-    return saved
 
 
 def draw_accuracy(path):

@@ -1,5 +1,7 @@
 """A recording on disk, and the command line as a function."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -48,3 +50,41 @@ def at_scan(monkeypatch):
         monkeypatch.setattr(MappingRun, "add", watched)
 
     return prepare
+
+
+class Shown(list):
+    """What a page drew: snapshots, and what came with them. Ctrl-C is pressed at the last one of `most`."""
+
+    most = math.inf
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What pages draw. Recordings are played at once, and Ctrl-C is pressed at their end."""
+    from torchelev.viz import live
+
+    shown = Shown()
+
+    class Page(live.Page):
+        def draw(self, snapshot, *args):
+            shown.append((snapshot, *args))
+            super().draw(snapshot, *args)
+            if len(shown) == shown.most:
+                raise KeyboardInterrupt
+
+        def wait(self):
+            raise KeyboardInterrupt
+
+    class Player(live.Player):
+        def hold(self):
+            raise KeyboardInterrupt
+
+        def _wait_until_due(self, time_now):
+            pass
+
+        def _is_due(self, number):
+            return True
+
+    monkeypatch.setattr(live, "Page", Page)
+    monkeypatch.setattr(live, "Player", Player)
+    return shown

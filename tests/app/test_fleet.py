@@ -11,12 +11,34 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("tqdm")
 
+from tests.app.drives import raise_interrupt
 from torchelev.app.fleet.command import finish
 from torchelev.app.fleet.mission import DT, Mission
 from torchelev.app.fleet.numbers import measure_seams
 from torchelev.app.fleet.request import FleetRequest
 
 SMALL = ("--robots", 3, "--size", 12, "--seconds", 4)
+
+
+@pytest.fixture
+def at_scan(monkeypatch):
+    """Let something happen before the scan of a number is mapped, of -1: before anything is computed."""
+
+    def prepare(number, action):
+        class Watched(Mission):
+            def __init__(self, *arguments):
+                if number == -1:
+                    action()
+                super().__init__(*arguments)
+
+            def step(self):
+                if self.num_scans == number:
+                    action()
+                super().step()
+
+        monkeypatch.setattr("torchelev.app.fleet.command.Mission", Watched)
+
+    return prepare
 
 
 @pytest.mark.slow(4)
@@ -72,33 +94,23 @@ def test_a_mission_repeats_by_its_seed():
         (("--out", "nowhere/fleet.png"), "nowhere/fleet.png: cannot be written"),
     ],
 )
-def test_bad_input_is_refused_before_anything_is_computed(run, monkeypatch, options, words):
-    monkeypatch.setattr("torchelev.app.fleet.command.Mission", lambda *arguments: pytest.fail("computed"))
+def test_bad_input_is_refused_before_anything_is_computed(run, at_scan, options, words):
+    at_scan(-1, lambda: pytest.fail("computed"))
     code, out, err = run("fleet", *options)
     assert code == 2 and words in err and err.count("\n") == 1
 
 
 @pytest.mark.slow(2)
-def test_ctrl_c_keeps_what_was_mapped(run, monkeypatch, tmp_path):
-    step = Mission.step
-
-    def interrupted_step(mission):
-        if mission.num_scans == 7:
-            os.kill(os.getpid(), signal.SIGINT)
-        step(mission)
-
-    monkeypatch.setattr(Mission, "step", interrupted_step)
+def test_ctrl_c_keeps_what_was_mapped(run, at_scan, tmp_path):
+    at_scan(7, lambda: os.kill(os.getpid(), signal.SIGINT))
     code, out, err = run("fleet", *SMALL, "--quiet")
     assert code == 130 and "interrupted: kept the map of 1 of 4 s" in err
     assert json.loads((tmp_path / "fleet.json").read_text())["history"][-1][0] == pytest.approx(7 * DT)
     assert (tmp_path / "fleet.png").exists() and "coverage" in out
 
 
-def test_ctrl_c_before_the_first_scan_writes_nothing(run, monkeypatch, tmp_path):
-    def interrupt(mission):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Mission, "step", interrupt)
+def test_ctrl_c_before_the_first_scan_writes_nothing(run, at_scan, tmp_path):
+    at_scan(0, raise_interrupt)
     code, out, err = run("fleet", *SMALL, "--quiet")
     assert (code, out) == (130, "") and "nothing was mapped" in err and not list(tmp_path.iterdir())
 
@@ -127,17 +139,9 @@ def test_help_says_what_happens(run):
 
 
 @pytest.mark.slow(2)
-def test_live_shows_the_site_and_the_robots(run, monkeypatch, port):
+def test_live_shows_the_site_and_the_robots(run, port, request):
     pytest.importorskip("viser", reason="needs torchelev[view]")
-    from torchelev.viz.live import Page
-
-    shown = []
-
-    def leave(page):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Page, "draw", lambda page, snapshot, status: shown.append((snapshot, status)))
-    monkeypatch.setattr(Page, "wait", leave)
+    shown = request.getfixturevalue("shown")
     code, out, err = run("fleet", *SMALL[:4], "--seconds", 2, "--live", "--port", port, "--quiet")
     assert (code, err) == (0, "") and f"open      http://localhost:{port}" in out
     assert [status[:4] for _, status in shown] == ["0 s,", "1 s,", "2 s,"]

@@ -43,15 +43,13 @@ def test_a_path_around_a_wall(tmp_path, save):
     assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_path_on_which_the_body_does_not_fit_is_marked(tmp_path, monkeypatch):
+def test_a_path_on_which_the_body_does_not_fit_is_marked(tmp_path, figures):
     """A body of 1.2 m beside a gap of 0.7 m: its centre passes where its front, which turns, hits the wall."""
     emap = world(gap=2.0)
     y = emap.cell_centers()[..., 1]
     emap.elevation.masked_fill_((y - 0.5).abs() < 0.35, 0.0)
     emap.load_state(rate(emap.state, emap.cfg))
     save_npz(tmp_path / "map.npz", emap)
-    figures = []
-    monkeypatch.setattr("torchelev.viz.style.write", lambda figure, path: figures.append(figure))
     code, text = run(tmp_path / "map.npz", *ENDS, "--width", 0.2, "--length", 1.2, "--out", tmp_path / "path.png")
     assert code == 1 and text.startswith("not safe") and "cannot be reached safely" in text
     x, y = text.split("at x = ")[1].split(" m ")[0].split(" m, y = ")

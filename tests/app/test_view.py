@@ -17,29 +17,6 @@ from torchelev.io import export
 viser = pytest.importorskip("viser", reason="needs torchelev[view]")
 
 
-@pytest.fixture
-def shown(monkeypatch):
-    """What pages drew. The player does not wait, and nothing stays open."""
-    from torchelev.viz.live import Page, Player
-
-    drawn = []
-    draw = Page.draw
-
-    def note(page, snapshot, *args):
-        drawn.append((snapshot, *args))
-        draw(page, snapshot, *args)
-
-    def leave(self):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Page, "draw", note)
-    monkeypatch.setattr(Player, "_wait_until_due", lambda self, time_now: None)
-    monkeypatch.setattr(Player, "_is_due", lambda self, number: True)
-    monkeypatch.setattr(Player, "hold", leave)
-    monkeypatch.setattr(Page, "wait", leave)
-    return drawn
-
-
 @pytest.mark.slow(2)
 def test_a_folder_shows_the_map_that_map_writes(run, recording, port, shown, tmp_path):
     options = ("--size", 6, "--resolution", 0.1, "--sensor-height", 1.0)
@@ -74,8 +51,8 @@ def test_a_saved_map(run, port, shown, tmp_path, save):
 
 
 @pytest.mark.slow(3)
-def test_without_a_recording_the_demo_walks(run, port, shown, monkeypatch):
-    monkeypatch.setattr("torchelev.app.demo.DemoWalk.__len__", lambda walk: 3)
+def test_without_a_recording_the_demo_walks(run, port, shown):
+    shown.most = 3
     code, _, err = run("view", "--port", port)
     assert (code, err) == (0, "") and len(shown) == 3 and shown[-1][0].time == pytest.approx(0.4)
 

@@ -91,9 +91,15 @@ def test_updates_are_timed_by_the_maps_clock():
         emap.update(points=cloud, T_map_sensor=T, T_map_base=T, dt=0.1)
 
 
-def test_updates_on_other_devices_are_not_timed(monkeypatch):
-    emap, (cloud, _), noted = mapped(), scan(5), []
-    monkeypatch.setattr(emap.update_times, "note", lambda seconds, num_points: noted.append(num_points))
+def test_updates_on_other_devices_are_not_timed():
+    noted = []
+
+    class Noted(UpdateTimes):
+        def note(self, seconds, num_points):
+            noted.append(num_points)
+
+    emap, (cloud, _) = mapped(), scan(5)
+    emap.update_times = Noted()
     on_other_device = torch.empty(cloud.shape, device="meta")
     update_times.timed(lambda *_: None)(emap, on_other_device)
     assert not noted

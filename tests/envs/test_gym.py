@@ -150,16 +150,14 @@ def test_environments_without_a_seed_differ():
 
 
 @pytest.mark.slow(2)
-def test_a_strip_shows_ground_and_map_in_one_extent(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr("envs.terrain_nav.render.save", lambda figure, path: drawn.append(figure))
+def test_a_strip_shows_ground_and_map_in_one_extent(tmp_path, figures):
     task = TerrainNav(CFG, 1)
     shots = [snapshot(task)]
     task.advance(torch.ones(1, 2))
     task.sense()
     shots.append(snapshot(task))
     save_strip(shots, tmp_path / "strip.png", trail=[shot.xy for shot in shots], cfg=CFG)
-    axes = [ax for ax in drawn[0].axes if ax.images]
+    axes = [ax for ax in figures[0].axes if ax.images]
     assert len(axes) == 4 and len({(*ax.get_xlim(), *ax.get_ylim()) for ax in axes}) == 1
     x_min, x_max, y_min, y_max = *axes[0].get_xlim(), *axes[0].get_ylim()
     places = np.array([*(shot.xy for shot in shots), shots[0].goal])

@@ -9,6 +9,7 @@ import torch
 from envs.terrain_nav import SightConfig, TerrainNav, TerrainNavConfig
 from tests.envs.terrain_nav_cases import FLAT, SMALL
 from torchelev.observations.fill import FILLS
+from torchelev.sim import SensorErrorConfig, SensorErrors
 
 
 @pytest.mark.slow(1)
@@ -74,20 +75,18 @@ def test_the_map_shows_the_ground_where_errors_are_none():
 
 
 @pytest.mark.slow(1)
-def test_rays_start_where_cameras_are_and_points_go_where_odometry_says(monkeypatch):
+def test_rays_start_where_cameras_are_and_points_go_where_odometry_says():
     task = TerrainNav(TerrainNavConfig(course=SMALL, sight=SightConfig(sensor_errors="perfect")), 3)
     for _ in range(5):
         task.advance(torch.ones(3, 2))
         task.sense()
     sight, T = task.sight, task.T_map_base
     assert float((sight.T_estimated - T).abs().max()) > 1e-3
-    bent = torch.eye(4).repeat(3, 1, 1)
-    bent[:, :3, 3] = torch.tensor([0.1, -0.05, 0.02])
-    for errors in sight.sensor_errors:
-        monkeypatch.setattr(errors, "mounting", lambda: bent)
+    bent = SensorErrorConfig(mounting_position=0.1, mounting_rotation_deg=2.0)
+    sight.sensor_errors = torch.nn.ModuleList(SensorErrors(bent, 3, seed=k) for k in range(len(sight.cameras)))
     points, poses = sight.look(T, task.tile_ids)
-    for k, camera in enumerate(sight.cameras):
-        seen = camera(task.course.field, task.tile_ids, T, T_base_sensor=camera.T_base_sensor @ bent)
+    for k, (camera, errors) in enumerate(zip(sight.cameras, sight.sensor_errors, strict=True)):
+        seen = camera(task.course.field, task.tile_ids, T, T_base_sensor=camera.T_base_sensor @ errors.mounting())
         torch.testing.assert_close(points[:, k], seen, equal_nan=True)
         torch.testing.assert_close(poses[:, k], sight.T_estimated @ camera.T_base_sensor)
 

@@ -170,7 +170,6 @@ def test_host_reads_nothing_back_from_the_device(monkeypatch, perception):
     monkeypatch.setattr(task_module, "Ground", lambda field, reach: ground)
     monkeypatch.setattr(torch, "Generator", NoGenerator)
     monkeypatch.setattr(mounted, "check_pose", lambda *_: None)  # reads the cameras' mountings when they are built
-    monkeypatch.setattr(TerrainNav, "seed", lambda *_: None)
     rand = torch.rand
     monkeypatch.setattr(torch, "rand", lambda *shape, generator, device: rand(*shape, device=device))
     task = TerrainNav(TerrainNavConfig(course=SMALL), 3, "meta", perception)

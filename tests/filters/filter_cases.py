@@ -1,10 +1,15 @@
 """What the tests of filters share: layers, loops over windows, and what must hold of every filter."""
 
+import contextlib
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
+
+from tests.helpers import without
+from torchelev.filters import opencv
 
 SEEDS = st.integers(0, 10_000)
 SHAPES = st.tuples(st.integers(1, 2), st.integers(1, 8), st.integers(1, 7))
@@ -19,6 +24,18 @@ def random_layer(seed, shape=(2, 7, 6), share=0.7, dtype=torch.float64):
     known = torch.from_numpy(rng.random(shape) < share)
     values = torch.from_numpy(rng.normal(size=shape).round(1)).to(dtype)  # rounded: equal heights come up
     return torch.where(known, values, torch.nan), known
+
+
+@contextlib.contextmanager
+def no_opencv():
+    """OpenCV is not installed."""
+    opencv.is_installed.cache_clear()
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            without(patch, "cv2")
+            yield
+    finally:
+        opencv.is_installed.cache_clear()
 
 
 def of_windows(layer, radius, function):

@@ -6,8 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.filters.filter_cases import SEEDS, SHARES, assert_batch_is_single, random_layer
-from tests.helpers import without
+from tests.filters.filter_cases import SEEDS, SHARES, assert_batch_is_single, no_opencv, random_layer
 from torchelev import filters
 from torchelev.filters import opencv
 from torchelev.filters.layer_tools import zero_unknown
@@ -36,8 +35,7 @@ def filtered(name, layer):
 
 
 def by_tensors(name, layer):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(opencv, "is_usable", lambda values: False)
+    with no_opencv():
         return filtered(name, layer)
 
 
@@ -145,17 +143,7 @@ def test_serves_no_tensors_of_functorch():
         torch.testing.assert_close(each, function((values, known), resolution=0.1)[0])
 
 
-def test_an_opencv_that_does_not_load_counts_as_none(monkeypatch):
-    without(monkeypatch, "cv2")  # an import of it raises ImportError
-    opencv.is_installed.cache_clear()
-    assert not opencv.is_usable(torch.zeros(1, 3, 3))
-    monkeypatch.undo()
-    opencv.is_installed.cache_clear()
+def test_an_opencv_that_does_not_load_counts_as_none():
+    with no_opencv():
+        assert not opencv.is_usable(torch.zeros(1, 3, 3))
     assert opencv.is_usable(torch.zeros(1, 3, 3))
-
-
-def test_without_opencv_tensors_do_it(monkeypatch):
-    layer = random_layer(3, (2, 7, 6), 0.8, torch.float32)
-    expected = by_tensors("gaussian", layer)
-    monkeypatch.setattr(opencv, "is_installed", lambda: False)
-    assert torch.equal(filtered("gaussian", layer)[0], expected[0])

@@ -9,7 +9,6 @@ import torch
 from tests.helpers import pose
 from tests.observations.maps import BASE, ground_map, plane, random_base, random_map
 from torchelev.kernels.cpu_build import find_compiler
-from torchelev.layers import LAYERS
 from torchelev.observations import image_kernel
 from torchelev.observations.fill import MODES
 from torchelev.observations.height_scan import HeightScan
@@ -49,11 +48,10 @@ def test_what_an_image_does_not_know_is_0():
     assert not image(emap, pose(BASE)).any()
 
 
-def test_an_image_shows_ratings_where_they_are_known(monkeypatch):
+def test_an_image_shows_ratings_where_they_are_known():
     """Elevations may be known where ratings are not."""
     emap = ground_map(plane, traversability=0.6)
-    rated = emap.cell_centers()[..., 0] > 0.3
-    monkeypatch.setitem(LAYERS, "traversability", lambda state: (state.traversability, rated))
+    emap.rated.copy_(emap.cell_centers()[..., 0] > 0.3)
     image = MapImage(length_x=0.4, length_y=0.2, resolution=0.1, alignment="world", mode="nearest")(emap, pose(BASE))
     assert image.shape == (1, 4, 4, 2) and (image[0, 1] == 1).all()
     expected = torch.tensor([0.0, 0.0, 0.6, 0.6], dtype=torch.float64)[:, None].expand(4, 2)

@@ -25,8 +25,17 @@ class Team:
 
 
 @pytest.fixture(autouse=True)
-def _two_cores(monkeypatch):
-    monkeypatch.setattr(waiting, "num_cores", lambda: 2)
+def cores(monkeypatch):
+    """Set the number of the machine's cores, at first 2."""
+
+    def set_number(number):
+        monkeypatch.setattr(os, "cpu_count", lambda: number)
+        waiting.num_cores.cache_clear()
+
+    set_number(2)
+    yield set_number
+    monkeypatch.undo()
+    waiting.num_cores.cache_clear()
 
 
 def made(count_running, clock=lambda: 0.0, sleep=lambda seconds: None, count_own=lambda: 1):
@@ -99,8 +108,8 @@ def test_how_long_threads_spin_is_learned():
     assert waits.short
 
 
-def test_a_free_core_for_each_thread_is_enough(monkeypatch):
-    monkeypatch.setattr(waiting, "num_cores", lambda: 8)
+def test_a_free_core_for_each_thread_is_enough(cores):
+    cores(8)
     waits = made(lambda: 5)
     updated(waits, 20, num_threads=4)
     assert not waits.short

@@ -21,7 +21,6 @@ from torchelev import (
     LearnedTraversabilityConfig,
     TraversabilityNet,
 )  # fmt: skip
-from torchelev.layers import LAYERS
 from torchelev.planning.footprint import check_footprint
 from torchelev.planning.path_check import check_path
 from torchelev.planning.path_reason import Reason
@@ -172,14 +171,14 @@ def test_bad_ground_below_the_robot_is_reported():
 # Ground of known elevation and unknown traversability -----------------------------------------------------------------
 
 
-def test_unrated_ground_is_neither_good_nor_bad(monkeypatch):
+def test_unrated_ground_is_neither_good_nor_bad():
     """It costs what bounded ground of its inclination costs: 2 where it is level."""
     unrated = torch.zeros(1, 16, 14, dtype=torch.bool)
     unrated[0, 8] = True
-    monkeypatch.setitem(LAYERS, "traversability", lambda state: (state.traversability, state.validity & ~unrated))
     ends = place(-0.5, 0.0), place(0.5, 0.0)
     for rating in (0.0, 1.0):
         emap = ground_map()
+        emap.rated[unrated] = False
         emap.traversability[unrated] = rating
         assert traversal_cost(emap)[unrated].eq(2).all()
         assert plan(emap, *ends).cost.item() == pytest.approx(1.0 + 0.125)
@@ -191,10 +190,10 @@ def test_unrated_ground_is_neither_good_nor_bad(monkeypatch):
         assert goal.reason.tolist() == [Reason.GOAL_UNKNOWN]
 
 
-def test_rows_along_a_slope_tell_nothing_of_it(monkeypatch):
+def test_rows_along_a_slope_tell_nothing_of_it():
     """Contour lines 25 cm apart on a slope of 50 degrees: level along each line."""
-    monkeypatch.setitem(LAYERS, "traversability", lambda state: (state.traversability, state.validity & False))
     emap = ground_map()
+    emap.rated.fill_(False)
     emap.elevation.copy_((torch.arange(16) * RESOLUTION * math.tan(math.radians(50)))[:, None])
     emap.validity[:, torch.arange(16) % 3 != 0] = False
     assert traversal_cost(emap).isinf().all()

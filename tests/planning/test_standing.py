@@ -22,7 +22,6 @@ from tests.planning.maps import (
     rectangle,
 )
 from torchelev import ElevationMap
-from torchelev.layers import LAYERS
 from torchelev.planning.footprint import FootprintConfig, check_footprint, unsafe_area
 from torchelev.planning.path_check import check_path
 from torchelev.planning.queries import height_profile, submap
@@ -30,11 +29,6 @@ from torchelev.planning.standing import mark_standing_cells, place_footprint
 
 SEEDS = st.integers(0, 10_000)
 FOOTPRINT = torch.tensor([[0.25, 0.125], [-0.25, 0.125], [-0.25, -0.125], [0.25, -0.125]]).double()
-
-
-def unrate(monkeypatch, cells):
-    """Let the traversability of these cells be unknown, however well their elevation is known."""
-    monkeypatch.setitem(LAYERS, "traversability", lambda state: (state.traversability, state.validity & ~cells))
 
 
 # By hand --------------------------------------------------------------------------------------------------------------
@@ -92,13 +86,13 @@ def test_a_path_starts_where_the_robot_stands():
 
 
 @pytest.mark.parametrize("rating", [0.0, 1.0, math.nan])
-def test_unrated_cells_are_unknown(monkeypatch, rating):
+def test_unrated_cells_are_unknown(rating):
     """Whatever they hold: a quarter of the footprint's cells."""
     unrated = torch.zeros(1, 16, 14, dtype=torch.bool)
     unrated[0, 6] = True
     emap = ground_map(0.8)
     emap.traversability[unrated] = rating
-    unrate(monkeypatch, unrated)
+    emap.rated[unrated] = False
     assert only(check_footprint(emap, rectangle())) == near(False, 0.8, 0.25, 0.0)
     assert only(check_footprint(emap, rectangle(), FootprintConfig(max_unknown=0.25))) == near(True, 0.8, 0.25, 0.0)
     assert only(check_footprint(emap, rectangle(), standing=rectangle()[:, 0])) == near(True, 0.8, 0.0, 0.0)

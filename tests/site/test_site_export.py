@@ -12,7 +12,7 @@ from tests.helpers import without
 from tests.site.helpers import fill, robots
 from torchelev.io.export import load_npz
 from torchelev.output_files import is_own_output
-from torchelev.site import SiteMap, site_export
+from torchelev.site import SiteMap
 
 
 @pytest.fixture
@@ -176,7 +176,12 @@ def test_a_place_where_no_file_can_be_is_named_as_it_was_given(site, tmp_path, m
 def test_a_file_that_fails_leaves_the_older_one(site, tmp_path, monkeypatch):
     site.export(tmp_path / "a.tif")
     before = (tmp_path / "a.tif").read_bytes()
-    monkeypatch.setattr(site_export, "_north_up", lambda layer: 1 / 0)
+
+    def fail(file, *args, **kwargs):
+        file.write(b"half")
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(tifffile, "imwrite", fail)
     with pytest.raises(ZeroDivisionError):
         site.export(tmp_path / "a.tif")
     assert (tmp_path / "a.tif").read_bytes() == before and len(list(tmp_path.iterdir())) == 1

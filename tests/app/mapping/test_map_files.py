@@ -13,8 +13,8 @@ from torchelev.io.export import load_npz
 
 @pytest.mark.parametrize("suffix", [".npz", ".png", ".ply"])
 @pytest.mark.parametrize("blocked", ["folder", "device"])
-def test_outputs_are_checked_before_mapping(run, recording, tmp_path, monkeypatch, suffix, blocked):
-    monkeypatch.setattr("torchelev.app.mapping.map_command.fuse_all", lambda *args: pytest.fail("mapped"))
+def test_outputs_are_checked_before_mapping(run, recording, tmp_path, at_scan, suffix, blocked):
+    at_scan(0, lambda: pytest.fail("mapped"))
     path = tmp_path / f"map{suffix}"
     path.mkdir() if blocked == "folder" else path.symlink_to("/dev/full")
     code, _, err = run("map", recording)
@@ -62,10 +62,10 @@ def test_out_may_have_the_suffix_of_an_output(run, recording, tmp_path):
     assert sorted(path.name for path in tmp_path.glob("course*")) == ["course.npz", "course.ply", "course.png"]
 
 
-def test_layers_of_filters_are_drawn(run, recording, tmp_path, monkeypatch):
+def test_layers_of_filters_are_drawn(run, recording, tmp_path, figures):
     (tmp_path / "cfg.yaml").write_text("filters: [{layer: smooth, filter: gaussian, sigma: 0.2}]\n")
-    drawn = []
-    monkeypatch.setattr("torchelev.viz.plot.save_layers", lambda path, panels, **_: drawn.extend(panels))
     assert run("map", recording, "--config", "cfg.yaml")[0] == 0
-    assert [panel.title for panel in drawn][4:] == ["smooth"]
-    np.testing.assert_array_equal(drawn[4].values, load_npz(tmp_path / "map.npz").layers["smooth"])
+    panels = [ax for ax in figures[0].axes if ax.get_title()]
+    assert [ax.get_title() for ax in panels[4:]] == ["smooth"]
+    drawn = panels[4].images[0].get_array().filled(np.nan)
+    np.testing.assert_array_equal(drawn.T, load_npz(tmp_path / "map.npz").layers["smooth"])

@@ -1,5 +1,7 @@
 """`torchelev map --video`: the growing map as a video."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -71,14 +73,17 @@ def test_ctrl_c_keeps_the_video_so_far(run, recording, tmp_path, at_scan, name):
 
 @pytest.mark.slow(1)
 def test_the_map_is_kept_where_the_video_cannot_be_finished(run, recording, tmp_path, monkeypatch):
-    from torchelev.viz.video import VideoWriter
+    replace = os.replace
 
-    def fail(self):
-        raise OSError("the disk is full")
+    def full_disk(source, target):
+        if str(target).endswith(".gif"):
+            raise OSError(28, "No space left on device")
+        replace(source, target)
 
-    monkeypatch.setattr(VideoWriter, "close", fail)
+    monkeypatch.setattr(os, "replace", full_disk)
     code, _, err = run("map", recording, "--size", 4, "--video", "grown.gif")
-    assert code == 2 and "the disk is full; kept the map of 4 of 4 scans" in err
+    assert code == 2 and "grown.gif: cannot be written (No space left on device)" in err
+    assert "kept the map of 4 of 4 scans" in err
     assert (tmp_path / "map.partial.npz").exists()
 
 

@@ -1,6 +1,7 @@
 """MuJoCo's part: the height field, the states and the sensors."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -127,10 +128,11 @@ def test_bodies_differ_and_the_seed_repeats_them():
     assert masses[0] == masses[1] != masses[2] and len(set(masses[0])) == RandomConfig().num_bodies
 
 
-def test_a_terrain_larger_than_the_height_field_is_refused(monkeypatch):
-    monkeypatch.setattr("envs.quadruped.physics._MAX_SAMPLES", 4 * 120 * 120 - 1)
-    with pytest.raises(ValueError, match=r"terrain: must fit a height field of 57599 samples, got 57600; take fewer"):
-        Physics(TERRAIN, 1, RandomConfig())
+def test_a_terrain_larger_than_the_height_field_is_refused():
+    heights = torch.zeros(1).expand(4, 2050, 2050)  # the rims are shared
+    terrain = dataclasses.replace(TERRAIN, field=SimpleNamespace(heights=heights, resolution=0.05))
+    with pytest.raises(ValueError, match=r"field of 16777216 samples, got 16793604; take fewer"):
+        Physics(terrain, 1, RandomConfig())
 
 
 def test_a_model_without_the_joints_is_refused(tmp_path):

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.filters.filter_cases import no_opencv
 from tests.filters.terrains import random_layer, terrain, whole
 from torchelev.filters.distances import distance
 from torchelev.filters.distances.distance import signed_distance, squared_distance
@@ -118,15 +119,12 @@ def test_distances_are_exact_on_a_large_map():
         assert (squared[1] > 400**2).all()
 
 
-def test_without_opencv(monkeypatch):
+def test_without_opencv():
     layer = random_layer(2)
     want, _ = signed_distance(layer, resolution=0.1)
-    monkeypatch.setattr(distance.opencv, "is_installed", lambda: False)
-    called = []
-    tensors = distance.squared_distance_by_tensors
-    monkeypatch.setattr(distance, "squared_distance_by_tensors", lambda *a: called.append(1) or tensors(*a))
-    result, _ = signed_distance(layer, resolution=0.1)
-    assert called and torch.equal(result, want)
+    with no_opencv():  # its import raises ImportError
+        result, _ = signed_distance(layer, resolution=0.1)
+    assert torch.equal(result, want)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

@@ -6,6 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.devices import never_wait
 from tests.filters.filter_cases import (
     SEEDS,
     random_layer,
@@ -40,7 +41,8 @@ def spiral(size):
 @pytest.fixture(params=[True, False])
 def stops(request, monkeypatch):
     """As a CPU does, and as a device whose host may not wait."""
-    monkeypatch.setattr("torchelev.filters.inpainting.holes.may_wait", lambda device: request.param)
+    if not request.param:
+        never_wait(monkeypatch)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -70,7 +72,7 @@ def test_parts_of_graphs(seed, count, edges):
 @pytest.mark.parametrize("order", ["up", "down", "star", "random"])
 def test_parts_of_the_worst_graphs_within_all_steps(order, monkeypatch):
     """A chain in any order, and a star whose middle is the highest: the rounds suffice that never stop early."""
-    monkeypatch.setattr("torchelev.filters.inpainting.holes.may_wait", lambda device: False)
+    never_wait(monkeypatch)
     nodes = {"up": torch.arange(1000), "down": torch.arange(1000).flip(0)}.get(order)
     nodes = torch.randperm(1000, generator=torch.Generator().manual_seed(0)) if nodes is None else nodes
     a, b = (torch.arange(999), torch.full((999,), 999)) if order == "star" else (nodes[1:], nodes[:-1])

@@ -9,22 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from tests.devices import NoConstants, OneDevice, needs_gpu
+from tests.devices import NoConstants, OneDevice, needs_gpu, never_wait
 from tests.helpers import rotation
 from tests.sim.sensors.ray_cases import flat, one, same, scene, unit
-from torchelev.sim.sensors import tracing
-from torchelev.sim.sensors.casting import Boxes, cast
+from torchelev.sim.sensors.casting import MAX_RAYS, Boxes, cast
 from torchelev.sim.terrains.heightfield import HeightField
 
 
-def test_parts_make_the_whole(monkeypatch):
+@pytest.mark.parametrize("rays", [MAX_RAYS // 2, MAX_RAYS + 1], ids=["two environments", "a part of one"])
+def test_parts_make_the_whole(rays):
     field, tiles, origin, d = scene(2, B=5)
     boxes = Boxes(torch.eye(4).expand(5, 1, 4, 4) + 0, torch.rand(5, 1, 3))
     whole = cast(field, tiles, origin, d, 3.0, boxes)
-    monkeypatch.setattr("torchelev.sim.sensors.casting.MAX_RAYS", 2 * d.shape[1] + 1)
-    same(cast(field, tiles, origin, d, 3.0, boxes), whole)
-    monkeypatch.setattr("torchelev.sim.sensors.casting.MAX_RAYS", 1)
-    same(cast(field, tiles, origin, d, 3.0, boxes), whole)
+    upwards = torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype).expand(5, rays - d.shape[1], 3)
+    same(cast(field, tiles, origin, torch.cat([d, upwards], 1), 3.0, boxes)[:, : d.shape[1]], whole)
 
 
 def box(position, half_size, yaw=0.0, pitch=0.0, roll=0.0):
@@ -133,7 +131,7 @@ def test_host_reads_nothing_back():
 
 
 def test_path_of_a_gpu_has_static_shapes(monkeypatch):
-    monkeypatch.setattr(tracing, "can_select_rays", lambda device: False)
+    never_wait(monkeypatch)
     field, *inputs, reach, boxes = on("cpu")
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         boxes = Boxes(*(mode.from_tensor(v) for v in boxes))

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.devices import never_wait
 from tests.sim.sensors.ray_cases import (
     FINE,
     RAYS,
@@ -150,14 +151,26 @@ def test_ray_that_is_next_to_a_border_by_rounding():
         assert float(ahead) == pytest.approx(0.1) and float(horizon) == count + 1
 
 
-def test_air_above_everything_takes_one_round(monkeypatch):
+@pytest.fixture
+def searches(monkeypatch):
+    """The rounds in which rays are searched: the rays, the number of cells, and what is found ahead up to where."""
+    rounds, search = [], tracing.search
+
+    def noted(field, rays, count):
+        found = search(field, rays, count)
+        rounds.append((rays, count, *found))
+        return found
+
+    monkeypatch.setattr(tracing, "search", noted)
+    return rounds
+
+
+def test_air_above_everything_takes_one_round(searches, monkeypatch):
     monkeypatch.setenv("TORCHELEV_NATIVE", "0")
     field, tiles, origin, _ = scene(3)
-    counts, search = [], tracing.search
-    monkeypatch.setattr(tracing, "search", lambda *args: (counts.append(1), search(*args))[1])
     d = torch.tensor([[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [0.0, 0.6, 0.8]]).expand(3, 3, 3)
     assert cast(field, tiles, origin + torch.tensor([0.0, 0.0, 5.0]), d, 100.0).isinf().all()
-    assert len(counts) == 1
+    assert len(searches) == 1
 
 
 def test_march_finds_what_it_must():
@@ -171,26 +184,20 @@ def test_march_finds_what_it_must():
 
 @pytest.mark.parametrize("terrain", TERRAINS)
 @pytest.mark.parametrize("path", ["selects rays", "keeps all rays"], indirect=True)
-def test_no_ray_is_left_over(terrain, path, monkeypatch):
+def test_no_ray_is_left_over(terrain, path, searches):
     """After the last round each ray has met the ground or come to the end of its range, also the longest ones."""
-    rng, last, seen = np.random.default_rng(9), {}, {}
-    search = tracing.search
-
-    def watched(field, rays, count):
-        ahead, horizon = search(field, rays, count)
-        seen["max"] = max(seen.get("max", 0), count)
-        done = (ahead <= horizon) | (rays.along + horizon > 6.0)
-        last.update({n: last.get(n, False) or d for n, d in zip(rays.ray.tolist(), done.tolist(), strict=True)})
-        return ahead, horizon
-
-    monkeypatch.setattr(tracing, "search", watched)
+    rng, most = np.random.default_rng(9), 0
     field = difficult_terrain(terrain, rng, 0.03)
     for kind in RAYS:
-        last.clear()
+        searches.clear()
         tile, origins, d = difficult_rays(kind, rng, field, 60)
         cast(field, torch.from_numpy(tile), torch.from_numpy(origins), torch.from_numpy(d)[:, None], 6.0)
-        assert len(last) == 60 and all(last.values()), kind
-    assert seen["max"] == tracing.MAX_CELLS
+        done = torch.zeros(60, dtype=torch.bool)
+        for rays, count, ahead, horizon in searches:
+            done[rays.ray] |= (ahead <= horizon) | (rays.along + horizon > 6.0)
+            most = max(most, count)
+        assert done.all(), kind
+    assert most == tracing.MAX_CELLS
 
 
 @given(st.integers(0, 10_000))
@@ -205,7 +212,8 @@ def test_hits_lie_on_the_surface(seed):
 def by_tensors(*arguments, selects=True):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCHELEV_NATIVE", "0")
-        patch.setattr(tracing, "can_select_rays", lambda device: selects)
+        if not selects:
+            never_wait(patch)
         return cast(*arguments)
 
 

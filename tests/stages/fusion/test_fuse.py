@@ -1,8 +1,6 @@
 """The height update."""
 
-import contextlib
 import dataclasses
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import reference
+from tests.devices import unread
 from tests.helpers import off_borders, pose, random_poses, random_state, scan, small_map
 from torchelev import EdgeConfig, FusionConfig, SensorConfig
-from torchelev.ops import indexing
-from torchelev.stages.fusion import contested
 from torchelev.stages.fusion.stage import fuse
 
 SEEDS = st.integers(0, 10_000)
@@ -85,36 +82,24 @@ EDGES = [EdgeConfig(), EdgeConfig(min_extreme=1, refinements=2), EdgeConfig(min_
 )
 def test_agrees_with_the_reference_at_steps(seed, num_points, sensors, edges, can_select, altitude):
     """On a CPU, which selects the contested cells, and as on a GPU, which goes through all cells."""
-    with patch_selection(can_select):
-        compare_with_reference(seed, num_points, sensors, FusionConfig(edges=edges), altitude)
+    compare_with_reference(seed, num_points, sensors, FusionConfig(edges=edges), altitude, can_select)
 
 
 @pytest.mark.parametrize("can_select", [True, False])
-def test_no_cell_is_contested(monkeypatch, can_select):
+def test_no_cell_is_contested(can_select):
     """Other cells keep their heights: with no points at all, and where all points agree with the map."""
-    monkeypatch.setattr(indexing, "can_select", lambda values: can_select)
-    monkeypatch.setattr(contested, "can_select", lambda values: can_select)
-    emap = small_map(1, CELLS)
-    emap.update(torch.empty(1, 0, 3), pose((0.0, 0.0, 1.0)), dt=0.0)
-    assert not emap.validity.any()
+    emap, T = small_map(1, CELLS), pose((0.0, 0.0, 1.0))
     flat = torch.tensor([[[x, y, -1.0] for x in (-0.15, 0.05) for y in (-0.15, 0.05)]]).repeat(1, 5, 1)
+    state = emap.state if can_select else unread(emap.state)
+    state = emap(state, emap.measure(flat[:, :0], T, None, 0.0))
+    assert not state.validity.any()
     for _ in range(2):
-        emap.update(flat, pose((0.0, 0.0, 1.0)), dt=0.0)
-    assert emap.elevation[emap.validity].tolist() == pytest.approx([0.0] * 4, abs=1e-6)
-    assert emap.statistics.points_used.item() == 20
+        state = emap(state, emap.measure(flat, T, None, 0.0))
+    assert state.elevation[state.validity].tolist() == pytest.approx([0.0] * 4, abs=1e-6)
+    assert state.statistics.points_used.item() == 20
 
 
-@contextlib.contextmanager
-def patch_selection(can_select):
-    """Select the contested cells, as on a CPU, or go through all of them, as on a GPU."""
-    with (
-        patch.object(indexing, "can_select", lambda values: can_select),
-        patch.object(contested, "can_select", lambda values: can_select),
-    ):
-        yield
-
-
-def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0):
+def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0, can_select=True):
     rng = np.random.default_rng(seed)
     emap = small_map(2, CELLS, dtype=torch.float64)
     state = random_state(rng, emap.cfg.grid, 2)
@@ -126,7 +111,7 @@ def compare_with_reference(seed, num_points, sensors, cfg, altitude=0.0):
     cloud = (torch.from_numpy(in_map) - T[:, :, None, :3, 3]) @ T[:, :, :3, :3]
     m = emap.measure(cloud, T, None, 0.1)
     grid = emap.cfg.grid
-    after = fuse(state, m, grid, cfg, has_rays=True)
+    after = fuse(*(state, m) if can_select else unread((state, m)), grid, cfg, has_rays=True)
     for b in range(2):
         points = in_map[b].reshape(-1, 3)
         origins = np.repeat(T[b, :, :3, 3].numpy(), num_points, 0)

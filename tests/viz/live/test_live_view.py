@@ -1,12 +1,15 @@
 """The live view of a loop: it shows the map, and never holds the loop up."""
 
+import os
+import signal
+import threading
 import time
 
 import numpy as np
 import pytest
 
 from tests.helpers import mapped, pose, wait_for
-from torchelev.viz.live import LiveView
+from torchelev.viz.live import LiveView, Page
 
 
 @pytest.fixture
@@ -28,15 +31,24 @@ def test_it_shows_the_robot_that_was_chosen(emap, port, capsys):
     assert (other == emap.layer("elevation")[2].numpy())[other == other].all()
 
 
-def test_after_the_loop_another_robot_can_be_chosen(emap, port, monkeypatch):
-    with LiveView(emap, port=port, max_share=1.0) as view:
-        view.show(pose(num_envs=3))
-        wait_for(lambda: view.num_drawn == 1)
-        monkeypatch.setattr(view.page, "wait", lambda: None)
-        view.wait()
+def test_after_the_loop_another_robot_can_be_chosen_until_ctrl_c(emap, port):
+    view = LiveView(emap, port=port, max_share=1.0)
+    view.show(pose(num_envs=3))
+    wait_for(lambda: view.num_drawn == 1)
+
+    during_the_loop = view.page.on_change
+
+    def choose():
+        wait_for(lambda: view.page.on_change is not during_the_loop)
+        time.sleep(0.2)
         view.page._env.value = 2
-        shown = view.page._last.map.layers["elevation"]
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=choose).start()
+    view.wait()
+    shown = view.page._last.map.layers["elevation"]
     assert np.array_equal(shown, emap.layer("elevation")[2].numpy(), equal_nan=True)
+    assert view.show(pose(num_envs=3)) is False, "it is closed"
 
 
 def work(seconds):
@@ -45,15 +57,16 @@ def work(seconds):
         pass
 
 
-def test_pictures_beyond_the_share_are_dropped(emap, port, monkeypatch):
+@pytest.fixture
+def drawing(monkeypatch):
+    """Let drawing only do this: `drawing(work)`."""
+    return lambda work: monkeypatch.setattr(Page, "draw", lambda *args: work())
+
+
+def test_pictures_beyond_the_share_are_dropped(emap, port, drawing, monkeypatch):
+    spent = []
+    drawing(lambda: (work(0.01), spent.append(0.01)))
     with LiveView(emap, port=port, max_share=0.05, max_rate=1e6) as view:
-        spent = []
-
-        def draw(*args):
-            work(0.01)
-            spent.append(0.01)
-
-        monkeypatch.setattr(view.page, "draw", draw)
         monkeypatch.setattr(view._load, "measure_idleness", lambda: 0.0)  # other programs may hold this one up
         start = time.perf_counter()
         while time.perf_counter() - start < 2.0:
@@ -74,9 +87,9 @@ def test_a_loop_that_waits_is_shown_more_often(emap, port):
     assert count(time.sleep) > 1.5 * count(work)
 
 
-def test_a_slow_page_never_holds_the_loop_up(emap, port, monkeypatch):
+def test_a_slow_page_never_holds_the_loop_up(emap, port, drawing):
+    drawing(lambda: time.sleep(1.0))
     with LiveView(emap, port=port, max_share=1.0, max_rate=1e6) as view:
-        monkeypatch.setattr(view.page, "draw", lambda *args: time.sleep(1.0))
         start = time.perf_counter()
         shown = [view.show(pose(num_envs=3)) for _ in range(50)]
         assert time.perf_counter() - start < 0.9 and sum(shown) <= 2
