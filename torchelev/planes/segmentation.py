@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 _MAX_HEIGHT = 1e5  # [m] heights beyond it are unknown
-_CELLS_AT_A_TIME = 2**16  # of several maps: so many fit the processor's caches
+_CELLS_AT_A_TIME = 2**17  # of several maps: fewer cost Python more, and more no longer fit the caches
 
 
 @dataclass(frozen=True, kw_only=True)
