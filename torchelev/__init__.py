@@ -63,7 +63,7 @@ __all__ = [
     "voxel_filter",
 ]
 
-# What a map needs only if it is told so, imported when first asked for: half of the time of `import torchelev`.
+# Imported when first asked for, as not every map needs them: they take half of the time of `import torchelev`.
 _LATER = {
     "CompletionNet": "torchelev.completion.net",
     "FilterConfig": "torchelev.filters.chain",

@@ -33,8 +33,8 @@ def side_of_step(
     exists, (in_scan, in_map) = values_around(list(shown), points.cells, di, dj, width)
     middle, top_height = points.mean + 0.5 * top, points.mean + top - relief
     behind = (in_map >= top_height[:, None]) & lie_behind(x, y, di, dj)
-    elsewhere = (exists & ((in_scan >= middle[:, None]) | behind)).any(1)
-    ground = (number_passed > cfg.min_passed * number_low) & elsewhere
+    has_top_beside = (exists & ((in_scan >= middle[:, None]) | behind)).any(1)
+    ground = (number_passed > cfg.min_passed * number_low) & has_top_beside
     return torch.where(ground, -1.0, 1.0).to(x.dtype), torch.where(ground, bottom, top)
 
 

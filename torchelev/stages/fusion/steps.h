@@ -100,13 +100,13 @@ INLINE Side side_of_step(const Points& points, float mean, int64_t slot, const A
     const Side is_top{1, top};
     if (!(passed > s.min_passed * low)) return is_top;
     const float middle = mean + 0.5f * top, top_height = mean + top - s.relief;
-    bool elsewhere = false;
+    bool has_top_beside = false;
     around.each(slot, [&](int64_t other, int di, int dj) {
-        if (elsewhere) return;
+        if (has_top_beside) return;
         const bool stands = around.known[other] && around.elevation[other] >= top_height;
-        elsewhere = (stands && lies_behind(x, y, di, dj)) || around.in_scan(other) >= middle;
+        has_top_beside = (stands && lies_behind(x, y, di, dj)) || around.in_scan(other) >= middle;
     });
-    return elsewhere ? Side{-1, -top_of_step(points, Heights{mean, -1}, 2, s)} : is_top;
+    return has_top_beside ? Side{-1, -top_of_step(points, Heights{mean, -1}, 2, s)} : is_top;
 }
 
 }  // namespace fusion
