@@ -48,6 +48,7 @@ class CudaUpdate:
         limits: Callable[[torch.device], Mapping[str, int]] = cuda_build.limits,
     ) -> None:
         self._order, self._launch, self._limits = tuple(order), launch, limits
+        self._kernels = tuple(kernels)
         self._arrays: dict[str, str] = {}
         for kernel in kernels:
             self._arrays |= kernel.scratch
@@ -91,10 +92,9 @@ class CudaUpdate:
 
     def _allocate(self, sizes: Any, device: torch.device) -> dict[str, Tensor]:
         parts = {name: text.split() for name, text in self._arrays.items()}
-        return {
-            name: torch.empty([_size(s, sizes) for s in shape], dtype=_DTYPES[kind], device=device)
-            for name, (kind, *shape) in parts.items()
-        }
+        shapes = {name: [_size(s, sizes) for s in shape] for name, (_, *shape) in parts.items()}
+        shapes |= {name: [0] for kernel in self._kernels for name in kernel.unused(sizes)}
+        return {name: torch.empty(shape, dtype=_DTYPES[parts[name][0]], device=device) for name, shape in shapes.items()}
 
     def _update(self, sizes: ctypes.Structure, *tensors: Sequence[Tensor | None]) -> ctypes.Structure:
         """Return `Update` of kernels/cuda/update.h."""

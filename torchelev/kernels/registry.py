@@ -35,6 +35,8 @@ class Kernel:
     cuda: Mapping[str, Sequence[Launch]] = field(default_factory=dict)
     #: arrays that the launches share, with those of other stages: name to C type and sizes, as "float B M"
     scratch: Mapping[str, str] = field(default_factory=dict)
+    #: returns the arrays of `scratch` that no launch uses, by the sizes
+    unused: Callable[[Any], Sequence[str]] = lambda sizes: ()
     #: returns sizes that launches and scratch take besides those of the inputs, by name, of an ElevationMapConfig
     sizes: Callable[[Any], Mapping[str, int]] = lambda cfg: {}
     #: stages whose launches run for each sensor, one after the other: the sensor of `Update`

@@ -115,4 +115,5 @@ KERNEL = Kernel(
         "borders": "float B 4 border",
         "slopes": "int32_t B ranges azimuths",  # in the order of floats
     },
+    unused=lambda sizes: ("slopes",) if in_blocks(sizes) else (),
 )
