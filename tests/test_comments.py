@@ -158,6 +158,12 @@ def test_what_comments_mention_exists(missing):
     assert not stale, "rename what moved, or add a name of another program to FOREIGN"
 
 
+def test_files_that_pages_mention_exist():
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    stale = {(str(page), name) for page in pages for name in missing_files(page.read_text())}
+    assert not {(page, name) for page, name in stale if name not in ("my_robot.py", "examples/NAME.py")}
+
+
 def test_stale_files_and_names_are_found():
     text = "# see `unheard`, `ElevationMap.unheard()`, `sensor.measure`, `torch.unheard`, lost.py and `io/lost.h`"
     assert missing_files(text) == ["io/lost.h", "lost.py"]

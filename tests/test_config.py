@@ -17,6 +17,7 @@ from torchelev import (
     SensorConfig,
 )
 from torchelev.config import differing_fields
+from torchelev.stages.visibility.kernel import settings
 
 SOME = [
     ElevationMapConfig(),
@@ -99,6 +100,14 @@ def test_fusion_refuses_what_is_negative_or_not_finite(name, value):
 def test_variances_are_finite(name):
     with pytest.raises(ValueError, match=rf"fusion\.{name}: must be finite"):
         FusionConfig(**{name: float("inf")})
+
+
+def test_rays_reach_over_no_more_cells_than_a_table_has():
+    grid = GridConfig(resolution=0.04, length_x=4.0, length_y=4.0)
+    farthest = ElevationMapConfig(grid=grid, raycast=RaycastConfig(max_range=2**15 * 0.04))
+    assert len(settings(farthest)["widen"]) == len(settings(ElevationMapConfig())["widen"])
+    with pytest.raises(ValueError, match=r"raycast\.max_range: must be at most 32,768 cells of 0\.04 m, got 2000"):
+        ElevationMapConfig(grid=grid, raycast=RaycastConfig(max_range=2000.0))
 
 
 @pytest.mark.parametrize("bad", [dict(refinements=1), dict(min_points=2.5), dict(min_extreme=0), dict(min_share=0.0)])

@@ -71,6 +71,8 @@ class ElevationMapConfig:
             require(isinstance(value, annotation), f"cfg.{name}", rule, repr(value), hint, TypeError)
         if self.completion is not None:
             self.completion.require_resolution(self.grid.resolution)
+        if self.raycast is not None:
+            self.raycast.require_resolution(self.grid.resolution)
 
     @property
     def drift_gate(self) -> float:

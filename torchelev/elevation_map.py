@@ -85,7 +85,7 @@ class ElevationMap(ReadableMap):
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
         self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
-        self._key = pipeline.compile_stages(self._update_cfg)
+        self._key = pipeline.register_stages(self._update_cfg)
         self._history = InputHistory()
         with torch.inference_mode(False):
             #: (B,) how often each environment was reset: what it told a site before does not count as its own
@@ -162,7 +162,7 @@ class ElevationMap(ReadableMap):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or an unpickled map, whose process may know its config by another key."""
         super().__setstate__(state)
-        self._key = pipeline.compile_stages(self._update_cfg)
+        self._key = pipeline.register_stages(self._update_cfg)
 
     def _take_out_predictions(self) -> MapState | None:
         """Make the cells that completion filled unknown, and return a copy of the state with them; None without."""

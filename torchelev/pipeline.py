@@ -37,6 +37,7 @@ from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_
 if TYPE_CHECKING:
     from torchelev.traversability.weight_file import Weights
 
+#: Of all stages, in no order.
 KERNELS = (MEASURE, RECENTER, AGE, COMPENSATE, DISAGREEMENT, FUSION, VISIBILITY, OVERLAP, SURFACE)
 TENSORS: tuple[Any, ...] = (("Statistics", Statistics, {}), ("MapState", MapState, {"statistics": "Statistics"}))
 
@@ -113,7 +114,7 @@ def update_by_tensors(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig,
 def update_in_place(
     stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int
 ) -> None:
-    """Do the same in place: by one call of C++ on a CPU, by kernels on a GPU. `key` is that of `compile_stages`."""
+    """Do the same in place: by one call of C++ on a CPU, by kernels on a GPU. `key` is that of `register_stages`."""
     tensors = (*stored[:-1], *stored.statistics)
     values = as_inputs(inputs._asdict() | {"own": find_own(inputs, cfg.sensor)})
     if stored.elevation.is_cuda:
@@ -132,8 +133,8 @@ def cuda_stages(cfg: ElevationMapConfig) -> CudaUpdate:
 
 
 @functools.lru_cache(maxsize=256)
-def compile_stages(cfg: ElevationMapConfig) -> int:
-    """Return a key of the compiled stages for a config; they are built when they first run."""
+def register_stages(cfg: ElevationMapConfig) -> int:
+    """Return the key of the C++ stages for a config; they are built when they first run."""
     return cpu_update.register(CpuUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig()))
 
 

@@ -49,7 +49,7 @@ def by_cpu(emap, state, inputs, *names):
     """Run stages after `measure` on a copy of the state."""
     after = clone(state)
     values = inputs._asdict() | {"own": find_own(inputs, emap.cfg.sensor)}
-    stages = compiled_stages(pipeline.compile_stages(emap.cfg))
+    stages = compiled_stages(pipeline.register_stages(emap.cfg))
     stages.run((*after[:-1], *after.statistics), as_inputs(values), ("measure", *names))
     return after
 

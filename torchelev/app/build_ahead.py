@@ -11,7 +11,7 @@ from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
 from torchelev.observations.image_kernel import LIBRARY as IMAGES
 from torchelev.observations.scan_kernel import LIBRARY as SCANS
-from torchelev.pipeline import compile_stages
+from torchelev.pipeline import register_stages
 from torchelev.planning.dijkstra import LIBRARY as DIJKSTRA
 from torchelev.sim.errors.cloud_kernel import LIBRARY as ERRORS
 from torchelev.sim.sensors.casting_kernel import LIBRARY as CASTING
@@ -21,7 +21,7 @@ from torchelev.sim.terrains.heights_kernel import LIBRARY as HEIGHTS
 def main() -> None:
     """Build all libraries for each instruction set of this machine's kind."""
     shutil.rmtree(AHEAD, ignore_errors=True)
-    stages = compiled_stages(compile_stages(ElevationMapConfig())).parts
+    stages = compiled_stages(register_stages(ElevationMapConfig())).parts
     completion = library_of(CompletionNet.from_pretrained().weights)
     for library in (stages, completion, CASTING, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, SCANS):
         for path in build_ahead(*library):

@@ -13,6 +13,8 @@ from torchelev.kernels.cpu_update import is_built
 from torchelev.kernels.cuda_build import can_launch
 from torchelev.ops.transforms import is_transforming
 
+_SWITCHED_OFF = "TORCHELEV_NATIVE=0 forbids compiled code"
+
 
 class Backend(NamedTuple):
     """What runs an update: "CPU" is C++ and "CUDA" are kernels, both in place; "TORCH" are tensors."""
@@ -55,12 +57,14 @@ def _why_no_kernels(layer: Tensor) -> str:
         return "results must repeat, and kernels add up in any order"
     if layer.numel() >= 2**31:
         return "kernels count cells in 32 bits"
-    return "" if can_launch(layer.get_device()) else "CUDA kernels do not run on this GPU, or TORCHELEV_NATIVE=0"
+    if is_switched_off():
+        return _SWITCHED_OFF
+    return "" if can_launch(layer.get_device()) else "CUDA kernels do not run on this GPU, see the warning"
 
 
 def _why_not_built() -> str:
     if is_switched_off():
-        return "TORCHELEV_NATIVE=0 forbids compiled code"
+        return _SWITCHED_OFF
     with contextlib.suppress(FileNotFoundError):  # CXX names none, of which a warning tells
         if find_compiler() is None:
             return "no C++ compiler was found"

@@ -112,7 +112,7 @@ def compiled_stages(key: int) -> CpuUpdate:
 
 
 def is_built(key: int) -> bool:
-    """Return whether the stages of a key are built, or could be now."""
+    """Build the stages of a key, unless they are built; return whether they are there."""
     return not is_switched_off() and _UPDATES[key].library is not None
 
 

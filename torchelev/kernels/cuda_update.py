@@ -91,10 +91,13 @@ class CudaUpdate:
         self._loaded.add(device)
 
     def _allocate(self, sizes: Any, device: torch.device) -> dict[str, Tensor]:
-        parts = {name: text.split() for name, text in self._arrays.items()}
-        shapes = {name: [_size(s, sizes) for s in shape] for name, (_, *shape) in parts.items()}
-        shapes |= {name: [0] for kernel in self._kernels for name in kernel.unused(sizes)}
-        return {name: torch.empty(shape, dtype=_DTYPES[parts[name][0]], device=device) for name, shape in shapes.items()}
+        unused = {name for kernel in self._kernels for name in kernel.unused(sizes)}
+
+        def allocate(name: str, kind: str, *shape: str) -> Tensor:
+            size = [0] if name in unused else [_size(s, sizes) for s in shape]
+            return torch.empty(size, dtype=_DTYPES[kind], device=device)
+
+        return {name: allocate(name, *text.split()) for name, text in self._arrays.items()}
 
     def _update(self, sizes: ctypes.Structure, *tensors: Sequence[Tensor | None]) -> ctypes.Structure:
         """Return `Update` of kernels/cuda/update.h."""

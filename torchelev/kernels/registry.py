@@ -18,7 +18,7 @@ class Launch:
     """A kernel of a stage's cuda.cu, which takes an `Update` of kernels/cuda/update.h."""
 
     kernel: str  #: name of the function
-    blocks: Callable[[Any], int]  #: returns the number of blocks, by the sizes B, H, W, S, N, K, M and the stages' own
+    blocks: Callable[[Any], int]  #: returns the number of blocks, by all sizes
     threads: int = 256  #: of a block
     #: returns the memory [bytes] that a block's threads share, by the sizes and the settings of all kernels
     memory: Callable[[Any, Any], int] = lambda sizes, settings: 0
@@ -26,10 +26,10 @@ class Launch:
 
 @dataclass(frozen=True, kw_only=True)
 class Kernel:
-    """The compiled code of one stage: `run_<name>(Update&)` in its cpu.cpp, and kernels in its cuda.cu."""
+    """The compiled code of one folder: `run_<stage>(Update&)` of each stage in cpu.cpp, and kernels in cuda.cu."""
 
-    name: str  #: of the stage, and of its settings in C
-    folder: str  #: of the stage, seen from the package
+    name: str  #: of the settings in C
+    folder: str  #: seen from the package
     settings: Callable[[Any], Settings]  #: returns what the equations need of an ElevationMapConfig, by name
     #: launches of each stage of this kernel, by the stage's name
     cuda: Mapping[str, Sequence[Launch]] = field(default_factory=dict)

@@ -20,7 +20,7 @@ INLINE float arctan(float a) { return std::atan(a); }
 INLINE float floor_of(float a) { return std::floor(a); }
 INLINE bool is_negative(float a) { return std::signbit(a); }
 INLINE bool any(bool flag) { return flag; }
-template <class V> INLINE V all(float value) { return value - V{}; }
+template <class V> INLINE V splat(float value) { return value - V{}; }
 INLINE int32_t integers(float a) { return int32_t(a); }
 INLINE int32_t index_or_none(bool exists, int32_t index) { return exists ? index : -1; }
 template <class V> INLINE V square(V a) { return a * a; }

@@ -19,15 +19,15 @@ typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t Flags __attribute__((vector_size(4 * LANES)));  // of comparisons: -1 true, 0 false
 typedef uint8_t Bytes __attribute__((vector_size(LANES)));
 
-inline Lanes all(float value) { return value - Lanes{}; }  // what + computes for zeros would cost an addition
+inline Lanes splat(float value) { return value - Lanes{}; }  // what + computes for zeros would cost an addition
 inline Lanes pick(Flags flags, Lanes yes, Lanes no) { return flags ? yes : no; }
 inline Lanes zero_unless(Flags flags, Lanes a) { return (Lanes)((Flags)a & flags); }
 inline Flags pick_int(Flags flags, Flags yes, Flags no) { return flags ? yes : no; }
 inline Flags pick_int(Flags flags, int yes, Flags no) { return pick_int(flags, Flags{} + yes, no); }
-inline Lanes one_if(Flags flags) { return pick(flags, all(1), all(0)); }
+inline Lanes one_if(Flags flags) { return pick(flags, splat(1), splat(0)); }
 inline Lanes smaller(Lanes a, Lanes b) { return pick(a < b, a, b); }
 inline Lanes larger(Lanes a, Lanes b) { return pick(a > b, a, b); }
-inline Lanes clamp(Lanes a, float low, float high) { return smaller(larger(a, all(low)), all(high)); }
+inline Lanes clamp(Lanes a, float low, float high) { return smaller(larger(a, splat(low)), splat(high)); }
 inline Lanes absolute(Lanes a) { return (Lanes)((Flags)a & 0x7fffffff); }
 inline Flags is_negative(Lanes a) { return (Flags)a < 0; }  // -0.0 is
 
@@ -156,7 +156,7 @@ inline bool any_set(const uint8_t* bytes, int64_t count) {
 inline Lanes log(Lanes x) {
     const Flags exponent = ((Flags)x - 0x3f3504f3) >> 23;  // such that the mantissa is in sqrt(1/2) to sqrt(2)
     const Lanes m = (Lanes)((Flags)x - (exponent << 23)) - 1, e = __builtin_convertvector(exponent, Lanes);
-    Lanes y = all(7.0376836292e-2f);
+    Lanes y = splat(7.0376836292e-2f);
     for (float c : {-1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f, 1.4249322787e-1f, -1.6668057665e-1f,
                     2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f})
         y = y * m + c;
@@ -170,7 +170,7 @@ inline Lanes exp(Lanes x) {
     const float whole = 12582912.0f;  // adding it rounds to integers
     const Lanes n = (x * 1.44269504088896341f + whole) - whole;
     x = x - n * 0.693359375f + n * 2.12194440e-4f;
-    Lanes y = all(1.9875691500e-4f);
+    Lanes y = splat(1.9875691500e-4f);
     for (float c : {1.3981999507e-3f, 8.3334519073e-3f, 4.1665795894e-2f, 1.6666665459e-1f, 5.0000001201e-1f})
         y = y * x + c;
     y = y * x * x + x + 1;
@@ -179,7 +179,7 @@ inline Lanes exp(Lanes x) {
 
 inline Lanes arctan_of_small(Lanes x) {
     const Lanes z = x * x;
-    Lanes p = all(8.05374449538e-2f);
+    Lanes p = splat(8.05374449538e-2f);
     for (float c : {-1.38776856032e-1f, 1.99777106478e-1f, -3.33329491539e-1f}) p = p * z + c;
     return p * z * x + x;
 }
@@ -188,9 +188,9 @@ inline Lanes arctan_of_small(Lanes x) {
 inline Lanes arctan(Lanes x) {
     const Flags is_large = x > 2.414213562f, is_middle = x > 0.4142135624f;
     if (!any(is_middle)) return arctan_of_small(x);
-    const Lanes above = pick(is_large, all(-1), pick(is_middle, x - 1, x));
-    const Lanes below = pick(is_large, x, pick(is_middle, x + 1, all(1)));
-    const Lanes start = pick(is_large, all(1.5707963268f), pick(is_middle, all(0.7853981634f), all(0)));
+    const Lanes above = pick(is_large, splat(-1), pick(is_middle, x - 1, x));
+    const Lanes below = pick(is_large, x, pick(is_middle, x + 1, splat(1)));
+    const Lanes start = pick(is_large, splat(1.5707963268f), pick(is_middle, splat(0.7853981634f), splat(0)));
     return start + arctan_of_small(above / below);
 }
 
@@ -214,7 +214,7 @@ inline void affine(const float* w, const float* b, const Lanes (*x)[COLUMNS], La
 #pragma GCC unroll 8
             for (int k = 0; k < DOWN; k++)
 #pragma GCC unroll 2
-                for (int c = 0; c < ACROSS; c++) sums[k][c] = b ? all(b[row + k]) : y[row + k][column + c];
+                for (int c = 0; c < ACROSS; c++) sums[k][c] = b ? splat(b[row + k]) : y[row + k][column + c];
 #pragma GCC unroll 2
             for (int in = 0; in < IN; in++)
 #pragma GCC unroll 8
@@ -225,7 +225,7 @@ inline void affine(const float* w, const float* b, const Lanes (*x)[COLUMNS], La
             for (int k = 0; k < DOWN; k++)
 #pragma GCC unroll 2
                 for (int c = 0; c < ACROSS; c++)
-                    y[row + k][column + c] = IS_HIDDEN ? larger(sums[k][c], all(0)) : sums[k][c];
+                    y[row + k][column + c] = IS_HIDDEN ? larger(sums[k][c], splat(0)) : sums[k][c];
         }
 }
 

@@ -102,6 +102,7 @@ def _c_struct(settings: Settings, default: Settings) -> ctypes.Structure:
         like = default[field]
         kind = _kind(like[0] if isinstance(like, tuple) else like)[1]
         numbers = [_converted(v, kind) for v in (value if isinstance(value, tuple) else (value,))]
+        assert len(numbers) == (len(like) if isinstance(like, tuple) else 1), f"{field}: as many as by default"
         types.append((field, kind * len(numbers) if isinstance(value, tuple) else kind))
         values[field] = (kind * len(numbers))(*numbers) if isinstance(value, tuple) else numbers[0]
     return _structure(types)(**values)

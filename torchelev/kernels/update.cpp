@@ -1,4 +1,4 @@
-// Updates of B maps, one after the other through all stages, so that a map's layers stay in the cache between stages.
+// Updates of B maps, each through all stages at once, so that its layers stay in the cache between stages.
 
 #include "kernels/update.h"
 
@@ -10,7 +10,8 @@ struct Own {
     Memory memory;
 };
 
-// What threads keep from update to update: the kernel clears memory anew, page by page, which takes longer than the work.
+// What threads keep from update to update: the operating system clears memory anew, page by page, which takes
+// longer than the work.
 class Kept {
     std::mutex mutex;
     std::vector<std::unique_ptr<Own>> unused;

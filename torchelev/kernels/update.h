@@ -69,7 +69,7 @@ typedef void (*Stage)(Update&);
 
 struct Update {
     const Settings& settings;
-    const Sizes& sizes;       // B, H, W, S, N, K
+    const Sizes& sizes;       // B, H, W, S, N, K, M, P: see structs.py
     MapState state;           // this map's: layers (H, W), numbers behind pointers
     Inputs inputs;            // this map's
     Measurement& measurement;

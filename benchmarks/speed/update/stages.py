@@ -38,7 +38,7 @@ def _alone(drive: Drive, name: str) -> Callable[[], None]:
     values = Inputs(cloud[:, None], T[:, None], T, drive.dt, None, None)
     inputs = as_inputs(values._asdict() | {"own": None})
     state = map_layers(torch.clone, emap.state)
-    run = compiled_stages(pipeline.compile_stages(emap.cfg)).run
+    run = compiled_stages(pipeline.register_stages(emap.cfg)).run
     order = ("measure",) if name == "measure" else ("measure", name)
     return partial(run, (*state[:-1], *state.statistics), inputs, order)
 

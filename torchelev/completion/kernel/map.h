@@ -51,7 +51,7 @@ struct Map {
     }
 
     // How far the level is above heights [m].
-    Lanes above(Lanes height) const { return (all(float(level)) - height) + level_rest; }
+    Lanes above(Lanes height) const { return (splat(float(level)) - height) + level_rest; }
 
     int index(int i, int j) const { return (i + 1) * stride + j + 1; }
 
@@ -138,13 +138,13 @@ inline void look_around(const Map& map, const Cells& cells, Surroundings& around
         const Flags steps = cells.read(&map.steps[size_t(d) * map.H * map.W], place);
         const Lanes height = read(steps), run = __builtin_convertvector(steps, Lanes) * length;
         const Flags is_known = height < UNKNOWN;
-        around.known[d] = one_if(is_known), around.height[d] = pick(is_known, height, all(0));
-        around.distance[d] = pick(is_known, run, all(0));
+        around.known[d] = one_if(is_known), around.height[d] = pick(is_known, height, splat(0));
+        around.distance[d] = pick(is_known, run, splat(0));
         for (int r = 0; r < NUM_REACHES; r++) {
             const int more = std::max(3, int(std::nearbyint(REACHES[r] / length)));
             const Lanes far = read(steps + more);
             around.has_slope[r][d] = one_if(far < UNKNOWN);
-            around.slope[r][d] = pick(far < UNKNOWN, (height - far) * (1 / (more * length)), all(0));
+            around.slope[r][d] = pick(far < UNKNOWN, (height - far) * (1 / (more * length)), splat(0));
         }
     }
 }

@@ -27,7 +27,7 @@ inline void view(Scene& scene, const Lanes* near, const Lanes* distance, const L
     for (int d = 0; d < NUM_DIRECTIONS; d++) {
         const int o = d ^ 1;
         const Lanes known = around.known[d], both = known * around.known[o];
-        if (d < o) across = both / larger(distance[d] + distance[o], all(1e-6f));
+        if (d < o) across = both / larger(distance[d] + distance[o], splat(1e-6f));
         const Lanes share = distance[o] * across;
         const Lanes step = (height[o] - height[d]) * both;
         scene.candidates[0][d] = height[d], scene.exists[0][d] = known;
@@ -50,33 +50,33 @@ inline void look(const Map& map, const Squares& of_rows, const Cells& cells, int
     Surroundings& around = scene.around;
     look_around(map, cells, around);
     const Flags in_map = cells.row * map.W + cells.column, has_bound = gather(map.layers.bounded, in_map) > 0;
-    const Lanes upper_bound = pick(has_bound, gather(map.layers.upper_bound, in_map), all(0));
+    const Lanes upper_bound = pick(has_bound, gather(map.layers.upper_bound, in_map), splat(0));
     scene.is_bounded = one_if(has_bound);
 
     // Heights from the mean of those around each cell, in which nearer ones count more.
-    Lanes has_any{}, lowest = all(NOWHERE), reach = all(NOWHERE);
+    Lanes has_any{}, lowest = splat(NOWHERE), reach = splat(NOWHERE);
     for (int d = 0; d < NUM_DIRECTIONS; d++) {
         const Flags is_known = around.known[d] > 0;
         has_any = larger(has_any, around.known[d]);
-        lowest = smaller(lowest, pick(is_known, around.height[d], all(NOWHERE)));
-        reach = smaller(reach, pick(is_known, around.distance[d], all(NOWHERE)));
+        lowest = smaller(lowest, pick(is_known, around.height[d], splat(NOWHERE)));
+        reach = smaller(reach, pick(is_known, around.distance[d], splat(NOWHERE)));
     }
-    lowest = pick(has_any > 0, lowest, all(float(map.level)));
-    const Lanes nearest = smaller(reach, all(FARTHEST));
+    lowest = pick(has_any > 0, lowest, splat(float(map.level)));
+    const Lanes nearest = smaller(reach, splat(FARTHEST));
     Lanes distance[NUM_DIRECTIONS], near[NUM_DIRECTIONS], height[NUM_DIRECTIONS], sum{}, total{};
     for (int d = 0; d < NUM_DIRECTIONS; d++) {
-        distance[d] = smaller(around.distance[d], all(FARTHEST));
-        near[d] = nearest / larger(distance[d], all(1e-6f)) * around.known[d];
+        distance[d] = smaller(around.distance[d], splat(FARTHEST));
+        near[d] = nearest / larger(distance[d], splat(1e-6f)) * around.known[d];
         height[d] = (around.height[d] - lowest) * around.known[d];
         sum += near[d] * height[d], total += near[d];
     }
-    const Lanes mean = sum / larger(total, all(1e-6f)), low = -mean;
-    Lanes high = all(-NOWHERE);
+    const Lanes mean = sum / larger(total, splat(1e-6f)), low = -mean;
+    Lanes high = splat(-NOWHERE);
     for (int d = 0; d < NUM_DIRECTIONS; d++) {
         height[d] = (height[d] - mean) * around.known[d];
-        high = larger(high, pick(around.known[d] > 0, height[d], all(-NOWHERE)));
+        high = larger(high, pick(around.known[d] > 0, height[d], splat(-NOWHERE)));
     }
-    high = pick(has_any > 0, high, all(0));
+    high = pick(has_any > 0, high, splat(0));
     scene.has_any = has_any, scene.reach = reach, scene.nearest = nearest;
     scene.base = lowest + mean, scene.low = low, scene.high = high;
     scene.bound = (upper_bound - lowest - mean) * scene.is_bounded;
@@ -90,7 +90,7 @@ inline void look(const Map& map, const Squares& of_rows, const Cells& cells, int
 
     Lanes num_known{};
     for (const Lanes& known : around.known) num_known += known;
-    const Lanes usual = all(float(map.resolution) / USUAL), bound = scene.bound, is_bounded = scene.is_bounded;
+    const Lanes usual = splat(float(map.resolution) / USUAL), bound = scene.bound, is_bounded = scene.is_bounded;
     for (Lanes value : {squash(high - low, SQUASH), squash(low, SQUASH), is_bounded,
                         squash(bound - low, SQUASH) * is_bounded, squash(bound, SQUASH),
                         log(1 + nearest * (1 / NEAR_STEP)), log(usual), num_known * (1.0f / NUM_DIRECTIONS)})
@@ -103,14 +103,14 @@ inline void look(const Map& map, const Squares& of_rows, const Cells& cells, int
 inline Answer answer(const Weights& weights, const Scene& scene, int g, const Lanes (*of_views)[NUM_COLUMNS],
                      const Lanes (*of_cell)[GROUPS]) {
     Lanes votes[NUM_CANDIDATES][NUM_DIRECTIONS], of_squares[NUM_RADII];
-    Lanes most = all(NO_VOTE), voters{}, answer{}, spread{};
+    Lanes most = splat(NO_VOTE), voters{}, answer{}, spread{};
     for (int v = 0; v < NUM_CANDIDATES; v++)
         for (int d = 0; d < NUM_DIRECTIONS; d++) {
-            votes[v][d] = pick(scene.exists[v][d] > 0, of_views[v][g * NUM_DIRECTIONS + d], all(NO_VOTE));
+            votes[v][d] = pick(scene.exists[v][d] > 0, of_views[v][g * NUM_DIRECTIONS + d], splat(NO_VOTE));
             most = larger(most, votes[v][d]);
         }
     for (int r = 0; r < NUM_RADII; r++) {
-        of_squares[r] = pick(scene.has_square[r] > 0, of_cell[r][g], all(NO_VOTE));
+        of_squares[r] = pick(scene.has_square[r] > 0, of_cell[r][g], splat(NO_VOTE));
         most = larger(most, of_squares[r]);
     }
     auto count = [&](Lanes vote, Lanes candidate) {
@@ -130,12 +130,12 @@ inline Answer answer(const Weights& weights, const Scene& scene, int g, const La
     spread = spread * per_voter + NO_SPREAD * NO_SPREAD;
 
     const Lanes correction = of_cell[NUM_RADII][g], factor = of_cell[NUM_RADII + 1][g];
-    answer = pick(scene.has_any > 0, answer + tanh(correction) * (scene.high - scene.low + MARGIN), all(0));
+    answer = pick(scene.has_any > 0, answer + tanh(correction) * (scene.high - scene.low + MARGIN), splat(0));
     answer = pick(scene.is_bounded > 0, smaller(answer, scene.bound), answer);
     const Lanes log_std = 0.5f * log(spread) + clamp(factor, -LARGEST_LOG, LARGEST_LOG) + weights.calibration[0];
     const Lanes fade = scene.reach * scene.reach / (scene.reach * scene.reach + FADE * FADE);
     const Lanes log_faded = (1 - fade) * log_std + fade * weights.prior[0];
-    return {scene.base + answer, exp(pick(scene.has_any > 0, log_faded, all(weights.prior[0])))};
+    return {scene.base + answer, exp(pick(scene.has_any > 0, log_faded, splat(weights.prior[0])))};
 }
 
 // The answers at some groups of cells.
@@ -160,7 +160,7 @@ inline void predict(const Weights& weights, const Map& map, const Squares& of_ro
     Lanes votes[NUM_CANDIDATES][NUM_COLUMNS];
     for (int g = 0; g < GROUPS; g++)
         for (int c = g * NUM_DIRECTIONS; c < (g + 1) * NUM_DIRECTIONS; c++) {
-            for (int k = 0; k < VIEWS; k++) channels[k][c] = larger(views[k][c] + told[k][g], all(0));
+            for (int k = 0; k < VIEWS; k++) channels[k][c] = larger(views[k][c] + told[k][g], splat(0));
             for (int v = 0; v < NUM_CANDIDATES; v++) votes[v][c] = told[VIEWS + v][g];
         }
     affine<NUM_CANDIDATES, VIEWS>(weights.vote, nullptr, channels, votes);

@@ -131,7 +131,7 @@ struct Robot {
         const float height = float(pose()[11]), z = std::isfinite(height) ? height : 0;
         const float top = float(scan.top), left = float(scan.left);
         blocks.average(map, int(scan.top), int(scan.left), z);
-        const Read under = blocks.find(all(base[0] - top), all(base[1] - left), 0, SIZE_MAX, true);
+        const Read under = blocks.find(splat(base[0] - top), splat(base[1] - left), 0, SIZE_MAX, true);
         const size_t first = scan.mode == BILINEAR;  // as single cells the points were read before
         fill_by([&](Lanes u, Lanes v) {
             const Read near = blocks.find(u - top, v - left, first, scan.num_near, false);
@@ -142,7 +142,7 @@ struct Robot {
     void fill_with_lowest() {
         float low = UNKNOWN;
         for (int64_t k = 0; k < M; k++) low = is_valid[k] > 0 ? std::min(low, ground[k]) : low;
-        const Read lowest{all(low < UNKNOWN ? low : 0), all(low) < UNKNOWN};
+        const Read lowest{splat(low < UNKNOWN ? low : 0), splat(low) < UNKNOWN};
         fill_by([&](Lanes, Lanes) { return lowest; });
     }
 
@@ -159,9 +159,9 @@ struct Robot {
             const int count = int(std::min<int64_t>(LANES, M - k));
             const Lanes z = load(&this->z[k]);
             Lanes value = z - load(&ground[k]) - scan.nominal_height;
-            value = pick((load(&has_ground[k]) > 0) & are_finite(z), value, all(scan.missing));
+            value = pick((load(&has_ground[k]) > 0) & are_finite(z), value, splat(scan.missing));
             const float* draws = scan.draws ? scan.draws + b * M + k : nullptr;
-            const Lanes error = draws ? (2 * load(draws, count) - 1) * scan.noise : all(0);
+            const Lanes error = draws ? (2 * load(draws, count) - 1) * scan.noise : splat(0);
             value = scan.noise_after_clip ? clamp(value, -scan.clip, scan.clip) + error
                                           : clamp(value + error, -scan.clip, scan.clip);
             store(scan.values + b * M + k, value * scan.scale, count);

@@ -33,7 +33,7 @@ template <class Known> struct Cells {
         const Flags inside = (i >= 0) & (i < height) & (j >= 0) & (j < width);
         const Flags place = pick_int(inside, integers(i) * stride + integers(j), Flags{});
         const Flags is_known = (gather(known, place) != 0) & inside;
-        return {pick(is_known, gather(values, place), all(0)), is_known};
+        return {pick(is_known, gather(values, place), splat(0)), is_known};
     }
 };
 
@@ -61,9 +61,9 @@ template <class Layer> Read read_minimum(const Layer& layer, Lanes u, Lanes v) {
     u -= 0.5f;
     v -= 0.5f;
     const Read corners[] = {read_nearest(layer, u, v), read_nearest(layer, u + 1, v), read_nearest(layer, u, v + 1)};
-    Lanes low = all(UNKNOWN);
+    Lanes low = splat(UNKNOWN);
     for (const Read& corner : corners) low = pick(corner.known, smaller(corner.value, low), low);
-    return {pick(low < UNKNOWN, low, all(0)), low < UNKNOWN};
+    return {pick(low < UNKNOWN, low, splat(0)), low < UNKNOWN};
 }
 
 // The mean of the known ones of four cells by their bilinear weights, known if these sum to at least one half.
@@ -72,15 +72,15 @@ template <class Layer> Read read_bilinear(const Layer& layer, Lanes u, Lanes v) 
     const Lanes i = floor_of(u - 0.5f), j = floor_of(v - 0.5f);
     const Lanes a = u - 0.5f - i, b = v - 0.5f - j;
     const Lanes weights[] = {(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b};
-    Lanes total = all(0), sum = all(0);
+    Lanes total = splat(0), sum = splat(0);
     for (int k = 0; k < 4; k++) {
         const Read cell = layer.at(i + float(k / 2), j + float(k % 2));
-        const Lanes weight = pick(cell.known, weights[k], all(0));
+        const Lanes weight = pick(cell.known, weights[k], splat(0));
         total += weight;
         sum += weight * cell.value;
     }
     const Flags known = total >= 0.5f;
-    return {pick(known, sum / total, all(0)), known};
+    return {pick(known, sum / total, splat(0)), known};
 }
 
 template <class Layer> Read read(const Layer& layer, Lanes u, Lanes v, int32_t mode) {

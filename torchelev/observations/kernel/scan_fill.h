@@ -9,7 +9,7 @@
 
 constexpr float HOLE = std::numeric_limits<float>::quiet_NaN();
 
-inline Lanes or_zero(Lanes a) { return pick(a == a, a, all(0)); }
+inline Lanes or_zero(Lanes a) { return pick(a == a, a, splat(0)); }
 
 // A part of a map, HOLE where not known, in rows that a rim of holes surrounds.
 struct Part {
@@ -88,12 +88,12 @@ struct Blocks {
 
     // The smallest block of the levels `first` to `end` that is known, and with `is_below` is lower than 0.
     Read find(Lanes u, Lanes v, size_t first, size_t end, bool is_below) const {
-        Read found{all(0), Flags{}};
+        Read found{splat(0), Flags{}};
         for (size_t k = first; k < std::min(end, levels.size()); k++) {
             const float scale = 1 / float(1 << k);
             const Read block = read_bilinear(levels[k], u * scale, v * scale);
             const Flags fits = is_below ? block.known & (block.value < 0) : block.known;
-            found = {pick(found.known, found.value, pick(fits, block.value, all(0))), found.known | fits};
+            found = {pick(found.known, found.value, pick(fits, block.value, splat(0))), found.known | fits};
             if (!any(~found.known)) break;
         }
         return found;

@@ -12,7 +12,7 @@ extern "C" void run_age(Update& u) {
     float *time = u.state.time, *variance = u.state.variance;
     for_chosen(u, u.state.validity, [&](int64_t k, Flags known, auto count) {
         const Lanes before = load(variance + k, count);
-        store(time + k, load(time + k, count) + zero_unless(known, all(dt)), count);
+        store(time + k, load(time + k, count) + zero_unless(known, splat(dt)), count);
         store(variance + k, pick(known, aging::grow(before, added, limit), before), count);
     });
 }

@@ -81,13 +81,13 @@ Sums find_errors(Update& u, float* errors) {
         const Flags slots = load_slots(&m.slot[k], count), cells = pick_int(slots >= 0, slots, Flags{});
         Flags counts = (slots >= 0) & (gather(map.validity, cells) > 0);
         counts &= drift::suits(gather(map.traversability, cells), gather(map.variance, cells), s);
-        Lanes error = all(NONE);
+        Lanes error = splat(NONE);
         if (any(counts)) {
             const Lanes gx = gather(map.gradient_x, cells), gy = gather(map.gradient_y, cells);
             error = drift::height_error(load(&m.x[k], count), load(&m.y[k], count), load(&m.z[k], count),
                                         gather(map.elevation, cells), gx, gy, s);
             counts &= absolute(error) <= s.max_error;
-            error = pick(counts, error, all(NONE));
+            error = pick(counts, error, splat(NONE));
             totals.add(counts, error, Lanes{});
         }
         store(errors + k, error, count);
@@ -99,7 +99,7 @@ void shift_heights(Update& u, float shift) {
     const MapState& map = u.state;
     auto add = [&](float* layer, const uint8_t* where) {
         for_chosen(u, where, [&](int64_t k, Flags chosen, auto count) {
-            store(layer + k, load(layer + k, count) + zero_unless(chosen, all(shift)), count);
+            store(layer + k, load(layer + k, count) + zero_unless(chosen, splat(shift)), count);
         });
     };
     add(map.elevation, map.validity), add(map.challenger, map.challenger_support), add(map.upper_bound, map.bounded);
@@ -133,9 +133,9 @@ bool compensate(Update& u) {
     const float first_mean = find_errors(u, errors).mean();
     // Again around the mean: the foot of a wall that was not seen before stands on ground that looks flat.
     const Sums near = sum_up(u, [&](int64_t k, auto count, Totals& totals) {
-        Lanes error = all(NONE), noise{};
+        Lanes error = splat(NONE), noise{};
         std::memcpy(&error, errors + k, sizeof(float) * count), noise = load(&m.noise[k], count);
-        totals.add(drift::is_near_mean(error, all(first_mean), noise, s), error, noise + s.relief_square);
+        totals.add(drift::is_near_mean(error, splat(first_mean), noise, s), error, noise + s.relief_square);
     });
     const float mean = near.mean(), correction = drift::correction(mean, near.number, s);
     const Statistics& to = u.state.statistics;

@@ -11,7 +11,7 @@ template <class Change> void change_variance(Update& u, const Change& change) {
     if (d == 0) return;
     float* variance = u.state.variance;
     for_chosen(u, u.state.validity, [&](int64_t k, Flags known, auto count) {
-        store(variance + k, change(load(variance + k, count), zero_unless(known, all(d2))), count);
+        store(variance + k, change(load(variance + k, count), zero_unless(known, splat(d2))), count);
     });
 }
 

@@ -15,9 +15,9 @@ INLINE float compare_scans(float last, float before, float correction, float err
     return root(last != 0 && correction != 0 ? mean : d2);
 }
 
-// Variance [m^2] of a cell relative to the others: `without_disagreement`, with d2 the squared disagreement.
-template <class V> INLINE V without(V variance, V of_known, const DisagreementSettings& s) {
-    return larger(variance - of_known, smaller(variance, all<V>(s.least)));
+// Variance [m^2] of a cell relative to the others: `without_disagreement`, with the squared disagreement, 0 if unknown.
+template <class V> INLINE V without(V variance, V d2, const DisagreementSettings& s) {
+    return larger(variance - d2, smaller(variance, splat<V>(s.least)));
 }
 
 }  // namespace disagreement

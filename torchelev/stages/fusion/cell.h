@@ -74,7 +74,7 @@ INLINE Resolved<V> settle_height(const Points& points, const Prior<V>& prior, co
 template <class Points, class V = typename Points::V>
 INLINE Measured<V> measure_cell(const Points& points, const Prior<V>& prior, V height, Flag<V> trusted, V side,
                                 const FusionSettings& s) {
-    const V gate_at = gate_variance(prior.variance, s), gate = pick(trusted, gate_at, all<V>(0));
+    const V gate_at = gate_variance(prior.variance, s), gate = pick(trusted, gate_at, splat<V>(0));
     const bool has_sides = any(side != 0);
     V information{}, moment{}, shared{}, kept{}, ignored{}, agreeing{};
     points.each([&](const Point<V>& q) {
@@ -84,7 +84,7 @@ INLINE Measured<V> measure_cell(const Points& points, const Prior<V>& prior, V h
             const Flag<V> ignores = q.used & (side * above < -s.margin * root(q.spread));
             ignored += number_if<V>(ignores), is_kept &= negated(ignores), is_near &= negated(ignores);
         }
-        const V weight = pick(is_kept, q.weight, all<V>(0));
+        const V weight = pick(is_kept, q.weight, splat<V>(0));
         information += weight, moment += weight * above, shared += weight * q.shared;
         kept += number_if<V>(is_kept), agreeing += number_if<V>(is_near);
     });

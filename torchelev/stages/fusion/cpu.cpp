@@ -155,7 +155,7 @@ class Fusion {
         const Prior<Lanes> before = prior(own);
         constexpr std::integral_constant<int, LANES> whole;
         const Flags marks = load_bytes(&scratch.marks[first], whole), won = (marks & WON) > 0;
-        const Lanes side = pick((marks & TOP) > 0, all(1), pick((marks & GROUND) > 0, all(-1), all(0)));
+        const Lanes side = pick((marks & TOP) > 0, splat(1), pick((marks & GROUND) > 0, splat(-1), splat(0)));
         const Measured<Lanes> measured =
             measure_cell(points(first), before, load(&scratch.height[first]), (marks & TRUSTED) > 0, side, s);
         const Decision<Lanes> decision = decide_by_vote(before, measured, won, s);
@@ -167,7 +167,7 @@ class Fusion {
         if (any(decision.founds | ((marks & CHALLENGED) > 0)))
             for (int l = 0; l < own.number; l++)
                 map.challenger_support[own.slots[l]] = decision.founds[l] ? 0 : scratch.challengers[first + l];
-        counts.used += integers(pick(decision.takes, measured.kept, all(0)));
+        counts.used += integers(pick(decision.takes, measured.kept, splat(0)));
         counts.ignored += integers(measured.ignored);
     }
 };

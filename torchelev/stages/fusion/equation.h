@@ -15,8 +15,8 @@ constexpr int TRUSTED = 1, STEP = 2, CHALLENGED = 4, TOP = 8, GROUND = 16, WON =
 
 template <class V> using Flag = decltype(V{} < V{});  // bool, or a vector of -1 and 0
 template <class F> INLINE F negated(F flag) { return flag == F{}; }
-template <class V> INLINE V number_if(Flag<V> flag) { return pick(flag, all<V>(1), all<V>(0)); }
-template <class V> INLINE V ratio(V numerator, V denominator) { return numerator / larger(denominator, all<V>(TINY)); }
+template <class V> INLINE V number_if(Flag<V> flag) { return pick(flag, splat<V>(1), splat<V>(0)); }
+template <class V> INLINE V ratio(V numerator, V denominator) { return numerator / larger(denominator, splat<V>(TINY)); }
 
 // A point of a cell: `ScanPoints`. Not used: the cell has fewer points than others beside it in a vector.
 template <class V> struct Point {
@@ -32,7 +32,7 @@ template <class V> struct Prior {
 
 // `gather_points`.
 template <class V> INLINE Point<V> make_point(V z, V noise, V shared, Flag<V> used, const FusionSettings& s) {
-    return {z, noise + square(s.relief) + shared, pick(used, 1 / noise, all<V>(0)), shared, used};
+    return {z, noise + square(s.relief) + shared, pick(used, 1 / noise, splat<V>(0)), shared, used};
 }
 
 // Variance [m^2] that the pose adds to a point's height, less what the map's heights share: `relative_variance`.
@@ -49,7 +49,7 @@ INLINE bool passed_center(float x, float y, float ray_x, float ray_y, float reso
 
 // The variance [m^2] that an elevation widens its cell's gate by: `gate_variance`.
 template <class V> INLINE V gate_variance(V variance, const FusionSettings& s) {
-    return smaller(variance, all<V>(square(s.max_gate_std)));
+    return smaller(variance, splat<V>(square(s.max_gate_std)));
 }
 
 // |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2): `agrees`.
@@ -59,7 +59,7 @@ template <class V> INLINE Flag<V> agrees(const Point<V>& q, V height, V variance
 
 // Variance [m^2] of a mean: what its points do not share, and what they do; `shared` is weighted: `add_shared`.
 template <class V> INLINE V variance_of_mean(V information, V shared, const FusionSettings& s) {
-    return larger(1 / larger(information, all<V>(1e-12f)), all<V>(s.floor)) + ratio(shared, information);
+    return larger(1 / larger(information, splat<V>(1e-12f)), splat<V>(s.floor)) + ratio(shared, information);
 }
 
 // Whether the elevation is known and at least half of the points agree with it: `trust_majority`.
@@ -170,11 +170,11 @@ INLINE Prior<V> update_cell(const Prior<V>& prior, const Measured<V>& m, Flag<V>
     const V gain = kalman_gain(prior.variance, m.variance, decision.agrees);
     const V h = prior.elevation + gain * (m.height - prior.elevation);
     const V raised = prior.variance + smaller(s.outlier_variance, s.max_variance) * m.kept;
-    const V variance = smaller(pick(decision.takes, gain * m.variance, raised), all<V>(s.max_variance));
+    const V variance = smaller(pick(decision.takes, gain * m.variance, raised), splat<V>(s.max_variance));
     const V fresh = pick(prior.known & negated(won), -decision.support, m.votes() - m.dissent());
     const V support = clamp(pick(decision.founds, fresh, decision.support), 0, s.max_support);
     const Flag<V> known = prior.known | decision.takes;
-    return {pick(decision.takes, h, prior.elevation), pick(known, variance, all<V>(1)),
+    return {pick(decision.takes, h, prior.elevation), pick(known, variance, splat<V>(1)),
             pick(m.kept > 0, support, prior.support), known};
 }
 

@@ -63,19 +63,19 @@ struct Sensor {
         Measurement& m = u.measurement;
         Vector<Lanes> p = read(3 * n, count);
         const Lanes largest = larger(larger(absolute(p.x), absolute(p.y)), absolute(p.z));
-        const Lanes given = u.inputs.variance ? load(u.inputs.variance + n, count) : all(1);
+        const Lanes given = u.inputs.variance ? load(u.inputs.variance + n, count) : splat(1);
         const Flags is_number = (p.x == p.x) & (p.y == p.y) & (p.z == p.z);
         const Flags finite = exists(count) & is_number & (largest < INFINITE) & (given >= TINY) & (given < INFINITE);
         // Zeroed before any product: the square of 1e30 would be infinite.
         const Flags small = finite & (largest <= s.max_distance);
-        p = {pick(small, p.x, all(0)), pick(small, p.y, all(0)), pick(small, p.z, all(0))};
+        p = {pick(small, p.x, splat(0)), pick(small, p.y, splat(0)), pick(small, p.z, splat(0))};
         const Lanes d2 = p.x * p.x + p.y * p.y + p.z * p.z;
         const Flags in_range = small & (d2 >= s.min_square) & (d2 <= s.max_square);
         const Vector<Lanes> relative = measurement::rotate<Lanes>(R, p.x, p.y, p.z);
         const Vector<Lanes> at{relative.x + origin[0], relative.y + origin[1], relative.z + origin[2]};
         const Flags casts = in_range & ~own(n, count, at);
         const Flags used = s.has_ramp ? casts & ~measurement::above_ramp(relative, s) : casts;
-        const Lanes noise = u.inputs.variance ? pick(finite, given, all(1)) : measurement::noise_of(d2, s);
+        const Lanes noise = u.inputs.variance ? pick(finite, given, splat(1)) : measurement::noise_of(d2, s);
         store(&m.x[n], at.x, count), store(&m.y[n], at.y, count), store(&m.z[n], at.z, count);
         store(&m.noise[n], noise, count);
         if (covariance)

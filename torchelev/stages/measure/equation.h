@@ -21,9 +21,9 @@ template <class V> INLINE V noise_of(V distance2, const MeasureSettings& s) {
 
 // Whether a point lies in the exclusion area (paper, Fig. 3), by its place from the sensor [m]: `above_ramp`.
 template <class V> INLINE auto above_ramp(const Vector<V>& relative, const MeasureSettings& s) {
-    const V r = root(larger(relative.x * relative.x + relative.y * relative.y, all<V>(1e-12f)));
-    const V rise = larger(r - s.ramp_distance, all<V>(0)) * s.ramp_slope + s.ramp_offset;
-    return relative.z > smaller(rise, all<V>(s.ramp_height));
+    const V r = root(larger(relative.x * relative.x + relative.y * relative.y, splat<V>(1e-12f)));
+    const V rise = larger(r - s.ramp_distance, splat<V>(0)) * s.ramp_slope + s.ramp_offset;
+    return relative.z > smaller(rise, splat<V>(s.ramp_height));
 }
 
 // Whether a point lies in the body box, by its place in the base frame [m]: `inside_body`.
@@ -36,7 +36,7 @@ template <class V> INLINE auto inside_body(const Vector<V>& p, const MeasureSett
 template <class V> INLINE V project_covariance(const float* C, V r_x, V r_y) {
     const float zz = C[14], zr = C[15], zp = C[16], rr = C[21], rp = C[22], pp = C[28];
     const V variance = zz + 2 * (zr * r_y - zp * r_x) + rr * (r_y * r_y) - 2 * rp * r_x * r_y + pp * (r_x * r_x);
-    return larger(variance, all<V>(0));
+    return larger(variance, splat<V>(0));
 }
 
 }  // namespace measurement

@@ -91,14 +91,14 @@ struct Totals {
     Lanes weights{}, moments{};
 
     void add(Flags cells, Lanes weight, Lanes moment) {
-        weights += pick(cells, weight, all(0)), moments += pick(cells, moment, all(0));
+        weights += pick(cells, weight, splat(0)), moments += pick(cells, moment, splat(0));
     }
     Total total() const { return {sum(weights), sum(moments)}; }
 };
 
 // `Range` of vectors.
 struct Ranges {
-    Lanes lowest = all(HUGE_VALF), highest = all(-HUGE_VALF);
+    Lanes lowest = splat(HUGE_VALF), highest = splat(-HUGE_VALF);
 
     void add(Flags cells, Lanes height) {
         lowest = smaller(pick(cells, height, lowest), lowest), highest = larger(pick(cells, height, highest), highest);
@@ -137,9 +137,9 @@ int64_t clear_row(const Around& around, int64_t i, const Floor& floor, const Ove
     int64_t number = 0;
     around.row(i, [&](int64_t cell, Lanes square, Flags near, auto count) {
         const Flags known = around.is_known(cell, count), bounded = around.is_bounded(cell, count);
-        const Lanes allowance = pick(known & around.is_hit(cell, count), overlap::allowance(square, s), all(0));
+        const Lanes allowance = pick(known & around.is_hit(cell, count), overlap::allowance(square, s), splat(0));
         const Flags other = near & known & overlap::is_outside(around.height(cell, count), floor, allowance);
-        const Flags no_bound = near & bounded & overlap::is_outside(around.bound(cell, count), floor, all(0));
+        const Flags no_bound = near & bounded & overlap::is_outside(around.bound(cell, count), floor, splat(0));
         if (!any(other | no_bound)) return;
         const Flags support = load_bytes(map.challenger_support + cell, count);
         store_bytes(map.validity + cell, -(known & ~other), count);

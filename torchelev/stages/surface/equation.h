@@ -26,7 +26,7 @@ template <class V> INLINE decltype(V{} < V{}) spans_plane(V uu, V uv, V vv, floa
 template <class V> INLINE void solve_gradient(V uu, V uv, V vv, V uz, V vz, const SurfaceSettings& s, Plane<V>& plane) {
     const V det = uu * vv - uv * uv, trace = uu + vv;
     const auto is_regular = det > s.min_det;
-    const V scale = 1 / pick(is_regular, det, larger(trace, all<V>(s.min_trace)));
+    const V scale = 1 / pick(is_regular, det, larger(trace, splat<V>(s.min_trace)));
     plane.gradient_u = pick(is_regular, vv * uz - uv * vz, uz) * scale;
     plane.gradient_v = pick(is_regular, uu * vz - uv * uz, vz) * scale;
 }
@@ -38,17 +38,17 @@ template <class V> INLINE Plane<V> fit_plane(const Moments<V>& m, float min_spre
     const V uz = m.uz * w - u * z, vz = m.vz * w - v * z, zz = m.zz * w - z * z;
     Plane<V> plane{spans_plane(uu, uv, vv, min_spread), {}, {}, {}};
     solve_gradient(uu, uv, vv, uz, vz, s, plane);
-    plane.residual = larger(zz - plane.gradient_u * uz - plane.gradient_v * vz, all<V>(0));
+    plane.residual = larger(zz - plane.gradient_u * uz - plane.gradient_v * vz, splat<V>(0));
     return plane;
 }
 
 // Rating by the worst of slope, step [m] and roughness.
 template <class V> INLINE V traversability(const Plane<V>& plane, V step, const SurfaceSettings& s) {
-    const V tiny = all<V>(1e-12f), x = plane.gradient_u * s.per_cell, y = plane.gradient_v * s.per_cell;
+    const V tiny = splat<V>(1e-12f), x = plane.gradient_u * s.per_cell, y = plane.gradient_v * s.per_cell;
     const V slope = arctan(root(larger(x * x + y * y, tiny)));
     const V roughness = root(larger(plane.residual, tiny));
     const V worst = larger(slope * s.per_critical[0], step * s.per_critical[1]);
-    return larger(1 - larger(worst, roughness * s.per_critical[2]), all<V>(0));
+    return larger(1 - larger(worst, roughness * s.per_critical[2]), splat<V>(0));
 }
 
 }  // namespace surface

@@ -73,7 +73,7 @@ class Rows {
             if (!is_inside(row) || !any_set(validity + first + begin, end - begin)) continue;
             for_lanes(begin, end, [&](int k, auto count) {
                 const Flags known = load_bytes(validity + first + k, count) > 0;
-                total += one_if(known), sum += pick(known, load(elevation + first + k, count), all(0));
+                total += one_if(known), sum += pick(known, load(elevation + first + k, count), splat(0));
             });
         }
         float of_total = 0, of_sum = 0;
@@ -104,9 +104,9 @@ class Rows {
         for_lanes(begin, end, [&](int k, auto count) {
             const Flags is_known = load_bytes(validity + first + k, count) > 0;
             const Lanes z = load(elevation + first + k, count) - mean;
-            store(to + k, one_if(is_known), count), store(to + width + k, pick(is_known, z, all(0)), count);
-            store(to + 2 * width + k, pick(is_known, z, all(-nowhere)), count);
-            store(to + 3 * width + k, pick(is_known, z, all(nowhere)), count);
+            store(to + k, one_if(is_known), count), store(to + width + k, pick(is_known, z, splat(0)), count);
+            store(to + 2 * width + k, pick(is_known, z, splat(-nowhere)), count);
+            store(to + 3 * width + k, pick(is_known, z, splat(nowhere)), count);
             some |= is_known;
         });
         flags[(row + number) % number] = any(some);

@@ -93,28 +93,28 @@ class Cells {
             const Found& at = found[next++];
             const Flags is_over = at.lowest < s.no_ray;
             if (!any(is_over)) return;
-            const Lanes slope = pick(is_over, at.lowest, all(0));
+            const Lanes slope = pick(is_over, at.lowest, splat(0));
             const Lanes height = sensor.view.origin[2] + slope * at.rho;
-            number += apply_at({is_over, all(x), load(y + j, size), at.rho, slope, height}, row + j, size);
+            number += apply_at({is_over, splat(x), load(y + j, size), at.rho, slope, height}, row + j, size);
         });
         return number;
     }
 
     // `find_lowest_rays` over cells, none of which lies in a range bin below `nearest`.
     Found find(float x, Lanes ys, int nearest) const {
-        const Lanes xs = all(x), rho = horizontal(xs, ys);
-        const Lanes k = smaller(floor_of(rho / s.resolution), all(float(s.ranges)));
+        const Lanes xs = splat(x), rho = horizontal(xs, ys);
+        const Lanes k = smaller(floor_of(rho / s.resolution), splat(float(s.ranges)));
         const Lanes azimuth = azimuth_fraction(xs, ys) * float(s.azimuths);
         int levels = 0;
         while (levels < s.levels && nearest < s.widen[levels]) levels++;
         const Lanes entry = entry_of(k, levels, s);
         const Window<Lanes> window = window_of(k, azimuth, entry, s);
-        return {rho, nearest < table.near ? lowest_near(k, window, entry) : all(s.no_ray), table.places(k, window)};
+        return {rho, nearest < table.near ? lowest_near(k, window, entry) : splat(s.no_ray), table.places(k, window)};
     }
 
     // The lowest rays over those cells that lie in rows that are stored whole.
     [[gnu::noinline]] Lanes lowest_near(Lanes k, const Window<Lanes>& window, Lanes entry) const {
-        Lanes lowest = all(s.no_ray);
+        Lanes lowest = splat(s.no_ray);
         const Flags row = integers(k), first = integers(window.first), number = integers(window.further + entry);
         for (int l = 0; l < LANES; l++)
             if (row[l] < table.near) lowest[l] = table.lowest_near(row[l], first[l], number[l]);
@@ -140,10 +140,10 @@ class Cells {
     // Eq. 3 and 4, of known cells with a ray over them.
     template <class Count> Flags gone(const RayOverCell<Lanes>& ray, int64_t k, Flags known, Count count) const {
         const Lanes depth = load(map.elevation + k, count) - ray.height, variance = load(map.variance + k, count);
-        const Flags may = ray.found & known & passes_below_old(depth, variance, load(map.time + k, count), s);
+        const Flags may = ray.found & known & passes_below(depth, variance) & is_old(load(map.time + k, count), s);
         if (!any(may)) return may;
         const Lanes gx = load(map.gradient_x + k, count), gy = load(map.gradient_y + k, count);
-        return may & is_steep_or_far_below(ray, depth, variance, gx, gy, s);
+        return may & is_credible(ray, depth, variance, gx, gy, s);
     }
 
     template <class Count>

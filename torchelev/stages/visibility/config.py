@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from torchelev.errors import require
 
+MAX_CELLS = 2**15  # that rays count up to; tables of more would not fit the memory
+
 
 @dataclass(frozen=True, kw_only=True)
 class RaycastConfig:
@@ -27,3 +29,10 @@ class RaycastConfig:
         require(reach, "raycast.max_range", "must be positive and finite", self.max_range, "give metres, or None")
         support = 0 <= self.min_support < math.inf
         require(support, "raycast.min_support", "must be finite and not negative", self.min_support, "give points")
+
+    def require_resolution(self, resolution: float) -> None:
+        """Refuse rays that reach over more cells than a table can have."""
+        reach = 0.0 if self.max_range is None else self.max_range / resolution
+        rule = f"must be at most {MAX_CELLS:,} cells of {resolution:g} m"
+        hint = "give None, or fewer metres"
+        require(reach <= MAX_CELLS, "raycast.max_range", rule, self.max_range, hint)

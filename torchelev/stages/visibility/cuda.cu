@@ -8,7 +8,7 @@
 #include "stages/visibility/ground_of_thread.h"
 #include "stages/visibility/rays_of_thread.h"
 
-// Write the running minimum of the falls to recently hit ground: `limits_by_tensors`. A thread for each azimuth.
+// Write the running minimum of the falls to recently hit ground: `horizon`. A thread for each azimuth.
 extern "C" __global__ void find_horizon(Update u) {
     const int64_t azimuths = u.sizes.horizon_azimuths;
     const Place at = place(azimuths);

@@ -1,4 +1,5 @@
-// What rays say of cells: the functions of this folder's Python files, with the same names. V is a float or a vector.
+// What rays say of cells: the equations of this folder's Python files. V is a float or a vector; `VisibilitySettings` are
+// what `settings` of kernel.py returns.
 #pragma once
 
 #include "kernels/scalar.h"
@@ -22,9 +23,9 @@ template <class V> struct RayBins {
 };
 
 template <class V> INLINE RayBins<V> bins_of(const Ray<V>& ray, V noise, const VisibilitySettings& s) {
-    const V last = smaller(floor_of((ray.r - noise) / s.resolution), all<V>(float(s.ranges + 1))) - 2;
+    const V last = smaller(floor_of((ray.r - noise) / s.resolution), splat<V>(float(s.ranges + 1))) - 2;
     const float azimuths = float(s.azimuths);
-    return {last, smaller(floor_of(ray.azimuth * azimuths), all<V>(azimuths - 1))};
+    return {last, smaller(floor_of(ray.azimuth * azimuths), splat<V>(azimuths - 1))};
 }
 
 // The angle of an azimuth of so many [rad]: `directions`.
@@ -41,7 +42,7 @@ template <class V> INLINE RayBins<V> horizon_bins_of(const Ray<V>& ray, const Vi
 
 // How far below an elevation a ray must pass to contradict it [m]: `height_margin`.
 template <class V> INLINE V height_margin(V variance, const VisibilitySettings& s) {
-    return smaller(s.gate * root(variance + s.relief), all<V>(s.nowhere));
+    return smaller(s.gate * root(variance + s.relief), splat<V>(s.nowhere));
 }
 
 // Where a sensor stands, in the map's axes and in the window.
@@ -70,8 +71,8 @@ template <class V> struct RayEnds {
 template <class V> INLINE V share_of(V length, int axis, const View& view, const VisibilitySettings& s) {
     const Flag<V> ahead = length > 0;
     const float inner = 0.5f * s.resolution, size = view.size[axis] * s.resolution;
-    const V room = pick(ahead, all<V>(size - inner - view.start[axis]), all<V>(inner - view.start[axis]));
-    return room / pick(ahead, larger(length, all<V>(1e-9f)), smaller(length, all<V>(-1e-9f)));  // never by zero
+    const V room = pick(ahead, splat<V>(size - inner - view.start[axis]), splat<V>(inner - view.start[axis]));
+    return room / pick(ahead, larger(length, splat<V>(1e-9f)), smaller(length, splat<V>(-1e-9f)));  // never by zero
 }
 
 template <class V> INLINE RayEnds<V> find_ends(const Ray<V>& ray, const View& view, const VisibilitySettings& s) {
@@ -79,12 +80,12 @@ template <class V> INLINE RayEnds<V> find_ends(const Ray<V>& ray, const View& vi
     const V end_x = view.start[0] + ray.x, end_y = view.start[1] + ray.y;
     const Flag<V> leaves = (end_x < 0) | (end_x >= view.size[0] * s.resolution) | (end_y < 0) |
                            (end_y >= view.size[1] * s.resolution);
-    const V share = pick(leaves, clamp(smaller(share_x, share_y), 0, 1), all<V>(1));
+    const V share = pick(leaves, clamp(smaller(share_x, share_y), 0, 1), splat<V>(1));
     const V i = cell_of(view.origin[0] + share * ray.x, 0, view, s);
     const V j = cell_of(view.origin[1] + share * ray.y, 1, view, s);
     const V near_i = clamp(i, 0, view.size[0] - 1), near_j = clamp(j, 0, view.size[1] - 1);
     const Flag<V> through_x = share_x <= share_y;
-    const V side = pick(through_x, pick(ray.x > 0, all<V>(1), all<V>(0)), pick(ray.y > 0, all<V>(3), all<V>(2)));
+    const V side = pick(through_x, pick(ray.x > 0, splat<V>(1), splat<V>(0)), pick(ray.y > 0, splat<V>(3), splat<V>(2)));
     const Flag<V> inside = (i == near_i) & (j == near_j);
     return {near_i, near_j, inside, share * ray.r, leaves, side, pick(through_x, near_j, near_i)};
 }
@@ -115,17 +116,17 @@ template <class V>
 INLINE CredibleEnd<V> has_credible_end(const Ray<V>& ray, const RayEnds<V>& end, V floor, V near, Flag<V> overhang,
                                        const View& view, const VisibilitySettings& s) {
     const float z = view.origin[2];
-    const V height = z + end.reach * ray.slope, deepest = z + ray.r * smaller(ray.slope, all<V>(0));
+    const V height = z + end.reach * ray.slope, deepest = z + ray.r * smaller(ray.slope, splat<V>(0));
     const Flag<V> over = height >= floor;
     const Flag<V> low = end.leaves & (height < floor) & (deepest >= near - s.clearance);
-    const V raised = larger(ray.slope, (near + s.clearance - z) / larger(end.reach, all<V>(1e-6f)));
+    const V raised = larger(ray.slope, (near + s.clearance - z) / larger(end.reach, splat<V>(1e-6f)));
     const Flag<V> well = (end.inside & (over | low)) | overhang;
     return {well, pick(low & !overhang, raised, ray.slope)};
 }
 
-// How far below the sensor a cell's lowest ground lies [m], NO_FALL where it was not hit recently: `limits_by_tensors`.
+// How far below the sensor a cell's lowest ground lies [m], NO_FALL where it was not hit recently: `horizon`.
 template <class V> INLINE V below_sensor(V lowest, Flag<V> known, V time, float z, const VisibilitySettings& s) {
-    return pick(known & (time <= s.min_time), z - lowest, all<V>(s.no_fall));
+    return pick(known & (time <= s.min_time), z - lowest, splat<V>(s.no_fall));
 }
 
 // The lowest ray over a cell so far from the sensor: `RayOverCell`.
@@ -147,14 +148,15 @@ INLINE Flag<V> passes_far_below(V depth, V variance, V gx, V gy, const Visibilit
     return depth > height_margin(variance, s) + root(gx * gx + gy * gy) * (0.5f * s.resolution);
 }
 
-// Eq. 3, and that the cell was not hit for `min_time`; `depth` [m] is how far below the elevation the ray passes.
-template <class V> INLINE Flag<V> passes_below_old(V depth, V variance, V time, const VisibilitySettings& s) {
-    return (depth > root(variance)) & (time > s.min_time);
-}
+// Eq. 3, by how far below the elevation the ray passes [m].
+template <class V> INLINE Flag<V> passes_below(V depth, V variance) { return depth > root(variance); }
 
-// Eq. 4, of cells that eq. 3 holds for: `clear_and_bound`.
+// Whether the cell was not hit for `min_time`.
+template <class V> INLINE Flag<V> is_old(V time, const VisibilitySettings& s) { return time > s.min_time; }
+
+// Eq. 4, of cells that eq. 3 holds for: the ray is not a grazing one, or passes far below: `clear_and_bound`.
 template <class V>
-INLINE Flag<V> is_steep_or_far_below(const RayOverCell<V>& ray, V depth, V variance, V gx, V gy,
+INLINE Flag<V> is_credible(const RayOverCell<V>& ray, V depth, V variance, V gx, V gy,
                                      const VisibilitySettings& s) {
     return (incidence(ray, gx, gy) > s.min_incidence) | passes_far_below(depth, variance, gx, gy, s);
 }

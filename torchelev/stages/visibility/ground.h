@@ -41,7 +41,7 @@ class Ground {
         const Lanes row = clamp(near_i, float(rows[0]), float(rows[1] - 1));
         const Lanes column = clamp(near_j, float(columns[0]), float(columns[1] - 1));
         const Lanes found = gather(below, integers(row) * int(width) + integers(column));
-        return pick((i == near_i) & (j == near_j), found, all(beyond));
+        return pick((i == near_i) & (j == near_j), found, splat(beyond));
     }
 
     // Return where the lowest ground at the ends of rays is found.
@@ -55,7 +55,7 @@ class Ground {
 
     // Return the lowest ground near the borders that rays leave through [m]: `ground_at_borders`.
     Lanes near(const RayEnds<Lanes>& end, Flags ends) const {
-        if (!has_borders) return all(s.nowhere);
+        if (!has_borders) return splat(s.nowhere);
         const float length = float(std::max(height, width));
         return gather(borders, pick_int(ends, integers(end.side * length + end.place), Flags{}));
     }
@@ -112,14 +112,14 @@ class Ground {
     template <class Count>
     void look_at(int64_t k, Count count, const float* before, const float* own, const float* after) const {
         const Flags known = load_bytes(map.validity + k, count) > 0;
-        if (!any(known)) return store(below + k, all(s.no_fall), count), store(floor + k, all(UNKNOWN), count);
+        if (!any(known)) return store(below + k, splat(s.no_fall), count), store(floor + k, splat(UNKNOWN), count);
         const Lanes elevation = load(map.elevation + k, count);
         const Lanes lowest = elevation - height_margin(load(map.variance + k, count), s);
         const Lanes fall = visibility::below_sensor(lowest, known, load(map.time + k, count), sensor.view.origin[2], s);
         const Lanes left = load(own - 1, count), right = load(own + 1, count);
         const Flags supported = well_supported<Lanes>(elevation, known, load(own, count), load(before, count),
                                                       load(after, count), left, right, s);
-        store(below + k, fall, count), store(floor + k, pick(supported, lowest, all(UNKNOWN)), count);
+        store(below + k, fall, count), store(floor + k, pick(supported, lowest, splat(UNKNOWN)), count);
     }
 
     // `ground_at_borders`, of the cells that were looked at.
@@ -165,7 +165,7 @@ class Ground {
     }
 
     float lowest_of(int64_t row, int64_t begin, int64_t end) const {
-        Lanes lowest = all(s.nowhere);
+        Lanes lowest = splat(s.nowhere);
         int64_t j = begin;
         for (; j + LANES <= end; j += LANES) lowest = smaller(lowest, known_ground(row + j, Full()));
         float values[LANES], least = s.nowhere;

@@ -94,7 +94,7 @@ class Horizon {
         const Lanes cosine = load(cosines + block * LANES), sine = load(sines + block * LANES);
         const float beyond = s.no_fall * step;
         float* entries = steepest + block * ranges * LANES;
-        Lanes lowest = all(std::numeric_limits<float>::infinity());
+        Lanes lowest = splat(std::numeric_limits<float>::infinity());
         for (int k = 0; k < rows[block]; k++) {
             const float rho = (float(k) + 0.5f) * step;
             const Lanes i = cell_of(sensor.view.origin[0] + rho * cosine, 0, sensor.view, s);

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -23,27 +23,12 @@ if TYPE_CHECKING:
 NO_FALL = 1e4  # a fall -dz/dr that no ray has
 
 
-class SeenRays(NamedTuple):
-    """Rays, and where their sensors are."""
-
-    r: Float[Tensor, "B N"]  #: [m] horizontal length
-    azimuth: Float[Tensor, "B N"]  #: in turns
-    origin: Float[Tensor, "B 3"]  #: [m] of the sensor, counted from the measurement's horizontal origin
-    offset: Float[Tensor, "B 2"]  #: [m] of that origin in the window
-
-
-class Directions(NamedTuple):
-    """Azimuths, evenly spaced."""
-
-    cosines: Float[Tensor, "A"]  #: of each azimuth
-    sines: Float[Tensor, "A"]  #: of each azimuth
-
-
 def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: RaycastConfig) -> Float[Tensor, "B N"]:
     """Return the steepest fall -dz/dr that a ray may have before it passes below ground hit within `min_time`.
 
     Rays that pass below it contradict it, and are wrong returns. It is the minimum, from the sensor to two bins before
-    the ray's end, of the fall to each bin's ground; bins are two cells long, and as wide.
+    the ray's end, of the fall to each bin's ground; bins are two cells long, and as wide. A polar table of them over
+    the whole window is filled by gathering from the map.
 
     Args:
         state: the maps.
@@ -52,31 +37,12 @@ def horizon(state: MapState, m: Measurement, rays: Rays, grid: GridConfig, cfg: 
         grid: the window.
         cfg: the rules.
     """
-    polar = PolarGrid.of(grid, cfg)
-    ranges, ways = 8 * (polar.ranges // 16 + 1), directions(polar.azimuths // 2, rays.r)
-    seen = SeenRays(rays.r, rays.azimuth, rays.origin, lattice_offset(state, m, grid))
-    return limits_by_tensors(state, seen, ways, ranges, grid, cfg)
-
-
-def directions(number: int, like: Tensor) -> Directions:
-    """Return the directions of so many azimuths."""
-    angle = (torch.arange(number, device=like.device, dtype=like.dtype) + 0.5) * (2 * math.pi / number)
-    return Directions(angle.cos(), angle.sin())
-
-
-def limits_by_tensors(
-    state: MapState,
-    rays: SeenRays,
-    ways: Directions,
-    ranges: int,
-    grid: GridConfig,
-    cfg: RaycastConfig,
-) -> Float[Tensor, "B N"]:
-    """Return each ray's limit, from a polar table over the whole window that is filled by gathering from the map."""
-    step, azimuths = 2 * grid.resolution, len(ways.cosines)
+    polar, step = PolarGrid.of(grid, cfg), 2 * grid.resolution
+    ranges, azimuths = polar.horizon_ranges, polar.horizon_azimuths
     rho = (torch.arange(ranges, device=rays.r.device, dtype=rays.r.dtype) + 0.5)[:, None] * step
-    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate(ways))
-    slot, inside = locate(x, y, rays.offset, grid)
+    angle = (torch.arange(azimuths, device=rays.r.device, dtype=rays.r.dtype) + 0.5) * (2 * math.pi / azimuths)
+    x, y = (rays.origin[:, k, None, None] + rho * part for k, part in enumerate((angle.cos(), angle.sin())))
+    slot, inside = locate(x, y, lattice_offset(state, m, grid), grid)
     lowest = state.elevation - height_margin(state.variance, grid, cfg)
     recent = state.validity & (state.time <= cfg.min_time)
     below_sensor = torch.where(recent, rays.origin[:, 2, None, None] - lowest, NO_FALL)

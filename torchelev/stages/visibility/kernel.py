@@ -23,11 +23,6 @@ if TYPE_CHECKING:
     from torchelev.config import ElevationMapConfig
 
 
-def horizon_ranges(polar: PolarGrid) -> int:
-    """Return the number of bins along a ray of the horizon's table."""
-    return 8 * (polar.ranges // 16 + 1)
-
-
 def settings(cfg: ElevationMapConfig) -> Settings:
     """Return what the equations need of a config."""
     rays = cfg.raycast or RaycastConfig()
@@ -45,7 +40,7 @@ def settings(cfg: ElevationMapConfig) -> Settings:
         bins=float(polar.bins),
         levels=len(polar.widen),
         widen=(*polar.widen, *[0] * (MAX_LEVELS - len(polar.widen))),
-        horizon_ranges=horizon_ranges(polar),
+        horizon_ranges=polar.horizon_ranges,
         near_cells=max(1, int(NEAR / size)),
         clearance=CLEARANCE,
         no_ray=NO_RAY,
@@ -62,8 +57,8 @@ def sizes(cfg: ElevationMapConfig) -> dict[str, int]:
         has_rays=int(rays is not None),
         ranges=polar.ranges,
         azimuths=polar.azimuths,
-        horizon_ranges=horizon_ranges(polar),
-        horizon_azimuths=polar.azimuths // 2,
+        horizon_ranges=polar.horizon_ranges,
+        horizon_azimuths=polar.horizon_azimuths,
         border=max(grid.height, grid.width),
     )
 

@@ -10,24 +10,24 @@ template <class V> using Flag = decltype(V{} < V{});
 
 // `mirrored`
 template <class V> INLINE V mirrored(V angle, float full, V side) {
-    return absolute(angle + pick(is_negative(side), all<V>(-full), all<V>(0)));
+    return absolute(angle + pick(is_negative(side), splat<V>(-full), splat<V>(0)));
 }
 
 // `azimuth_fraction`, in turns
 template <class V> INLINE V azimuth_fraction(V x, V y) {
     const V ax = absolute(x), ay = absolute(y);
-    const V t = smaller(ax, ay) / larger(larger(ax, ay), all<V>(1e-30f));
+    const V t = smaller(ax, ay) / larger(larger(ax, ay), splat<V>(1e-30f));
     const V eighth = t * (0.125f + 0.0434f * (1 - t));
     return mirrored(mirrored(mirrored(eighth, 0.25f, ax - ay), 0.5f, x), 1.0f, y);
 }
 
 // Horizontal distance [m].
-template <class V> INLINE V horizontal(V x, V y) { return root(larger(x * x + y * y, all<V>(1e-12f))); }
+template <class V> INLINE V horizontal(V x, V y) { return root(larger(x * x + y * y, splat<V>(1e-12f))); }
 
 // Of how many azimuth bins an entry at range k is the minimum: `PolarGrid.covered`. The first `levels` alone may count.
 template <class V> INLINE V entry_of(V k, int levels, const VisibilitySettings& s) {
-    V entry = all<V>(1);
-    for (int w = 0; w < levels; w++) entry += pick(k < float(s.widen[w]), all<V>(float(int64_t(1) << w)), all<V>(0));
+    V entry = splat<V>(1);
+    for (int w = 0; w < levels; w++) entry += pick(k < float(s.widen[w]), splat<V>(float(int64_t(1) << w)), splat<V>(0));
     return entry;
 }
 
@@ -38,11 +38,11 @@ template <class V> struct Window {
 
 // `lowest_slope`, of a cell at range k, where an entry is the minimum of so many azimuth bins; `azimuth` counts bins.
 template <class V> INLINE Window<V> window_of(V k, V azimuth, V entry, const VisibilitySettings& s) {
-    const V half = 0.5f * (s.bins * (1 / larger(k, all<V>(0.5f))));
+    const V half = 0.5f * (s.bins * (1 / larger(k, splat<V>(0.5f))));
     const float azimuths = float(s.azimuths);
     const V a = floor_of(azimuth - half);
-    const V further = larger(floor_of(azimuth + half) - a + 1 - entry, all<V>(0));
-    return {smaller(pick(a < 0, a + azimuths, a), all<V>(azimuths - 1)), further};
+    const V further = larger(floor_of(azimuth + half) - a + 1 - entry, splat<V>(0));
+    return {smaller(pick(a < 0, a + azimuths, a), splat<V>(azimuths - 1)), further};
 }
 
 }  // namespace visibility

@@ -25,6 +25,16 @@ class PolarGrid(NamedTuple):
     bins: float  #: how many azimuth bins BREADTH cells cover at a range of one cell
     widen: tuple[int, ...]  #: below which range an entry is the minimum of 2, 4, 8, ... azimuth bins
 
+    @property
+    def horizon_ranges(self) -> int:
+        """Bins along a ray of the horizon's table, two cells long; a multiple of 8."""
+        return 8 * (self.ranges // 16 + 1)
+
+    @property
+    def horizon_azimuths(self) -> int:
+        """Bins around the sensor of the horizon's table, of two of these each."""
+        return self.azimuths // 2
+
     @classmethod
     def of(cls, grid: GridConfig, cfg: RaycastConfig) -> PolarGrid:
         """Choose the table's size for a window."""

@@ -70,7 +70,7 @@ class AcceptedRays {
     int accept(const Seen& seen, Entry* entries) const {
         const VisibilitySettings& s = sensor.s;
         const Flags casts = seen.casts & (seen.limit_found + seen.ray.slope >= 0);
-        const Lanes near = any(seen.end.leaves) ? ground.near(seen.end, casts & seen.end.leaves) : all(s.nowhere);
+        const Lanes near = any(seen.end.leaves) ? ground.near(seen.end, casts & seen.end.leaves) : splat(s.nowhere);
         const CredibleEnd<Lanes> credible =
             has_credible_end(seen.ray, seen.end, seen.floor_found, near, seen.overhang, sensor.view, s);
         const RayBins<Lanes> bins = bins_of(seen.ray, seen.noise, s);

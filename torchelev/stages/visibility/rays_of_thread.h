@@ -59,8 +59,8 @@ inline visibility::RayOverCell<float> find_lowest_ray(const int32_t* slopes, flo
 inline bool is_gone(const visibility::RayOverCell<float>& ray, const MapState& map, int64_t k,
                     const VisibilitySettings& s) {
     const float depth = map.elevation[k] - ray.height, variance = map.variance[k];
-    return visibility::passes_below_old(depth, variance, map.time[k], s) &&
-           visibility::is_steep_or_far_below(ray, depth, variance, map.gradient_x[k], map.gradient_y[k], s);
+    return visibility::passes_below(depth, variance) && visibility::is_old(map.time[k], s) &&
+           visibility::is_credible(ray, depth, variance, map.gradient_x[k], map.gradient_y[k], s);
 }
 
 // Apply the lowest ray over a cell; return whether the cell is cleared: `clear_and_bound`.

@@ -102,14 +102,14 @@ struct Sensor {
         auto include = [&](int64_t n, auto count) {
             const Measurement& m = u.measurement;
             const Flags casting = casts(n, count);
-            const Lanes x = pick(casting, load(&m.x[first + n], count) - view.origin[0], all(0));
-            const Lanes y = pick(casting, load(&m.y[first + n], count) - view.origin[1], all(0));
+            const Lanes x = pick(casting, load(&m.x[first + n], count) - view.origin[0], splat(0));
+            const Lanes y = pick(casting, load(&m.y[first + n], count) - view.origin[1], splat(0));
             low[0] = smaller(low[0], x), high[0] = larger(high[0], x);
             low[1] = smaller(low[1], y), high[1] = larger(high[1], y);
             square = larger(square, x * x + y * y);
         };
         each_vector(begin, end, number, include);
-        const Lanes r = root(larger(square, all(1e-12f)));
+        const Lanes r = root(larger(square, splat(1e-12f)));
         Extent own{};
         for (int l = 0; l < LANES; l++)
             own.include({{low[0][l], low[1][l]}, {high[0][l], high[1][l]}, r[l]});

@@ -1,4 +1,4 @@
-"""Rays: what lies below a ray that reached farther is gone, and what no ray saw lies below the lowest ray."""
+"""Rays: a cell that stands above a ray is gone, and ground that no ray saw lies below the lowest one."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def clear_and_bound(state: MapState, ray: RayOverCell, grid: GridConfig, cfg: Ra
     """
     h, sigma, p_z = state.elevation, state.variance.sqrt(), ray.height
     passes_below = h - p_z > sigma
-    is_steep = ray.incidence > cfg.min_incidence
+    is_credible = (ray.incidence > cfg.min_incidence) | passes_far_below(state, h - p_z, grid, cfg)
     is_old = state.time > cfg.min_time
-    gone = ray.found & passes_below & is_old & (is_steep | passes_far_below(state, h - p_z, grid, cfg))
+    gone = ray.found & passes_below & is_old & is_credible
     return lower_upper_bound(refute_challengers(state._replace(validity=state.validity & ~gone), ray), ray)
 
 

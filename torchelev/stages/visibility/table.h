@@ -104,7 +104,7 @@ class Table {
     // Return the lowest entry of so many from an azimuth on, in a row that is stored whole.
     float lowest_near(int row, int azimuth, int number) const {
         const float* values = whole + row * whole_width + azimuth;
-        Lanes lowest = all(s.no_ray);
+        Lanes lowest = splat(s.no_ray);
         for (int k = 0; k < number; k += LANES) lowest = smaller(lowest, load(values + std::min(k, number - LANES)));
         return lowest_lane(lowest);
     }
@@ -140,9 +140,9 @@ class Table {
 
     // Turn a block into its running minimum from far to near, and widen it by the next one, which is unchanged as yet.
     void scan_block(int b, const float* next) {
-        Scan scan{*this, b, block(b), next, rows[b], b + 1 < count ? rows[b + 1] : 0, all(s.no_ray), all(s.no_ray)};
+        Scan scan{*this, b, block(b), next, rows[b], b + 1 < count ? rows[b + 1] : 0, splat(s.no_ray), splat(s.no_ray)};
         int end = std::max(scan.rows, scan.rows_of_next);
-        for (int row = near - 1; row >= end; row--) store(whole + row * whole_width + b * LANES, all(s.no_ray));
+        for (int row = near - 1; row >= end; row--) store(whole + row * whole_width + b * LANES, splat(s.no_ray));
         end = scan.rows_down_to<0>(first_row(0), end);
         end = scan.rows_down_to<1>(first_row(1), end);
         end = scan.rows_down_to<2>(first_row(2), end);

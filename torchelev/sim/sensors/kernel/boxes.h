@@ -11,9 +11,9 @@ struct Box {
 
 // Return the distance [m] at which rays enter the first box, infinite where they miss all.
 inline Lanes distance_to_boxes(const Box* boxes, int count, const Lanes* direction) {
-    Lanes nearest = all(__builtin_inff());
+    Lanes nearest = splat(__builtin_inff());
     for (const Box* box = boxes; box < boxes + count; box++) {
-        Lanes enter = all(0), leave = all(__builtin_inff());
+        Lanes enter = splat(0), leave = splat(__builtin_inff());
         Flags misses = {};
         for (int axis = 0; axis < 3; axis++) {
             const float* r = box->rotation + 3 * axis;

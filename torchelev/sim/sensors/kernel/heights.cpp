@@ -34,8 +34,8 @@ struct Place {
 };
 
 inline Place find_place(const Query& query, Lanes x, Lanes y) {
-    const Lanes limit = all(3.4028234663852886e38f);
-    x = pick(x == x, x / query.resolution, all(0)), y = pick(y == y, y / query.resolution, all(0));
+    const Lanes limit = splat(3.4028234663852886e38f);
+    x = pick(x == x, x / query.resolution, splat(0)), y = pick(y == y, y / query.resolution, splat(0));
     const Lanes across = smaller(larger(x, -limit), limit) + 0.5f * query.rows;
     const Lanes along = smaller(larger(y, -limit), limit) + 0.5f * query.columns;
     const Lanes i = floor_of(across), j = floor_of(along);

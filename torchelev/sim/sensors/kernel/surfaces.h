@@ -18,7 +18,7 @@ inline Coefficients coefficients(const float* samples, Flags first, int width) {
 
 template <Surface surface> inline Lanes height(const Coefficients& at, Lanes u, Lanes v) {
     if constexpr (surface == BILINEAR) return at.a + at.b * u + (at.c + at.d * u) * v;
-    const Lanes bend = surface == RISING ? smaller(u, v) : larger(u + v - 1, all(0));
+    const Lanes bend = surface == RISING ? smaller(u, v) : larger(u + v - 1, splat(0));
     return at.a + at.b * u + at.c * v + at.d * bend;
 }
 
@@ -33,8 +33,8 @@ struct Plane {
     Lanes over, sinking, begin, end;
 
     Plane(Lanes over, Lanes sinking) : over(over), sinking(sinking) {
-        const Lanes crossing = over / sinking, endless = all(__builtin_inff());
-        begin = pick(over <= 0, all(0), pick(sinking > 0, crossing, endless));
+        const Lanes crossing = over / sinking, endless = splat(__builtin_inff());
+        begin = pick(over <= 0, splat(0), pick(sinking > 0, crossing, endless));
         end = pick(sinking < 0, crossing, endless);
     }
 };
@@ -56,7 +56,7 @@ inline Meeting meet_triangles(const Coefficients& at, Lanes u, Lanes v, Lanes z,
                        sinking + at.d * (is_falling ? step[0] + step[1] : step[0]));
     const Flags is_lower = is_falling ? at.d < 0 : at.d > 0;
     const Lanes both = larger(first.begin, second.begin), either = smaller(first.begin, second.begin);
-    const Lanes below = pick(both <= smaller(first.end, second.end), both, all(__builtin_inff()));
+    const Lanes below = pick(both <= smaller(first.end, second.end), both, splat(__builtin_inff()));
     const Lanes one = first.over - leave * first.sinking, other = second.over - leave * second.sinking;
     return {pick(is_lower, larger(first.over, second.over), smaller(first.over, second.over)),
             pick(is_lower, below, either), pick(is_lower, larger(one, other), smaller(one, other))};
