@@ -1,6 +1,7 @@
 """What all tests share: hypothesis' profile, one thread, and how workers share the tests."""
 
 import collections
+import signal
 import socket
 
 import pytest
@@ -18,6 +19,8 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("torchelev")
+# A script's background jobs ignore Ctrl-C, and so would the programs that tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(config, items):
