@@ -49,7 +49,7 @@ def _draw_points(ax: Axes, result: dict[str, Any]) -> None:
     top = ax.secondary_xaxis("top")
     top.set_xticks([n for _, n, *_ in SENSORS], [name for name, *_ in SENSORS], rotation=30, ha="left", fontsize=9)
     top.xaxis.set_minor_locator(NullLocator())
-    ax.legend(loc="upper left")
+    ax.legend(loc="center left", frameon=False)
 
 
 def _plain_ticks(axis: Any) -> None:

@@ -16,13 +16,14 @@ from benchmarks.speed.meter import progress
 _IMPORT = "import time, torch; t = time.perf_counter(); import torchelev; print(time.perf_counter() - t)"
 # Imports nothing that a user's program does not, as its memory is measured, too.
 _FIRST_UPDATE = """
-import resource, time, torch
+import time, torch
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 torch.set_num_threads({threads})
 drive = Drive(full_config(), BPEARL, scans=1)
 t = time.perf_counter()
 drive()
-print(time.perf_counter() - t, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-6)
+seconds = time.perf_counter() - t
+print(seconds, next(1024e-6 * int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")))
 """
 
 
