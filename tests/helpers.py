@@ -98,7 +98,7 @@ def random_state(rng, grid, num_envs=1, known=0.6, dtype=torch.float64):
     return blank_state(grid, num_envs, "cpu", dtype)._replace(
         elapsed=3_000_000_000 + torch.arange(num_envs),
         elevation=torch.where(validity, draw(-0.3, 0.3), 0.0),
-        variance=torch.where(validity, draw(1e-5, 1e-2), 1.0),
+        variance=draw(1e-5, 1e-2),
         validity=validity,
         support=torch.where(validity, torch.floor(draw(0, 20)), 0.0),
         time=draw(0, 2),

@@ -373,7 +373,7 @@ def fuse_cell(
     `max_support`.
     """
     after, relief = dict(cell), relief * resolution
-    after["variance"] = min(cell["variance"], max_variance) if cell["known"] else 1.0
+    after["variance"] = min(cell["variance"], max_variance) if cell["known"] else cell["variance"]
     if not points:
         return after, 0, 0
     settings = dict(gate=gate, max_gate_std=max_gate_std, edges=edges)

@@ -104,10 +104,15 @@ def test_variances_are_finite(name):
 
 def test_rays_reach_over_no_more_cells_than_a_table_has():
     grid = GridConfig(resolution=0.04, length_x=4.0, length_y=4.0)
-    farthest = ElevationMapConfig(grid=grid, raycast=RaycastConfig(max_range=2**15 * 0.04))
-    assert len(settings(farthest)["widen"]) == len(settings(ElevationMapConfig())["widen"])
-    with pytest.raises(ValueError, match=r"raycast\.max_range: must be at most 32,768 cells of 0\.04 m, got 2000"):
-        ElevationMapConfig(grid=grid, raycast=RaycastConfig(max_range=2000.0))
+    farthest = ElevationMapConfig(grid=grid, raycast=RaycastConfig(max_range=2**14 * 0.04))
+    own = settings(farthest)
+    assert own["ranges"] * own["azimuths"] < 2**31 and len(own["widen"]) == len(settings(ElevationMapConfig())["widen"])
+    longest = GridConfig(resolution=0.1, length_x=4000.0, length_y=1.0)
+    for window, rays in ((grid, RaycastConfig(max_range=1000.0)), (longest, RaycastConfig())):
+        with pytest.raises(
+            ValueError, match=r"raycast\.max_range: .* reach over at most 16,384 of them, got 2.,... cells"
+        ):
+            ElevationMapConfig(grid=window, raycast=rays)
 
 
 @pytest.mark.parametrize("bad", [dict(refinements=1), dict(min_points=2.5), dict(min_extreme=0), dict(min_share=0.0)])

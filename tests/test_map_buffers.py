@@ -1,9 +1,10 @@
 """A state goes into the buffers of a map, and comes back out of their names."""
 
+import numpy as np
 import pytest
 import torch
 
-from tests.helpers import differences, mapped, scan, small_map, snapshot
+from tests.helpers import differences, mapped, random_state, scan, small_map, snapshot
 from torchelev import FilterConfig
 from torchelev.map_buffers import name_tensors, state_of, without_shared_memory
 
@@ -68,3 +69,9 @@ def test_a_shared_tensor_is_copied_alone():
     fresh = without_shared_memory(new, (*state[:-1], *state.statistics, None))
     assert fresh.time is new.time and fresh.elevation is not state.elevation
     assert differences(fresh, new) == []
+
+
+def test_a_rated_state_is_unrated_in_a_map_without_a_head():
+    rated, unrated = small_map(2), small_map(2, traversability=None)
+    unrated.load_state(random_state(np.random.default_rng(0), rated.cfg.grid, 2))
+    assert unrated.layer("elevation").isfinite().any() and unrated.layer("traversability").isnan().all()

@@ -72,7 +72,7 @@ class ElevationMapConfig:
         if self.completion is not None:
             self.completion.require_resolution(self.grid.resolution)
         if self.raycast is not None:
-            self.raycast.require_resolution(self.grid.resolution)
+            self.raycast.require_grid(self.grid)
 
     @property
     def drift_gate(self) -> float:

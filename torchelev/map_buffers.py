@@ -99,6 +99,8 @@ class MapBuffers(nn.Module):
         self._forget_derived()
         with torch.no_grad():
             map_layers(Tensor.copy_, self.state, state)
+            if self.cfg.traversability is None:  # no stage would rate these cells anew
+                self.state.rated.zero_(), self.state.traversability.zero_()
 
     def _forget_derived(self) -> None:
         """Forget what belongs to the state that was here before; called when all of it is replaced or moved."""

@@ -50,7 +50,7 @@ class MapState(NamedTuple):
     support: Float[Tensor, "B H W"]  #: points that agree, less points that disagree; -1 of a prediction
     challenger: Float[Tensor, "B H W"]  #: [m] lowest height that contradicts the elevation from above; no gradient
     challenger_support: UInt8[Tensor, "B H W"]  #: points that do so, less points that do not
-    time: Float[Tensor, "B H W"]  #: [s] since the last hit
+    time: Float[Tensor, "B H W"]  #: [s] since the last hit; of unknown cells it stands still
     upper_bound: Float[Tensor, "B H W"]  #: [m] of cells that are not known
     bounded: Bool[Tensor, "B H W"]  #: upper_bound is known; of known cells only until `clear_seen_through`
     gradient_x: Float[Tensor, "B H W"]  #: dz/dx
@@ -86,7 +86,7 @@ class Measurement(NamedTuple):
 LAYERS = MapState._fields[4:-1]  # (B, H, W)
 MASKS = ("validity", "bounded", "has_normal", "rated")  # layers that are true or false
 CARRIED = ("drift_correction", "disagreement")  # statistics that the next update reads
-# What an unknown cell holds, by layer; everything else is zero.
+# What a cell that was never known holds, by layer; everything else is zero.
 BLANK = {"variance": 1.0}
 
 

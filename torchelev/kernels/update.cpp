@@ -43,7 +43,7 @@ struct Borrowed {
     }
 };
 
-// Run the stages. One may fail without memory, before it changes its map; the map stays sound.
+// Run the stages. One may fail without memory, with a part of its work done: what was taken out is then put back.
 void run(Update& one, const Stage* stages, int64_t num_stages) {
     try {
         for (int64_t k = 0; k < num_stages; k++) stages[k](one);

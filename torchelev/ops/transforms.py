@@ -49,15 +49,13 @@ def _is_batched(value: Tensor) -> bool:
     return False
 
 
-def has_values(tensor: Tensor) -> bool:
-    """Return whether the host may read a tensor: it is no fake one, and torch neither compiles nor transforms."""
-    is_plain = type(tensor) in (Tensor, torch.nn.Parameter)
-    return is_plain and not torch.compiler.is_compiling() and not is_transforming()
-
-
 def is_readable(tensor: Tensor, may_wait: bool = False) -> bool:
-    """Return whether the host may read a tensor now: it lies on the CPU, or the host `may_wait` for its device."""
-    return (may_wait or tensor.is_cpu) and has_values(tensor)
+    """Return whether the host may read a tensor now: it lies on the CPU, or the host `may_wait` for its device.
+
+    Never true of fake tensors, and while torch compiles or transforms.
+    """
+    is_plain = type(tensor) in (Tensor, torch.nn.Parameter) and (may_wait or tensor.is_cpu)
+    return is_plain and not torch.compiler.is_compiling() and not is_transforming()
 
 
 def can_compute_unseen(tensors: Iterable[Tensor]) -> bool:

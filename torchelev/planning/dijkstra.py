@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchelev.kernels.cpu_build import call, load
-from torchelev.ops.transforms import is_readable
+from torchelev.ops.transforms import can_compute_unseen
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -51,7 +51,7 @@ def follow(
 
 
 def _library(cost: Tensor, *others: Tensor) -> ctypes.CDLL | None:
-    is_plain = cost.dtype in _SUFFIXES and all(map(is_readable, (cost, *others)))
+    is_plain = cost.dtype in _SUFFIXES and can_compute_unseen((cost, *others))
     fits = (cost.shape[1] + 2) * (cost.shape[2] + 2) < _MOST_CELLS
     return load(*LIBRARY) if is_plain and fits else None
 

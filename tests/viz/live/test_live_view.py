@@ -39,13 +39,17 @@ def test_after_the_loop_another_robot_can_be_chosen_until_ctrl_c(emap, port):
     during_the_loop = view.page.on_change
 
     def choose():
-        wait_for(lambda: view.page.on_change is not during_the_loop)
-        time.sleep(0.2)
-        view.page._env.value = 2
-        os.kill(os.getpid(), signal.SIGINT)
+        try:
+            wait_for(lambda: view.page.on_change is not during_the_loop)
+            time.sleep(0.2)
+            view.page._env.value = 2
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
 
-    threading.Thread(target=choose).start()
+    chooser = threading.Thread(target=choose, daemon=True)
+    chooser.start()
     view.wait()
+    chooser.join()
     shown = view.page._last.map.layers["elevation"]
     assert np.array_equal(shown, emap.layer("elevation")[2].numpy(), equal_nan=True)
     assert view.show(pose(num_envs=3)) is False, "it is closed"

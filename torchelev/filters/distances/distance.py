@@ -20,7 +20,7 @@ from torchelev.filters.distances.opencv_distance import FAR
 from torchelev.filters.registry import register
 from torchelev.layers import Layer
 from torchelev.ops.masks import where_finite
-from torchelev.ops.transforms import is_readable
+from torchelev.ops.transforms import can_compute_unseen
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -116,7 +116,7 @@ def squared_distance(seeds: Bool[Tensor, "B H W"], reach: int) -> Float[Tensor, 
 
     Whole numbers. More than reach^2 beyond `reach` [cells], and on maps without seeds.
     """
-    if is_readable(seeds) and opencv.is_installed():
+    if can_compute_unseen([seeds]) and opencv.is_installed():
         cells = opencv_distance.nearest_seed(seeds.numpy(), reach + 1)
         return torch.from_numpy(np.rint(cells * cells))
     return squared_distance_by_tensors(seeds, reach)

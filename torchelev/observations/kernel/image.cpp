@@ -44,7 +44,7 @@ struct Pixels {
     const Images& all;
     std::vector<float> u, v;  // [cells]
 
-    explicit Pixels(const Images& all) : splat(all), u(all.P + LANES), v(all.P + LANES) {}
+    explicit Pixels(const Images& all) : all(all), u(all.P + LANES), v(all.P + LANES) {}
 
     void place(const double* pose, const int64_t* corner) {
         float x[2], y[2], start[2];

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.kernels.cpu_build import call, load
-from torchelev.ops.transforms import is_readable
+from torchelev.ops.transforms import can_compute_unseen
 from torchelev.sim.cpp_library import address
 from torchelev.sim.terrains.heightfield import HeightField
 
@@ -72,9 +72,8 @@ def see(
 
 
 def _find_library(field: HeightField, *values: Tensor) -> ctypes.CDLL | None:
-    if not all(is_readable(value) for value in (field.padded, *values)) or len(field.bounds.highest) >= 2**31:
-        return None
-    return load(*LIBRARY)
+    fits = can_compute_unseen((field.padded, *values)) and len(field.bounds.highest) < 2**31
+    return load(*LIBRARY) if fits else None
 
 
 def _tiles(field: HeightField) -> tuple[Tensor, ...]:

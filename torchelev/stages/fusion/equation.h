@@ -174,7 +174,7 @@ INLINE Prior<V> update_cell(const Prior<V>& prior, const Measured<V>& m, Flag<V>
     const V fresh = pick(prior.known & negated(won), -decision.support, m.votes() - m.dissent());
     const V support = clamp(pick(decision.founds, fresh, decision.support), 0, s.max_support);
     const Flag<V> known = prior.known | decision.takes;
-    return {pick(decision.takes, h, prior.elevation), pick(known, variance, splat<V>(1)),
+    return {pick(decision.takes, h, prior.elevation), pick(known, variance, prior.variance),
             pick(m.kept > 0, support, prior.support), known};
 }
 

@@ -16,7 +16,6 @@ from torchelev.stages.fusion.consensus import estimate_consensus
 from torchelev.stages.fusion.contested import ratio
 from torchelev.stages.fusion.points import CellLayers, HitPoints, Prior, gather_points, gather_prior
 from torchelev.stages.fusion.vote import Decision, decide_by_vote
-from torchelev.state import BLANK
 
 if TYPE_CHECKING:
     from jaxtyping import Int
@@ -74,7 +73,7 @@ def update_cells(
     validity = prior.known | takes
     return CellLayers(
         elevation=h,
-        variance=torch.where(validity, variance, BLANK["variance"]),
+        variance=torch.where(validity, variance, prior.variance),
         support=torch.where(measured.kept > 0, support, prior.support),
         challenger=challenge.height,
         challenger_support=torch.where(founds, 0, challenge.support),

@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass
 
 from torchelev.errors import require
+from torchelev.grid import GridConfig
+from torchelev.stages.visibility.polar_table import PolarGrid
 
-MAX_CELLS = 2**15  # that rays count up to; tables of more would not fit the memory
+MAX_CELLS = 2**14  # that rays count up to: C++ counts the places of the polar table in 32 bits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +32,9 @@ class RaycastConfig:
         support = 0 <= self.min_support < math.inf
         require(support, "raycast.min_support", "must be finite and not negative", self.min_support, "give points")
 
-    def require_resolution(self, resolution: float) -> None:
-        """Refuse rays that reach over more cells than a table can have."""
-        reach = 0.0 if self.max_range is None else self.max_range / resolution
-        rule = f"must be at most {MAX_CELLS:,} cells of {resolution:g} m"
-        hint = "give None, or fewer metres"
-        require(reach <= MAX_CELLS, "raycast.max_range", rule, self.max_range, hint)
+    def require_grid(self, grid: GridConfig) -> None:
+        """Refuse rays that reach over more cells than the polar table can have."""
+        reach = PolarGrid.of(grid, self).ranges
+        rule = f"rays of {grid.resolution:g} m cells must reach over at most {MAX_CELLS:,} of them"
+        hint = "set max_range to fewer metres, or shorten the window"
+        require(reach <= MAX_CELLS, "raycast.max_range", rule, f"{reach:,} cells", hint)

@@ -41,7 +41,7 @@ struct Extent {
         farthest = std::max(farthest, other.farthest);
     }
     Extent widened(float by) const {
-        return {{low[0] - by, low[1] - by}, {high[0] + by, high[1] + by}, farthest + by};
+        return {{low[0] - by, low[1] - by}, {high[0] + by, high[1] + by}, farthest};
     }
 };
 
