@@ -1,4 +1,4 @@
-"""Sums per cell, borders, running minima and polar tables."""
+"""Sums per cell, running minima and polar tables."""
 
 import numpy as np
 import pytest
