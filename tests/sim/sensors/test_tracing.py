@@ -115,8 +115,8 @@ def test_range_is_the_limit(path):
 @pytest.mark.slow(13)
 @pytest.mark.parametrize("terrain", TERRAINS)
 def test_equals_a_fine_march(terrain):
-    """All kinds of rays on one kind of terrain: 5,250 of them, and 36,750 over all terrains, by C++ and by tensors."""
-    rng, N, reach, touching = np.random.default_rng(TERRAINS.index(terrain)), 150, 1.5, 0
+    """All kinds of rays on one kind of terrain: 2,625 of them, and 18,375 over all terrains, by C++ and by tensors."""
+    rng, N, reach, touching = np.random.default_rng(TERRAINS.index(terrain)), 75, 1.5, 0
     for resolution, surface in zip((0.02, 0.035, 0.05, 0.035, 0.05), (0, 0, 0, 1, 2), strict=True):
         field = difficult_terrain(terrain, rng, resolution).with_surface(*SURFACES[surface])
         for kind in RAYS:
@@ -128,7 +128,7 @@ def test_equals_a_fine_march(terrain):
                 differ = np.flatnonzero(~far & ~np.isclose(got, expected, rtol=0, atol=0.005))
                 touching += len(differ)
                 assert all(only_touches(field, tile[n], origins[n], d[n], got[n], expected[n]) for n in differ), kind
-    assert touching <= 33  # of 10,500
+    assert touching <= 16  # of 5,250
 
 
 def only_touches(field, tile, origin, d, got, expected):
