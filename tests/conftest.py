@@ -9,6 +9,8 @@ import torch
 from hypothesis import HealthCheck, Phase, settings
 
 import envs.offscreen  # noqa: F401  (before any test imports MuJoCo)
+from torchelev import ElevationMapConfig, pipeline
+from torchelev.kernels.cpu_update import is_built
 
 settings.register_profile(
     "torchelev",
@@ -21,6 +23,12 @@ settings.register_profile(
 settings.load_profile("torchelev")
 # A script's background jobs ignore Ctrl-C, and so would the programs that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_sessionstart(session):
+    """Build the C++ of updates once, on all cores, before each of xdist's workers would do it."""
+    if getattr(session.config.option, "numprocesses", None) and not hasattr(session.config, "workerinput"):
+        is_built(pipeline.register_stages(ElevationMapConfig()))
 
 
 def pytest_collection_modifyitems(config, items):

@@ -36,5 +36,5 @@ class RaycastConfig:
         """Refuse rays that reach over more cells than the polar table can have."""
         reach = PolarGrid.of(grid, self).ranges
         rule = f"rays of {grid.resolution:g} m cells must reach over at most {MAX_CELLS:,} of them"
-        hint = "set max_range to fewer metres, or shorten the window"
+        hint = "use larger cells, or a shorter window" if self.max_range is None else "give fewer metres, or None"
         require(reach <= MAX_CELLS, "raycast.max_range", rule, f"{reach:,} cells", hint)
