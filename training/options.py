@@ -32,6 +32,11 @@ def runs_option(default: str) -> Callable[[Command], Command]:
     )
 
 
+compile_option = click.option(
+    "--compile/--no-compile", "compiled", default=True, show_default=True, help="Build updates ahead."
+)
+
+
 def smoke_option(**values: object) -> Callable[[Command], Command]:
     """Return the option --smoke, which gives other options small values in place of their defaults.
 

@@ -17,7 +17,7 @@ from torchelev.observations.fill import FILLS
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export
-from training.options import smoke_option
+from training.options import compile_option, smoke_option
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
 
@@ -113,13 +113,7 @@ def make_runner(
     "--out", type=click.Path(path_type=Path), default=Path("runs/nav"), show_default=True, help="Output folder."
 )
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
-@click.option(
-    "--compile/--no-compile",
-    "compiled",
-    default=True,
-    show_default=True,
-    help="Build updates ahead.",
-)
+@compile_option
 @smoke_option(num_envs=8, iterations=2, episodes=4, compiled=False)
 @click.option("--episodes", type=_POSITIVE, default=256, show_default=True, help="Episodes of the evaluation.")
 @click.pass_obj

@@ -15,7 +15,7 @@ from envs.quadruped import Quadruped, QuadrupedConfig
 from envs.quadruped.config import PERCEPTION
 from envs.quadruped.rsl_rl import RslRlQuadruped
 from torchelev.errors import require
-from training.options import smoke_option
+from training.options import compile_option, smoke_option
 from training.quadruped.evaluate import evaluate, table
 from training.quadruped.play import play
 from training.quadruped.policy import GROUPS, LoadedPolicy, export, load_policy, sight_of
@@ -100,13 +100,7 @@ def make_runner(
     "--out", type=click.Path(path_type=Path), default=Path("runs/quadruped"), show_default=True, help="Output folder."
 )
 @click.option("--resume", is_flag=True, help="Continue from OUT/checkpoint.pt.")
-@click.option(
-    "--compile/--no-compile",
-    "compiled",
-    default=True,
-    show_default=True,
-    help="Build updates ahead.",
-)
+@compile_option
 @click.option("--episodes", type=_POSITIVE, default=280, show_default=True, help="Episodes of the evaluation.")
 @smoke_option(num_envs=7, iterations=2, episodes=7, compiled=False)
 @click.option(

@@ -67,7 +67,7 @@ def look_up(
     cells: Int[Tensor, "N 2"],
     resolution: float,
 ) -> Float[Tensor, "C N"]:
-    """Return the values of moved layers at cells: each takes that of the cell its centre came from; NaN where unknown.
+    """Return the values that layers have at cells once the motion has moved them; NaN where unknown.
 
     Args:
         layers: heights [m], which turn with the move, and others, which do not.
