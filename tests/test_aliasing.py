@@ -41,6 +41,7 @@ def assert_fresh(emap, result, *given):
     assert tensors(result) and not memory(result) & memory(buffers, *given)
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("with_base", [True, False])
 @pytest.mark.parametrize("off", STAGES)
 @pytest.mark.parametrize("inference", [False, True])

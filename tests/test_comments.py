@@ -164,6 +164,7 @@ def test_files_that_pages_mention_exist():
     assert not {(page, name) for page, name in stale if name not in ("my_robot.py", "examples/NAME.py")}
 
 
+@pytest.mark.slow(4)
 def test_stale_files_and_names_are_found():
     text = "# see `unheard`, `ElevationMap.unheard()`, `sensor.measure`, `torch.unheard`, lost.py and `io/lost.h`"
     assert missing_files(text) == ["io/lost.h", "lost.py"]

@@ -30,6 +30,7 @@ def undocumented(source):
     return missing
 
 
+@pytest.mark.slow(1)
 def test_every_field_is_documented():
     missing = {path.name: names for path in ROOT.rglob("*.py") if (names := undocumented(path.read_text()))}
     assert not missing, "add a `#:` comment: unit, meaning, and of a setting when to change it"

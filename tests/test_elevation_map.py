@@ -434,6 +434,7 @@ def test_fake_tensors_do_catch_a_host_sync():
         bool(torch.zeros(2).any())
 
 
+@pytest.mark.slow(1)
 def test_a_map_on_the_meta_device():
     """Shapes without memory; a stand-in for any device that is not the CPU."""
     emap = ElevationMap(small_config(), num_envs=2, device="meta")

@@ -23,6 +23,7 @@ def forbid_reading(monkeypatch):
         monkeypatch.setattr(torch, constructor, None)
 
 
+@pytest.mark.slow(2)
 def test_host_reads_nothing_back(monkeypatch):
     # Tensors on "meta" have no values, so that reading one raises; all but the CPU takes the GPU's paths.
     forbid_reading(monkeypatch)
@@ -40,6 +41,7 @@ def test_host_reads_nothing_back(monkeypatch):
         emap.reset()
 
 
+@pytest.mark.slow(1)
 def test_links_are_not_read_back(monkeypatch):
     forbid_reading(monkeypatch)
     body = random_body(np.random.default_rng(0))
@@ -60,6 +62,7 @@ def completing_map(num_envs, device, **settings):
     return ElevationMap(small_config((40, 40), 0.05, **parts), num_envs, device, completion_net=net)
 
 
+@pytest.mark.slow(3)
 @pytest.mark.parametrize("when", ["read", "update"])
 def test_completion_copies_nothing_from_the_host(monkeypatch, when):
     emap = completing_map(5, "meta", when=when)
@@ -69,6 +72,7 @@ def test_completion_copies_nothing_from_the_host(monkeypatch, when):
     read_completed(emap)
 
 
+@pytest.mark.slow(1)
 def test_completion_reads_no_values_back():
     read_completed(completing_map(5, "meta"))
 

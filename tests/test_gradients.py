@@ -62,6 +62,7 @@ def test_gradcheck_of_points_and_prior():
     )
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("layer", ["variance", "gradient_x", "gradient_y", "traversability"])
 def test_gradcheck_of_the_other_layers(layer):
     emap, state, cloud, T = scene(1)

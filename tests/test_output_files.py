@@ -63,6 +63,7 @@ def test_every_writer_refuses_folders_and_devices(tmp_path, name):
     assert path.is_symlink() and stat.S_ISCHR(os.stat("/dev/full").st_mode) and os.listdir(tmp_path) == [name]
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("name", WRITERS)
 def test_only_what_is_written_for_people_is_told_from_scans(tmp_path, name):
     WRITERS[name](tmp_path / name)
@@ -138,6 +139,7 @@ def test_what_cannot_be_written_is_known_before(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.slow(1)
 def test_damaged_weights_are_a_value_error_that_names_the_file(tmp_path):
     path, rng = tmp_path / "weights.pt", np.random.default_rng(0)
     TraversabilityNet.from_pretrained().save(path)

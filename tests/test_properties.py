@@ -1,6 +1,7 @@
 """What must hold of whole updates, whatever the clouds, poses, sizes and dtypes."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -72,6 +73,7 @@ def test_the_recordings_give_every_stage_work():
 # Batches --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.integers(2, 5), CLOUD_DTYPES, MAP_DTYPES)
 def test_a_batch_equals_single_maps_bit_for_bit(seed, num_envs, cloud_dtype, map_dtype):
     walk = recording(seed, num_envs, dtype=cloud_dtype)
@@ -147,6 +149,7 @@ def test_the_dtype_of_a_cloud_only_rounds_it(seed):
     assert differences(half.state, full.state) == []
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_a_float32_map_is_a_float64_map_to_rounding(seed):
     walk = recording(seed)

@@ -40,6 +40,7 @@ def test_topics_frames_and_poses_can_be_given(run, bag, tmp_path):
     assert np.nanmin(variance) > 0.9 * COVARIANCE[2, 2]
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_a_recording_is_not_written_over(run, tmp_path, kind):
     bag = write_drive(tmp_path, kind)
@@ -106,6 +107,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(("options", "words"), REFUSED.values(), ids=REFUSED)
 def test_wrong_options_are_refused_in_one_line(run, bag, tmp_path, options, words):
     code, _, err = run("map", bag, *options)
@@ -152,6 +154,7 @@ def test_the_growing_map_of_a_folder_is_recorded(run, recording, tmp_path):
     assert code == 0 and "recorded  4 maps in grown.bag" in out
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(("options", "words"), [
     (("--every", -1), "--every: must not be negative"),
     (("--grid-map", "x.png"), "path: must be a bag's, got x.png"),

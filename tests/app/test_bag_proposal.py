@@ -45,6 +45,7 @@ def test_the_proposed_command_gives_the_map(run, tmp_path, name):
         assert len(found) > 5 and abs(np.median(found) - z) < 0.01
 
 
+@pytest.mark.slow(1)
 def test_what_cannot_be_proposed_names_the_option(run, tmp_path):
     _, out, _ = run("bag", write(tmp_path / "drive", Shape(odometry="base_link", tf=False, mount=False)))
     assert "give --poses /odom, and --extrinsics with the pose of lidar on the base" in out
@@ -70,6 +71,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", REFUSED)
 def test_wrong_options_are_refused(run, tmp_path, name):
     options, words = REFUSED[name]

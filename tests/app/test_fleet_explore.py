@@ -106,6 +106,7 @@ def test_advances_along_a_path():
     assert np.allclose(advance(place, rest, 1.0)[0], place)
 
 
+@pytest.mark.slow(1)
 def test_a_world_repeats_by_its_seed_and_has_a_level_camp():
     xy = (torch.rand(500, 2, generator=torch.Generator().manual_seed(0)).double() - 0.5) * 20
     heights = [World(20.0, 3.0, seed).truth(xy) for seed in (0, 0, 1)]

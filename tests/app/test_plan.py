@@ -43,6 +43,7 @@ def test_a_path_around_a_wall(tmp_path, save):
     assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow(1)
 def test_a_path_on_which_the_body_does_not_fit_is_marked(tmp_path, figures):
     """A body of 1.2 m beside a gap of 0.7 m: its centre passes where its front, which turns, hits the wall."""
     emap = world(gap=2.0)

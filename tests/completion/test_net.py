@@ -53,6 +53,7 @@ def test_steps_lead_to_the_next_known_cell():
             assert int(steps[k, 0, i, j]) == (NONE if expected is None else expected)
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("known", [0.0, 0.02, 0.15, 0.7])
 @pytest.mark.parametrize(("resolution", "size"), [(0.02, (14, 11)), (0.08, (14, 11)), (0.1, (3, 40)), (0.1, (40, 3))])
 def test_every_cell_follows_the_slow_equations(known, resolution, size):
@@ -261,6 +262,7 @@ def test_maps_of_any_size(size, known):
     assert all(bool(layer.isfinite().all()) and layer.shape == (2, *size) for layer in run(random_net(), layers))
 
 
+@pytest.mark.slow(1)
 def test_gradients_with_respect_to_elevation_and_weights():
     net, layers = random_net(), random_layers(12, 1, H=5, W=4, known=0.4)
     net.requires_grad_(True)

@@ -120,6 +120,7 @@ SILENT_GATES = {
 }
 
 
+@pytest.mark.slow(4)
 @pytest.mark.parametrize("setting", SILENT_GATES)
 def test_a_gate_that_takes_everything_is_named(walked, setting):
     stages = SILENT_GATES[setting] | {"grid": dict(resolution=0.08, length_x=8.0, length_y=8.0)}
@@ -140,6 +141,7 @@ def test_no_time_between_updates(walked):
     assert emap.diagnose() == []
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("knows_base", [True, False])
 @pytest.mark.parametrize("height", [0.15, 0.25, 0.35])
 @pytest.mark.parametrize("slope", [0.0, 0.4])

@@ -66,6 +66,7 @@ def exact(directions, reach=50.0, **world):
     return scan
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize("directions", [CAMERA, LIDAR], ids=["camera", "lidar"])
@@ -121,6 +122,7 @@ SOUND = {
 }
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", SOUND)
 def test_surfaces_of_one_range_or_depth_are_none(name):
     scan, moving = SOUND[name]

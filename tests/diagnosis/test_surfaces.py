@@ -27,6 +27,7 @@ def climb(degrees, **exclusion):
     return emap
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("degrees", [30, 35])
 def test_a_hillside_that_is_cut_off_is_named_with_its_cure(degrees):
     (sentence,) = climb(degrees).diagnose()

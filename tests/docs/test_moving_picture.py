@@ -32,6 +32,7 @@ def test_the_body_keeps_its_height_and_moves_smoothly(path):
     assert speed.max() < 1.4 * walk.SPEED
 
 
+@pytest.mark.slow(1)
 def test_legs_have_links_of_one_length_and_two_feet_stand_at_all_times(path):
     for t in np.linspace(0.5, path.seconds - 0.5, 40):
         joints = leg_joints(path, t)

@@ -40,6 +40,7 @@ def test_backward_is_slower_and_turning_turns_left():
     assert float(turned.yaw[0]) > 3.5 and turned.xy.abs().max() < 1e-6
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("rise, passes", [(0.1, True), (0.15, True), (0.3, False), (0.7, False)])
 def test_low_steps_are_climbed_and_high_ones_block(rise, passes):
     last = drive(field_of(lambda x, y: rise * (x > 1.0)), (1.0, 0.0), 6.0)[-1]

@@ -29,6 +29,7 @@ def test_observations_have_the_same_shapes_are_fresh_and_finite(perception):
         assert torch.equal(value, kept[name]), f"{name} changed after it was returned"
 
 
+@pytest.mark.slow(1)
 def test_truth_is_the_ground_at_the_crops_pixels():
     task = TerrainNav(TerrainNavConfig(course=SMALL), 2, perception="truth", seed=5)
     image = task.observe()["truth"]
@@ -45,6 +46,7 @@ def test_truth_is_the_ground_at_the_crops_pixels():
     assert torch.equal(image[:, 0], image[:, 1]) and bool((image[:, 2] == 1).all())
 
 
+@pytest.mark.slow(1)
 def test_white_noise_is_uniform_and_new_at_each_look():
     task = TerrainNav(TerrainNavConfig(course=SMALL), 64, perception="truth")
     seen = task.observe()
@@ -56,6 +58,7 @@ def test_white_noise_is_uniform_and_new_at_each_look():
     assert not torch.equal(task.observe()["map"], seen["map"])
 
 
+@pytest.mark.slow(1)
 def test_blind_sees_nothing():
     task = TerrainNav(TerrainNavConfig(course=SMALL), 2, perception="blind")
     assert float(task.observe()["map"].abs().max()) == 0.0
@@ -91,6 +94,7 @@ def test_rays_start_where_cameras_are_and_points_go_where_odometry_says():
         torch.testing.assert_close(poses[:, k], sight.T_estimated @ camera.T_base_sensor)
 
 
+@pytest.mark.slow(1)
 def test_each_look_casts_from_the_true_pose(monkeypatch):
     task = TerrainNav(TerrainNavConfig(course=SMALL), 3)
     asked, look = [], task.sight.look
@@ -131,6 +135,7 @@ def test_a_fill_changes_the_elevation_of_unknown_pixels_alone(fill):
     assert bool(image[:, 0][~known].any()) == (fill != "base")
 
 
+@pytest.mark.slow(1)
 def test_completed_pixels_are_those_of_the_completed_map():
     task = TerrainNav(TerrainNavConfig(course=SMALL, sight=SightConfig(fill="completed")), 2)
     task.advance(torch.ones(2, 2))
@@ -141,6 +146,7 @@ def test_completed_pixels_are_those_of_the_completed_map():
     torch.testing.assert_close(image[:, 0][unknown], completed[unknown], atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow(1)
 def test_each_camera_sees_from_its_own_mounting():
     """Cast together, the cameras see what each would see alone."""
     cfg = TerrainNavConfig(course=SMALL, sight=SightConfig(sensor_errors="perfect", pose_errors="perfect"))

@@ -81,6 +81,7 @@ def test_time_runs_out():
     assert steps == 100 and bool(outcome.truncated) and not bool(outcome.terminated)
 
 
+@pytest.mark.slow(1)
 def test_reset_of_some_leaves_the_others_alone():
     task = TerrainNav(TerrainNavConfig(course=SMALL), 4, perception="map")
     for _ in range(3):

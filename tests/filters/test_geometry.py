@@ -65,6 +65,7 @@ def expected(name, values, known, b, i, j, radius, resolution=0.1):
     }[name]()
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", [*NAMES, "step_height, less_slope"])
 @settings(max_examples=8)
 @given(SEEDS, SIZES, SHARES, st.integers(1, 3))
@@ -115,6 +116,7 @@ def test_unknown_cells_do_not_count(name):
         assert torch.isfinite(gradient).all() and not gradient[~known].any() and gradient[known].any()
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("share", [0.6, 1.0])
 def test_gradients(name, share):

@@ -152,6 +152,7 @@ def rmse(points, T):
     return float(error[error.isfinite()].square().mean().sqrt())
 
 
+@pytest.mark.slow(1)
 def test_a_moving_lidar_over_stairs_maps_like_a_still_one():
     """By 2 degrees and 10 cm within a scan."""
     lidar = Lidar(azimuths=720)

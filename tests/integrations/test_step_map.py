@@ -175,6 +175,7 @@ def test_terms_with_equal_settings_share_a_map():
     assert share_map(other, source, CFG, 1) is not maps
 
 
+@pytest.mark.slow(1)
 def test_maps_go_with_their_environment():
     env = Env()
     maps = weakref.ref(share_map(env, GroundSource(torch.zeros(3, 3), torch.zeros(3)), CFG, 1))

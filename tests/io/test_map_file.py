@@ -64,6 +64,7 @@ def path(tmp_path):
     return tmp_path / "map.npz"
 
 
+@pytest.mark.slow(1)
 @given(st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64]), st.integers(1, 3))
 def test_a_loaded_map_goes_on_to_the_bit(tmp_path, dtype, num_envs):
     full = torch.promote_types(dtype, torch.float32)  # half precision is for reading
@@ -257,6 +258,7 @@ def test_a_save_that_fails_leaves_the_older_file(path, monkeypatch):
     assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == [path.name]
 
 
+@pytest.mark.slow(3)
 @pytest.mark.parametrize("save, load", [(save_map, load_map), (save_npz, load_npz)])
 def test_a_damaged_file_is_a_value_error_that_names_it(tmp_path, save, load):
     """Truncations and flipped bits all over the file; what cannot be noticed may load."""

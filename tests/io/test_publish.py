@@ -39,6 +39,7 @@ def test_publishes_the_layers_with_where_they_lie():
     assert publisher.take() is None, "nothing was finished since"
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("updates, rate, expected", [(10, 5, 2), (30, 20, 2), (10, 10, 1), (10, 3, 4), (2, 5, 1)])
 def test_never_more_often_than_asked(updates, rate, expected):
     """Offered at each of so many updates a second for 100 s: every so many offers start a copy."""

@@ -18,6 +18,7 @@ def _fresh_compiler():
     torch._dynamo.reset()
 
 
+@pytest.mark.slow(12)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_an_update_is_part_of_the_users_graph(dtype):
     """No graph break: by an operator where C++ runs, by tensors else."""

@@ -110,6 +110,7 @@ def test_a_user_without_a_home_is_told(monkeypatch, tmp_path):
         assert load("answer.cpp", {}) is None
 
 
+@pytest.mark.slow(1)
 @needs_compiler
 def test_what_is_thrown_on_a_thread_is_no_crash(tmp_path):
     (tmp_path / "throwing.cpp").write_text(
@@ -135,6 +136,7 @@ def test_it_can_be_switched_off(monkeypatch, tmp_path):
     assert load("answer.cpp", {}) is None and not (tmp_path / "cache").exists()
 
 
+@pytest.mark.slow(1)
 @needs_compiler
 @pytest.mark.parametrize("is_of_torch", [True, False])
 def test_threads_of_torch_and_its_own_do_all_the_work(is_of_torch, tmp_path):
@@ -154,6 +156,7 @@ def test_threads_of_torch_and_its_own_do_all_the_work(is_of_torch, tmp_path):
         assert list(times) == [1] * number
 
 
+@pytest.mark.slow(13)
 @needs_compiler
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names vectors of x86-64")
 @pytest.mark.parametrize("narrow", ["-mno-avx512f", "-mno-avx512f -mno-avx"])

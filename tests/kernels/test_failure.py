@@ -27,6 +27,7 @@ def failing(tmp_path_factory):
     return Kernel(name="failing", folder=str(folder), settings=lambda cfg: dict(unused=0))
 
 
+@pytest.mark.slow(3)
 @pytest.mark.parametrize("between", [(), ("add_disagreement",)], ids=["taken out", "put in again"])
 def test_variances_keep_the_disagreement(between, failing):
     """It is taken out while the map's own cells are compared."""

@@ -20,6 +20,7 @@ def bridge_map():
     return emap, state
 
 
+@pytest.mark.slow(4)
 @pytest.mark.parametrize("run", BACKENDS)
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.13, -0.09), (-100_000.03, 70_000.12)])
 def test_bridge_over_known_ground(run, place):

@@ -41,6 +41,7 @@ def walk(emap):
         yield inputs_of(emap, points, T_map_sensor, base, 0.3, variance, None, covariance)
 
 
+@pytest.mark.slow(26)
 @pytest.mark.parametrize("stages", CONFIGS.values(), ids=CONFIGS)
 @pytest.mark.parametrize("run", BACKENDS)
 def test_each_stage_along_a_walk(run, stages):
@@ -89,6 +90,7 @@ def test_stage_on_random_maps(run, name, seed, cells, sensors, num_points, threa
     assert_states_close(run(emap, state, inputs, name), expected, name, 1e-5, share)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("stages", CONFIGS.values(), ids=CONFIGS)
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_update(stages, num_threads):

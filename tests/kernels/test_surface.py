@@ -19,6 +19,7 @@ def rated_by(run, emap, state):
     return by_tensors(emap, exact, inputs, "rate_surface"), run(emap, state, inputs, "rate_surface")
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("run", BACKENDS)
 def test_forgotten_cells(run):
     """Cells that are no longer known lose normal and rating, in rows without any known cell too."""
@@ -33,6 +34,7 @@ def test_forgotten_cells(run):
     assert_states_close(actual, expected, "forgotten")
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("run", BACKENDS)
 @pytest.mark.parametrize("radius, head", [(1, None), (1, 0.05), (1, 0.1), (2, 0.1), (4, 0.05), (2, 0.25), (44, 0.05)])
 def test_windows_of_all_widths(run, radius, head):

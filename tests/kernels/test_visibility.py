@@ -32,6 +32,7 @@ def narrow_view(rng, cells, resolution, width):
     return torch.from_numpy(np.stack(points, -1)).float()[None]
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", [0.04, 0.25])
 @pytest.mark.parametrize("width", [0.0, 0.05, 0.5, 1.5])
 def test_a_narrow_view_changes_what_the_definition_changes(width, resolution):

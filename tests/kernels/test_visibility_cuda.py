@@ -11,6 +11,7 @@ from tests.kernels.emulation.launcher import needs_emulation
 pytestmark = needs_emulation
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("seed", range(3))
 def test_blocks_and_launches_agree(seed):
     rng = np.random.default_rng(seed)

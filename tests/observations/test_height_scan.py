@@ -119,6 +119,7 @@ def test_feet_on_a_tilted_plane():
 # Against slow loops ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.sampled_from(ALIGNMENTS), st.sampled_from(MODES), st.sampled_from([*FILLS, 0.35]), st.booleans())
 def test_scans_agree_with_loops(seed, alignment, mode, fill, at_feet):
     emap, rng = random_map(seed)
@@ -151,6 +152,7 @@ def test_the_random_maps_have_every_kind_of_cell():
     assert (reads["upper_bound"][0] == 0).any() and (reads["inpaint"][0] == 0).any(), "some have no answer"
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("fill", [*FILLS, 1.5])
 @pytest.mark.parametrize("known", [0.0, 0.5, 1.0])
 def test_values_are_never_nan(fill, known):
@@ -223,6 +225,7 @@ def turned(T, position, angle):
     return torch.cat([top, T[:, 3:]], 1)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("alignment", ALIGNMENTS)
 @pytest.mark.parametrize("fill", PLAIN_FILLS)
 def test_gradcheck_of_map_and_pose(alignment, fill):

@@ -70,6 +70,7 @@ def test_images_are_scans_of_a_grid(mode):
     assert torch.equal(channels[:, 0].flatten(1), valid.double())
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("layers", [CHANNELS, CHANNELS[::-1], ("validity",), ("upper_bound", "variance")], ids=str)
 @pytest.mark.parametrize("alignment", ALIGNMENTS)
 @pytest.mark.parametrize("mode", MODES)

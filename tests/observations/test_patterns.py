@@ -111,6 +111,7 @@ def test_a_pattern_first_read_in_inference_mode_can_be_trained_through():
     assert T.grad[0, 2, 3] == 1 and T.grad[0, 0, 3] == pytest.approx(-0.1)
 
 
+@pytest.mark.slow(1)
 def test_a_pattern_is_copied_to_a_device_once():
     scan, emap = HeightScan.isaac_lab(), ElevationMap(num_envs=1, device="meta")
     T = torch.empty(1, 4, 4, device="meta")
@@ -136,6 +137,7 @@ def test_windows_that_are_too_small_are_refused_before_anything_else():
         MapImage()(small_map(1, (20, 20)), T)
 
 
+@pytest.mark.slow(1)
 def test_no_point_leaves_a_window_that_is_large_enough():
     """At every heading, with the base half a cell off the centre."""
     emap = ground_map(flat, corner=(-10, -11), cells=(21, 21))

@@ -88,6 +88,7 @@ def rigid(top):
     return torch.cat([top, LAST_ROW.expand(*top.shape[:-2], 1, 4)], -2)
 
 
+@pytest.mark.slow(4)
 @pytest.mark.parametrize("head", HEADS)
 @pytest.mark.parametrize("sensors, base", [(1, True), (2, True), (1, False)])
 def test_finite_differences_of_every_layer_by_every_input(head, sensors, base):

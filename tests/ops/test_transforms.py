@@ -31,6 +31,7 @@ def ordinary_jacobian(run, inputs):
     return [torch.stack(columns) for columns in zip(*rows, strict=True)]
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("head", [None, LearnedTraversabilityConfig()])
 def test_func_gradients_equal_ordinary_ones(head):
     run, inputs = core(head)
@@ -97,6 +98,7 @@ def test_dual_levels_without_tangents_do_no_harm():
         torch.testing.assert_close(run(*inputs), run(*inputs))
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("seed", range(5))
 def test_gradient_of_the_polar_minimum(seed):
     """Against finite differences, and equal values share it."""

@@ -1,6 +1,7 @@
 """Planes of windows, and which neighbours agree."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +20,7 @@ def test_windows_are_in_metres():
     assert {resolution: window_radius(0.2, resolution) for resolution in expected} == expected
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.sampled_from([1, 2]))
 def test_local_planes_are_those_of_least_squares(seed, radius):
     rng = np.random.default_rng(seed)

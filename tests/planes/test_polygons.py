@@ -76,6 +76,7 @@ def test_free_polygon_beside_a_hole_by_hand():
     np.testing.assert_allclose([found.min(0), found.max(0)], [[0, 0], [2, 2]], atol=1e-12)
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.sampled_from([0.0, 0.05]))
 def test_free_polygon_is_convex_around_the_seed_and_free(seed, margin):
     """Inside a star with a hole: counter-clockwise, and no point of the border inside or within the margin."""

@@ -63,6 +63,7 @@ def require_consistent(planes, resolution):
         assert sum(map(polygon_area, region.inset + region.inset_holes)) <= region.area
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", [0.02, 0.04])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_every_tread_of_stairs_is_a_plane(resolution, seed):
@@ -233,6 +234,7 @@ def test_high_places_are_as_good(dtype):
         np.testing.assert_allclose(a.normal, b.normal, atol=3e-3)
 
 
+@pytest.mark.slow(1)
 def test_unknown_is_nan_or_inf_and_leaves_the_rest_alone():
     height = stairs(0.04)
     elevation = noisy(height)
@@ -376,6 +378,7 @@ def test_the_scenes_are_what_they_say():
     assert [SCENES[name](0.04).shape for name in SCENES] == [(250, 250)] * 3
 
 
+@pytest.mark.slow(1)
 def test_many_maps_equal_single_ones():
     """More maps than are segmented at a time, some without any plane, each with its own height and place."""
     rng = np.random.default_rng(0)

@@ -96,6 +96,7 @@ def test_far_from_the_origin_nothing_changes():
         assert torch.equal(a, b)
 
 
+@pytest.mark.slow(1)
 def test_float32_polygons_are_placed_in_float64():
     """In float32, a kilometre away, a cell of 0.1 m is known to a thousandth."""
     emap = small_map(1, CELLS, 0.1)
@@ -138,6 +139,7 @@ def loop_check(layer, corner, polygon, cfg):
     return bool(few and values and mean >= cfg.min_traversability), mean, unknown, unsafe
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_checks_agree_with_loops(seed):
     rng = np.random.default_rng(seed)
@@ -175,6 +177,7 @@ def test_the_random_polygons_have_every_outcome():
     assert sum(result[2] <= 0.4 and result[3] <= 0.35 and not result[0] for result, _ in full) > 0, "some by their mean"
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_unsafe_areas_hold_the_unsafe_cells(seed):
     emap = random_map(seed)
@@ -194,6 +197,7 @@ def test_unsafe_areas_hold_the_unsafe_cells(seed):
                 assert (hull >= low).all() and (hull <= high).all()
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.sampled_from([torch.float32, torch.float64]))
 def test_batches_equal_single_maps_and_polygons(seed, dtype):
     emap = random_map(seed)

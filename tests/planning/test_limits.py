@@ -59,6 +59,7 @@ def stairs(rise, run=0.3):
 # Steps ----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(3)
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 @pytest.mark.parametrize("height", [
     lambda x, y: torch.where(x > 0, -0.71, 0.0),
@@ -79,12 +80,14 @@ def test_no_plan_crosses_a_known_step(resolution, height):
     assert len(unsafe_area(emap, torch.tensor([[[[-0.3, -0.2], [0.3, -0.2], [0.3, 0.2]]]]), ANY_GROUND)[0][0])
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 def test_a_step_below_the_limit_is_crossed(resolution):
     emap = world(lambda x, y: torch.where(x > 0, 0.3, 0.0), resolution)
     assert walk(emap, ANY_RATING).reached and straight(emap, ANY_GROUND).safe
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 @pytest.mark.parametrize("gap", [1, -1])
 def test_unknown_cells_are_no_bridge(resolution, gap):
@@ -123,6 +126,7 @@ def ramp(degrees, top=0.5):
     return lambda x, y: math.tan(math.radians(degrees)) * x.clamp(-top, top)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 @pytest.mark.parametrize("degrees, passes", [(15, True), (26, True), (35, False), (45, False)])
 def test_slopes(resolution, degrees, passes):
@@ -135,12 +139,14 @@ def test_slopes(resolution, degrees, passes):
         assert "a slope of" in check.explain()[0] and "exceeds its 29" in check.explain()[0]
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 def test_the_ground_beside_a_wall_is_not_steep(resolution):
     emap = world(lambda x, y: torch.where(y > 0.45, 0.8, 0.0), resolution, CLIMBER)
     assert walk(emap).reached and straight(emap).safe
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", [0.02, 0.05, 0.1])
 def test_clearance(resolution):
     """A ridge of two low steps is as high as the belly."""
@@ -157,6 +163,7 @@ def test_clearance(resolution):
 # Stairs and flat ground -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 @pytest.mark.parametrize("rise, passes", [(0.08, True), (0.12, True), (0.17, False), (0.2, False)])
 def test_stairs_of_a_climber(resolution, rise, passes):

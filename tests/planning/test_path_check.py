@@ -129,6 +129,7 @@ def test_a_path_that_is_not_safe_says_where():
 # Properties -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(2)
 @given(SEEDS, st.integers(3, 9))
 def test_each_place_is_a_footprint(seed, samples):
     rng = np.random.default_rng(seed)
@@ -200,6 +201,7 @@ def test_batches_equal_single_paths():
 # Devices, and what is refused -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(1)
 def test_checks_do_not_read_values():
     """Tensors on "meta" have no values, so that reading one raises."""
     emap = ElevationMap(num_envs=2, device="meta")

@@ -261,6 +261,7 @@ def test_the_upper_bound_tells_a_safe_occlusion_from_a_drop(make, goes):
         assert decide(emap, x, case.goal)["upper bound"].reached.item() == goes == case.safe
 
 
+@pytest.mark.slow(1)
 def test_a_cautious_planner_stops_before_what_it_does_not_see():
     case = hump([0.6, 0.4])
     emap, x = views(case, torch.Generator().manual_seed(1))[2.0]

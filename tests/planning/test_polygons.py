@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -95,6 +96,7 @@ def test_small_and_narrow_polygons_have_cells():
     assert marks([(y, x) for x, y in between]) == {(j, 0) for j in range(6)}
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_marks_agree_with_loops(seed):
     rng = np.random.default_rng(seed)
@@ -108,6 +110,7 @@ def test_marks_agree_with_loops(seed):
             assert found and found <= loop_touched(polygon, 1000)
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_narrow_polygons_have_no_gaps(seed):
     """Cells that an edge is in for long are never left out: those that a sample a cell's 0.71 apart must meet."""
@@ -121,6 +124,7 @@ def test_narrow_polygons_have_no_gaps(seed):
     assert found <= {tuple(c) for c in cells.tolist()} | loop_touched(np.array([start, start + 10 * along]), 10_000)
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.booleans())
 def test_order_orientation_padding_and_place_do_not_matter(seed, narrow):
     rng = np.random.default_rng(seed)

@@ -136,6 +136,7 @@ def test_a_submap_by_hand():
     assert torch.equal(odd.layers["elevation"], emap.layer("elevation")[:, 5:8, 6:7])
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.integers(1, 15), st.integers(1, 13), st.sampled_from([torch.float32, torch.float64]))
 def test_submaps_hold_the_maps_cells(seed, h, w, dtype):
     emap, rng = random_map(seed), np.random.default_rng(seed)

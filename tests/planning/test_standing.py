@@ -110,6 +110,7 @@ def test_unrated_cells_are_unknown(rating):
 # Against loops --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_the_cells_are_those_of_loops(seed):
     """Polygons of five corners, some across the window's border; of those without a cell's centre see below."""

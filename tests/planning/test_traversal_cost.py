@@ -168,6 +168,7 @@ def slow_inclination(state, b, i, j, reach, resolution):
     return max(angles) if spans else None
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_the_cost_is_that_of_loops(seed):
     """Unknown cells hold NaN: none of it may be read."""

@@ -40,6 +40,7 @@ def entry(h, v=1e-4, t=10.0, relief=0.0, contributed=None):
     return dict(h=h, v=v, t=t, relief=relief, contributed=contributed)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("seed", range(8))
 def test_every_cell_is_that_of_the_reference(seed):
     rng = np.random.default_rng(seed)

@@ -65,6 +65,7 @@ def site(request, tmp_path):
         yield made
 
 
+@pytest.mark.slow(1)
 def test_keeping_keyframes_changes_nothing(site):
     plain = SiteMap(0.1)
     drive(site), drive(plain)
@@ -73,6 +74,7 @@ def test_keeping_keyframes_changes_nothing(site):
     assert len(known_cells(site, "other_elevation")) > 20 and len(known_cells(site, "upper_bound")) > 1000
 
 
+@pytest.mark.slow(1)
 def test_corrections_along_z_and_by_whole_cells_are_those_of_mapping_from_the_start(site):
     rng = np.random.default_rng(0)
     shifts = rng.integers(-9, 9, (NUM_MERGES, 3, 2))
@@ -86,6 +88,7 @@ def test_corrections_along_z_and_by_whole_cells_are_those_of_mapping_from_the_st
     torch.testing.assert_close(site.keyframes.T_map_base, moved)
 
 
+@pytest.mark.slow(1)
 def test_moving_there_and_back_changes_no_bit(site):
     drive(site)
     before, poses = every_bit(site), site.keyframes.T_map_base
@@ -170,6 +173,7 @@ def test_any_correction_is_right_within_half_a_cell(site, turn):
     assert far < 0.1 * np.hypot(20, 18) + 0.1
 
 
+@pytest.mark.slow(1)
 def test_mapping_goes_on_after_a_correction(site):
     rng = np.random.default_rng(1)
     shifts = rng.integers(-5, 5, (NUM_MERGES, 3, 2))
@@ -182,6 +186,7 @@ def test_mapping_goes_on_after_a_correction(site):
     assert_same(site, truth)
 
 
+@pytest.mark.slow(1)
 def test_opening_again_continues(tmp_path):
     rises = torch.tensor([[0.1, 0.0, -0.1]]).expand(NUM_MERGES, 3)
     with SiteMap(0.1, tmp_path, keyframes=True) as site:
@@ -199,6 +204,7 @@ def test_opening_again_continues(tmp_path):
         assert_same(site, truth)
 
 
+@pytest.mark.slow(1)
 def test_a_move_that_fails_changes_nothing(site, monkeypatch):
     drive(site)
     before, poses = every_bit(site), site.keyframes.T_map_base

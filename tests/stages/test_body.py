@@ -41,6 +41,7 @@ def own_points(body, cloud, T_map_sensor, T_map_base, T_base_links, dtype=torch.
     return own
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.integers(1, 2), st.integers(1, 3))
 def test_agrees_with_the_reference(seed, num_envs, sensors):
     rng = np.random.default_rng(seed)
@@ -138,6 +139,7 @@ def test_moving_robot_and_points_together_changes_nothing(seed):
     assert (own != again).double().mean() < 0.01  # of which rounding decides
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_larger_padding_and_tolerance_never_give_a_point_back(seed):
     rng = np.random.default_rng(seed)
@@ -149,6 +151,7 @@ def test_larger_padding_and_tolerance_never_give_a_point_back(seed):
         assert (own_points(larger, *case) | ~own).all()
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_a_batch_equals_single_maps_bit_for_bit(seed):
     rng = np.random.default_rng(seed)

@@ -44,6 +44,7 @@ def claimed(emap):
     return float(emap.layer("variance")[emap.validity[None].squeeze(0)].sqrt().median())
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("bias", [0.02, 0.05, 0.1])
 @pytest.mark.parametrize("slope", [0.0, 0.3])
 def test_two_sensors_of_one_call(bias, slope):

@@ -18,6 +18,7 @@ def random_feet(seed, num_envs=2, number=4):
     return np.dstack([rng.uniform(-0.5, 0.5, (num_envs, number, 2)), rng.uniform(-0.2, 0.2, (num_envs, number, 1))])
 
 
+@pytest.mark.slow(1)
 @given(st.integers(0, 10_000), st.integers(1, 6))
 def test_nearest_agrees_with_the_reference(seed, number):
     emap = small_map(2)

@@ -17,6 +17,7 @@ from torchelev.plane_fit import fit_plane, known_ground
 SEEDS = st.integers(0, 10_000)
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.integers(1, 3), st.floats(0.1, 1.0), st.sampled_from([torch.float32, torch.float64]))
 def test_fit_plane_agrees_with_the_reference(seed, radius, known, dtype):
     grid = small_map(1, (7, 6)).cfg.grid

@@ -97,6 +97,7 @@ def test_on_flat_ground_all_is_nothing():
     assert slope_step_belly == pytest.approx(0, abs=1e-12) and verdict == pytest.approx(1)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("resolution", [0.02, 0.04, 0.08, 0.1])
 @pytest.mark.parametrize("heading", [0.0, 0.3, math.pi / 4, 2.0])
 @pytest.mark.parametrize(("tilt", "stands"), [(0.4, True), (0.62, False)])

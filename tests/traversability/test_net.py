@@ -50,6 +50,7 @@ def logits(net, maps, resolution=CELLS, robot=ROBOT):
     return torch.stack(net.logits(*maps, resolution=resolution, robot=robot)).detach()
 
 
+@pytest.mark.slow(5)
 @given(SEEDS)
 @pytest.mark.parametrize("turns", range(4))
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -66,6 +67,7 @@ def test_turns_and_mirrors_with_the_map(turns, mirrored, robot, seed):
     assume((got.amax((1, 2, 3)) - got.amin((1, 2, 3)) > 1e-3).all())  # few random nets answer the same everywhere
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_altitude_changes_nothing(seed):
     net = random_net(seed)
@@ -94,6 +96,7 @@ def test_the_rim_of_a_map_is_unknown_ground():
     torch.testing.assert_close(got, logits(net, maps), atol=1e-9, rtol=0)
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_batch_is_single(seed):
     net, maps = random_net(seed), random_maps(seed, (3, 9, 8))
@@ -102,6 +105,7 @@ def test_batch_is_single(seed):
         torch.testing.assert_close(both[:, b : b + 1], logits(net, [m[b : b + 1] for m in maps]), atol=1e-9, rtol=0)
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_what_unknown_cells_hold_changes_nothing(seed):
     net, maps, other = random_net(seed), random_maps(seed), random_maps(seed + 1)
@@ -127,6 +131,7 @@ def test_resolutions_agree_on_smooth_ground(seed):
     assert (stacked.amax(0) - stacked.amin(0)).max() < 0.1
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, SHAPES, SHARES)
 @example(0, (1, 1, 1), 1.0)
 @example(0, (1, 1, 7), 1.0)
@@ -201,6 +206,7 @@ def test_nothing_known_gets_the_answer_of_far_unknown_ground():
     assert not torch.allclose(far[:, :, :8], nothing[:, :, :8], atol=1e-3)
 
 
+@pytest.mark.slow(1)
 def test_never_waits():
     with FakeTensorMode():
         net, layer, mask = TraversabilityNet(), torch.zeros(2, 9, 8), torch.ones(2, 9, 8, dtype=torch.bool)

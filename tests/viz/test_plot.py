@@ -29,6 +29,7 @@ def pixel(figure, ax, x, y):
     return picture[picture.shape[0] - 1 - int(row), int(column)]
 
 
+@pytest.mark.slow(1)
 def test_corner_is_drawn_where_the_axes_say(values):
     figure = draw_layers(
         [Panel(title="elevation", values=values, unit="m", cmap="Reds", vmin=0, vmax=1)], extent=EXTENT
@@ -51,6 +52,7 @@ def test_axes_and_bars_carry_units(values):
     assert labels.count("[m^2]") == 6
 
 
+@pytest.mark.slow(1)
 def test_every_panel_count_fits(values, tmp_path):
     for count in range(1, 9):
         figure = draw_layers([Panel(title=str(k), values=values) for k in range(count)], extent=EXTENT)
@@ -66,6 +68,7 @@ def test_a_noisy_picture_stays_small(tmp_path):
     assert Image.open(tmp_path / "noise.png").size[0] > 500
 
 
+@pytest.mark.slow(1)
 def test_draws_maps_without_a_known_cell_and_of_one_height(tmp_path):
     panels = [Panel(title="a", values=np.full((3, 3), np.nan)), Panel(title="b", values=np.ones((3, 3)))]
     save_layers(tmp_path / "empty.png", panels, extent=EXTENT)

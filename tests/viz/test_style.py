@@ -25,6 +25,7 @@ def draw(values):
     return figure
 
 
+@pytest.mark.slow(1)
 def test_a_figure_is_saved_as_png_and_svg_and_always_the_same(tmp_path):
     for name in ("a.png", "b.png"):
         style.save(draw(np.ones((2, 1))), tmp_path / name)
@@ -34,6 +35,7 @@ def test_a_figure_is_saved_as_png_and_svg_and_always_the_same(tmp_path):
         assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
 
 
+@pytest.mark.slow(1)
 def test_a_noisy_svg_stays_small_and_keeps_its_colours(tmp_path):
     figure = style.make_figure(4, 3)
     noise = np.random.default_rng(0).uniform(0, 1, (300, 240))
@@ -47,6 +49,7 @@ def test_a_noisy_svg_stays_small_and_keeps_its_colours(tmp_path):
     assert (np.asarray(small.convert("RGBA")) == np.asarray(large)).all()
 
 
+@pytest.mark.slow(1)
 def test_other_endings_choose_their_format(tmp_path):
     for name, start in (("a", b"\x89PNG"), ("a.jpg", b"\xff\xd8"), ("a.pdf", b"%PDF")):
         style.write(draw(np.ones((2, 1))), tmp_path / name)

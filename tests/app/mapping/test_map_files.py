@@ -11,6 +11,7 @@ from torchelev import output_files
 from torchelev.io.export import load_npz
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("suffix", [".npz", ".png", ".ply"])
 @pytest.mark.parametrize("blocked", ["folder", "device"])
 def test_outputs_are_checked_before_mapping(run, recording, tmp_path, at_scan, suffix, blocked):
@@ -62,6 +63,7 @@ def test_out_may_have_the_suffix_of_an_output(run, recording, tmp_path):
     assert sorted(path.name for path in tmp_path.glob("course*")) == ["course.npz", "course.ply", "course.png"]
 
 
+@pytest.mark.slow(2)
 def test_layers_of_filters_are_drawn(run, recording, tmp_path, figures):
     (tmp_path / "cfg.yaml").write_text("filters: [{layer: smooth, filter: gaussian, sigma: 0.2}]\n")
     assert run("map", recording, "--config", "cfg.yaml")[0] == 0

@@ -1,11 +1,13 @@
 """The models that are timed: each reads its map, and the table names all of them."""
 
+import pytest
 import torch
 from tensordict import TensorDict
 
 from benchmarks.speed import encoders
 
 
+@pytest.mark.slow(1)
 def test_every_model_reads_its_map_and_has_a_line():
     rows = encoders.measure(seconds=1e-3, num_envs=3)
     lines = encoders.table(rows).split("\n")

@@ -28,6 +28,7 @@ def test_figures_by_hand():
     assert figures == pytest.approx({"p50": 50, "p99": 99, "max": 100, "late": 0.1, "updates": 100})
 
 
+@pytest.mark.slow(1)
 def test_the_loop_is_timed_idle_and_beside_a_process():
     rows = loop.measure(3, threads=1, compiled=False, points=500)
     assert set(rows) == {"idle", "busy"} and all(row["updates"] == 3 and row["p50"] > 0 for row in rows.values())

@@ -18,6 +18,7 @@ def test_filters_give_what_opencv_and_scipy_give(name):
     )
 
 
+@pytest.mark.slow(1)
 def test_postprocessing_is_measured_and_tabulated():
     sizes = (1, 20), (2, 16)
     rows = postprocessing.measure(0.0, sizes)

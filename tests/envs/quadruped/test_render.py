@@ -33,6 +33,7 @@ def test_a_picture_shows_robot_and_map(task):
     assert (render.draw(task, 1) != without).any()
 
 
+@pytest.mark.slow(1)
 def test_strip_and_video_are_written(task, tmp_path):
     pictures = [np.full((20, 30, 3), k, np.uint8) for k in range(0, 100, 10)]
     render.save_strip(pictures, tmp_path / "strip.png")

@@ -136,6 +136,7 @@ def test_steps_run_in_inference_mode_and_after_it():
     task.reset()
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("perception", ["map", "truth"])
 def test_the_state_dict_continues_an_episode(perception):
     a, b = (Quadruped(CFG, 2, perception=perception, seed=0) for _ in range(2))

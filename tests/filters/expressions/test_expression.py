@@ -65,6 +65,7 @@ def single(formula, **numbers):
     return float(value) if known else None
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("formula", FORMULAS)
 @settings(max_examples=5)
 @given(SEEDS, st.sampled_from([torch.float32, torch.float64]))
@@ -139,6 +140,7 @@ def test_what_unknown_cells_hold_reaches_nothing():
             assert torch.isfinite(gradient).all() and not gradient[~layers[name][1]].any() and gradient.any()
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("formula", sorted(set(FORMULAS) - {"1 / (a - a)"}))
 def test_gradients(formula):
     rng = np.random.default_rng(0)

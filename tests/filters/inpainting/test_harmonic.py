@@ -26,6 +26,7 @@ LARGE = {
 }
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("case", LARGE)
 @pytest.mark.parametrize("dtype, altitude", [(torch.float64, 0.0), (torch.float32, 300.0)])
 def test_diffusion_is_right_to_its_tolerance(case, dtype, altitude):

@@ -187,6 +187,7 @@ def test_opencv_fills_each_map_of_a_batch_as_alone(function, threads):
     assert_batch_is_single(lambda layer: function(layer, resolution=0.1), (layer[0].nan_to_num(), layer[1]))
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("function", OPENCV)
 @pytest.mark.parametrize("shape", [(1, 1, 40), (1, 40, 1)])
 def test_a_single_line_of_cells_gives_the_same_each_time(function, shape):

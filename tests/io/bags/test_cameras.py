@@ -41,6 +41,7 @@ def assert_right(emap, expected):
     assert len(error) > 300 and float((error < 2e-3).float().mean()) > 0.98
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", ["option/Depth_Units/value", "option/Depth Units/value"])
 def test_the_unit_that_librealsense_recorded_is_used(tmp_path, name, expected):
     options = [("/device_0/sensor_1/" + name, "0.01"), ("/device_0/sensor_0/" + name, "0.0001")]

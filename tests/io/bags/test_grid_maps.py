@@ -22,6 +22,7 @@ def assert_equal(read, emap, env=0):
     np.testing.assert_array_equal(read.center[:2], emap.center[env, :2].numpy())
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", PATHS)
 def test_what_is_written_is_read_back_to_the_bit(tmp_path, name):
     emap = mapped(num_envs=2)
@@ -66,6 +67,7 @@ def stored(path, grid_map, topic="/map", orientation=(0.0, 0.0, 0.0, 1.0)):
         bag.write(topic, "grid_map_msgs/msg/GridMap", 0.0, message)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", ["map.bag", "map.mcap"])
 @pytest.mark.parametrize("start", [(0, 0), (3, 5)])
 @pytest.mark.parametrize("row_major", [False, True])
@@ -119,6 +121,7 @@ def test_a_bag_without_a_grid_map_is_refused(tmp_path):
         read_grid_map(tmp_path / "other.mcap")
 
 
+@pytest.mark.slow(1)
 def test_a_cut_bag_is_refused_or_its_end_is_said(tmp_path):
     emap, path = mapped(), tmp_path / "maps.mcap"
     with GridMapWriter(path, ("elevation",)) as writer:

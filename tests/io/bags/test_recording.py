@@ -172,6 +172,7 @@ MISSING = {
 }
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(("transforms", "request_", "words"), MISSING.values(), ids=MISSING)
 def test_what_is_missing_is_named(tmp_path, transforms, request_, words):
     path = bag_of(tmp_path / "drive", *transforms)

@@ -31,6 +31,7 @@ def test_a_frame_with_two_parents_is_named(tmp_path):
     assert words in " ".join(recording.warnings)
 
 
+@pytest.mark.slow(1)
 def test_requested_poses_take_the_place_of_transforms(tmp_path):
     """Odometry says odom -> base_link, and /tf another parent."""
     plain = map_bag(write_drive(tmp_path, depth=False), BagRequest(poses="/odom"))[1]

@@ -30,6 +30,7 @@ def test_kittis_layout_is_taken(tmp_path, seed):
     np.testing.assert_array_equal(read_cloud(tmp_path / "0.bin"), points[:, :3].astype(np.float32))
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("layout", ["float32x5", "float32x3", "float32x6", "float64x3", "float64x4", "float64x5"])
 def test_other_layouts_are_refused_by_name_and_read_with_the_option(tmp_path, seed, layout):
@@ -78,6 +79,7 @@ def write_tum(path, quaternions, times=None, header=""):
     np.savetxt(path, rows, header=header, comments="# " if header else "")
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("turn", [0.0, 0.3, 2.0, 6.0])
 @pytest.mark.parametrize("tilt", [0.0, 0.05, 0.25])

@@ -71,11 +71,13 @@ def test_the_base_is_what_is_fixed_to_the_lidar(bag):
     np.testing.assert_allclose(mounted, T_BASE_LIDAR.numpy(), atol=1e-6)
 
 
+@pytest.mark.slow(1)
 def test_bag_proposes_odometry_where_there_are_clouds_and_no_poses(bag):
     text = CliRunner().invoke(main, ["bag", str(bag)]).output
     assert f"--points {CLOUDS} --odometry kiss-icp --imu {IMU}" in text
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

@@ -113,6 +113,7 @@ def test_a_block_that_no_gpu_has_is_refused(samples):
         samples("places", 1, 32, 2**18, zeros(32))
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("call", ["atomicAdd(x, 1LL)", "atomicMin((float*)x, 1.0f)"])
 def test_what_cuda_lacks_does_not_compile(tmp_path, call):
     path = tmp_path / "wrong.cu"
@@ -121,6 +122,7 @@ def test_what_cuda_lacks_does_not_compile(tmp_path, call):
         emulated(path)
 
 
+@pytest.mark.slow(1)
 def test_undefined_behaviour_is_an_error_with_its_line(tmp_path):
     path = tmp_path / "sums.cu"
     path.write_text('extern "C" __global__ void sum(int* x) {\nx[0] += x[1]; }')

@@ -26,6 +26,7 @@ TILES = torch.zeros(1, dtype=torch.int64)
 REST = pose((0.0, 0.0, 0.0))
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_agrees_with_the_reference(seed):
     rng = np.random.default_rng(seed)
@@ -40,6 +41,7 @@ def test_agrees_with_the_reference(seed):
         assert distance == pytest.approx(reference.first_hit(origin, ray, *robot, reach=3.0), abs=1e-4)
 
 
+@pytest.mark.slow(1)
 @given(SEEDS)
 def test_hits_are_the_robots_own_points_and_nothing_before_them_is(seed):
     rng = np.random.default_rng(seed)
@@ -135,6 +137,7 @@ ROBOT = RobotBody(
 LINKS = torch.cat([pose((0.45, 0.05, 0.0), pitch=0.2), REST])[None]
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("pattern", [DepthCamera(width=32, height=24), Lidar(rings=8, azimuths=64)])
 @given(seed=SEEDS)
 def test_the_nearer_of_body_and_ground_is_seen(pattern, seed):
@@ -188,6 +191,7 @@ def test_refuses():
         sensor(FLAT, TILES, REST, T_base_links=LINKS)
 
 
+@pytest.mark.slow(1)
 def test_host_reads_nothing_back():
     sensor = MountedSensor(DepthCamera(width=8, height=6), mount())
     field, T = FLAT.to("meta"), torch.empty(3, 4, 4, device="meta")

@@ -87,6 +87,7 @@ def slab(T, half, origin, d):
     return best
 
 
+@pytest.mark.slow(1)
 @given(st.integers(0, 10_000))
 def test_boxes_by_definition(seed):
     rng, B, K, M = np.random.default_rng(seed), 2, 4, 25
@@ -124,12 +125,14 @@ def on(device, B=2, M=5, K=3):
     return field, torch.zeros(B, dtype=torch.int64).to(device), torch.rand(B, 3).to(device), directions, 8.0, boxes
 
 
+@pytest.mark.slow(1)
 def test_host_reads_nothing_back():
     inputs = on("meta")
     with OneDevice(), NoConstants():
         assert cast(*inputs).shape == (2, 5)
 
 
+@pytest.mark.slow(1)
 def test_path_of_a_gpu_has_static_shapes(monkeypatch):
     never_wait(monkeypatch)
     field, *inputs, reach, boxes = on("cpu")

@@ -137,6 +137,7 @@ def test_feeds_a_map():
     torch.testing.assert_close(known, torch.full_like(known, 0.125), atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow(1)
 def test_host_reads_nothing_back():
     field, T = FLAT.to("meta"), torch.empty(3, 4, 4, device="meta")
     sensors = [MountedSensor(pattern, mount()) for pattern in PATTERNS]

@@ -182,6 +182,7 @@ def test_march_finds_what_it_must():
     np.testing.assert_allclose(march(field, np.zeros(3, int), origins, d, 1.5), [0.62, 0.2, np.inf], atol=1e-9)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("terrain", TERRAINS)
 @pytest.mark.parametrize("path", ["selects rays", "keeps all rays"], indirect=True)
 def test_no_ray_is_left_over(terrain, path, searches):
@@ -200,6 +201,7 @@ def test_no_ray_is_left_over(terrain, path, searches):
     assert most == tracing.MAX_CELLS
 
 
+@pytest.mark.slow(1)
 @given(st.integers(0, 10_000))
 def test_hits_lie_on_the_surface(seed):
     field, tiles, origin, d = scene(seed)
@@ -226,6 +228,7 @@ def test_paths_agree(seed, threads):
     same(cast(field, tiles, origin, d, 4.0), picked)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, 0.0])
 def test_directions_that_are_none_end_all_the_same(bad, path):
     field, tiles, origin, d = scene(4, B=3)

@@ -11,6 +11,7 @@ from torchelev.sim import CourseConfig, make_course
 SMALL = CourseConfig(num_tiles=4, num_routes=16)
 
 
+@pytest.mark.slow(1)
 def test_courses_come_from_their_seed():
     one, same, other = (make_course(dataclasses.replace(SMALL, seed=seed)) for seed in (3, 3, 4))
     assert torch.equal(one.field.heights, same.field.heights) and torch.equal(one.starts, same.starts)

@@ -59,6 +59,7 @@ def test_the_field_is_the_truth_at_its_samples(kind, resolution):
     torch.testing.assert_close(t.field.height(ids, xy.expand(3, -1, 2)), truth, atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("hard", [0, 1])
 def test_heights_lie_within_what_the_table_says_and_use_it(kind, hard):

@@ -58,6 +58,7 @@ def reference_fuse(state, points, variances, used, origins, b, cfg):
 PLAIN = FusionConfig(edges=None)
 
 
+@pytest.mark.slow(1)
 @given(
     SEEDS,
     st.sampled_from([30, 200, 500]),
@@ -72,6 +73,7 @@ def test_agrees_with_the_reference(seed, num_points, sensors, cfg):
 EDGES = [EdgeConfig(), EdgeConfig(min_extreme=1, refinements=2), EdgeConfig(min_extreme=4, refinements=3, margin=1e-6)]
 
 
+@pytest.mark.slow(1)
 @given(
     SEEDS,
     st.sampled_from([200, 500]),
@@ -168,6 +170,7 @@ def one_cell(**fusion):
     )
 
 
+@pytest.mark.slow(1)
 @given(SEEDS, st.integers(1, 8), st.integers(1, 4))
 def test_equals_the_papers_equations_point_after_point(seed, num_points, scans):
     """Equations (1) and (2): in information form there is no order, and many points of a scan are one sum."""
@@ -245,6 +248,7 @@ def settled(**fusion):
     return emap
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("points, scans", [(1, 5), (2, 3), (20, 3)])
 def test_points_that_agree_win_in_a_few_scans(points, scans):
     """However settled the cell is, but never by a single bad scan."""
@@ -255,6 +259,7 @@ def test_points_that_agree_win_in_a_few_scans(points, scans):
     assert float(emap.elevation) == pytest.approx(0.3)
 
 
+@pytest.mark.slow(1)
 def test_points_that_scatter_lose():
     """Even where nothing else is hit, for as many as the cell's support."""
     emap = settled()
@@ -278,6 +283,7 @@ def settled_cells(heights):
     return emap
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("columns, wins", [(2, True), (1, False)])
 def test_a_face_that_shows_at_all_heights_wins_where_cells_beside_it_rise_too(columns, wins):
     emap = settled_cells(np.zeros((3, 3)))
@@ -289,6 +295,7 @@ def test_a_face_that_shows_at_all_heights_wins_where_cells_beside_it_rise_too(co
     assert float(emap.elevation[0, :, columns:].max()) < 0.01
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("step, flips", [(0.3, False), (0.0, True)])
 def test_the_edge_of_a_known_step_stays_where_it_was(step, flips):
     """A few scans from another view hit its top in the cell before it; without the step they are a new obstacle."""
@@ -298,6 +305,7 @@ def test_the_edge_of_a_known_step_stays_where_it_was(step, flips):
     assert bool(emap.elevation[0, 1, 1] > 0.2) == flips
 
 
+@pytest.mark.slow(1)
 def test_ground_that_is_still_hit_takes_a_challengers_points_off():
     emap = settled()
     for _ in range(20):

@@ -39,6 +39,7 @@ def map_of(resolution: float, length: float = 8.0) -> ElevationMap:
     return ElevationMap(ElevationMapConfig(grid=grid, overlap=None))
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize("resolution", [0.04, 0.1])
 @pytest.mark.parametrize("angle", [0, 20, 45, 60])

@@ -63,6 +63,7 @@ def marched(state, hits, T):
 # Against marching -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(4)
 @pytest.mark.parametrize("place", PLACES)
 def test_bounds_agree_with_marching(place):
     """Of a blank map and rays to overhangs, so that every ray is believed.
@@ -118,6 +119,7 @@ def ghosts(emap, cells=CELLS, seed=0):
     )
 
 
+@pytest.mark.slow(2)
 @pytest.mark.parametrize("place", PLACES)
 def test_cleared_cells_agree_with_marching(place):
     """Ghosts that rays pass below. Rays that end on the floor of a ghost's cell are left out: they are not believed.
@@ -297,6 +299,7 @@ def test_where_nothing_is_known_only_rays_to_overhangs_are_believed(used, casts,
     assert clear_seen_through(emap.state, changed, emap.cfg.grid, EVERY).bounded.any() == bounds
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("side", range(4))
 @pytest.mark.parametrize(
     "unknown, ghost, end, clears",
@@ -381,6 +384,7 @@ def test_where_rays_end_agrees_with_the_reference(place):
     assert (changed & expected).sum() > 5 and not (changed & overhang).any()
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("place", PLACES)
 def test_believed_rays_agree_with_the_reference(place):
     """Rough ground with gaps, part of it hit of late, and rays to points above and below it, within and without.

@@ -45,6 +45,7 @@ def test_two_iterations_leave_result_policies_and_logs(small):
     assert list(out.glob("events.*")) and "speed by command" in printed
 
 
+@pytest.mark.slow(3)
 def test_a_policy_is_loaded_onto_the_scans_that_it_was_trained_with(small):
     out, _ = small
     loaded = policy.load_policy(out / "policy.pt", CFG)
@@ -91,6 +92,7 @@ def _play(path, *options):
     return invoke("--play", str(path), "--out", str(path.parent), *options)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("trained, walks", [("map", "map"), ("truth", "map"), ("blind", "blind")])
 def test_a_film_shows_a_policy_with_what_it_sees(trained, walks, tmp_path):
     loaded, films = policy.load_policy(_save(tmp_path / "policy.pt", trained), CFG), []

@@ -25,6 +25,7 @@ def test_agreement_by_hand():
     assert "| a | 2 | 2 | 1 | 1 | 0 | 1 | 66.7 % | 66.7 % |" in table(result)
 
 
+@pytest.mark.slow(1)
 def test_a_tile_gives_stances_of_both_labels():
     pytest.importorskip("mujoco")
     from training.traversability.physics import rows_of_tile

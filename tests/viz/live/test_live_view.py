@@ -67,6 +67,7 @@ def drawing(monkeypatch):
     return lambda work: monkeypatch.setattr(Page, "draw", lambda *args: work())
 
 
+@pytest.mark.slow(2)
 def test_pictures_beyond_the_share_are_dropped(emap, port, drawing, monkeypatch):
     spent = []
     drawing(lambda: (work(0.01), spent.append(0.01)))
@@ -79,6 +80,7 @@ def test_pictures_beyond_the_share_are_dropped(emap, port, drawing, monkeypatch)
         assert 2 <= len(spent) and sum(spent[:-1]) < 0.05 * 2.0
 
 
+@pytest.mark.slow(6)
 def test_a_loop_that_waits_is_shown_more_often(emap, port):
     def count(wait):
         with LiveView(emap, port=port, max_rate=50) as view:
@@ -91,6 +93,7 @@ def test_a_loop_that_waits_is_shown_more_often(emap, port):
     assert count(time.sleep) > 1.5 * count(work)
 
 
+@pytest.mark.slow(1)
 def test_a_slow_page_never_holds_the_loop_up(emap, port, drawing):
     drawing(lambda: time.sleep(1.0))
     with LiveView(emap, port=port, max_share=1.0, max_rate=1e6) as view:

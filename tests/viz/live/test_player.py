@@ -48,6 +48,7 @@ def scrub(player, number):
     player.made._scrub(SimpleNamespace(client=object(), target=SimpleNamespace(value=number)))
 
 
+@pytest.mark.slow(1)
 def test_paused_it_waits_and_steps_one_by_one(player, snapshot):
     play(player, snapshot)
     wait_for(lambda: player.made.num_shown == 1)
@@ -62,6 +63,7 @@ def has_status(player, start):
     return player.page._status.content.startswith(start)
 
 
+@pytest.mark.slow(1)
 def test_it_plays_in_the_recordings_time(player, snapshot):
     thread = play(player, snapshot, spacing=0.1)
     wait_for(lambda: player.made.num_shown == 1)
@@ -106,6 +108,7 @@ def test_play_from_an_earlier_scan_goes_on_at_the_last_one(player, snapshot):
     assert player.made.num_shown == SCANS
 
 
+@pytest.mark.slow(1)
 def test_after_the_last_scan_play_shows_it_all_again(player, snapshot):
     player.made._speed.value = "max"
     thread = play(player, snapshot)

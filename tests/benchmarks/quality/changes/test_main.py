@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from click.testing import CliRunner
 
 from benchmarks.quality.changes.__main__ import Measures, main
@@ -12,6 +13,7 @@ from benchmarks.quality.changes.world import SENSORS
 GONE = {"cells": 3, "environments": 2, "seen_through": 0, "environments_seen_through": 0, "of": 50}
 
 
+@pytest.mark.slow(1)
 def test_the_command_writes_and_tabulates(tmp_path):
     measures = Measures(
         obstacles=lambda *_: {"median": 3, "most": WATCHED + 1, "points": 0.5},

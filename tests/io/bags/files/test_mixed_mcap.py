@@ -30,6 +30,7 @@ def scans_of(path):
         return [frame.points for frame in frames], recording.warnings, bag.unread
 
 
+@pytest.mark.slow(3)
 @pytest.mark.parametrize("profile", ["ros2", "", "ros1", "px4"])
 @pytest.mark.parametrize("extra", [(), (JSON,), (JSON, PROTOBUF)])
 def test_clouds_are_read_whatever_lies_beside_them(tmp_path, source, profile, extra):
@@ -43,6 +44,7 @@ def test_clouds_are_read_whatever_lies_beside_them(tmp_path, source, profile, ex
     ][: len(extra)]  # fmt: skip
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(
     "options", [{"use_chunking": False}, {"use_statistics": False}, {"compression": CompressionType.LZ4}]
 )

@@ -45,6 +45,7 @@ def count(path):
         return sum(frame is not None for frame in recording), recording.warnings
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("kind", SUFFIX)
 def test_parts_are_read_one_after_the_other(tmp_path, kind):
     files = [write_part(tmp_path, kind, number) for number in (0, 1)]
@@ -58,6 +59,7 @@ def test_parts_are_read_one_after_the_other(tmp_path, kind):
     assert 3 <= num <= SCANS and f"{files[1].name}: the bag was not closed" in " ".join(warnings)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("mode", ["alone", "in a folder"])
 def test_files_that_are_compressed_by_zstd_are_read(tmp_path, kind, mode):
@@ -82,6 +84,7 @@ def split(tmp_path, kind):
     return folder
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
 def test_a_missing_part_is_named_and_the_rest_is_read(tmp_path, kind):
     num, warnings = count(split(tmp_path, kind))
@@ -124,6 +127,7 @@ def test_a_journal_that_was_not_merged_is_said(tmp_path):
     assert num == 3 and "drive_0.db3-wal holds messages that are not read" in " ".join(warnings)
 
 
+@pytest.mark.slow(1)
 def test_a_database_without_definitions_or_metadata_is_whole(tmp_path):
     file = write_part(tmp_path, "sqlite3", 0)
     with sqlite3.connect(file) as database:

@@ -130,6 +130,7 @@ CLOUDS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", SOUND)
 def test_the_map_is_where_the_base_travels(name):
     tree, map_frame, base_frame = SOUND[name]

@@ -57,6 +57,7 @@ JUMPS = {
 }
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("rate", [10, 50, 400])
 @pytest.mark.parametrize("name", JUMPS)
 def test_a_jump_is_found_once(name, rate):

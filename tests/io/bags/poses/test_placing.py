@@ -94,6 +94,7 @@ CURED = {
 }
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", CURED)
 def test_the_poses_are_right(tmp_path, name):
     shape, request = CURED[name]
@@ -118,6 +119,7 @@ NAMED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("name", NAMED)
 def test_the_option_is_named(tmp_path, name):
     shape, request, words = NAMED[name]
@@ -126,6 +128,7 @@ def test_the_option_is_named(tmp_path, name):
     assert words in str(error.value)
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("ahead", [37.0, 812.25 - START])
 def test_clocks_that_differ_are_named_with_both_ranges_and_the_offset(tmp_path, ahead):
     path = write(tmp_path / "drive", Shape(ahead=ahead))
@@ -235,6 +238,7 @@ def test_a_lidar_whose_clock_is_set_while_recording_loses_these_scans_only(tmp_p
     assert len(read(tmp_path / "drive", stamps="recorded")[1]) == 16
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("pose_start", [0.3, -6.0])
 def test_poses_that_arrive_late_are_used(tmp_path, pose_start):
     """A mapper that lags by 3 s at first, then by 6 s, before or while the scans begin."""

@@ -20,6 +20,7 @@ def at(field, x, y=0.003, robot=ROBOT):
     return [VERDICTS[number] for number in found.flatten()]
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("robot", [ROBOT, SMALL])
 def test_on_flat_ground_all_stand(robot):
     field = HeightField(torch.full((2, 2, 2), 3.0), 0.5)
@@ -27,6 +28,7 @@ def test_on_flat_ground_all_stand(robot):
     assert can_stand(field, torch.tensor([1, 0]), xy, [robot, robot]).tolist() == [[[True] * 8] * 3] * 2
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("height", [0.02, 0.1, 0.15, 0.19, 0.21])
 @pytest.mark.parametrize("heading", [ALONG, ACROSS])
 def test_across_a_ledge_stands_who_can_step_on_it(height, heading):
@@ -34,6 +36,7 @@ def test_across_a_ledge_stands_who_can_step_on_it(height, heading):
     assert at(ledge(height), 0.01)[heading] == ("stands" if height <= 0.2 else "step")
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize(
     "x, stands",
     [
@@ -48,6 +51,7 @@ def test_beside_a_ledge_feet_make_way_by_their_reach(x, stands):
     assert (at(ledge(0.25), x)[ALONG] == "stands") == stands
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("turn", [0.0, 0.4, math.pi / 4])
 def test_slopes_are_stood_on_up_to_the_limit(turn):
     def slope(gradient):
@@ -114,6 +118,7 @@ def test_a_slope_is_no_step():
     assert at(tile(lambda x, y: 0.5 * x), 0.0, robot=low)[ALONG] == "stands"
 
 
+@pytest.mark.slow(1)
 @pytest.mark.parametrize("robot, height", [(ROBOT, 0.4), (SMALL, 0.25)])
 def test_turned_and_mirrored_ground_gives_turned_and_mirrored_labels(robot, height):
     """But for the choice between footholds as near and as high, a few stances in a thousand."""

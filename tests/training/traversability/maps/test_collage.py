@@ -14,6 +14,7 @@ def collages(count, **shapes):
     return torch.stack([make_collage(AXIS, np.random.default_rng(seed), Shapes(**shapes)) for seed in range(count)])
 
 
+@pytest.mark.slow(1)
 def test_a_seed_gives_one_collage_and_another_seed_another():
     first, again = (make_collage(AXIS, np.random.default_rng(1)) for _ in range(2))
     assert torch.equal(first, again) and not torch.equal(first, make_collage(AXIS, np.random.default_rng(2)))
