@@ -135,7 +135,8 @@ class ElevationMap(ReadableMap):
             ValueError: if a shape, device or value is wrong. Nothing has changed then.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
-        self._history.add(inputs, self.state.statistics.drift_correction)
+        state = self.state
+        self._history.add(inputs, state.statistics.drift_correction)
         self._derived.clear()
         if is_readable(self.elevation):
             keep_freed_memory(self._num_bytes)
@@ -143,10 +144,10 @@ class ElevationMap(ReadableMap):
         before = self._take_out_predictions()
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         with torch.inference_mode():
-            self._run_stages(self.state, inputs, weights)
+            self._run_stages(state, inputs, weights)
         if before is not None:
             with torch.no_grad():
-                write(self.state, self._write_back(before, self.state))
+                write(state, self._write_back(before, state))
         if self.cfg.completion is not None and self.cfg.completion.when == "update":
             self._complete()
 

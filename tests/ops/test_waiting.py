@@ -72,7 +72,7 @@ def test_what_is_over_within_the_samples_changes_nothing():
     pauses = []
     waits = made(busy_once.__next__, sleep=pauses.append)
     for _ in range(20):
-        waits._shorten_if_busy(2, own=1)
+        waits._shorten_if_busy(2, waits.count_running(), own=1)
     assert not waits.team.calls and len(pauses) == 20 * (BUSY - 1)
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.inputs.update_inputs import Inputs
+from torchelev.ops.transforms import is_readable
 
 MAX_ENVS = 4  # the first environments: a wrong convention is wrong in all of them
 _MAX_UPDATES = 8
@@ -36,15 +37,19 @@ class InputHistory:
     def __init__(self) -> None:
         self._updates: deque[PastUpdate] = deque(maxlen=_MAX_UPDATES)
         self._num_updates = 0
-        self._corrections: deque[tuple[int, Tensor]] = deque(maxlen=_MAX_CORRECTIONS)
+        self._corrections: deque[tuple[int, Tensor | list[float]]] = deque(maxlen=_MAX_CORRECTIONS)
         self._first: Tensor | None = None  # (MAX_ENVS,) number of the first update since the last reset; None: 0
 
     def add(self, inputs: Inputs, last_correction: Tensor) -> None:
         """Keep an update's inputs, if it is their turn, and the drift correction (B,) [m] of the update before it."""
         if torch.compiler.is_compiling():
             return
-        with torch.inference_mode(False), torch.no_grad():
-            self._corrections.append((self._num_updates - 1, last_correction[:MAX_ENVS].detach().clone()))
+        few = last_correction[:MAX_ENVS]
+        if is_readable(few):
+            self._corrections.append((self._num_updates - 1, few.tolist()))
+        else:
+            with torch.inference_mode(False), torch.no_grad():
+                self._corrections.append((self._num_updates - 1, few.detach().clone()))
         if self._num_updates < _MAX_UPDATES or self._num_updates % _PERIOD < 2:
             self._updates.append(PastUpdate(self._num_updates, _thin(inputs)))
         self._num_updates += 1

@@ -51,7 +51,7 @@ def check_tensor(
 
 
 def _is_same(a: torch.device, b: torch.device) -> bool:
-    return (a.type, a.index or 0) == (b.type, b.index or 0)
+    return a == b or (a.type, a.index or 0) == (b.type, b.index or 0)
 
 
 def given_or_default(kind: type[Config], cfg: object) -> Config:
@@ -79,11 +79,11 @@ def check_pose(name: str, pose: object, shape: tuple[int, ...], device: torch.de
 
 def _are_rigid(pose: Tensor) -> bool:
     """Return quickly whether all matrices are rigid; if not, `_require_rigid` decides and words the error."""
-    matrices = pose.detach().cpu().reshape(-1, 16)
+    matrices = pose.reshape(-1, 16)
     if len(matrices) <= _FEW:
         return all(map(_is_rigid, matrices.tolist()))
     with np.errstate(all="ignore"):  # of what is not finite
-        return bool(np.all(_is_rigid(matrices.double().T.contiguous().numpy())))
+        return bool(np.all(_is_rigid(matrices.detach().cpu().double().T.contiguous().numpy())))
 
 
 def _is_rigid(matrix: Any) -> Any:

@@ -170,7 +170,8 @@ def _check_dt(
     hint = "give the seconds since the last update, or 0.0 for a further sensor of the same instant"
     require(dt is not None, "dt", "is required", "none", hint, TypeError)
     if isinstance(dt, Tensor):
-        return _check_dt_tensor(dt, num_envs, device, check_values).to(dtype).expand(num_envs)
+        value = _check_dt_tensor(dt, num_envs, device, check_values).to(dtype)
+        return value if value.ndim else value.expand(num_envs)
     is_number = isinstance(dt, (float, Real)) and not isinstance(dt, bool)  # float first: ten times as fast
     require(is_number, "dt", "must be a number or a tensor", type(dt).__name__, "give seconds", TypeError)
     seconds = float(dt)  # type: ignore[arg-type]
@@ -185,10 +186,10 @@ def _check_dt_tensor(dt: Tensor, num_envs: int, device: torch.device, check_valu
         rule = f"expected a number or ({num_envs},)"
         raise ValueError(message("dt", rule, tuple(value.shape), "give one dt per environment"))
     if is_readable(value, check_values):
-        good = (value >= 0) & (value < math.inf)
-        if not good.all():
-            bad = np.atleast_1d(~good.cpu().numpy())
-            actual = f"{value[~good].flatten()[0]:g}{checks.name_environments(bad)}"
+        seconds = value.reshape(-1).tolist()
+        if not all(0 <= s < math.inf for s in seconds):
+            bad = np.array([not 0 <= s < math.inf for s in seconds])
+            actual = f"{seconds[bad.argmax()]:g}{checks.name_environments(bad)}"
             hint = "give the seconds since the last update"
             raise ValueError(message("dt", "must be finite and not negative", actual, hint))
     return value

@@ -153,11 +153,11 @@ def addresses(tensors: Sequence[Tensor | None]) -> ctypes.Array[ctypes.c_void_p]
 
 def as_inputs(values: Mapping[str, Tensor | None]) -> Inputs:
     """Return inputs, by name, in the dtypes and layout that C++ takes."""
+    chosen = ((values[name], kind) for name, kind in _KINDS.items())
+    return Inputs(*(None if value is None else value.to(kind).contiguous() for value, kind in chosen))  # type: ignore
 
-    def convert(name: str, value: Tensor | None) -> Tensor | None:
-        if value is None:
-            return None
-        kind = torch.bool if name == "own" else torch.float64 if name.startswith("T_") else torch.float32
-        return value.to(kind).contiguous()
 
-    return Inputs(**{name: convert(name, values[name]) for name in Inputs._fields})  # type: ignore[arg-type]
+_KINDS = {
+    name: torch.bool if name == "own" else torch.float64 if name.startswith("T_") else torch.float32
+    for name in Inputs._fields
+}

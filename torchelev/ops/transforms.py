@@ -54,8 +54,9 @@ def is_readable(tensor: Tensor, may_wait: bool = False) -> bool:
 
     Never true of fake tensors, and while torch compiles or transforms.
     """
-    is_plain = type(tensor) in (Tensor, torch.nn.Parameter) and (may_wait or tensor.is_cpu)
-    return is_plain and not torch.compiler.is_compiling() and not is_transforming()
+    if torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None:
+        return False
+    return type(tensor) in (Tensor, torch.nn.Parameter) and (may_wait or tensor.is_cpu)
 
 
 def can_compute_unseen(tensors: Iterable[Tensor]) -> bool:

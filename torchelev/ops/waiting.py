@@ -90,27 +90,28 @@ class Waits:
             if self.short:
                 self._lengthen_if_free(num_threads)
             else:
-                self._shorten_if_busy(num_threads, self._expect_own(num_threads))
+                running = self.count_running()
+                self._shorten_if_busy(num_threads, running, self._expect_own(num_threads, running))
         yield
         is_spinning = not self.short and self.count_running() >= num_threads
         self._spinning_from = self.clock() if is_spinning else float("-inf")
 
-    def _expect_own(self, num_threads: int) -> int:
+    def _expect_own(self, num_threads: int, running: int) -> int:
         """Return how many threads of this process may be running before an update: those of the last one may spin."""
         since = self.clock() - self._spinning_from
-        if self.count_running() == 1:
+        if running == 1:
             self._spin = min(self._spin, since)
         return num_threads if since < self._spin + _TAIL else 1
 
-    def _shorten_if_busy(self, num_threads: int, own: int) -> None:
+    def _shorten_if_busy(self, num_threads: int, running: int, own: int) -> None:
+        spare = num_cores() - num_threads
         for k in range(BUSY):
-            spare = num_cores() - num_threads
-            running = self.count_running()
             # Threads of this process may also spin after an operation that was no update.
             if running - own <= spare or running - self.count_own() <= spare:
                 return
             if k < BUSY - 1:
                 self.sleep(_PAUSE)
+                running = self.count_running()
         self.team.start()
         self.short, self._num_free = True, 0
 
