@@ -7,9 +7,11 @@ import functools
 import types
 import typing
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchelev.completion.config import CompletionConfig
+from torchelev.config_files import read_settings, without_version, write_settings
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.stages.age.config import AgingConfig
@@ -62,7 +64,7 @@ class ElevationMapConfig:
         hint = "give (FilterConfig(layer=..., filter=...), ...)"
         is_chain = _is_chain(self.filters)
         require(is_chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), hint, TypeError)
-        for name, annotation in _setting_types(type(self)).items():  # type: ignore[arg-type]
+        for name, annotation in setting_types(type(self)).items():  # type: ignore[arg-type]
             if name == "filters":
                 continue
             value, kinds = getattr(self, name), typing.get_args(annotation) or (annotation,)
@@ -101,12 +103,37 @@ class ElevationMapConfig:
         Raises:
             ValueError: if there is no such setting, naming those that exist, or its value does not fit.
         """
+        if isinstance(values, dict):
+            values = without_version(values)
         if not isinstance(values, dict) or "filters" not in values:
             return _build(cls, values, "config")
         from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them
 
         stages = {name: value for name, value in values.items() if name != "filters"}
         return dataclasses.replace(_build(cls, stages, "config"), filters=filters_from_list(values["filters"]))
+
+    def save(self, path: str | Path) -> None:
+        """Write all settings as JSON, by group and name, with a version: what `load`, the command line's `--config` and
+        the C library `libtorchelev` read. Units are those of this class's fields: metres, seconds and radians.
+
+        Raises:
+            WriteError: the file cannot be written; an existing one is left as it was.
+        """
+        write_settings(path, self.to_dict())
+
+    @classmethod
+    def load(cls, path: str | Path) -> ElevationMapConfig:
+        """Read a file of `save`, or one written by hand: JSON if its name ends in .json, else YAML.
+
+        Raises:
+            ValueError: the file cannot be read, is of another version, or holds a setting that does not exist or does
+                not fit; settings that are left out keep their defaults.
+        """
+        try:
+            return cls.from_dict(read_settings(path))
+        except (ValueError, TypeError) as error:
+            text = str(error)
+            raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from error
 
 
 def _is_chain(filters: object) -> bool:
@@ -119,7 +146,7 @@ def _is_chain(filters: object) -> bool:
 
 
 @functools.cache
-def _setting_types(cls: type) -> dict[str, Any]:
+def setting_types(cls: type) -> dict[str, Any]:
     """Return the type of each of a config's settings, by name; that of filters, which are read apart, is not known."""
     hints = typing.get_type_hints(cls, localns={"FilterConfig": Any})
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
@@ -129,7 +156,7 @@ def _build(cls: type, values: object, where: str) -> Any:
     """Return a config of this type from its plain dict; errors call it `where`."""
     require(isinstance(values, dict), where, "must be a mapping", type(values).__name__, "see ElevationMapConfig")
     assert isinstance(values, dict)
-    hints = _setting_types(cls)
+    hints = setting_types(cls)
     for name in values:
         require(name in hints, f"{where}.{name}", "is not a setting", repr(name), f"there are {', '.join(hints)}")
     return cls(**{name: _convert(hints[name], value, f"{where}.{name}") for name, value in values.items()})
@@ -152,7 +179,7 @@ def _convert(hint: Any, value: object, where: str) -> Any:
     if dataclasses.is_dataclass(kind):
         names = set(value) if isinstance(value, dict) else set()
         # Of several types, the one that has these settings, and few others: `robot` alone is the learned head's.
-        kind = max(kinds, key=lambda k: _share_of_settings(names, set(_setting_types(k))))
+        kind = max(kinds, key=lambda k: _share_of_settings(names, set(setting_types(k))))
         return _build(typing.cast(type, kind), value, where)
     element = next(iter(typing.get_args(kind)), None)
     if dataclasses.is_dataclass(element):
@@ -161,6 +188,8 @@ def _convert(hint: Any, value: object, where: str) -> Any:
         return tuple(_build(typing.cast(type, element), item, f"{where}[{k}]") for k, item in items)
     if isinstance(value, list):
         return tuple(value)
+    if kind is float and value in ("inf", "-inf"):  # JSON has no infinity
+        return float(typing.cast(str, value))
     number = isinstance(value, int | float) and not isinstance(value, bool)
     require(number or kind is not float, where, "must be a number", repr(value), "give a number without quotes")
     return float(value) if kind is float else value  # type: ignore[arg-type]

@@ -1,23 +1,23 @@
-"""Settings of the command line: a YAML file by stage, overridden by --resolution and --size."""
+"""Settings of the command line: a YAML or JSON file by stage, overridden by --resolution and --size."""
 
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 from torchelev.config import ElevationMapConfig
+from torchelev.config_files import read_settings
 
 _RESOLUTION, _SIZE = 0.1, 20.0  # [m] defaults
 _MAX_CELLS = 16_000_000  # an update takes about 350 bytes of memory per cell
 
 
 def load_config(path: Path | None, resolution: float | None, size: float | None) -> ElevationMapConfig:
-    """Read settings from YAML and apply the command line's grid options.
+    """Read settings from YAML or JSON and apply the command line's grid options.
 
     Args:
-        path: YAML file with fields of ElevationMapConfig; None: defaults.
+        path: YAML or JSON file with fields of ElevationMapConfig; None: defaults.
         resolution: [m] cell size; None: the file's, or 0.1.
         size: [m] side length, rounded up to whole cells; None: the file's, or 20.
 
@@ -27,7 +27,7 @@ def load_config(path: Path | None, resolution: float | None, size: float | None)
     Raises:
         ValueError: the file cannot be read, holds an unknown or invalid setting, or the map would be too large.
     """
-    values = {} if path is None else _read_yaml(path)
+    values = {} if path is None else read_settings(path)
     grid = values.get("grid") or {}
     if not isinstance(grid, dict):
         raise ValueError(f"{path}: config.grid must be a mapping; see ElevationMapConfig")
@@ -52,20 +52,3 @@ def _override_grid(grid: dict[str, Any], resolution: float | None, size: float |
     rounded = {name: cell * math.ceil(length / cell - 1e-6) for name, length in lengths.items()}
     from_file = {} if resolution is not None or size is not None else grid
     return {**grid, "resolution": cell, **rounded, **from_file}
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """Also read 1e-4 as a number; YAML 1.1 requires a decimal point and would read text."""
-
-    number = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
-    try:
-        values = yaml.load(path.read_text(encoding="utf-8"), Loader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: cannot be read as YAML ({error})") from error
-    if not isinstance(values, dict | None):
-        raise ValueError(f"{path}: expected settings grouped by stage, such as 'grid: {{resolution: 0.1}}'")
-    return values or {}

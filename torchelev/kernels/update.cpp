@@ -4,12 +4,6 @@
 
 namespace {
 
-// What a thread keeps.
-struct Own {
-    Measurement measurement;
-    Memory memory;
-};
-
 // What threads keep from update to update: the operating system clears memory anew, page by page, which takes
 // longer than the work.
 class Kept {
@@ -43,16 +37,6 @@ struct Borrowed {
     }
 };
 
-// Run the stages. One may fail without memory, with a part of its work done: what was taken out is then put back.
-void run(Update& one, const Stage* stages, int64_t num_stages) {
-    try {
-        for (int64_t k = 0; k < num_stages; k++) stages[k](one);
-    } catch (...) {
-        if (one.on_failure) one.on_failure(one);
-        throw;
-    }
-}
-
 }  // namespace
 
 // Leave what is kept to the parent of a forked process, a thread of which may hold the mutex.
@@ -66,7 +50,7 @@ extern "C" int update_maps(const MapState* state, const Inputs* inputs, const Se
         Own& own = *borrowed.own;
         Update one{*settings,          *sizes,     state->at(b, *sizes), inputs->at(b, *sizes),
                    own.measurement,    own.memory, threads};
-        run(one, stages, num_stages);
+        run_stages(one, stages, num_stages);
     };
     return code_of([&] { for_environments(sizes->B, num_threads, make, update); });
 }

@@ -87,3 +87,19 @@ struct Update {
     }
 };
 
+
+// What a thread keeps from update to update.
+struct Own {
+    Measurement measurement;
+    Memory memory;
+};
+
+// Run the stages. One may fail without memory, with a part of its work done: what was taken out is then put back.
+inline void run_stages(Update& one, const Stage* stages, int64_t num_stages) {
+    try {
+        for (int64_t k = 0; k < num_stages; k++) stages[k](one);
+    } catch (...) {
+        if (one.on_failure) one.on_failure(one);
+        throw;
+    }
+}

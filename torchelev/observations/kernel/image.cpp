@@ -14,6 +14,8 @@
 
 namespace {
 
+using namespace scans;
+
 constexpr int64_t FEW = 4096;  // pixels, which one thread reads before another one wakes up
 
 // `_Source` of image_kernel.py: a layer (B, height, width), another one that counts where it is unknown or null, and

@@ -7,6 +7,8 @@
 
 #include "kernels/simd.h"
 
+namespace scans {
+
 constexpr float FAR = 1e6f;  // [cells] farther points are clamped
 constexpr float UNKNOWN = std::numeric_limits<float>::infinity();
 constexpr double MIN_HORIZONTAL = 0.1;
@@ -106,3 +108,5 @@ inline float turn(float along, float across, float x, float y) { return __builti
 
 // A coordinate [m] in cells from the window's corner.
 inline float to_cells(double x, int64_t corner, double resolution) { return float(x / resolution - double(corner)); }
+
+}  // namespace scans

@@ -7,6 +7,8 @@
 
 #include "observations/kernel/scan.h"
 
+namespace scans {
+
 constexpr float HOLE = std::numeric_limits<float>::quiet_NaN();
 
 inline Lanes or_zero(Lanes a) { return pick(a == a, a, splat(0)); }
@@ -176,3 +178,5 @@ struct Inpainted {
         return (sums[1] + (sums[0] + sums[2])) / numbers(count);
     }
 };
+
+}  // namespace scans

@@ -51,7 +51,8 @@ struct Errors {
 // Sum over the points by parts, in an order that does not depend on the threads: `add(k, count, totals)`.
 template <class Add> Sums sum_up(const Update& u, const Add& add) {
     const int64_t number = u.measurement.number, parts = (number + AT_A_TIME - 1) / AT_A_TIME;
-    std::vector<Sums> sums(parts);
+    auto& sums = u.memory.get<std::vector<Sums>>();
+    sums.assign(parts, Sums());
     u.each(parts, 1, [&](int64_t, int64_t begin, int64_t end) {
         for (int64_t p = begin; p < end; p++)
             for (int64_t k = p * AT_A_TIME; k < std::min(number, (p + 1) * AT_A_TIME); k += IN_FLOAT) {

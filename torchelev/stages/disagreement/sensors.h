@@ -10,14 +10,20 @@
 
 namespace disagreement {
 
-// Memory that is zero, of which large maps use a few pages.
-struct Zeros {
-    std::unique_ptr<float, decltype(&std::free)> values;
+// Memory that users leave zero, of which large maps use a few pages.
+class Zeros {
+    std::unique_ptr<float, decltype(&std::free)> values{nullptr, &std::free};
+    size_t room = 0;
 
-    explicit Zeros(size_t number) : values(static_cast<float*>(std::calloc(number, sizeof(float))), &std::free) {
-        if (!values) throw std::bad_alloc();
+  public:
+    float* resize(size_t number) {
+        if (number > room) {
+            values.reset(static_cast<float*>(std::calloc(number, sizeof(float))));
+            room = values ? number : 0;
+            if (!values) throw std::bad_alloc();
+        }
+        return values.get();
     }
-    float& operator[](size_t k) { return values.get()[k]; }
 };
 
 // What the cells say of one sensor.
@@ -31,6 +37,13 @@ struct Bias {
     }
 };
 
+// What a thread keeps from update to update.
+struct Compared {
+    Zeros numbers, moments;      // (H, W, S) points of each sensor; the sum of their heights [m]
+    std::vector<int32_t> cells;  // those that are hit, once for each sensor
+    std::vector<Bias> biases;    // (S)
+};
+
 // Mean height [m] of the points, from which the others count.
 inline float level_of(const Measurement& m) {
     double sum = 0;
@@ -39,7 +52,7 @@ inline float level_of(const Measurement& m) {
 }
 
 // Sum the heights of each sensor's points in each cell, without the slope of the ground within a cell.
-inline void sum_heights(const Update& u, Zeros& number, Zeros& moment, std::vector<int32_t>& cells) {
+inline void sum_heights(const Update& u, float* number, float* moment, std::vector<int32_t>& cells) {
     const Measurement& m = u.measurement;
     const float size = u.settings.disagreement.resolution, level = level_of(m);
     const int64_t per_sensor = m.number / m.sensors;
@@ -85,14 +98,15 @@ inline float compare_sensors(Update& u) {
     const DisagreementSettings& s = u.settings.disagreement;
     locate(u, s.resolution);
     const size_t sensors = u.measurement.sensors;
-    Zeros number(u.cells() * sensors), moment(u.cells() * sensors);
-    std::vector<int32_t> cells;  // those that are hit, once for each sensor
+    auto& [numbers, moments, cells, biases] = u.memory.get<Compared>();
+    float *number = numbers.resize(u.cells() * sensors), *moment = moments.resize(u.cells() * sensors);
+    cells.clear(), cells.reserve(u.measurement.number);  // nothing below runs out of memory and leaves numbers behind
+    biases.assign(sensors, Bias());
     sum_heights(u, number, moment, cells);
-    std::vector<Bias> biases(sensors);
     for (int32_t cell : cells) {
-        float* own = &number[cell * sensors];
-        compare_in_cell(own, &moment[cell * sensors], s.max_bias, biases);
-        std::fill_n(own, sensors, 0.0f);  // compared once
+        float *own = number + cell * sensors, *sums = moment + cell * sensors;
+        compare_in_cell(own, sums, s.max_bias, biases);
+        std::fill_n(own, sensors, 0.0f), std::fill_n(sums, sensors, 0.0f);  // compared once
     }
     return deviation_of(biases, *u.state.statistics.disagreement, s);
 }

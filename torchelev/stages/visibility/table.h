@@ -23,7 +23,7 @@ struct Places {
 
 // Memory of all sensors and maps.
 struct TableMemory {
-    Buffer<float> blocks, whole;
+    Buffer<float> blocks, whole, next;
     Buffer<int32_t> rows, top;
 };
 
@@ -34,6 +34,7 @@ class Table {
     static constexpr int NEAR_LEVEL = LANES >= 8 ? 3 : 2;
     const Update& u;
     const VisibilitySettings& s;
+    TableMemory& memory;
     const int stride;          // rows of a block that there is room for
     const int real, count;     // blocks of azimuths; and those with copies of the first LANES - 1 azimuths at the end
     const int whole_width;
@@ -47,7 +48,7 @@ class Table {
     int near = 0;  // rows that are stored whole
 
     Table(const Update& u, float farthest, TableMemory& memory)
-        : u(u), s(u.settings.visibility),
+        : u(u), s(u.settings.visibility), memory(memory),
           stride(int(std::clamp(std::floor(farthest / s.resolution), 1.0f, float(s.ranges))) + 1),
           real((s.azimuths + LANES - 1) / LANES), count((s.azimuths + 2 * LANES - 2) / LANES),
           whole_width(s.azimuths + int(2 * s.bins) + 4 * LANES), blank(count * stride * LANES) {
@@ -72,12 +73,12 @@ class Table {
         place_blocks();
         const int64_t parts = u.threads == 1 || int64_t(count) * far * LANES < ENTRIES_AT_A_TIME ? 1 : 4 * u.threads;
         auto begin = [&](int64_t part) { return int(part * real / parts); };
-        std::vector<std::vector<float>> next;  // the blocks that follow each part, unchanged
-        for (int64_t k = 1; k < parts; k++) next.push_back({block(begin(k)), block(begin(k)) + far * LANES});
+        float* next = memory.next.resize(parts * far * LANES);  // the blocks that follow each part, unchanged
+        for (int64_t k = 1; k < parts; k++) std::copy_n(block(begin(k)), far * LANES, next + (k - 1) * far * LANES);
         for_each(int(parts), parts == 1 ? 1 : u.threads, [&](int turn) {
             const int64_t k = parts - 1 - turn;  // from the last one on, or tests on one core would not miss the copies
             for (int b = begin(k); b < begin(k + 1); b++)
-                scan_block(b, k + 1 < parts && b + 1 == begin(k + 1) ? next[k].data() : block(b + 1));
+                scan_block(b, k + 1 < parts && b + 1 == begin(k + 1) ? next + k * far * LANES : block(b + 1));
         });
         for (int row = 0; row < near; row++) {
             float* values = whole + row * whole_width;

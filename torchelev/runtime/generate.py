@@ -1,0 +1,166 @@
+"""Write the headers of the C library that follow from Python's declarations: `python -m torchelev.runtime.generate`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from torchelev.config import ElevationMapConfig, setting_types
+from torchelev.kernels.cpu_update import Inputs
+from torchelev.kernels.registry import header
+from torchelev.kernels.structs import Double, members
+from torchelev.observations import presets
+from torchelev.observations.height_scan import HeightScan
+from torchelev.pipeline import KERNELS, ORDER, TENSORS
+from torchelev.robot import RobotConfig
+from torchelev.robot_body.shapes import RobotBody
+from torchelev.state import BLANK, MapState, Statistics
+from torchelev.traversability.heads import LearnedTraversabilityConfig
+
+FOLDER = Path(__file__).parent / "generated"
+_NOTE = "// Written by `python -m torchelev.runtime.generate`.\n"
+_ONLY_PYTHON = (RobotBody, LearnedTraversabilityConfig)  # settings of these types need Python
+_PLANNING = (RobotConfig,)  # settings that no update reads
+_DTYPES = {"float": "F32", "int64_t": "I64", "uint8_t": "U8"}  # of safetensors
+
+
+def headers() -> dict[str, str]:
+    """Return the headers' texts by name."""
+    structs = header(KERNELS, ElevationMapConfig(), [*TENSORS, ("Inputs", Inputs, {})])
+    return {"generated.h": _NOTE + structs, "tables.h": _tables()}
+
+
+def _tables() -> str:
+    return "\n".join(
+        [
+            _NOTE + '#pragma once\n\n#include "runtime/source/table_types.h"\n',
+            _table("Setting", "SETTINGS", _settings(ElevationMapConfig(), "")),
+            _table("Tensor", "STATE", _tensors()),
+            _default_settings(),
+            _order(),
+            *(_axes(name) for name in presets.PRESETS),
+            _table("Preset", "PRESETS", map(_preset, presets.PRESETS)),
+        ]
+    )
+
+
+def _table(kind: str, name: str, rows: Any) -> str:
+    lines = ",\n".join(f"    {row}" for row in rows)
+    return f"constexpr {kind} {name}[] = {{\n{lines},\n}};\n"
+
+
+def _number(value: float) -> str:
+    """Return a number in C++."""
+    if isinstance(value, float) and math.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return repr(float(value)) if isinstance(value, float) else str(int(value))
+
+
+# Settings -----------------------------------------------------------------------------------------------------------
+
+
+def _settings(cfg: Any, prefix: str) -> Iterator[str]:
+    """Yield a row for each setting below a config's group, the groups included, before what they hold."""
+    for name, hint in setting_types(type(cfg)).items():
+        kinds = [kind for kind in (typing.get_args(hint) or (hint,)) if kind is not type(None)]
+        nullable = type(None) in typing.get_args(hint)
+        value, path = getattr(cfg, name), prefix + name
+        kind = _kind(name, kinds)
+        yield _setting(path, kind, nullable, value)
+        if kind == "GROUP":
+            group = next(k for k in kinds if k not in _ONLY_PYTHON)
+            yield from _settings(group() if value is None else value, f"{path}.")
+
+
+def _kind(name: str, kinds: list[Any]) -> str:
+    if name == "filters" or name == "completion":
+        return "ONLY_PYTHON"
+    if any(kind in _PLANNING for kind in kinds):
+        return "IGNORED"
+    if any(dataclasses.is_dataclass(kind) for kind in kinds):
+        return "GROUP"
+    if typing.get_origin(kinds[0]) is tuple or len(kinds) == 3:
+        return "PLACE"
+    return "INTEGER" if kinds == [int] else "NUMBER"
+
+
+def _setting(path: str, kind: str, nullable: bool, value: Any) -> str:
+    numbers = value if kind == "PLACE" else (value,) if kind in ("NUMBER", "INTEGER") else ()
+    texts = ", ".join(_number(number) for number in numbers if number is not None)
+    return f'{{"{path}", {kind}, {str(nullable).lower()}, {str(value is None).lower()}, {{{texts}}}}}'
+
+
+def _default_settings() -> str:
+    """Return a function that makes the C settings of the default config, the constants of all stages among them."""
+    lines = []
+    for kernel in KERNELS:
+        for name, value in kernel.settings(ElevationMapConfig()).items():
+            values = value if isinstance(value, tuple) else (value,)
+            for k, number in enumerate(values):
+                place = f"{kernel.name}.{name}" + (f"[{k}]" if isinstance(value, tuple) else "")
+                text = _number(number)
+                is_float = isinstance(number, float) and not isinstance(number, Double)
+                lines.append(f"    s.{place} = {f'float({text})' if is_float else text};")
+    body = "\n".join(lines)
+    return f"inline Settings default_settings() {{\n    Settings s{{}};\n{body}\n    return s;\n}}\n"
+
+
+# Tensors and stages -------------------------------------------------------------------------------------------------
+
+
+def _tensors() -> Iterator[str]:
+    """Yield a row for each tensor of a map, in the order of `MapState`'s struct."""
+    named = [*((m.name, m) for m in members(MapState)), *((f"last_{m.name}", m) for m in members(Statistics))]
+    for name, member in named:
+        shape = [size if size.isdigit() else f"-'{size}'" for size in member.shape[1:]]
+        sizes = ", ".join({"-'H'": "ROWS", "-'W'": "COLUMNS"}.get(size, size) for size in shape)
+        blank = _number(float(BLANK.get(name, 0)))
+        kind = "BOOL" if "Bool" in str(_annotation(name)) else _DTYPES[member.type]
+        yield f'{{"{name}", "{kind}", sizeof({member.type}), {{{sizes}}}, {blank}}}'
+
+
+def _annotation(name: str) -> Any:
+    return MapState.__annotations__.get(name, "")
+
+
+def _order() -> str:
+    declared = "\n".join(f"void run_{name}(Update&);" for name in ORDER)
+    stages = ", ".join(f"run_{name}" for name in ORDER)
+    return f'extern "C" {{\n{declared}\n}}\nconstexpr Stage ORDER[] = {{{stages}}};\n'
+
+
+# Height scans -------------------------------------------------------------------------------------------------------
+
+
+def _axes(name: str) -> str:
+    points = HeightScan.preset(name).pattern
+    axes = (tuple(dict.fromkeys(point[axis] for point in points)) for axis in (0, 1))
+    rows = (f"{name.upper()}_{axis}[] = {{{', '.join(map(_number, a))}}}" for axis, a in zip("XY", axes, strict=True))
+    return "".join(f"constexpr double {row};\n" for row in rows)
+
+
+def _preset(name: str) -> str:
+    scan = HeightScan.preset(name)
+    x_fastest = scan.pattern[0][1] == scan.pattern[1][1]
+    mode = scan.mode.upper()
+    original = "NAN" if scan.original == "base" else _number(float(scan.original))
+    numbers = [scan.nominal_height, math.inf if scan.clip is None else scan.clip, scan.scale]
+    numbers.append(scan.nominal_height if scan.standing_height is None else scan.standing_height)
+    texts = ", ".join(_number(float(number)) for number in numbers)
+    axes = ", ".join(f"{name.upper()}_{a}, int(std::size({name.upper()}_{a}))" for a in "XY")
+    return f'{{"{name}", {axes}, {str(x_fastest).lower()}, scans::{mode}, {texts}, {original}}}'
+
+
+def main() -> None:
+    """Write the headers."""
+    FOLDER.mkdir(exist_ok=True)
+    for name, text in headers().items():
+        (FOLDER / name).write_text(text)
+
+
+if __name__ == "__main__":
+    main()

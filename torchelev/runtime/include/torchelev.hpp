@@ -1,0 +1,91 @@
+// C++ on top of torchelev.h: objects that free themselves, and exceptions with the library's sentences.
+#ifndef TORCHELEV_HPP
+#define TORCHELEV_HPP
+
+#include <array>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "torchelev.h"
+
+namespace torchelev {
+
+using Pose = std::array<double, 16>;  // (4, 4), row by row
+
+// What the library refused.
+struct Error : std::runtime_error {
+    torchelev_status status;
+    explicit Error(torchelev_status status) : std::runtime_error(torchelev_last_error()), status(status) {}
+};
+
+inline void check(torchelev_status status) {
+    if (status != TORCHELEV_OK) throw Error(status);
+}
+
+class Map {
+    std::unique_ptr<torchelev_map, decltype(&torchelev_map_free)> map{nullptr, &torchelev_map_free};
+
+  public:
+    // A map of a config file.
+    explicit Map(const std::string& config_path, torchelev_limits limits = {131072, 4, 1}) {
+        torchelev_map* made = nullptr;
+        check(torchelev_map_create(config_path.c_str(), &limits, &made));
+        map.reset(made);
+    }
+
+    void update(const torchelev_input& input) { check(torchelev_map_update(map.get(), &input)); }
+
+    // Points (N, 3) of one sensor, seen from T_map_sensor.
+    void update(const std::vector<float>& points, const Pose& T_map_sensor, const Pose& T_map_base, double dt) {
+        update({1, int64_t(points.size() / 3), points.data(), T_map_sensor.data(), T_map_base.data(), dt, nullptr, nullptr});
+    }
+
+    void move(const Pose& T_map_base) { check(torchelev_map_move(map.get(), T_map_base.data())); }
+    void reset() { check(torchelev_map_reset(map.get())); }
+    void save(const std::string& path) const { check(torchelev_map_save(map.get(), path.c_str())); }
+    void load(const std::string& path) { check(torchelev_map_load(map.get(), path.c_str())); }
+
+    // A layer (H, W), NaN where not known.
+    std::vector<float> layer(const std::string& name) const {
+        int64_t rows, columns;
+        check(torchelev_map_size(map.get(), &rows, &columns, nullptr));
+        std::vector<float> values(size_t(rows * columns));
+        check(torchelev_map_layer(map.get(), name.c_str(), values.data(), values.size()));
+        return values;
+    }
+
+    torchelev_statistics statistics() const {
+        torchelev_statistics found;
+        check(torchelev_map_statistics(map.get(), &found));
+        return found;
+    }
+
+    const torchelev_map* get() const { return map.get(); }
+};
+
+// The heights that a policy reads.
+class HeightScan {
+    std::unique_ptr<torchelev_scan, decltype(&torchelev_scan_free)> scan{nullptr, &torchelev_scan_free};
+
+  public:
+    std::vector<float> values;  // of the last call
+
+    // "isaac_lab", "mjlab", "legged_gym", or a layout as JSON.
+    HeightScan(const Map& map, const std::string& layout) {
+        torchelev_scan* made = nullptr;
+        check(torchelev_scan_create(map.get(), layout.c_str(), &made));
+        scan.reset(made);
+        values.resize(size_t(torchelev_scan_size(made)));
+    }
+
+    const std::vector<float>& operator()(const Map& map, const Pose& T_map_base) {
+        check(torchelev_scan_read(scan.get(), map.get(), T_map_base.data(), nullptr, values.data(), nullptr));
+        return values;
+    }
+};
+
+}  // namespace torchelev
+
+#endif

@@ -1,0 +1,217 @@
+"""The C library from Python: built or loaded, and one of its maps as an object."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchelev.kernels.cpu_build import load
+from torchelev.runtime.generate import headers
+from torchelev.runtime.sources import SOURCES
+
+_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
+
+
+class LibraryError(ValueError):
+    """What the C library refused, in its own sentence. `status` is its `torchelev_status`."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class Limits(ctypes.Structure):
+    """`torchelev_limits`."""
+
+    _fields_ = (("max_points", _COUNT), ("max_sensors", ctypes.c_int32), ("num_threads", ctypes.c_int32))
+
+
+class _Input(ctypes.Structure):
+    """`torchelev_input`."""
+
+    _fields_ = (
+        *(("num_sensors", ctypes.c_int32), ("num_points", _COUNT)),
+        *((name, _POINTER) for name in ("points", "T_map_sensor", "T_map_base")),
+        ("dt", ctypes.c_double),
+        *((name, _POINTER) for name in ("variance", "pose_covariance")),
+    )
+
+
+def build_library() -> ctypes.CDLL:
+    """Return the library of this checkout or wheel, built for this machine if need be.
+
+    Raises:
+        RuntimeError: there is no C++ compiler, or TORCHELEV_NATIVE=0 forbids to build.
+    """
+    version = {"TORCHELEV_VERSION": '"' + _version() + '"'}
+    library = load(SOURCES, version, headers())
+    if library is None:
+        raise RuntimeError("libtorchelev: no C++ compiler was found, or TORCHELEV_NATIVE=0; install g++ or clang++")
+    return _declared(library)
+
+
+def open_library(path: str | Path) -> ctypes.CDLL:
+    """Return a library that was built elsewhere, such as by CMake.
+
+    Raises:
+        ValueError: it cannot be loaded, or is no libtorchelev.
+    """
+    try:
+        return _declared(ctypes.CDLL(str(path)))
+    except (OSError, AttributeError) as error:
+        raise ValueError(f"{path}: no libtorchelev of this machine ({error})") from error
+
+
+def _version() -> str:
+    from torchelev import __version__
+
+    return __version__
+
+
+def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
+    for name in ("torchelev_last_error", "torchelev_version"):
+        getattr(library, name).restype = ctypes.c_char_p
+    library.torchelev_map_tensor.restype = _POINTER
+    library.torchelev_scan_size.restype = _COUNT
+    return library
+
+
+def _text(value: str) -> ctypes.c_char_p:
+    return ctypes.c_char_p(value.encode())
+
+
+def _address(array: NDArray | None) -> int | None:
+    return None if array is None else array.ctypes.data
+
+
+class CMap:
+    """A map of the C library: `torchelev.h`.
+
+    Args:
+        library: what `build_library` or `open_library` returned.
+        config: path of a config file, or its text if that contains a brace.
+        max_points: of all sensors of one update.
+        max_sensors: of one update.
+        num_threads: that share an update.
+
+    Raises:
+        LibraryError: the library refuses the config.
+    """
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        config: str | Path,
+        max_points: int = 131072,
+        max_sensors: int = 4,
+        num_threads: int = 1,
+    ) -> None:
+        self._library, self._map = library, _POINTER()
+        create = "create_from_text" if "{" in str(config) else "create"
+        limits = Limits(max_points, max_sensors, num_threads)
+        self._call(f"torchelev_map_{create}", _text(str(config)), ctypes.byref(limits), ctypes.byref(self._map))
+
+    def __del__(self) -> None:
+        if self._map:
+            self._library.torchelev_map_free(self._map)
+
+    def _call(self, name: str, *arguments: Any) -> None:
+        status = getattr(self._library, name)(*arguments)
+        if status:
+            raise LibraryError(status, self._library.torchelev_last_error().decode())
+
+    @functools.cached_property
+    def size(self) -> tuple[int, int]:
+        """H and W."""
+        rows, columns = _COUNT(), _COUNT()
+        self._call("torchelev_map_size", self._map, ctypes.byref(rows), ctypes.byref(columns), None)
+        return rows.value, columns.value
+
+    def update(
+        self,
+        points: Any,
+        T_map_sensor: Any,
+        T_map_base: Any = None,
+        dt: float = 0.0,
+        variance: Any = None,
+        pose_covariance: Any = None,
+    ) -> None:
+        """Update by points (S, N, 3), poses (S, 4, 4) and (4, 4), a variance (S, N) and covariances (S, 6, 6)."""
+        points = np.ascontiguousarray(points, np.float32)
+        kinds = (np.float64, np.float64, np.float32, np.float64)
+        given = (T_map_sensor, T_map_base, variance, pose_covariance)
+        arrays = [None if v is None else np.ascontiguousarray(v, kind) for v, kind in zip(given, kinds, strict=True)]
+        sensor, base, variance, covariance = map(_address, arrays)
+        entry = _Input(*points.shape[:2], _address(points), sensor, base, dt, variance, covariance)
+        self._call("torchelev_map_update", self._map, ctypes.byref(entry))
+
+    def move(self, T_map_base: Any) -> None:
+        """Move the window to the robot."""
+        pose = np.ascontiguousarray(T_map_base, np.float64)
+        self._call("torchelev_map_move", self._map, _POINTER(_address(pose)))
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._call("torchelev_map_reset", self._map)
+
+    def layer(self, name: str) -> NDArray:
+        """Return a layer (H, W), NaN where not known."""
+        values = np.empty(self.size, np.float32)
+        address = _POINTER(_address(values))
+        self._call("torchelev_map_layer", self._map, _text(name), address, ctypes.c_size_t(values.size))
+        return values
+
+    def tensor(self, name: str, dtype: Any) -> NDArray:
+        """Return a copy of a tensor of the state, flat."""
+        size = ctypes.c_size_t()
+        address = self._library.torchelev_map_tensor(self._map, _text(name), ctypes.byref(size))
+        if not address:
+            raise LibraryError(1, self._library.torchelev_last_error().decode())
+        return np.frombuffer(ctypes.string_at(address, size.value), dtype)
+
+    def sample(self, name: str, xy: Any, mode: str = "bilinear") -> tuple[NDArray, NDArray]:
+        """Return a layer's values at points (M, 2) [m], and where they are known."""
+        xy = np.ascontiguousarray(xy, np.float64)
+        values, known = np.empty(len(xy), np.float32), np.empty(len(xy), bool)
+        places = (_POINTER(_address(array)) for array in (values, known))
+        at = _POINTER(_address(xy)), _COUNT(len(xy))
+        self._call("torchelev_map_sample", self._map, _text(name), _text(mode), *at, *places)
+        return values, known
+
+    def save(self, path: str | Path) -> None:
+        """Save the whole map."""
+        self._call("torchelev_map_save", self._map, _text(str(path)))
+
+    def load(self, path: str | Path) -> None:
+        """Load a map that was saved."""
+        self._call("torchelev_map_load", self._map, _text(str(path)))
+
+    def scan(self, layout: str) -> CScan:
+        """Return a height scan by the name of a preset, or by a layout as JSON."""
+        return CScan(self, layout)
+
+
+class CScan:
+    """A height scan of the C library."""
+
+    def __init__(self, emap: CMap, layout: str) -> None:
+        self._library, self._scan, self._emap = emap._library, _POINTER(), emap
+        emap._call("torchelev_scan_create", emap._map, _text(layout), ctypes.byref(self._scan))
+
+    def __del__(self) -> None:
+        if self._scan:
+            self._library.torchelev_scan_free(self._scan)
+
+    def __call__(self, T_map_base: Any, feet: Any = None) -> tuple[NDArray, NDArray]:
+        """Return values (P), and where the elevation is known."""
+        size = self._library.torchelev_scan_size(self._scan)
+        pose, values, known = np.ascontiguousarray(T_map_base, np.float64), np.empty(size, np.float32), np.empty(size, bool)
+        feet = None if feet is None else np.ascontiguousarray(feet, np.float64)
+        places = (_POINTER(_address(array)) for array in (pose, feet, values, known))
+        self._emap._call("torchelev_scan_read", self._scan, self._emap._map, *places)
+        return values, known

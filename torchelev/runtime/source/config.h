@@ -1,0 +1,48 @@
+// Settings of a map: config.py, read from JSON, with the same names, rules and defaults.
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "generated.h"
+#include "runtime/source/json.h"
+
+class Config {
+    struct Entry {
+        bool is_null;
+        double values[3];
+    };
+    std::vector<Entry> entries;  // in the order of SETTINGS
+
+    static size_t find(const std::string& name);
+    void read_group(const Json& group, const std::string& prefix);
+    void read_setting(size_t k, const Json& value);
+    void read_group_setting(size_t k, const Json& value);
+    void read_place(size_t k, const Json& value);
+    void check() const;
+    void check_grid() const;
+    void check_sensor() const;
+    void check_drift() const;
+    void check_fusion() const;
+    void check_rays() const;
+    void check_surface() const;
+    void require_rule(bool holds, const std::string& name, const std::string& rule, const std::string& hint) const;
+    void require_at_least(const std::string& name, double least, const std::string& rule, const std::string& hint) const;
+
+  public:
+    // Read the text of a file; errors name it. Raises Error.
+    Config(const std::string& text, const std::string& where);
+
+    bool has(const std::string& name) const { return !entries[find(name)].is_null; }
+    double operator[](const std::string& name) const { return entries[find(name)].values[0]; }
+    const double* place(const std::string& name) const { return entries[find(name)].values; }
+    int64_t rows() const;
+    int64_t columns() const;
+    // The least traversability of cells that measure the drift: `drift_gate`.
+    double drift_gate() const;
+    // All settings, whatever was given and what was left out: a canonical text, to compare configs.
+    std::string canonical() const;
+};
+
+// What the equations need of a config: `settings` of each stage's kernel.py.
+Settings settings_of(const Config& cfg);

@@ -1,0 +1,226 @@
+// A map that is updated in place, without Python: elevation_map.py.
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF  // layers are rounded as in torch
+#else
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#include "runtime/source/map.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "runtime/source/team.h"
+
+namespace {
+
+const char* const LAYERS[] = {"elevation", "variance", "time", "upper_bound", "traversability",
+                              "normal_x",  "normal_y", "normal_z"};
+enum Layer { ELEVATION, VARIANCE, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z };
+
+constexpr torchelev_limits USUAL{131072, 4, 1};
+
+torchelev_limits checked_limits(const torchelev_limits* given) {
+    const torchelev_limits limits = given ? *given : USUAL;
+    auto require_positive = [](const char* name, int64_t value, int64_t most, const char* hint) {
+        require(value > 0 && value <= most, name, "must be from 1 to " + std::to_string(most), std::to_string(value),
+                hint);
+    };
+    require_positive("limits.max_points", limits.max_points, int64_t(1) << 30, "give the points of a scan");
+    require_positive("limits.max_sensors", limits.max_sensors, 1 << 10, "give the number of sensors");
+    require_positive("limits.num_threads", limits.num_threads, 1 << 10, "give the number of free cores");
+    return limits;
+}
+
+template <class T> void fill(void* to, int64_t count, double value) { std::fill_n(static_cast<T*>(to), count, T(value)); }
+
+void fill_tensor(const Tensor& tensor, void* to, int64_t count) {
+    const std::string dtype = tensor.dtype;
+    if (dtype == "F32") return fill<float>(to, count, tensor.blank);
+    if (dtype == "I64") return fill<int64_t>(to, count, tensor.blank);
+    fill<uint8_t>(to, count, tensor.blank);
+}
+
+// What the position's covariance adds to a height's variance: `pose_variance` of layers.py.
+float pose_variance(const float* C, float gx, float gy) {
+    const float level = C[0] * (gx * gx) + 2 * C[1] * gx * gy + C[4] * (gy * gy);
+    return std::max(level + C[8] - 2 * (C[2] * gx + C[5] * gy), 0.0f);
+}
+
+float normal_component(float gx, float gy, int axis) {
+    const float component[] = {-gx, -gy, 1};
+    return component[axis] / std::sqrt(1 + gx * gx + gy * gy);
+}
+
+}  // namespace
+
+// Creation -----------------------------------------------------------------------------------------------------------
+
+torchelev_map::torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* given)
+    : cfg(text, where), settings(settings_of(cfg)), sizes{}, limits(checked_limits(given)) {
+    sizes.B = 1, sizes.H = cfg.rows(), sizes.W = cfg.columns();
+    void* addresses[NUMBER_OF_TENSORS];
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
+        tensors.emplace_back(new unsigned char[bytes(k)]);
+        addresses[k] = tensors.back().get();
+    }
+    static_assert(sizeof(MapState) == sizeof addresses && std::size(STATE) == NUMBER_OF_TENSORS);
+    std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
+    covariance.resize(36 * limits.max_sensors);
+    if (!team) use_team(run_on_shared_team);
+    if (limits.num_threads > 1) Team::shared().grow(limits.num_threads - 1);
+    warm_up();
+    forget();
+}
+
+int64_t torchelev_map::count(size_t k) const {
+    int64_t count = 1;
+    for (const int64_t size : STATE[k].shape)
+        count *= size == ROWS ? sizes.H : size == COLUMNS ? sizes.W : size > 0 ? size : 1;
+    return count;
+}
+
+size_t torchelev_map::find(const std::string& name) const {
+    size_t k = 0;
+    while (k < NUMBER_OF_TENSORS && name != STATE[k].name) k++;
+    return k;
+}
+
+void torchelev_map::forget() {
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) fill_tensor(STATE[k], tensors[k].get(), count(k));
+    state.corner[0] = -(sizes.H / 2), state.corner[1] = -(sizes.W / 2);
+}
+
+// Run the largest updates, so that later ones allocate nothing: first a point in each cell, then rays beyond the window.
+void torchelev_map::warm_up() {
+    const double T[] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 1}, size = resolution();
+    std::vector<float> points(3 * limits.max_points), variance(limits.max_points, 1e-4f);
+    std::vector<double> poses, covariances(36 * limits.max_sensors, 0.0);
+    for (int k = 0; k < limits.max_sensors; k++) poses.insert(poses.end(), T, T + 16);
+    for (const int sensors : {1, limits.max_sensors})
+        for (const float scale : {1.0f, 2.5f}) {
+            const int64_t N = limits.max_points / sensors;
+            forget();
+            for (int64_t k = 0; k < N * sensors; k++) {
+                const int64_t cell = k % cells();
+                points[3 * k] = scale * float((double(cell / sizes.W - sizes.H / 2) + 0.5) * size);
+                points[3 * k + 1] = scale * float((double(cell % sizes.W - sizes.W / 2) + 0.5) * size);
+                points[3 * k + 2] = -1 + 0.01f * float(k % 7);
+            }
+            const torchelev_input input{sensors, N, points.data(), poses.data(), T, 0.1, variance.data(),
+                                        covariances.data()};
+            for (int repeat = 0; repeat < 2; repeat++) run(input, ORDER, std::size(ORDER));
+        }
+}
+
+// Updates ------------------------------------------------------------------------------------------------------------
+
+void torchelev_map::check(const torchelev_input& input) const {
+    const int64_t S = input.num_sensors, N = input.num_points;
+    require(S >= 1 && S <= limits.max_sensors, "input.num_sensors",
+            "must be from 1 to " + std::to_string(limits.max_sensors), std::to_string(S),
+            "create the map with larger limits");
+    require(N >= 0 && N <= limits.max_points / S, "input.num_points",
+            "must be from 0 to " + std::to_string(limits.max_points / S) + " of each sensor", std::to_string(N),
+            "create the map with larger limits");
+    require(input.points || N == 0, "input.points", "must be given", "null", "give (S, N, 3) floats");
+    require(input.T_map_sensor, "T_map_sensor", "must be given", "null", "give (S, 4, 4) doubles");
+    require_poses("T_map_sensor", input.T_map_sensor, S);
+    if (input.T_map_base) require_poses("T_map_base", input.T_map_base, 1);
+    require(std::isfinite(input.dt) && input.dt >= 0, "dt", "must be finite and not negative", repr(input.dt),
+            "give the seconds since the last update");
+}
+
+namespace {
+
+// Whether a symmetric matrix (6, 6), to which `least` is added on its diagonal, has no negative eigenvalue: its
+// Cholesky factorisation exists.
+bool is_semidefinite(const double* matrix, double least) {
+    double L[6][6] = {};
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j <= i; j++) {
+            double rest = matrix[6 * i + j] + (i == j ? least : 0);
+            for (int k = 0; k < j; k++) rest -= L[i][k] * L[j][k];
+            if (i == j && rest < 0) return false;
+            L[i][j] = i == j ? std::sqrt(rest) : L[j][j] > 0 ? rest / L[j][j] : 0;
+        }
+    return true;
+}
+
+void require_covariances(const double* values, int64_t number) {
+    const char* name = "pose_covariance";
+    double scale = 0;
+    for (int64_t k = 0; k < 36 * number; k++) {
+        require(std::isfinite(values[k]), name, "must be finite", "NaN or inf",
+                "where the pose's uncertainty is unknown, leave it out");
+        scale = std::max(scale, std::fabs(values[k]));
+    }
+    for (int64_t s = 0; s < number; s++) {
+        const double* matrix = values + 36 * s;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < i; j++)
+                require(std::fabs(matrix[6 * i + j] - matrix[6 * j + i]) <= 1e-4 * scale, name, "must be symmetric",
+                        "another", "give the covariance of x, y, z and the rotations about the map's axes");
+        require(is_semidefinite(matrix, 1e-4 * scale), name, "must have no negative eigenvalue", "one",
+                "give the covariance of x, y, z and the rotations about the map's axes");
+    }
+}
+
+}  // namespace
+
+void torchelev_map::update(const torchelev_input& input) {
+    check(input);
+    if (input.pose_covariance) require_covariances(input.pose_covariance, input.num_sensors);
+    run(input, ORDER, std::size(ORDER));
+}
+
+void torchelev_map::move(const double* T_map_base) {
+    require(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
+    require_poses("T_map_base", T_map_base, 1);
+    const torchelev_input input{1, 0, nullptr, T_map_base, T_map_base, 0, nullptr, nullptr};
+    const Stage stages[] = {run_measure, run_recenter};
+    run(input, stages, std::size(stages));
+}
+
+void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64_t number) {
+    float dt = float(input.dt);
+    Inputs inputs{};
+    inputs.points = const_cast<float*>(input.points), inputs.variance = const_cast<float*>(input.variance);
+    inputs.T_map_sensor = const_cast<double*>(input.T_map_sensor);
+    inputs.T_map_base = const_cast<double*>(input.T_map_base);
+    inputs.dt = &dt;
+    if (input.pose_covariance) {
+        std::copy_n(input.pose_covariance, 36 * input.num_sensors, covariance.begin());
+        inputs.pose_covariance = covariance.data();
+    }
+    sizes.S = input.num_sensors, sizes.N = input.num_points, sizes.M = sizes.S * sizes.N;
+    sizes.P = sizes.S > 1 ? sizes.S : 0;
+    Update one{settings, sizes, state, inputs, own.measurement, own.memory, limits.num_threads};
+    run_stages(one, stages, number);
+}
+
+// Reading ------------------------------------------------------------------------------------------------------------
+
+int torchelev_map::layer(const std::string& name) {
+    std::string names;
+    for (int k = 0; k < int(std::size(LAYERS)); k++) {
+        if (name == LAYERS[k]) return k;
+        names += (k ? ", " : "") + std::string(LAYERS[k]);
+    }
+    throw Error{TORCHELEV_BAD_VALUE, message("layer", "must be one of " + names, "'" + name + "'", "use elevation")};
+}
+
+CellValue torchelev_map::read(int layer, int64_t k) const {
+    const MapState& s = state;
+    const float gx = s.gradient_x[k], gy = s.gradient_y[k];
+    const bool known = s.validity[k];
+    switch (layer) {
+        case ELEVATION: return {s.elevation[k], known};
+        case VARIANCE: return {s.variance[k] + pose_variance(s.pose_covariance, gx, gy), known};
+        case TIME: return {s.time[k], known};
+        case UPPER_BOUND: return {known ? s.elevation[k] : s.upper_bound[k], known || s.bounded[k]};
+        case TRAVERSABILITY: return {s.traversability[k], known && s.rated[k]};
+        default: return {normal_component(gx, gy, layer - NORMAL_X), known && s.has_normal[k]};
+    }
+}

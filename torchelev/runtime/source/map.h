@@ -1,0 +1,54 @@
+// One map: its settings, its tensors, and what updates need besides.
+#pragma once
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "runtime/source/config.h"
+#include "tables.h"
+
+constexpr size_t NUMBER_OF_TENSORS = sizeof(MapState) / sizeof(void*);
+
+// A value and whether it is known.
+struct CellValue {
+    float value;
+    bool known;
+};
+
+struct torchelev_map {
+    Config cfg;
+    Settings settings;
+    Sizes sizes;
+    torchelev_limits limits;
+    Own own;
+    std::vector<std::unique_ptr<unsigned char[]>> tensors;  // in the order of STATE
+    MapState state;                                         // their addresses
+    std::vector<float> covariance;                          // (S, 6, 6) of the input
+
+    torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* limits);
+
+    int64_t cells() const { return sizes.H * sizes.W; }
+    double resolution() const { return settings.measure.resolution; }
+    int64_t count(size_t k) const;                               // of a tensor's elements
+    size_t bytes(size_t k) const { return count(k) * STATE[k].size; }
+    size_t find(const std::string& name) const;                  // a tensor; NUMBER_OF_TENSORS without it
+    void forget();                                               // make the map blank
+    void update(const torchelev_input& input);
+    void move(const double* T_map_base);
+    CellValue read(int layer, int64_t cell) const;               // a cell of a layer by its number
+    static int layer(const std::string& name);                   // its number; raises Error
+
+  private:
+    void check(const torchelev_input& input) const;
+    void run(const torchelev_input& input, const Stage* stages, int64_t number);
+    void warm_up();
+};
+
+// Refuse matrices (number, 4, 4) that are not rigid, as `check_pose` does.
+void require_poses(const std::string& name, const double* poses, int64_t number);
+
+// A saved map: state_file.cpp.
+void save_state(const torchelev_map& map, const std::string& path);
+void load_state(torchelev_map& map, const std::string& path);
+std::string read_file(const std::string& path);

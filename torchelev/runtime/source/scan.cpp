@@ -1,0 +1,230 @@
+// Height scans without Python: height_scan.py, scan_settings.py and scan_layout.py.
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same points are known
+#else
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#include "runtime/source/scan.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace {
+
+constexpr double MARGIN = 0.5, MAX_BLOCK = 1.0;  // [m] of ground.py
+constexpr double REACH = 0.6;                    // [m] of feet from the base, of `HeightScan.feet`
+
+const Preset* find_preset(const std::string& name) {
+    for (const Preset& preset : PRESETS)
+        if (name == preset.name) return &preset;
+    return nullptr;
+}
+
+int place_of(const std::string& name, const std::string& value, std::initializer_list<const char*> values) {
+    std::string names;
+    int k = 0;
+    for (const char* one : values) {
+        if (value == one) return k;
+        names += (k++ ? ", " : "") + std::string(one);
+    }
+    throw Error{TORCHELEV_BAD_VALUE, message(name, "must be one of " + names, "'" + value + "'", "see the docs")};
+}
+
+const std::initializer_list<const char*> KEYS = {"pattern",  "alignment",       "mode",          "nominal_height",
+                                                 "clip",     "scale",           "fill",          "original",
+                                                 "standing_height", "inpaint_rings", "num_feet", "reach"};
+
+// A layout as JSON.
+class Layout {
+    const Json root;
+
+    static const Json& null() {
+        static const Json value;
+        return value;
+    }
+
+  public:
+    explicit Layout(const std::string& text) : root(JsonReader::read(text, "layout")) {
+        require(root.kind == Json::OBJECT, "layout", "must be a mapping", root.describe(), "give what scan_layout returned");
+        for (const auto& [name, value] : root.members) place_of("layout." + name, name, KEYS);
+    }
+
+    const Json& operator[](const std::string& name) const {
+        const Json* found = root.find(name);
+        return found ? *found : null();
+    }
+
+    double number(const std::string& name, double usual, double least = -INFINITY) const {
+        const Json& value = (*this)[name];
+        if (value.kind == Json::NUL) return usual;
+        const bool fits = value.kind == Json::NUMBER && std::isfinite(value.number) && value.number >= least;
+        require(fits, "layout." + name, "must be a finite number", value.describe(), "leave it out for its default");
+        return value.number;
+    }
+
+    int64_t count(const std::string& name, int64_t usual) const {
+        const double value = number(name, double(usual), 0);
+        require(value == std::floor(value) && value < 1e6, "layout." + name, "must be an int of at least 0", repr(value),
+                "leave it out for its default");
+        return int64_t(value);
+    }
+
+    std::string text(const std::string& name, const char* usual) const {
+        const Json& value = (*this)[name];
+        if (value.kind == Json::NUL) return usual;
+        require(value.kind == Json::STRING, "layout." + name, "must be a name", value.describe(), std::string("give ") + usual);
+        return value.text;
+    }
+
+    std::vector<double> points() const {
+        const Json& pattern = (*this)["pattern"];
+        std::vector<double> xy;
+        bool fits = pattern.kind == Json::ARRAY && !pattern.items.empty();
+        for (const Json& point : pattern.items) {
+            fits = fits && point.kind == Json::ARRAY && point.items.size() == 2;
+            for (const Json& coordinate : point.items) {
+                fits = fits && coordinate.kind == Json::NUMBER && std::isfinite(coordinate.number);
+                xy.push_back(coordinate.number);
+            }
+        }
+        require(fits, "layout.pattern", "must be one or more points (x, y)", pattern.describe(), "give [[x, y], ...] in metres");
+        return xy;
+    }
+};
+
+constexpr scans::Fill NUMBER = scans::NONE;
+
+// A fill: its rule, and the number that it reads where nothing has a height; NAN: as over flat ground.
+struct Rule {
+    scans::Fill fill = NUMBER;
+    double value = NAN;
+    bool is_original = false;
+};
+
+Rule rule_of(const std::string& name, const Json& value, const char* usual) {
+    if (value.kind == Json::NUMBER) return {NUMBER, value.number};
+    const std::string text = value.kind == Json::STRING ? value.text : usual;
+    if (text == "inf" || text == "-inf") return {NUMBER, text == "inf" ? INFINITY : -INFINITY};
+    require(text != "completed", name, "needs Python: this library has no completion", "'completed'", "use ground",
+            TORCHELEV_UNSUPPORTED);
+    switch (place_of(name, text, {"ground", "original", "base", "lowest", "upper_bound", "inpaint"})) {
+        case 0: return {scans::GROUND};
+        case 1: return {NUMBER, NAN, true};
+        case 2: return {NUMBER};
+        case 3: return {scans::LOWEST};
+        case 4: return {scans::UPPER_BOUND};
+        default: return {scans::INPAINT};
+    }
+}
+
+}  // namespace
+
+torchelev_scan::torchelev_scan(const torchelev_map& map, const std::string& layout) {
+    std::vector<double> xy;
+    double reach = 0;
+    if (const Preset* preset = find_preset(layout)) use_preset(*preset, xy);
+    else {
+        const bool is_json = layout.find('{') != std::string::npos;
+        require(is_json, "layout", "must be one of isaac_lab, mjlab, legged_gym, or JSON", "'" + layout + "'",
+                "use isaac_lab");
+        reach = read_layout(layout, xy);
+    }
+    scan.points = int64_t(xy.size() / 2), scan.environments = 1;
+    pattern.assign(xy.begin(), xy.end());
+    place_in(map, xy, reach);
+    scan.pattern = pattern.data();
+    own_known.resize(size());
+    robot = std::make_unique<scans::Robot>(scan);
+    read_blank(map);
+}
+
+void torchelev_scan::use_preset(const Preset& preset, std::vector<double>& xy) {
+    const int outer = preset.is_x_fastest ? preset.num_y : preset.num_x;
+    const int inner = preset.is_x_fastest ? preset.num_x : preset.num_y;
+    for (int a = 0; a < outer; a++)
+        for (int b = 0; b < inner; b++) {
+            xy.push_back(preset.x[preset.is_x_fastest ? b : a]);
+            xy.push_back(preset.y[preset.is_x_fastest ? a : b]);
+        }
+    scan.mode = preset.mode, scan.alignment = scans::YAW, scan.fill = scans::GROUND, scan.rings = 5, scan.origins = 1;
+    scan.nominal_height = float(preset.nominal_height), scan.clip = float(preset.clip), scan.scale = float(preset.scale);
+    scan.missing = float(preset.standing_height - preset.nominal_height);
+}
+
+// Read a layout; return how far [m] feet may be from the base.
+double torchelev_scan::read_layout(const std::string& text, std::vector<double>& xy) {
+    const Layout layout(text);
+    xy = layout.points();
+    scan.alignment = place_of("layout.alignment", layout.text("alignment", "yaw"), {"yaw", "base", "world"});
+    scan.mode = place_of("layout.mode", layout.text("mode", "bilinear"), {"bilinear", "nearest", "minimum"});
+    const double nominal = layout.number("nominal_height", 0), clip = layout.number("clip", INFINITY);
+    require(clip > 0, "clip", "must be a positive number", repr(clip), "give metres");
+    scan.nominal_height = float(nominal), scan.clip = float(clip), scan.scale = float(layout.number("scale", 1));
+    scan.rings = int32_t(layout.count("inpaint_rings", 5));
+    Rule rule = rule_of("layout.fill", layout["fill"], "ground");
+    if (rule.is_original) rule = rule_of("layout.original", layout["original"], "base");
+    require(!rule.is_original, "layout.original", "must name a rule", "'original'", "use base");
+    require(!std::isinf(rule.value) || std::isfinite(clip), "layout.fill", "must be finite without a clip",
+            repr(rule.value), "give a clip");
+    const double standing = layout.number("standing_height", nominal);
+    scan.fill = rule.fill, scan.missing = float(std::isnan(rule.value) ? standing - nominal : rule.value);
+    num_feet = layout.count("num_feet", 0);
+    scan.origins = std::max<int64_t>(1, num_feet);
+    return layout.number("reach", num_feet ? REACH : 0, 0);
+}
+
+// What the map's grid decides, and whether the window holds the points at every heading: patterns.py and ground.py.
+void torchelev_scan::place_in(const torchelev_map& map, const std::vector<double>& xy, double reach) {
+    const double size = map.resolution();
+    double radius = 0, far_x = 0, far_y = 0;
+    for (size_t k = 0; k < xy.size(); k += 2) {
+        radius = std::max(radius, std::hypot(xy[k], xy[k + 1]));
+        far_x = std::max(far_x, std::fabs(xy[k])), far_y = std::max(far_y, std::fabs(xy[k + 1]));
+    }
+    const bool turns = scan.alignment != scans::WORLD;
+    const double span_x = reach + (turns ? radius : far_x), span_y = reach + (turns ? radius : far_y);
+    const double wanted_x = 2 * (span_x + size), wanted_y = 2 * (span_y + size);
+    const double length_x = map.cfg["grid.length_x"], length_y = map.cfg["grid.length_y"];
+    require(wanted_x <= length_x + 1e-9 && wanted_y <= length_y + 1e-9, "pattern",
+            "must lie in the map at any heading, which takes " + general(wanted_x, 3) + " x " + general(wanted_y, 3) + " m",
+            "a window of " + general(length_x) + " x " + general(length_y) + " m",
+            "enlarge length_x and length_y of GridConfig, or shrink the pattern");
+    scan.resolution = size, scan.height = map.sizes.H, scan.width = map.sizes.W;
+    scan.num_near = 1 + std::max(0, int(std::floor(std::log2(MAX_BLOCK / size))));
+    const int64_t margin = scan.fill == scans::INPAINT ? scan.rings : int64_t(std::ceil(MARGIN / size));
+    auto left_out = [&](int64_t cells, double span) {
+        return std::max<int64_t>(0, cells / 2 - (int64_t(std::ceil(span / size)) + 1) - margin);
+    };
+    scan.top = left_out(scan.height, span_x), scan.left = left_out(scan.width, span_y);
+}
+
+// Read where nothing is known, so that later reads allocate nothing.
+void torchelev_scan::read_blank(const torchelev_map& map) {
+    std::vector<uint8_t> nothing(map.cells()), known(size());
+    std::vector<float> values(size()), heights(map.cells());
+    std::vector<double> feet(3 * scan.origins);
+    const double T[] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    const int64_t corner[] = {-(scan.height / 2), -(scan.width / 2)};
+    scan.elevation = scan.upper_bound = heights.data(), scan.validity = scan.bounded = nothing.data();
+    scan.corner = corner, scan.pose = T, scan.feet = num_feet ? feet.data() : nullptr;
+    scan.values = values.data(), scan.valid = known.data();
+    robot->read_all();
+}
+
+void torchelev_scan::read(const torchelev_map& map, const double* T_map_base, const double* feet, float* values,
+                          uint8_t* known) {
+    require(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
+    require_poses("T_map_base", T_map_base, 1);
+    const bool fits = scan.height == map.sizes.H && scan.width == map.sizes.W && scan.resolution == map.resolution();
+    require(fits, "map", "must have the grid that the scan was created for", "another", "create a scan for this map");
+    require(bool(feet) == bool(num_feet), "feet", num_feet ? "must be given for a scan around feet" : "must be left out",
+            feet ? "feet for a scan around the base" : "null", "use a layout with num_feet for feet only");
+    for (int64_t k = 0; feet && k < 3 * num_feet; k++)
+        require(std::isfinite(feet[k]), "feet", "must be finite", "NaN or inf", "leave those feet out");
+    scan.pose = T_map_base, scan.feet = feet, scan.corner = map.state.corner;
+    scan.elevation = map.state.elevation, scan.validity = map.state.validity;
+    scan.upper_bound = map.state.upper_bound, scan.bounded = map.state.bounded;
+    scan.values = values, scan.valid = known ? known : own_known.data();
+    robot->read_all();
+}

@@ -1,0 +1,138 @@
+// Files of a whole map, as safetensors: eight bytes with the length of a JSON header, the header, the tensors.
+#include <cerrno>
+#include <cstdio>
+#include <cstring>
+#include <memory>
+
+#include "runtime/source/map.h"
+
+namespace {
+
+const char* const FORMAT = "torchelev map";
+const char* const VERSION = "1";
+constexpr uint64_t LONGEST = 1 << 20;  // [bytes] of a header
+
+using File = std::unique_ptr<std::FILE, int (*)(std::FILE*)>;
+
+std::string quoted(const std::string& text) {
+    std::string out = "\"";
+    for (const char c : text) {
+        if (c == '\n') out += "\\n";
+        else if (c == '"' || c == '\\') out += std::string("\\") + c;
+        else out += c;
+    }
+    return out + "\"";
+}
+
+std::string shape_of(const torchelev_map& map, size_t k) {
+    std::string text = "[1";
+    for (const int64_t size : STATE[k].shape)
+        if (size) text += "," + std::to_string(size == ROWS ? map.sizes.H : size == COLUMNS ? map.sizes.W : size);
+    return text + "]";
+}
+
+// The header, padded to whole eight bytes.
+std::string header_of(const torchelev_map& map) {
+    std::string text = "{\"__metadata__\":{\"format\":" + quoted(FORMAT) + ",\"version\":" + quoted(VERSION) +
+                       ",\"config\":" + quoted(map.cfg.canonical()) + "}";
+    size_t at = 0;
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
+        const size_t end = at + map.bytes(k);
+        text += "," + quoted(STATE[k].name) + ":{\"dtype\":" + quoted(STATE[k].dtype) + ",\"shape\":" + shape_of(map, k) +
+                ",\"data_offsets\":[" + std::to_string(at) + "," + std::to_string(end) + "]}";
+        at = end;
+    }
+    text += "}";
+    return text + std::string((8 - text.size() % 8) % 8, ' ');
+}
+
+[[noreturn]] void refuse(const std::string& path, const std::string& why) {
+    throw Error{TORCHELEV_BAD_FILE, path + ": " + why};
+}
+
+// Name the first setting that differs.
+std::string difference(const std::string& ours, const std::string& theirs) {
+    size_t line = 0, k = 0;
+    while (k < ours.size() && k < theirs.size() && ours[k] == theirs[k])
+        if (ours[k++] == '\n') line = k;
+    auto take = [&](const std::string& text) { return text.substr(line, text.find('\n', line) - line); };
+    return "\"" + take(theirs) + "\" instead of \"" + take(ours) + "\"";
+}
+
+void write_all(const torchelev_map& map, std::FILE* file, const std::string& path) {
+    const std::string header = header_of(map);
+    const uint64_t length = header.size();
+    unsigned char bytes[8];
+    for (int k = 0; k < 8; k++) bytes[k] = static_cast<unsigned char>(length >> (8 * k));
+    bool fits = std::fwrite(bytes, 1, 8, file) == 8 && std::fwrite(header.data(), 1, length, file) == length;
+    for (size_t k = 0; fits && k < NUMBER_OF_TENSORS; k++)
+        fits = std::fwrite(map.tensors[k].get(), 1, map.bytes(k), file) == map.bytes(k);
+    if (!fits || std::fflush(file) != 0) refuse(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+}
+
+// A tensor of a file whose values no update would leave behind.
+bool is_sound(const Tensor& tensor, const unsigned char* values, int64_t count) {
+    const std::string dtype = tensor.dtype;
+    for (int64_t k = 0; k < count; k++) {
+        float value;
+        if (dtype == "BOOL" && values[k] > 1) return false;
+        if (dtype != "F32") continue;
+        std::memcpy(&value, values + 4 * k, 4);
+        if (!std::isfinite(value)) return false;
+    }
+    return true;
+}
+
+}  // namespace
+
+std::string read_file(const std::string& path) {
+    const File file(std::fopen(path.c_str(), "rb"), std::fclose);
+    if (!file) refuse(path, std::string("cannot be read (") + std::strerror(errno) + ")");
+    std::string text;
+    char part[65536];
+    for (size_t n; (n = std::fread(part, 1, sizeof part, file.get())) > 0;) text.append(part, n);
+    if (std::ferror(file.get())) refuse(path, "cannot be read");
+    return text;
+}
+
+void save_state(const torchelev_map& map, const std::string& path) {
+    const std::string unfinished = path + ".unfinished";
+    try {
+        File file(std::fopen(unfinished.c_str(), "wb"), std::fclose);
+        if (!file) refuse(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+        write_all(map, file.get(), path);
+        if (std::fclose(file.release()) != 0 || std::rename(unfinished.c_str(), path.c_str()) != 0)
+            refuse(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+    } catch (...) {
+        std::remove(unfinished.c_str());
+        throw;
+    }
+}
+
+void load_state(torchelev_map& map, const std::string& path) {
+    const std::string text = read_file(path);
+    uint64_t length = 0;
+    for (int k = 0; k < 8 && text.size() >= 8; k++) length |= uint64_t(static_cast<unsigned char>(text[k])) << (8 * k);
+    if (text.size() < 8 || length > LONGEST || length > text.size() - 8) refuse(path, "no file of safetensors, or damaged");
+    const Json root = JsonReader::read(text.substr(8, length), path);
+    const Json* data = root.find("__metadata__");
+    auto is = [&](const char* name, const std::string& wanted) {
+        const Json* found = data ? data->find(name) : nullptr;
+        return found && found->text == wanted;
+    };
+    if (!is("format", FORMAT)) refuse(path, "no map; write it with torchelev_map_save");
+    if (!is("version", VERSION)) refuse(path, "of another version; read it with a newer torchelev");
+    const Json* config = data->find("config");
+    const std::string theirs = config ? config->text : "", ours = map.cfg.canonical();
+    if (theirs != ours) refuse(path, "the map of another config, " + difference(ours, theirs) + "; create the map with its config");
+    // With the same config, the header of a whole file is the one that this map would write.
+    if (text.substr(8, length) != header_of(map)) refuse(path, "damaged: its header does not describe a map");
+    size_t at = 8 + length, end = at;
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) end += map.bytes(k);
+    if (text.size() != end) refuse(path, "damaged: " + std::to_string(text.size()) + " bytes instead of " + std::to_string(end));
+    const auto* bytes = reinterpret_cast<const unsigned char*>(text.data());
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++))
+        if (!is_sound(STATE[k], bytes + at, map.count(k))) refuse(path, std::string("damaged: ") + STATE[k].name + " is not finite");
+    at = 8 + length;
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++)) std::memcpy(map.tensors[k].get(), bytes + at, map.bytes(k));
+}

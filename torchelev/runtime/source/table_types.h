@@ -1,0 +1,40 @@
+// The types of the tables that follow from Python's declarations: generate.py.
+#pragma once
+
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <iterator>
+
+#include "kernels/update.h"
+#include "observations/kernel/scan.h"
+
+// GROUP: an object of settings. ONLY_PYTHON: what this library cannot do. IGNORED: what no update reads.
+enum Kind { GROUP, NUMBER, INTEGER, PLACE, ONLY_PYTHON, IGNORED };
+
+struct Setting {
+    const char* name;  // with its groups, as "fusion.edges.margin"
+    Kind kind;
+    bool is_nullable, is_null;
+    double values[3];  // by default
+};
+
+constexpr int64_t ROWS = -1, COLUMNS = -2;
+
+struct Tensor {
+    const char *name, *dtype;  // of safetensors
+    size_t size;               // [bytes] of an element
+    int64_t shape[2];          // of one map; 0: none
+    double blank;
+};
+
+struct Preset {
+    const char* name;
+    const double* x;
+    int num_x;
+    const double* y;
+    int num_y;
+    bool is_x_fastest;
+    scans::Mode mode;
+    double nominal_height, clip, scale, standing_height, original;  // original: NAN for "base"
+};

@@ -1,0 +1,205 @@
+// The functions of torchelev.h.
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF  // samples are rounded as in torch
+#else
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#include <cstring>
+#include <new>
+
+#include "runtime/source/scan.h"
+
+namespace {
+
+thread_local std::string last_error;
+
+// Do the work, and turn what it throws into a status.
+template <class Work> torchelev_status status_of(const Work& work) {
+    try {
+        work();
+        return TORCHELEV_OK;
+    } catch (const Error& error) {
+        last_error = error.text;
+        return error.status;
+    } catch (const std::exception& error) {
+        last_error = std::string("there is not enough memory, or not enough threads (") + error.what() + ")";
+        return TORCHELEV_NO_MEMORY;
+    }
+}
+
+template <class T> T& given(const char* name, T* value) {
+    require(value, name, "must be given", "null", "see torchelev.h");
+    return *value;
+}
+
+// A layer whose cells are computed as they are read; cells outside are not known.
+struct CellsOfLayer {
+    const torchelev_map& map;
+    int layer;
+
+    scans::Read at(Lanes i, Lanes j) const {
+        scans::Read found{splat(0), Flags{}};
+        for (int l = 0; l < LANES; l++) {
+            if (!(i[l] >= 0 && i[l] < float(map.sizes.H) && j[l] >= 0 && j[l] < float(map.sizes.W))) continue;
+            const CellValue cell = map.read(layer, int64_t(i[l]) * map.sizes.W + int64_t(j[l]));
+            if (cell.known) found.value[l] = cell.value, found.known[l] = -1;
+        }
+        return found;
+    }
+};
+
+void sample(const torchelev_map& map, int layer, scans::Mode mode, const double* xy, int64_t number, float* values,
+            uint8_t* known) {
+    const CellsOfLayer cells{map, layer};
+    for (int64_t first = 0; first < number; first += LANES) {
+        float u[LANES]{}, v[LANES]{};
+        const int count = int(std::min<int64_t>(LANES, number - first));
+        for (int l = 0; l < count; l++) {
+            u[l] = scans::to_cells(xy[2 * (first + l)], map.state.corner[0], map.resolution());
+            v[l] = scans::to_cells(xy[2 * (first + l) + 1], map.state.corner[1], map.resolution());
+        }
+        const scans::Read found = scans::read(cells, load(u), load(v), mode);
+        for (int l = 0; l < count; l++) {
+            values[first + l] = found.known[l] ? found.value[l] : 0;
+            if (known) known[first + l] = found.known[l] != 0;
+        }
+    }
+}
+
+torchelev_status create(const std::string& text, const std::string& where, const torchelev_limits* limits,
+                        torchelev_map** map) {
+    return status_of([&] { given("map", map) = new torchelev_map(text, where, limits); });
+}
+
+}  // namespace
+
+extern "C" {
+
+const char* torchelev_last_error(void) { return last_error.c_str(); }
+
+const char* torchelev_version(void) { return TORCHELEV_VERSION; }
+
+torchelev_status torchelev_map_create(const char* config_path, const torchelev_limits* limits, torchelev_map** map) {
+    std::string text;
+    const torchelev_status status = status_of([&] { text = read_file(&given("config_path", config_path)); });
+    return status ? status : create(text, config_path, limits, map);
+}
+
+torchelev_status torchelev_map_create_from_text(const char* config, const torchelev_limits* limits,
+                                                torchelev_map** map) {
+    const torchelev_status status = status_of([&] { given("config", config); });
+    return status ? status : create(config, "config", limits, map);
+}
+
+void torchelev_map_free(torchelev_map* map) { delete map; }
+
+torchelev_status torchelev_map_reset(torchelev_map* map) {
+    return status_of([&] { given("map", map).forget(); });
+}
+
+torchelev_status torchelev_map_update(torchelev_map* map, const torchelev_input* input) {
+    return status_of([&] { given("map", map).update(given("input", input)); });
+}
+
+torchelev_status torchelev_map_move(torchelev_map* map, const double* T_map_base) {
+    return status_of([&] { given("map", map).move(T_map_base); });
+}
+
+torchelev_status torchelev_map_size(const torchelev_map* map, int64_t* rows, int64_t* columns, double* resolution) {
+    return status_of([&] {
+        const torchelev_map& m = given("map", map);
+        if (rows) *rows = m.sizes.H;
+        if (columns) *columns = m.sizes.W;
+        if (resolution) *resolution = m.resolution();
+    });
+}
+
+torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]) {
+    return status_of([&] {
+        const torchelev_map& m = given("map", map);
+        for (int axis = 0; axis < 2; axis++) (&given("corner", corner))[axis] = double(m.state.corner[axis]) * m.resolution();
+    });
+}
+
+torchelev_status torchelev_map_layer(const torchelev_map* map, const char* name, float* values, size_t size) {
+    return status_of([&] {
+        const torchelev_map& m = given("map", map);
+        const int layer = torchelev_map::layer(&given("name", name));
+        given("values", values);
+        require(size >= size_t(m.cells()), "size", "must be at least " + std::to_string(m.cells()), std::to_string(size),
+                "see torchelev_map_size");
+        for (int64_t k = 0; k < m.cells(); k++) {
+            const CellValue cell = m.read(layer, k);
+            values[k] = cell.known ? cell.value : NAN;
+        }
+    });
+}
+
+const void* torchelev_map_tensor(const torchelev_map* map, const char* name, size_t* size_bytes) {
+    const void* found = nullptr;
+    status_of([&] {
+        const torchelev_map& m = given("map", map);
+        const size_t k = m.find(&given("name", name));
+        require(k < NUMBER_OF_TENSORS, "name", "must be a tensor of MapState", std::string("'") + name + "'",
+                "use elevation");
+        if (size_bytes) *size_bytes = m.bytes(k);
+        found = m.tensors[k].get();
+    });
+    return found;
+}
+
+torchelev_status torchelev_map_sample(const torchelev_map* map, const char* name, const char* mode, const double* xy,
+                                      int64_t num_points, float* values, uint8_t* known) {
+    return status_of([&] {
+        const torchelev_map& m = given("map", map);
+        const int layer = torchelev_map::layer(&given("name", name));
+        const std::string how = &given("mode", mode);
+        require(how == "bilinear" || how == "nearest", "mode", "must be one of bilinear, nearest", "'" + how + "'",
+                "use bilinear");
+        require(num_points >= 0, "num_points", "must not be negative", std::to_string(num_points), "give M");
+        if (num_points == 0) return;
+        given("xy", xy), given("values", values);
+        sample(m, layer, how == "nearest" ? scans::NEAREST : scans::BILINEAR, xy, num_points, values, known);
+    });
+}
+
+torchelev_status torchelev_map_statistics(const torchelev_map* map, torchelev_statistics* statistics) {
+    return status_of([&] {
+        const Statistics& s = given("map", map).state.statistics;
+        given("statistics", statistics) = {
+            *s.points_used,       *s.rejected_invalid, *s.rejected_range,   *s.rejected_body,
+            *s.rejected_overhang, *s.rejected_outside, *s.rejected_outlier, *s.rejected_edge,
+            *s.drift_points,      *s.drift_error,      *s.drift_correction, *s.disagreement,
+            *s.cleared_seen_through, *s.cleared_other_floors, *s.cells_bounded};
+    });
+}
+
+torchelev_status torchelev_map_save(const torchelev_map* map, const char* path) {
+    return status_of([&] { save_state(given("map", map), &given("path", path)); });
+}
+
+torchelev_status torchelev_map_load(torchelev_map* map, const char* path) {
+    return status_of([&] { load_state(given("map", map), &given("path", path)); });
+}
+
+torchelev_status torchelev_scan_create(const torchelev_map* map, const char* layout, torchelev_scan** scan) {
+    return status_of([&] {
+        given("scan", scan) = new torchelev_scan(given("map", map), &given("layout", layout));
+    });
+}
+
+void torchelev_scan_free(torchelev_scan* scan) { delete scan; }
+
+int64_t torchelev_scan_size(const torchelev_scan* scan) { return scan ? scan->size() : 0; }
+
+torchelev_status torchelev_scan_read(torchelev_scan* scan, const torchelev_map* map, const double* T_map_base,
+                                     const double* feet, float* values, uint8_t* known) {
+    return status_of([&] {
+        torchelev_scan& s = given("scan", scan);
+        given("values", values);
+        s.read(given("map", map), T_map_base, feet, values, known);
+    });
+}
+
+}  // extern "C"
