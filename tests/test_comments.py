@@ -25,7 +25,7 @@ FOREIGN = {
     *("mdp.height_scan", "measured_points_x", "measured_points_y"),  # Isaac Lab, legged_gym
     *("cam_quat", "mj_kinematics"),  # MuJoCo
     *("env.call", "spec.max_episode_steps"),  # gymnasium
-    *("camera_link", "tensorstore.TensorStore", "compression_common.h", "malloc.h"),
+    *("camera_link", "tensorstore.TensorStore", "compression_common.h", "malloc.h", "libtorchelev"),
 }
 CODE = "torchelev", "envs", "training", "benchmarks", "docs", "examples", "tests"
 SOURCES = ".py", ".h", ".cpp", ".cu"

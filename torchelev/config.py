@@ -113,8 +113,10 @@ class ElevationMapConfig:
         return dataclasses.replace(_build(cls, stages, "config"), filters=filters_from_list(values["filters"]))
 
     def save(self, path: str | Path) -> None:
-        """Write all settings as JSON, by group and name, with a version: what `load`, the command line's `--config` and
-        the C library `libtorchelev` read. Units are those of this class's fields: metres, seconds and radians.
+        """Write all settings as JSON, by group and name, with a version.
+
+        `load`, the command line's `--config` and the C library `libtorchelev` read it. Units are those of this class's
+        fields: metres, seconds and radians.
 
         Raises:
             WriteError: the file cannot be written; an existing one is left as it was.

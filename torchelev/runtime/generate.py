@@ -65,7 +65,8 @@ def _number(value: float) -> str:
 
 def _settings(cfg: Any, prefix: str) -> Iterator[str]:
     """Yield a row for each setting below a config's group, the groups included, before what they hold."""
-    for name, hint in setting_types(type(cfg)).items():
+    cls: Any = type(cfg)
+    for name, hint in setting_types(cls).items():
         kinds = [kind for kind in (typing.get_args(hint) or (hint,)) if kind is not type(None)]
         nullable = type(None) in typing.get_args(hint)
         value, path = getattr(cfg, name), prefix + name

@@ -210,7 +210,11 @@ class CScan:
     def __call__(self, T_map_base: Any, feet: Any = None) -> tuple[NDArray, NDArray]:
         """Return values (P), and where the elevation is known."""
         size = self._library.torchelev_scan_size(self._scan)
-        pose, values, known = np.ascontiguousarray(T_map_base, np.float64), np.empty(size, np.float32), np.empty(size, bool)
+        pose, values, known = (
+            np.ascontiguousarray(T_map_base, np.float64),
+            np.empty(size, np.float32),
+            np.empty(size, bool),
+        )
         feet = None if feet is None else np.ascontiguousarray(feet, np.float64)
         places = (_POINTER(_address(array)) for array in (pose, feet, values, known))
         self._emap._call("torchelev_scan_read", self._scan, self._emap._map, *places)

@@ -23,6 +23,7 @@ def write_instant(file: BinaryIO, points: Any, T_map_sensor: Any, T_map_base: An
     actual = f"{points.shape} and {poses.shape}"
     require(fits, "points, T_map_sensor", "expected (S, N, 3) and (S, 4, 4)", actual, "give one pose per sensor")
     head = np.zeros((), HEAD)
-    head["dt"], head["T_map_base"], head["num_sensors"], head["num_points"] = dt, T_map_base, *points.shape[:2]
+    head["dt"], head["T_map_base"] = dt, T_map_base
+    head["num_sensors"], head["num_points"] = points.shape[:2]
     for part in (head, poses, points):
         file.write(part.tobytes())

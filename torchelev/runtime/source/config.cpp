@@ -27,7 +27,7 @@ std::string names_in(const std::string& group) {
 void require_known_version(const Json& root, const std::string& where) {
     const Json* version = root.find(VERSION_NAME);
     const bool is_known = !version || (version->is_whole && version->number == VERSION);
-    require(is_known, where + ", " + VERSION_NAME, "must be 1", version ? version->describe() : "none",
+    REQUIRE(is_known, where + ", " + VERSION_NAME, "must be 1", version ? version->describe() : "none",
             "read it with a newer torchelev", TORCHELEV_BAD_FILE);
 }
 
@@ -44,7 +44,7 @@ size_t Config::find(const std::string& name) {
 Config::Config(const std::string& text, const std::string& where) {
     for (const Setting& s : SETTINGS) entries.push_back({s.is_null, {s.values[0], s.values[1], s.values[2]}});
     Json root = JsonReader::read(text, where);
-    require(root.kind == Json::OBJECT, "config", "must be a mapping", root.describe(), "see ElevationMapConfig");
+    REQUIRE(root.kind == Json::OBJECT, "config", "must be a mapping", root.type(), "see ElevationMapConfig");
     require_known_version(root, where);
     read_group(root, "");
     check();
@@ -55,7 +55,7 @@ void Config::read_group(const Json& group, const std::string& prefix) {
         if (prefix.empty() && name == VERSION_NAME) continue;
         const size_t k = find(prefix + name);
         const std::string parent = prefix.empty() ? "" : prefix.substr(0, prefix.size() - 1);
-        require(k < NUMBER_OF_SETTINGS, "config." + prefix + name, "is not a setting", "'" + name + "'",
+        REQUIRE(k < NUMBER_OF_SETTINGS, "config." + prefix + name, "is not a setting", "'" + name + "'",
                 "there are " + names_in(parent));
         read_setting(k, value);
     }
@@ -67,20 +67,21 @@ void Config::read_setting(size_t k, const Json& value) {
     if (setting.kind == IGNORED) return;
     if (setting.kind == ONLY_PYTHON) {
         const bool is_off = value.kind == Json::NUL || (value.kind == Json::ARRAY && value.items.empty());
-        return require(is_off, where, "needs Python: this library has neither filters nor completion",
+        REQUIRE(is_off, where, "needs Python: this library has neither filters nor completion",
                        value.describe(), "leave it out, or run the map in Python", TORCHELEV_UNSUPPORTED);
+        return;
     }
     if (setting.kind == GROUP) return read_group_setting(k, value);
     if (value.kind == Json::NUL) {
-        require(setting.is_nullable, where, "cannot be switched off", "None", "leave it out to keep its default");
+        REQUIRE(setting.is_nullable, where, "cannot be switched off", "None", "leave it out to keep its default");
         entries[k].is_null = true;
         return;
     }
     if (setting.kind == PLACE) return read_place(k, value);
     const bool is_infinite = value.kind == Json::STRING && (value.text == "inf" || value.text == "-inf");
-    require(value.kind == Json::NUMBER || is_infinite, where, "must be a number", value.describe(),
+    REQUIRE(value.kind == Json::NUMBER || is_infinite, where, "must be a number", value.describe(),
             "give a number without quotes");
-    require(setting.kind == NUMBER || (value.is_whole && std::fabs(value.number) < 2147483648.0), setting.name,
+    REQUIRE(setting.kind == NUMBER || (value.is_whole && std::fabs(value.number) < 2147483648.0), setting.name,
             "must be a positive int", value.describe(), "see its default");
     const double infinite = value.text == "inf" ? INFINITY : -INFINITY;
     entries[k].is_null = false, entries[k].values[0] = is_infinite ? infinite : value.number;
@@ -90,14 +91,16 @@ void Config::read_group_setting(size_t k, const Json& value) {
     const Setting& setting = SETTINGS[k];
     const std::string where = std::string("config.") + setting.name, name = setting.name;
     entries[k].is_null = value.kind == Json::NUL;
-    if (value.kind == Json::NUL)
-        return require(setting.is_nullable, where, "cannot be switched off", "None", "leave it out to keep its default");
-    require(value.kind == Json::OBJECT, where, "must be a mapping", value.describe(), "see ElevationMapConfig");
+    if (value.kind == Json::NUL) {
+        REQUIRE(setting.is_nullable, where, "cannot be switched off", "None", "leave it out to keep its default");
+        return;
+    }
+    REQUIRE(value.kind == Json::OBJECT, where, "must be a mapping", value.type(), "see ElevationMapConfig");
     const bool is_body = name == "sensor.body" && (value.find("capsules") || value.find("boxes"));
-    require(!is_body, where, "needs Python: this library has no shapes of links", "capsules and boxes",
+    REQUIRE(!is_body, where, "needs Python: this library has no shapes of links", "capsules and boxes",
             "give the box `lower` and `upper`, or run the map in Python", TORCHELEV_UNSUPPORTED);
     const bool is_learned = name == "traversability" && value.find("weights");
-    require(!is_learned, where, "needs Python: this library has no learned head", "weights",
+    REQUIRE(!is_learned, where, "needs Python: this library has no learned head", "weights",
             "give the analytic head, or null for no traversability", TORCHELEV_UNSUPPORTED);
     read_group(value, name + ".");
 }
@@ -106,7 +109,7 @@ void Config::read_place(size_t k, const Json& value) {
     const std::string where = std::string("config.") + SETTINGS[k].name;
     bool fits = value.kind == Json::ARRAY && value.items.size() == 3;
     for (const Json& item : value.items) fits = fits && item.kind == Json::NUMBER;
-    require(fits, where, "must be three numbers", value.describe(), "give [x, y, z] in metres");
+    REQUIRE(fits, where, "must be three numbers", value.describe(), "give [x, y, z] in metres");
     for (int axis = 0; axis < 3; axis++) entries[k].values[axis] = value.items[axis].number;
 }
 
@@ -144,7 +147,7 @@ std::string Config::canonical() const {
 void Config::require_rule(bool holds, const std::string& name, const std::string& rule, const std::string& hint) const {
     const size_t k = find(name);
     const double value = entries[k].values[0];
-    require(holds, name, rule, SETTINGS[k].kind == INTEGER ? general(value, 10) : repr(value), hint);
+    REQUIRE(holds, name, rule, SETTINGS[k].kind == INTEGER ? general(value, 10) : repr(value), hint);
 }
 
 void Config::require_at_least(const std::string& name, double least, const std::string& rule,
@@ -165,11 +168,11 @@ void Config::check_grid() const {
         const double cells = cfg[name] / size, whole = round_half_even(cells);
         const bool is_whole = std::isfinite(cells) && whole >= 1 && std::fabs(cells - whole) < 1e-6 * cells;
         const std::string hint = std::isfinite(cells) ? "try " + general(std::max(1.0, whole) * size) : "give metres";
-        require(is_whole, name, "must be a whole number of times " + general(size) + " m", general(cells) + " times",
+        REQUIRE(is_whole, name, "must be a whole number of times " + general(size) + " m", general(cells) + " times",
                 hint);
     }
     const double number = round_half_even(cfg["grid.length_x"] / size) * round_half_even(cfg["grid.length_y"] / size);
-    require(number < 2147483648.0, "grid", "must have fewer than 2^31 cells", general(number), "use larger cells");
+    REQUIRE(number < 2147483648.0, "grid", "must have fewer than 2^31 cells", general(number), "use larger cells");
 }
 
 void Config::check_sensor() const {
@@ -178,7 +181,7 @@ void Config::check_sensor() const {
     require_at_least("sensor.noise_factor", 0, not_negative, "give 1e-4");
     require_rule(cfg["sensor.noise_floor"] > 0, "sensor.noise_floor", "must be positive", "give 2.5e-5 m^2");
     const double nearest = cfg["sensor.min_distance"], farthest = cfg["sensor.max_distance"];
-    require(0 <= nearest && nearest < farthest, "sensor.min_distance, max_distance", "must be ordered",
+    REQUIRE(0 <= nearest && nearest < farthest, "sensor.min_distance, max_distance", "must be ordered",
             "(" + repr(nearest) + ", " + repr(farthest) + ")", "give 0 <= min < max in metres");
     require_at_least("aging.variance_rate", 0, not_negative, "give m^2/s");
 }

@@ -20,10 +20,16 @@ inline std::string message(const std::string& argument, const std::string& rule,
     return argument + ": " + rule + ", got " + actual + "; " + hint;
 }
 
-inline void require(bool holds, const std::string& argument, const std::string& rule, const std::string& actual,
-                    const std::string& hint, torchelev_status status = TORCHELEV_BAD_VALUE) {
-    if (!holds) throw Error{status, message(argument, rule, actual, hint)};
+[[noreturn]] inline void refuse(const std::string& argument, const std::string& rule, const std::string& actual,
+                                const std::string& hint, torchelev_status status = TORCHELEV_BAD_VALUE) {
+    throw Error{status, message(argument, rule, actual, hint)};
 }
+
+// Refuse by these sentences, which are composed only then, unless the rule holds.
+#define REQUIRE(holds, ...) \
+    do { \
+        if (!(holds)) refuse(__VA_ARGS__); \
+    } while (false)
 
 // A number as Python prints it with `:g` and so many digits.
 inline std::string general(double value, int digits = 6) {

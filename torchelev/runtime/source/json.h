@@ -22,6 +22,12 @@ struct Json {
         return nullptr;
     }
 
+    // The name of its type in Python.
+    const char* type() const {
+        const char* const names[] = {"NoneType", "bool", is_whole ? "int" : "float", "str", "list", "dict"};
+        return names[kind];
+    }
+
     // What an error calls it, as Python does.
     std::string describe() const {
         switch (kind) {

@@ -24,7 +24,7 @@ constexpr torchelev_limits USUAL{131072, 4, 1};
 torchelev_limits checked_limits(const torchelev_limits* given) {
     const torchelev_limits limits = given ? *given : USUAL;
     auto require_positive = [](const char* name, int64_t value, int64_t most, const char* hint) {
-        require(value > 0 && value <= most, name, "must be from 1 to " + std::to_string(most), std::to_string(value),
+        REQUIRE(value > 0 && value <= most, name, "must be from 1 to " + std::to_string(most), std::to_string(value),
                 hint);
     };
     require_positive("limits.max_points", limits.max_points, int64_t(1) << 30, "give the points of a scan");
@@ -103,14 +103,15 @@ void torchelev_map::warm_up() {
             const int64_t N = limits.max_points / sensors;
             forget();
             for (int64_t k = 0; k < N * sensors; k++) {
-                const int64_t cell = k % cells();
+                const int64_t turn = k % N * sensors + k / N, all = N * sensors;  // each sensor's reach over the window
+                const int64_t cell = all < cells() ? turn * cells() / all : turn % cells();
                 points[3 * k] = scale * float((double(cell / sizes.W - sizes.H / 2) + 0.5) * size);
                 points[3 * k + 1] = scale * float((double(cell % sizes.W - sizes.W / 2) + 0.5) * size);
                 points[3 * k + 2] = -1 + 0.01f * float(k % 7);
             }
             const torchelev_input input{sensors, N, points.data(), poses.data(), T, 0.1, variance.data(),
                                         covariances.data()};
-            for (int repeat = 0; repeat < 2; repeat++) run(input, ORDER, std::size(ORDER));
+            run(input, ORDER, std::size(ORDER));
         }
 }
 
@@ -118,17 +119,17 @@ void torchelev_map::warm_up() {
 
 void torchelev_map::check(const torchelev_input& input) const {
     const int64_t S = input.num_sensors, N = input.num_points;
-    require(S >= 1 && S <= limits.max_sensors, "input.num_sensors",
+    REQUIRE(S >= 1 && S <= limits.max_sensors, "input.num_sensors",
             "must be from 1 to " + std::to_string(limits.max_sensors), std::to_string(S),
             "create the map with larger limits");
-    require(N >= 0 && N <= limits.max_points / S, "input.num_points",
+    REQUIRE(N >= 0 && N <= limits.max_points / S, "input.num_points",
             "must be from 0 to " + std::to_string(limits.max_points / S) + " of each sensor", std::to_string(N),
             "create the map with larger limits");
-    require(input.points || N == 0, "input.points", "must be given", "null", "give (S, N, 3) floats");
-    require(input.T_map_sensor, "T_map_sensor", "must be given", "null", "give (S, 4, 4) doubles");
+    REQUIRE(input.points || N == 0, "input.points", "must be given", "null", "give (S, N, 3) floats");
+    REQUIRE(input.T_map_sensor, "T_map_sensor", "must be given", "null", "give (S, 4, 4) doubles");
     require_poses("T_map_sensor", input.T_map_sensor, S);
     if (input.T_map_base) require_poses("T_map_base", input.T_map_base, 1);
-    require(std::isfinite(input.dt) && input.dt >= 0, "dt", "must be finite and not negative", repr(input.dt),
+    REQUIRE(std::isfinite(input.dt) && input.dt >= 0, "dt", "must be finite and not negative", repr(input.dt),
             "give the seconds since the last update");
 }
 
@@ -152,7 +153,7 @@ void require_covariances(const double* values, int64_t number) {
     const char* name = "pose_covariance";
     double scale = 0;
     for (int64_t k = 0; k < 36 * number; k++) {
-        require(std::isfinite(values[k]), name, "must be finite", "NaN or inf",
+        REQUIRE(std::isfinite(values[k]), name, "must be finite", "NaN or inf",
                 "where the pose's uncertainty is unknown, leave it out");
         scale = std::max(scale, std::fabs(values[k]));
     }
@@ -160,9 +161,9 @@ void require_covariances(const double* values, int64_t number) {
         const double* matrix = values + 36 * s;
         for (int i = 0; i < 6; i++)
             for (int j = 0; j < i; j++)
-                require(std::fabs(matrix[6 * i + j] - matrix[6 * j + i]) <= 1e-4 * scale, name, "must be symmetric",
+                REQUIRE(std::fabs(matrix[6 * i + j] - matrix[6 * j + i]) <= 1e-4 * scale, name, "must be symmetric",
                         "another", "give the covariance of x, y, z and the rotations about the map's axes");
-        require(is_semidefinite(matrix, 1e-4 * scale), name, "must have no negative eigenvalue", "one",
+        REQUIRE(is_semidefinite(matrix, 1e-4 * scale), name, "must have no negative eigenvalue", "one",
                 "give the covariance of x, y, z and the rotations about the map's axes");
     }
 }
@@ -176,7 +177,7 @@ void torchelev_map::update(const torchelev_input& input) {
 }
 
 void torchelev_map::move(const double* T_map_base) {
-    require(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
+    REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
     require_poses("T_map_base", T_map_base, 1);
     const torchelev_input input{1, 0, nullptr, T_map_base, T_map_base, 0, nullptr, nullptr};
     const Stage stages[] = {run_measure, run_recenter};
@@ -203,12 +204,11 @@ void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64
 // Reading ------------------------------------------------------------------------------------------------------------
 
 int torchelev_map::layer(const std::string& name) {
-    std::string names;
-    for (int k = 0; k < int(std::size(LAYERS)); k++) {
+    for (int k = 0; k < int(std::size(LAYERS)); k++)
         if (name == LAYERS[k]) return k;
-        names += (k ? ", " : "") + std::string(LAYERS[k]);
-    }
-    throw Error{TORCHELEV_BAD_VALUE, message("layer", "must be one of " + names, "'" + name + "'", "use elevation")};
+    std::string names;
+    for (const char* one : LAYERS) names += (names.empty() ? "" : ", ") + std::string(one);
+    refuse("layer", "must be one of " + names, "'" + name + "'", "use elevation");
 }
 
 CellValue torchelev_map::read(int layer, int64_t k) const {
@@ -224,3 +224,6 @@ CellValue torchelev_map::read(int layer, int64_t k) const {
         default: return {normal_component(gx, gy, layer - NORMAL_X), known && s.has_normal[k]};
     }
 }
+
+// For tests, which compare them with Python's.
+extern "C" const void* settings_of_map(const torchelev_map* map) { return &map->settings; }

@@ -46,7 +46,7 @@ struct torchelev_map {
 };
 
 // Refuse matrices (number, 4, 4) that are not rigid, as `check_pose` does.
-void require_poses(const std::string& name, const double* poses, int64_t number);
+void require_poses(const char* name, const double* poses, int64_t number);
 
 // A saved map: state_file.cpp.
 void save_state(const torchelev_map& map, const std::string& path);

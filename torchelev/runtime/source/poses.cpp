@@ -21,30 +21,39 @@ double skew(const double* T) {
     return error;
 }
 
-void require_pose(const std::string& name, const double* T) {
-    const bool is_finite = std::all_of(T, T + 16, [](double v) { return std::isfinite(v); });
-    require(is_finite, name, "must be finite", "NaN or inf",
+const char* const HINT = "use torchelev.frames.transform(position, quat_wxyz)";
+const double LAST[] = {0, 0, 0, 1};
+
+bool is_last_row(const double* T, double tolerance) {
+    for (int k = 0; k < 4; k++)
+        if (!(std::fabs(T[12 + k] - LAST[k]) <= tolerance)) return false;
+    return true;
+}
+
+bool is_transposed(const double* T) {
+    for (int k = 0; k < 4; k++)
+        if (T[4 * k + 3] != LAST[k]) return false;
+    return true;
+}
+
+std::string last_row(const double* T) {
+    return general(T[12]) + " " + general(T[13]) + " " + general(T[14]) + " " + general(T[15]);
+}
+
+void require_pose(const char* name, const double* T) {
+    REQUIRE(std::all_of(T, T + 16, [](double v) { return std::isfinite(v); }), name, "must be finite", "NaN or inf",
             "where the pose is unknown, give any rigid one, and NaN points if they should be ignored");
-    const std::string hint = "use torchelev.frames.transform(position, quat_wxyz)";
-    const double error = skew(T);
-    require(error < 1e-3, name, "must be rigid (R R^T = 1)", "an error of " + general(error, 3), hint);
-    require(determinant(T) > 0, name, "must not mirror", "determinant -1", hint);
-    const double last[] = {0, 0, 0, 1};
-    bool is_last = true, is_transposed = true;
-    for (int k = 0; k < 4; k++) {
-        is_last = is_last && std::fabs(T[12 + k] - last[k]) <= 1e-6;
-        is_transposed = is_transposed && T[4 * k + 3] == last[k];
-    }
-    const std::string row = general(T[12]) + " " + general(T[13]) + " " + general(T[14]) + " " + general(T[15]);
-    require(is_last, name, "must have the last row 0 0 0 1", row,
-            is_transposed ? "transpose it: the position is the last column" : hint);
-    const double distance = std::max({std::fabs(T[3]), std::fabs(T[7]), std::fabs(T[11])});
-    require(distance <= FARTHEST, name, "must lie within 1e+09 m", general(distance, 3) + " m",
+    const double error = skew(T), distance = std::max({std::fabs(T[3]), std::fabs(T[7]), std::fabs(T[11])});
+    REQUIRE(error < 1e-3, name, "must be rigid (R R^T = 1)", "an error of " + general(error, 3), HINT);
+    REQUIRE(determinant(T) > 0, name, "must not mirror", "determinant -1", HINT);
+    REQUIRE(is_last_row(T, 1e-6), name, "must have the last row 0 0 0 1", last_row(T),
+            is_transposed(T) ? "transpose it: the position is the last column" : HINT);
+    REQUIRE(distance <= FARTHEST, name, "must lie within 1e+09 m", general(distance, 3) + " m",
             "check its units and source");
 }
 
 }  // namespace
 
-void require_poses(const std::string& name, const double* poses, int64_t number) {
+void require_poses(const char* name, const double* poses, int64_t number) {
     for (int64_t k = 0; k < number; k++) require_pose(name, poses + 16 * k);
 }

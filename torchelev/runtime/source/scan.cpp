@@ -28,7 +28,7 @@ int place_of(const std::string& name, const std::string& value, std::initializer
         if (value == one) return k;
         names += (k++ ? ", " : "") + std::string(one);
     }
-    throw Error{TORCHELEV_BAD_VALUE, message(name, "must be one of " + names, "'" + value + "'", "see the docs")};
+    refuse(name, "must be one of " + names, "'" + value + "'", "see the docs");
 }
 
 const std::initializer_list<const char*> KEYS = {"pattern",  "alignment",       "mode",          "nominal_height",
@@ -46,7 +46,7 @@ class Layout {
 
   public:
     explicit Layout(const std::string& text) : root(JsonReader::read(text, "layout")) {
-        require(root.kind == Json::OBJECT, "layout", "must be a mapping", root.describe(), "give what scan_layout returned");
+        REQUIRE(root.kind == Json::OBJECT, "layout", "must be a mapping", root.describe(), "give what scan_layout returned");
         for (const auto& [name, value] : root.members) place_of("layout." + name, name, KEYS);
     }
 
@@ -59,13 +59,13 @@ class Layout {
         const Json& value = (*this)[name];
         if (value.kind == Json::NUL) return usual;
         const bool fits = value.kind == Json::NUMBER && std::isfinite(value.number) && value.number >= least;
-        require(fits, "layout." + name, "must be a finite number", value.describe(), "leave it out for its default");
+        REQUIRE(fits, "layout." + name, "must be a finite number", value.describe(), "leave it out for its default");
         return value.number;
     }
 
     int64_t count(const std::string& name, int64_t usual) const {
         const double value = number(name, double(usual), 0);
-        require(value == std::floor(value) && value < 1e6, "layout." + name, "must be an int of at least 0", repr(value),
+        REQUIRE(value == std::floor(value) && value < 1e6, "layout." + name, "must be an int of at least 0", repr(value),
                 "leave it out for its default");
         return int64_t(value);
     }
@@ -73,7 +73,7 @@ class Layout {
     std::string text(const std::string& name, const char* usual) const {
         const Json& value = (*this)[name];
         if (value.kind == Json::NUL) return usual;
-        require(value.kind == Json::STRING, "layout." + name, "must be a name", value.describe(), std::string("give ") + usual);
+        REQUIRE(value.kind == Json::STRING, "layout." + name, "must be a name", value.describe(), std::string("give ") + usual);
         return value.text;
     }
 
@@ -88,7 +88,7 @@ class Layout {
                 xy.push_back(coordinate.number);
             }
         }
-        require(fits, "layout.pattern", "must be one or more points (x, y)", pattern.describe(), "give [[x, y], ...] in metres");
+        REQUIRE(fits, "layout.pattern", "must be one or more points (x, y)", pattern.describe(), "give [[x, y], ...] in metres");
         return xy;
     }
 };
@@ -106,7 +106,7 @@ Rule rule_of(const std::string& name, const Json& value, const char* usual) {
     if (value.kind == Json::NUMBER) return {NUMBER, value.number};
     const std::string text = value.kind == Json::STRING ? value.text : usual;
     if (text == "inf" || text == "-inf") return {NUMBER, text == "inf" ? INFINITY : -INFINITY};
-    require(text != "completed", name, "needs Python: this library has no completion", "'completed'", "use ground",
+    REQUIRE(text != "completed", name, "needs Python: this library has no completion", "'completed'", "use ground",
             TORCHELEV_UNSUPPORTED);
     switch (place_of(name, text, {"ground", "original", "base", "lowest", "upper_bound", "inpaint"})) {
         case 0: return {scans::GROUND};
@@ -126,7 +126,7 @@ torchelev_scan::torchelev_scan(const torchelev_map& map, const std::string& layo
     if (const Preset* preset = find_preset(layout)) use_preset(*preset, xy);
     else {
         const bool is_json = layout.find('{') != std::string::npos;
-        require(is_json, "layout", "must be one of isaac_lab, mjlab, legged_gym, or JSON", "'" + layout + "'",
+        REQUIRE(is_json, "layout", "must be one of isaac_lab, mjlab, legged_gym, or JSON", "'" + layout + "'",
                 "use isaac_lab");
         reach = read_layout(layout, xy);
     }
@@ -159,13 +159,13 @@ double torchelev_scan::read_layout(const std::string& text, std::vector<double>&
     scan.alignment = place_of("layout.alignment", layout.text("alignment", "yaw"), {"yaw", "base", "world"});
     scan.mode = place_of("layout.mode", layout.text("mode", "bilinear"), {"bilinear", "nearest", "minimum"});
     const double nominal = layout.number("nominal_height", 0), clip = layout.number("clip", INFINITY);
-    require(clip > 0, "clip", "must be a positive number", repr(clip), "give metres");
+    REQUIRE(clip > 0, "clip", "must be a positive number", repr(clip), "give metres");
     scan.nominal_height = float(nominal), scan.clip = float(clip), scan.scale = float(layout.number("scale", 1));
     scan.rings = int32_t(layout.count("inpaint_rings", 5));
     Rule rule = rule_of("layout.fill", layout["fill"], "ground");
     if (rule.is_original) rule = rule_of("layout.original", layout["original"], "base");
-    require(!rule.is_original, "layout.original", "must name a rule", "'original'", "use base");
-    require(!std::isinf(rule.value) || std::isfinite(clip), "layout.fill", "must be finite without a clip",
+    REQUIRE(!rule.is_original, "layout.original", "must name a rule", "'original'", "use base");
+    REQUIRE(!std::isinf(rule.value) || std::isfinite(clip), "layout.fill", "must be finite without a clip",
             repr(rule.value), "give a clip");
     const double standing = layout.number("standing_height", nominal);
     scan.fill = rule.fill, scan.missing = float(std::isnan(rule.value) ? standing - nominal : rule.value);
@@ -186,7 +186,7 @@ void torchelev_scan::place_in(const torchelev_map& map, const std::vector<double
     const double span_x = reach + (turns ? radius : far_x), span_y = reach + (turns ? radius : far_y);
     const double wanted_x = 2 * (span_x + size), wanted_y = 2 * (span_y + size);
     const double length_x = map.cfg["grid.length_x"], length_y = map.cfg["grid.length_y"];
-    require(wanted_x <= length_x + 1e-9 && wanted_y <= length_y + 1e-9, "pattern",
+    REQUIRE(wanted_x <= length_x + 1e-9 && wanted_y <= length_y + 1e-9, "pattern",
             "must lie in the map at any heading, which takes " + general(wanted_x, 3) + " x " + general(wanted_y, 3) + " m",
             "a window of " + general(length_x) + " x " + general(length_y) + " m",
             "enlarge length_x and length_y of GridConfig, or shrink the pattern");
@@ -205,6 +205,9 @@ void torchelev_scan::read_blank(const torchelev_map& map) {
     std::vector<float> values(size()), heights(map.cells());
     std::vector<double> feet(3 * scan.origins);
     const double T[] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    const size_t room = size_t(scan.height - 2 * scan.top + 2) * size_t(scan.width - 2 * scan.left + 1 + LANES) + LANES;
+    for (scans::Part* part : {&robot->inpainted.now, &robot->inpainted.next})
+        if (scan.fill == scans::INPAINT) part->heights.reserve(room);  // at any heading
     const int64_t corner[] = {-(scan.height / 2), -(scan.width / 2)};
     scan.elevation = scan.upper_bound = heights.data(), scan.validity = scan.bounded = nothing.data();
     scan.corner = corner, scan.pose = T, scan.feet = num_feet ? feet.data() : nullptr;
@@ -214,14 +217,14 @@ void torchelev_scan::read_blank(const torchelev_map& map) {
 
 void torchelev_scan::read(const torchelev_map& map, const double* T_map_base, const double* feet, float* values,
                           uint8_t* known) {
-    require(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
+    REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
     require_poses("T_map_base", T_map_base, 1);
     const bool fits = scan.height == map.sizes.H && scan.width == map.sizes.W && scan.resolution == map.resolution();
-    require(fits, "map", "must have the grid that the scan was created for", "another", "create a scan for this map");
-    require(bool(feet) == bool(num_feet), "feet", num_feet ? "must be given for a scan around feet" : "must be left out",
+    REQUIRE(fits, "map", "must have the grid that the scan was created for", "another", "create a scan for this map");
+    REQUIRE(bool(feet) == bool(num_feet), "feet", num_feet ? "must be given for a scan around feet" : "must be left out",
             feet ? "feet for a scan around the base" : "null", "use a layout with num_feet for feet only");
     for (int64_t k = 0; feet && k < 3 * num_feet; k++)
-        require(std::isfinite(feet[k]), "feet", "must be finite", "NaN or inf", "leave those feet out");
+        REQUIRE(std::isfinite(feet[k]), "feet", "must be finite", "NaN or inf", "leave those feet out");
     scan.pose = T_map_base, scan.feet = feet, scan.corner = map.state.corner;
     scan.elevation = map.state.elevation, scan.validity = map.state.validity;
     scan.upper_bound = map.state.upper_bound, scan.bounded = map.state.bounded;

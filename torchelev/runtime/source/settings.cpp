@@ -65,6 +65,12 @@ void set_fusion(const Config& cfg, FusionSettings& s) {
     set_edges(cfg, s);
 }
 
+std::string with_commas(int64_t number) {
+    std::string text = std::to_string(number);
+    for (int k = int(text.size()) - 3; k > 0; k -= 3) text.insert(k, ",");
+    return text;
+}
+
 // The polar table: `PolarGrid.of`.
 void set_table(const Config& cfg, VisibilitySettings& s) {
     const double diagonal = std::hypot(cfg["grid.length_x"], cfg["grid.length_y"]);
@@ -90,7 +96,7 @@ void set_visibility(const Config& cfg, VisibilitySettings& s) {
     const std::string rule = "rays of " + general(size) + " m cells must reach over at most 16,384 of them";
     const std::string hint = cfg.has("raycast.max_range") ? "give fewer metres, or None"
                                                           : "use larger cells, or a shorter window";
-    require(!s.has_rays || s.ranges <= most, "raycast.max_range", rule, std::to_string(s.ranges) + " cells", hint);
+    REQUIRE(!s.has_rays || s.ranges <= most, "raycast.max_range", rule, with_commas(s.ranges) + " cells", hint);
 }
 
 // Which of so many cells may lie within a radius [cells] of the window's centre: `middle`.

@@ -46,7 +46,7 @@ std::string header_of(const torchelev_map& map) {
     return text + std::string((8 - text.size() % 8) % 8, ' ');
 }
 
-[[noreturn]] void refuse(const std::string& path, const std::string& why) {
+[[noreturn]] void refuse_file(const std::string& path, const std::string& why) {
     throw Error{TORCHELEV_BAD_FILE, path + ": " + why};
 }
 
@@ -67,7 +67,7 @@ void write_all(const torchelev_map& map, std::FILE* file, const std::string& pat
     bool fits = std::fwrite(bytes, 1, 8, file) == 8 && std::fwrite(header.data(), 1, length, file) == length;
     for (size_t k = 0; fits && k < NUMBER_OF_TENSORS; k++)
         fits = std::fwrite(map.tensors[k].get(), 1, map.bytes(k), file) == map.bytes(k);
-    if (!fits || std::fflush(file) != 0) refuse(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+    if (!fits || std::fflush(file) != 0) refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
 }
 
 // A tensor of a file whose values no update would leave behind.
@@ -87,11 +87,11 @@ bool is_sound(const Tensor& tensor, const unsigned char* values, int64_t count) 
 
 std::string read_file(const std::string& path) {
     const File file(std::fopen(path.c_str(), "rb"), std::fclose);
-    if (!file) refuse(path, std::string("cannot be read (") + std::strerror(errno) + ")");
+    if (!file) refuse_file(path, std::string("cannot be read (") + std::strerror(errno) + ")");
     std::string text;
     char part[65536];
     for (size_t n; (n = std::fread(part, 1, sizeof part, file.get())) > 0;) text.append(part, n);
-    if (std::ferror(file.get())) refuse(path, "cannot be read");
+    if (std::ferror(file.get())) refuse_file(path, "cannot be read");
     return text;
 }
 
@@ -99,10 +99,10 @@ void save_state(const torchelev_map& map, const std::string& path) {
     const std::string unfinished = path + ".unfinished";
     try {
         File file(std::fopen(unfinished.c_str(), "wb"), std::fclose);
-        if (!file) refuse(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+        if (!file) refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
         write_all(map, file.get(), path);
         if (std::fclose(file.release()) != 0 || std::rename(unfinished.c_str(), path.c_str()) != 0)
-            refuse(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+            refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
     } catch (...) {
         std::remove(unfinished.c_str());
         throw;
@@ -113,26 +113,26 @@ void load_state(torchelev_map& map, const std::string& path) {
     const std::string text = read_file(path);
     uint64_t length = 0;
     for (int k = 0; k < 8 && text.size() >= 8; k++) length |= uint64_t(static_cast<unsigned char>(text[k])) << (8 * k);
-    if (text.size() < 8 || length > LONGEST || length > text.size() - 8) refuse(path, "no file of safetensors, or damaged");
+    if (text.size() < 8 || length > LONGEST || length > text.size() - 8) refuse_file(path, "no file of safetensors, or damaged");
     const Json root = JsonReader::read(text.substr(8, length), path);
     const Json* data = root.find("__metadata__");
     auto is = [&](const char* name, const std::string& wanted) {
         const Json* found = data ? data->find(name) : nullptr;
         return found && found->text == wanted;
     };
-    if (!is("format", FORMAT)) refuse(path, "no map; write it with torchelev_map_save");
-    if (!is("version", VERSION)) refuse(path, "of another version; read it with a newer torchelev");
+    if (!is("format", FORMAT)) refuse_file(path, "no map; write it with torchelev_map_save");
+    if (!is("version", VERSION)) refuse_file(path, "of another version; read it with a newer torchelev");
     const Json* config = data->find("config");
     const std::string theirs = config ? config->text : "", ours = map.cfg.canonical();
-    if (theirs != ours) refuse(path, "the map of another config, " + difference(ours, theirs) + "; create the map with its config");
+    if (theirs != ours) refuse_file(path, "the map of another config, " + difference(ours, theirs) + "; create the map with its config");
     // With the same config, the header of a whole file is the one that this map would write.
-    if (text.substr(8, length) != header_of(map)) refuse(path, "damaged: its header does not describe a map");
+    if (text.substr(8, length) != header_of(map)) refuse_file(path, "damaged: its header does not describe a map");
     size_t at = 8 + length, end = at;
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) end += map.bytes(k);
-    if (text.size() != end) refuse(path, "damaged: " + std::to_string(text.size()) + " bytes instead of " + std::to_string(end));
+    if (text.size() != end) refuse_file(path, "damaged: " + std::to_string(text.size()) + " bytes instead of " + std::to_string(end));
     const auto* bytes = reinterpret_cast<const unsigned char*>(text.data());
     for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++))
-        if (!is_sound(STATE[k], bytes + at, map.count(k))) refuse(path, std::string("damaged: ") + STATE[k].name + " is not finite");
+        if (!is_sound(STATE[k], bytes + at, map.count(k))) refuse_file(path, std::string("damaged: ") + STATE[k].name + " is not finite");
     at = 8 + length;
     for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++)) std::memcpy(map.tensors[k].get(), bytes + at, map.bytes(k));
 }

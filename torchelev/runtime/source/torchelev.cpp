@@ -29,7 +29,7 @@ template <class Work> torchelev_status status_of(const Work& work) {
 }
 
 template <class T> T& given(const char* name, T* value) {
-    require(value, name, "must be given", "null", "see torchelev.h");
+    REQUIRE(value, name, "must be given", "null", "see torchelev.h");
     return *value;
 }
 
@@ -127,7 +127,7 @@ torchelev_status torchelev_map_layer(const torchelev_map* map, const char* name,
         const torchelev_map& m = given("map", map);
         const int layer = torchelev_map::layer(&given("name", name));
         given("values", values);
-        require(size >= size_t(m.cells()), "size", "must be at least " + std::to_string(m.cells()), std::to_string(size),
+        REQUIRE(size >= size_t(m.cells()), "size", "must be at least " + std::to_string(m.cells()), std::to_string(size),
                 "see torchelev_map_size");
         for (int64_t k = 0; k < m.cells(); k++) {
             const CellValue cell = m.read(layer, k);
@@ -141,7 +141,7 @@ const void* torchelev_map_tensor(const torchelev_map* map, const char* name, siz
     status_of([&] {
         const torchelev_map& m = given("map", map);
         const size_t k = m.find(&given("name", name));
-        require(k < NUMBER_OF_TENSORS, "name", "must be a tensor of MapState", std::string("'") + name + "'",
+        REQUIRE(k < NUMBER_OF_TENSORS, "name", "must be a tensor of MapState", std::string("'") + name + "'",
                 "use elevation");
         if (size_bytes) *size_bytes = m.bytes(k);
         found = m.tensors[k].get();
@@ -155,9 +155,9 @@ torchelev_status torchelev_map_sample(const torchelev_map* map, const char* name
         const torchelev_map& m = given("map", map);
         const int layer = torchelev_map::layer(&given("name", name));
         const std::string how = &given("mode", mode);
-        require(how == "bilinear" || how == "nearest", "mode", "must be one of bilinear, nearest", "'" + how + "'",
+        REQUIRE(how == "bilinear" || how == "nearest", "mode", "must be one of bilinear, nearest", "'" + how + "'",
                 "use bilinear");
-        require(num_points >= 0, "num_points", "must not be negative", std::to_string(num_points), "give M");
+        REQUIRE(num_points >= 0, "num_points", "must not be negative", std::to_string(num_points), "give M");
         if (num_points == 0) return;
         given("xy", xy), given("values", values);
         sample(m, layer, how == "nearest" ? scans::NEAREST : scans::BILINEAR, xy, num_points, values, known);

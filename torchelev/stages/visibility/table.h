@@ -71,9 +71,10 @@ class Table {
         far = *std::max_element(rows, rows + count);
         near = near_rows(far);
         place_blocks();
-        const int64_t parts = u.threads == 1 || int64_t(count) * far * LANES < ENTRIES_AT_A_TIME ? 1 : 4 * u.threads;
+        const int64_t most = u.threads == 1 ? 1 : 4 * u.threads;
+        const int64_t parts = int64_t(count) * far * LANES < ENTRIES_AT_A_TIME ? 1 : most;
         auto begin = [&](int64_t part) { return int(part * real / parts); };
-        float* next = memory.next.resize(parts * far * LANES);  // the blocks that follow each part, unchanged
+        float* next = memory.next.resize(most * stride * LANES);  // the blocks that follow each part, unchanged
         for (int64_t k = 1; k < parts; k++) std::copy_n(block(begin(k)), far * LANES, next + (k - 1) * far * LANES);
         for_each(int(parts), parts == 1 ? 1 : u.threads, [&](int turn) {
             const int64_t k = parts - 1 - turn;  // from the last one on, or tests on one core would not miss the copies
