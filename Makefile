@@ -8,10 +8,10 @@ PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
 	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
-EXTRAS := io,bags,odometry,video,view,geo,site,rl,dev,docs
+EXTRAS := io,bags,odometry,video,view,geo,site,rl,deploy,dev,docs
 MJLAB := .venv-mjlab
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab matrix lint types setup bench quality quality-odometry docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab matrix lint types setup bench quality quality-odometry runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -92,6 +92,11 @@ quality: setup  ## measure accuracy and features, five minutes
 quality-odometry: setup  ## measure maps whose poses come from the clouds, five minutes
 	$(BIN)/python -m benchmarks.quality.odometry
 	$(BIN)/python -m docs.readme_tables
+
+runtime: setup  ## measure the C library, and replay under sanitizers and on aarch64, twenty minutes
+	$(BIN)/python -m benchmarks.runtime speed
+	$(BIN)/python -m benchmarks.runtime aarch64
+	$(BIN)/python -m benchmarks.runtime sanitize
 
 docs: setup  ## build the documentation in docs/_build/html, warnings as errors; needs no network once it is set up
 	$(BIN)/python -m sphinx -b html -W --keep-going --quiet -d docs/_build/trees docs docs/_build/html

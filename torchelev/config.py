@@ -75,6 +75,8 @@ class ElevationMapConfig:
             self.completion.require_resolution(self.grid.resolution)
         if self.raycast is not None:
             self.raycast.require_grid(self.grid)
+        if isinstance(self.traversability, TraversabilityConfig):
+            self.traversability.require_grid(self.grid)
 
     @property
     def drift_gate(self) -> float:

@@ -12,6 +12,7 @@ from torchelev.ops.windows import padded, window_moments
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+MAX_RADIUS = 1000  # [cells] of a window that a config may ask for: far beyond any robot's, and memory ends
 MIN_DET = 1e-4  # [cells^4] of the covariance of places that spread in two directions
 MIN_TRACE = 1e-2  # [cells^2] of the covariance of places that spread in one
 

@@ -65,7 +65,7 @@ def figures(times: list[float], period: float = _PERIOD) -> dict[str, float]:
 
 
 @contextlib.contextmanager
-def _busy_process() -> Iterator[None]:
+def busy_process() -> Iterator[None]:
     """Keep one core busy with another process."""
     process = subprocess.Popen([sys.executable, "-c", _BUSY])
     try:
@@ -91,7 +91,7 @@ def measure(count: int, threads: int, compiled: bool = True, points: int = BPEAR
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # slow updates are what is measured
         idle = figures(loop(step, count))
-        with _busy_process():
+        with busy_process():
             time.sleep(0.2)  # until the other process runs
             return {"idle": idle, "busy": figures(loop(step, count))}
 

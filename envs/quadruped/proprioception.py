@@ -7,7 +7,15 @@ import math
 import torch
 from torch import Tensor
 
-NUM_POLICY = 50
+from envs.quadruped.kinematics import JOINTS
+
+#: names of the entries of the observation "policy"
+ENTRIES = (
+    *(f"{name} {axis}" for name in ("velocity [m/s]", "angular velocity [rad/s]", "gravity") for axis in "xyz"),
+    *("command ahead [m/s]", "command to the left [m/s]", "command yaw rate [rad/s]"),
+    *(f"{name} of {joint}" for name in ("angle [rad]", "velocity [10 rad/s]", "last action") for joint in JOINTS),
+    *("gait's sine", "gait's cosine"),
+)
 
 
 def observe_body(

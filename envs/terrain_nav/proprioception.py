@@ -5,6 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+#: names of the entries of the observation
+ENTRIES = (
+    *("goal ahead [m]", "goal to the left [m]", "distance to the goal [5 m]", "goal's cosine", "goal's sine"),
+    *("speed [m/s]", "yaw rate [rad/s]", "slope ahead", "slope to the left"),
+    *("last speed action", "last yaw action", "blocked for [s]"),
+)
 LATERAL = (1, 4, 6, 8, 10)  # entries of the observation whose sign a mirror changes
 
 

@@ -17,7 +17,7 @@ from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE
 from torchelev.ops.windows import shifted, window_maximum
-from torchelev.plane_fit import Ground, fit_plane
+from torchelev.plane_fit import MAX_RADIUS, Ground, fit_plane
 from torchelev.robot import RobotConfig
 from torchelev.state import MapState
 from torchelev.traversability.rating import Rating
@@ -103,6 +103,12 @@ class TraversabilityConfig:
     def cells(self, grid: GridConfig) -> int:
         """Return the window's radius in cells."""
         return max(1, round(self.radius / grid.resolution))
+
+    def require_grid(self, grid: GridConfig) -> None:
+        """Refuse a window of more cells than `surface.radius` may have."""
+        cells = self.radius / grid.resolution
+        rule = f"must be at most {MAX_RADIUS} cells of {grid.resolution:g} m"
+        require(cells <= MAX_RADIUS, "traversability.radius", rule, self.radius, "give 0.1")
 
     @property
     def critical(self) -> Critical:

@@ -16,7 +16,7 @@ from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
 from torchelev.observations.fill import FILLS
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
-from training.nav.export import export
+from training.nav.export import export, record
 from training.options import compile_option, smoke_option
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
@@ -170,6 +170,9 @@ def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool, c
     click.echo(" ".join(f"{name} {value:.3f}" for name, value in result.items() if value is not None))
     picture(policy, cfg, out / "episode.png", runner.device)
     export(runner, out)
+    is_recorded = record(runner.get_inference_policy(device="cpu"), cfg, out)
     training = {"steps": runner.logger.tot_timesteps, "seconds": runner.logger.tot_time}
     write_result(out / "result.json", {"training": training, "evaluation": result})
     click.echo(f"Wrote result.json, episode.png, policy.pt and policy.onnx to {out}.")
+    if is_recorded:
+        click.echo(f"For a robot: torchelev export {out} --out bundle")

@@ -18,7 +18,7 @@ from torchelev.errors import require
 from training.options import compile_option, smoke_option
 from training.quadruped.evaluate import evaluate, table
 from training.quadruped.play import play
-from training.quadruped.policy import GROUPS, LoadedPolicy, export, load_policy, sight_of
+from training.quadruped.policy import GROUPS, LoadedPolicy, export, load_policy, record, sight_of
 from training.resume import checkpoint_path, write_result
 from training.runner import ResumableRunner
 
@@ -197,3 +197,6 @@ def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool, c
     write_result(out / "result.json", {"training": training, "evaluation": result})
     export(runner, config(), out)
     click.echo(f"Wrote result.json, policy.pt and policy.onnx to {out}.")
+    if sight == "map":
+        record(runner.get_inference_policy(device="cpu"), config(held_out=True), out)
+        click.echo(f"For a robot: torchelev export {out} --out bundle")

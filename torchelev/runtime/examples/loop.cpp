@@ -38,7 +38,7 @@ double quantile(const std::vector<double>& sorted, double q) { return sorted[siz
 }  // namespace
 
 int main(int count, char** arguments) try {
-    if (count < 3) return std::fprintf(stderr, "usage: %s map.json layout [threads] [hertz] < stream > scans\n", arguments[0]), 2;
+    if (count < 3) return std::fprintf(stderr, "usage: %s map.json layout [threads [hertz [saved]]] < stream > scans\n", arguments[0]), 2;
     const int threads = count > 3 ? std::atoi(arguments[3]) : 1;
     const double hertz = count > 4 ? std::atof(arguments[4]) : 0;  // 0: as fast as it goes
     torchelev::Map map(arguments[1], {131072, 4, threads});
@@ -56,6 +56,7 @@ int main(int count, char** arguments) try {
         times.push_back(std::chrono::duration<double, std::milli>(Clock::now() - start).count());
         std::fwrite(heights.data(), 4, heights.size(), stdout);
     }
+    if (count > 5) map.save(arguments[5]);
     if (times.empty()) return std::fprintf(stderr, "stream: empty\n"), 1;
     std::sort(times.begin(), times.end());
     std::fprintf(stderr, "%zu updates: p50 %.2f ms, p99 %.2f ms\n", times.size(), quantile(times, 0.5), quantile(times, 0.99));

@@ -6,7 +6,7 @@
 namespace {
 
 constexpr size_t NUMBER_OF_SETTINGS = std::size(SETTINGS);
-constexpr int VERSION = 1;
+constexpr int VERSION = 1, MAX_RADIUS = 1000;
 const char* const VERSION_NAME = "torchelev_config";
 
 std::string last_part(const std::string& name) { return name.substr(name.rfind('.') + 1); }
@@ -206,6 +206,8 @@ void Config::check_fusion() const {
             require_at_least(std::string("fusion.edges.") + name, value, value > 1 ? several : "must be a positive int",
                              "see its default");
         }
+        require_rule(cfg["fusion.edges.refinements"] <= 100, "fusion.edges.refinements", "must be at most 100",
+                     "see its default");
         require_at_least("fusion.edges.margin", 0, "must not be negative", "give 0.25");
         require_rule(cfg["fusion.edges.min_share"] > 0, "fusion.edges.min_share", "must be positive", "give 0.25");
     }
@@ -248,6 +250,7 @@ void Config::check_rays() const {
 void Config::check_surface() const {
     const Config& cfg = *this;
     require_at_least("surface.radius", 1, "must be at least 1 cell", "give 1");
+    require_rule(cfg["surface.radius"] <= MAX_RADIUS, "surface.radius", "must be at most 1000 cells", "give 1");
     if (!has("traversability")) return;
     const double radius = cfg["traversability.radius"], slope = cfg["traversability.critical_slope"];
     require_rule(radius > 0 && std::isfinite(radius), "traversability.radius", "must be positive and finite",
@@ -258,4 +261,6 @@ void Config::check_surface() const {
     }
     require_rule(slope < std::acos(-1.0) / 2 || std::isinf(slope), "traversability.critical_slope",
                  "must be below pi / 2", "give radians, such as 0.7, or inf to switch it off");
+    require_rule(radius / cfg["grid.resolution"] <= MAX_RADIUS, "traversability.radius",
+                 "must be at most 1000 cells of " + general(cfg["grid.resolution"]) + " m", "give 0.1");
 }

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torchelev.errors import require, require_count
 
+MAX_REFINEMENTS = 100  # after some thirty, float32 has no digits left
+
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeConfig:
@@ -25,6 +27,9 @@ class EdgeConfig:
     def __post_init__(self) -> None:
         for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
             require_count(f"fusion.edges.{name}", getattr(self, name), "see its default", least)
+        many, hint = self.refinements > MAX_REFINEMENTS, "see its default"
+        rule = f"must be at most {MAX_REFINEMENTS}"
+        require(not many, "fusion.edges.refinements", rule, self.refinements, hint)
         require(self.margin >= 0, "fusion.edges.margin", "must not be negative", self.margin, "give 0.25")
         require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchelev.errors import require
+from torchelev.plane_fit import MAX_RADIUS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,3 +16,5 @@ class SurfaceConfig:
 
     def __post_init__(self) -> None:
         require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")
+        most = self.radius <= MAX_RADIUS
+        require(most, "surface.radius", f"must be at most {MAX_RADIUS} cells", self.radius, "give 1")

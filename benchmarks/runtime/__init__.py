@@ -1,0 +1,1 @@
+"""Measurements and proofs of the C library: `python -m benchmarks.runtime`."""

@@ -1,0 +1,58 @@
+"""Measure the C library: `speed`, `sanitize` and `aarch64` write JSON to benchmarks/results."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from benchmarks import RESULTS
+from torchelev.app.results import write_json
+
+_OUT = click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
+
+
+@click.group(help=__doc__)
+def main() -> None:
+    """Measure the C library."""
+
+
+@main.command()
+@click.option("--rounds", default=5, show_default=True, help="Rounds, in turns, whose medians are written.")
+@click.option("--seconds", default=10.0, show_default=True, help="Length of the 50 Hz loops [s].")
+@_OUT
+def speed(rounds: int, seconds: float, out: Path) -> None:
+    """Time start, updates and a loop of 50 Hz, beside Python: runtime_speed.json."""
+    from benchmarks.runtime.speed import measure
+
+    found = measure(rounds, seconds)
+    write_json(out / "runtime_speed.json", found)
+    click.echo(json.dumps(found, indent=2))
+
+
+@main.command()
+@click.option("--seconds", default=600, show_default=True, help="How long damaged files are read [s].")
+@_OUT
+def sanitize(seconds: int, out: Path) -> None:
+    """Replay streams and read damaged files under sanitizers: runtime_sanitizers.json."""
+    from benchmarks.runtime.proofs import sanitize as prove
+
+    found = prove(seconds)
+    write_json(out / "runtime_sanitizers.json", found)
+    click.echo(json.dumps(found, indent=2))
+
+
+@main.command()
+@_OUT
+def aarch64(out: Path) -> None:
+    """Compare with aarch64, emulated by qemu-user: runtime_aarch64.json."""
+    from benchmarks.runtime.proofs import compare_processors
+
+    found = compare_processors()
+    write_json(out / "runtime_aarch64.json", found)
+    click.echo(json.dumps(found, indent=2))
+
+
+if __name__ == "__main__":
+    main()

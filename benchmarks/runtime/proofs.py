@@ -1,0 +1,99 @@
+"""Proofs that take long: sanitizers over replays and damaged files, and another processor."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.runtime.build import build, machine, run, write_config, write_stream
+from torchelev import ElevationMapConfig
+from torchelev.errors import require
+
+_SANITIZERS = {"address,undefined": "address,undefined", "thread": "thread"}
+_FEET = {"pattern": [[0.1, 0.2], [-0.3, 0.0]], "fill": "inpaint"}
+
+
+def sanitize(seconds: int) -> dict[str, Any]:
+    """Replay streams and read damaged files under sanitizers, which end a program that does what C++ forbids."""
+    found: dict[str, Any] = {**machine(), "seconds": seconds}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_config(folder / "map.json")
+        for sensors in (1, 3):
+            write_stream(folder / f"stream{sensors}", 30, sensors, 12_000)
+        for kind, flag in _SANITIZERS.items():
+            flags = f"-g -O1 -fsanitize={flag} -fno-sanitize-recover=all -fno-omit-frame-pointer"
+            programs = build(folder / kind, "-DCMAKE_BUILD_TYPE=None", f"-DCMAKE_CXX_FLAGS={flags}")
+            for sensors in (1, 3):
+                for threads in (1, 4):
+                    _replay(programs["loop"], folder, sensors, threads)
+            found[kind] = "30 updates of 1 and of 3 sensors on 1 and on 4 threads: nothing"
+            if kind != "thread":
+                done = run(programs["fuzz"], folder / "map.json", folder, seconds)
+                found["damaged files"] = done.stdout.decode().strip()
+    return found
+
+
+def _replay(loop: Path, folder: Path, sensors: int, threads: int) -> None:
+    for layout in ("isaac_lab", json.dumps(_FEET)):
+        with (folder / f"stream{sensors}").open("rb") as stream:
+            run(loop, folder / "map.json", layout, threads, stdin=stream)
+
+
+def compare_processors() -> dict[str, Any]:
+    """Run the same streams on this processor and, emulated, on aarch64; return how far saved layers differ."""
+    for tool in ("aarch64-linux-gnu-g++", "qemu-aarch64"):
+        hint = "install Debian's g++-aarch64-linux-gnu and qemu-user"
+        require(shutil.which(tool) is not None, tool, "must be there", "none", hint, FileNotFoundError)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        cfg = ElevationMapConfig()
+        cfg.save(folder / "map.json")
+        cross = ("-DCMAKE_SYSTEM_NAME=Linux", "-DCMAKE_SYSTEM_PROCESSOR=aarch64", "-DTORCHELEV_ARCH=armv8-a")
+        compiler = "-DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++"
+        here = build(folder / "here")["loop"]
+        there = build(folder / "there", *cross, compiler)["loop"]
+        rows = {}
+        for sensors in (1, 3):
+            write_stream(folder / "stream", 40, sensors, 12_000)
+            scans = [_scans(folder, here), _scans(folder, "qemu-aarch64", "-L", "/usr/aarch64-linux-gnu", there)]
+            rows[f"{sensors} sensors"] = _difference(*scans)
+    return {**machine(), "rows": rows}
+
+
+def _scans(folder: Path, *command: Any) -> dict[str, np.ndarray]:
+    """Return all height scans of a stream, and the layers after it."""
+    saved = folder / "saved"
+    with (folder / "stream").open("rb") as stream:
+        done = run(*command, folder / "map.json", "isaac_lab", 1, 0, saved, stdin=stream)
+    return {"height scans": np.frombuffer(done.stdout, np.float32), **read_saved(saved)}
+
+
+def read_saved(path: Path) -> dict[str, np.ndarray]:
+    """Return the layers of floats of a saved map, where the elevation is known."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    kinds = {"F32": np.float32, "BOOL": np.uint8}
+
+    def tensor(name: str) -> np.ndarray:
+        begin, end = (8 + length + at for at in header[name]["data_offsets"])
+        return np.frombuffer(data[begin:end], kinds[header[name]["dtype"]])
+
+    layers = ("elevation", "variance", "support", "time", "upper_bound", "gradient_x", "traversability")
+    return {"validity": tensor("validity"), **{name: tensor(name) for name in layers}}
+
+
+def _difference(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return by layer the largest difference over the layer's range, and how many values differ at all."""
+    rows = {}
+    for name, value in a.items():
+        spread = float(np.ptp(value)) or 1.0
+        apart = np.abs(value.astype(np.float64) - b[name].astype(np.float64))
+        rows[name] = {"largest": float(apart.max()) / spread, "differing": int((apart > 0).sum()), "of": value.size}
+    return rows

@@ -1,0 +1,70 @@
+"""The observation groups of a policy, in its order: what the robot gives itself, height scans and images of the map."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torchelev.errors import require
+from torchelev.observations.height_scan import HeightScan
+from torchelev.observations.map_image import MapImage
+from torchelev.observations.scan_layout import scan_layout
+
+#: of a group: the names of its entries if the robot gives them itself, else what reads the map
+Group = HeightScan | MapImage | Sequence[str]
+
+_IMAGE_SETTINGS = [field.name for field in dataclasses.fields(MapImage) if field.init]
+
+
+def shape_of(group: Group) -> tuple[int, ...]:
+    """Return the shape of a group's values in one environment."""
+    if isinstance(group, HeightScan):
+        return (group.num_points,)
+    return group.shape if isinstance(group, MapImage) else (len(group),)
+
+
+def to_json(groups: Mapping[str, Group]) -> list[dict[str, Any]]:
+    """Return groups as values that JSON can hold."""
+    return [{"name": name, **_describe(group)} for name, group in groups.items()]
+
+
+def _describe(group: Group) -> dict[str, Any]:
+    if isinstance(group, HeightScan):
+        return {"kind": "height_scan", "layout": scan_layout(group) | {"reach": group.reach}}
+    if isinstance(group, MapImage):
+        return {"kind": "map_image", "image": {name: getattr(group, name) for name in _IMAGE_SETTINGS}}
+    return {"kind": "given", "entries": list(group)}
+
+
+def from_json(where: str, rows: Any) -> dict[str, Group]:
+    """Return the groups that `to_json` described; errors call them `where`.
+
+    Raises:
+        ValueError: a row is of another kind, or its settings do not fit.
+    """
+    is_list = isinstance(rows, list) and all(isinstance(row, dict) and "name" in row for row in rows) and len(rows) > 0
+    require(is_list, where, "must be a list of groups with names", type(rows).__name__, "export the run again")
+    return {row["name"]: _group(f"{where}, {row['name']}", row) for row in rows}
+
+
+def _group(where: str, row: dict[str, Any]) -> Group:
+    kind, hint = row.get("kind"), "export the run again"
+    rule = "must be of kind given, height_scan or map_image"
+    require(kind in ("given", "height_scan", "map_image"), where, rule, repr(kind), hint)
+    try:
+        if kind == "given":
+            return tuple(row["entries"])
+        if kind == "map_image":
+            settings: dict[str, Any] = {
+                name: tuple(v) if isinstance(v, list) else v for name, v in row["image"].items()
+            }
+            return MapImage(**settings)
+        return HeightScan(**{name: _number(value) for name, value in row["layout"].items()})
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}; {hint}") from error
+
+
+def _number(value: Any) -> Any:
+    """Return the infinities that `scan_layout` writes as texts."""
+    return float(value) if value in ("inf", "-inf") else value
