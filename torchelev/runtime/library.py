@@ -195,6 +195,10 @@ class CMap:
         """Return a height scan by the name of a preset, or by a layout as JSON."""
         return CScan(self, layout)
 
+    def image(self, settings: str) -> CImage:
+        """Return an image by its settings as JSON."""
+        return CImage(self, settings)
+
 
 class CScan:
     """A height scan of the C library."""
@@ -219,3 +223,24 @@ class CScan:
         places = (_POINTER(_address(array)) for array in (pose, feet, values, known))
         self._emap._call("torchelev_scan_read", self._scan, self._emap._map, *places)
         return values, known
+
+
+class CImage:
+    """An image of the C library."""
+
+    def __init__(self, emap: CMap, settings: str) -> None:
+        self._library, self._image, self._emap = emap._library, _POINTER(), emap
+        emap._call("torchelev_image_create", emap._map, _text(settings), ctypes.byref(self._image))
+
+    def __del__(self) -> None:
+        if self._image:
+            self._library.torchelev_image_free(self._image)
+
+    def __call__(self, T_map_base: Any) -> NDArray:
+        """Return the image (C, H, W)."""
+        shape = (_COUNT * 3)()
+        self._emap._call("torchelev_image_shape", self._image, shape)
+        pose, values = np.ascontiguousarray(T_map_base, np.float64), np.empty(tuple(shape), np.float32)
+        places = (_POINTER(_address(array)) for array in (pose, values))
+        self._emap._call("torchelev_image_read", self._image, self._emap._map, *places)
+        return values

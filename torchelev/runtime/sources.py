@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from torchelev.kernels.registry import PACKAGE
 
+_OWN = ("torchelev", "config", "image", "layout", "map", "poses", "scan", "settings", "state_file")
+
 #: seen from the package; the first one names the library
 SOURCES = (
-    *(
-        f"runtime/source/{name}.cpp"
-        for name in ("torchelev", "config", "map", "poses", "scan", "settings", "state_file")
-    ),
+    *(f"runtime/source/{name}.cpp" for name in _OWN),
     *sorted(str(path.relative_to(PACKAGE)) for path in (PACKAGE / "stages").glob("*/cpu.cpp")),
 )

@@ -18,7 +18,7 @@ from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
 from torchelev.observations.scan_layout import scan_layout
 from torchelev.runtime.bundle.bundle import Bundle
-from torchelev.runtime.bundle.groups import Group, shape_of
+from torchelev.runtime.bundle.groups import Group, image_settings, shape_of
 from torchelev.runtime.bundle.recording import CONFIG, POLICY
 from torchelev.runtime.library import CMap, LibraryError
 
@@ -100,10 +100,13 @@ class _LibraryMap:
         sensors = points.shape[1] if points.ndim == 4 else 1
         limits = max(1, points[0].size // 3), sensors
         self.emap = CMap(library, bundle.folder / CONFIG, *limits)
-        scans = {name: group for name, group in _reading_groups(bundle).items() if isinstance(group, HeightScan)}
+        groups = _reading_groups(bundle)
+        scans = {name: group for name, group in groups.items() if isinstance(group, HeightScan)}
         layouts = {name: json.dumps(scan_layout(scan) | {"reach": scan.reach}) for name, scan in scans.items()}
         self.scans = {name: self.emap.scan(layout) for name, layout in layouts.items()}
         self.feet = {name: scan.num_feet for name, scan in scans.items()}
+        settings = {name: image_settings(group) for name, group in groups.items() if isinstance(group, MapImage)}
+        self.images = {name: self.emap.image(json.dumps(values)) for name, values in settings.items()}
 
     def reset(self) -> None:
         self.emap.reset()
@@ -123,21 +126,17 @@ class _LibraryMap:
         )
 
     def read(self, T_map_base: NDArray, feet: NDArray | None) -> Values:
-        return {name: scan(T_map_base, feet if self.feet[name] else None)[0] for name, scan in self.scans.items()}
+        values = {name: scan(T_map_base, feet if self.feet[name] else None)[0] for name, scan in self.scans.items()}
+        return values | {name: image(T_map_base) for name, image in self.images.items()}
 
 
 def _check_library(bundle: Bundle, library: ctypes.CDLL, python: list[Values]) -> Result:
     name = "the C library, with the map in Python"
-    groups = _reading_groups(bundle)
-    images = [key for key, group in groups.items() if isinstance(group, MapImage)]
-    if len(images) == len(groups):
-        return Result(name, None, f"it reads no images of the map, such as {', '.join(images)}")
     try:
         found = list(_replay(bundle, _LibraryMap(bundle, library)))
     except LibraryError as error:
         return Result(name, None if error.status == 3 else False, str(error))
-    scans = [{key: row[key] for key in found[0]} for row in python]
-    return _compare(name, scans, found, 0.0)
+    return _compare(name, python, found, 0.0)
 
 
 def _compare(name: str, wanted: list[Values], found: list[Values], tolerance: float) -> Result:

@@ -33,8 +33,13 @@ def _describe(group: Group) -> dict[str, Any]:
     if isinstance(group, HeightScan):
         return {"kind": "height_scan", "layout": scan_layout(group) | {"reach": group.reach}}
     if isinstance(group, MapImage):
-        return {"kind": "map_image", "image": {name: getattr(group, name) for name in _IMAGE_SETTINGS}}
+        return {"kind": "map_image", "image": image_settings(group)}
     return {"kind": "given", "entries": list(group)}
+
+
+def image_settings(image: MapImage) -> dict[str, Any]:
+    """Return the settings of an image by name."""
+    return {name: getattr(image, name) for name in _IMAGE_SETTINGS}
 
 
 def from_json(where: str, rows: Any) -> dict[str, Group]:

@@ -8,10 +8,10 @@
  * Errors: functions return a status; `torchelev_last_error` then holds the sentence that Python raises. Nothing has
  * changed when a function fails, but for TORCHELEV_NO_MEMORY.
  *
- * Threads: a map, and a scan, belongs to one thread at a time; different ones may be used at the same time. What reads
+ * Threads: a map, a scan or an image belongs to one thread at a time; different ones may be used at the same time. What reads
  * a map (layers, samples, statistics) may run on several threads while none updates it.
  *
- * Memory: after a map or a scan is created, updates and reads allocate nothing.
+ * Memory: after a map, a scan or an image is created, updates and reads allocate nothing.
  */
 #ifndef TORCHELEV_H
 #define TORCHELEV_H
@@ -37,6 +37,9 @@ typedef struct torchelev_map torchelev_map;
 
 /** Points at which a policy reads heights, and how: `torchelev.HeightScan`. */
 typedef struct torchelev_scan torchelev_scan;
+
+/** An image of the map around the robot: `torchelev.MapImage`. */
+typedef struct torchelev_image torchelev_image;
 
 /** How large updates may be. Memory for them is allocated when a map is created. */
 typedef struct {
@@ -184,6 +187,32 @@ int64_t torchelev_scan_size(const torchelev_scan* scan);
  */
 torchelev_status torchelev_scan_read(torchelev_scan* scan, const torchelev_map* map, const double* T_map_base,
                                      const double* feet, float* values, uint8_t* known);
+
+/* Images ---------------------------------------------------------------------------------------------------------- */
+
+/**
+ * Create an image for a map.
+ *
+ * @param map the map whose grid it reads; any other of the same grid will do, too.
+ * @param settings the fields of `MapImage` as JSON; those that are left out keep their defaults.
+ * @param image the new image; free it with `torchelev_image_free`.
+ */
+torchelev_status torchelev_image_create(const torchelev_map* map, const char* settings, torchelev_image** image);
+
+/** Free an image; null is ignored. */
+void torchelev_image_free(torchelev_image* image);
+
+/** Write its channels, rows and columns. */
+torchelev_status torchelev_image_shape(const torchelev_image* image, int64_t shape[3]);
+
+/**
+ * Read the image, as `MapImage` does.
+ *
+ * @param T_map_base (4, 4) the robot.
+ * @param values (C, H, W), never NaN.
+ */
+torchelev_status torchelev_image_read(torchelev_image* image, const torchelev_map* map, const double* T_map_base,
+                                      float* values);
 
 #ifdef __cplusplus
 }

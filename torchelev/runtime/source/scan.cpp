@@ -10,6 +10,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "runtime/source/layout.h"
+
 namespace {
 
 constexpr double MARGIN = 0.5, MAX_BLOCK = 1.0;  // [m] of ground.py
@@ -21,77 +23,9 @@ const Preset* find_preset(const std::string& name) {
     return nullptr;
 }
 
-int place_of(const std::string& name, const std::string& value, std::initializer_list<const char*> values) {
-    std::string names;
-    int k = 0;
-    for (const char* one : values) {
-        if (value == one) return k;
-        names += (k++ ? ", " : "") + std::string(one);
-    }
-    refuse(name, "must be one of " + names, "'" + value + "'", "see the docs");
-}
-
-const std::initializer_list<const char*> KEYS = {"pattern",  "alignment",       "mode",          "nominal_height",
-                                                 "clip",     "scale",           "fill",          "original",
-                                                 "standing_height", "inpaint_rings", "num_feet", "reach"};
-
-// A layout as JSON.
-class Layout {
-    const Json root;
-
-    static const Json& null() {
-        static const Json value;
-        return value;
-    }
-
-  public:
-    explicit Layout(const std::string& text) : root(JsonReader::read(text, "layout")) {
-        REQUIRE(root.kind == Json::OBJECT, "layout", "must be a mapping", root.describe(), "give what scan_layout returned");
-        for (const auto& [name, value] : root.members) place_of("layout." + name, name, KEYS);
-    }
-
-    const Json& operator[](const std::string& name) const {
-        const Json* found = root.find(name);
-        return found ? *found : null();
-    }
-
-    double number(const std::string& name, double usual, double least = -INFINITY) const {
-        const Json& value = (*this)[name];
-        if (value.kind == Json::NUL) return usual;
-        const bool fits = value.kind == Json::NUMBER && std::isfinite(value.number) && value.number >= least;
-        REQUIRE(fits, "layout." + name, "must be a finite number", value.describe(), "leave it out for its default");
-        return value.number;
-    }
-
-    int64_t count(const std::string& name, int64_t usual) const {
-        const double value = number(name, double(usual), 0);
-        REQUIRE(value == std::floor(value) && value < 1e6, "layout." + name, "must be an int of at least 0", repr(value),
-                "leave it out for its default");
-        return int64_t(value);
-    }
-
-    std::string text(const std::string& name, const char* usual) const {
-        const Json& value = (*this)[name];
-        if (value.kind == Json::NUL) return usual;
-        REQUIRE(value.kind == Json::STRING, "layout." + name, "must be a name", value.describe(), std::string("give ") + usual);
-        return value.text;
-    }
-
-    std::vector<double> points() const {
-        const Json& pattern = (*this)["pattern"];
-        std::vector<double> xy;
-        bool fits = pattern.kind == Json::ARRAY && !pattern.items.empty();
-        for (const Json& point : pattern.items) {
-            fits = fits && point.kind == Json::ARRAY && point.items.size() == 2;
-            for (const Json& coordinate : point.items) {
-                fits = fits && coordinate.kind == Json::NUMBER && std::isfinite(coordinate.number);
-                xy.push_back(coordinate.number);
-            }
-        }
-        REQUIRE(fits, "layout.pattern", "must be one or more points (x, y)", pattern.describe(), "give [[x, y], ...] in metres");
-        return xy;
-    }
-};
+const std::initializer_list<const char*> KEYS = {
+    "pattern", "alignment", "mode",          "nominal_height",  "clip",     "scale",
+    "fill",    "original",  "standing_height", "inpaint_rings", "num_feet", "reach"};
 
 constexpr scans::Fill NUMBER = scans::NONE;
 
@@ -154,10 +88,10 @@ void torchelev_scan::use_preset(const Preset& preset, std::vector<double>& xy) {
 
 // Read a layout; return how far [m] feet may be from the base.
 double torchelev_scan::read_layout(const std::string& text, std::vector<double>& xy) {
-    const Layout layout(text);
+    const Layout layout("layout", text, KEYS);
     xy = layout.points();
-    scan.alignment = place_of("layout.alignment", layout.text("alignment", "yaw"), {"yaw", "base", "world"});
-    scan.mode = place_of("layout.mode", layout.text("mode", "bilinear"), {"bilinear", "nearest", "minimum"});
+    scan.alignment = layout.choice("alignment", "yaw", {"yaw", "base", "world"});
+    scan.mode = layout.choice("mode", "bilinear", {"bilinear", "nearest", "minimum"});
     const double nominal = layout.number("nominal_height", 0), clip = layout.number("clip", INFINITY);
     REQUIRE(clip > 0, "clip", "must be a positive number", repr(clip), "give metres");
     scan.nominal_height = float(nominal), scan.clip = float(clip), scan.scale = float(layout.number("scale", 1));
@@ -177,26 +111,15 @@ double torchelev_scan::read_layout(const std::string& text, std::vector<double>&
 // What the map's grid decides, and whether the window holds the points at every heading: patterns.py and ground.py.
 void torchelev_scan::place_in(const torchelev_map& map, const std::vector<double>& xy, double reach) {
     const double size = map.resolution();
-    double radius = 0, far_x = 0, far_y = 0;
-    for (size_t k = 0; k < xy.size(); k += 2) {
-        radius = std::max(radius, std::hypot(xy[k], xy[k + 1]));
-        far_x = std::max(far_x, std::fabs(xy[k])), far_y = std::max(far_y, std::fabs(xy[k + 1]));
-    }
-    const bool turns = scan.alignment != scans::WORLD;
-    const double span_x = reach + (turns ? radius : far_x), span_y = reach + (turns ? radius : far_y);
-    const double wanted_x = 2 * (span_x + size), wanted_y = 2 * (span_y + size);
-    const double length_x = map.cfg["grid.length_x"], length_y = map.cfg["grid.length_y"];
-    REQUIRE(wanted_x <= length_x + 1e-9 && wanted_y <= length_y + 1e-9, "pattern",
-            "must lie in the map at any heading, which takes " + general(wanted_x, 3) + " x " + general(wanted_y, 3) + " m",
-            "a window of " + general(length_x) + " x " + general(length_y) + " m",
-            "enlarge length_x and length_y of GridConfig, or shrink the pattern");
+    const Span span(xy, scan.alignment, reach);
+    span.require_inside(map.cfg);
     scan.resolution = size, scan.height = map.sizes.H, scan.width = map.sizes.W;
     scan.num_near = 1 + std::max(0, int(std::floor(std::log2(MAX_BLOCK / size))));
     const int64_t margin = scan.fill == scans::INPAINT ? scan.rings : int64_t(std::ceil(MARGIN / size));
-    auto left_out = [&](int64_t cells, double span) {
-        return std::max<int64_t>(0, cells / 2 - (int64_t(std::ceil(span / size)) + 1) - margin);
+    auto left_out = [&](int64_t cells, double reached) {
+        return std::max<int64_t>(0, cells / 2 - (int64_t(std::ceil(reached / size)) + 1) - margin);
     };
-    scan.top = left_out(scan.height, span_x), scan.left = left_out(scan.width, span_y);
+    scan.top = left_out(scan.height, span.x), scan.left = left_out(scan.width, span.y);
 }
 
 // Read where nothing is known, so that later reads allocate nothing.

@@ -8,6 +8,7 @@
 #include <cstring>
 #include <new>
 
+#include "runtime/source/image.h"
 #include "runtime/source/scan.h"
 
 namespace {
@@ -200,6 +201,23 @@ torchelev_status torchelev_scan_read(torchelev_scan* scan, const torchelev_map* 
         given("values", values);
         s.read(given("map", map), T_map_base, feet, values, known);
     });
+}
+
+torchelev_status torchelev_image_create(const torchelev_map* map, const char* settings, torchelev_image** image) {
+    return status_of([&] {
+        given("image", image) = new torchelev_image(given("map", map), &given("settings", settings));
+    });
+}
+
+void torchelev_image_free(torchelev_image* image) { delete image; }
+
+torchelev_status torchelev_image_shape(const torchelev_image* image, int64_t shape[3]) {
+    return status_of([&] { std::copy_n(given("image", image).shape, 3, &given("shape", shape)); });
+}
+
+torchelev_status torchelev_image_read(torchelev_image* image, const torchelev_map* map, const double* T_map_base,
+                                      float* values) {
+    return status_of([&] { given("image", image).read(given("map", map), T_map_base, &given("values", values)); });
 }
 
 }  // extern "C"

@@ -1,0 +1,117 @@
+// Images of the map without Python: map_image.py.
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same pixels are known
+#else
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#include "runtime/source/image.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "runtime/source/layout.h"
+
+namespace {
+
+const std::initializer_list<const char*> KEYS = {"length_x",  "length_y", "resolution", "offset", "layers",
+                                                 "alignment", "mode",     "nominal_height"};
+const std::initializer_list<const char*> CHANNELS = {"elevation", "validity", "variance", "upper_bound", "traversability"};
+
+int64_t pixels_along(const Layout& layout, const char* key, double resolution) {
+    const double length = layout.number(key, 1.6), pixels = length / resolution, whole = std::nearbyint(pixels);
+    REQUIRE(length > 0, key, "must be a positive number", repr(length), "give metres");
+    REQUIRE(whole >= 1 && std::fabs(pixels - whole) < 1e-6 * pixels && whole < 1e5, key,
+            "must be a whole number of times " + general(resolution) + " m", general(pixels) + " times",
+            "try " + general(std::max(1.0, whole) * resolution));
+    return int64_t(whole);
+}
+
+std::vector<std::string> channels_of(const Layout& layout) {
+    const Json& layers = layout["layers"];
+    if (layers.kind == Json::NUL) return {"elevation", "validity", "upper_bound", "traversability"};
+    std::vector<std::string> names;
+    for (const Json& layer : layers.items) {
+        const bool is_completed = layer.text == "completed" || layer.text == "completed_std";
+        REQUIRE(!is_completed, "image.layers", "needs Python: this library has no completion", "'" + layer.text + "'",
+                "leave it out", TORCHELEV_UNSUPPORTED);
+        place_of("image.layers", layer.text, CHANNELS);
+        const bool is_new = std::find(names.begin(), names.end(), layer.text) == names.end();
+        REQUIRE(is_new, "image.layers", "must name each channel once", "'" + layer.text + "' twice", "leave one out");
+        names.push_back(layer.text);
+    }
+    REQUIRE(!names.empty(), "image.layers", "must be some of elevation, validity, variance, upper_bound, traversability",
+            layers.describe(), "correct their names");
+    return names;
+}
+
+}  // namespace
+
+torchelev_image::torchelev_image(const torchelev_map& map, const std::string& text) {
+    const Layout layout("image", text, KEYS);
+    const double resolution = layout.number("resolution", 0.05);
+    REQUIRE(resolution > 0, "resolution", "must be a positive number", repr(resolution), "give metres");
+    const Json& offset = layout["offset"];
+    const bool fits = offset.kind == Json::NUL || (offset.kind == Json::ARRAY && offset.items.size() == 2);
+    REQUIRE(fits, "image.offset", "must be two numbers", offset.describe(), "give [x, y] in metres");
+    const double middle[] = {offset.items.empty() ? 0 : offset.items[0].number, offset.items.empty() ? 0 : offset.items[1].number};
+    shape[1] = pixels_along(layout, "length_x", resolution), shape[2] = pixels_along(layout, "length_y", resolution);
+    std::vector<double> xy;
+    for (int64_t i = 0; i < shape[1]; i++)
+        for (int64_t j = 0; j < shape[2]; j++) {
+            xy.push_back(middle[0] + (double(i) - double(shape[1] - 1) / 2) * resolution);
+            xy.push_back(middle[1] + (double(j) - double(shape[2] - 1) / 2) * resolution);
+        }
+    settings.alignment = layout.choice("alignment", "yaw", {"yaw", "base", "world"});
+    settings.mode = layout.choice("mode", "bilinear", {"bilinear", "nearest", "minimum"});
+    settings.nominal_height = float(layout.number("nominal_height", 0));
+    Span(xy, settings.alignment, 0).require_inside(map.cfg);
+    pattern.assign(xy.begin(), xy.end());
+    const std::vector<std::string> channels = channels_of(layout);
+    settings.pattern = pattern.data(), settings.resolution = map.resolution();
+    settings.B = 1, settings.P = shape[1] * shape[2], settings.channels = shape[0] = int64_t(channels.size());
+    settings.height = map.sizes.H, settings.width = map.sizes.W;
+    add_sources(channels);
+    settings.sources = sources.data(), settings.num_sources = int64_t(sources.size());
+    values.resize(map.cells() * sources.size()), known.resize(values.size());
+    pixels = std::make_unique<images::Pixels>(settings);
+}
+
+// The layers that the channels are read from: "validity" is that of the elevation, "upper_bound" the elevation and, where
+// that is not known, the bound.
+void torchelev_image::add_sources(const std::vector<std::string>& channels) {
+    auto place = [&](const char* name) {
+        const auto found = std::find(channels.begin(), channels.end(), name);
+        return found == channels.end() ? int64_t(-1) : int64_t(found - channels.begin());
+    };
+    auto add = [&](const char* layer, int64_t channel, int64_t validity, bool is_height) {
+        if (channel < 0 && validity < 0) return;
+        layers.push_back(torchelev_map::layer(layer));
+        sources.push_back({nullptr, nullptr, nullptr, nullptr, channel, validity, is_height});
+    };
+    add("elevation", place("elevation"), place("validity"), true);
+    add("variance", place("variance"), -1, false);
+    add("traversability", place("traversability"), -1, false);
+    add("upper_bound", place("upper_bound"), -1, true);
+}
+
+// Compute a layer's cells.
+void torchelev_image::compute(const torchelev_map& map, size_t source) {
+    float* to = &values[map.cells() * source];
+    uint8_t* flags = &known[map.cells() * source];
+    for (int64_t k = 0; k < map.cells(); k++) {
+        const CellValue cell = map.read(layers[source], k);
+        to[k] = cell.value, flags[k] = cell.known;
+    }
+    sources[source].values = to, sources[source].known = flags;
+}
+
+void torchelev_image::read(const torchelev_map& map, const double* T_map_base, float* to) {
+    REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
+    require_poses("T_map_base", T_map_base, 1);
+    const bool fits = settings.height == map.sizes.H && settings.width == map.sizes.W && settings.resolution == map.resolution();
+    REQUIRE(fits, "map", "must have the grid that the image was created for", "another", "create an image for this map");
+    for (size_t k = 0; k < sources.size(); k++) compute(map, k);
+    settings.pose = T_map_base, settings.corner = map.state.corner, settings.images = to;
+    pixels->show(0);
+}
