@@ -43,7 +43,7 @@ int main(int, char** arguments) try {
         std::copy_n(head.T_map_base, 16, base.begin());
         const bool is_odd = number % 2;
         const long before = allocations;
-        map.update({head.num_sensors, head.num_points, points.data(), poses.data(), head.T_map_base, head.dt, is_odd ? variance.data() : nullptr, is_odd ? covariance.data() : nullptr});
+        map.update({head.num_sensors, head.num_points, points.data(), poses.data(), head.T_map_base, nullptr, head.dt, is_odd ? variance.data() : nullptr, is_odd ? covariance.data() : nullptr});
         ground(map, base);
         inpaint(map, base);
         if (number % 7 == 6) map.move(base);

@@ -91,6 +91,36 @@ def test_bits_are_those_of_python(library, tmp_path, name, sensors):
         assert_equal(found, emap)
 
 
+def test_bits_of_a_body_of_links(library):
+    body = te.RobotBody(
+        capsules=[te.Capsule(link="leg", start=(0, 0, 0), end=(0, 0, -0.4), radius=0.1)],
+        boxes=[te.Box(link="trunk", center=(0.1, 0, 0), half_lengths=(0.3, 0.2, 0.1), quat_wxyz=(0.8, 0.6, 0, 0))],
+    )
+    cfg = te.ElevationMapConfig(grid=GRID, sensor=te.SensorConfig(body=body))
+    emap, found = te.ElevationMap(cfg), CMap(library, json.dumps(cfg.to_dict()))
+    assert found.links == ["leg", "trunk"] == list(body.links)
+    rng, own = np.random.default_rng(0), 0
+    for points, T_map_sensor, _, dt in instants(2, 5, number=2000):
+        links = random_poses(rng, 2, height=(-0.5, 0.0))
+        points[:, :400] = torch.from_numpy(rng.normal(0, 0.3, (2, 400, 3)))
+        update(emap, points, T_map_sensor, T_map_sensor[0], dt, T_base_links=links)
+        found.update(*numpy(points, T_map_sensor, T_map_sensor[0], dt), T_base_links=links.numpy())
+        assert_equal(found, emap)
+        own += int(emap.statistics.rejected_body)
+    assert own > 50
+    T, points = np.eye(4), np.zeros((1, 5, 3))
+    for more, words in [
+        ({}, "T_base_links: must be given: the poses of 2 links"),
+        ({"T_base_links": 2 * links.numpy()}, "T_base_links: must be rigid"),
+    ]:
+        with pytest.raises(LibraryError, match=words):
+            found.update(points, T[None], T, 0.1, **more)
+    with pytest.raises(LibraryError, match="T_map_base: is required to pose the links"):
+        found.update(points, T[None], None, 0.1, T_base_links=links.numpy())
+    with pytest.raises(LibraryError, match="T_base_links: must be left out"):
+        CMap(library, "{}").update(points, T[None], T, 0.1, T_base_links=links.numpy())
+
+
 def test_bits_100_km_from_the_origin(library):
     emap, found = te.ElevationMap(CONFIGS["default"]), CMap(library, json.dumps(CONFIGS["default"].to_dict()))
     for instant in instants(2, far=1e5):

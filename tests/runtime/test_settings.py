@@ -101,6 +101,8 @@ def test_headers_are_up_to_date():
         assert (generate.FOLDER / name).read_text() == text, "run python -m torchelev.runtime.generate"
 
 
+CAPSULE = {"link": "leg", "start": [0.0, 0.0, 0.0], "end": [0.0, 0.0, -0.3], "radius": 0.05}
+BOX = {"link": "base", "center": [0.0, 0.0, 0.0], "half_lengths": [0.2, 0.1, 0.1]}
 BAD = [
     {"grid": {"resolution": -1.0}},
     {"grid": {"resolution": 0.3}},
@@ -143,6 +145,12 @@ BAD = [
     {"traversability": {"critical_step": 0.0}},
     {"traversability": {"critical_slope": 1.7}},
     {"torchelev_config": 2},
+    {"sensor": {"body": {"capsules": []}}},
+    {"sensor": {"body": {"capsules": [CAPSULE | {"radius": -1.0}]}}},
+    {"sensor": {"body": {"capsules": [CAPSULE | {"color": 1}]}}},
+    {"sensor": {"body": {"capsules": [CAPSULE], "padding": -0.5}}},
+    {"sensor": {"body": {"boxes": [BOX | {"half_lengths": [0.1, 0.0, 0.1]}]}}},
+    {"sensor": {"body": {"boxes": [BOX | {"quat_wxyz": [1.0, 1.0, 0.0, 0.0]}]}}},
 ]
 
 
@@ -161,7 +169,6 @@ NEEDS_PYTHON = {
     "learned": ElevationMapConfig(traversability=LearnedTraversabilityConfig()).to_dict(),
     "completion": {"completion": {}},
     "filters": {"filters": [{"layer": "smooth", "filter": "gaussian"}]},
-    "links": {"sensor": {"body": {"capsules": []}}},
 }
 
 

@@ -13,6 +13,7 @@ from torchelev.observations.image_kernel import LIBRARY as IMAGES
 from torchelev.observations.scan_kernel import LIBRARY as SCANS
 from torchelev.pipeline import register_stages
 from torchelev.planning.dijkstra import LIBRARY as DIJKSTRA
+from torchelev.robot_body.own_kernel import LIBRARY as OWN_POINTS
 from torchelev.sim.errors.cloud_kernel import LIBRARY as ERRORS
 from torchelev.sim.sensors.casting_kernel import LIBRARY as CASTING
 from torchelev.sim.terrains.heights_kernel import LIBRARY as HEIGHTS
@@ -23,7 +24,7 @@ def main() -> None:
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(register_stages(ElevationMapConfig())).parts
     completion = library_of(CompletionNet.from_pretrained().weights)
-    for library in (stages, completion, CASTING, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, SCANS):
+    for library in (stages, completion, CASTING, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, OWN_POINTS, SCANS):
         for path in build_ahead(*library):
             print(path.name)
 

@@ -36,7 +36,7 @@ class _Input(ctypes.Structure):
 
     _fields_ = (
         *(("num_sensors", ctypes.c_int32), ("num_points", _COUNT)),
-        *((name, _POINTER) for name in ("points", "T_map_sensor", "T_map_base")),
+        *((name, _POINTER) for name in ("points", "T_map_sensor", "T_map_base", "T_base_links")),
         ("dt", ctypes.c_double),
         *((name, _POINTER) for name in ("variance", "pose_covariance")),
     )
@@ -74,7 +74,7 @@ def _version() -> str:
 
 
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
-    for name in ("torchelev_last_error", "torchelev_version"):
+    for name in ("torchelev_last_error", "torchelev_version", "torchelev_map_link_name"):
         getattr(library, name).restype = ctypes.c_char_p
     library.torchelev_map_tensor.restype = _POINTER
     library.torchelev_scan_size.restype = _COUNT
@@ -140,15 +140,22 @@ class CMap:
         dt: float = 0.0,
         variance: Any = None,
         pose_covariance: Any = None,
+        T_base_links: Any = None,
     ) -> None:
-        """Update by points (S, N, 3), poses (S, 4, 4) and (4, 4), a variance (S, N) and covariances (S, 6, 6)."""
+        """Update by points (S, N, 3), poses (S, 4, 4), (4, 4), (K, 4, 4), variance (S, N) and covariance (S, 6, 6)."""
         points = np.ascontiguousarray(points, np.float32)
-        kinds = (np.float64, np.float64, np.float32, np.float64)
-        given = (T_map_sensor, T_map_base, variance, pose_covariance)
+        kinds = (np.float64, np.float64, np.float64, np.float32, np.float64)
+        given = (T_map_sensor, T_map_base, T_base_links, variance, pose_covariance)
         arrays = [None if v is None else np.ascontiguousarray(v, kind) for v, kind in zip(given, kinds, strict=True)]
-        sensor, base, variance, covariance = map(_address, arrays)
-        entry = _Input(*points.shape[:2], _address(points), sensor, base, dt, variance, covariance)
+        *poses, variance, covariance = map(_address, arrays)
+        entry = _Input(*points.shape[:2], _address(points), *poses, dt, variance, covariance)
         self._call("torchelev_map_update", self._map, ctypes.byref(entry))
+
+    @property
+    def links(self) -> list[str]:
+        """Names of the K links whose poses updates take."""
+        name = self._library.torchelev_map_link_name
+        return [name(self._map, k).decode() for k in range(self._library.torchelev_map_num_links(self._map))]
 
     def move(self, T_map_base: Any) -> None:
         """Move the window to the robot."""

@@ -123,6 +123,7 @@ class _LibraryMap:
             float(inputs["dt"]),
             per_sensor("variance", 2),
             per_sensor("pose_covariance", 3),
+            inputs.get("T_base_links"),
         )
 
     def read(self, T_map_base: NDArray, feet: NDArray | None) -> Values:

@@ -44,24 +44,23 @@ void update(torchelev_map* map) {
     float points[300];
     for (float& value : points) value = float(below(4000)) / 1000 - 2;
     const torchelev::Pose T{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1};
-    const torchelev_input input{1, 100, points, T.data(), T.data(), 0.1, nullptr, nullptr};
-    torchelev_map_update(map, &input);
+    const torchelev_input input{1, 100, points, T.data(), T.data(), nullptr, 0.1, nullptr, nullptr};
+    if (!torchelev_map_num_links(map)) return void(torchelev_map_update(map, &input));
+    std::vector<double> links;
+    for (int k = 0; k < torchelev_map_num_links(map); k++) links.insert(links.end(), T.begin(), T.end());
+    torchelev_input with_links = input;
+    with_links.T_base_links = links.data();
+    torchelev_map_update(map, &with_links);
 }
 
-// The grid stays small: a config may ask for a map that no machine has memory for.
-std::string with_small_grid(const std::string& config) {
-    const size_t brace = config.find('{');
-    if (brace == std::string::npos || config.find("\"grid\"") != std::string::npos) return config;
-    return config.substr(0, brace + 1) + "\"grid\": {\"resolution\": 0.1, \"length_x\": 2.0, \"length_y\": 1.5}, " + config.substr(brace + 1);
-}
-
+// Whether a config may ask for a large grid, which may be more than there is memory for.
 bool is_large(const std::string& config) { return config.find("\"grid\": {\"resolution\": 0.1,") == std::string::npos; }
 
 }  // namespace
 
 int main(int count, char** arguments) {
     if (count != 4) return std::fprintf(stderr, "usage: %s map.json folder seconds\n", arguments[0]), 2;
-    const std::string config = with_small_grid(read(arguments[1])), path = std::string(arguments[2]) + "/map.safetensors";
+    const std::string config = read(arguments[1]), path = std::string(arguments[2]) + "/map.safetensors";
     const std::string layout = "{\"pattern\": [[0.3, 0.2], [-0.4, 0.1]], \"fill\": \"inpaint\", \"clip\": 1.0, \"original\": \"-inf\", \"num_feet\": 0}";
     const torchelev_limits limits{200, 1, 1};
     torchelev_map* map = nullptr;

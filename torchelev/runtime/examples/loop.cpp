@@ -29,7 +29,7 @@ struct Instant {
                std::fread(points.data(), 4, points.size(), stdin) == points.size();
     }
     torchelev_input input() const {
-        return {head.num_sensors, head.num_points, points.data(), T_map_sensor.data(), head.T_map_base, head.dt, nullptr, nullptr};
+        return {head.num_sensors, head.num_points, points.data(), T_map_sensor.data(), head.T_map_base, nullptr, head.dt, nullptr, nullptr};
     }
 };
 

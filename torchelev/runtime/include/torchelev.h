@@ -28,7 +28,7 @@ typedef enum {
     TORCHELEV_OK = 0,
     TORCHELEV_BAD_VALUE = 1,   /**< an argument or a setting breaks a rule */
     TORCHELEV_BAD_FILE = 2,    /**< a file cannot be read or written, is damaged, or is of another version */
-    TORCHELEV_UNSUPPORTED = 3, /**< a setting needs Python: filters, completion, a learned head, shapes of links */
+    TORCHELEV_UNSUPPORTED = 3, /**< a setting needs Python: filters, completion, a learned head */
     TORCHELEV_NO_MEMORY = 4    /**< there is not enough memory */
 } torchelev_status;
 
@@ -55,6 +55,7 @@ typedef struct {
     const float* points;           /**< (S, N, 3) [m] sensor frame; NaN or inf where there is no return */
     const double* T_map_sensor;    /**< (S, 4, 4) */
     const double* T_map_base;      /**< (4, 4) the robot, which the window follows; null: the window stays */
+    const double* T_base_links;    /**< (K, 4, 4) the links of the config's `sensor.body`, from joint angles; null without */
     double dt;                     /**< [s] since the last update; 0 for a further sensor of the same instant */
     const float* variance;         /**< (S, N) [m^2] of each height, or null: the noise model's */
     const double* pose_covariance; /**< (S, 6, 6) x, y, z, rotations about the map's axes; null: poses are exact */
@@ -115,6 +116,12 @@ torchelev_status torchelev_map_move(torchelev_map* map, const double* T_map_base
 
 /** Write H and W, the cells along x and y, and the side of a cell [m]. Each pointer may be null. */
 torchelev_status torchelev_map_size(const torchelev_map* map, int64_t* rows, int64_t* columns, double* resolution);
+
+/** Return K, the links whose poses updates take: those of the shapes in the config's `sensor.body`. */
+int32_t torchelev_map_num_links(const torchelev_map* map);
+
+/** Return the name of a link, from 0 to K - 1; null beyond. Valid as long as the map. */
+const char* torchelev_map_link_name(const torchelev_map* map, int32_t link);
 
 /** Write the position [m] of the window's corner (x, y), from which cell (i, j) spans [i, i + 1] and [j, j + 1] cells. */
 torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]);

@@ -96,9 +96,11 @@ void Config::read_group_setting(size_t k, const Json& value) {
         return;
     }
     REQUIRE(value.kind == Json::OBJECT, where, "must be a mapping", value.type(), "see ElevationMapConfig");
-    const bool is_body = name == "sensor.body" && (value.find("capsules") || value.find("boxes"));
-    REQUIRE(!is_body, where, "needs Python: this library has no shapes of links", "capsules and boxes",
-            "give the box `lower` and `upper`, or run the map in Python", TORCHELEV_UNSUPPORTED);
+    if (name == "sensor.body" && (value.find("capsules") || value.find("boxes"))) {
+        entries[k].is_null = true;  // no box
+        body = RobotBody(value);
+        return;
+    }
     const bool is_learned = name == "traversability" && value.find("weights");
     REQUIRE(!is_learned, where, "needs Python: this library has no learned head", "weights",
             "give the analytic head, or null for no traversability", TORCHELEV_UNSUPPORTED);
@@ -139,7 +141,7 @@ std::string Config::canonical() const {
         else if (SETTINGS[k].kind != GROUP) text += " " + repr(entry.values[0]);
         text += "\n";
     }
-    return text;
+    return text + body.text;
 }
 
 // Rules --------------------------------------------------------------------------------------------------------------

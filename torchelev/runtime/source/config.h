@@ -5,7 +5,26 @@
 #include <vector>
 
 #include "generated.h"
+#include "robot_body/kernel/own_points.h"
 #include "runtime/source/json.h"
+
+// The shapes of a robot's links: shapes.py.
+struct RobotBody {
+    std::vector<std::string> links;
+    std::vector<robot_body::Capsule> capsules;
+    std::vector<robot_body::Box> boxes;
+    double padding = 0, depth_tolerance = 0;
+    std::string text;  // all numbers, to compare configs
+
+    RobotBody() = default;
+    explicit RobotBody(const Json& body);
+    robot_body::Body packed() const;
+
+  private:
+    int link_of(const Json& shape, const std::string& where);
+    void add_capsule(const Json& capsule);
+    void add_box(const Json& box);
+};
 
 class Config {
     struct Entry {
@@ -30,6 +49,8 @@ class Config {
     void require_at_least(const std::string& name, double least, const std::string& rule, const std::string& hint) const;
 
   public:
+    RobotBody body;  // of `sensor.body`, if that has shapes of links
+
     // Read the text of a file; errors name it. Raises Error.
     Config(const std::string& text, const std::string& where);
 

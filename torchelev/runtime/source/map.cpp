@@ -68,6 +68,7 @@ torchelev_map::torchelev_map(const std::string& text, const std::string& where, 
     static_assert(sizeof(MapState) == sizeof addresses && std::size(STATE) == NUMBER_OF_TENSORS);
     std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
     covariance.resize(36 * limits.max_sensors);
+    if (!cfg.body.links.empty()) on_robot.resize(limits.max_points);
     if (!team) use_team(run_on_shared_team);
     if (limits.num_threads > 1) Team::shared().grow(limits.num_threads - 1);
     warm_up();
@@ -96,8 +97,9 @@ void torchelev_map::forget() {
 void torchelev_map::warm_up() {
     const double T[] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 1}, size = resolution();
     std::vector<float> points(3 * limits.max_points), variance(limits.max_points, 1e-4f);
-    std::vector<double> poses, covariances(36 * limits.max_sensors, 0.0);
+    std::vector<double> poses, links, covariances(36 * limits.max_sensors, 0.0);
     for (int k = 0; k < limits.max_sensors; k++) poses.insert(poses.end(), T, T + 16);
+    for (size_t k = 0; k < cfg.body.links.size(); k++) links.insert(links.end(), T, T + 16);
     for (const int sensors : {1, limits.max_sensors})
         for (const float scale : {1.0f, 2.5f}) {
             const int64_t N = limits.max_points / sensors;
@@ -109,7 +111,7 @@ void torchelev_map::warm_up() {
                 points[3 * k + 1] = scale * float((double(cell % sizes.W - sizes.W / 2) + 0.5) * size);
                 points[3 * k + 2] = -1 + 0.01f * float(k % 7);
             }
-            const torchelev_input input{sensors, N, points.data(), poses.data(), T, 0.1, variance.data(),
+            const torchelev_input input{sensors, N, points.data(), poses.data(), T, links.empty() ? nullptr : links.data(), 0.1, variance.data(),
                                         covariances.data()};
             run(input, ORDER, std::size(ORDER));
         }
@@ -129,6 +131,17 @@ void torchelev_map::check(const torchelev_input& input) const {
     REQUIRE(input.T_map_sensor, "T_map_sensor", "must be given", "null", "give (S, 4, 4) doubles");
     require_poses("T_map_sensor", input.T_map_sensor, S);
     if (input.T_map_base) require_poses("T_map_base", input.T_map_base, 1);
+    const std::vector<std::string>& links = cfg.body.links;
+    if (links.empty()) {
+        REQUIRE(!input.T_base_links, "T_base_links", "must be left out, as sensor.body has no links", "poses",
+                "give sensor.body=RobotBody(...), or leave it out");
+    } else {
+        REQUIRE(input.T_base_links, "T_base_links", "must be given: the poses of " + std::to_string(links.size()) + " links",
+                "null", "compute them from the joint angles");
+        REQUIRE(input.T_map_base, "T_map_base", "is required to pose the links of sensor.body", "None",
+                "give it, or sensor.body=None");
+        require_poses("T_base_links", input.T_base_links, int64_t(links.size()));
+    }
     REQUIRE(std::isfinite(input.dt) && input.dt >= 0, "dt", "must be finite and not negative", repr(input.dt),
             "give the seconds since the last update");
 }
@@ -179,9 +192,19 @@ void torchelev_map::update(const torchelev_input& input) {
 void torchelev_map::move(const double* T_map_base) {
     REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
     require_poses("T_map_base", T_map_base, 1);
-    const torchelev_input input{1, 0, nullptr, T_map_base, T_map_base, 0, nullptr, nullptr};
+    const torchelev_input input{1, 0, nullptr, T_map_base, T_map_base, nullptr, 0, nullptr, nullptr};
     const Stage stages[] = {run_measure, run_recenter};
     run(input, stages, std::size(stages));
+}
+
+// Mark the points on the robot's links: `find_own` of measure/stage.py.
+void torchelev_map::find_own(const torchelev_input& input) {
+    const robot_body::Body body = cfg.body.packed();
+    for (int64_t k = 0; k < input.num_sensors; k++) {
+        const int64_t first = k * input.num_points;
+        posed.pose(body, input.T_map_sensor + 16 * k, input.T_map_base, input.T_base_links);
+        posed.find(input.points + 3 * first, input.num_points, body.depth_tolerance, &on_robot[first]);
+    }
 }
 
 void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64_t number) {
@@ -195,6 +218,11 @@ void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64
         std::copy_n(input.pose_covariance, 36 * input.num_sensors, covariance.begin());
         inputs.pose_covariance = covariance.data();
     }
+    if (input.T_base_links) {
+        find_own(input);
+        inputs.own = on_robot.data(), inputs.T_base_links = const_cast<double*>(input.T_base_links);
+    }
+    sizes.K = input.T_base_links ? int64_t(cfg.body.links.size()) : 0;
     sizes.S = input.num_sensors, sizes.N = input.num_points, sizes.M = sizes.S * sizes.N;
     sizes.P = sizes.S > 1 ? sizes.S : 0;
     Update one{settings, sizes, state, inputs, own.measurement, own.memory, limits.num_threads};

@@ -25,6 +25,8 @@ struct torchelev_map {
     std::vector<std::unique_ptr<unsigned char[]>> tensors;  // in the order of STATE
     MapState state;                                         // their addresses
     std::vector<float> covariance;                          // (S, 6, 6) of the input
+    std::vector<uint8_t> on_robot;                          // (S, N) of the input, with shapes of links
+    robot_body::Posed posed;
 
     torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* limits);
 
@@ -41,6 +43,7 @@ struct torchelev_map {
 
   private:
     void check(const torchelev_input& input) const;
+    void find_own(const torchelev_input& input);
     void run(const torchelev_input& input, const Stage* stages, int64_t number);
     void warm_up();
 };

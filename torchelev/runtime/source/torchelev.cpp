@@ -116,6 +116,13 @@ torchelev_status torchelev_map_size(const torchelev_map* map, int64_t* rows, int
     });
 }
 
+int32_t torchelev_map_num_links(const torchelev_map* map) { return map ? int32_t(map->cfg.body.links.size()) : 0; }
+
+const char* torchelev_map_link_name(const torchelev_map* map, int32_t link) {
+    const bool is_link = link >= 0 && link < torchelev_map_num_links(map);
+    return is_link ? map->cfg.body.links[link].c_str() : nullptr;
+}
+
 torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]) {
     return status_of([&] {
         const torchelev_map& m = given("map", map);

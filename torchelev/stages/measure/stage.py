@@ -11,6 +11,7 @@ from torchelev.grid import GridConfig
 from torchelev.inputs.checks import FARTHEST
 from torchelev.inputs.update_inputs import Inputs
 from torchelev.ops.masks import count
+from torchelev.robot_body import own_kernel
 from torchelev.robot_body.shapes import RobotBody
 from torchelev.stages.measure.body import inside_body, on_robot, rotate
 from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
@@ -218,12 +219,19 @@ def on_links(
 
 
 def find_own(inputs: Inputs, cfg: SensorConfig) -> Bool[Tensor, "B S N"] | None:
-    """Return which points of an update's inputs lie on the robot's links; None for a body without links."""
+    """Return which points of an update's inputs lie on the robot's links; None for a body without links.
+
+    For compiled updates, of points without gradients; of points out of range, it does not matter.
+    """
     if not isinstance(cfg.body, RobotBody):
         return None
     sound, T_map_sensor, T_map_base, T_base_links = sound_poses(
         inputs.T_map_sensor, inputs.T_map_base, inputs.T_base_links
     )
     assert T_map_base is not None and T_base_links is not None
+    if inputs.points.is_cpu:
+        own = own_kernel.find_own_points(inputs.points, T_map_sensor, T_map_base, T_base_links, cfg.body)
+        if own is not None:
+            return own
     sensed = gate_range(inputs.points.float(), None, sound, cfg)
     return on_links(sensed, T_map_sensor, T_map_base, T_base_links, cfg.body)
