@@ -20,7 +20,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "sphinx_design",
-    *(f"docs.extensions.{name}" for name in ("docstrings", "fields", "filters", "help_texts", "mathml")),
+    *(f"docs.extensions.{name}" for name in ("c_header", "docstrings", "fields", "filters", "help_texts", "mathml")),
 ]
 exclude_patterns = ["_build", "extensions", "pictures/README.md"]
 nitpicky = True

@@ -16,7 +16,7 @@ from torchelev.errors import require
 
 _SANITIZERS = {"address,undefined": "address,undefined", "thread": "thread"}
 _FEET = {"pattern": [[0.1, 0.2], [-0.3, 0.0]], "fill": "inpaint"}
-# Written as the example `fuzz` looks for it: the grid stays small, as a config may ask for more than there is memory for.
+# As the example `fuzz` looks for it: the grid stays small, as a config may ask for more memory than there is.
 _SMALL: dict[str, Any] = {
     "grid": {"resolution": 0.1, "length_x": 2.0, "length_y": 1.5},
     "sensor": {
@@ -47,7 +47,7 @@ def sanitize(seconds: int) -> dict[str, Any]:
             write_stream(folder / f"stream{sensors}", 30, sensors, 12_000)
         for kind, flag in _SANITIZERS.items():
             flags = f"-g -O1 -fsanitize={flag} -fno-sanitize-recover=all -fno-omit-frame-pointer"
-            programs = build(folder / kind, "-DCMAKE_BUILD_TYPE=None", f"-DCMAKE_CXX_FLAGS={flags}")
+            programs = build(folder / kind.replace(",", "-"), "-DCMAKE_BUILD_TYPE=None", f"-DCMAKE_CXX_FLAGS={flags}")
             for sensors in (1, 3):
                 for threads in (1, 4):
                     _replay(programs["loop"], folder, sensors, threads)

@@ -41,7 +41,7 @@ int main(int count, char** arguments) try {
     if (count < 3) return std::fprintf(stderr, "usage: %s map.json layout [threads [hertz [saved]]] < stream > scans\n", arguments[0]), 2;
     const int threads = count > 3 ? std::atoi(arguments[3]) : 1;
     const double hertz = count > 4 ? std::atof(arguments[4]) : 0;  // 0: as fast as it goes
-    torchelev::Map map(arguments[1], {131072, 4, threads});
+    torchelev::Map map(arguments[1], {65536, 4, threads});
     torchelev::HeightScan scan(map, arguments[2]);
     using Clock = std::chrono::steady_clock;
     std::vector<double> times;  // [ms]

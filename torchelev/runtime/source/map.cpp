@@ -100,8 +100,9 @@ void torchelev_map::warm_up() {
     std::vector<double> poses, links, covariances(36 * limits.max_sensors, 0.0);
     for (int k = 0; k < limits.max_sensors; k++) poses.insert(poses.end(), T, T + 16);
     for (size_t k = 0; k < cfg.body.links.size(); k++) links.insert(links.end(), T, T + 16);
-    for (const int sensors : {1, limits.max_sensors})
-        for (const float scale : {1.0f, 2.5f}) {
+    for (const float scale : {1.0f, 2.5f})
+        for (const int sensors : {limits.max_sensors, 1}) {
+            if (scale > 1 && sensors == 1 && limits.max_sensors > 1) continue;  // several sensors reach as far
             const int64_t N = limits.max_points / sensors;
             forget();
             for (int64_t k = 0; k < N * sensors; k++) {
@@ -111,8 +112,8 @@ void torchelev_map::warm_up() {
                 points[3 * k + 1] = scale * float((double(cell % sizes.W - sizes.W / 2) + 0.5) * size);
                 points[3 * k + 2] = -1 + 0.01f * float(k % 7);
             }
-            const torchelev_input input{sensors, N, points.data(), poses.data(), T, links.empty() ? nullptr : links.data(), 0.1, variance.data(),
-                                        covariances.data()};
+            const torchelev_input input{sensors, N, points.data(), poses.data(), T,
+                                        links.empty() ? nullptr : links.data(), 0.1, variance.data(), covariances.data()};
             run(input, ORDER, std::size(ORDER));
         }
 }

@@ -1,6 +1,9 @@
-// Threads that share the work of updates, and sleep between them.
+// Threads that share the work of updates. They look for the next piece for a moment, then sleep.
 #pragma once
 
+#include <algorithm>
+#include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <mutex>
 #include <thread>
@@ -12,8 +15,15 @@ class Team {
     std::vector<std::thread> helpers;
     void (*function)(void*) = nullptr;
     void* data = nullptr;
-    unsigned wanted = 0, running = 0;  // helpers that shall begin; that work
+    std::atomic<unsigned> wanted{0}, running{0};  // helpers that shall begin; that work
     bool leaves = false;
+
+    // Look for a moment whether something holds: waking up takes as long as many a piece of an update.
+    template <class Holds> static void watch(const Holds& holds) {
+        using Clock = std::chrono::steady_clock;
+        for (const auto end = Clock::now() + std::chrono::microseconds(100); !holds() && Clock::now() < end;)
+            std::this_thread::yield();
+    }
 
     void help() {
         std::unique_lock<std::mutex> lock(mutex);
@@ -25,6 +35,9 @@ class Team {
             function(data);
             lock.lock();
             if (--running == 0) ends.notify_all();
+            lock.unlock();
+            watch([&] { return wanted > 0; });
+            lock.lock();
         }
     }
 
@@ -55,6 +68,7 @@ class Team {
         }
         begins.notify_all();
         call(argument);
+        watch([&] { return running == 0; });
         std::unique_lock<std::mutex> lock(mutex);
         wanted = 0;  // who has not begun finds nothing left to do
         ends.wait(lock, [&] { return running == 0; });
