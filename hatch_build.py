@@ -17,7 +17,7 @@ class LibrariesHook(BuildHookInterface):
         if version != "editable" and libraries:
             build_data["pure_python"] = False
             build_data["tag"] = f"py3-none-{_platform()}"
-            build_data["artifacts"] += ["torchelev/kernels/built/*.so"]
+            build_data["artifacts"] += ["torchelev/kernels/built/*.so", "torchelev/kernels/built/*.h*"]
 
 
 def _platform() -> str:

@@ -22,6 +22,7 @@ from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.quality.odometry import report as odometry
 from benchmarks.quality.real import completed, merged
+from benchmarks.runtime import report as runtime
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
 from benchmarks.speed import (
@@ -142,6 +143,8 @@ TABLES = {
     "real": _real,
     "speed": _speed,
     "loop": _made_by(loop.table, "loop", "rows"),
+    "runtime_speed": _made_by(runtime.speed_table, "runtime_speed"),
+    "runtime_aarch64": _made_by(runtime.aarch64_table, "runtime_aarch64"),
     "long_run": _long_run,
     "odometry": _made_by(odometry.table, "odometry"),
     "bags": _made_by(bags.table, "bags", "rows"),

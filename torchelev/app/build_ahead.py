@@ -9,14 +9,18 @@ from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
+from torchelev.kernels.registry import PACKAGE
 from torchelev.observations.image_kernel import LIBRARY as IMAGES
 from torchelev.observations.scan_kernel import LIBRARY as SCANS
 from torchelev.pipeline import register_stages
 from torchelev.planning.dijkstra import LIBRARY as DIJKSTRA
 from torchelev.robot_body.own_kernel import LIBRARY as OWN_POINTS
+from torchelev.runtime.library import library_parts
 from torchelev.sim.errors.cloud_kernel import LIBRARY as ERRORS
 from torchelev.sim.sensors.casting_kernel import LIBRARY as CASTING
 from torchelev.sim.terrains.heights_kernel import LIBRARY as HEIGHTS
+
+INCLUDE = PACKAGE / "runtime" / "include"
 
 
 def main() -> None:
@@ -24,9 +28,11 @@ def main() -> None:
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(register_stages(ElevationMapConfig())).parts
     completion = library_of(CompletionNet.from_pretrained().weights)
-    for library in (stages, completion, CASTING, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, OWN_POINTS, SCANS):
+    for library in (stages, completion, CASTING, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, OWN_POINTS, SCANS, library_parts()):
         for path in build_ahead(*library):
             print(path.name)
+    for name in ("torchelev.h", "torchelev.hpp"):
+        shutil.copy(INCLUDE / name, AHEAD / name)  # beside the libtorchelev of each instruction set
 
 
 if __name__ == "__main__":

@@ -48,11 +48,15 @@ def build_library() -> ctypes.CDLL:
     Raises:
         RuntimeError: there is no C++ compiler, or TORCHELEV_NATIVE=0 forbids to build.
     """
-    version = {"TORCHELEV_VERSION": '"' + _version() + '"'}
-    library = load(SOURCES, version, headers())
+    library = load(*library_parts())
     if library is None:
         raise RuntimeError("libtorchelev: no C++ compiler was found, or TORCHELEV_NATIVE=0; install g++ or clang++")
     return _declared(library)
+
+
+def library_parts() -> tuple[tuple[str, ...], dict[str, str], dict[str, str]]:
+    """Return sources, constants and headers of the library."""
+    return SOURCES, {"TORCHELEV_VERSION": '"' + _version() + '"'}, headers()
 
 
 def open_library(path: str | Path) -> ctypes.CDLL:

@@ -80,6 +80,10 @@ typedef struct {
     int64_t cells_bounded;        /**< unknown cells that have an upper bound */
 } torchelev_statistics;
 
+#ifdef __GNUC__
+#pragma GCC visibility push(default)  // the library exports these functions alone
+#endif
+
 /** Return this thread's last error as a sentence, or "" before the first one. Valid until the thread's next error. */
 const char* torchelev_last_error(void);
 
@@ -221,6 +225,9 @@ torchelev_status torchelev_image_shape(const torchelev_image* image, int64_t sha
 torchelev_status torchelev_image_read(torchelev_image* image, const torchelev_map* map, const double* T_map_base,
                                       float* values);
 
+#ifdef __GNUC__
+#pragma GCC visibility pop
+#endif
 #ifdef __cplusplus
 }
 #endif
