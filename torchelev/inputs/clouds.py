@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -60,6 +60,41 @@ def depth_to_points(
         rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     hit = torch.isfinite(depth) & (depth > 0)
     return (rays * torch.where(hit, depth, math.nan)[..., None]).flatten(-3, -2).to(dtype)
+
+
+def height_map_to_points(
+    heights: Float[Tensor, "... h w"],
+    resolution: float,
+    origin: tuple[float, float],
+    empty: float = 1e9,
+) -> Float[Tensor, "... h*w 3"]:
+    """Turn a height map that a robot sends into points [m] of its frame, one for each cell.
+
+    Args:
+        heights: [m]; cell [j, i] is at origin + (i, j) * resolution.
+        resolution: side of a cell [m].
+        origin: x, y [m] of cell [0, 0].
+        empty: the value of cells without a height, beside NaN and infinity; Unitree's robots send 1e9.
+
+    Returns:
+        Points (..., h * w, 3), row by row; NaN where there is no height.
+
+    Raises:
+        ValueError: for a resolution that is not positive, or heights of one dimension.
+        TypeError: for heights that are no floats.
+    """
+    is_float = isinstance(heights, Tensor) and heights.is_floating_point()
+    require(is_float, "heights", "must be a tensor of floats", type(heights).__name__, "use .float()", TypeError)
+    hint = "reshape the message's data to (height, width)"
+    require(heights.ndim >= 2, "heights", "expected (..., h, w)", tuple(heights.shape), hint)
+    require_positive(resolution=resolution)
+    like: dict[str, Any] = {"device": heights.device, "dtype": heights.dtype}
+    y = origin[1] + resolution * torch.arange(heights.shape[-2], **like)[:, None]
+    x = origin[0] + resolution * torch.arange(heights.shape[-1], **like)
+    known = torch.isfinite(heights) & (heights != empty)
+    z = torch.where(known, heights, math.nan)
+    x, y = x.expand_as(z), y.expand_as(z)
+    return torch.stack([torch.where(known, x, math.nan), torch.where(known, y, math.nan), z], -1).flatten(-3, -2)
 
 
 def _check_images(depth: Tensor, intrinsics: Tensor) -> None:
