@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.errors import require_positive, whole_cells
+from torchelev.errors import require, require_positive, whole_cells
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
+
+
+MIN_RESOLUTION = 1e-4  # [m] finer cells are no cells of ground, and their numbers would not fit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +31,8 @@ class GridConfig:
 
     def __post_init__(self) -> None:
         require_positive(**{"grid.resolution": self.resolution})
+        fits, rule = self.resolution >= MIN_RESOLUTION, f"must be at least {MIN_RESOLUTION} m"
+        require(fits, "grid.resolution", rule, self.resolution, "give metres")
         for name in ("length_x", "length_y"):
             whole_cells(f"grid.{name}", getattr(self, name), self.resolution)
 

@@ -17,7 +17,7 @@ PROGRAMS = "step", "loop", "fuzz"
 
 
 def run(*command: Any, **options: Any) -> subprocess.CompletedProcess[bytes]:
-    """Run a command; raise CalledProcessError with what it printed if it fails."""
+    """Run a command; raise RuntimeError with what it printed if it fails."""
     done = subprocess.run([str(part) for part in command], capture_output=True, **options)
     if done.returncode:
         raise RuntimeError(

@@ -38,12 +38,15 @@ int main(int, char** arguments) try {
     std::vector<double> covariance(3 * 36, 0.0);
     for (int number = 0; std::fread(&head, sizeof head, 1, stdin) == 1; number++) {
         const size_t S = size_t(head.num_sensors), N = size_t(head.num_points);
-        if (std::fread(poses.data(), 8, 16 * S, stdin) != 16 * S || std::fread(points.data(), 4, 3 * S * N, stdin) != 3 * S * N) return 2;
+        if (std::fread(poses.data(), 8, 16 * S, stdin) != 16 * S ||
+            std::fread(points.data(), 4, 3 * S * N, stdin) != 3 * S * N)
+            return 2;
         torchelev::Pose base;
         std::copy_n(head.T_map_base, 16, base.begin());
         const bool is_odd = number % 2;
         const long before = allocations;
-        map.update({head.num_sensors, head.num_points, points.data(), poses.data(), head.T_map_base, nullptr, head.dt, is_odd ? variance.data() : nullptr, is_odd ? covariance.data() : nullptr});
+        map.update({head.num_sensors, head.num_points, points.data(), poses.data(), head.T_map_base, nullptr, head.dt,
+                    is_odd ? variance.data() : nullptr, is_odd ? covariance.data() : nullptr});
         ground(map, base);
         inpaint(map, base);
         if (number % 7 == 6) map.move(base);

@@ -187,6 +187,39 @@ def test_a_missing_group_is_named(run):
             recorder.write(run)
 
 
+def test_clouds_of_other_sizes_and_a_reset_without_an_update_are_recorded(library, run, tmp_path):
+    emap = te.ElevationMap(te.ElevationMapConfig(grid=te.GridConfig(resolution=0.05, length_x=3, length_y=3)))
+    T = pose((0.0, 0.0, 0.8))
+    with Recorder(emap, {"scan": SCAN}) as recorder:
+        for step, number in enumerate((300, 200, 0, 250)):
+            if step == 2:
+                emap.reset()
+            else:
+                emap.update(random_clouds(np.random.default_rng(step), T, number), T, T, 0.1)
+            scan = SCAN(emap, T)[0]
+            recorder.step({"scan": scan}, 0.5 * scan.sum(1, keepdim=True) * torch.tensor([1.0, -1.0]), T)
+        with pytest.raises(NotImplementedError, match="emap.initialize: is not recorded"):
+            emap.initialize(torch.zeros(1, 3, 3))
+    recorder.write(run)
+    save_policy(run / POLICY, 3)
+    invoke("export", run, "--out", tmp_path / "bundle")
+    lines = invoke("check", tmp_path / "bundle").splitlines()
+    assert [line.split(":")[0] for line in lines] == ["same"] * 3
+
+
+def test_an_export_that_was_interrupted_is_made_again(run, tmp_path):
+    bundle = tmp_path / "bundle"
+    invoke("export", run, "--out", bundle)
+    (bundle / "bundle.json").unlink()
+    invoke("export", run, "--out", bundle)
+
+
+def test_a_file_that_is_no_policy_is_refused(run, tmp_path):
+    (run / POLICY).write_bytes(b"no model")
+    invoke("export", run, "--out", tmp_path / "bundle")
+    assert "policy.onnx: cannot be read" in invoke("check", tmp_path / "bundle", code=2)
+
+
 def test_the_episode_is_that_of_its_environment(run, tmp_path):
     invoke("export", run, "--out", tmp_path / "bundle")
     bundle = read_bundle(tmp_path / "bundle")

@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import os
 import re
 
 import numpy as np
@@ -289,6 +290,49 @@ def test_a_saved_map_continues(library, walked, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.safetensors"]
 
 
+def with_corner(saved, number):
+    """A file of a saved map with another corner, whose numbers are its first."""
+    first = 8 + int.from_bytes(saved[:8], "little")
+    return saved[:first] + number.to_bytes(8, "little", signed=True) + saved[first + 8 :]
+
+
+def test_a_link_is_followed_and_no_other_file_is_touched(walked, tmp_path):
+    _, found = walked
+    target, link = tmp_path / "a.safetensors", tmp_path / "link"
+    link.symlink_to(target)
+    target.write_bytes(b"old")
+    found.save(link)
+    assert link.is_symlink() and target.stat().st_size > 1000 and target.stat().st_mode & 0o777 == 0o644
+    assert {path.name for path in tmp_path.iterdir()} == {"a.safetensors", "link"}
+
+
+def test_a_forked_child_maps_on_several_threads(library):
+    wanted = CMap(library, "{}", num_threads=2)
+    wanted.update(*numpy(*next(instants())))
+    child = os.fork()
+    if child == 0:
+        emap = CMap(library, "{}", num_threads=2)
+        emap.update(*numpy(*next(instants())))
+        os._exit(0 if np.array_equal(emap.layer("elevation"), wanted.layer("elevation"), equal_nan=True) else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("points", np.zeros((5, 3))),
+        ("T_map_sensor", np.eye(4)),
+        ("T_map_base", np.eye(3)),
+        ("variance", np.zeros(5)),
+        ("pose_covariance", np.eye(6)),
+    ],
+)
+def test_other_shapes_are_refused_before_c_reads_them(walked, name, value):
+    given = {"points": np.zeros((1, 5, 3)), "T_map_sensor": np.eye(4)[None], "dt": 0.1, name: value}
+    with pytest.raises(ValueError, match=f"{name}: expected"):
+        walked[1].update(**given)
+
+
 def test_another_map_is_refused(library, walked, tmp_path):
     _, found = walked
     path = tmp_path / "a.safetensors"
@@ -306,6 +350,7 @@ def test_another_map_is_refused(library, walked, tmp_path):
         lambda b: b.replace(b'"version":"1"', b'"version":"2"'),
         lambda b: b.replace(b"F32", b"I32"),
         lambda b: b.replace(height.tobytes(), np.float32(np.nan).tobytes()),
+        lambda b: with_corner(b, -(2**63)),
     ):
         path.write_bytes(damage(path.read_bytes()))
         before = found.tensor("elevation", np.uint8)

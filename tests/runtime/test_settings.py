@@ -106,6 +106,7 @@ BOX = {"link": "base", "center": [0.0, 0.0, 0.0], "half_lengths": [0.2, 0.1, 0.1
 BAD = [
     {"grid": {"resolution": -1.0}},
     {"grid": {"resolution": 0.3}},
+    {"grid": {"resolution": 1e-11, "length_x": 1e-10, "length_y": 1e-10}},
     {"grid": {"resolution": "fine"}},
     {"grid": {"size": 3}},
     {"grids": {}},
@@ -167,6 +168,7 @@ def test_bad_settings_are_refused_in_pythons_words(library, tmp_path, values):
 
 NEEDS_PYTHON = {
     "learned": ElevationMapConfig(traversability=LearnedTraversabilityConfig()).to_dict(),
+    "learned, in short": {"traversability": {"robot": {"length": 0.5}}},
     "completion": {"completion": {}},
     "filters": {"filters": [{"layer": "smooth", "filter": "gaussian"}]},
 }
@@ -197,3 +199,17 @@ def test_limits_are_checked(library):
     for name in ("max_points", "max_sensors", "num_threads"):
         with pytest.raises(LibraryError, match=f"limits.{name}: must be from 1"):
             CMap(library, "{}", **{name: 0})
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ('{"traversability": {"robot": 3, "radius": 0.1}}', "config.traversability.robot: must be a mapping, got int"),
+        ('{"grid": {"length_x": 4000.0, "length_y": 4000.0}}', "grid: must have at most 2^26 cells"),
+        ('{"raycast": {"max_range": 1e308}}', "raycast.max_range: rays of 0.04 m cells"),
+    ],
+)
+def test_what_there_is_no_memory_or_meaning_for_is_refused(library, text, words):
+    with pytest.raises(LibraryError) as error:
+        CMap(library, text)
+    assert words in str(error.value)

@@ -40,6 +40,10 @@ class _OwnPoints(ctypes.Structure):
     )
 
 
+def _floats(rows: list[list[float]]) -> Tensor:
+    return torch.tensor(rows, dtype=torch.float32, device="cpu")
+
+
 @functools.lru_cache(maxsize=64)
 def _packed(body: RobotBody) -> tuple[Tensor, Tensor]:
     """Return the shapes as C++ takes them: capsules (P, 9) and boxes (Q, 16), float32."""
@@ -52,7 +56,7 @@ def _packed(body: RobotBody) -> tuple[Tensor, Tensor]:
         [body.links.index(b.link), *b.center, *rotation_rows(b.quat_wxyz), *(h + body.padding for h in b.half_lengths)]
         for b in body.boxes
     ]
-    return torch.tensor(capsules, dtype=torch.float32), torch.tensor(boxes, dtype=torch.float32)
+    return _floats(capsules), _floats(boxes)
 
 
 def find_own_points(
@@ -69,7 +73,7 @@ def find_own_points(
     B, S, N = points.shape[:3]
     points = points.float().contiguous()
     poses = [T.double().contiguous() for T in (T_map_sensor, T_map_base, T_base_links)]
-    own = torch.empty(B, S, N, dtype=torch.bool)
+    own = torch.empty(B, S, N, dtype=torch.bool, device=points.device)
     capsules, boxes = _packed(body)
     shapes = _Body(capsules.data_ptr(), boxes.data_ptr(), len(capsules), len(boxes), body.depth_tolerance)
     addresses = (value.data_ptr() for value in (points, *poses, own))

@@ -148,12 +148,11 @@ def _preset(name: str) -> str:
     scan = HeightScan.preset(name)
     x_fastest = scan.pattern[0][1] == scan.pattern[1][1]
     mode = scan.mode.upper()
-    original = "NAN" if scan.original == "base" else _number(float(scan.original))
     numbers = [scan.nominal_height, math.inf if scan.clip is None else scan.clip, scan.scale]
     numbers.append(scan.nominal_height if scan.standing_height is None else scan.standing_height)
     texts = ", ".join(_number(float(number)) for number in numbers)
     axes = ", ".join(f"{name.upper()}_{a}, int(std::size({name.upper()}_{a}))" for a in "XY")
-    return f'{{"{name}", {axes}, {str(x_fastest).lower()}, scans::{mode}, {texts}, {original}}}'
+    return f'{{"{name}", {axes}, {str(x_fastest).lower()}, scans::{mode}, {texts}}}'
 
 
 def main() -> None:

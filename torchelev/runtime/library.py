@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.errors import require
 from torchelev.kernels.cpu_build import load
 from torchelev.runtime.generate import headers
 from torchelev.runtime.sources import SOURCES
@@ -93,6 +94,16 @@ def _address(array: NDArray | None) -> int | None:
     return None if array is None else array.ctypes.data
 
 
+def _array(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
+    """Return a value as an array of this dtype and shape, in which -1 is any size; None stays None."""
+    if value is None:
+        return None
+    array = np.ascontiguousarray(value, dtype)
+    fits = array.ndim == len(shape) and all(b in (-1, a) for a, b in zip(array.shape, shape, strict=True))
+    require(fits, name, f"expected {shape}", array.shape, "see torchelev.h")
+    return array
+
+
 class CMap:
     """A map of the C library: `torchelev.h`.
 
@@ -147,12 +158,17 @@ class CMap:
         T_base_links: Any = None,
     ) -> None:
         """Update by points (S, N, 3), poses (S, 4, 4), (4, 4), (K, 4, 4), variance (S, N) and covariance (S, 6, 6)."""
-        points = np.ascontiguousarray(points, np.float32)
-        kinds = (np.float64, np.float64, np.float64, np.float32, np.float64)
-        given = (T_map_sensor, T_map_base, T_base_links, variance, pose_covariance)
-        arrays = [None if v is None else np.ascontiguousarray(v, kind) for v, kind in zip(given, kinds, strict=True)]
-        *poses, variance, covariance = map(_address, arrays)
-        entry = _Input(*points.shape[:2], _address(points), *poses, dt, variance, covariance)
+        points = _array("points", points, np.float32, (-1, -1, 3))
+        S, N = points.shape[:2]
+        poses = [
+            _array("T_map_sensor", T_map_sensor, np.float64, (S, 4, 4)),
+            _array("T_map_base", T_map_base, np.float64, (4, 4)),
+            _array("T_base_links", T_base_links, np.float64, (len(self.links) or -1, 4, 4)),
+        ]
+        variance = _array("variance", variance, np.float32, (S, N))
+        covariance = _array("pose_covariance", pose_covariance, np.float64, (S, 6, 6))
+        addresses = (_address(value) for value in (points, *poses))
+        entry = _Input(S, N, *addresses, dt, _address(variance), _address(covariance))
         self._call("torchelev_map_update", self._map, ctypes.byref(entry))
 
     @property
@@ -163,7 +179,7 @@ class CMap:
 
     def move(self, T_map_base: Any) -> None:
         """Move the window to the robot."""
-        pose = np.ascontiguousarray(T_map_base, np.float64)
+        pose = _array("T_map_base", T_map_base, np.float64, (4, 4))
         self._call("torchelev_map_move", self._map, _POINTER(_address(pose)))
 
     def reset(self) -> None:
@@ -187,7 +203,7 @@ class CMap:
 
     def sample(self, name: str, xy: Any, mode: str = "bilinear") -> tuple[NDArray, NDArray]:
         """Return a layer's values at points (M, 2) [m], and where they are known."""
-        xy = np.ascontiguousarray(xy, np.float64)
+        xy = _array("xy", xy, np.float64, (-1, 2))
         values, known = np.empty(len(xy), np.float32), np.empty(len(xy), bool)
         places = (_POINTER(_address(array)) for array in (values, known))
         at = _POINTER(_address(xy)), _COUNT(len(xy))
@@ -225,12 +241,10 @@ class CScan:
     def __call__(self, T_map_base: Any, feet: Any = None) -> tuple[NDArray, NDArray]:
         """Return values (P), and where the elevation is known."""
         size = self._library.torchelev_scan_size(self._scan)
-        pose, values, known = (
-            np.ascontiguousarray(T_map_base, np.float64),
-            np.empty(size, np.float32),
-            np.empty(size, bool),
-        )
-        feet = None if feet is None else np.ascontiguousarray(feet, np.float64)
+        pose = _array("T_map_base", T_map_base, np.float64, (4, 4))
+        values, known = np.empty(size, np.float32), np.empty(size, bool)
+        num_feet = self._library.torchelev_scan_num_feet(self._scan)
+        feet = _array("feet", feet, np.float64, (num_feet, 3) if num_feet else (-1, 3))
         places = (_POINTER(_address(array)) for array in (pose, feet, values, known))
         self._emap._call("torchelev_scan_read", self._scan, self._emap._map, *places)
         return values, known
@@ -251,7 +265,7 @@ class CImage:
         """Return the image (C, H, W)."""
         shape = (_COUNT * 3)()
         self._emap._call("torchelev_image_shape", self._image, shape)
-        pose, values = np.ascontiguousarray(T_map_base, np.float64), np.empty(tuple(shape), np.float32)
+        pose, values = _array("T_map_base", T_map_base, np.float64, (4, 4)), np.empty(tuple(shape), np.float32)
         places = (_POINTER(_address(array)) for array in (pose, values))
         self._emap._call("torchelev_image_read", self._image, self._emap._map, *places)
         return values

@@ -1,4 +1,5 @@
-// One robot's image of the map at a time: map_image.py. Included by files that forbid the contraction of products and sums.
+// One robot's image of the map at a time: map_image.py. Included by files that forbid the contraction of products and
+// sums.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,5 @@
-// One robot's height scan at a time: scan_reading.py. Included by files that forbid the contraction of products and sums.
+// One robot's height scan at a time: scan_reading.py. Included by files that forbid the contraction of products and
+// sums.
 #pragma once
 
 #include <algorithm>

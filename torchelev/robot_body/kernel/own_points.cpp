@@ -11,10 +11,10 @@
 
 // `_OwnPoints` of own_kernel.py.
 struct OwnPoints {
-    const float* points;         // (B, S, N, 3) [m] sensor frame
-    const double *T_map_sensor;  // (B, S, 4, 4)
+    const float* points;                      // (B, S, N, 3) [m] sensor frame
+    const double* T_map_sensor;               // (B, S, 4, 4)
     const double *T_map_base, *T_base_links;  // (B, 4, 4), (B, K, 4, 4)
-    uint8_t* own;                // (B, S, N)
+    uint8_t* own;                             // (B, S, N)
     robot_body::Body body;
     int64_t B, S, N, K;
 };

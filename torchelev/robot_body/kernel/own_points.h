@@ -113,7 +113,8 @@ inline Lanes excess(const Pieces& p, const PosedCapsule& c) {
     Lanes v = clamp((on_start * on_axis - c.start_axis) / larger(c.squared - on_axis * on_axis, splat(TINY)), 0, 1);
     const Lanes t = within(on_start + v * on_axis);
     v = clamp((t * on_axis - c.start_axis) / c.squared, 0, 1);
-    const Lanes distance2 = t * (t - 2 * (on_start + v * on_axis)) + c.start_start + v * (2 * c.start_axis + v * c.squared);
+    const Lanes distance2 =
+        t * (t - 2 * (on_start + v * on_axis)) + c.start_start + v * (2 * c.start_axis + v * c.squared);
     return distance2 - c.limit;
 }
 

@@ -68,7 +68,8 @@ def export_bundle(run: str | Path, out: str | Path) -> Bundle:
         hint = "train again, or record an episode with torchelev.runtime.bundle.recording.Recorder"
         require((run / name).is_file(), str(run / name), "must be there", "no file", hint)
     bundle = _read(run)
-    is_bundle = not out.exists() or (out / MANIFEST).is_file() or (out.is_dir() and not any(out.iterdir()))
+    others = {path.name for path in out.iterdir()} - {MANIFEST, *PARTS} if out.is_dir() else set()
+    is_bundle = not out.exists() or (out.is_dir() and not others)
     require(is_bundle, str(out), "must be a new folder or an older bundle", "other files", "give another --out")
     out.mkdir(parents=True, exist_ok=True)
     (out / MANIFEST).unlink(missing_ok=True)  # until all parts are there
@@ -94,8 +95,8 @@ def read_bundle(folder: str | Path) -> Bundle:
     for name in PARTS:
         is_there = (folder / name).is_file()
         require(is_there, str(folder / name), "must be there", "no file", _AGAIN)
-        wanted = manifest.get("sha256", {}).get(name)
-        is_same = _hash(folder / name) == wanted
+        hashes = manifest.get("sha256")
+        is_same = isinstance(hashes, dict) and _hash(folder / name) == hashes.get(name)
         require(is_same, str(folder / name), "must be as it was exported", "another hash", _AGAIN)
     return _read(folder)
 
@@ -132,8 +133,20 @@ def _read(folder: Path) -> Bundle:
 def _require_fit(bundle: Bundle) -> None:
     """Refuse parts that do not fit each other, by their names."""
     episode, where = bundle.episode, str(bundle.folder / EPISODE)
-    for name in ("step_action", "step_T_map_base", "update_step", "update_points", "update_T_map_sensor", "update_dt"):
+    for name in (
+        "step_action",
+        "step_T_map_base",
+        "step_resets",
+        "update_step",
+        "update_resets",
+        "update_points",
+        "update_T_map_sensor",
+        "update_dt",
+    ):
         require(name in episode, where, f"must have an array {name}", "none", _AGAIN)
+    sizes = {prefix: {len(v) for k, v in episode.items() if k.startswith(prefix)} for prefix in ("step_", "update_")}
+    for prefix, lengths in sizes.items():
+        require(len(lengths) == 1, where, f"must have {prefix}* arrays of one length", sorted(lengths), _AGAIN)
     for name, group in bundle.groups.items():
         found = episode.get(f"step_group_{name}")
         shape = (bundle.num_steps, *shape_of(group))

@@ -67,6 +67,8 @@ def _replay(bundle: Bundle, emap: Any) -> Iterator[Values]:
             if inputs.pop("resets"):
                 emap.reset()
             emap.update(inputs)
+        if bundle.episode["step_resets"][step]:
+            emap.reset()
         T_map_base = bundle.episode["step_T_map_base"][step]
         yield emap.read(T_map_base, None if feet is None else feet[step])
 
@@ -116,13 +118,16 @@ class _LibraryMap:
             value = inputs.get(name)
             return value if value is None or value.ndim == ndim else value[None]
 
+        covariance, sensors = per_sensor("pose_covariance", 3), per_sensor("T_map_sensor", 3)
+        if covariance is not None:  # one may be given for all sensors
+            covariance = np.broadcast_to(covariance, (len(sensors), 6, 6))
         self.emap.update(
             per_sensor("points", 3),
-            per_sensor("T_map_sensor", 3),
+            sensors,
             inputs.get("T_map_base"),
             float(inputs["dt"]),
             per_sensor("variance", 2),
-            per_sensor("pose_covariance", 3),
+            covariance,
             inputs.get("T_base_links"),
         )
 
@@ -177,7 +182,10 @@ def open_policy(bundle: Bundle) -> Callable[[Values], NDArray]:
     import onnxruntime
 
     path = bundle.folder / POLICY
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    try:
+        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's own kinds
+        raise ValueError(f"{path}: cannot be read ({error}); export the run again") from error
     inputs, shapes = session.get_inputs(), {name: shape_of(group) for name, group in bundle.groups.items()}
     if len(inputs) == 1 and all(len(shape) == 1 for shape in shapes.values()):
         wanted: dict[str, tuple[int, ...]] = {inputs[0].name: (sum(shape[0] for shape in shapes.values()),)}

@@ -66,7 +66,7 @@ def _group(where: str, row: dict[str, Any]) -> Group:
             }
             return MapImage(**settings)
         return HeightScan(**{name: _number(value) for name, value in row["layout"].items()})
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{where}: {error}; {hint}") from error
 
 

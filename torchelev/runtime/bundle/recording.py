@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,12 +15,14 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.observations.height_scan import HeightScan
 from torchelev.output_files import atomic_file
 from torchelev.runtime.bundle import groups as observation_groups
 from torchelev.runtime.bundle.groups import Group
 
 VERSION = 1  # of the format
 CONFIG, OBSERVATION, EPISODE, POLICY = "map.json", "observation.json", "episode.npz", "policy.onnx"
+_NOT_RECORDED = ("initialize", "initialize_from", "load_state")
 _INPUTS = ("points", "T_map_sensor", "T_map_base", "dt", "variance", "T_base_links", "pose_covariance")
 
 
@@ -56,10 +59,12 @@ class Recorder:
         self.emap.reset(torch.tensor([self.env], device=self.emap.device))
         for name in ("update", "reset"):  # of this object alone
             self.emap.__dict__[name] = getattr(self, f"_{name}")
+        for name in _NOT_RECORDED:
+            self.emap.__dict__[name] = functools.partial(_refuse, name)
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        for name in ("update", "reset"):
+        for name in ("update", "reset", *_NOT_RECORDED):
             self.emap.__dict__.pop(name, None)
 
     def _update(self, *args: Any, **kwargs: Any) -> None:
@@ -99,7 +104,11 @@ class Recorder:
             ValueError: a group is missing or of another shape.
         """
         row = {"T_map_base": T_map_base[self.env].double(), "action": action[self.env]}
-        if feet is not None:
+        row["resets"] = torch.tensor(self._resets and len(self._updates) > 0)  # after the last update
+        takes_feet = any(isinstance(group, HeightScan) and group.num_feet > 0 for group in self.groups.values())
+        given = feet is not None or not takes_feet
+        require(given, "feet", "must be given for scans around feet", "none", "give those of the observation")
+        if feet is not None and takes_feet:
             row["feet"] = feet[self.env].double()
         for name, group in self.groups.items():
             actual = tuple(observation[name].shape[1:]) if name in observation.keys() else None
@@ -112,18 +121,23 @@ class Recorder:
         """Write config, groups and episode to a folder.
 
         Raises:
-            ValueError: nothing was recorded.
+            ValueError: nothing was recorded, or the number of sensors changed.
             WriteError: a file cannot be written.
         """
         require(len(self._steps) > 0, "recorder", "must have recorded a step", "none", "call step")
         folder = Path(folder)
+        arrays: dict[str, Any] = _stack("step", self._steps) | _stack("update", self._updates)
         self.emap.cfg.save(folder / CONFIG)
         described = {"torchelev_bundle": VERSION, "groups": observation_groups.to_json(self.groups)}
         with atomic_file(folder / OBSERVATION) as file:
             file.write((json.dumps(described, indent=1, allow_nan=False) + "\n").encode())
-        arrays: dict[str, Any] = _stack("step", self._steps) | _stack("update", self._updates)
         with atomic_file(folder / EPISODE) as file:
             np.savez_compressed(file, **arrays)
+
+
+def _refuse(name: str, *args: Any, **kwargs: Any) -> None:
+    hint = "call it before the recording: the map is forgotten then, and updates alone explain what is in it"
+    require(False, f"emap.{name}", "is not recorded", "a call", hint, NotImplementedError)
 
 
 def _stack(prefix: str, rows: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -131,8 +145,24 @@ def _stack(prefix: str, rows: list[dict[str, np.ndarray]]) -> dict[str, np.ndarr
     arrays = {}
     for name in dict.fromkeys(key for row in rows for key in row):
         given = [name in row for row in rows]
-        like = next(row[name] for row in rows if name in row)
-        arrays[f"{prefix}_{name}"] = np.stack([row.get(name, np.zeros_like(like)) for row in rows])
+        found = [row[name] for row in rows if name in row]
+        blank = np.zeros_like(found[0])
+        padded = _padded(name, [row.get(name, blank) for row in rows])
+        arrays[f"{prefix}_{name}"] = np.stack(padded)
         if not all(given):
             arrays[f"{prefix}_{name}_given"] = np.array(given)
     return arrays
+
+
+def _padded(name: str, values: list[np.ndarray]) -> list[np.ndarray]:
+    """Return values of one shape: clouds of fewer points end with NaN."""
+    axis = {"points": -2, "variance": -1}.get(name)
+    if axis is None:
+        sizes = sorted({value.shape for value in values})
+        require(len(sizes) == 1, name, "must keep its shape while it is recorded", sizes, "record with all sensors")
+        return values
+    most = max(value.shape[axis] for value in values)
+    pads = [[(0, 0)] * value.ndim for value in values]
+    for pad, value in zip(pads, values, strict=True):
+        pad[axis] = (0, most - value.shape[axis])
+    return [np.pad(value, pad, constant_values=np.nan) for value, pad in zip(values, pads, strict=True)]

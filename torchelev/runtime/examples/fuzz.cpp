@@ -1,5 +1,5 @@
-// Damages configs, layouts and saved maps at random and reads them: `python -m benchmarks.runtime sanitize`. Nothing but
-// an error may come of it; the sanitizers that it is built with watch.
+// Damages configs, layouts and saved maps at random and reads them: `python -m benchmarks.runtime sanitize`. Nothing
+// but an error may come of it; the sanitizers that it is built with watch.
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
@@ -14,20 +14,33 @@ std::mt19937 generator;
 
 size_t below(size_t number) { return number ? generator() % number : 0; }
 
-const char* const TOKENS[] = {"null", "true", "-1", "0", "1e999", "-0.0", "\"inf\"", "1e-320", "2147483648", "{", "}", "[", "]",
-                              ",", ":", "\"", "\\u0041", "\\", "0.1", "255", "\"grid\"", "\"filters\"", "9999999999999"};
+const char* const TOKENS[] = {"null",        "true",         "-1",      "0",  "1e999", "-0.0", "\"inf\"",
+                              "1e-320",      "2147483648",   "{",       "}",  "[",     "]",    ",",
+                              ":",           "\"",           "\\u0041", "\\", "0.1",   "255",  "\"grid\"",
+                              "\"filters\"", "9999999999999"};
 
 std::string damaged(std::string text) {
     for (size_t k = 1 + below(3); k > 0 && !text.empty(); k--) {
         const size_t at = below(text.size()), length = 1 + below(12);
         const bool is_digit = text[at] >= '0' && text[at] <= '9';
         switch (is_digit ? 5 : below(5)) {
-            case 5: text[at] = char('0' + below(10)); break;
-            case 0: text[at] = char(generator()); break;
-            case 1: text.erase(at, length); break;
-            case 2: text.insert(at, TOKENS[below(std::size(TOKENS))]); break;
-            case 3: text.insert(at, text.substr(below(text.size()), length)); break;
-            default: text.replace(at, std::min(length, text.size() - at), TOKENS[below(std::size(TOKENS))]);
+            case 5:
+                text[at] = char('0' + below(10));
+                break;
+            case 0:
+                text[at] = char(generator());
+                break;
+            case 1:
+                text.erase(at, length);
+                break;
+            case 2:
+                text.insert(at, TOKENS[below(std::size(TOKENS))]);
+                break;
+            case 3:
+                text.insert(at, text.substr(below(text.size()), length));
+                break;
+            default:
+                text.replace(at, std::min(length, text.size() - at), TOKENS[below(std::size(TOKENS))]);
         }
     }
     return text;
@@ -61,10 +74,13 @@ bool is_large(const std::string& config) { return config.find("\"grid\": {\"reso
 int main(int count, char** arguments) {
     if (count != 4) return std::fprintf(stderr, "usage: %s map.json folder seconds\n", arguments[0]), 2;
     const std::string config = read(arguments[1]), path = std::string(arguments[2]) + "/map.safetensors";
-    const std::string layout = "{\"pattern\": [[0.3, 0.2], [-0.4, 0.1]], \"fill\": \"inpaint\", \"clip\": 1.0, \"original\": \"-inf\", \"num_feet\": 0}";
+    const std::string layout =
+        "{\"pattern\": [[0.3, 0.2], [-0.4, 0.1]], \"fill\": \"inpaint\", \"clip\": 1.0, \"original\": \"-inf\", "
+        "\"num_feet\": 0}";
     const torchelev_limits limits{200, 1, 1};
     torchelev_map* map = nullptr;
-    if (torchelev_map_create_from_text(config.c_str(), &limits, &map)) return std::fprintf(stderr, "%s\n", torchelev_last_error()), 1;
+    if (torchelev_map_create_from_text(config.c_str(), &limits, &map))
+        return std::fprintf(stderr, "%s\n", torchelev_last_error()), 1;
     update(map);
     if (torchelev_map_save(map, path.c_str())) return std::fprintf(stderr, "%s\n", torchelev_last_error()), 1;
     const std::string saved = read(path);

@@ -29,7 +29,8 @@ struct Instant {
                std::fread(points.data(), 4, points.size(), stdin) == points.size();
     }
     torchelev_input input() const {
-        return {head.num_sensors, head.num_points, points.data(), T_map_sensor.data(), head.T_map_base, nullptr, head.dt, nullptr, nullptr};
+        return {head.num_sensors, head.num_points, points.data(), T_map_sensor.data(), head.T_map_base, nullptr,
+                head.dt,          nullptr,         nullptr};
     }
 };
 
@@ -38,7 +39,10 @@ double quantile(const std::vector<double>& sorted, double q) { return sorted[siz
 }  // namespace
 
 int main(int count, char** arguments) try {
-    if (count < 3) return std::fprintf(stderr, "usage: %s map.json layout [threads [hertz [saved]]] < stream > scans\n", arguments[0]), 2;
+    if (count < 3)
+        return std::fprintf(stderr, "usage: %s map.json layout [threads [hertz [saved]]] < stream > scans\n",
+                            arguments[0]),
+               2;
     const int threads = count > 3 ? std::atoi(arguments[3]) : 1;
     const double hertz = count > 4 ? std::atof(arguments[4]) : 0;  // 0: as fast as it goes
     torchelev::Map map(arguments[1], {65536, 4, threads});
@@ -59,7 +63,8 @@ int main(int count, char** arguments) try {
     if (count > 5) map.save(arguments[5]);
     if (times.empty()) return std::fprintf(stderr, "stream: empty\n"), 1;
     std::sort(times.begin(), times.end());
-    std::fprintf(stderr, "%zu updates: p50 %.2f ms, p99 %.2f ms\n", times.size(), quantile(times, 0.5), quantile(times, 0.99));
+    std::fprintf(stderr, "%zu updates: p50 %.2f ms, p99 %.2f ms\n", times.size(), quantile(times, 0.5),
+                 quantile(times, 0.99));
 } catch (const std::exception& error) {
     return std::fprintf(stderr, "%s\n", error.what()), 1;
 }

@@ -10,7 +10,8 @@ torchelev::Pose pose(double x, double z) { return {1, 0, 0, x, 0, 1, 0, 0, 0, 0,
 std::vector<float> look(double x, double z) {
     std::vector<float> points;
     for (double a = -2; a < 2; a += 0.03)
-        for (double b = -2; b < 2; b += 0.03) points.insert(points.end(), {float(a), float(b), float((x + a > 1) * 0.15 - z)});
+        for (double b = -2; b < 2; b += 0.03)
+            points.insert(points.end(), {float(a), float(b), float((x + a > 1) * 0.15 - z)});
     return points;
 }
 

@@ -257,7 +257,7 @@ constexpr double LEGGED_GYM_X[] = {-0.8, -0.7, -0.6, -0.5, -0.4, -0.3, -0.2, -0.
 constexpr double LEGGED_GYM_Y[] = {-0.5, -0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3, 0.4, 0.5};
 
 constexpr Preset PRESETS[] = {
-    {"isaac_lab", ISAAC_LAB_X, int(std::size(ISAAC_LAB_X)), ISAAC_LAB_Y, int(std::size(ISAAC_LAB_Y)), true, scans::BILINEAR, 0.5, 1.0, 1.0, 0.5, -INFINITY},
-    {"mjlab", MJLAB_X, int(std::size(MJLAB_X)), MJLAB_Y, int(std::size(MJLAB_Y)), true, scans::BILINEAR, 0.0, INFINITY, 0.2, 0.5, 5.0},
-    {"legged_gym", LEGGED_GYM_X, int(std::size(LEGGED_GYM_X)), LEGGED_GYM_Y, int(std::size(LEGGED_GYM_Y)), false, scans::MINIMUM, 0.5, 1.0, 5.0, 0.5, NAN},
+    {"isaac_lab", ISAAC_LAB_X, int(std::size(ISAAC_LAB_X)), ISAAC_LAB_Y, int(std::size(ISAAC_LAB_Y)), true, scans::BILINEAR, 0.5, 1.0, 1.0, 0.5},
+    {"mjlab", MJLAB_X, int(std::size(MJLAB_X)), MJLAB_Y, int(std::size(MJLAB_Y)), true, scans::BILINEAR, 0.0, INFINITY, 0.2, 0.5},
+    {"legged_gym", LEGGED_GYM_X, int(std::size(LEGGED_GYM_X)), LEGGED_GYM_Y, int(std::size(LEGGED_GYM_Y)), false, scans::MINIMUM, 0.5, 1.0, 5.0, 0.5},
 };

@@ -8,8 +8,8 @@
  * Errors: functions return a status; `torchelev_last_error` then holds the sentence that Python raises. Nothing has
  * changed when a function fails, but for TORCHELEV_NO_MEMORY.
  *
- * Threads: a map, a scan or an image belongs to one thread at a time; different ones may be used at the same time. What reads
- * a map (layers, samples, statistics) may run on several threads while none updates it.
+ * Threads: a map, a scan or an image belongs to one thread at a time; different ones may be used at the same time. What
+ * reads a map (layers, samples, statistics) may run on several threads while none updates it.
  *
  * Memory: after a map, a scan or an image is created, updates and reads allocate nothing.
  */
@@ -55,7 +55,7 @@ typedef struct {
     const float* points;           /**< (S, N, 3) [m] sensor frame; NaN or inf where there is no return */
     const double* T_map_sensor;    /**< (S, 4, 4) */
     const double* T_map_base;      /**< (4, 4) the robot, which the window follows; null: the window stays */
-    const double* T_base_links;    /**< (K, 4, 4) the links of the config's `sensor.body`, from joint angles; null without */
+    const double* T_base_links;    /**< (K, 4, 4) the links of `sensor.body`, from joint angles; null without */
     double dt;                     /**< [s] since the last update; 0 for a further sensor of the same instant */
     const float* variance;         /**< (S, N) [m^2] of each height, or null: the noise model's */
     const double* pose_covariance; /**< (S, 6, 6) x, y, z, rotations about the map's axes; null: poses are exact */
@@ -127,7 +127,7 @@ int32_t torchelev_map_num_links(const torchelev_map* map);
 /** Return the name of a link, from 0 to K - 1; null beyond. Valid as long as the map. */
 const char* torchelev_map_link_name(const torchelev_map* map, int32_t link);
 
-/** Write the position [m] of the window's corner (x, y), from which cell (i, j) spans [i, i + 1] and [j, j + 1] cells. */
+/** Write the position [m] of the window's corner (x, y): cell (i, j) spans i to i + 1 and j to j + 1 cells from it. */
 torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]);
 
 /**
@@ -149,7 +149,7 @@ const void* torchelev_map_tensor(const torchelev_map* map, const char* name, siz
 /**
  * Read a layer at points.
  *
- * @param name as in `torchelev_map_layer`, without normals.
+ * @param name as in `torchelev_map_layer`.
  * @param mode "bilinear" or "nearest", as in `ElevationMap.sample`.
  * @param xy (M, 2) [m] map frame.
  * @param num_points M.
@@ -187,6 +187,9 @@ void torchelev_scan_free(torchelev_scan* scan);
 
 /** Return the number of values. */
 int64_t torchelev_scan_size(const torchelev_scan* scan);
+
+/** Return K, the feet that a read takes; 0 for a scan around the base. */
+int64_t torchelev_scan_num_feet(const torchelev_scan* scan);
 
 /**
  * Read the heights, as `HeightScan` does without noise.

@@ -39,7 +39,8 @@ class Map {
 
     // Points (N, 3) of one sensor, seen from T_map_sensor.
     void update(const std::vector<float>& points, const Pose& T_map_sensor, const Pose& T_map_base, double dt) {
-        update({1, int64_t(points.size() / 3), points.data(), T_map_sensor.data(), T_map_base.data(), nullptr, dt, nullptr, nullptr});
+        update({1, int64_t(points.size() / 3), points.data(), T_map_sensor.data(), T_map_base.data(), nullptr, dt,
+                nullptr, nullptr});
     }
 
     void move(const Pose& T_map_base) { check(torchelev_map_move(map.get(), T_map_base.data())); }

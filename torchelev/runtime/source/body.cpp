@@ -24,7 +24,8 @@ void require_names(const Json& value, const std::string& where, std::initializer
 }
 
 // Finite numbers of a member, which must be there.
-std::vector<double> numbers(const Json& shape, const std::string& where, const char* name, size_t size, const char* hint) {
+std::vector<double> numbers(const Json& shape, const std::string& where, const char* name, size_t size,
+                            const char* hint) {
     const Json* value = shape.find(name);
     std::vector<double> found;
     bool fits = value && value->kind == Json::ARRAY && value->items.size() == size;
@@ -42,7 +43,10 @@ double positive(const Json& shape, const std::string& where, const char* name) {
     const bool fits = value && value->kind == Json::NUMBER && value->number > 0 && std::isfinite(value->number);
     const bool is_number = value && value->kind == Json::NUMBER;
     REQUIRE(fits, where + "." + name, "must be a positive number",
-            is_number ? repr(value->number) : value ? value->describe() : "none", "give metres");
+            is_number ? repr(value->number)
+            : value   ? value->describe()
+                      : "none",
+            "give metres");
     return value->number;
 }
 
@@ -83,7 +87,8 @@ robot_body::Body RobotBody::packed() const {
 // The number of a shape's link; links are numbered in the order in which shapes name them, capsules first.
 int RobotBody::link_of(const Json& shape, const std::string& where) {
     const Json* link = shape.find("link");
-    const bool fits = link && link->kind == Json::STRING && !link->text.empty();
+    bool fits = link && link->kind == Json::STRING && !link->text.empty();
+    for (size_t k = 0; fits && k < link->text.size(); k++) fits = static_cast<unsigned char>(link->text[k]) >= 0x20;
     REQUIRE(fits, where + ".link", "must be the name of a link", link ? link->describe() : "none",
             "give the link that the shape is fixed to");
     const auto found = std::find(links.begin(), links.end(), link->text);
@@ -94,7 +99,8 @@ int RobotBody::link_of(const Json& shape, const std::string& where) {
 }
 
 void RobotBody::add_capsule(const Json& capsule) {
-    require_names(capsule, "config.sensor.body.capsules[" + std::to_string(capsules.size()) + "]", {"link", "start", "end", "radius"});
+    require_names(capsule, "config.sensor.body.capsules[" + std::to_string(capsules.size()) + "]",
+                  {"link", "start", "end", "radius"});
     robot_body::Capsule packed{};
     packed.link = float(link_of(capsule, "capsule"));
     const double radius = positive(capsule, "capsule", "radius");
@@ -112,7 +118,8 @@ void RobotBody::add_capsule(const Json& capsule) {
 }
 
 void RobotBody::add_box(const Json& box) {
-    require_names(box, "config.sensor.body.boxes[" + std::to_string(boxes.size()) + "]", {"link", "center", "half_lengths", "quat_wxyz"});
+    require_names(box, "config.sensor.body.boxes[" + std::to_string(boxes.size()) + "]",
+                  {"link", "center", "half_lengths", "quat_wxyz"});
     robot_body::Box packed{};
     packed.link = float(link_of(box, "box"));
     const std::vector<double> center = numbers(box, "box", "center", 3, "give metres");
@@ -120,7 +127,8 @@ void RobotBody::add_box(const Json& box) {
     std::vector<double> q{1, 0, 0, 0};
     if (box.find("quat_wxyz")) q = numbers(box, "box", "quat_wxyz", 4, "give w, x, y, z");
     REQUIRE(*std::min_element(half.begin(), half.end()) > 0, "box.half_lengths", "must be positive",
-            "(" + repr(half[0]) + ", " + repr(half[1]) + ", " + repr(half[2]) + ")", "give half the side lengths in metres");
+            "(" + repr(half[0]) + ", " + repr(half[1]) + ", " + repr(half[2]) + ")",
+            "give half the side lengths in metres");
     const double w = q[0], x = q[1], y = q[2], z = q[3], norm = std::sqrt(w * w + x * x + y * y + z * z);
     REQUIRE(std::fabs(norm - 1) < 1e-3, "box.quat_wxyz", "must have norm 1", general(norm), "divide it by its norm");
     const double rows[] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),

@@ -31,8 +31,6 @@ void require_known_version(const Json& root, const std::string& where) {
             "read it with a newer torchelev", TORCHELEV_BAD_FILE);
 }
 
-double round_half_even(double value) { return std::nearbyint(value); }
-
 }  // namespace
 
 size_t Config::find(const std::string& name) {
@@ -64,11 +62,15 @@ void Config::read_group(const Json& group, const std::string& prefix) {
 void Config::read_setting(size_t k, const Json& value) {
     const Setting& setting = SETTINGS[k];
     const std::string where = std::string("config.") + setting.name;
-    if (setting.kind == IGNORED) return;
+    if (setting.kind == IGNORED) {
+        const bool is_group = value.kind == Json::NUL || value.kind == Json::OBJECT;
+        REQUIRE(is_group, where, "must be a mapping", value.type(), "see ElevationMapConfig");
+        return;
+    }
     if (setting.kind == ONLY_PYTHON) {
         const bool is_off = value.kind == Json::NUL || (value.kind == Json::ARRAY && value.items.empty());
-        REQUIRE(is_off, where, "needs Python: this library has neither filters nor completion",
-                       value.describe(), "leave it out, or run the map in Python", TORCHELEV_UNSUPPORTED);
+        REQUIRE(is_off, where, "needs Python: this library has neither filters nor completion", value.describe(),
+                "leave it out, or run the map in Python", TORCHELEV_UNSUPPORTED);
         return;
     }
     if (setting.kind == GROUP) return read_group_setting(k, value);
@@ -101,9 +103,10 @@ void Config::read_group_setting(size_t k, const Json& value) {
         body = RobotBody(value);
         return;
     }
-    const bool is_learned = name == "traversability" && value.find("weights");
-    REQUIRE(!is_learned, where, "needs Python: this library has no learned head", "weights",
-            "give the analytic head, or null for no traversability", TORCHELEV_UNSUPPORTED);
+    // As in Python: `robot` alone is of the learned head.
+    const bool is_learned = value.find("weights") || (value.members.size() == 1 && value.find("robot"));
+    REQUIRE(name != "traversability" || !is_learned, where, "needs Python: this library has no learned head",
+            "its settings", "give the analytic head, or null for no traversability", TORCHELEV_UNSUPPORTED);
     read_group(value, name + ".");
 }
 
@@ -115,12 +118,10 @@ void Config::read_place(size_t k, const Json& value) {
     for (int axis = 0; axis < 3; axis++) entries[k].values[axis] = value.items[axis].number;
 }
 
-int64_t Config::rows() const {
-    return int64_t(round_half_even((*this)["grid.length_x"] / (*this)["grid.resolution"]));
-}
+int64_t Config::rows() const { return int64_t(std::nearbyint((*this)["grid.length_x"] / (*this)["grid.resolution"])); }
 
 int64_t Config::columns() const {
-    return int64_t(round_half_even((*this)["grid.length_y"] / (*this)["grid.resolution"]));
+    return int64_t(std::nearbyint((*this)["grid.length_y"] / (*this)["grid.resolution"]));
 }
 
 double Config::drift_gate() const {
@@ -167,14 +168,15 @@ void Config::check_grid() const {
         require_rule(cfg[name] > 0 && std::isfinite(cfg[name]), name, "must be a positive number", "give metres");
     const double size = cfg["grid.resolution"];
     for (const char* name : {"grid.length_x", "grid.length_y"}) {
-        const double cells = cfg[name] / size, whole = round_half_even(cells);
+        const double cells = cfg[name] / size, whole = std::nearbyint(cells);
         const bool is_whole = std::isfinite(cells) && whole >= 1 && std::fabs(cells - whole) < 1e-6 * cells;
         const std::string hint = std::isfinite(cells) ? "try " + general(std::max(1.0, whole) * size) : "give metres";
         REQUIRE(is_whole, name, "must be a whole number of times " + general(size) + " m", general(cells) + " times",
                 hint);
     }
-    const double number = round_half_even(cfg["grid.length_x"] / size) * round_half_even(cfg["grid.length_y"] / size);
-    REQUIRE(number < 2147483648.0, "grid", "must have fewer than 2^31 cells", general(number), "use larger cells");
+    REQUIRE(size >= 1e-4, "grid.resolution", "must be at least 0.0001 m", repr(size), "give metres");
+    const double number = std::nearbyint(cfg["grid.length_x"] / size) * std::nearbyint(cfg["grid.length_y"] / size);
+    REQUIRE(number <= 67108864.0, "grid", "must have at most 2^26 cells", general(number), "use larger cells");
 }
 
 void Config::check_sensor() const {

@@ -46,7 +46,8 @@ class Config {
     void check_rays() const;
     void check_surface() const;
     void require_rule(bool holds, const std::string& name, const std::string& rule, const std::string& hint) const;
-    void require_at_least(const std::string& name, double least, const std::string& rule, const std::string& hint) const;
+    void require_at_least(const std::string& name, double least, const std::string& rule,
+                          const std::string& hint) const;
 
   public:
     RobotBody body;  // of `sensor.body`, if that has shapes of links

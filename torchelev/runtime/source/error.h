@@ -26,8 +26,8 @@ inline std::string message(const std::string& argument, const std::string& rule,
 }
 
 // Refuse by these sentences, which are composed only then, unless the rule holds.
-#define REQUIRE(holds, ...) \
-    do { \
+#define REQUIRE(holds, ...)                \
+    do {                                   \
         if (!(holds)) refuse(__VA_ARGS__); \
     } while (false)
 

@@ -14,9 +14,12 @@
 
 namespace {
 
-const std::initializer_list<const char*> KEYS = {"length_x",  "length_y", "resolution", "offset", "layers",
-                                                 "alignment", "mode",     "nominal_height"};
-const std::initializer_list<const char*> CHANNELS = {"elevation", "validity", "variance", "upper_bound", "traversability"};
+const std::initializer_list<const char*> KEYS = {"length_x", "length_y",  "resolution", "offset",
+                                                 "layers",   "alignment", "mode",       "nominal_height"};
+const std::initializer_list<const char*> CHANNELS = {"elevation", "validity", "variance", "upper_bound",
+                                                     "traversability"};
+
+constexpr int64_t MOST_PIXELS = 1 << 24;
 
 int64_t pixels_along(const Layout& layout, const char* key, double resolution) {
     const double length = layout.number(key, 1.6), pixels = length / resolution, whole = std::nearbyint(pixels);
@@ -37,11 +40,13 @@ std::vector<std::string> channels_of(const Layout& layout) {
                 "leave it out", TORCHELEV_UNSUPPORTED);
         place_of("image.layers", layer.text, CHANNELS);
         const bool is_new = std::find(names.begin(), names.end(), layer.text) == names.end();
-        REQUIRE(is_new, "image.layers", "must name each channel once", "'" + layer.text + "' twice", "leave one out");
+        REQUIRE(is_new, "image.layers", "must name each channel once", "'" + layer.text + "' twice", "leave one out",
+                TORCHELEV_UNSUPPORTED);
         names.push_back(layer.text);
     }
-    REQUIRE(!names.empty(), "image.layers", "must be some of elevation, validity, variance, upper_bound, traversability",
-            layers.describe(), "correct their names");
+    REQUIRE(!names.empty(), "image.layers",
+            "must be some of elevation, validity, variance, upper_bound, traversability", layers.describe(),
+            "correct their names");
     return names;
 }
 
@@ -52,10 +57,15 @@ torchelev_image::torchelev_image(const torchelev_map& map, const std::string& te
     const double resolution = layout.number("resolution", 0.05);
     REQUIRE(resolution > 0, "resolution", "must be a positive number", repr(resolution), "give metres");
     const Json& offset = layout["offset"];
-    const bool fits = offset.kind == Json::NUL || (offset.kind == Json::ARRAY && offset.items.size() == 2);
+    bool fits = offset.kind == Json::NUL || (offset.kind == Json::ARRAY && offset.items.size() == 2);
+    for (const Json& item : offset.items) fits = fits && item.kind == Json::NUMBER && std::isfinite(item.number);
     REQUIRE(fits, "image.offset", "must be two numbers", offset.describe(), "give [x, y] in metres");
-    const double middle[] = {offset.items.empty() ? 0 : offset.items[0].number, offset.items.empty() ? 0 : offset.items[1].number};
+    const double middle[] = {offset.items.empty() ? 0 : offset.items[0].number,
+                             offset.items.empty() ? 0 : offset.items[1].number};
     shape[1] = pixels_along(layout, "length_x", resolution), shape[2] = pixels_along(layout, "length_y", resolution);
+    const bool is_small = double(shape[1]) * double(shape[2]) <= double(MOST_PIXELS);
+    REQUIRE(is_small, "image", "must have at most 2^24 pixels",
+            std::to_string(shape[1]) + " x " + std::to_string(shape[2]), "use larger pixels");
     std::vector<double> xy;
     for (int64_t i = 0; i < shape[1]; i++)
         for (int64_t j = 0; j < shape[2]; j++) {
@@ -77,8 +87,8 @@ torchelev_image::torchelev_image(const torchelev_map& map, const std::string& te
     pixels = std::make_unique<images::Pixels>(settings);
 }
 
-// The layers that the channels are read from: "validity" is that of the elevation, "upper_bound" the elevation and, where
-// that is not known, the bound.
+// The layers that the channels are read from: "validity" is that of the elevation, "upper_bound" the elevation and,
+// where that is not known, the bound.
 void torchelev_image::add_sources(const std::vector<std::string>& channels) {
     auto place = [&](const char* name) {
         const auto found = std::find(channels.begin(), channels.end(), name);
@@ -109,8 +119,10 @@ void torchelev_image::compute(const torchelev_map& map, size_t source) {
 void torchelev_image::read(const torchelev_map& map, const double* T_map_base, float* to) {
     REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
     require_poses("T_map_base", T_map_base, 1);
-    const bool fits = settings.height == map.sizes.H && settings.width == map.sizes.W && settings.resolution == map.resolution();
-    REQUIRE(fits, "map", "must have the grid that the image was created for", "another", "create an image for this map");
+    const bool fits =
+        settings.height == map.sizes.H && settings.width == map.sizes.W && settings.resolution == map.resolution();
+    REQUIRE(fits, "map", "must have the grid that the image was created for", "another",
+            "create an image for this map");
     for (size_t k = 0; k < sources.size(); k++) compute(map, k);
     settings.pose = T_map_base, settings.corner = map.state.corner, settings.images = to;
     pixels->show(0);

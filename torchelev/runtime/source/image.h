@@ -18,9 +18,9 @@ struct torchelev_image {
   private:
     images::Images settings{};
     std::vector<images::Source> sources;
-    std::vector<int> layers;      // of each source
-    std::vector<float> pattern;   // (P, 2) [m]
-    std::vector<float> values;    // of the layers that are computed, one after the other
+    std::vector<int> layers;     // of each source
+    std::vector<float> pattern;  // (P, 2) [m]
+    std::vector<float> values;   // of the layers that are computed, one after the other
     std::vector<uint8_t> known;
     std::unique_ptr<images::Pixels> pixels;
 

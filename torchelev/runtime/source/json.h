@@ -12,8 +12,8 @@ struct Json {
     enum Kind { NUL, BOOLEAN, NUMBER, STRING, ARRAY, OBJECT } kind = NUL;
     bool is_true = false, is_whole = false;  // a number without point or exponent
     double number = 0;
-    std::string text;                                  // of a string; of a number, as it was written
-    std::vector<Json> items;                           // of an array
+    std::string text;                                   // of a string; of a number, as it was written
+    std::vector<Json> items;                            // of an array
     std::vector<std::pair<std::string, Json>> members;  // of an object
 
     const Json* find(const std::string& name) const {
@@ -31,12 +31,18 @@ struct Json {
     // What an error calls it, as Python does.
     std::string describe() const {
         switch (kind) {
-            case NUL: return "None";
-            case BOOLEAN: return is_true ? "True" : "False";
-            case NUMBER: return is_whole ? text : repr(number);
-            case STRING: return "'" + text + "'";
-            case ARRAY: return "list";
-            default: return "dict";
+            case NUL:
+                return "None";
+            case BOOLEAN:
+                return is_true ? "True" : "False";
+            case NUMBER:
+                return is_whole ? text : repr(number);
+            case STRING:
+                return "'" + text + "'";
+            case ARRAY:
+                return "list";
+            default:
+                return "dict";
         }
     }
 };
@@ -81,7 +87,10 @@ class JsonReader {
         unsigned code = 0;
         for (int k = 0; k < 4; k++, at++) {
             const char c = at < source.size() ? source[at] : ' ';
-            const int digit = c >= '0' && c <= '9' ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10 : c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
+            const int digit = c >= '0' && c <= '9'   ? c - '0'
+                              : c >= 'a' && c <= 'f' ? c - 'a' + 10
+                              : c >= 'A' && c <= 'F' ? c - 'A' + 10
+                                                     : -1;
             if (digit < 0) refuse("a bad \\u escape");
             code = 16 * code + digit;
         }

@@ -24,8 +24,9 @@ Span::Span(const std::vector<double>& xy, int32_t alignment, double reach) {
 void Span::require_inside(const Config& cfg) const {
     const double size = cfg["grid.resolution"], length_x = cfg["grid.length_x"], length_y = cfg["grid.length_y"];
     const double wanted_x = 2 * (x + size), wanted_y = 2 * (y + size);
-    REQUIRE(wanted_x <= length_x + 1e-9 && wanted_y <= length_y + 1e-9, "pattern",
-            "must lie in the map at any heading, which takes " + general(wanted_x, 3) + " x " + general(wanted_y, 3) + " m",
-            "a window of " + general(length_x) + " x " + general(length_y) + " m",
-            "enlarge length_x and length_y of GridConfig, or shrink the pattern");
+    REQUIRE(
+        wanted_x <= length_x + 1e-9 && wanted_y <= length_y + 1e-9, "pattern",
+        "must lie in the map at any heading, which takes " + general(wanted_x, 3) + " x " + general(wanted_y, 3) + " m",
+        "a window of " + general(length_x) + " x " + general(length_y) + " m",
+        "enlarge length_x and length_y of GridConfig, or shrink the pattern");
 }

@@ -61,7 +61,8 @@ class Layout {
     std::string text(const std::string& key, const char* usual) const {
         const Json& value = (*this)[key];
         if (value.kind == Json::NUL) return usual;
-        REQUIRE(value.kind == Json::STRING, named(key), "must be a name", value.describe(), std::string("give ") + usual);
+        REQUIRE(value.kind == Json::STRING, named(key), "must be a name", value.describe(),
+                std::string("give ") + usual);
         return value.text;
     }
 
@@ -76,7 +77,8 @@ class Layout {
                 xy.push_back(coordinate.number);
             }
         }
-        REQUIRE(fits, named("pattern"), "must be one or more points (x, y)", pattern.describe(), "give [[x, y], ...] in metres");
+        REQUIRE(fits, named("pattern"), "must be one or more points (x, y)", pattern.describe(),
+                "give [[x, y], ...] in metres");
         return xy;
     }
 

@@ -15,8 +15,8 @@
 
 namespace {
 
-const char* const LAYERS[] = {"elevation", "variance", "time", "upper_bound", "traversability",
-                              "normal_x",  "normal_y", "normal_z"};
+const char* const LAYERS[] = {"elevation",      "variance", "time",     "upper_bound",
+                              "traversability", "normal_x", "normal_y", "normal_z"};
 enum Layer { ELEVATION, VARIANCE, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z };
 
 constexpr torchelev_limits USUAL{131072, 4, 1};
@@ -33,7 +33,10 @@ torchelev_limits checked_limits(const torchelev_limits* given) {
     return limits;
 }
 
-template <class T> void fill(void* to, int64_t count, double value) { std::fill_n(static_cast<T*>(to), count, T(value)); }
+template <class T>
+void fill(void* to, int64_t count, double value) {
+    std::fill_n(static_cast<T*>(to), count, T(value));
+}
 
 void fill_tensor(const Tensor& tensor, void* to, int64_t count) {
     const std::string dtype = tensor.dtype;
@@ -69,8 +72,8 @@ torchelev_map::torchelev_map(const std::string& text, const std::string& where, 
     std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
     covariance.resize(36 * limits.max_sensors);
     if (!cfg.body.links.empty()) on_robot.resize(limits.max_points);
-    if (!team) use_team(run_on_shared_team);
-    if (limits.num_threads > 1) Team::shared().grow(limits.num_threads - 1);
+    Team::use();
+    if (limits.num_threads > 1) Team::shared()->grow(limits.num_threads - 1);
     warm_up();
     forget();
 }
@@ -93,14 +96,20 @@ void torchelev_map::forget() {
     state.corner[0] = -(sizes.H / 2), state.corner[1] = -(sizes.W / 2);
 }
 
-// Run the largest updates, so that later ones allocate nothing: first a point in each cell, then rays beyond the window.
+// Run the largest updates, so that later ones allocate nothing: first a point in each cell, then rays to the farthest
+// range. No gate rejects these points.
 void torchelev_map::warm_up() {
     const double T[] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 1}, size = resolution();
     std::vector<float> points(3 * limits.max_points), variance(limits.max_points, 1e-4f);
     std::vector<double> poses, links, covariances(36 * limits.max_sensors, 0.0);
     for (int k = 0; k < limits.max_sensors; k++) poses.insert(poses.end(), T, T + 16);
     for (size_t k = 0; k < cfg.body.links.size(); k++) links.insert(links.end(), T, T + 16);
-    for (const float scale : {1.0f, 2.5f})
+    if (!links.empty()) posed.pose(cfg.body.packed(), T, T, links.data());
+    const Settings usual = settings;
+    settings.measure.min_square = 0, settings.measure.max_square = settings.measure.max_distance = 1e30f;
+    settings.measure.has_ramp = settings.measure.has_box = 0;
+    const double reach = settings.visibility.ranges + 2, diagonal = 0.5 * std::hypot(double(sizes.H), double(sizes.W));
+    for (const float scale : {1.0f, std::max(2.5f, float(reach / diagonal))})
         for (const int sensors : {limits.max_sensors, 1}) {
             if (scale > 1 && sensors == 1 && limits.max_sensors > 1) continue;  // several sensors reach as far
             const int64_t N = limits.max_points / sensors;
@@ -112,10 +121,11 @@ void torchelev_map::warm_up() {
                 points[3 * k + 1] = scale * float((double(cell % sizes.W - sizes.W / 2) + 0.5) * size);
                 points[3 * k + 2] = -1 + 0.01f * float(k % 7);
             }
-            const torchelev_input input{sensors, N, points.data(), poses.data(), T,
-                                        links.empty() ? nullptr : links.data(), 0.1, variance.data(), covariances.data()};
+            const torchelev_input input{sensors, N,   points.data(),   poses.data(),      T,
+                                        nullptr, 0.1, variance.data(), covariances.data()};
             run(input, ORDER, std::size(ORDER));
         }
+    settings = usual;
 }
 
 // Updates ------------------------------------------------------------------------------------------------------------
@@ -137,8 +147,9 @@ void torchelev_map::check(const torchelev_input& input) const {
         REQUIRE(!input.T_base_links, "T_base_links", "must be left out, as sensor.body has no links", "poses",
                 "give sensor.body=RobotBody(...), or leave it out");
     } else {
-        REQUIRE(input.T_base_links, "T_base_links", "must be given: the poses of " + std::to_string(links.size()) + " links",
-                "null", "compute them from the joint angles");
+        REQUIRE(input.T_base_links, "T_base_links",
+                "must be given: the poses of " + std::to_string(links.size()) + " links", "null",
+                "compute them from the joint angles");
         REQUIRE(input.T_map_base, "T_map_base", "is required to pose the links of sensor.body", "None",
                 "give it, or sensor.body=None");
         require_poses("T_base_links", input.T_base_links, int64_t(links.size()));
@@ -245,12 +256,18 @@ CellValue torchelev_map::read(int layer, int64_t k) const {
     const float gx = s.gradient_x[k], gy = s.gradient_y[k];
     const bool known = s.validity[k];
     switch (layer) {
-        case ELEVATION: return {s.elevation[k], known};
-        case VARIANCE: return {s.variance[k] + pose_variance(s.pose_covariance, gx, gy), known};
-        case TIME: return {s.time[k], known};
-        case UPPER_BOUND: return {known ? s.elevation[k] : s.upper_bound[k], known || s.bounded[k]};
-        case TRAVERSABILITY: return {s.traversability[k], known && s.rated[k]};
-        default: return {normal_component(gx, gy, layer - NORMAL_X), known && s.has_normal[k]};
+        case ELEVATION:
+            return {s.elevation[k], known};
+        case VARIANCE:
+            return {s.variance[k] + pose_variance(s.pose_covariance, gx, gy), known};
+        case TIME:
+            return {s.time[k], known};
+        case UPPER_BOUND:
+            return {known ? s.elevation[k] : s.upper_bound[k], known || s.bounded[k]};
+        case TRAVERSABILITY:
+            return {s.traversability[k], known && s.rated[k]};
+        default:
+            return {normal_component(gx, gy, layer - NORMAL_X), known && s.has_normal[k]};
     }
 }
 

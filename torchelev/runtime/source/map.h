@@ -32,14 +32,14 @@ struct torchelev_map {
 
     int64_t cells() const { return sizes.H * sizes.W; }
     double resolution() const { return settings.measure.resolution; }
-    int64_t count(size_t k) const;                               // of a tensor's elements
+    int64_t count(size_t k) const;  // of a tensor's elements
     size_t bytes(size_t k) const { return count(k) * STATE[k].size; }
-    size_t find(const std::string& name) const;                  // a tensor; NUMBER_OF_TENSORS without it
-    void forget();                                               // make the map blank
+    size_t find(const std::string& name) const;  // a tensor; NUMBER_OF_TENSORS without it
+    void forget();                               // make the map blank
     void update(const torchelev_input& input);
     void move(const double* T_map_base);
-    CellValue read(int layer, int64_t cell) const;               // a cell of a layer by its number
-    static int layer(const std::string& name);                   // its number; raises Error
+    CellValue read(int layer, int64_t cell) const;  // a cell of a layer by its number
+    static int layer(const std::string& name);      // its number; raises Error
 
   private:
     void check(const torchelev_input& input) const;

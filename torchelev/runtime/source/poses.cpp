@@ -10,7 +10,8 @@ constexpr double FARTHEST = 1e9;  // [m] of inputs/checks.py
 double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 double determinant(const double* T) {
-    return T[0] * (T[5] * T[10] - T[6] * T[9]) - T[1] * (T[4] * T[10] - T[6] * T[8]) + T[2] * (T[4] * T[9] - T[5] * T[8]);
+    return T[0] * (T[5] * T[10] - T[6] * T[9]) - T[1] * (T[4] * T[10] - T[6] * T[8]) +
+           T[2] * (T[4] * T[9] - T[5] * T[8]);
 }
 
 // The largest error of R R^T = 1.

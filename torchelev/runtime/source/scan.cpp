@@ -24,31 +24,39 @@ const Preset* find_preset(const std::string& name) {
 }
 
 const std::initializer_list<const char*> KEYS = {
-    "pattern", "alignment", "mode",          "nominal_height",  "clip",     "scale",
-    "fill",    "original",  "standing_height", "inpaint_rings", "num_feet", "reach"};
+    "pattern",  "alignment",       "mode",          "nominal_height", "clip", "scale", "fill",
+    "original", "standing_height", "inpaint_rings", "num_feet",       "reach"};
 
-constexpr scans::Fill NUMBER = scans::NONE;
+constexpr scans::Fill NO_RULE = scans::NONE;
 
 // A fill: its rule, and the number that it reads where nothing has a height; NAN: as over flat ground.
 struct Rule {
-    scans::Fill fill = NUMBER;
+    scans::Fill fill = NO_RULE;
     double value = NAN;
     bool is_original = false;
 };
 
 Rule rule_of(const std::string& name, const Json& value, const char* usual) {
-    if (value.kind == Json::NUMBER) return {NUMBER, value.number};
+    if (value.kind == Json::NUMBER) return {NO_RULE, value.number};
+    const bool is_name = value.kind == Json::STRING || value.kind == Json::NUL;
+    REQUIRE(is_name, name, "must be the name of a rule or a number", value.describe(), std::string("use ") + usual);
     const std::string text = value.kind == Json::STRING ? value.text : usual;
-    if (text == "inf" || text == "-inf") return {NUMBER, text == "inf" ? INFINITY : -INFINITY};
+    if (text == "inf" || text == "-inf") return {NO_RULE, text == "inf" ? INFINITY : -INFINITY};
     REQUIRE(text != "completed", name, "needs Python: this library has no completion", "'completed'", "use ground",
             TORCHELEV_UNSUPPORTED);
     switch (place_of(name, text, {"ground", "original", "base", "lowest", "upper_bound", "inpaint"})) {
-        case 0: return {scans::GROUND};
-        case 1: return {NUMBER, NAN, true};
-        case 2: return {NUMBER};
-        case 3: return {scans::LOWEST};
-        case 4: return {scans::UPPER_BOUND};
-        default: return {scans::INPAINT};
+        case 0:
+            return {scans::GROUND};
+        case 1:
+            return {NO_RULE, NAN, true};
+        case 2:
+            return {NO_RULE};
+        case 3:
+            return {scans::LOWEST};
+        case 4:
+            return {scans::UPPER_BOUND};
+        default:
+            return {scans::INPAINT};
     }
 }
 
@@ -82,7 +90,8 @@ void torchelev_scan::use_preset(const Preset& preset, std::vector<double>& xy) {
             xy.push_back(preset.y[preset.is_x_fastest ? a : b]);
         }
     scan.mode = preset.mode, scan.alignment = scans::YAW, scan.fill = scans::GROUND, scan.rings = 5, scan.origins = 1;
-    scan.nominal_height = float(preset.nominal_height), scan.clip = float(preset.clip), scan.scale = float(preset.scale);
+    scan.nominal_height = float(preset.nominal_height), scan.clip = float(preset.clip),
+    scan.scale = float(preset.scale);
     scan.missing = float(preset.standing_height - preset.nominal_height);
 }
 
@@ -144,7 +153,8 @@ void torchelev_scan::read(const torchelev_map& map, const double* T_map_base, co
     require_poses("T_map_base", T_map_base, 1);
     const bool fits = scan.height == map.sizes.H && scan.width == map.sizes.W && scan.resolution == map.resolution();
     REQUIRE(fits, "map", "must have the grid that the scan was created for", "another", "create a scan for this map");
-    REQUIRE(bool(feet) == bool(num_feet), "feet", num_feet ? "must be given for a scan around feet" : "must be left out",
+    REQUIRE(bool(feet) == bool(num_feet), "feet",
+            num_feet ? "must be given for a scan around feet" : "must be left out",
             feet ? "feet for a scan around the base" : "null", "use a layout with num_feet for feet only");
     for (int64_t k = 0; feet && k < 3 * num_feet; k++)
         REQUIRE(std::isfinite(feet[k]), "feet", "must be finite", "NaN or inf", "leave those feet out");

@@ -11,6 +11,7 @@
 struct torchelev_scan {
     torchelev_scan(const torchelev_map& map, const std::string& layout);
 
+    int64_t feet() const { return num_feet; }
     int64_t size() const { return scan.origins * scan.points; }
     void read(const torchelev_map& map, const double* T_map_base, const double* feet, float* values, uint8_t* known);
 

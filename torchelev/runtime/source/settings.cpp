@@ -74,8 +74,14 @@ std::string with_commas(int64_t number) {
 // The polar table: `PolarGrid.of`.
 void set_table(const Config& cfg, VisibilitySettings& s) {
     const double diagonal = std::hypot(cfg["grid.length_x"], cfg["grid.length_y"]);
-    const double range = cfg.has("raycast") && cfg.has("raycast.max_range") ? cfg["raycast.max_range"] : 0.55 * diagonal;
-    const double reach = std::ceil(range / cfg["grid.resolution"]);
+    const double range =
+        cfg.has("raycast") && cfg.has("raycast.max_range") ? cfg["raycast.max_range"] : 0.55 * diagonal;
+    const double reach = std::ceil(range / cfg["grid.resolution"]), most_cells = 1 << 14;  // MAX_CELLS
+    const std::string rule =
+        "rays of " + general(cfg["grid.resolution"]) + " m cells must reach over at most 16,384 of them";
+    REQUIRE(!s.has_rays || reach <= most_cells, "raycast.max_range", rule,
+            reach < 1e15 ? with_commas(int64_t(reach)) + " cells" : "more",
+            cfg.has("raycast.max_range") ? "give fewer metres, or None" : "use larger cells, or a shorter window");
     const double azimuths = 2 * std::ceil(std::max(16.0, 1.08 * 2 * PI * reach) / 2);
     const double bins = BREADTH * azimuths / (2 * PI);
     const int most = int(std::size(s.widen));
@@ -92,11 +98,6 @@ void set_visibility(const Config& cfg, VisibilitySettings& s) {
     s.min_support = float(cfg["raycast.min_support"]), s.gate = float(cfg["raycast.gate"]);
     s.near_cells = std::max(1, int(NEAR / size));
     set_table(cfg, s);
-    const int most = 1 << 14;  // MAX_CELLS
-    const std::string rule = "rays of " + general(size) + " m cells must reach over at most 16,384 of them";
-    const std::string hint = cfg.has("raycast.max_range") ? "give fewer metres, or None"
-                                                          : "use larger cells, or a shorter window";
-    REQUIRE(!s.has_rays || s.ranges <= most, "raycast.max_range", rule, with_commas(s.ranges) + " cells", hint);
 }
 
 // Which of so many cells may lie within a radius [cells] of the window's centre: `middle`.

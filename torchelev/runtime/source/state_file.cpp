@@ -1,6 +1,10 @@
 // Files of a whole map, as safetensors: eight bytes with the length of a JSON header, the header, the tensors.
+#include <sys/stat.h>
+#include <unistd.h>
+
 #include <cerrno>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <memory>
 
@@ -14,11 +18,18 @@ constexpr uint64_t LONGEST = 1 << 20;  // [bytes] of a header
 
 using File = std::unique_ptr<std::FILE, int (*)(std::FILE*)>;
 
+std::string control_character(char c) {
+    char text[8];
+    std::snprintf(text, sizeof text, "\\u%04x", static_cast<unsigned>(static_cast<unsigned char>(c)));
+    return text;
+}
+
 std::string quoted(const std::string& text) {
     std::string out = "\"";
     for (const char c : text) {
         if (c == '\n') out += "\\n";
         else if (c == '"' || c == '\\') out += std::string("\\") + c;
+        else if (static_cast<unsigned char>(c) < 0x20) out += control_character(c);
         else out += c;
     }
     return out + "\"";
@@ -38,8 +49,9 @@ std::string header_of(const torchelev_map& map) {
     size_t at = 0;
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
         const size_t end = at + map.bytes(k);
-        text += "," + quoted(STATE[k].name) + ":{\"dtype\":" + quoted(STATE[k].dtype) + ",\"shape\":" + shape_of(map, k) +
-                ",\"data_offsets\":[" + std::to_string(at) + "," + std::to_string(end) + "]}";
+        text += "," + quoted(STATE[k].name) + ":{\"dtype\":" + quoted(STATE[k].dtype) +
+                ",\"shape\":" + shape_of(map, k) + ",\"data_offsets\":[" + std::to_string(at) + "," +
+                std::to_string(end) + "]}";
         at = end;
     }
     text += "}";
@@ -67,7 +79,8 @@ void write_all(const torchelev_map& map, std::FILE* file, const std::string& pat
     bool fits = std::fwrite(bytes, 1, 8, file) == 8 && std::fwrite(header.data(), 1, length, file) == length;
     for (size_t k = 0; fits && k < NUMBER_OF_TENSORS; k++)
         fits = std::fwrite(map.tensors[k].get(), 1, map.bytes(k), file) == map.bytes(k);
-    if (!fits || std::fflush(file) != 0) refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+    if (!fits || std::fflush(file) != 0)
+        refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
 }
 
 // A tensor of a file whose values no update would leave behind.
@@ -79,6 +92,20 @@ bool is_sound(const Tensor& tensor, const unsigned char* values, int64_t count) 
         if (dtype != "F32") continue;
         std::memcpy(&value, values + 4 * k, 4);
         if (!std::isfinite(value)) return false;
+    }
+    return true;
+}
+
+// Whether the window lies where poses may be, and the clock has not run for ever.
+bool has_sound_place(const torchelev_map& map, const unsigned char* data) {
+    const double farthest = 1.1 * double(map.settings.measure.farthest) / map.resolution();
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; data += map.bytes(k++)) {
+        int64_t numbers[2] = {};
+        const std::string name = STATE[k].name;
+        if (name != "corner" && name != "elapsed") continue;
+        std::memcpy(numbers, data, map.bytes(k));
+        const bool is_far = std::fabs(double(numbers[0])) > farthest || std::fabs(double(numbers[1])) > farthest;
+        if (name == "corner" ? is_far : numbers[0] < 0 || numbers[0] > INT64_MAX / 2) return false;
     }
     return true;
 }
@@ -96,12 +123,18 @@ std::string read_file(const std::string& path) {
 }
 
 void save_state(const torchelev_map& map, const std::string& path) {
-    const std::string unfinished = path + ".unfinished";
+    const std::unique_ptr<char, decltype(&std::free)> linked(realpath(path.c_str(), nullptr), &std::free);
+    const std::string target = linked ? linked.get() : path;  // of a link, what it points to is replaced
+    std::string unfinished = target + ".XXXXXX";
+    const int number = mkstemp(unfinished.data());
+    if (number < 0) refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
     try {
-        File file(std::fopen(unfinished.c_str(), "wb"), std::fclose);
+        File file(fdopen(number, "wb"), std::fclose);
         if (!file) refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
+        fchmod(number, 0644);
         write_all(map, file.get(), path);
-        if (std::fclose(file.release()) != 0 || std::rename(unfinished.c_str(), path.c_str()) != 0)
+        const bool is_safe = fsync(number) == 0;  // before the old file goes
+        if (std::fclose(file.release()) != 0 || !is_safe || std::rename(unfinished.c_str(), target.c_str()) != 0)
             refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
     } catch (...) {
         std::remove(unfinished.c_str());
@@ -113,7 +146,8 @@ void load_state(torchelev_map& map, const std::string& path) {
     const std::string text = read_file(path);
     uint64_t length = 0;
     for (int k = 0; k < 8 && text.size() >= 8; k++) length |= uint64_t(static_cast<unsigned char>(text[k])) << (8 * k);
-    if (text.size() < 8 || length > LONGEST || length > text.size() - 8) refuse_file(path, "no file of safetensors, or damaged");
+    if (text.size() < 8 || length > LONGEST || length > text.size() - 8)
+        refuse_file(path, "no file of safetensors, or damaged");
     const Json root = JsonReader::read(text.substr(8, length), path);
     const Json* data = root.find("__metadata__");
     auto is = [&](const char* name, const std::string& wanted) {
@@ -124,15 +158,21 @@ void load_state(torchelev_map& map, const std::string& path) {
     if (!is("version", VERSION)) refuse_file(path, "of another version; read it with a newer torchelev");
     const Json* config = data->find("config");
     const std::string theirs = config ? config->text : "", ours = map.cfg.canonical();
-    if (theirs != ours) refuse_file(path, "the map of another config, " + difference(ours, theirs) + "; create the map with its config");
+    if (theirs != ours)
+        refuse_file(path,
+                    "the map of another config, " + difference(ours, theirs) + "; create the map with its config");
     // With the same config, the header of a whole file is the one that this map would write.
     if (text.substr(8, length) != header_of(map)) refuse_file(path, "damaged: its header does not describe a map");
     size_t at = 8 + length, end = at;
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) end += map.bytes(k);
-    if (text.size() != end) refuse_file(path, "damaged: " + std::to_string(text.size()) + " bytes instead of " + std::to_string(end));
+    if (text.size() != end)
+        refuse_file(path, "damaged: " + std::to_string(text.size()) + " bytes instead of " + std::to_string(end));
     const auto* bytes = reinterpret_cast<const unsigned char*>(text.data());
     for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++))
-        if (!is_sound(STATE[k], bytes + at, map.count(k))) refuse_file(path, std::string("damaged: ") + STATE[k].name + " is not finite");
+        if (!is_sound(STATE[k], bytes + at, map.count(k)))
+            refuse_file(path, std::string("damaged: ") + STATE[k].name + " holds what no update leaves");
     at = 8 + length;
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++)) std::memcpy(map.tensors[k].get(), bytes + at, map.bytes(k));
+    if (!has_sound_place(map, bytes + at)) refuse_file(path, "damaged: its window or its clock cannot be");
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++))
+        std::memcpy(map.tensors[k].get(), bytes + at, map.bytes(k));
 }

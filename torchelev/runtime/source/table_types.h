@@ -36,5 +36,5 @@ struct Preset {
     int num_y;
     bool is_x_fastest;
     scans::Mode mode;
-    double nominal_height, clip, scale, standing_height, original;  // original: NAN for "base"
+    double nominal_height, clip, scale, standing_height;
 };

@@ -5,6 +5,8 @@
 #pragma GCC optimize("fp-contract=off")
 #endif
 
+#include <locale.h>
+
 #include <cstring>
 #include <new>
 
@@ -15,8 +17,24 @@ namespace {
 
 thread_local std::string last_error;
 
+// While it lives, this thread reads and writes numbers with a point, whatever the program's locale.
+class NumbersOfC {
+    locale_t before;
+
+  public:
+    NumbersOfC() {
+        static const locale_t c = newlocale(LC_ALL_MASK, "C", nullptr);
+        before = c ? uselocale(c) : nullptr;
+    }
+    ~NumbersOfC() {
+        if (before) uselocale(before);
+    }
+};
+
 // Do the work, and turn what it throws into a status.
-template <class Work> torchelev_status status_of(const Work& work) {
+template <class Work>
+torchelev_status status_of(const Work& work) {
+    const NumbersOfC numbers;
     try {
         work();
         return TORCHELEV_OK;
@@ -29,7 +47,8 @@ template <class Work> torchelev_status status_of(const Work& work) {
     }
 }
 
-template <class T> T& given(const char* name, T* value) {
+template <class T>
+T& given(const char* name, T* value) {
     REQUIRE(value, name, "must be given", "null", "see torchelev.h");
     return *value;
 }
@@ -68,9 +87,14 @@ void sample(const torchelev_map& map, int layer, scans::Mode mode, const double*
     }
 }
 
-torchelev_status create(const std::string& text, const std::string& where, const torchelev_limits* limits,
-                        torchelev_map** map) {
-    return status_of([&] { given("map", map) = new torchelev_map(text, where, limits); });
+// Put a new object where its pointer goes; null if it cannot be made.
+template <class T, class Make>
+torchelev_status make(const char* name, T** place, const Make& made) {
+    return status_of([&] {
+        T*& out = given(name, place);
+        out = nullptr;
+        out = made();
+    });
 }
 
 }  // namespace
@@ -82,15 +106,13 @@ const char* torchelev_last_error(void) { return last_error.c_str(); }
 const char* torchelev_version(void) { return TORCHELEV_VERSION; }
 
 torchelev_status torchelev_map_create(const char* config_path, const torchelev_limits* limits, torchelev_map** map) {
-    std::string text;
-    const torchelev_status status = status_of([&] { text = read_file(&given("config_path", config_path)); });
-    return status ? status : create(text, config_path, limits, map);
+    return make("map", map,
+                [&] { return new torchelev_map(read_file(&given("config_path", config_path)), config_path, limits); });
 }
 
 torchelev_status torchelev_map_create_from_text(const char* config, const torchelev_limits* limits,
                                                 torchelev_map** map) {
-    const torchelev_status status = status_of([&] { given("config", config); });
-    return status ? status : create(config, "config", limits, map);
+    return make("map", map, [&] { return new torchelev_map(&given("config", config), "config", limits); });
 }
 
 void torchelev_map_free(torchelev_map* map) { delete map; }
@@ -126,7 +148,8 @@ const char* torchelev_map_link_name(const torchelev_map* map, int32_t link) {
 torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]) {
     return status_of([&] {
         const torchelev_map& m = given("map", map);
-        for (int axis = 0; axis < 2; axis++) (&given("corner", corner))[axis] = double(m.state.corner[axis]) * m.resolution();
+        for (int axis = 0; axis < 2; axis++)
+            (&given("corner", corner))[axis] = double(m.state.corner[axis]) * m.resolution();
     });
 }
 
@@ -135,8 +158,8 @@ torchelev_status torchelev_map_layer(const torchelev_map* map, const char* name,
         const torchelev_map& m = given("map", map);
         const int layer = torchelev_map::layer(&given("name", name));
         given("values", values);
-        REQUIRE(size >= size_t(m.cells()), "size", "must be at least " + std::to_string(m.cells()), std::to_string(size),
-                "see torchelev_map_size");
+        REQUIRE(size >= size_t(m.cells()), "size", "must be at least " + std::to_string(m.cells()),
+                std::to_string(size), "see torchelev_map_size");
         for (int64_t k = 0; k < m.cells(); k++) {
             const CellValue cell = m.read(layer, k);
             values[k] = cell.known ? cell.value : NAN;
@@ -175,11 +198,11 @@ torchelev_status torchelev_map_sample(const torchelev_map* map, const char* name
 torchelev_status torchelev_map_statistics(const torchelev_map* map, torchelev_statistics* statistics) {
     return status_of([&] {
         const Statistics& s = given("map", map).state.statistics;
-        given("statistics", statistics) = {
-            *s.points_used,       *s.rejected_invalid, *s.rejected_range,   *s.rejected_body,
-            *s.rejected_overhang, *s.rejected_outside, *s.rejected_outlier, *s.rejected_edge,
-            *s.drift_points,      *s.drift_error,      *s.drift_correction, *s.disagreement,
-            *s.cleared_seen_through, *s.cleared_other_floors, *s.cells_bounded};
+        given("statistics", statistics) = {*s.points_used,          *s.rejected_invalid,     *s.rejected_range,
+                                           *s.rejected_body,        *s.rejected_overhang,    *s.rejected_outside,
+                                           *s.rejected_outlier,     *s.rejected_edge,        *s.drift_points,
+                                           *s.drift_error,          *s.drift_correction,     *s.disagreement,
+                                           *s.cleared_seen_through, *s.cleared_other_floors, *s.cells_bounded};
     });
 }
 
@@ -192,14 +215,14 @@ torchelev_status torchelev_map_load(torchelev_map* map, const char* path) {
 }
 
 torchelev_status torchelev_scan_create(const torchelev_map* map, const char* layout, torchelev_scan** scan) {
-    return status_of([&] {
-        given("scan", scan) = new torchelev_scan(given("map", map), &given("layout", layout));
-    });
+    return make("scan", scan, [&] { return new torchelev_scan(given("map", map), &given("layout", layout)); });
 }
 
 void torchelev_scan_free(torchelev_scan* scan) { delete scan; }
 
 int64_t torchelev_scan_size(const torchelev_scan* scan) { return scan ? scan->size() : 0; }
+
+int64_t torchelev_scan_num_feet(const torchelev_scan* scan) { return scan ? scan->feet() : 0; }
 
 torchelev_status torchelev_scan_read(torchelev_scan* scan, const torchelev_map* map, const double* T_map_base,
                                      const double* feet, float* values, uint8_t* known) {
@@ -211,9 +234,7 @@ torchelev_status torchelev_scan_read(torchelev_scan* scan, const torchelev_map* 
 }
 
 torchelev_status torchelev_image_create(const torchelev_map* map, const char* settings, torchelev_image** image) {
-    return status_of([&] {
-        given("image", image) = new torchelev_image(given("map", map), &given("settings", settings));
-    });
+    return make("image", image, [&] { return new torchelev_image(given("map", map), &given("settings", settings)); });
 }
 
 void torchelev_image_free(torchelev_image* image) { delete image; }
