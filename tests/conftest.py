@@ -1,6 +1,7 @@
 """What all tests share: hypothesis' profile, one thread, and how workers share the tests."""
 
 import collections
+import contextlib
 import signal
 import socket
 
@@ -11,6 +12,7 @@ from hypothesis import HealthCheck, Phase, settings
 import envs.offscreen  # noqa: F401  (before any test imports MuJoCo)
 from torchelev import ElevationMapConfig, pipeline
 from torchelev.kernels.cpu_update import is_built
+from torchelev.runtime.library import build_library
 
 settings.register_profile(
     "torchelev",
@@ -26,9 +28,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_sessionstart(session):
-    """Build the C++ of updates once, on all cores, before each of xdist's workers would do it."""
+    """Build the C++ of updates and the C library once, on all cores, before each of xdist's workers would do it."""
     if getattr(session.config.option, "numprocesses", None) and not hasattr(session.config, "workerinput"):
         is_built(pipeline.register_stages(ElevationMapConfig()))
+        with contextlib.suppress(RuntimeError):  # without a compiler
+            build_library()
 
 
 def pytest_collection_modifyitems(config, items):

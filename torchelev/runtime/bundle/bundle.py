@@ -31,8 +31,8 @@ _AGAIN = "export the run again"
 class Bundle:
     """What a policy was trained with, read from a folder."""
 
-    folder: Path
-    cfg: ElevationMapConfig
+    folder: Path  #: that it was read from
+    cfg: ElevationMapConfig  #: of the map
     groups: dict[str, Group]  #: in the policy's order
     episode: dict[str, NDArray]  #: of `Recorder`
 
