@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchelev.completion.config import CompletionConfig
-from torchelev.config_files import read_settings, without_version, write_settings
+from torchelev.config_files import from_json, read_settings, without_version, write_settings
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.stages.age.config import AgingConfig
@@ -133,11 +133,11 @@ class ElevationMapConfig:
             ValueError: the file cannot be read, is of another version, or holds a setting that does not exist or does
                 not fit; settings that are left out keep their defaults.
         """
+        values = read_settings(path)
         try:
-            return cls.from_dict(read_settings(path))
+            return cls.from_dict(values)
         except (ValueError, TypeError) as error:
-            text = str(error)
-            raise ValueError(text if text.startswith(str(path)) else f"{path}: {text}") from error
+            raise ValueError(f"{path}: {error}") from error
 
 
 def _is_chain(filters: object) -> bool:
@@ -192,8 +192,8 @@ def _convert(hint: Any, value: object, where: str) -> Any:
         return tuple(_build(typing.cast(type, element), item, f"{where}[{k}]") for k, item in items)
     if isinstance(value, list):
         return tuple(value)
-    if kind is float and value in ("inf", "-inf"):  # JSON has no infinity
-        return float(typing.cast(str, value))
+    if kind is float:
+        value = from_json(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)
     require(number or kind is not float, where, "must be a number", repr(value), "give a number without quotes")
     return float(value) if kind is float else value  # type: ignore[arg-type]

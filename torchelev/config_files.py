@@ -37,7 +37,7 @@ def write_settings(path: str | Path, values: dict[str, Any]) -> None:
     Raises:
         WriteError: the file cannot be written; an existing one is left as it was.
     """
-    text = json.dumps({VERSION_NAME: VERSION, **_to_json(values)}, indent=2, allow_nan=False) + "\n"
+    text = json.dumps({VERSION_NAME: VERSION, **to_json(values)}, indent=2, allow_nan=False) + "\n"
     with atomic_file(path) as file:
         file.write(text.encode())
 
@@ -50,11 +50,17 @@ def without_version(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name != VERSION_NAME}
 
 
-def _to_json(value: Any) -> Any:
+def from_json(value: Any) -> Any:
+    """Return the number that `to_json` wrote as a text; anything else as it is."""
+    return float(value) if value in ("inf", "-inf") else value
+
+
+def to_json(value: Any) -> Any:
+    """Return nested values as JSON can hold them: infinities as "inf" and "-inf", tuples as lists."""
     if isinstance(value, dict):
-        return {key: _to_json(item) for key, item in value.items()}
+        return {key: to_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_json(item) for item in value]
+        return [to_json(item) for item in value]
     return str(value) if isinstance(value, float) and math.isinf(value) else value
 
 

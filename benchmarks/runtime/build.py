@@ -13,7 +13,7 @@ from torchelev.kernels.registry import PACKAGE
 from torchelev.runtime.stream import write_instant
 
 RUNTIME = PACKAGE / "runtime"
-PROGRAMS = "step", "loop", "fuzz"
+PROGRAMS = "step", "loop"
 
 
 def run(*command: Any, **options: Any) -> subprocess.CompletedProcess[bytes]:

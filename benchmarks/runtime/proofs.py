@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.runtime.build import build, machine, run, write_config, write_stream
+from benchmarks.runtime.build import RUNTIME, build, machine, run, write_config, write_stream
 from torchelev import ElevationMapConfig
 from torchelev.errors import require
 
 _SANITIZERS = {"address,undefined": "address,undefined", "thread": "thread"}
 _FEET = {"pattern": [[0.1, 0.2], [-0.3, 0.0]], "fill": "inpaint"}
-# As the example `fuzz` looks for it: the grid stays small, as a config may ask for more memory than there is.
+# As `fuzz.cpp` looks for it: the grid stays small, as a config may ask for more memory than there is.
 _SMALL: dict[str, Any] = {
     "grid": {"resolution": 0.1, "length_x": 2.0, "length_y": 1.5},
     "sensor": {
@@ -54,9 +54,17 @@ def sanitize(seconds: int) -> dict[str, Any]:
             found[kind] = "30 updates of 1 and of 3 sensors on 1 and on 4 threads: nothing"
             if kind != "thread":
                 (folder / "small.json").write_text(json.dumps(_SMALL))
-                done = run(programs["fuzz"], folder / "small.json", folder, seconds)
+                done = run(_build_fuzz(folder / kind.replace(",", "-"), flags), folder / "small.json", folder, seconds)
                 found["damaged files"] = done.stdout.decode().strip()
     return found
+
+
+def _build_fuzz(library: Path, flags: str) -> Path:
+    """Build what damages files, against the library in a folder."""
+    program = library / "fuzz"
+    source, include = Path(__file__).with_name("fuzz.cpp"), f"-I{RUNTIME / 'include'}"
+    run("c++", "-std=c++17", *flags.split(), include, source, library / "libtorchelev.a", "-pthread", "-o", program)
+    return program
 
 
 def _replay(loop: Path, folder: Path, sensors: int, threads: int) -> None:

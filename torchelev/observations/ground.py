@@ -16,8 +16,8 @@ from torchelev.layers import Layer, sample_layer
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_MARGIN = 0.5  # [m] beyond the pattern within which cells are read
-_MAX_BLOCK = 1.0  # [m] side of the largest block of cells that counts as near a point
+MARGIN = 0.5  # [m] beyond the pattern within which cells are read
+MAX_BLOCK = 1.0  # [m] side of the largest block of cells that counts as near a point
 
 
 def continue_ground(
@@ -63,12 +63,12 @@ def continue_ground(
 
 def margin_around(grid: GridConfig) -> int:
     """Return how many cells beyond the points `continue_ground` reads."""
-    return math.ceil(_MARGIN / grid.resolution)
+    return math.ceil(MARGIN / grid.resolution)
 
 
 def count_near_levels(grid: GridConfig) -> int:
     """Return how many sizes of blocks, from a cell on, count as near a point."""
-    return 1 + max(0, math.floor(math.log2(_MAX_BLOCK / grid.resolution)))
+    return 1 + max(0, math.floor(math.log2(MAX_BLOCK / grid.resolution)))
 
 
 def border_left_out(size: Sequence[int], half_extent: tuple[int, int], margin: int) -> tuple[int, int]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any
 
+from torchelev.config_files import to_json
 from torchelev.errors import require
 from torchelev.observations.scan_settings import ScanSettings
 
@@ -21,14 +21,8 @@ def scan_layout(scan: ScanSettings) -> dict[str, Any]:
     Store it with a policy, and check it with `require_layout` where the policy is deployed.
     """
     names = [field.name for field in dataclasses.fields(scan) if field.name not in _LEFT_OUT]
-    layout = {name: _to_json(getattr(scan, name)) for name in names}
-    layout["pattern"] = [[round(x, _DIGITS), round(y, _DIGITS)] for x, y in scan.pattern]
-    return layout
-
-
-def _to_json(value: Any) -> Any:
-    """Return infinities, which JSON cannot hold, as strings."""
-    return str(value) if isinstance(value, float) and math.isinf(value) else value
+    pattern = [[round(x, _DIGITS), round(y, _DIGITS)] for x, y in scan.pattern]
+    return {name: pattern if name == "pattern" else to_json(getattr(scan, name)) for name in names}
 
 
 def require_layout(scan: ScanSettings, layout: Mapping[str, Any], name: str = "height_scan") -> None:

@@ -10,22 +10,47 @@ from pathlib import Path
 from typing import Any
 
 from torchelev.config import ElevationMapConfig, setting_types
+from torchelev.config_files import VERSION
+from torchelev.grid import MIN_RESOLUTION
+from torchelev.inputs.checks import FARTHEST
 from torchelev.kernels.cpu_update import Inputs
 from torchelev.kernels.registry import header
 from torchelev.kernels.structs import Double, members
 from torchelev.observations import presets
+from torchelev.observations.ground import MARGIN, MAX_BLOCK
 from torchelev.observations.height_scan import HeightScan
 from torchelev.pipeline import KERNELS, ORDER, TENSORS
+from torchelev.plane_fit import MAX_RADIUS
 from torchelev.robot import RobotConfig
 from torchelev.robot_body.shapes import RobotBody
+from torchelev.stages.fusion.config import MAX_REFINEMENTS
+from torchelev.stages.visibility.accepted_rays import NEAR
+from torchelev.stages.visibility.config import MAX_CELLS
+from torchelev.stages.visibility.polar_table import BREADTH
 from torchelev.state import BLANK, MapState, Statistics
-from torchelev.traversability.heads import LearnedTraversabilityConfig
+from torchelev.traversability.heads import STEP_REACH, LearnedTraversabilityConfig
 
 FOLDER = Path(__file__).parent / "generated"
 _NOTE = "// Written by `python -m torchelev.runtime.generate`.\n"
 _ONLY_PYTHON = (RobotBody, LearnedTraversabilityConfig)  # settings of these types need Python
 _PLANNING = (RobotConfig,)  # settings that no update reads
 _DTYPES = {"float": "F32", "int64_t": "I64", "uint8_t": "U8"}  # of safetensors
+
+
+#: of Python, beside those in the settings: type in C++, name, value
+_CONSTANTS = (
+    ("int", "CONFIG_VERSION", VERSION),
+    ("int", "MAX_RADIUS", MAX_RADIUS),  # [cells]
+    ("int", "MAX_REFINEMENTS", MAX_REFINEMENTS),
+    ("int", "MAX_CELLS", MAX_CELLS),  # of a ray
+    ("double", "MIN_RESOLUTION", MIN_RESOLUTION),  # [m]
+    ("double", "FARTHEST", FARTHEST),  # [m]
+    ("double", "STEP_REACH", STEP_REACH),  # [m]
+    ("double", "NEAR", NEAR),  # [m]
+    ("double", "BREADTH", BREADTH),  # [cells]
+    ("double", "MARGIN", MARGIN),  # [m]
+    ("double", "MAX_BLOCK", MAX_BLOCK),  # [m]
+)
 
 
 def headers() -> dict[str, str]:
@@ -40,6 +65,8 @@ def _tables() -> str:
             _NOTE + '#pragma once\n\n#include "runtime/source/table_types.h"\n',
             _table("Setting", "SETTINGS", _settings(ElevationMapConfig(), "")),
             _table("Tensor", "STATE", _tensors()),
+            *(f"constexpr {kind} {name} = {_number(value)};" for kind, name, value in _CONSTANTS),
+            "",
             _default_settings(),
             _order(),
             *(_axes(name) for name in presets.PRESETS),

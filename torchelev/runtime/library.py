@@ -82,7 +82,7 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
     for name in ("torchelev_last_error", "torchelev_version", "torchelev_map_link_name"):
         getattr(library, name).restype = ctypes.c_char_p
     library.torchelev_map_tensor.restype = _POINTER
-    library.torchelev_scan_size.restype = _COUNT
+    library.torchelev_scan_size.restype = library.torchelev_scan_num_feet.restype = _COUNT
     return library
 
 
@@ -227,45 +227,49 @@ class CMap:
         return CImage(self, settings)
 
 
-class CScan:
-    """A height scan of the C library."""
+class _Reader:
+    """What reads a map of the C library: an object of the kind "scan" or "image"."""
 
-    def __init__(self, emap: CMap, layout: str) -> None:
-        self._library, self._scan, self._emap = emap._library, _POINTER(), emap
-        emap._call("torchelev_scan_create", emap._map, _text(layout), ctypes.byref(self._scan))
+    kind: str
+
+    def __init__(self, emap: CMap, settings: str) -> None:
+        self._library, self._handle, self._emap = emap._library, _POINTER(), emap
+        emap._call(f"torchelev_{self.kind}_create", emap._map, _text(settings), ctypes.byref(self._handle))
 
     def __del__(self) -> None:
-        if self._scan:
-            self._library.torchelev_scan_free(self._scan)
+        if self._handle:
+            getattr(self._library, f"torchelev_{self.kind}_free")(self._handle)
+
+    def _read(self, *arrays: NDArray | None) -> None:
+        places = (_POINTER(_address(array)) for array in arrays)
+        self._emap._call(f"torchelev_{self.kind}_read", self._handle, self._emap._map, *places)
+
+
+class CScan(_Reader):
+    """A height scan of the C library."""
+
+    kind = "scan"
 
     def __call__(self, T_map_base: Any, feet: Any = None) -> tuple[NDArray, NDArray]:
         """Return values (P), and where the elevation is known."""
-        size = self._library.torchelev_scan_size(self._scan)
+        size = self._library.torchelev_scan_size(self._handle)
+        num_feet = self._library.torchelev_scan_num_feet(self._handle)
         pose = _array("T_map_base", T_map_base, np.float64, (4, 4))
+        feet = _array("feet", feet, np.float64, (num_feet or -1, 3))
         values, known = np.empty(size, np.float32), np.empty(size, bool)
-        num_feet = self._library.torchelev_scan_num_feet(self._scan)
-        feet = _array("feet", feet, np.float64, (num_feet, 3) if num_feet else (-1, 3))
-        places = (_POINTER(_address(array)) for array in (pose, feet, values, known))
-        self._emap._call("torchelev_scan_read", self._scan, self._emap._map, *places)
+        self._read(pose, feet, values, known)
         return values, known
 
 
-class CImage:
+class CImage(_Reader):
     """An image of the C library."""
 
-    def __init__(self, emap: CMap, settings: str) -> None:
-        self._library, self._image, self._emap = emap._library, _POINTER(), emap
-        emap._call("torchelev_image_create", emap._map, _text(settings), ctypes.byref(self._image))
-
-    def __del__(self) -> None:
-        if self._image:
-            self._library.torchelev_image_free(self._image)
+    kind = "image"
 
     def __call__(self, T_map_base: Any) -> NDArray:
         """Return the image (C, H, W)."""
         shape = (_COUNT * 3)()
-        self._emap._call("torchelev_image_shape", self._image, shape)
+        self._emap._call("torchelev_image_shape", self._handle, shape)
         pose, values = _array("T_map_base", T_map_base, np.float64, (4, 4)), np.empty(tuple(shape), np.float32)
-        places = (_POINTER(_address(array)) for array in (pose, values))
-        self._emap._call("torchelev_image_read", self._image, self._emap._map, *places)
+        self._read(pose, values)
         return values

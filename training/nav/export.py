@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 
 from envs.terrain_nav import TerrainNav, TerrainNavConfig
 from envs.terrain_nav.proprioception import ENTRIES
 from envs.terrain_nav.sight import MapSight
 from torchelev.errors import require
-from torchelev.runtime.bundle.recording import Recorder
+from training import episode
 from training.runner import ResumableRunner, export_onnx
 
 _TOLERANCE = 1e-4  # largest difference of an action
@@ -45,9 +44,8 @@ def export(runner: ResumableRunner, folder: Path, tolerance: float = _TOLERANCE)
     actor.to(runner.device)
 
 
-@torch.inference_mode()
-def record(policy: Any, cfg: TerrainNavConfig, folder: Path, steps: int = 40) -> bool:
-    """Write an episode with the map in the loop beside policy.onnx, for `torchelev export`.
+def record(policy: Any, cfg: TerrainNavConfig, folder: Path) -> bool:
+    """Write an episode with the map in the loop beside policy.onnx.
 
     Returns:
         False, with nothing written, if the policy reads images that are filled: `MapImage` does not fill.
@@ -57,15 +55,8 @@ def record(policy: Any, cfg: TerrainNavConfig, folder: Path, steps: int = 40) ->
     assert isinstance(sight, MapSight)
     if sight.filled_scan is not None:
         return False
-    with Recorder(sight.emap, {"policy": ENTRIES, "map": sight.crop}) as recorder:
-        task.sense()
-        for _ in range(steps):
-            observation = TensorDict(task.observe(critic=False), batch_size=[1])
-            action = policy(observation)
-            recorder.step(observation, action, sight.T_estimated)
-            task.reset(task.advance(action).done)
-            task.sense()
-    recorder.write(folder)
+    groups: dict[str, Any] = {"policy": ENTRIES, "map": sight.crop}
+    episode.record(task, sight.emap, groups, policy, lambda: (sight.T_estimated, None), folder)
     return True
 
 

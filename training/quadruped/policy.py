@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from envs.quadruped import Quadruped, QuadrupedConfig
@@ -20,7 +19,7 @@ from envs.quadruped.proprioception import ENTRIES
 from envs.quadruped.sight import MapSight, make_scans
 from torchelev.errors import message, require
 from torchelev.observations.scan_layout import require_layout, scan_layout
-from torchelev.runtime.bundle.recording import Recorder
+from training import episode
 from training.runner import ResumableRunner, export_onnx
 
 LAYOUT = "torchelev.json"  # name of the layout in a TorchScript file, and of its metadata in an ONNX file
@@ -87,22 +86,18 @@ def export(runner: ResumableRunner, cfg: QuadrupedConfig, folder: Path) -> None:
     actor.to(runner.device)
 
 
-@torch.inference_mode()
-def record(policy: Any, cfg: QuadrupedConfig, folder: Path, steps: int = 40) -> None:
-    """Write an episode with the map in the loop beside policy.onnx, for `torchelev export`."""
+def record(policy: Any, cfg: QuadrupedConfig, folder: Path) -> None:
+    """Write an episode with the map in the loop beside policy.onnx."""
     task = Quadruped(cfg, 1, "cpu", "map", seed=12)
     sight = task.sight
     assert isinstance(sight, MapSight)
+
+    def poses() -> tuple[Tensor, Tensor]:
+        view = task.view()
+        return view.T_estimated, view.feet_in(view.T_estimated)
+
     groups: dict[str, Any] = {"policy": ENTRIES, "height_scan": sight.scan, "feet": sight.foot_scan}
-    with Recorder(sight.emap, groups) as recorder:
-        task.sense()
-        for _ in range(steps):
-            observation, view = TensorDict(task.observe(critic=False), batch_size=[1]), task.view()
-            action = policy(observation)
-            recorder.step(observation, action, view.T_estimated, view.feet_in(view.T_estimated))
-            task.reset(task.advance(action).done)
-            task.sense()
-    recorder.write(folder)
+    episode.record(task, sight.emap, groups, policy, poses, folder)
 
 
 def load_policy(path: Path, cfg: QuadrupedConfig) -> LoadedPolicy:

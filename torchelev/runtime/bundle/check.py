@@ -16,9 +16,8 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
-from torchelev.observations.scan_layout import scan_layout
 from torchelev.runtime.bundle.bundle import Bundle
-from torchelev.runtime.bundle.groups import Group, image_settings, shape_of
+from torchelev.runtime.bundle.groups import Group, image_settings, scan_settings, shape_of
 from torchelev.runtime.bundle.recording import CONFIG, POLICY
 from torchelev.runtime.library import CMap, LibraryError
 
@@ -104,7 +103,7 @@ class _LibraryMap:
         self.emap = CMap(library, bundle.folder / CONFIG, *limits)
         groups = _reading_groups(bundle)
         scans = {name: group for name, group in groups.items() if isinstance(group, HeightScan)}
-        layouts = {name: json.dumps(scan_layout(scan) | {"reach": scan.reach}) for name, scan in scans.items()}
+        layouts = {name: json.dumps(scan_settings(scan)) for name, scan in scans.items()}
         self.scans = {name: self.emap.scan(layout) for name, layout in layouts.items()}
         self.feet = {name: scan.num_feet for name, scan in scans.items()}
         settings = {name: image_settings(group) for name, group in groups.items() if isinstance(group, MapImage)}

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from torchelev import config_files
 from torchelev.errors import require
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
@@ -31,10 +32,15 @@ def to_json(groups: Mapping[str, Group]) -> list[dict[str, Any]]:
 
 def _describe(group: Group) -> dict[str, Any]:
     if isinstance(group, HeightScan):
-        return {"kind": "height_scan", "layout": scan_layout(group) | {"reach": group.reach}}
+        return {"kind": "height_scan", "layout": scan_settings(group)}
     if isinstance(group, MapImage):
         return {"kind": "map_image", "image": image_settings(group)}
     return {"kind": "given", "entries": list(group)}
+
+
+def scan_settings(scan: HeightScan) -> dict[str, Any]:
+    """Return the settings of a height scan by name, as the C library takes them."""
+    return scan_layout(scan) | {"reach": scan.reach}
 
 
 def image_settings(image: MapImage) -> dict[str, Any]:
@@ -65,11 +71,6 @@ def _group(where: str, row: dict[str, Any]) -> Group:
                 name: tuple(v) if isinstance(v, list) else v for name, v in row["image"].items()
             }
             return MapImage(**settings)
-        return HeightScan(**{name: _number(value) for name, value in row["layout"].items()})
+        return HeightScan(**{name: config_files.from_json(value) for name, value in row["layout"].items()})
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{where}: {error}; {hint}") from error
-
-
-def _number(value: Any) -> Any:
-    """Return the infinities that `scan_layout` writes as texts."""
-    return float(value) if value in ("inf", "-inf") else value

@@ -109,6 +109,18 @@ constexpr Tensor STATE[] = {
     {"last_cells_bounded", "I64", sizeof(int64_t), {}, 0.0},
 };
 
+constexpr int CONFIG_VERSION = 1;
+constexpr int MAX_RADIUS = 1000;
+constexpr int MAX_REFINEMENTS = 100;
+constexpr int MAX_CELLS = 16384;
+constexpr double MIN_RESOLUTION = 0.0001;
+constexpr double FARTHEST = 1000000000.0;
+constexpr double STEP_REACH = 0.1;
+constexpr double NEAR = 1.0;
+constexpr double BREADTH = 1.4142135623730951;
+constexpr double MARGIN = 0.5;
+constexpr double MAX_BLOCK = 1.0;
+
 inline Settings default_settings() {
     Settings s{};
     s.measure.resolution = 0.04;

@@ -15,12 +15,16 @@ namespace {
 // Names that a shape or a body may have.
 void require_names(const Json& value, const std::string& where, std::initializer_list<const char*> names) {
     REQUIRE(value.kind == Json::OBJECT, where, "must be a mapping", value.type(), "see ElevationMapConfig");
-    std::string all;
-    for (const char* name : names) all += (all.empty() ? "" : ", ") + std::string(name);
     for (const auto& [name, part] : value.members) {
         const bool is_known = std::find(names.begin(), names.end(), name) != names.end();
-        REQUIRE(is_known, where + "." + name, "is not a setting", "'" + name + "'", "there are " + all);
+        REQUIRE(is_known, where + "." + name, "is not a setting", "'" + name + "'", "there are " + joined(names));
     }
+}
+
+// A member as an error shows it; all numbers of shapes are floats.
+std::string shown(const Json* value) {
+    if (!value) return "none";
+    return value->kind == Json::NUMBER ? repr(value->number) : value->describe();
 }
 
 // Finite numbers of a member, which must be there.
@@ -33,20 +37,14 @@ std::vector<double> numbers(const Json& shape, const std::string& where, const c
         fits = value->items[k].kind == Json::NUMBER && std::isfinite(value->items[k].number);
         found.push_back(value->items[k].number);
     }
-    REQUIRE(fits, where + "." + name, "must be " + std::to_string(size) + " finite numbers",
-            value ? value->describe() : "none", hint);
+    REQUIRE(fits, where + "." + name, "must be " + std::to_string(size) + " finite numbers", shown(value), hint);
     return found;
 }
 
 double positive(const Json& shape, const std::string& where, const char* name) {
     const Json* value = shape.find(name);
     const bool fits = value && value->kind == Json::NUMBER && value->number > 0 && std::isfinite(value->number);
-    const bool is_number = value && value->kind == Json::NUMBER;
-    REQUIRE(fits, where + "." + name, "must be a positive number",
-            is_number ? repr(value->number)
-            : value   ? value->describe()
-                      : "none",
-            "give metres");
+    REQUIRE(fits, where + "." + name, "must be a positive number", shown(value), "give metres");
     return value->number;
 }
 
@@ -54,8 +52,8 @@ double not_negative(const Json& body, const char* name, double usual) {
     const Json* value = body.find(name);
     if (!value) return usual;
     const bool fits = value->kind == Json::NUMBER && value->number >= 0 && std::isfinite(value->number);
-    REQUIRE(fits, std::string("body.") + name, "must be finite and not negative",
-            value->kind == Json::NUMBER ? repr(value->number) : value->describe(), "give metres, such as 0.003");
+    REQUIRE(fits, std::string("body.") + name, "must be finite and not negative", shown(value),
+            "give metres, such as 0.003");
     return value->number;
 }
 
@@ -89,7 +87,7 @@ int RobotBody::link_of(const Json& shape, const std::string& where) {
     const Json* link = shape.find("link");
     bool fits = link && link->kind == Json::STRING && !link->text.empty();
     for (size_t k = 0; fits && k < link->text.size(); k++) fits = static_cast<unsigned char>(link->text[k]) >= 0x20;
-    REQUIRE(fits, where + ".link", "must be the name of a link", link ? link->describe() : "none",
+    REQUIRE(fits, where + ".link", "must be the name of a link", shown(link),
             "give the link that the shape is fixed to");
     const auto found = std::find(links.begin(), links.end(), link->text);
     const int number = int(found - links.begin());

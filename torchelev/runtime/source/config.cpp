@@ -6,7 +6,6 @@
 namespace {
 
 constexpr size_t NUMBER_OF_SETTINGS = std::size(SETTINGS);
-constexpr int VERSION = 1, MAX_RADIUS = 1000;
 const char* const VERSION_NAME = "torchelev_config";
 
 std::string last_part(const std::string& name) { return name.substr(name.rfind('.') + 1); }
@@ -18,17 +17,17 @@ std::string group_of(const std::string& name) {
 
 // The names of the settings of a group, the root's for "".
 std::string names_in(const std::string& group) {
-    std::string names;
+    std::vector<std::string> names;
     for (const Setting& setting : SETTINGS)
-        if (group_of(setting.name) == group) names += (names.empty() ? "" : ", ") + last_part(setting.name);
-    return names;
+        if (group_of(setting.name) == group) names.push_back(last_part(setting.name));
+    return joined(names);
 }
 
 void require_known_version(const Json& root, const std::string& where) {
     const Json* version = root.find(VERSION_NAME);
-    const bool is_known = !version || (version->is_whole && version->number == VERSION);
-    REQUIRE(is_known, where + ", " + VERSION_NAME, "must be 1", version ? version->describe() : "none",
-            "read it with a newer torchelev", TORCHELEV_BAD_FILE);
+    const bool is_known = !version || (version->is_whole && version->number == CONFIG_VERSION);
+    REQUIRE(is_known, where + ", " + VERSION_NAME, "must be " + std::to_string(CONFIG_VERSION),
+            version ? version->describe() : "none", "read it with a newer torchelev", TORCHELEV_BAD_FILE);
 }
 
 }  // namespace
@@ -174,7 +173,8 @@ void Config::check_grid() const {
         REQUIRE(is_whole, name, "must be a whole number of times " + general(size) + " m", general(cells) + " times",
                 hint);
     }
-    REQUIRE(size >= 1e-4, "grid.resolution", "must be at least 0.0001 m", repr(size), "give metres");
+    REQUIRE(size >= MIN_RESOLUTION, "grid.resolution", "must be at least " + repr(MIN_RESOLUTION) + " m", repr(size),
+            "give metres");
     const double number = std::nearbyint(cfg["grid.length_x"] / size) * std::nearbyint(cfg["grid.length_y"] / size);
     REQUIRE(number <= 67108864.0, "grid", "must have at most 2^26 cells", general(number), "use larger cells");
 }
@@ -210,8 +210,8 @@ void Config::check_fusion() const {
             require_at_least(std::string("fusion.edges.") + name, value, value > 1 ? several : "must be a positive int",
                              "see its default");
         }
-        require_rule(cfg["fusion.edges.refinements"] <= 100, "fusion.edges.refinements", "must be at most 100",
-                     "see its default");
+        require_rule(cfg["fusion.edges.refinements"] <= MAX_REFINEMENTS, "fusion.edges.refinements",
+                     "must be at most " + std::to_string(MAX_REFINEMENTS), "see its default");
         require_at_least("fusion.edges.margin", 0, "must not be negative", "give 0.25");
         require_rule(cfg["fusion.edges.min_share"] > 0, "fusion.edges.min_share", "must be positive", "give 0.25");
     }
@@ -254,7 +254,8 @@ void Config::check_rays() const {
 void Config::check_surface() const {
     const Config& cfg = *this;
     require_at_least("surface.radius", 1, "must be at least 1 cell", "give 1");
-    require_rule(cfg["surface.radius"] <= MAX_RADIUS, "surface.radius", "must be at most 1000 cells", "give 1");
+    require_rule(cfg["surface.radius"] <= MAX_RADIUS, "surface.radius",
+                 "must be at most " + std::to_string(MAX_RADIUS) + " cells", "give 1");
     if (!has("traversability")) return;
     const double radius = cfg["traversability.radius"], slope = cfg["traversability.critical_slope"];
     require_rule(radius > 0 && std::isfinite(radius), "traversability.radius", "must be positive and finite",
@@ -265,6 +266,8 @@ void Config::check_surface() const {
     }
     require_rule(slope < std::acos(-1.0) / 2 || std::isinf(slope), "traversability.critical_slope",
                  "must be below pi / 2", "give radians, such as 0.7, or inf to switch it off");
-    require_rule(radius / cfg["grid.resolution"] <= MAX_RADIUS, "traversability.radius",
-                 "must be at most 1000 cells of " + general(cfg["grid.resolution"]) + " m", "give 0.1");
+    require_rule(
+        radius / cfg["grid.resolution"] <= MAX_RADIUS, "traversability.radius",
+        "must be at most " + std::to_string(MAX_RADIUS) + " cells of " + general(cfg["grid.resolution"]) + " m",
+        "give 0.1");
 }

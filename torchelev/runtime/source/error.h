@@ -31,6 +31,14 @@ inline std::string message(const std::string& argument, const std::string& rule,
         if (!(holds)) refuse(__VA_ARGS__); \
     } while (false)
 
+// Texts with commas between them.
+template <class Texts>
+std::string joined(const Texts& texts) {
+    std::string all;
+    for (const auto& text : texts) all += (all.empty() ? "" : ", ") + std::string(text);
+    return all;
+}
+
 // A number as Python prints it with `:g` and so many digits.
 inline std::string general(double value, int digits = 6) {
     char text[64];

@@ -81,49 +81,54 @@ torchelev_image::torchelev_image(const torchelev_map& map, const std::string& te
     settings.pattern = pattern.data(), settings.resolution = map.resolution();
     settings.B = 1, settings.P = shape[1] * shape[2], settings.channels = shape[0] = int64_t(channels.size());
     settings.height = map.sizes.H, settings.width = map.sizes.W;
-    add_sources(channels);
+    add_sources(map, channels);
     settings.sources = sources.data(), settings.num_sources = int64_t(sources.size());
-    values.resize(map.cells() * sources.size()), known.resize(values.size());
     pixels = std::make_unique<images::Pixels>(settings);
 }
 
 // The layers that the channels are read from: "validity" is that of the elevation, "upper_bound" the elevation and,
 // where that is not known, the bound.
-void torchelev_image::add_sources(const std::vector<std::string>& channels) {
+void torchelev_image::add_sources(const torchelev_map& map, const std::vector<std::string>& channels) {
     auto place = [&](const char* name) {
         const auto found = std::find(channels.begin(), channels.end(), name);
         return found == channels.end() ? int64_t(-1) : int64_t(found - channels.begin());
     };
-    auto add = [&](const char* layer, int64_t channel, int64_t validity, bool is_height) {
+    auto add = [&](Layer layer, int64_t channel, int64_t validity, bool is_height) {
         if (channel < 0 && validity < 0) return;
-        layers.push_back(torchelev_map::layer(layer));
+        layers.push_back(layer);
         sources.push_back({nullptr, nullptr, nullptr, nullptr, channel, validity, is_height});
     };
-    add("elevation", place("elevation"), place("validity"), true);
-    add("variance", place("variance"), -1, false);
-    add("traversability", place("traversability"), -1, false);
-    add("upper_bound", place("upper_bound"), -1, true);
+    add(VARIANCE, place("variance"), -1, false);
+    add(TRAVERSABILITY, place("traversability"), -1, false);
+    values.resize(map.cells() * sources.size()),
+        known.resize(values.size());  // of these two; the others are the state's
+    add(ELEVATION, place("elevation"), place("validity"), true);
+    add(UPPER_BOUND, place("upper_bound"), -1, true);
 }
 
-// Compute a layer's cells.
-void torchelev_image::compute(const torchelev_map& map, size_t source) {
-    float* to = &values[map.cells() * source];
-    uint8_t* flags = &known[map.cells() * source];
-    for (int64_t k = 0; k < map.cells(); k++) {
-        const CellValue cell = map.read(layers[source], k);
-        to[k] = cell.value, flags[k] = cell.known;
+// Point a source at its layer: at the state, or at cells that are computed here.
+void torchelev_image::look_at(const torchelev_map& map, size_t k) {
+    images::Source& source = sources[k];
+    const MapState& state = map.state;
+    const bool is_bound = layers[k] == UPPER_BOUND;
+    if (is_bound || layers[k] == ELEVATION) {
+        source.values = state.elevation, source.known = state.validity;
+        if (is_bound) source.second = state.upper_bound, source.second_known = state.bounded;
+        return;
     }
-    sources[source].values = to, sources[source].known = flags;
+    float* to = &values[map.cells() * k];
+    uint8_t* flags = &known[map.cells() * k];
+    for (int64_t cell = 0; cell < map.cells(); cell++) {
+        const CellValue found = map.read(layers[k], cell);
+        to[cell] = found.value, flags[cell] = found.known;
+    }
+    source.values = to, source.known = flags;
 }
 
 void torchelev_image::read(const torchelev_map& map, const double* T_map_base, float* to) {
-    REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
     require_poses("T_map_base", T_map_base, 1);
-    const bool fits =
-        settings.height == map.sizes.H && settings.width == map.sizes.W && settings.resolution == map.resolution();
-    REQUIRE(fits, "map", "must have the grid that the image was created for", "another",
-            "create an image for this map");
-    for (size_t k = 0; k < sources.size(); k++) compute(map, k);
+    map.require_grid(settings.height, settings.width, settings.resolution, "image");
+    for (size_t k = 0; k < sources.size(); k++) look_at(map, k);
     settings.pose = T_map_base, settings.corner = map.state.corner, settings.images = to;
     pixels->show(0);
 }

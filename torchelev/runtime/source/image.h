@@ -18,12 +18,12 @@ struct torchelev_image {
   private:
     images::Images settings{};
     std::vector<images::Source> sources;
-    std::vector<int> layers;     // of each source
+    std::vector<Layer> layers;   // of each source
     std::vector<float> pattern;  // (P, 2) [m]
     std::vector<float> values;   // of the layers that are computed, one after the other
     std::vector<uint8_t> known;
     std::unique_ptr<images::Pixels> pixels;
 
-    void add_sources(const std::vector<std::string>& channels);
-    void compute(const torchelev_map& map, size_t source);
+    void add_sources(const torchelev_map& map, const std::vector<std::string>& channels);
+    void look_at(const torchelev_map& map, size_t k);
 };

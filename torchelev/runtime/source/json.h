@@ -1,6 +1,7 @@
 // A strict reader of JSON: objects, arrays, strings, numbers, true, false and null, nothing else.
 #pragma once
 
+#include <cstring>
 #include <memory>
 #include <string>
 #include <utility>
@@ -61,7 +62,7 @@ class JsonReader {
     }
 
     void skip_space() {
-        while (at < source.size() && std::string(" \t\r\n").find(source[at]) != std::string::npos) at++;
+        while (at < source.size() && std::strchr(" \t\r\n", source[at]) && source[at]) at++;
     }
 
     bool take(char c) {

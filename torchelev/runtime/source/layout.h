@@ -1,6 +1,7 @@
 // Settings of height scans and images as JSON, and where their points lie: scan_layout.py and patterns.py.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <initializer_list>
 #include <string>
@@ -10,13 +11,9 @@
 
 // The place of a value among others; refused if it is none of them.
 inline int place_of(const std::string& name, const std::string& value, std::initializer_list<const char*> values) {
-    std::string names;
-    int k = 0;
-    for (const char* one : values) {
-        if (value == one) return k;
-        names += (k++ ? ", " : "") + std::string(one);
-    }
-    refuse(name, "must be one of " + names, "'" + value + "'", "see the docs");
+    const auto found = std::find(values.begin(), values.end(), value);
+    REQUIRE(found != values.end(), name, "must be one of " + joined(values), "'" + value + "'", "see the docs");
+    return int(found - values.begin());
 }
 
 // Settings of a scan or an image as JSON; errors begin with their name.

@@ -17,7 +17,6 @@ namespace {
 
 const char* const LAYERS[] = {"elevation",      "variance", "time",     "upper_bound",
                               "traversability", "normal_x", "normal_y", "normal_z"};
-enum Layer { ELEVATION, VARIANCE, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z };
 
 constexpr torchelev_limits USUAL{131072, 4, 1};
 
@@ -139,7 +138,6 @@ void torchelev_map::check(const torchelev_input& input) const {
             "must be from 0 to " + std::to_string(limits.max_points / S) + " of each sensor", std::to_string(N),
             "create the map with larger limits");
     REQUIRE(input.points || N == 0, "input.points", "must be given", "null", "give (S, N, 3) floats");
-    REQUIRE(input.T_map_sensor, "T_map_sensor", "must be given", "null", "give (S, 4, 4) doubles");
     require_poses("T_map_sensor", input.T_map_sensor, S);
     if (input.T_map_base) require_poses("T_map_base", input.T_map_base, 1);
     const std::vector<std::string>& links = cfg.body.links;
@@ -202,7 +200,6 @@ void torchelev_map::update(const torchelev_input& input) {
 }
 
 void torchelev_map::move(const double* T_map_base) {
-    REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
     require_poses("T_map_base", T_map_base, 1);
     const torchelev_input input{1, 0, nullptr, T_map_base, T_map_base, nullptr, 0, nullptr, nullptr};
     const Stage stages[] = {run_measure, run_recenter};
@@ -243,15 +240,19 @@ void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64
 
 // Reading ------------------------------------------------------------------------------------------------------------
 
-int torchelev_map::layer(const std::string& name) {
+Layer torchelev_map::layer(const std::string& name) {
     for (int k = 0; k < int(std::size(LAYERS)); k++)
-        if (name == LAYERS[k]) return k;
-    std::string names;
-    for (const char* one : LAYERS) names += (names.empty() ? "" : ", ") + std::string(one);
-    refuse("layer", "must be one of " + names, "'" + name + "'", "use elevation");
+        if (name == LAYERS[k]) return Layer(k);
+    refuse("layer", "must be one of " + joined(LAYERS), "'" + name + "'", "use elevation");
 }
 
-CellValue torchelev_map::read(int layer, int64_t k) const {
+void torchelev_map::require_grid(int64_t height, int64_t width, double side, const char* reader) const {
+    const bool fits = height == sizes.H && width == sizes.W && side == resolution();
+    REQUIRE(fits, "map", std::string("must have the grid that the ") + reader + " was created for", "another",
+            std::string("create one for this map"));
+}
+
+CellValue torchelev_map::read(Layer layer, int64_t k) const {
     const MapState& s = state;
     const float gx = s.gradient_x[k], gy = s.gradient_y[k];
     const bool known = s.validity[k];

@@ -10,6 +10,8 @@
 
 constexpr size_t NUMBER_OF_TENSORS = sizeof(MapState) / sizeof(void*);
 
+enum Layer { ELEVATION, VARIANCE, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z };
+
 // A value and whether it is known.
 struct CellValue {
     float value;
@@ -38,8 +40,10 @@ struct torchelev_map {
     void forget();                               // make the map blank
     void update(const torchelev_input& input);
     void move(const double* T_map_base);
-    CellValue read(int layer, int64_t cell) const;  // a cell of a layer by its number
-    static int layer(const std::string& name);      // its number; raises Error
+    CellValue read(Layer layer, int64_t cell) const;  // a cell of a layer by its number
+    static Layer layer(const std::string& name);      // its number; raises Error
+    // Refuse another grid than that of a scan or an image.
+    void require_grid(int64_t height, int64_t width, double side, const char* reader) const;
 
   private:
     void check(const torchelev_input& input) const;
@@ -48,7 +52,7 @@ struct torchelev_map {
     void warm_up();
 };
 
-// Refuse matrices (number, 4, 4) that are not rigid, as `check_pose` does.
+// Refuse matrices (number, 4, 4) that are not given or not rigid, as `check_pose` does.
 void require_poses(const char* name, const double* poses, int64_t number);
 
 // A saved map: state_file.cpp.

@@ -5,8 +5,6 @@
 
 namespace {
 
-constexpr double FARTHEST = 1e9;  // [m] of inputs/checks.py
-
 double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 double determinant(const double* T) {
@@ -56,5 +54,6 @@ void require_pose(const char* name, const double* T) {
 }  // namespace
 
 void require_poses(const char* name, const double* poses, int64_t number) {
+    REQUIRE(poses, name, "must be given", "null", "give (4, 4) doubles for each");
     for (int64_t k = 0; k < number; k++) require_pose(name, poses + 16 * k);
 }

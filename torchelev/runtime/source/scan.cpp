@@ -14,8 +14,7 @@
 
 namespace {
 
-constexpr double MARGIN = 0.5, MAX_BLOCK = 1.0;  // [m] of ground.py
-constexpr double REACH = 0.6;                    // [m] of feet from the base, of `HeightScan.feet`
+constexpr double REACH = 0.6;  // [m] of feet from the base, of `HeightScan.feet`
 
 const Preset* find_preset(const std::string& name) {
     for (const Preset& preset : PRESETS)
@@ -149,10 +148,8 @@ void torchelev_scan::read_blank(const torchelev_map& map) {
 
 void torchelev_scan::read(const torchelev_map& map, const double* T_map_base, const double* feet, float* values,
                           uint8_t* known) {
-    REQUIRE(T_map_base, "T_map_base", "must be given", "null", "give (4, 4) doubles");
     require_poses("T_map_base", T_map_base, 1);
-    const bool fits = scan.height == map.sizes.H && scan.width == map.sizes.W && scan.resolution == map.resolution();
-    REQUIRE(fits, "map", "must have the grid that the scan was created for", "another", "create a scan for this map");
+    map.require_grid(scan.height, scan.width, scan.resolution, "scan");
     REQUIRE(bool(feet) == bool(num_feet), "feet",
             num_feet ? "must be given for a scan around feet" : "must be left out",
             feet ? "feet for a scan around the base" : "null", "use a layout with num_feet for feet only");

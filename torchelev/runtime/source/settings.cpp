@@ -13,8 +13,7 @@
 
 namespace {
 
-constexpr double STEP_REACH = 0.1, NEAR = 1.0;  // [m] of heads.py and accepted_rays.py
-const double PI = std::acos(-1.0), BREADTH = std::sqrt(2.0);
+const double PI = std::acos(-1.0);
 
 double square(double value) { return value * value; }
 
@@ -76,10 +75,10 @@ void set_table(const Config& cfg, VisibilitySettings& s) {
     const double diagonal = std::hypot(cfg["grid.length_x"], cfg["grid.length_y"]);
     const double range =
         cfg.has("raycast") && cfg.has("raycast.max_range") ? cfg["raycast.max_range"] : 0.55 * diagonal;
-    const double reach = std::ceil(range / cfg["grid.resolution"]), most_cells = 1 << 14;  // MAX_CELLS
-    const std::string rule =
-        "rays of " + general(cfg["grid.resolution"]) + " m cells must reach over at most 16,384 of them";
-    REQUIRE(!s.has_rays || reach <= most_cells, "raycast.max_range", rule,
+    const double reach = std::ceil(range / cfg["grid.resolution"]);
+    const std::string rule = "rays of " + general(cfg["grid.resolution"]) + " m cells must reach over at most " +
+                             with_commas(MAX_CELLS) + " of them";
+    REQUIRE(!s.has_rays || reach <= MAX_CELLS, "raycast.max_range", rule,
             reach < 1e15 ? with_commas(int64_t(reach)) + " cells" : "more",
             cfg.has("raycast.max_range") ? "give fewer metres, or None" : "use larger cells, or a shorter window");
     const double azimuths = 2 * std::ceil(std::max(16.0, 1.08 * 2 * PI * reach) / 2);

@@ -56,7 +56,7 @@ T& given(const char* name, T* value) {
 // A layer whose cells are computed as they are read; cells outside are not known.
 struct CellsOfLayer {
     const torchelev_map& map;
-    int layer;
+    Layer layer;
 
     scans::Read at(Lanes i, Lanes j) const {
         scans::Read found{splat(0), Flags{}};
@@ -69,7 +69,7 @@ struct CellsOfLayer {
     }
 };
 
-void sample(const torchelev_map& map, int layer, scans::Mode mode, const double* xy, int64_t number, float* values,
+void sample(const torchelev_map& map, Layer layer, scans::Mode mode, const double* xy, int64_t number, float* values,
             uint8_t* known) {
     const CellsOfLayer cells{map, layer};
     for (int64_t first = 0; first < number; first += LANES) {
@@ -156,7 +156,7 @@ torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]
 torchelev_status torchelev_map_layer(const torchelev_map* map, const char* name, float* values, size_t size) {
     return status_of([&] {
         const torchelev_map& m = given("map", map);
-        const int layer = torchelev_map::layer(&given("name", name));
+        const Layer layer = torchelev_map::layer(&given("name", name));
         given("values", values);
         REQUIRE(size >= size_t(m.cells()), "size", "must be at least " + std::to_string(m.cells()),
                 std::to_string(size), "see torchelev_map_size");
@@ -184,7 +184,7 @@ torchelev_status torchelev_map_sample(const torchelev_map* map, const char* name
                                       int64_t num_points, float* values, uint8_t* known) {
     return status_of([&] {
         const torchelev_map& m = given("map", map);
-        const int layer = torchelev_map::layer(&given("name", name));
+        const Layer layer = torchelev_map::layer(&given("name", name));
         const std::string how = &given("mode", mode);
         REQUIRE(how == "bilinear" || how == "nearest", "mode", "must be one of bilinear, nearest", "'" + how + "'",
                 "use bilinear");
