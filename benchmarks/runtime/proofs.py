@@ -35,6 +35,17 @@ _SMALL: dict[str, Any] = {
     "traversability": {"radius": 0.1, "critical_step": "inf"},
     "filters": [],
 }
+# What runs the code of other processors, and how it is built.
+_OTHERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "aarch64": (
+        ("qemu-aarch64", "-L", "/usr/aarch64-linux-gnu"),
+        (
+            *("-DCMAKE_SYSTEM_NAME=Linux", "-DCMAKE_SYSTEM_PROCESSOR=aarch64", "-DTORCHELEV_ARCH=armv8-a"),
+            "-DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++",
+        ),
+    ),
+    "x86-64 without AVX": ((), ("-DTORCHELEV_ARCH=x86-64-v2",)),
+}
 
 
 def sanitize(seconds: int) -> dict[str, Any]:
@@ -74,23 +85,23 @@ def _replay(loop: Path, folder: Path, sensors: int, threads: int) -> None:
 
 
 def compare_processors() -> dict[str, Any]:
-    """Run the same streams on this processor and, emulated, on aarch64; return how far saved layers differ."""
+    """Run the same streams by this processor's code and by others'; return how far scans and saved layers differ."""
     for tool in ("aarch64-linux-gnu-g++", "qemu-aarch64"):
         hint = "install Debian's g++-aarch64-linux-gnu and qemu-user"
         require(shutil.which(tool) is not None, tool, "must be there", "none", hint, FileNotFoundError)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        cfg = ElevationMapConfig()
-        cfg.save(folder / "map.json")
-        cross = ("-DCMAKE_SYSTEM_NAME=Linux", "-DCMAKE_SYSTEM_PROCESSOR=aarch64", "-DTORCHELEV_ARCH=armv8-a")
-        compiler = "-DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++"
+        ElevationMapConfig().save(folder / "map.json")
         here = build(folder / "here")["loop"]
-        there = build(folder / "there", *cross, compiler)["loop"]
+        others = {
+            kind: [*run_by, build(folder / kind, *settings)["loop"]] for kind, (run_by, settings) in _OTHERS.items()
+        }
         rows = {}
         for sensors in (1, 3):
             write_stream(folder / "stream", 40, sensors, 12_000)
-            scans = [_scans(folder, here), _scans(folder, "qemu-aarch64", "-L", "/usr/aarch64-linux-gnu", there)]
-            rows[f"{sensors} sensors"] = _difference(*scans)
+            expected = _scans(folder, here)
+            for kind, command in others.items():
+                rows[f"{kind}, {sensors} sensors"] = _difference(expected, _scans(folder, *command))
     return {**machine(), "rows": rows}
 
 

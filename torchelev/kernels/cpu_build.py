@@ -23,7 +23,8 @@ from typing import Any
 from torchelev.errors import require
 from torchelev.kernels.registry import PACKAGE
 
-_FLAGS = "-std=c++17 -O3 -fno-math-errno -fno-trapping-math -fPIC -pthread -Wno-psabi".split()
+# Without contraction numbers are rounded as in torch, and alike on all processors.
+_FLAGS = "-std=c++17 -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math -fPIC -pthread -Wno-psabi".split()
 AHEAD = PACKAGE / "kernels" / "built"  # libraries that a wheel carries
 # By kind of machine, the largest first: what compilers call them, and the flags of /proc/cpuinfo that they need.
 INSTRUCTION_SETS: dict[str, dict[str, tuple[str, ...]]] = {

@@ -145,6 +145,29 @@ template <class Work> inline void for_vectors(int64_t first, int64_t last, const
     if (first < last) work(first, int(last - first));
 }
 
+// A sum in eight parts, so that its rounding does not depend on LANES.
+class PartialSums {
+    static constexpr int NUMBER = 8, WIDTH = LANES < NUMBER ? LANES : NUMBER;
+    typedef float Part __attribute__((vector_size(4 * WIDTH)));
+    Part parts[NUMBER / WIDTH]{};
+
+  public:
+    // Add numbers, of which the first is the `number`-th that is added, a multiple of LANES.
+    void add(int64_t number, Lanes values) {
+        Part pieces[LANES / WIDTH];
+        std::memcpy(pieces, &values, sizeof values);
+        for (const Part& piece : pieces) parts[number / WIDTH % (NUMBER / WIDTH)] += piece, number += WIDTH;
+    }
+
+    template <class T> T total() const {
+        float values[NUMBER];
+        std::memcpy(values, parts, sizeof parts);
+        T total = 0;
+        for (float value : values) total += value;
+        return total;
+    }
+};
+
 // Return whether any of some masks' bytes is set.
 inline bool any_set(const uint8_t* bytes, int64_t count) {
     uint8_t some = 0;

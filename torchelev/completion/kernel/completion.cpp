@@ -1,5 +1,12 @@
 // The completed maps: complete.py.
 
+// To multiply and add in one step takes a quarter of the time off convolutions.
+#ifdef __clang__
+#pragma clang fp contract(fast)
+#else
+#pragma GCC optimize("fp-contract=fast")
+#endif
+
 #include "kernels/threads.h"
 #include "predict.h"
 #include "refine.h"

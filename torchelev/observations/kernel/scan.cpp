@@ -1,9 +1,4 @@
 // Height scans of many robots: scan_reading.py. The points that are read decide what is computed, not the window.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same points are known
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include "observations/kernel/scan_of_robot.h"
 

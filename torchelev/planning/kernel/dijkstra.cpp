@@ -1,10 +1,5 @@
 // The cost to go by Dijkstra's algorithm, and the descent along it: planning/dijkstra.py.
 
-// A sum of rounded steps is the same in any order of the cells, and so bit for bit that of the tensors.
-#if defined(__GNUC__) && !defined(__clang__)
-#pragma GCC optimize("fp-contract=off")
-#endif
-
 #include <functional>
 #include <queue>
 #include <utility>

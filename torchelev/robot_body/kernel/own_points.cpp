@@ -1,9 +1,4 @@
 // The points on the robots' links, of many robots and sensors.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same points are found
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include "robot_body/kernel/own_points.h"
 

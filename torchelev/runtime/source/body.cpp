@@ -1,9 +1,4 @@
 // The shapes of a robot's links in a config, and their rules: shapes.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in Python
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <algorithm>
 #include <initializer_list>

@@ -1,9 +1,4 @@
 // Images of the map without Python: map_image.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same pixels are known
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include "runtime/source/image.h"
 

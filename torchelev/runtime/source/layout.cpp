@@ -1,9 +1,4 @@
 // Where the points of scans and images lie in a map's window: patterns.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in Python
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include "runtime/source/layout.h"
 

@@ -1,9 +1,4 @@
 // A map that is updated in place, without Python: elevation_map.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // layers are rounded as in torch
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include "runtime/source/map.h"
 

@@ -1,9 +1,4 @@
 // Height scans without Python: height_scan.py, scan_settings.py and scan_layout.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same points are known
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include "runtime/source/scan.h"
 

@@ -1,9 +1,4 @@
 // What the equations need of a config: `settings` of each stage's kernel.py. Constants are those of the default config.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in Python
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <algorithm>
 #include <cmath>

@@ -1,9 +1,4 @@
 // The functions of torchelev.h.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // samples are rounded as in torch
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <locale.h>
 

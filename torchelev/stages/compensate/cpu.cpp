@@ -1,9 +1,4 @@
 // Height drift compensation: stage.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <algorithm>
 #include <limits>
@@ -18,7 +13,7 @@
 namespace {
 
 constexpr int64_t AT_A_TIME = 16384;  // points that are worth a thread
-constexpr int64_t IN_FLOAT = 64 * LANES;  // points whose sums keep float's precision
+constexpr int64_t IN_FLOAT = 1024;  // points whose sums keep float's precision
 constexpr float NONE = std::numeric_limits<float>::infinity();
 
 // Sums over the points that measure the drift.
@@ -32,15 +27,15 @@ struct Sums {
 
 // `Sums` of vectors, of few points.
 struct Totals {
-    Lanes error{}, noise{};
+    PartialSums error, noise;
     int64_t number = 0;
 
-    void add(Flags counts, Lanes own, Lanes own_noise) {
-        error += zero_unless(counts, own), noise += zero_unless(counts, own_noise), number += count_set(counts);
+    void add(int64_t k, Flags counts, Lanes own, Lanes own_noise) {
+        error.add(k, zero_unless(counts, own)), noise.add(k, zero_unless(counts, own_noise));
+        number += count_set(counts);
     }
     void add_to(Sums& sums) const {
-        for (int l = 0; l < LANES; l++) sums.error += error[l], sums.noise += noise[l];
-        sums.number += number;
+        sums.error += error.total<double>(), sums.noise += noise.total<double>(), sums.number += number;
     }
 };
 
@@ -89,7 +84,7 @@ Sums find_errors(Update& u, float* errors) {
                                         gather(map.elevation, cells), gx, gy, s);
             counts &= absolute(error) <= s.max_error;
             error = pick(counts, error, splat(NONE));
-            totals.add(counts, error, Lanes{});
+            totals.add(k, counts, error, Lanes{});
         }
         store(errors + k, error, count);
     });
@@ -136,7 +131,7 @@ bool compensate(Update& u) {
     const Sums near = sum_up(u, [&](int64_t k, auto count, Totals& totals) {
         Lanes error = splat(NONE), noise{};
         std::memcpy(&error, errors + k, sizeof(float) * count), noise = load(&m.noise[k], count);
-        totals.add(drift::is_near_mean(error, splat(first_mean), noise, s), error, noise + s.relief_square);
+        totals.add(k, drift::is_near_mean(error, splat(first_mean), noise, s), error, noise + s.relief_square);
     });
     const float mean = near.mean(), correction = drift::correction(mean, near.number, s);
     const Statistics& to = u.state.statistics;

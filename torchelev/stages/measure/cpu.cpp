@@ -1,9 +1,4 @@
 // From a sensor's points to a measurement, on a CPU: stage.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that points fall into the same cells
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <algorithm>
 #include <atomic>

@@ -1,9 +1,4 @@
 // Other floors than the robot's: stage.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same cells are near
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <algorithm>
 #include <type_traits>
@@ -80,20 +75,14 @@ class Around {
     }
 };
 
-float sum(Lanes values) {
-    float total = 0;
-    for (int l = 0; l < LANES; l++) total += values[l];
-    return total;
-}
-
 // `Total` of vectors.
 struct Totals {
-    Lanes weights{}, moments{};
+    PartialSums weights, moments;
 
-    void add(Flags cells, Lanes weight, Lanes moment) {
-        weights += pick(cells, weight, splat(0)), moments += pick(cells, moment, splat(0));
+    void add(int64_t column, Flags cells, Lanes weight, Lanes moment) {
+        weights.add(column, zero_unless(cells, weight)), moments.add(column, zero_unless(cells, moment));
     }
-    Total total() const { return {sum(weights), sum(moments)}; }
+    Total total() const { return {weights.total<float>(), moments.total<float>()}; }
 };
 
 // `Range` of vectors.
@@ -111,7 +100,8 @@ struct Ranges {
 };
 
 // Return the height of the ground on which the robot stands [m], and find the range of each row.
-float ground_below(const Around& around, const OverlapSettings& s, Range* ranges) {
+float ground_below(const Update& u, const Around& around, Range* ranges) {
+    const OverlapSettings& s = u.settings.overlap;
     Totals below_base, within, hit;
     for (int64_t i = s.first_row; i < s.end_row; i++) {
         Ranges row;
@@ -122,10 +112,11 @@ float ground_below(const Around& around, const OverlapSettings& s, Range* ranges
             row.add(known, height);
             if (any(bounded)) row.add(bounded, around.bound(cell, count));
             if (!any(below)) return;
+            const int64_t column = cell - i * u.sizes.W - s.first_column;
             const Lanes weight = overlap::weight_of(square, s), moment = weight * height;
-            below_base.add(below, weight, moment);
-            within.add(below & (height >= -s.max_base_height), weight, moment);
-            hit.add(below & around.is_hit(cell, count), weight, moment);
+            below_base.add(column, below, weight, moment);
+            within.add(column, below & (height >= -s.max_base_height), weight, moment);
+            hit.add(column, below & around.is_hit(cell, count), weight, moment);
         });
         ranges[i] = row.range();
     }
@@ -155,7 +146,7 @@ int64_t clear_near(Update& u) {
     const OverlapSettings& s = u.settings.overlap;
     const Around around(u);
     Range* ranges = u.memory.get<Places>().ranges.resize(u.sizes.H);
-    const Floor floor = overlap::own_floor(ground_below(around, s, ranges), s);
+    const Floor floor = overlap::own_floor(ground_below(u, around, ranges), s);
     int64_t number = 0;
     for (int64_t i = s.first_row; i < s.end_row; i++)
         if (ranges[i].exceeds(floor)) number += clear_row(around, i, floor, s, u.state);

@@ -67,19 +67,18 @@ class Rows {
 
     // Heights count from about their mean: squares of absolute heights would cost float32 its millimetres.
     bool find_mean() {
-        Lanes total{}, sum{};
+        PartialSums known_cells, sum;
         for (int row = -rim; row < extent.rows + rim; row++) {
             const ptrdiff_t first = cell(row);
             if (!is_inside(row) || !any_set(validity + first + begin, end - begin)) continue;
-            for_lanes(begin, end, [&](int k, auto count) {
+            for_vectors(begin, end, [&](int64_t k, auto count) {
                 const Flags known = load_bytes(validity + first + k, count) > 0;
-                total += one_if(known), sum += pick(known, load(elevation + first + k, count), splat(0));
+                known_cells.add(k - begin, one_if(known));
+                sum.add(k - begin, zero_unless(known, load(elevation + first + k, count)));
             });
         }
-        float of_total = 0, of_sum = 0;
-        for (int l = 0; l < LANES; l++) of_total += total[l], of_sum += sum[l];
-        mean = of_sum / larger(of_total, 1);
-        return of_total > 0;
+        mean = sum.total<float>() / larger(known_cells.total<float>(), 1);
+        return known_cells.total<float>() > 0;
     }
 
   public:

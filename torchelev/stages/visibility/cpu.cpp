@@ -1,9 +1,4 @@
 // Visibility clean-up and the upper bound on a CPU: stage.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that cells and rays fall into the same bins
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <atomic>
 #include <cmath>

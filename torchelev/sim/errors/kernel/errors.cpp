@@ -1,9 +1,4 @@
 // Errors of the clouds of many sensors: cloud_errors.py.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same points are moved and lost
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <algorithm>
 #include <cstdint>

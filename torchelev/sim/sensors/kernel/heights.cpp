@@ -1,9 +1,4 @@
 // Heights of the surfaces of height fields at points: HeightField.height.
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF  // rounded as in torch, so that the same robots are blocked
-#else
-#pragma GCC optimize("fp-contract=off")
-#endif
 
 #include <algorithm>
 #include <cstdint>
