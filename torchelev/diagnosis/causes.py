@@ -17,7 +17,7 @@ from torchelev.diagnosis.shared_range import find_points_on_path, find_shared_ra
 from torchelev.diagnosis.surfaces import find_cut_hillside, is_overgrown
 from torchelev.state import MapState
 
-_REASONS = {
+REASONS = {
     "invalid": "are NaN or infinite, or their pose or variance is: check what makes them",
     "range": "are too near or too far: check their unit, and sensor.min_distance and sensor.max_distance",
     "body": "lie on the robot's own body: check sensor.body, T_map_base and T_base_links",
@@ -96,7 +96,7 @@ def _find_closed_gate(seen: Evidence) -> str | None:
     for name in GATES:
         tested = seen.num_points - (0 if name == "invalid" else seen.gates["invalid"])
         if tested >= MIN_POINTS and seen.gates[name] >= 0.95 * tested:
-            return f"points: {seen.gates[name]:,} of {tested:,} {_REASONS[name]}"
+            return f"points: {seen.gates[name]:,} of {tested:,} {REASONS[name]}"
     used = sum(int(mask.sum()) for mask in seen.used)
     if used >= 0.01 * seen.num_points or seen.gates["invalid"] > 0.9 * seen.num_points:
         return None

@@ -19,7 +19,7 @@ from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement
 
 MIN_POINTS = 20  # points that a fraction or a median must rest on
-_FAR = 250.0  # [m] farther than sensors of robots measure
+FAR = 250.0  # [m] farther than sensors of robots measure
 GATES = ("invalid", "range", "body", "overhang")  # of the sensor, in their order
 
 
@@ -89,7 +89,7 @@ class Evidence:
             return T is not None and bool(np.linalg.norm(middle - T[:3, 3]) < 0.2 * distance)
 
         is_near = radius < min(0.2 * distance, self.cfg.sensor.max_distance)  # in metres; millimetres spread farther
-        is_elsewhere = is_at(scan.T) or is_at(scan.base) or distance >= _FAR
+        is_elsewhere = is_at(scan.T) or is_at(scan.base) or distance >= FAR
         return FarCloud(distance, radius, is_at(scan.T)) if is_near and is_elsewhere else None
 
     @cached_property
@@ -97,7 +97,7 @@ class Evidence:
         """Whether the points lie hundreds of times as far away as sensors measure, and as far from each other."""
         if not self.is_beyond_range or self.far_cloud is not None:
             return False
-        return float(np.median(self.distances)) >= max(_FAR, 2 * self.cfg.sensor.max_distance)
+        return float(np.median(self.distances)) >= max(FAR, 2 * self.cfg.sensor.max_distance)
 
     @cached_property
     def explained(self) -> tuple[Fit, list[str]]:

@@ -12,12 +12,12 @@ from torchelev.inputs.update_inputs import Inputs
 from torchelev.ops.transforms import is_readable
 
 MAX_ENVS = 4  # the first environments: a wrong convention is wrong in all of them
-_MAX_UPDATES = 8
-_MAX_CORRECTIONS = 32  # of updates in a row
-_MAX_POINTS = 3000  # per sensor, evenly spaced
+MAX_UPDATES = 8
+MAX_CORRECTIONS = 32  # of updates in a row
+MAX_POINTS = 3000  # per sensor, evenly spaced
 # After the first updates two of seven are kept, so that a robot moves between the first and the last, and sensors that
 # take turns, two to six of them, are all among them.
-_PERIOD = 7
+PERIOD = 7
 
 
 class PastUpdate(NamedTuple):
@@ -35,9 +35,9 @@ class InputHistory:
     """
 
     def __init__(self) -> None:
-        self._updates: deque[PastUpdate] = deque(maxlen=_MAX_UPDATES)
+        self._updates: deque[PastUpdate] = deque(maxlen=MAX_UPDATES)
         self._num_updates = 0
-        self._corrections: deque[tuple[int, Tensor | list[float]]] = deque(maxlen=_MAX_CORRECTIONS)
+        self._corrections: deque[tuple[int, Tensor | list[float]]] = deque(maxlen=MAX_CORRECTIONS)
         self._first: Tensor | None = None  # (MAX_ENVS,) number of the first update since the last reset; None: 0
 
     def add(self, inputs: Inputs, last_correction: Tensor) -> None:
@@ -50,7 +50,7 @@ class InputHistory:
         else:
             with torch.inference_mode(False), torch.no_grad():
                 self._corrections.append((self._num_updates - 1, few.detach().clone()))
-        if self._num_updates < _MAX_UPDATES or self._num_updates % _PERIOD < 2:
+        if self._num_updates < MAX_UPDATES or self._num_updates % PERIOD < 2:
             self._updates.append(PastUpdate(self._num_updates, _thin(inputs)))
         self._num_updates += 1
 
@@ -82,7 +82,7 @@ class InputHistory:
 
 def _thin(inputs: Inputs) -> Inputs:
     """Copy the inputs of the first environments, with every k-th point."""
-    step = max(1, -(-inputs.points.shape[2] // _MAX_POINTS)) | 1  # odd: rings and columns often are powers of two
+    step = max(1, -(-inputs.points.shape[2] // MAX_POINTS)) | 1  # odd: rings and columns often are powers of two
 
     def copy(value: Tensor) -> Tensor:
         return value[:MAX_ENVS].detach().clone()

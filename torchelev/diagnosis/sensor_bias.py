@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from torchelev.diagnosis.evidence import Evidence
 from torchelev.diagnosis.scan_fit import MIN_CELLS, average_cells
 
-_MIN_BIAS = 0.01  # [m]
-_MAX_SENSORS = 6  # that take turns
-_MIN_TURNS = 5  # of all sensors, that a period must rest on
-_MIN_EXPLAINED = 0.8  # of the corrections' variance; noise of the poses leaves less than half of it to a period
+MIN_BIAS = 0.01  # [m]
+MAX_SENSORS = 6  # that take turns
+MIN_TURNS = 5  # of all sensors, that a period must rest on
+MIN_EXPLAINED = 0.8  # of the corrections' variance; noise of the poses leaves less than half of it to a period
 _CURE = "calibrate the heights at which they are mounted"
 
 
@@ -41,7 +41,7 @@ def _bias_of(seen: Evidence, sensor: int) -> float | None:
     if not differences:
         return None
     mean = float(np.mean(differences))
-    return mean if abs(mean) >= max(_MIN_BIAS, 2 * float(np.std(differences))) else None
+    return mean if abs(mean) >= max(MIN_BIAS, 2 * float(np.std(differences))) else None
 
 
 def _cells_of(seen: Evidence, k: int, sensor: int) -> dict[tuple[int, int], float]:
@@ -54,12 +54,12 @@ def _cells_of(seen: Evidence, k: int, sensor: int) -> dict[tuple[int, int], floa
 def find_alternating_corrections(seen: Evidence) -> str | None:
     """Find drift corrections that repeat: each sensor, or each phase of a gait, has its own height offset."""
     corrections = np.array(seen.corrections)
-    for period in range(2, _MAX_SENSORS + 1):
+    for period in range(2, MAX_SENSORS + 1):
         recent = corrections[-(len(corrections) // period) * period :]
-        if len(recent) < _MIN_TURNS * period:
+        if len(recent) < MIN_TURNS * period:
             return None
         heights = _repeated_heights(recent.reshape(-1, period))
-        if heights is not None and np.ptp(heights) >= _MIN_BIAS:
+        if heights is not None and np.ptp(heights) >= MIN_BIAS:
             return (
                 f"sensors or poses: drift compensation moves the map by {100 * np.ptp(heights):.1f} cm and back, every "
                 f"{period} updates: sensors take turns and disagree in height, or poses lag behind a robot that sways; "
@@ -73,4 +73,4 @@ def _repeated_heights(corrections: NDArray) -> NDArray | None:
     corrections = corrections - corrections.mean()  # a common offset, such as steady drift, is not a disagreement
     mean = corrections.mean(0)
     total, left = np.square(corrections).sum(), np.square(corrections - mean).sum()
-    return np.cumsum(mean) if left < (1 - _MIN_EXPLAINED) * total else None
+    return np.cumsum(mean) if left < (1 - MIN_EXPLAINED) * total else None

@@ -9,7 +9,7 @@ from torchelev.diagnosis.scan_fit import find_plane
 
 _MIN_SHARE = 0.05  # of the points, on the hillside and above the ramp
 _MAX_SLOPE = 50.0  # [deg] steeper planes are walls
-_CELL_SIZE, _MIN_IN_CELL, _SPREAD = 0.1, 4, 0.05  # [m], points, [m]
+CELL_SIZE, MIN_IN_CELL, SPREAD = 0.1, 4, 0.05  # [m], points, [m]
 
 
 def find_cut_hillside(seen: Evidence) -> str | None:
@@ -43,10 +43,10 @@ def is_overgrown(seen: Evidence) -> bool:
     for k in range(len(seen.numbers)):
         points = seen.used_points(k)
         if len(points) >= MIN_POINTS:
-            _, cell = np.unique(np.floor(points[:, :2] / _CELL_SIZE).astype(np.int64), axis=0, return_inverse=True)
+            _, cell = np.unique(np.floor(points[:, :2] / CELL_SIZE).astype(np.int64), axis=0, return_inverse=True)
             number = np.bincount(cell.ravel())
             mean = np.bincount(cell.ravel(), points[:, 2]) / number
             square = np.bincount(cell.ravel(), np.square(points[:, 2] - mean[cell.ravel()])) / number
-            spreads.append(np.sqrt(square[number >= _MIN_IN_CELL]))
+            spreads.append(np.sqrt(square[number >= MIN_IN_CELL]))
     spread = np.concatenate(spreads or [np.zeros(0)])
-    return len(spread) >= MIN_POINTS and float(np.median(spread)) > _SPREAD
+    return len(spread) >= MIN_POINTS and float(np.median(spread)) > SPREAD

@@ -11,6 +11,9 @@ from typing import Any
 
 from torchelev.config import ElevationMapConfig, setting_types
 from torchelev.config_files import VERSION
+from torchelev.diagnosis import history, sensor_bias, surfaces
+from torchelev.diagnosis.causes import REASONS
+from torchelev.diagnosis.evidence import FAR, GATES, MIN_POINTS
 from torchelev.grid import MIN_RESOLUTION
 from torchelev.inputs.checks import FARTHEST
 from torchelev.kernels.cpu_update import Inputs
@@ -50,6 +53,20 @@ _CONSTANTS = (
     ("double", "BREADTH", BREADTH),  # [cells]
     ("double", "MARGIN", MARGIN),  # [m]
     ("double", "MAX_BLOCK", MAX_BLOCK),  # [m]
+    # of diagnosis
+    ("int", "MAX_UPDATES", history.MAX_UPDATES),
+    ("int", "MAX_CORRECTIONS", history.MAX_CORRECTIONS),
+    ("int", "MAX_POINTS", history.MAX_POINTS),  # of a sensor
+    ("int", "PERIOD", history.PERIOD),  # [updates]
+    ("int", "MIN_POINTS", MIN_POINTS),
+    ("double", "FAR", FAR),  # [m]
+    ("double", "MIN_BIAS", sensor_bias.MIN_BIAS),  # [m]
+    ("int", "MAX_TURNS", sensor_bias.MAX_SENSORS),
+    ("int", "MIN_TURNS", sensor_bias.MIN_TURNS),
+    ("double", "MIN_EXPLAINED", sensor_bias.MIN_EXPLAINED),
+    ("double", "CELL_SIZE", surfaces.CELL_SIZE),  # [m]
+    ("int", "MIN_IN_CELL", surfaces.MIN_IN_CELL),
+    ("double", "SPREAD", surfaces.SPREAD),  # [m]
 )
 
 
@@ -67,6 +84,7 @@ def _tables() -> str:
             _table("Tensor", "STATE", _tensors()),
             *(f"constexpr {kind} {name} = {_number(value)};" for kind, name, value in _CONSTANTS),
             "",
+            _table("const char*", "REASONS", (f'"{REASONS[gate]}"' for gate in GATES)),
             _default_settings(),
             _order(),
             *(_axes(name) for name in presets.PRESETS),

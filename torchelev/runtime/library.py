@@ -79,7 +79,7 @@ def _version() -> str:
 
 
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
-    for name in ("torchelev_last_error", "torchelev_version", "torchelev_map_link_name"):
+    for name in ("torchelev_last_error", "torchelev_version", "torchelev_map_link_name", "torchelev_map_diagnose"):
         getattr(library, name).restype = ctypes.c_char_p
     library.torchelev_map_tensor.restype = _POINTER
     library.torchelev_scan_size.restype = library.torchelev_scan_num_feet.restype = _COUNT
@@ -209,6 +209,13 @@ class CMap:
         at = _POINTER(_address(xy)), _COUNT(len(xy))
         self._call("torchelev_map_sample", self._map, _text(name), _text(mode), *at, *places)
         return values, known
+
+    def diagnose(self) -> list[str]:
+        """Return what looks wrong with the inputs, a sentence each."""
+        text = self._library.torchelev_map_diagnose(self._map)
+        if text is None:
+            raise LibraryError(1, self._library.torchelev_last_error().decode())
+        return text.decode().splitlines()
 
     def save(self, path: str | Path) -> None:
         """Save the whole map."""

@@ -4,7 +4,20 @@ from __future__ import annotations
 
 from torchelev.kernels.registry import PACKAGE
 
-_OWN = ("torchelev", "body", "config", "image", "layout", "map", "poses", "scan", "settings", "state_file")
+_OWN = (
+    "torchelev",
+    "body",
+    "config",
+    "image",
+    "layout",
+    "map",
+    "poses",
+    "scan",
+    "settings",
+    "state_file",
+    "diagnosis/causes",
+    "diagnosis/evidence",
+)
 
 #: seen from the package; the first one names the library
 SOURCES = (

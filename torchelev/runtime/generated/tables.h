@@ -120,6 +120,26 @@ constexpr double NEAR = 1.0;
 constexpr double BREADTH = 1.4142135623730951;
 constexpr double MARGIN = 0.5;
 constexpr double MAX_BLOCK = 1.0;
+constexpr int MAX_UPDATES = 8;
+constexpr int MAX_CORRECTIONS = 32;
+constexpr int MAX_POINTS = 3000;
+constexpr int PERIOD = 7;
+constexpr int MIN_POINTS = 20;
+constexpr double FAR = 250.0;
+constexpr double MIN_BIAS = 0.01;
+constexpr int MAX_TURNS = 6;
+constexpr int MIN_TURNS = 5;
+constexpr double MIN_EXPLAINED = 0.8;
+constexpr double CELL_SIZE = 0.1;
+constexpr int MIN_IN_CELL = 4;
+constexpr double SPREAD = 0.05;
+
+constexpr const char* REASONS[] = {
+    "are NaN or infinite, or their pose or variance is: check what makes them",
+    "are too near or too far: check their unit, and sensor.min_distance and sensor.max_distance",
+    "lie on the robot's own body: check sensor.body, T_map_base and T_base_links",
+    "lie above the exclusion ramp: check that the pose's z axis points up, that points with optical axes have a pose with such axes, and sensor.exclusion",
+};
 
 inline Settings default_settings() {
     Settings s{};

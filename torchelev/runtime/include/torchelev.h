@@ -11,7 +11,7 @@
  * Threads: a map, a scan or an image belongs to one thread at a time; different ones may be used at the same time. What
  * reads a map (layers, samples, statistics) may run on several threads while none updates it.
  *
- * Memory: after a map, a scan or an image is created, updates and reads allocate nothing.
+ * Memory: after a map, a scan or an image is created, updates and reads allocate nothing; a diagnosis does.
  */
 #ifndef TORCHELEV_H
 #define TORCHELEV_H
@@ -161,6 +161,19 @@ torchelev_status torchelev_map_sample(const torchelev_map* map, const char* name
 
 /** Write what the last update did. */
 torchelev_status torchelev_map_statistics(const torchelev_map* map, torchelev_statistics* statistics);
+
+/**
+ * Describe what looks wrong with the inputs: `ElevationMap.diagnose`, without the rules that fit planes and poses.
+ *
+ * It names points in millimetres or in another frame, a base that moves against its sensor, sensors that take turns and
+ * disagree in height, gates that reject nearly everything, a window beside the points, a stage that clears most cells,
+ * scans that contradict the map, and a wrong `dt`. It looks at a few of the updates since the last reset, of which the
+ * map keeps up to 3,000 points of each sensor. It allocates memory.
+ *
+ * @return a sentence on each line, worst first, "" if nothing is found; null, with an error, if this fails. Valid until
+ * the next diagnosis, or until the map is freed.
+ */
+const char* torchelev_map_diagnose(torchelev_map* map);
 
 /**
  * Save everything that the next update needs, as a file of safetensors. An existing file is replaced as a whole or,

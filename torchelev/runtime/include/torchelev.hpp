@@ -63,6 +63,13 @@ class Map {
         return found;
     }
 
+    // What looks wrong with the inputs, a sentence on each line.
+    std::string diagnose() {
+        const char* found = torchelev_map_diagnose(map.get());
+        if (!found) throw Error(TORCHELEV_NO_MEMORY);
+        return found;
+    }
+
     const torchelev_map* get() const { return map.get(); }
 };
 
@@ -83,6 +90,29 @@ class HeightScan {
 
     const std::vector<float>& operator()(const Map& map, const Pose& T_map_base) {
         check(torchelev_scan_read(scan.get(), map.get(), T_map_base.data(), nullptr, values.data(), nullptr));
+        return values;
+    }
+};
+
+// An image of the map around the robot.
+class MapImage {
+    std::unique_ptr<torchelev_image, decltype(&torchelev_image_free)> image{nullptr, &torchelev_image_free};
+
+  public:
+    std::array<int64_t, 3> shape{};  // channels, rows, columns
+    std::vector<float> values;       // of the last call
+
+    // The fields of `MapImage` in Python, as JSON.
+    MapImage(const Map& map, const std::string& settings) {
+        torchelev_image* made = nullptr;
+        check(torchelev_image_create(map.get(), settings.c_str(), &made));
+        image.reset(made);
+        check(torchelev_image_shape(made, shape.data()));
+        values.resize(size_t(shape[0] * shape[1] * shape[2]));
+    }
+
+    const std::vector<float>& operator()(const Map& map, const Pose& T_map_base) {
+        check(torchelev_image_read(image.get(), map.get(), T_map_base.data(), values.data()));
         return values;
     }
 };

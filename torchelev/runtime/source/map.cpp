@@ -66,6 +66,7 @@ torchelev_map::torchelev_map(const std::string& text, const std::string& where, 
     std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
     covariance.resize(36 * limits.max_sensors);
     if (!cfg.body.links.empty()) on_robot.resize(limits.max_points);
+    history.resize(limits);
     Team::use();
     if (limits.num_threads > 1) Team::shared()->grow(limits.num_threads - 1);
     warm_up();
@@ -88,6 +89,7 @@ size_t torchelev_map::find(const std::string& name) const {
 void torchelev_map::forget() {
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) fill_tensor(STATE[k], tensors[k].get(), count(k));
     state.corner[0] = -(sizes.H / 2), state.corner[1] = -(sizes.W / 2);
+    history.forget();
 }
 
 // Run the largest updates, so that later ones allocate nothing: first a point in each cell, then rays to the farthest
@@ -191,7 +193,23 @@ void require_covariances(const double* values, int64_t number) {
 void torchelev_map::update(const torchelev_input& input) {
     check(input);
     if (input.pose_covariance) require_covariances(input.pose_covariance, input.num_sensors);
+    const double last_correction = *state.statistics.drift_correction;
     run(input, ORDER, std::size(ORDER));
+    history.add(input, input.T_base_links ? on_robot.data() : nullptr, last_correction);
+}
+
+const Measurement& torchelev_map::measure_again(const PastUpdate& past) {
+    Sizes size = sizes;
+    size.S = past.sensors, size.N = past.points, size.M = size.S * size.N, size.K = 0;
+    float dt = past.dt;
+    Inputs inputs{};
+    inputs.points = past.xyz.data(), inputs.T_map_sensor = past.poses.data(), inputs.dt = &dt;
+    inputs.T_map_base = past.has_base ? const_cast<double*>(past.base) : nullptr;
+    inputs.variance = past.has_variance ? past.variance.data() : nullptr;
+    inputs.own = past.has_own ? past.own.data() : nullptr;
+    Update one{settings, size, state, inputs, own.measurement, own.memory, limits.num_threads};
+    run_measure(one);
+    return own.measurement;
 }
 
 void torchelev_map::move(const double* T_map_base) {

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "runtime/source/config.h"
+#include "runtime/source/diagnosis/history.h"
 #include "tables.h"
 
 constexpr size_t NUMBER_OF_TENSORS = sizeof(MapState) / sizeof(void*);
@@ -29,6 +30,8 @@ struct torchelev_map {
     std::vector<float> covariance;                          // (S, 6, 6) of the input
     std::vector<uint8_t> on_robot;                          // (S, N) of the input, with shapes of links
     robot_body::Posed posed;
+    History history;
+    std::string findings;  // of the last diagnosis
 
     torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* limits);
 
@@ -40,6 +43,8 @@ struct torchelev_map {
     void forget();                               // make the map blank
     void update(const torchelev_input& input);
     void move(const double* T_map_base);
+    // Measure the points of a past update again, into memory that the next update overwrites.
+    const Measurement& measure_again(const PastUpdate& past);
     CellValue read(Layer layer, int64_t cell) const;  // a cell of a layer by its number
     static Layer layer(const std::string& name);      // its number; raises Error
     // Refuse another grid than that of a scan or an image.

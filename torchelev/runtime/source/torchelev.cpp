@@ -5,6 +5,7 @@
 #include <cstring>
 #include <new>
 
+#include "runtime/source/diagnosis/diagnose.h"
 #include "runtime/source/image.h"
 #include "runtime/source/scan.h"
 
@@ -199,6 +200,16 @@ torchelev_status torchelev_map_statistics(const torchelev_map* map, torchelev_st
                                            *s.drift_error,          *s.drift_correction,     *s.disagreement,
                                            *s.cleared_seen_through, *s.cleared_other_floors, *s.cells_bounded};
     });
+}
+
+const char* torchelev_map_diagnose(torchelev_map* map) {
+    const char* found = nullptr;
+    status_of([&] {
+        torchelev_map& m = given("map", map);
+        m.findings = diagnose(m);
+        found = m.findings.c_str();
+    });
+    return found;
 }
 
 torchelev_status torchelev_map_save(const torchelev_map* map, const char* path) {
