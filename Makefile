@@ -95,6 +95,8 @@ quality-odometry: setup  ## measure maps whose poses come from the clouds, five 
 
 runtime: setup  ## measure the C library, and replay under sanitizers and on aarch64, twenty minutes
 	$(BIN)/python -m benchmarks.runtime speed
+	$(BIN)/python -m benchmarks.runtime replay
+	$(BIN)/python -m benchmarks.runtime spacing
 	$(BIN)/python -m benchmarks.runtime aarch64
 	$(BIN)/python -m benchmarks.runtime sanitize
 

@@ -23,6 +23,7 @@ from benchmarks.quality.changes import report as changes
 from benchmarks.quality.odometry import report as odometry
 from benchmarks.quality.real import completed, merged
 from benchmarks.runtime import report as runtime
+from benchmarks.runtime import spacing
 from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
 from benchmarks.speed import (
@@ -144,6 +145,8 @@ TABLES = {
     "speed": _speed,
     "loop": _made_by(loop.table, "loop", "rows"),
     "runtime_speed": _made_by(runtime.speed_table, "runtime_speed"),
+    "runtime_replay": _made_by(runtime.replay_table, "runtime_replay"),
+    "runtime_spacing": _made_by(spacing.table, "runtime_spacing"),
     "runtime_aarch64": _made_by(runtime.aarch64_table, "runtime_aarch64"),
     "long_run": _long_run,
     "odometry": _made_by(odometry.table, "odometry"),

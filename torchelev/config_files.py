@@ -12,6 +12,7 @@ from torchelev.errors import require
 from torchelev.output_files import atomic_file
 
 VERSION_NAME, VERSION = "torchelev_config", 1  # of the format; files without it are of version 1
+SCHEMA_NAME = "$schema"  # by which editors find the file that describes the settings
 
 
 def read_settings(path: str | Path) -> dict[str, Any]:
@@ -43,11 +44,11 @@ def write_settings(path: str | Path, values: dict[str, Any]) -> None:
 
 
 def without_version(values: dict[str, Any]) -> dict[str, Any]:
-    """Return settings without the format's version; ValueError if it is another one."""
+    """Return settings without the format's version and schema; ValueError if it is another version."""
     version = values.get(VERSION_NAME, VERSION)
     is_known = version == VERSION and type(version) is int
     require(is_known, VERSION_NAME, f"must be {VERSION}", version, "read it with a newer torchelev")
-    return {name: value for name, value in values.items() if name != VERSION_NAME}
+    return {name: value for name, value in values.items() if name not in (VERSION_NAME, SCHEMA_NAME)}
 
 
 def from_json(value: Any) -> Any:

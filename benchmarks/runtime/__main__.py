@@ -1,4 +1,4 @@
-"""Measure the C library: `speed`, `sanitize` and `aarch64` write JSON to benchmarks/results."""
+"""Measure the C library: `speed`, `replay`, `spacing`, `aarch64` and `sanitize` write JSON to benchmarks/results."""
 
 from __future__ import annotations
 
@@ -52,6 +52,28 @@ def aarch64(out: Path) -> None:
     found = compare_processors()
     write_json(out / "runtime_aarch64.json", found)
     click.echo(json.dumps(found, indent=2))
+
+
+@main.command()
+@_OUT
+def replay(out: Path) -> None:
+    """Map the scenes of the accuracy and feature tables by Python and by the library: runtime_replay.json."""
+    from benchmarks.runtime.replay import replay as map_by_both
+
+    found = map_by_both()
+    write_json(out / "runtime_replay.json", found)
+    click.echo(json.dumps(found, indent=2))
+
+
+@main.command()
+@_OUT
+def spacing(out: Path) -> None:
+    """Read points 0.1 m apart of maps with other cells: runtime_spacing.json."""
+    from benchmarks.runtime.spacing import measure, table
+
+    found = measure()
+    write_json(out / "runtime_spacing.json", found)
+    click.echo(table(found))
 
 
 if __name__ == "__main__":

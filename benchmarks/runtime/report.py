@@ -14,6 +14,14 @@ def speed_table(result: dict[str, Any]) -> str:
     return markdown_table(["run", "p50 [ms]", "p99 [ms]", "process [ms]", "memory [MB]"], lines)
 
 
+def replay_table(result: dict[str, Any]) -> str:
+    """Tabulate by scenes how many updates and scans there were, and how many differ."""
+    columns = list(next(iter(result["rows"].values())))
+    return markdown_table(
+        ["scenes", *columns], [[name, *map(str, row.values())] for name, row in result["rows"].items()]
+    )
+
+
 def aarch64_table(result: dict[str, Any]) -> str:
     """Tabulate by layer how far the processors are apart."""
     lines = []

@@ -24,7 +24,7 @@ from torchelev import ElevationMapConfig
 from torchelev.app.results import write_json
 
 
-def _cases() -> list[tuple[str, str, str]]:
+def cases() -> list[tuple[str, str, str]]:
     """Return the combinations of scene, motion and noise."""
     return [(s, m, n) for m in ("turn", "walk", "lidar") for s in SCENES for n in NOISES]
 
@@ -40,8 +40,8 @@ def main() -> None:
     only_help = "score only the rows that contain this text, such as 'stairs turn', and write nothing"
     parser.add_argument("--only", default="", help=only_help)
     args = parser.parse_args()
-    cases = [case for case in _cases() if args.only in " ".join(case)]
-    rows = [score(*case) for case in tqdm(cases, desc="accuracy")]
+    chosen = [case for case in cases() if args.only in " ".join(case)]
+    rows = [score(*case) for case in tqdm(chosen, desc="accuracy")]
     print(table(rows))
     if not args.only:
         values = [asdict(r) | {"holds": meets(r)} for r in rows]

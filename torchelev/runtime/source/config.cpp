@@ -6,7 +6,7 @@
 namespace {
 
 constexpr size_t NUMBER_OF_SETTINGS = std::size(SETTINGS);
-const char* const VERSION_NAME = "torchelev_config";
+const char *const VERSION_NAME = "torchelev_config", *const SCHEMA_NAME = "$schema";
 
 std::string last_part(const std::string& name) { return name.substr(name.rfind('.') + 1); }
 
@@ -49,7 +49,7 @@ Config::Config(const std::string& text, const std::string& where) {
 
 void Config::read_group(const Json& group, const std::string& prefix) {
     for (const auto& [name, value] : group.members) {
-        if (prefix.empty() && name == VERSION_NAME) continue;
+        if (prefix.empty() && (name == VERSION_NAME || name == SCHEMA_NAME)) continue;
         const size_t k = find(prefix + name);
         const std::string parent = prefix.empty() ? "" : prefix.substr(0, prefix.size() - 1);
         REQUIRE(k < NUMBER_OF_SETTINGS, "config." + prefix + name, "is not a setting", "'" + name + "'",
