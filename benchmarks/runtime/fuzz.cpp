@@ -58,12 +58,36 @@ void update(torchelev_map* map) {
     for (float& value : points) value = float(below(4000)) / 1000 - 2;
     const torchelev::Pose T{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1};
     const torchelev_input input{1, 100, points, T.data(), T.data(), nullptr, 0.1, nullptr, nullptr};
-    if (!torchelev_map_num_links(map)) return void(torchelev_map_update(map, &input));
     std::vector<double> links;
     for (int k = 0; k < torchelev_map_num_links(map); k++) links.insert(links.end(), T.begin(), T.end());
     torchelev_input with_links = input;
-    with_links.T_base_links = links.data();
+    if (!links.empty()) with_links.T_base_links = links.data();
     torchelev_map_update(map, &with_links);
+}
+
+// Update a map, and read the layers of its filters and its diagnosis.
+void use(torchelev_map* map) {
+    update(map);
+    int64_t rows, columns;
+    torchelev_map_size(map, &rows, &columns, nullptr);
+    std::vector<float> values(size_t(rows * columns));
+    for (const char* layer : {"smooth", "nearest", "lowest", "harmonic"})
+        torchelev_map_layer(map, layer, values.data(), values.size());
+    torchelev_map_diagnose(map);
+}
+
+// Create and read an image; return whether its settings were good.
+bool read_image(const torchelev_map* map, const std::string& settings) {
+    const torchelev::Pose T{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1};
+    torchelev_image* image = nullptr;
+    int64_t shape[3];
+    const bool is_good = !torchelev_image_create(map, settings.c_str(), &image);
+    if (is_good && !torchelev_image_shape(image, shape)) {
+        std::vector<float> values(size_t(shape[0] * shape[1] * shape[2]));
+        torchelev_image_read(image, map, T.data(), values.data());
+    }
+    torchelev_image_free(image);
+    return is_good;
 }
 
 // Whether a config may ask for a large grid, which may be more than there is memory for.
@@ -77,6 +101,9 @@ int main(int count, char** arguments) {
     const std::string layout =
         "{\"pattern\": [[0.3, 0.2], [-0.4, 0.1]], \"fill\": \"inpaint\", \"clip\": 1.0, \"original\": \"-inf\", "
         "\"num_feet\": 0}";
+    const std::string image =
+        "{\"length_x\": 1.0, \"length_y\": 0.8, \"resolution\": 0.1, \"offset\": [0.1, 0.0], \"mode\": \"bilinear\", "
+        "\"layers\": [\"elevation\", \"validity\", \"variance\"], \"nominal_height\": 0.3}";
     const torchelev_limits limits{200, 1, 1};
     torchelev_map* map = nullptr;
     if (torchelev_map_create_from_text(config.c_str(), &limits, &map))
@@ -84,12 +111,12 @@ int main(int count, char** arguments) {
     update(map);
     if (torchelev_map_save(map, path.c_str())) return std::fprintf(stderr, "%s\n", torchelev_last_error()), 1;
     const std::string saved = read(path);
-    long tries = 0, good[3] = {};
+    long tries = 0, good[4] = {};
     const auto end = std::chrono::steady_clock::now() + std::chrono::seconds(std::atoi(arguments[3]));
     for (; std::chrono::steady_clock::now() < end; tries++) {
         torchelev_map* other = nullptr;
         const std::string text = damaged(config);
-        if (!is_large(text) && !torchelev_map_create_from_text(text.c_str(), &limits, &other)) good[0]++, update(other);
+        if (!is_large(text) && !torchelev_map_create_from_text(text.c_str(), &limits, &other)) good[0]++, use(other);
         torchelev_map_free(other);
         torchelev_scan* scan = nullptr;
         const torchelev::Pose T{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1};
@@ -100,8 +127,10 @@ int main(int count, char** arguments) {
         torchelev_scan_free(scan);
         std::ofstream(path, std::ios::binary) << damaged(saved);
         good[2] += !torchelev_map_load(map, path.c_str());
-        update(map);
+        use(map);
+        good[3] += read_image(map, damaged(image));
     }
     torchelev_map_free(map);
-    std::printf("%ld of each: read %ld configs, %ld layouts, %ld saved maps\n", tries, good[0], good[1], good[2]);
+    std::printf("%ld of each: read %ld configs, %ld layouts, %ld saved maps, %ld images\n", tries, good[0], good[1],
+                good[2], good[3]);
 }

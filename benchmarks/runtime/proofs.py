@@ -33,7 +33,12 @@ _SMALL: dict[str, Any] = {
     "raycast": {"max_range": 2.0, "min_time": 0.0},
     "overlap": {"radius": 3.0},
     "traversability": {"radius": 0.1, "critical_step": "inf"},
-    "filters": [],
+    "filters": [
+        {"layer": "smooth", "filter": "gaussian", "sigma": 0.1},
+        {"layer": "nearest", "filter": "inpaint_nearest", "inputs": ["smooth"]},
+        {"layer": "lowest", "filter": "inpaint_minimum", "iterations": 3},
+        {"layer": "harmonic", "filter": "inpaint_diffusion", "iterations": 9},
+    ],
 }
 # What runs the code of other processors, and how it is built.
 _OTHERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {

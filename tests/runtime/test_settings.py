@@ -170,7 +170,7 @@ NEEDS_PYTHON = {
     "learned": ElevationMapConfig(traversability=LearnedTraversabilityConfig()).to_dict(),
     "learned, in short": {"traversability": {"robot": {"length": 0.5}}},
     "completion": {"completion": {}},
-    "filters": {"filters": [{"layer": "smooth", "filter": "gaussian"}]},
+    "filters": {"filters": [{"layer": "slope", "filter": "slope"}]},
 }
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchelev.errors import message, require, require_positive
 from torchelev.filters import opencv
 from torchelev.layers import Layer
+from torchelev.plane_fit import MAX_RADIUS
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -33,9 +34,12 @@ def known_weight(known: Bool[Tensor, "B H W"], dtype: torch.dtype) -> Float[Tens
 
 
 def radius_cells(radius: float, resolution: float) -> int:
-    """Return a window's radius in cells, rounded, at least 1."""
+    """Return a window's radius in cells, rounded, from 1 to `MAX_RADIUS`."""
     require_positive(radius=radius, resolution=resolution)
-    return max(1, round(radius / resolution))
+    cells = radius / resolution
+    rule = f"must be at most {MAX_RADIUS} cells of {resolution:g} m"
+    require(cells <= MAX_RADIUS, "radius", rule, radius, "give metres")
+    return max(1, round(cells))
 
 
 def zero_unknown(layer: Layer) -> Layer:

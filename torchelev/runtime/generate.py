@@ -123,7 +123,9 @@ def _settings(cfg: Any, prefix: str) -> Iterator[str]:
 
 
 def _kind(name: str, kinds: list[Any]) -> str:
-    if name == "filters" or name == "completion":
+    if name == "filters":
+        return "CHAIN"
+    if name == "completion":
         return "ONLY_PYTHON"
     if any(kind in _PLANNING for kind in kinds):
         return "IGNORED"

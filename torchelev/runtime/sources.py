@@ -4,23 +4,8 @@ from __future__ import annotations
 
 from torchelev.kernels.registry import PACKAGE
 
-_OWN = (
-    "torchelev",
-    "body",
-    "config",
-    "image",
-    "layout",
-    "map",
-    "poses",
-    "scan",
-    "settings",
-    "state_file",
-    "diagnosis/causes",
-    "diagnosis/evidence",
-)
+_NAMED_FOR = "runtime/source/torchelev.cpp"  # the library is called as its first source
+_FOUND = (path for pattern in ("runtime/source/**/*.cpp", "stages/*/cpu.cpp") for path in PACKAGE.glob(pattern))
 
 #: seen from the package; the first one names the library
-SOURCES = (
-    *(f"runtime/source/{name}.cpp" for name in _OWN),
-    *sorted(str(path.relative_to(PACKAGE)) for path in (PACKAGE / "stages").glob("*/cpu.cpp")),
-)
+SOURCES = (_NAMED_FOR, *sorted({str(path.relative_to(PACKAGE)) for path in _FOUND} - {_NAMED_FOR}))

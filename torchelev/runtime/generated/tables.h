@@ -70,7 +70,7 @@ constexpr Setting SETTINGS[] = {
     {"traversability.critical_roughness", NUMBER, false, false, {0.05}},
     {"traversability.robot", IGNORED, true, true, {}},
     {"completion", ONLY_PYTHON, true, true, {}},
-    {"filters", ONLY_PYTHON, false, false, {}},
+    {"filters", CHAIN, false, false, {}},
 };
 
 constexpr Tensor STATE[] = {

@@ -11,7 +11,8 @@
  * Threads: a map, a scan or an image belongs to one thread at a time; different ones may be used at the same time. What
  * reads a map (layers, samples, statistics) may run on several threads while none updates it.
  *
- * Memory: after a map, a scan or an image is created, updates and reads allocate nothing; a diagnosis does.
+ * Memory: after a map, a scan or an image is created, updates and reads allocate nothing. A diagnosis does, and so does
+ * the first read of a layer that filters make.
  */
 #ifndef TORCHELEV_H
 #define TORCHELEV_H
@@ -28,7 +29,7 @@ typedef enum {
     TORCHELEV_OK = 0,
     TORCHELEV_BAD_VALUE = 1,   /**< an argument or a setting breaks a rule */
     TORCHELEV_BAD_FILE = 2,    /**< a file cannot be read or written, is damaged, or is of another version */
-    TORCHELEV_UNSUPPORTED = 3, /**< a setting needs Python: filters, completion, a learned head */
+    TORCHELEV_UNSUPPORTED = 3, /**< a setting needs Python: completion, a learned head, some filters */
     TORCHELEV_NO_MEMORY = 4    /**< there is not enough memory */
 } torchelev_status;
 
@@ -131,7 +132,8 @@ const char* torchelev_map_link_name(const torchelev_map* map, int32_t link);
 torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]);
 
 /**
- * Copy a layer: "elevation", "variance", "time", "upper_bound", "traversability", "normal_x", "normal_y" or "normal_z".
+ * Copy a layer: "elevation", "variance", "validity", "time", "upper_bound", "traversability", "normal_x", "normal_y",
+ * "normal_z", or one of the config's filters.
  *
  * @param values (H, W), NaN where not known.
  * @param size number of values that fit.

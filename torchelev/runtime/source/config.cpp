@@ -66,9 +66,14 @@ void Config::read_setting(size_t k, const Json& value) {
         REQUIRE(is_group, where, "must be a mapping", value.type(), "see ElevationMapConfig");
         return;
     }
+    if (setting.kind == CHAIN) {
+        REQUIRE(value.kind == Json::ARRAY, where, "must be a list", value.type(),
+                "write one as {layer: smooth, filter: gaussian, sigma: 0.1}");
+        filters = value;
+        return;
+    }
     if (setting.kind == ONLY_PYTHON) {
-        const bool is_off = value.kind == Json::NUL || (value.kind == Json::ARRAY && value.items.empty());
-        REQUIRE(is_off, where, "needs Python: this library has neither filters nor completion", value.describe(),
+        REQUIRE(value.kind == Json::NUL, where, "needs Python: this library has no completion", value.describe(),
                 "leave it out, or run the map in Python", TORCHELEV_UNSUPPORTED);
         return;
     }

@@ -51,6 +51,7 @@ class Config {
 
   public:
     RobotBody body;  // of `sensor.body`, if that has shapes of links
+    Json filters;    // the list; null if it is left out
 
     // Read the text of a file; errors name it. Raises Error.
     Config(const std::string& text, const std::string& where);

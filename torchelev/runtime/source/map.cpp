@@ -10,8 +10,8 @@
 
 namespace {
 
-const char* const LAYERS[] = {"elevation",      "variance", "time",     "upper_bound",
-                              "traversability", "normal_x", "normal_y", "normal_z"};
+const std::vector<std::string> LAYERS = {"elevation",      "variance", "validity", "time",    "upper_bound",
+                                         "traversability", "normal_x", "normal_y", "normal_z"};
 
 constexpr torchelev_limits USUAL{131072, 4, 1};
 
@@ -55,7 +55,8 @@ float normal_component(float gx, float gy, int axis) {
 // Creation -----------------------------------------------------------------------------------------------------------
 
 torchelev_map::torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* given)
-    : cfg(text, where), settings(settings_of(cfg)), sizes{}, limits(checked_limits(given)) {
+    : cfg(text, where), settings(settings_of(cfg)), sizes{}, limits(checked_limits(given)),
+      filters(cfg.filters.items, {cfg.rows(), cfg.columns(), settings.measure.resolution}, LAYERS) {
     sizes.B = 1, sizes.H = cfg.rows(), sizes.W = cfg.columns();
     void* addresses[NUMBER_OF_TENSORS];
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
@@ -89,7 +90,7 @@ size_t torchelev_map::find(const std::string& name) const {
 void torchelev_map::forget() {
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) fill_tensor(STATE[k], tensors[k].get(), count(k));
     state.corner[0] = -(sizes.H / 2), state.corner[1] = -(sizes.W / 2);
-    history.forget();
+    history.forget(), filters.forget();
 }
 
 // Run the largest updates, so that later ones allocate nothing: first a point in each cell, then rays to the farthest
@@ -248,15 +249,32 @@ void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64
     sizes.S = input.num_sensors, sizes.N = input.num_points, sizes.M = sizes.S * sizes.N;
     sizes.P = sizes.S > 1 ? sizes.S : 0;
     Update one{settings, sizes, state, inputs, own.measurement, own.memory, limits.num_threads};
+    filters.forget();
     run_stages(one, stages, number);
 }
 
 // Reading ------------------------------------------------------------------------------------------------------------
 
-Layer torchelev_map::layer(const std::string& name) {
-    for (int k = 0; k < int(std::size(LAYERS)); k++)
-        if (name == LAYERS[k]) return Layer(k);
-    refuse("layer", "must be one of " + joined(LAYERS), "'" + name + "'", "use elevation");
+LayerView torchelev_map::view(const std::string& name) const {
+    const auto own = [&](const std::string& layer) {
+        return LayerView{*this, Layer(std::find(LAYERS.begin(), LAYERS.end(), layer) - LAYERS.begin()), nullptr};
+    };
+    if (std::find(LAYERS.begin(), LAYERS.end(), name) != LAYERS.end()) return own(name);
+    std::vector<std::string> names = LAYERS;
+    for (const std::string& made : filters.names()) names.push_back(made);
+    REQUIRE(filters.has(name), "layer", "must be one of " + joined(names), "'" + name + "'", "use elevation");
+    const std::lock_guard<std::mutex> lock(filtering);
+    const Cells& made = filters.read(name, [&](const std::string& layer, Cells& to) {
+        for (int64_t k = 0; k < cells(); k++) {
+            const CellValue cell = own(layer).at(k);
+            to.values[k] = cell.known ? cell.value : 0, to.known[k] = cell.known;
+        }
+    });
+    return {*this, ELEVATION, &made};
+}
+
+CellValue LayerView::at(int64_t cell) const {
+    return made ? CellValue{made->values[cell], made->known[cell] != 0} : map.read(layer, cell);
 }
 
 void torchelev_map::require_grid(int64_t height, int64_t width, double side, const char* reader) const {
@@ -274,6 +292,8 @@ CellValue torchelev_map::read(Layer layer, int64_t k) const {
             return {s.elevation[k], known};
         case VARIANCE:
             return {s.variance[k] + pose_variance(s.pose_covariance, gx, gy), known};
+        case VALIDITY:
+            return {float(known), true};
         case TIME:
             return {s.time[k], known};
         case UPPER_BOUND:

@@ -2,21 +2,34 @@
 #pragma once
 
 #include <memory>
+#include <mutex>
 #include <string>
 #include <vector>
 
 #include "runtime/source/config.h"
 #include "runtime/source/diagnosis/history.h"
+#include "runtime/source/filters/chain.h"
 #include "tables.h"
 
 constexpr size_t NUMBER_OF_TENSORS = sizeof(MapState) / sizeof(void*);
 
-enum Layer { ELEVATION, VARIANCE, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z };
+enum Layer { ELEVATION, VARIANCE, VALIDITY, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z };
 
 // A value and whether it is known.
 struct CellValue {
     float value;
     bool known;
+};
+
+struct torchelev_map;
+
+// A layer as it is read, cell by cell.
+struct LayerView {
+    const torchelev_map& map;
+    Layer layer;
+    const Cells* made;  // by filters; null for a layer of the map
+
+    CellValue at(int64_t cell) const;
 };
 
 struct torchelev_map {
@@ -32,6 +45,8 @@ struct torchelev_map {
     robot_body::Posed posed;
     History history;
     std::string findings;  // of the last diagnosis
+    mutable FilterChain filters;
+    mutable std::mutex filtering;  // several threads may read
 
     torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* limits);
 
@@ -46,7 +61,7 @@ struct torchelev_map {
     // Measure the points of a past update again, into memory that the next update overwrites.
     const Measurement& measure_again(const PastUpdate& past);
     CellValue read(Layer layer, int64_t cell) const;  // a cell of a layer by its number
-    static Layer layer(const std::string& name);      // its number; raises Error
+    LayerView view(const std::string& name) const;    // of a layer, or of one that filters make; raises Error
     // Refuse another grid than that of a scan or an image.
     void require_grid(int64_t height, int64_t width, double side, const char* reader) const;
 

@@ -175,5 +175,5 @@ void load_state(torchelev_map& map, const std::string& path) {
     if (!has_sound_place(map, bytes + at)) refuse_file(path, "damaged: its window or its clock cannot be");
     for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++))
         std::memcpy(map.tensors[k].get(), bytes + at, map.bytes(k));
-    map.history.forget();
+    map.history.forget(), map.filters.forget();
 }

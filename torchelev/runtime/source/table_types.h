@@ -9,8 +9,8 @@
 #include "kernels/update.h"
 #include "observations/kernel/scan.h"
 
-// GROUP: an object of settings. ONLY_PYTHON: what this library cannot do. IGNORED: what no update reads.
-enum Kind { GROUP, NUMBER, INTEGER, PLACE, ONLY_PYTHON, IGNORED };
+// GROUP: an object of settings. ONLY_PYTHON: what this library cannot do. IGNORED: what no update reads. CHAIN: filters.
+enum Kind { GROUP, NUMBER, INTEGER, PLACE, ONLY_PYTHON, IGNORED, CHAIN };
 
 struct Setting {
     const char* name;  // with its groups, as "fusion.edges.margin"

@@ -51,23 +51,23 @@ T& given(const char* name, T* value) {
 
 // A layer whose cells are computed as they are read; cells outside are not known.
 struct CellsOfLayer {
-    const torchelev_map& map;
-    Layer layer;
+    const LayerView view;
 
     scans::Read at(Lanes i, Lanes j) const {
         scans::Read found{splat(0), Flags{}};
         for (int l = 0; l < LANES; l++) {
-            if (!(i[l] >= 0 && i[l] < float(map.sizes.H) && j[l] >= 0 && j[l] < float(map.sizes.W))) continue;
-            const CellValue cell = map.read(layer, int64_t(i[l]) * map.sizes.W + int64_t(j[l]));
+            if (!(i[l] >= 0 && i[l] < float(view.map.sizes.H) && j[l] >= 0 && j[l] < float(view.map.sizes.W))) continue;
+            const CellValue cell = view.at(int64_t(i[l]) * view.map.sizes.W + int64_t(j[l]));
             if (cell.known) found.value[l] = cell.value, found.known[l] = -1;
         }
         return found;
     }
 };
 
-void sample(const torchelev_map& map, Layer layer, scans::Mode mode, const double* xy, int64_t number, float* values,
+void sample(const LayerView& view, scans::Mode mode, const double* xy, int64_t number, float* values,
             uint8_t* known) {
-    const CellsOfLayer cells{map, layer};
+    const CellsOfLayer cells{view};
+    const torchelev_map& map = view.map;
     for (int64_t first = 0; first < number; first += LANES) {
         float u[LANES]{}, v[LANES]{};
         const int count = int(std::min<int64_t>(LANES, number - first));
@@ -152,12 +152,12 @@ torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]
 torchelev_status torchelev_map_layer(const torchelev_map* map, const char* name, float* values, size_t size) {
     return status_of([&] {
         const torchelev_map& m = given("map", map);
-        const Layer layer = torchelev_map::layer(&given("name", name));
+        const LayerView view = m.view(&given("name", name));
         given("values", values);
         REQUIRE(size >= size_t(m.cells()), "size", "must be at least " + std::to_string(m.cells()),
                 std::to_string(size), "see torchelev_map_size");
         for (int64_t k = 0; k < m.cells(); k++) {
-            const CellValue cell = m.read(layer, k);
+            const CellValue cell = view.at(k);
             values[k] = cell.known ? cell.value : NAN;
         }
     });
@@ -180,14 +180,14 @@ torchelev_status torchelev_map_sample(const torchelev_map* map, const char* name
                                       int64_t num_points, float* values, uint8_t* known) {
     return status_of([&] {
         const torchelev_map& m = given("map", map);
-        const Layer layer = torchelev_map::layer(&given("name", name));
+        const LayerView view = m.view(&given("name", name));
         const std::string how = &given("mode", mode);
         REQUIRE(how == "bilinear" || how == "nearest", "mode", "must be one of bilinear, nearest", "'" + how + "'",
                 "use bilinear");
         REQUIRE(num_points >= 0, "num_points", "must not be negative", std::to_string(num_points), "give M");
         if (num_points == 0) return;
         given("xy", xy), given("values", values);
-        sample(m, layer, how == "nearest" ? scans::NEAREST : scans::BILINEAR, xy, num_points, values, known);
+        sample(view, how == "nearest" ? scans::NEAREST : scans::BILINEAR, xy, num_points, values, known);
     });
 }
 
