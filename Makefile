@@ -93,11 +93,11 @@ quality-odometry: setup  ## measure maps whose poses come from the clouds, five 
 	$(BIN)/python -m benchmarks.quality.odometry
 	$(BIN)/python -m docs.readme_tables
 
-runtime: setup  ## measure the C library, and replay under sanitizers and on aarch64, twenty minutes
+runtime: setup  ## measure the C library, and prove its answers on other processors and under sanitizers, half an hour
 	$(BIN)/python -m benchmarks.runtime speed
 	$(BIN)/python -m benchmarks.runtime replay
 	$(BIN)/python -m benchmarks.runtime spacing
-	$(BIN)/python -m benchmarks.runtime aarch64
+	$(BIN)/python -m benchmarks.runtime processors
 	$(BIN)/python -m benchmarks.runtime sanitize
 
 docs: setup  ## build the documentation in docs/_build/html, warnings as errors; needs no network once it is set up

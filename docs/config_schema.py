@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import types
 import typing
+from pathlib import Path
 from typing import Any
 
 from docs.extensions.fields import comments
+from torchelev.completion.config import WHEN
 from torchelev.config import ElevationMapConfig, setting_types
 from torchelev.config_files import SCHEMA_NAME, VERSION, VERSION_NAME, to_json
 from torchelev.kernels.registry import PACKAGE
@@ -26,12 +29,14 @@ _FILTERS = {
         },
     },
 }
+_CHOICES: dict[str, Any] = {"when": list(WHEN)}
 _NUMBER = {"anyOf": [{"type": "number"}, {"enum": ["inf", "-inf"]}]}
 _SIMPLE: dict[Any, dict[str, Any]] = {
     float: {"$ref": "#/$defs/number"},
     int: {"type": "integer"},
     bool: {"type": "boolean"},
     str: {"type": "string"},
+    Path: {"type": "string"},
     type(None): {"type": "null"},
 }
 
@@ -62,9 +67,9 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _setting(hint: Any, field: dataclasses.Field[Any], meaning: str) -> dict[str, Any]:
-    plain = isinstance(field.default, int | float | tuple | None) and field.default is not dataclasses.MISSING
-    default = {"default": to_json(field.default)} if plain else {}
-    return {"description": meaning, **_type(hint), **default}
+    default = {"default": to_json(field.default)} if isinstance(field.default, int | float | str | tuple | None) else {}
+    kind = {"enum": _CHOICES[field.name]} if field.name in _CHOICES else _type(hint)
+    return {"description": re.sub(r"\bNone\b", "null", meaning), **kind, **default}
 
 
 def _type(hint: Any) -> dict[str, Any]:
@@ -78,7 +83,7 @@ def _type(hint: Any) -> dict[str, Any]:
         first, *others = typing.get_args(hint)
         sizes = {} if others[-1:] in ([], [...]) else {"minItems": 1 + len(others), "maxItems": 1 + len(others)}
         return {"type": "array", "items": _type(first), **sizes}
-    return _SIMPLE.get(hint, {"type": "string"})
+    return _SIMPLE[hint]
 
 
 if __name__ == "__main__":

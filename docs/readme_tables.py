@@ -147,7 +147,7 @@ TABLES = {
     "runtime_speed": _made_by(runtime.speed_table, "runtime_speed"),
     "runtime_replay": _made_by(runtime.replay_table, "runtime_replay"),
     "runtime_spacing": _made_by(spacing.table, "runtime_spacing"),
-    "runtime_aarch64": _made_by(runtime.aarch64_table, "runtime_aarch64"),
+    "runtime_processors": _made_by(runtime.processors_table, "runtime_processors"),
     "long_run": _long_run,
     "odometry": _made_by(odometry.table, "odometry"),
     "bags": _made_by(bags.table, "bags", "rows"),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchelev.completion.config import CompletionConfig
-from torchelev.config_files import from_json, read_settings, without_version, write_settings
+from torchelev.config_files import from_json, read_settings, without_header, write_settings
 from torchelev.errors import require
 from torchelev.grid import GridConfig
 from torchelev.stages.age.config import AgingConfig
@@ -106,7 +106,7 @@ class ElevationMapConfig:
             ValueError: if there is no such setting, naming those that exist, or its value does not fit.
         """
         if isinstance(values, dict):
-            values = without_version(values)
+            values = without_header(values)
         if not isinstance(values, dict) or "filters" not in values:
             return _build(cls, values, "config")
         from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them

@@ -43,7 +43,7 @@ def write_settings(path: str | Path, values: dict[str, Any]) -> None:
         file.write(text.encode())
 
 
-def without_version(values: dict[str, Any]) -> dict[str, Any]:
+def without_header(values: dict[str, Any]) -> dict[str, Any]:
     """Return settings without the format's version and schema; ValueError if it is another version."""
     version = values.get(VERSION_NAME, VERSION)
     is_known = version == VERSION and type(version) is int

@@ -1,4 +1,4 @@
-"""Measure the C library: `speed`, `replay`, `spacing`, `aarch64` and `sanitize` write JSON to benchmarks/results."""
+"""Measure the C library: `speed`, `replay`, `spacing`, `processors` and `sanitize` write JSON to benchmarks/results."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def sanitize(seconds: int, out: Path) -> None:
 
 @main.command()
 @_OUT
-def aarch64(out: Path) -> None:
-    """Compare with aarch64, emulated by qemu-user: runtime_aarch64.json."""
+def processors(out: Path) -> None:
+    """Compare code for other processors, aarch64 emulated by qemu-user: runtime_processors.json."""
     from benchmarks.runtime.proofs import compare_processors
 
     found = compare_processors()
-    write_json(out / "runtime_aarch64.json", found)
+    write_json(out / "runtime_processors.json", found)
     click.echo(json.dumps(found, indent=2))
 
 

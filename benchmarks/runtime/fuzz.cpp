@@ -73,7 +73,8 @@ void use(torchelev_map* map) {
     std::vector<float> values(size_t(rows * columns));
     for (const char* layer : {"smooth", "nearest", "lowest", "harmonic"})
         torchelev_map_layer(map, layer, values.data(), values.size());
-    torchelev_map_diagnose(map);
+    const char* findings;
+    torchelev_map_diagnose(map, &findings);
 }
 
 // Create and read an image; return whether its settings were good.

@@ -22,7 +22,7 @@ def replay_table(result: dict[str, Any]) -> str:
     )
 
 
-def aarch64_table(result: dict[str, Any]) -> str:
+def processors_table(result: dict[str, Any]) -> str:
     """Tabulate by layer how far the processors are apart."""
     lines = []
     for layer in next(iter(result["rows"].values())):

@@ -47,6 +47,7 @@ def test_saved_configs_fit(tmp_path, name):
         {"fusion": None},
         {"sensor": {"body": {"capsules": [{"link": "leg"}]}}},
         {"filters": [{"layer": "smooth"}]},
+        {"completion": {"when": "never"}},
     ],
 )
 def test_what_is_refused_does_not_fit(values):

@@ -1,4 +1,5 @@
-// Counts what updates and scans of a stream allocate after a map was created: none is allowed.
+// Counts what updates and reads of a stream allocate after a map was created: none is allowed. The config has a filter,
+// `smooth`, whose layer may allocate when it is made, but not when it is read again.
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
@@ -26,12 +27,22 @@ struct Head {
     int32_t num_sensors, num_points;
 };
 
+static void read(const torchelev::Map& map, const char* layer, std::vector<float>& values) {
+    float sampled;
+    const double at[] = {0.1, 0.2};
+    torchelev::check(torchelev_map_layer(map.get(), layer, values.data(), values.size()));
+    torchelev::check(torchelev_map_sample(map.get(), layer, "bilinear", at, 1, &sampled, nullptr));
+}
+
 int main(int, char** arguments) try {
     const torchelev_limits limits{std::atol(arguments[2]), 3, std::atoi(arguments[3])};
     torchelev::Map map(arguments[1], limits);
     torchelev::HeightScan ground(map, "isaac_lab");
     torchelev::HeightScan inpaint(map, "{\"pattern\": [[0.3, 0.2], [-0.4, 0.1]], \"fill\": \"inpaint\"}");
     Head head;
+    int64_t rows, columns;
+    torchelev::check(torchelev_map_size(map.get(), &rows, &columns, nullptr));
+    std::vector<float> values(size_t(rows * columns));
     std::vector<double> poses(48);
     std::vector<float> points(3 * size_t(limits.max_points));
     std::vector<float> variance(limits.max_points, 1e-4f);
@@ -50,7 +61,12 @@ int main(int, char** arguments) try {
         ground(map, base);
         inpaint(map, base);
         if (number % 7 == 6) map.move(base);
+        read(map, "elevation", values);
         if (allocations != before) return std::printf("instant %d: %ld allocations\n", number, allocations - before), 1;
+        read(map, "smooth", values);
+        const long first = allocations;
+        read(map, "smooth", values);
+        if (allocations != first) return std::printf("a filter's layer is made twice\n"), 1;
     }
     std::printf("none\n");
 } catch (const torchelev::Error& error) {

@@ -10,6 +10,7 @@ from tests.diagnosis.walks import CFG, DT
 from tests.helpers import pose
 from tests.runtime.test_maps import numpy, update
 from tests.stages.test_disagreement import GRID, clouds
+from torchelev.map_buffers import name_tensors
 from torchelev.runtime.library import CMap
 from torchelev.sim import DepthCamera, mount, walk
 from torchelev.sim.exact import scenes
@@ -97,5 +98,42 @@ def test_a_diagnosis_changes_nothing(library):
     for points, T, base in SCANS[5:10]:
         other.diagnose()
         other.update(*numpy(points[None], T[None], base, DT))
-    for name in ("elevation", "variance", "last_drift_error"):
-        assert found.tensor(name, "u1").tobytes() == other.tensor(name, "u1").tobytes()
+    assert found.diagnose() == other.diagnose()
+    for name in name_tensors(te.ElevationMap(CFG).state):
+        assert found.tensor(name, "u1").tobytes() == other.tensor(name, "u1").tobytes(), name
+
+
+def test_gates_that_share_the_points_are_counted(library):
+    """Half of the points are too near, the others above the ramp: no gate takes nearly all."""
+    cfg = te.ElevationMapConfig.from_dict(
+        GATES | {"sensor": {"min_distance": 1.5, "exclusion": {"offset": -9.0, "height": -8.0}}}
+    )
+    emap, found = both(library, SCANS[:3], cfg)
+    (sentence,) = found.diagnose()
+    assert "gates let 0 of" in sentence and "range" in sentence and "overhang" in sentence
+    assert found.diagnose() == [text for text in emap.diagnose() if text in found.diagnose()]
+
+
+def test_cells_that_rays_clear_are_counted(library):
+    """The ground was half a metre too high; then rays pass below most of it."""
+    grid = te.GridConfig(resolution=0.1, length_x=2.0, length_y=2.0)
+    cfg = te.ElevationMapConfig(grid=grid, drift=None, overlap=None, raycast=te.RaycastConfig(gate=1e9, min_time=0.0))
+    xy = 2 * torch.rand(4000, 2, generator=torch.Generator().manual_seed(0)) - 1
+    near = torch.cat([xy, torch.full((4000, 1), -0.5)], 1)
+    far = torch.cat([1.5 * xy / xy.norm(dim=1, keepdim=True), torch.full((4000, 1), -1.0)], 1)
+    T = pose((0.0, 0.0, 1.0))[0].double()
+    emap, found = both(library, [(near, T, T), (far, T, T)], cfg)
+    assert any("are left, as rays pass below them" in text for text in found.diagnose())
+    assert found.diagnose() == [text for text in emap.diagnose() if text in found.diagnose()]
+
+
+def test_vegetation_contradicts_nothing(library):
+    """Points at all heights from 0 to 1 m: the gate rejects many, whatever the poses."""
+    generator = torch.Generator().manual_seed(0)
+    T = torch.eye(4, dtype=torch.float64)
+    scale, shift = torch.tensor([6.0, 6.0, 1.0]), torch.tensor([-3.0, -3.0, -2.0])
+    scans = [(torch.rand(9000, 3, generator=generator) * scale + shift, T, None) for _ in range(6)]
+    emap, found = both(library, scans)
+    statistics = emap.statistics
+    assert statistics.rejected_outlier > 0.3 * (statistics.points_used + statistics.rejected_outlier)
+    assert found.diagnose() == emap.diagnose() == []

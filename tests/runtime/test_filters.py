@@ -17,6 +17,10 @@ FILTERS = {
     "gaussian": {"filter": "gaussian"},
     "wide": {"filter": "gaussian", "sigma": 0.4},
     "narrow": {"filter": "gaussian", "sigma": 0.01},
+    "none": {"filter": "gaussian", "sigma": 1e-170},
+    "box_as_is": {"filter": "box"},
+    "median_as_is": {"filter": "median"},
+    "diffusion_as_is": {"filter": "inpaint_diffusion"},
     "box": {"filter": "box", "radius": 0.15, "inputs": "variance"},
     "median": {"filter": "median", "radius": 0.1},
     "minimum": {"filter": "inpaint_minimum"},
@@ -29,6 +33,10 @@ FILTERS = {
 }
 ENTRIES = [{"layer": name, **entry} for name, entry in FILTERS.items()]
 CFG = te.ElevationMapConfig.from_dict({"grid": dataclasses.asdict(GRID), "filters": ENTRIES})
+
+
+LARGE = {"resolution": 0.1, "radius": 1e9}
+TOLERANCES = {"diffusion": 5e-4, "diffusion_as_is": 5e-3}  # [m]
 
 
 def both(library, scans):
@@ -64,12 +72,12 @@ def test_layers_of_filters_are_those_of_python(filtered, name):
     emap, found = filtered
     wanted, mine = emap.layer(name)[0].numpy(), found.layer(name)
     assert np.array_equal(np.isfinite(wanted), np.isfinite(mine))
-    np.testing.assert_allclose(mine, wanted, atol=5e-4 if name == "diffusion" else 2e-6)
+    np.testing.assert_allclose(mine, wanted, atol=TOLERANCES.get(name, 2e-6))
     xy = np.random.default_rng(0).uniform(-1.5, 1.5, (50, 2))
     values, known = emap.sample(torch.from_numpy(xy)[None], name)
     mine, mine_known = found.sample(name, xy)
     assert np.array_equal(mine_known, known[0].numpy())
-    np.testing.assert_allclose(mine, values[0].numpy(), atol=5e-4 if name == "diffusion" else 2e-6)
+    np.testing.assert_allclose(mine, values[0].numpy(), atol=TOLERANCES.get(name, 2e-6))
 
 
 def test_they_follow_the_map(library):
@@ -124,6 +132,8 @@ BAD = [
     {"filter": "fill_from"},
     {"filter": "gaussian", "inputs": "foo"},
     {"filter": "gaussian", "inputs": ["elevation", "variance"]},
+    {"filter": "gaussian", "inputs": ["elevation", "variance"], "sigma": -1},
+    {"filter": "gausian"},
     {"filter": "gaussian", "layer": "elevation"},
     {"filter": "gaussian", "layer": "a b"},
 ]
@@ -136,10 +146,11 @@ def test_bad_filters_are_refused_in_pythons_words(library, entry):
         te.ElevationMap(te.ElevationMapConfig.from_dict(values))
     with pytest.raises(LibraryError) as c:
         CMap(library, json.dumps(values))
-    assert str(c.value) == str(python.value)
+    # Other tests may have registered filters of their own, which Python lists too.
+    assert str(c.value).partition("; there are")[0] == str(python.value).partition("; there are")[0]
 
 
-@pytest.mark.parametrize("name", ["inpaint_telea", "expression", "slope", "gausian"])
+@pytest.mark.parametrize("name", ["inpaint_telea", "expression", "slope"])
 def test_other_filters_are_refused_by_name(library, name):
     with pytest.raises(LibraryError, match=f"filters.layer: filter: needs Python.* got '{name}'") as error:
         CMap(library, json.dumps({"filters": [{"layer": "layer", "filter": name}]}))
@@ -154,5 +165,14 @@ def test_what_is_no_list_of_filters_is_refused(library, filters):
 
 def test_filters_of_python_have_a_largest_radius():
     layer = torch.zeros(1, 4, 4), torch.ones(1, 4, 4, dtype=torch.bool)
-    with pytest.raises(ValueError, match="radius: must be at most 1000 cells"):
-        te.filters.box(layer, resolution=0.1, radius=1e9)
+    for words, call in {
+        "^radius: must be at most 100 m, a window of 1000 cells, got": lambda: te.filters.box(layer, **LARGE),
+        "^sigma: must be at most 33.3333 m, a window of 1000 cells, got": lambda: te.filters.gaussian(
+            layer, resolution=0.1, sigma=100.0
+        ),
+        "^dilation_radius: must be at most 100 m": lambda: te.filters.virtual_floor(
+            layer, resolution=0.1, dilation_radius=1e4
+        ),
+    }.items():
+        with pytest.raises(ValueError, match=words):
+            call()

@@ -33,13 +33,26 @@ def known_weight(known: Bool[Tensor, "B H W"], dtype: torch.dtype) -> Float[Tens
     return known.view(torch.uint8).to(dtype)
 
 
-def radius_cells(radius: float, resolution: float) -> int:
-    """Return a window's radius in cells, rounded, from 1 to `MAX_RADIUS`."""
-    require_positive(radius=radius, resolution=resolution)
-    cells = radius / resolution
-    rule = f"must be at most {MAX_RADIUS} cells of {resolution:g} m"
-    require(cells <= MAX_RADIUS, "radius", rule, radius, "give metres")
+def radius_cells(radius: float, resolution: float, name: str = "radius", reach: float = 1.0) -> int:
+    """Return the radius of a window in cells, rounded, from 1 to `MAX_RADIUS`.
+
+    Args:
+        radius: the setting [m].
+        resolution: [m] of a cell.
+        name: of the setting.
+        reach: how many times as far as the setting the window reaches.
+    """
+    require_positive(**{name: radius, "resolution": resolution})
+    cells = reach * radius / resolution
+    rule = f"must be at most {MAX_RADIUS * resolution / reach:g} m, a window of {MAX_RADIUS} cells"
+    require(cells <= MAX_RADIUS, name, rule, radius, "give a smaller one")
     return max(1, round(cells))
+
+
+def require_radii(resolution: float, **radii: float) -> None:
+    """Refuse radii [m] by their names, as `radius_cells` does."""
+    for name, radius in radii.items():
+        radius_cells(radius, resolution, name)
 
 
 def zero_unknown(layer: Layer) -> Layer:

@@ -89,7 +89,7 @@ def _split_batch(layers: tuple[Layer, ...]) -> list[list[Layer]]:
     return [list(part) for part in zip(*pieces, strict=True)]
 
 
-def _settings_of(name: str) -> dict[str, inspect.Parameter]:
+def settings_of(name: str) -> dict[str, inspect.Parameter]:
     """Return the settings of a filter, without `resolution`."""
     parameters = inspect.signature(FILTERS[name]).parameters
     return {n: p for n, p in parameters.items() if _is_keyword_only(p) and n != "resolution"}
@@ -100,7 +100,7 @@ def listing() -> str:
     lines = []
     for name, function in sorted(FILTERS.items()):
         inputs = [str(p) for p in inspect.signature(function).parameters.values() if not _is_keyword_only(p)]
-        settings = [n if p.default is p.empty else f"{n}={p.default!r}" for n, p in _settings_of(name).items()]
+        settings = [n if p.default is p.empty else f"{n}={p.default!r}" for n, p in settings_of(name).items()]
         names = ", ".join(text.split(":")[0] for text in inputs)
         lines.append(f"{name}({names})" + (f"  {', '.join(settings)}" if settings else ""))
         lines.append(f"    {(inspect.getdoc(function) or '').partition(chr(10))[0]}")
@@ -123,7 +123,7 @@ class Filter(nn.Module):
         super().__init__()
         names = ", ".join(sorted(FILTERS))
         require(name in FILTERS, "filter", "must be a filter's name", repr(name), f"there are {names}")
-        available = _settings_of(name)
+        available = settings_of(name)
         unknown = sorted(set(settings) - set(available))
         hint = f"it takes {', '.join(available) or 'none'}"
         require(not unknown, f"filter {name}", "must be given settings that it has", ", ".join(unknown), hint)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.errors import require_positive
 from torchelev.filters import opencv
 from torchelev.filters.extrema import blank, with_blanks
 from torchelev.filters.layer_tools import known_weight, radius_cells
@@ -37,8 +36,7 @@ def gaussian(layer: Layer, *, resolution: float, sigma: float = 0.1) -> Layer:
     Raises:
         ValueError: if sigma is not positive.
     """
-    require_positive(sigma=sigma)
-    radius, sigma_cells = radius_cells(3 * sigma, resolution), sigma / resolution
+    radius, sigma_cells = radius_cells(sigma, resolution, "sigma", reach=3.0), sigma / resolution
     if opencv.is_usable(layer[0]):
         return opencv.gaussian_mean(layer, radius, sigma_cells), layer[1]
     return _mean(layer, radius, lambda rimmed, dim: gaussian_sum(rimmed, radius, sigma_cells, dim))

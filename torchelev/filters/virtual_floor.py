@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchelev.filters.extrema import dilation
+from torchelev.filters.layer_tools import require_radii
 from torchelev.filters.registry import register
 from torchelev.filters.smoothing import box, median
 from torchelev.layers import Layer
@@ -24,6 +25,7 @@ def smooth_ground(layer: Layer, *, resolution: float, median_radius: float = 0.0
     Raises:
         ValueError: if a radius is not positive.
     """
+    require_radii(resolution, median_radius=median_radius, blur_radius=blur_radius)
     artifact_free = median(layer, resolution=resolution, radius=median_radius)
     return box(artifact_free, resolution=resolution, radius=blur_radius)
 
@@ -53,6 +55,7 @@ def virtual_floor(
     Raises:
         ValueError: if a radius is not positive.
     """
+    require_radii(resolution, median_radius=median_radius, dilation_radius=dilation_radius, blur_radius=blur_radius)
     artifact_free = median(layer, resolution=resolution, radius=median_radius)
     bridged = dilation(artifact_free, resolution=resolution, radius=dilation_radius)
     return box(bridged, resolution=resolution, radius=blur_radius)

@@ -152,7 +152,8 @@ class PartialSums {
     Part parts[NUMBER / WIDTH]{};
 
   public:
-    // Add numbers, of which the first is the `number`-th that is added, a multiple of LANES.
+    // Add the numbers from the `number`-th on of a sequence, in their order. Sequences begin with number 0, which need not
+    // be the first that is added: all sums of it then have its parts.
     void add(int64_t number, Lanes values) {
         Part pieces[LANES / WIDTH];
         std::memcpy(pieces, &values, sizeof values);

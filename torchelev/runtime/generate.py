@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from torchelev.config_files import VERSION
 from torchelev.diagnosis import history, sensor_bias, surfaces
 from torchelev.diagnosis.causes import REASONS
 from torchelev.diagnosis.evidence import FAR, GATES, MIN_POINTS
+from torchelev.filters.inpainting import harmonic
+from torchelev.filters.registry import FILTERS, settings_of
 from torchelev.grid import MIN_RESOLUTION
 from torchelev.inputs.checks import FARTHEST
 from torchelev.kernels.cpu_update import Inputs
@@ -37,11 +39,13 @@ FOLDER = Path(__file__).parent / "generated"
 _NOTE = "// Written by `python -m torchelev.runtime.generate`.\n"
 _ONLY_PYTHON = (RobotBody, LearnedTraversabilityConfig)  # settings of these types need Python
 _PLANNING = (RobotConfig,)  # settings that no update reads
+# The filters that the library has: `KINDS` in source/filters/chain.cpp.
+_FILTERS = ("box", "gaussian", "inpaint_diffusion", "inpaint_minimum", "median")
 _DTYPES = {"float": "F32", "int64_t": "I64", "uint8_t": "U8"}  # of safetensors
 
 
 #: of Python, beside those in the settings: type in C++, name, value
-_CONSTANTS = (
+_CONSTANTS: tuple[tuple[str, str, float], ...] = (
     ("int", "CONFIG_VERSION", VERSION),
     ("int", "MAX_RADIUS", MAX_RADIUS),  # [cells]
     ("int", "MAX_REFINEMENTS", MAX_REFINEMENTS),
@@ -53,7 +57,12 @@ _CONSTANTS = (
     ("double", "BREADTH", BREADTH),  # [cells]
     ("double", "MARGIN", MARGIN),  # [m]
     ("double", "MAX_BLOCK", MAX_BLOCK),  # [m]
-    # of diagnosis
+    ("double", "DAMPING", harmonic.DAMPING),
+    ("double", "OVERCORRECTION", harmonic.OVERCORRECTION),
+    ("double", "SAFETY", harmonic.SAFETY),
+)
+
+_OF_DIAGNOSIS = (
     ("int", "MAX_UPDATES", history.MAX_UPDATES),
     ("int", "MAX_CORRECTIONS", history.MAX_CORRECTIONS),
     ("int", "MAX_POINTS", history.MAX_POINTS),  # of a sensor
@@ -82,9 +91,14 @@ def _tables() -> str:
             _NOTE + '#pragma once\n\n#include "runtime/source/table_types.h"\n',
             _table("Setting", "SETTINGS", _settings(ElevationMapConfig(), "")),
             _table("Tensor", "STATE", _tensors()),
-            *(f"constexpr {kind} {name} = {_number(value)};" for kind, name, value in _CONSTANTS),
-            "",
-            _table("const char*", "REASONS", (f'"{REASONS[gate]}"' for gate in GATES)),
+            _constants(_CONSTANTS),
+            _in_namespace(
+                "diagnosis",
+                _constants(_OF_DIAGNOSIS)
+                + _table("Gate", "GATES", (f'{{"{name}", "{REASONS[name]}"}}' for name in GATES)),
+            ),
+            _table("FilterSetting", "FILTER_SETTINGS", _filter_settings()),
+            _table("const char*", "ALL_FILTERS", (f'"{name}"' for name in sorted(FILTERS) if _is_ours(name))),
             _default_settings(),
             _order(),
             *(_axes(name) for name in presets.PRESETS),
@@ -96,6 +110,14 @@ def _tables() -> str:
 def _table(kind: str, name: str, rows: Any) -> str:
     lines = ",\n".join(f"    {row}" for row in rows)
     return f"constexpr {kind} {name}[] = {{\n{lines},\n}};\n"
+
+
+def _constants(constants: Iterable[tuple[str, str, float]]) -> str:
+    return "".join(f"constexpr {kind} {name} = {_number(value)};\n" for kind, name, value in constants)
+
+
+def _in_namespace(name: str, text: str) -> str:
+    return f"namespace {name} {{\n\n{text}\n}}  // namespace {name}\n"
 
 
 def _number(value: float) -> str:
@@ -155,6 +177,22 @@ def _default_settings() -> str:
                 lines.append(f"    s.{place} = {f'float({text})' if is_float else text};")
     body = "\n".join(lines)
     return f"inline Settings default_settings() {{\n    Settings s{{}};\n{body}\n    return s;\n}}\n"
+
+
+# Filters ------------------------------------------------------------------------------------------------------------
+
+
+def _filter_settings() -> Iterator[str]:
+    """Yield a row for each setting of the filters that the library has, with its default."""
+    for name in _FILTERS:
+        for setting, parameter in settings_of(name).items():
+            usual = "NAN" if parameter.default is None else _number(parameter.default)
+            yield f'{{"{name}", "{setting}", {usual}}}'
+
+
+def _is_ours(name: str) -> bool:
+    """Return whether a filter is no user's."""
+    return FILTERS[name].__module__.startswith("torchelev.")
 
 
 # Tensors and stages -------------------------------------------------------------------------------------------------

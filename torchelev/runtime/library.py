@@ -79,7 +79,7 @@ def _version() -> str:
 
 
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
-    for name in ("torchelev_last_error", "torchelev_version", "torchelev_map_link_name", "torchelev_map_diagnose"):
+    for name in ("torchelev_last_error", "torchelev_version", "torchelev_map_link_name"):
         getattr(library, name).restype = ctypes.c_char_p
     library.torchelev_map_tensor.restype = _POINTER
     library.torchelev_scan_size.restype = library.torchelev_scan_num_feet.restype = _COUNT
@@ -212,10 +212,9 @@ class CMap:
 
     def diagnose(self) -> list[str]:
         """Return what looks wrong with the inputs, a sentence each."""
-        text = self._library.torchelev_map_diagnose(self._map)
-        if text is None:
-            raise LibraryError(1, self._library.torchelev_last_error().decode())
-        return text.decode().splitlines()
+        text = ctypes.c_char_p()
+        self._call("torchelev_map_diagnose", self._map, ctypes.byref(text))
+        return (text.value or b"").decode().splitlines()
 
     def save(self, path: str | Path) -> None:
         """Save the whole map."""

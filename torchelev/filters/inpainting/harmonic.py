@@ -16,9 +16,9 @@ from torch import Tensor
 from torchelev.ops.library import LIBRARY, operator
 from torchelev.ops.windows import padded
 
-_DAMPING = 0.8  # of a Jacobi sweep
-_OVERCORRECTION = 1.8  # heights that are constant per block come out too low (Braess, Computing 55, 1995)
-_SAFETY = 4.0  # ratio of the assumed error to a cycle's estimate of it
+DAMPING = 0.8  # of a Jacobi sweep
+OVERCORRECTION = 1.8  # heights that are constant per block come out too low (Braess, Computing 55, 1995)
+SAFETY = 4.0  # ratio of the assumed error to a cycle's estimate of it
 
 
 class _Level(NamedTuple):
@@ -94,12 +94,12 @@ def _cycle(levels: list[_Level], right: Tensor) -> Tensor:
     level = levels[0]
     if len(levels) == 1:
         return level.inverse * right
-    u = _DAMPING * level.inverse * right
+    u = DAMPING * level.inverse * right
     correction = _cycle(levels[1:], _block_sum(_residual(level, u, right)))
     H, W = right.shape[1:]
     spread = correction.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, :H, :W]
-    u = u + _OVERCORRECTION * spread * (level.inverse > 0)
-    return torch.addcmul(u, level.inverse, _residual(level, u, right), value=_DAMPING)
+    u = u + OVERCORRECTION * spread * (level.inverse > 0)
+    return torch.addcmul(u, level.inverse, _residual(level, u, right), value=DAMPING)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ def solve_laplace(unknown: Tensor, right: Tensor, tolerance: float, iterations: 
     estimate = _cycle(levels, rest)
     direction, product = estimate, _dot(rest, estimate)
     for _ in range(iterations):
-        error = _SAFETY * estimate.abs().amax((1, 2), keepdim=True)
+        error = SAFETY * estimate.abs().amax((1, 2), keepdim=True)
         is_unsolved = (error > tolerance) & (product > 0)
         if u.device.type == "cpu" and not is_unsolved.any():
             break

@@ -1,5 +1,4 @@
-// One robot's image of the map at a time: map_image.py. Included by files that forbid the contraction of products and
-// sums.
+// One robot's image of the map at a time: map_image.py.
 #pragma once
 
 #include <algorithm>

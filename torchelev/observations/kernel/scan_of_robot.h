@@ -1,5 +1,4 @@
-// One robot's height scan at a time: scan_reading.py. Included by files that forbid the contraction of products and
-// sums.
+// One robot's height scan at a time: scan_reading.py.
 #pragma once
 
 #include <algorithm>

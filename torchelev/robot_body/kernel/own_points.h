@@ -1,5 +1,4 @@
-// Which points lie on the robot's links: own_points.py and posing.py. Included by files that forbid the contraction of
-// products and sums.
+// Which points lie on the robot's links: own_points.py and posing.py.
 #pragma once
 
 #include <algorithm>

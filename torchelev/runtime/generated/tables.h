@@ -120,6 +120,12 @@ constexpr double NEAR = 1.0;
 constexpr double BREADTH = 1.4142135623730951;
 constexpr double MARGIN = 0.5;
 constexpr double MAX_BLOCK = 1.0;
+constexpr double DAMPING = 0.8;
+constexpr double OVERCORRECTION = 1.8;
+constexpr double SAFETY = 4.0;
+
+namespace diagnosis {
+
 constexpr int MAX_UPDATES = 8;
 constexpr int MAX_CORRECTIONS = 32;
 constexpr int MAX_POINTS = 3000;
@@ -133,12 +139,54 @@ constexpr double MIN_EXPLAINED = 0.8;
 constexpr double CELL_SIZE = 0.1;
 constexpr int MIN_IN_CELL = 4;
 constexpr double SPREAD = 0.05;
+constexpr Gate GATES[] = {
+    {"invalid", "are NaN or infinite, or their pose or variance is: check what makes them"},
+    {"range", "are too near or too far: check their unit, and sensor.min_distance and sensor.max_distance"},
+    {"body", "lie on the robot's own body: check sensor.body, T_map_base and T_base_links"},
+    {"overhang", "lie above the exclusion ramp: check that the pose's z axis points up, that points with optical axes have a pose with such axes, and sensor.exclusion"},
+};
 
-constexpr const char* REASONS[] = {
-    "are NaN or infinite, or their pose or variance is: check what makes them",
-    "are too near or too far: check their unit, and sensor.min_distance and sensor.max_distance",
-    "lie on the robot's own body: check sensor.body, T_map_base and T_base_links",
-    "lie above the exclusion ramp: check that the pose's z axis points up, that points with optical axes have a pose with such axes, and sensor.exclusion",
+}  // namespace diagnosis
+
+constexpr FilterSetting FILTER_SETTINGS[] = {
+    {"box", "radius", 0.1},
+    {"gaussian", "sigma", 0.1},
+    {"inpaint_diffusion", "tolerance", 0.001},
+    {"inpaint_diffusion", "iterations", 40},
+    {"inpaint_minimum", "iterations", NAN},
+    {"median", "radius", 0.05},
+};
+
+constexpr const char* ALL_FILTERS[] = {
+    "box",
+    "closing",
+    "curvature",
+    "dilation",
+    "erosion",
+    "expression",
+    "fill_from",
+    "foothold_score",
+    "gaussian",
+    "inpaint_diffusion",
+    "inpaint_minimum",
+    "inpaint_navier_stokes",
+    "inpaint_nearest",
+    "inpaint_telea",
+    "maximum",
+    "median",
+    "minimum",
+    "normal_x",
+    "normal_y",
+    "normal_z",
+    "opening",
+    "roughness",
+    "signed_distance",
+    "slope",
+    "smooth_ground",
+    "standard_deviation",
+    "step_height",
+    "traversability_three_part",
+    "virtual_floor",
 };
 
 inline Settings default_settings() {

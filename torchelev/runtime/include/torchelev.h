@@ -12,7 +12,7 @@
  * reads a map (layers, samples, statistics) may run on several threads while none updates it.
  *
  * Memory: after a map, a scan or an image is created, updates and reads allocate nothing. A diagnosis does, and so does
- * the first read of a layer that filters make.
+ * the first read of a filter's layer after an update.
  */
 #ifndef TORCHELEV_H
 #define TORCHELEV_H
@@ -172,10 +172,10 @@ torchelev_status torchelev_map_statistics(const torchelev_map* map, torchelev_st
  * scans that contradict the map, and a wrong `dt`. It looks at a few of the updates since the last reset, of which the
  * map keeps up to 3,000 points of each sensor. It allocates memory.
  *
- * @return a sentence on each line, worst first, "" if nothing is found; null, with an error, if this fails. Valid until
- * the next diagnosis, or until the map is freed.
+ * @param findings a sentence on each line, worst first; "" if nothing is found. Valid until the next diagnosis, or until
+ * the map is freed.
  */
-const char* torchelev_map_diagnose(torchelev_map* map);
+torchelev_status torchelev_map_diagnose(torchelev_map* map, const char** findings);
 
 /**
  * Save everything that the next update needs, as a file of safetensors. An existing file is replaced as a whole or,

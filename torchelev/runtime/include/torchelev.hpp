@@ -65,8 +65,8 @@ class Map {
 
     // What looks wrong with the inputs, a sentence on each line.
     std::string diagnose() {
-        const char* found = torchelev_map_diagnose(map.get());
-        if (!found) throw Error(TORCHELEV_NO_MEMORY);
+        const char* found = nullptr;
+        check(torchelev_map_diagnose(map.get(), &found));
         return found;
     }
 

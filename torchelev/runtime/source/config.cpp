@@ -23,6 +23,9 @@ std::string names_in(const std::string& group) {
     return joined(names);
 }
 
+// Whether a saved map depends on a setting of this kind. On filters it does not: they only read it.
+bool is_of_state(Kind kind) { return kind == GROUP || kind == NUMBER || kind == INTEGER || kind == PLACE; }
+
 void require_known_version(const Json& root, const std::string& where) {
     const Json* version = root.find(VERSION_NAME);
     const bool is_known = !version || (version->is_whole && version->number == CONFIG_VERSION);
@@ -138,7 +141,7 @@ std::string Config::canonical() const {
     std::string text;
     for (size_t k = 0; k < NUMBER_OF_SETTINGS; k++) {
         const Entry& entry = entries[k];
-        if (SETTINGS[k].kind >= ONLY_PYTHON) continue;
+        if (!is_of_state(SETTINGS[k].kind)) continue;
         text += SETTINGS[k].name;
         if (entry.is_null) text += " null";
         else if (SETTINGS[k].kind == PLACE)

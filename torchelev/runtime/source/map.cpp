@@ -10,8 +10,8 @@
 
 namespace {
 
-const std::vector<std::string> LAYERS = {"elevation",      "variance", "validity", "time",    "upper_bound",
-                                         "traversability", "normal_x", "normal_y", "normal_z"};
+const char* const LAYERS[] = {"elevation",      "variance", "validity", "time",    "upper_bound",
+                              "traversability", "normal_x", "normal_y", "normal_z"};
 
 constexpr torchelev_limits USUAL{131072, 4, 1};
 
@@ -56,7 +56,8 @@ float normal_component(float gx, float gy, int axis) {
 
 torchelev_map::torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* given)
     : cfg(text, where), settings(settings_of(cfg)), sizes{}, limits(checked_limits(given)),
-      filters(cfg.filters.items, {cfg.rows(), cfg.columns(), settings.measure.resolution}, LAYERS) {
+      filters(cfg.filters.items, {cfg.rows(), cfg.columns(), settings.measure.resolution},
+              {std::begin(LAYERS), std::end(LAYERS)}) {
     sizes.B = 1, sizes.H = cfg.rows(), sizes.W = cfg.columns();
     void* addresses[NUMBER_OF_TENSORS];
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
@@ -257,12 +258,11 @@ void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64
 
 LayerView torchelev_map::view(const std::string& name) const {
     const auto own = [&](const std::string& layer) {
-        return LayerView{*this, Layer(std::find(LAYERS.begin(), LAYERS.end(), layer) - LAYERS.begin()), nullptr};
+        return LayerView{*this, Layer(std::find(std::begin(LAYERS), std::end(LAYERS), layer) - LAYERS), nullptr};
     };
-    if (std::find(LAYERS.begin(), LAYERS.end(), name) != LAYERS.end()) return own(name);
-    std::vector<std::string> names = LAYERS;
-    for (const std::string& made : filters.names()) names.push_back(made);
-    REQUIRE(filters.has(name), "layer", "must be one of " + joined(names), "'" + name + "'", "use elevation");
+    if (const LayerView found = own(name); found.layer < Layer(std::size(LAYERS))) return found;
+    REQUIRE(filters.has(name), "layer", "must be one of " + joined(LAYERS) + filters.listed(), "'" + name + "'",
+            "use elevation");
     const std::lock_guard<std::mutex> lock(filtering);
     const Cells& made = filters.read(name, [&](const std::string& layer, Cells& to) {
         for (int64_t k = 0; k < cells(); k++) {

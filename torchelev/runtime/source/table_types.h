@@ -19,6 +19,17 @@ struct Setting {
     double values[3];  // by default
 };
 
+// A setting of a filter; NAN by default: none.
+struct FilterSetting {
+    const char *filter, *name;
+    double usual;
+};
+
+// A gate of the sensor, and what a diagnosis says of points that it rejects.
+struct Gate {
+    const char *name, *reason;
+};
+
 constexpr int64_t ROWS = -1, COLUMNS = -2;
 
 struct Tensor {

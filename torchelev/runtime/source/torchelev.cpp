@@ -202,14 +202,13 @@ torchelev_status torchelev_map_statistics(const torchelev_map* map, torchelev_st
     });
 }
 
-const char* torchelev_map_diagnose(torchelev_map* map) {
-    const char* found = nullptr;
-    status_of([&] {
+torchelev_status torchelev_map_diagnose(torchelev_map* map, const char** findings) {
+    return status_of([&] {
         torchelev_map& m = given("map", map);
+        const char*& found = given("findings", findings);
         m.findings = diagnose(m);
         found = m.findings.c_str();
     });
-    return found;
 }
 
 torchelev_status torchelev_map_save(const torchelev_map* map, const char* path) {

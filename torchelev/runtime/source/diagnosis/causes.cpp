@@ -10,22 +10,22 @@
 
 namespace {
 
-constexpr double NONE = NAN;
+using namespace diagnosis;
 
-// A number as Python prints it with `:,.{digits}f`.
-std::string grouped(double value, int digits = 0) {
-    char text[400];
-    std::snprintf(text, sizeof text, "%.*f", digits, value);
-    std::string all = text;
-    const size_t point = std::min(all.find('.'), all.size());
-    for (size_t k = point; k > 3 + (all[0] == '-'); k -= 3) all.insert(k - 3, ",");
-    return all;
-}
+constexpr double NONE = NAN;
 
 std::string fixed(double value, int digits) {
     char text[400];
     std::snprintf(text, sizeof text, "%.*f", digits, value);
     return text;
+}
+
+// A number as Python prints it with `:,.{digits}f`.
+std::string grouped(double value, int digits = 0) {
+    std::string all = fixed(value, digits);
+    const size_t point = std::min(all.find('.'), all.size());
+    for (size_t k = point; k > 3 + (all[0] == '-'); k -= 3) all.insert(k - 3, ",");
+    return all;
 }
 
 std::string find_millimetres(const Evidence& seen) {
@@ -106,28 +106,18 @@ std::string find_alternating_corrections(const Evidence& seen) {
     return "";
 }
 
-struct Gate {
-    const char *name, *reason;
-    int64_t rejected;
-};
-
 // Sensor gates that reject nearly all points.
 std::string find_closed_gate(const Evidence& seen) {
     if (seen.num_points < MIN_POINTS || seen.is_in_millimetres || seen.far_cloud.exists) return "";
-    const Gate gates[] = {{"invalid", REASONS[0], seen.invalid},
-                          {"range", REASONS[1], seen.range},
-                          {"body", REASONS[2], seen.body},
-                          {"overhang", REASONS[3], seen.overhang}};
     std::string counts;
-    for (const Gate& gate : gates) {
-        const int64_t tested = seen.num_points - (&gate == gates ? 0 : seen.invalid);
-        if (tested >= MIN_POINTS && double(gate.rejected) >= 0.95 * double(tested))
-            return "points: " + grouped(double(gate.rejected)) + " of " + grouped(double(tested)) + " " + gate.reason;
-        if (gate.rejected)
-            counts += (counts.empty() ? "" : ", ") + grouped(double(gate.rejected)) + " " + gate.name;
+    const double points = double(seen.num_points), invalid = double(seen.rejected[0]);
+    for (int k = 0; k < 4; k++) {
+        const double tested = points - (k ? invalid : 0), rejected = double(seen.rejected[k]);
+        if (tested >= MIN_POINTS && rejected >= 0.95 * tested)
+            return "points: " + grouped(rejected) + " of " + grouped(tested) + " " + GATES[k].reason;
+        if (rejected > 0) counts += (counts.empty() ? "" : ", ") + grouped(rejected) + " " + GATES[k].name;
     }
-    const double points = double(seen.num_points);
-    if (double(seen.num_used) >= 0.01 * points || double(seen.invalid) > 0.9 * points) return "";
+    if (double(seen.num_used) >= 0.01 * points || invalid > 0.9 * points) return "";
     return "points: the sensor's gates let " + grouped(double(seen.num_used)) + " of " + grouped(points) + " pass (" +
            counts + "); check poses and sensor=...";
 }

@@ -7,6 +7,9 @@
 
 namespace {
 
+using namespace diagnosis;
+constexpr int RANGE = 1;  // number of the gate
+
 bool is_finite(const float* p) { return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]); }
 
 double norm(const Place& p) { return std::sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]); }
@@ -27,8 +30,7 @@ Evidence::Evidence(torchelev_map& given) : map(given), updates(given.history.all
     measure_again(given);
     find_distances();
     far_cloud = find_far_cloud();
-    is_in_millimetres = !far_cloud.exists && distances.size() >= MIN_POINTS &&
-                        2 * range >= int64_t(distances.size()) &&
+    is_in_millimetres = !far_cloud.exists && is_beyond_range() &&
                         median(distances) >= std::max(FAR, 2 * map.cfg["sensor.max_distance"]);
     look_at_map();
     travel = 0;
@@ -43,8 +45,8 @@ void Evidence::measure_again(torchelev_map& given) {
     for (const PastUpdate* past : updates) {
         const Measurement& m = given.measure_again(*past);
         used.emplace_back(m.used.data(), m.used.data() + m.number);
-        invalid += m.number - m.counts.finite, range += m.counts.finite - m.counts.in_range;
-        body += m.counts.in_range - m.counts.casts, overhang += m.counts.casts - m.counts.used;
+        const int64_t passed[] = {m.number, m.counts.finite, m.counts.in_range, m.counts.casts, m.counts.used};
+        for (int gate = 0; gate < 4; gate++) rejected[gate] += passed[gate] - passed[gate + 1];
         num_points += m.number, num_used += m.counts.used;
         positions.push_back(position(past->has_base ? past->base : past->pose(0)));
     }
@@ -58,9 +60,12 @@ void Evidence::find_distances() {
         }
 }
 
+bool Evidence::is_beyond_range() const {
+    return distances.size() >= MIN_POINTS && 2 * rejected[RANGE] >= int64_t(distances.size());
+}
+
 FarCloud Evidence::find_far_cloud() const {
-    const bool is_beyond_range = distances.size() >= MIN_POINTS && 2 * range >= int64_t(distances.size());
-    if (!is_beyond_range) return {};
+    if (!is_beyond_range()) return {};
     const PastUpdate* past = nullptr;
     std::vector<Place> cloud;
     const double* T = nullptr;

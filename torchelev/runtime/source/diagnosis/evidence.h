@@ -20,7 +20,8 @@ struct Evidence {
     const torchelev_map& map;
     std::vector<const PastUpdate*> updates;
     std::vector<std::vector<uint8_t>> used;  // points of each update that passed the sensor's gates
-    int64_t invalid = 0, range = 0, body = 0, overhang = 0, num_points = 0, num_used = 0;
+    int64_t rejected[4] = {};  // points of all updates, by the gates in their order
+    int64_t num_points = 0, num_used = 0;
     std::vector<double> distances;  // [m] of the finite points from their sensors
     FarCloud far_cloud;
     bool is_in_millimetres;
@@ -38,5 +39,6 @@ struct Evidence {
     void measure_again(torchelev_map& map);
     void find_distances();
     void look_at_map();
+    bool is_beyond_range() const;  // whether most points are rejected for their distance
     FarCloud find_far_cloud() const;
 };

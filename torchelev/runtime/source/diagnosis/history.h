@@ -24,6 +24,8 @@ struct PastUpdate {
 };
 
 class History {
+    static constexpr int64_t MAX_UPDATES = diagnosis::MAX_UPDATES, MAX_CORRECTIONS = diagnosis::MAX_CORRECTIONS,
+                             MAX_POINTS = diagnosis::MAX_POINTS, PERIOD = diagnosis::PERIOD;
     PastUpdate updates[MAX_UPDATES];
     double corrections[MAX_CORRECTIONS];
     int64_t kept = 0, number = 0;

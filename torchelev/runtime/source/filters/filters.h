@@ -6,7 +6,7 @@
 #include <vector>
 
 // The cells of a map's grid.
-struct Plane2D {
+struct FilterGrid {
     int64_t H, W;
     double resolution;  // [m]
 
@@ -22,12 +22,12 @@ struct Cells {
 namespace filters {
 
 // Each cell's mean of the known ones around it, weighted by `weights[|dx|] * weights[|dy|]`; unknown ones stay so.
-void mean(const Plane2D& grid, const Cells& from, const std::vector<double>& weights, Cells& to);
-void median(const Plane2D& grid, const Cells& from, int64_t radius, Cells& to);
+void mean(const FilterGrid& grid, const Cells& from, const std::vector<double>& weights, Cells& to);
+void median(const FilterGrid& grid, const Cells& from, int64_t radius, Cells& to);
 
-void inpaint_minimum(const Plane2D& grid, const Cells& from, std::optional<int64_t> iterations, Cells& to);
-void inpaint_nearest(const Plane2D& grid, const Cells& from, Cells& to);
-void inpaint_diffusion(const Plane2D& grid, const Cells& from, double tolerance, int64_t iterations, Cells& to);
+void inpaint_minimum(const FilterGrid& grid, const Cells& from, std::optional<int64_t> iterations, Cells& to);
+void inpaint_nearest(const FilterGrid& grid, const Cells& from, Cells& to);
+void inpaint_diffusion(const FilterGrid& grid, const Cells& from, double tolerance, int64_t iterations, Cells& to);
 void fill_from(const Cells& from, const Cells& other, Cells& to);
 
 }  // namespace filters

@@ -4,10 +4,10 @@
 #include <cmath>
 
 #include "runtime/source/filters/filters.h"
+#include "tables.h"
 
 namespace {
 
-constexpr double DAMPING = 0.8, OVERCORRECTION = 1.8, SAFETY = 4;  // of harmonic.py
 typedef std::vector<double> Numbers;
 
 // The equations of one grid, and memory for a cycle.
@@ -116,7 +116,7 @@ class Solver {
 };
 
 // One equation for each unknown cell, and its right side: the sum of its known neighbours' heights.
-Level equations(const Plane2D& grid, const Cells& from, double datum, Numbers& right) {
+Level equations(const FilterGrid& grid, const Cells& from, double datum, Numbers& right) {
     Level level(grid.H, grid.W);
     auto link = [&](int64_t k, int64_t n, Numbers& edges) {
         if (!from.known[k] && !from.known[n]) edges[k] = 1;
@@ -133,7 +133,7 @@ Level equations(const Plane2D& grid, const Cells& from, double datum, Numbers& r
 
 }  // namespace
 
-void filters::inpaint_diffusion(const Plane2D& grid, const Cells& from, double tolerance, int64_t iterations,
+void filters::inpaint_diffusion(const FilterGrid& grid, const Cells& from, double tolerance, int64_t iterations,
                                 Cells& to) {
     to = from;
     double sum = 0, number = 0;

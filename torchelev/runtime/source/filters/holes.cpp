@@ -9,7 +9,7 @@ namespace {
 
 // Call `work(n)` for the eight neighbours of a cell.
 template <class Work>
-void each_neighbour(const Plane2D& grid, int64_t k, const Work& work) {
+void each_neighbour(const FilterGrid& grid, int64_t k, const Work& work) {
     const int64_t i = k / grid.W, j = k % grid.W;
     for (int64_t row = std::max<int64_t>(0, i - 1); row <= std::min(grid.H - 1, i + 1); row++)
         for (int64_t column = std::max<int64_t>(0, j - 1); column <= std::min(grid.W - 1, j + 1); column++)
@@ -17,7 +17,7 @@ void each_neighbour(const Plane2D& grid, int64_t k, const Work& work) {
 }
 
 // Fill the hole of a cell with the lowest height of its border; `hole` is memory for its cells.
-void fill_hole(const Plane2D& grid, const Cells& from, int64_t first, std::vector<int64_t>& hole,
+void fill_hole(const FilterGrid& grid, const Cells& from, int64_t first, std::vector<int64_t>& hole,
                std::vector<uint8_t>& seen, Cells& to) {
     float lowest = INFINITY;
     hole.assign(1, first), seen[first] = 1;
@@ -31,13 +31,16 @@ void fill_hole(const Plane2D& grid, const Cells& from, int64_t first, std::vecto
 }
 
 // As above within so many steps from the border.
-void fill_steps(const Plane2D& grid, const Cells& from, int64_t iterations, Cells& to) {
+void fill_steps(const FilterGrid& grid, const Cells& from, int64_t iterations, Cells& to) {
     std::vector<float> lowest(grid.cells()), next(grid.cells());
     for (int64_t k = 0; k < grid.cells(); k++) lowest[k] = from.known[k] ? from.values[k] : INFINITY;
-    for (int64_t step = 0; step < std::min(iterations, grid.cells()); step++) {
+    bool is_changing = true;
+    for (int64_t step = 0; step < iterations && is_changing; step++) {
+        is_changing = step == 0;  // when known cells give way to the hole's
         for (int64_t k = 0; k < grid.cells(); k++) {
             next[k] = from.known[k] ? INFINITY : lowest[k];
             if (!from.known[k]) each_neighbour(grid, k, [&](int64_t n) { next[k] = std::min(next[k], lowest[n]); });
+            is_changing |= next[k] < lowest[k];
         }
         lowest.swap(next);
     }
@@ -47,7 +50,7 @@ void fill_steps(const Plane2D& grid, const Cells& from, int64_t iterations, Cell
 
 }  // namespace
 
-void filters::inpaint_minimum(const Plane2D& grid, const Cells& from, std::optional<int64_t> iterations, Cells& to) {
+void filters::inpaint_minimum(const FilterGrid& grid, const Cells& from, std::optional<int64_t> iterations, Cells& to) {
     to = from;
     if (iterations) return fill_steps(grid, from, *iterations, to);
     std::vector<uint8_t> seen(grid.cells());
@@ -57,7 +60,7 @@ void filters::inpaint_minimum(const Plane2D& grid, const Cells& from, std::optio
 }
 
 // By the exact distance; of equally near cells the one with the lowest index.
-void filters::inpaint_nearest(const Plane2D& grid, const Cells& from, Cells& to) {
+void filters::inpaint_nearest(const FilterGrid& grid, const Cells& from, Cells& to) {
     const int64_t H = grid.H, W = grid.W, none = 2 * (H + W);
     std::vector<int64_t> row_of(grid.cells(), none);  // of the nearest known cell in the same column
     for (int64_t j = 0; j < W; j++) {

@@ -16,7 +16,7 @@ double sum_along(const std::vector<double>& values, int64_t k, int64_t at, int64
     return total;
 }
 
-std::vector<double> window_sums(const Plane2D& grid, std::vector<double> values, const std::vector<double>& weights) {
+std::vector<double> window_sums(const FilterGrid& grid, std::vector<double> values, const std::vector<double>& weights) {
     std::vector<double> rows(values.size());
     for (int64_t k = 0; k < grid.cells(); k++) rows[k] = sum_along(values, k, k % grid.W, grid.W, 1, weights);
     for (int64_t k = 0; k < grid.cells(); k++) values[k] = sum_along(rows, k, k / grid.W, grid.H, grid.W, weights);
@@ -25,14 +25,14 @@ std::vector<double> window_sums(const Plane2D& grid, std::vector<double> values,
 
 }  // namespace
 
-void filters::mean(const Plane2D& grid, const Cells& from, const std::vector<double>& weights, Cells& to) {
+void filters::mean(const FilterGrid& grid, const Cells& from, const std::vector<double>& weights, Cells& to) {
     std::vector<double> values(from.values.begin(), from.values.end()), known(from.known.begin(), from.known.end());
     const std::vector<double> sums = window_sums(grid, values, weights), numbers = window_sums(grid, known, weights);
     for (int64_t k = 0; k < grid.cells(); k++) to.values[k] = from.known[k] ? float(sums[k] / numbers[k]) : 0;
     to.known = from.known;
 }
 
-void filters::median(const Plane2D& grid, const Cells& from, int64_t radius, Cells& to) {
+void filters::median(const FilterGrid& grid, const Cells& from, int64_t radius, Cells& to) {
     std::vector<float> window;
     for (int64_t k = 0; k < grid.cells(); k++) {
         to.values[k] = 0;
