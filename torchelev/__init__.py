@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from torchelev.completion.config import CompletionConfig
-from torchelev.config import ElevationMapConfig
-from torchelev.elevation_map import ElevationMap
-from torchelev.grid import GridConfig
-from torchelev.inputs.clouds import depth_to_points, voxel_filter
-from torchelev.robot import RobotConfig
-from torchelev.robot_body.shapes import Box, Capsule, RobotBody
-from torchelev.stages.age.config import AgingConfig
-from torchelev.stages.compensate.config import DriftConfig
-from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
-from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
-from torchelev.stages.overlap.config import OverlapConfig
-from torchelev.stages.surface.config import SurfaceConfig
-from torchelev.stages.visibility.config import RaycastConfig
-from torchelev.state import MapState, Measurement, Statistics
-from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
+from torchelev.lazy_names import import_later
 
 if TYPE_CHECKING:
+    from torchelev.completion.config import CompletionConfig
     from torchelev.completion.net import CompletionNet
+    from torchelev.config import ElevationMapConfig
+    from torchelev.elevation_map import ElevationMap
     from torchelev.filters.chain import FilterConfig
+    from torchelev.grid import GridConfig
+    from torchelev.inputs.clouds import depth_to_points, voxel_filter
     from torchelev.observations.height_scan import HeightScan
     from torchelev.observations.map_image import MapImage
+    from torchelev.robot import RobotConfig
+    from torchelev.robot_body.shapes import Box, Capsule, RobotBody
+    from torchelev.stages.age.config import AgingConfig
+    from torchelev.stages.compensate.config import DriftConfig
+    from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
+    from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
+    from torchelev.stages.overlap.config import OverlapConfig
+    from torchelev.stages.surface.config import SurfaceConfig
+    from torchelev.stages.visibility.config import RaycastConfig
+    from torchelev.state import MapState, Measurement, Statistics
+    from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
     from torchelev.traversability.net import TraversabilityNet
 
 __version__ = "0.1.0"
@@ -63,25 +63,38 @@ __all__ = [
     "voxel_filter",
 ]
 
-# Imported when first asked for, as not every map needs them: they take half of the time of `import torchelev`.
+# Imported when first asked for: a robot's node may run without PyTorch, and not every map needs them all.
 _LATER = {
+    **{"filters": "", "observations": ""},  # `torchelev.filters.gaussian` works without an import of its own
+    "AgingConfig": "torchelev.stages.age.config",
+    "BodyConfig": "torchelev.stages.measure.config",
+    "Box": "torchelev.robot_body.shapes",
+    "Capsule": "torchelev.robot_body.shapes",
+    "CompletionConfig": "torchelev.completion.config",
     "CompletionNet": "torchelev.completion.net",
+    "DriftConfig": "torchelev.stages.compensate.config",
+    "EdgeConfig": "torchelev.stages.fusion.config",
+    "ElevationMap": "torchelev.elevation_map",
+    "ElevationMapConfig": "torchelev.config",
+    "ExclusionConfig": "torchelev.stages.measure.config",
     "FilterConfig": "torchelev.filters.chain",
+    "FusionConfig": "torchelev.stages.fusion.config",
+    "GridConfig": "torchelev.grid",
     "HeightScan": "torchelev.observations.height_scan",
+    "LearnedTraversabilityConfig": "torchelev.traversability.heads",
     "MapImage": "torchelev.observations.map_image",
+    "MapState": "torchelev.state",
+    "Measurement": "torchelev.state",
+    "OverlapConfig": "torchelev.stages.overlap.config",
+    "RaycastConfig": "torchelev.stages.visibility.config",
+    "RobotBody": "torchelev.robot_body.shapes",
+    "RobotConfig": "torchelev.robot",
+    "SensorConfig": "torchelev.stages.measure.config",
+    "Statistics": "torchelev.state",
+    "SurfaceConfig": "torchelev.stages.surface.config",
+    "TraversabilityConfig": "torchelev.traversability.heads",
     "TraversabilityNet": "torchelev.traversability.net",
+    "depth_to_points": "torchelev.inputs.clouds",
+    "voxel_filter": "torchelev.inputs.clouds",
 }
-_ROOMS = ("filters", "observations")  # `torchelev.filters.gaussian` works without an import of its own
-
-
-def __getattr__(name: str) -> Any:
-    if name in _ROOMS:
-        return importlib.import_module(f"torchelev.{name}")
-    if name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
-    value = globals()[name] = getattr(importlib.import_module(_LATER[name]), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LATER, *_ROOMS})
+__getattr__, __dir__ = import_later(__name__, _LATER)

@@ -16,7 +16,7 @@ from torchelev.kernels.registry import PACKAGE
 from torchelev.kernels.structs import members
 from torchelev.map_buffers import name_tensors
 from torchelev.pipeline import update_by_tensors
-from torchelev.runtime.library import CMap, LibraryError
+from torchelev.runtime.library import STATISTICS, CMap, LibraryError
 from torchelev.stages.recenter.stage import recenter
 from torchelev.state import LAYERS, Statistics
 
@@ -185,14 +185,13 @@ def test_normals_are_those_of_python_to_the_last_bit_but_one(walked, axis):
     np.testing.assert_allclose(found.layer(f"normal_{axis}"), wanted, atol=1.2e-7)  # torch rounds roots otherwise
 
 
-def test_statistics_are_those_of_python(library, walked):
+def test_statistics_are_those_of_python(walked):
     emap, found = walked
-    fields = [(m.name, ctypes.c_double if m.type == "float" else ctypes.c_int64) for m in members(Statistics)]
-    kind = type("Found", (ctypes.Structure,), {"_fields_": fields})
-    statistics = kind()
-    assert library.torchelev_map_statistics(found._map, ctypes.byref(statistics)) == 0
-    for name, _ in fields:
-        assert getattr(statistics, name) == getattr(emap.state.statistics, name).item(), name
+    assert {m.name: m.type == "float" for m in members(Statistics)} == STATISTICS
+    for name, value in found.statistics().items():
+        assert value == getattr(emap.state.statistics, name).item(), name
+    corner = emap.state.corner[0].double() * emap.cfg.grid.resolution
+    assert found.corner == tuple(corner.tolist()) and found.resolution == emap.cfg.grid.resolution
     text = (PACKAGE / "runtime/include/torchelev.h").read_text()
     struct = re.search(r"typedef struct \{([^}]*)\} torchelev_statistics", text)[1]
     assert tuple(re.findall(r"(?:int64_t|double) (\w+);", struct)) == Statistics._fields

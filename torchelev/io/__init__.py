@@ -6,16 +6,23 @@ Plots are in `torchelev.viz`.
 ``torchelev[io]``, and robot models need MuJoCo; these are imported on first use.
 """
 
-from torchelev.io.bags import GridMapWriter, is_bag, read_grid_map, read_grid_maps, write_grid_map
-from torchelev.io.clouds import read_cloud
-from torchelev.io.depth import read_depth
-from torchelev.io.errors import RecordingError
-from torchelev.io.files.intrinsics import Intrinsics, read_intrinsics
-from torchelev.io.files.layout import FileLayout
-from torchelev.io.folders.recording import Frame, Recording, open_recording
-from torchelev.io.mapping import MappingRun, base_poses
-from torchelev.io.poses import Poses, read_poses, read_transform
-from torchelev.io.robot_model import link_poses, read_body
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torchelev.lazy_names import import_later
+
+if TYPE_CHECKING:
+    from torchelev.io.bags import GridMapWriter, is_bag, read_grid_map, read_grid_maps, write_grid_map
+    from torchelev.io.clouds import read_cloud
+    from torchelev.io.depth import read_depth
+    from torchelev.io.errors import RecordingError
+    from torchelev.io.files.intrinsics import Intrinsics, read_intrinsics
+    from torchelev.io.files.layout import FileLayout
+    from torchelev.io.folders.recording import Frame, Recording, open_recording
+    from torchelev.io.mapping import MappingRun, base_poses
+    from torchelev.io.poses import Poses, read_poses, read_transform
+    from torchelev.io.robot_model import link_poses, read_body
 
 __all__ = [
     "FileLayout",
@@ -40,3 +47,29 @@ __all__ = [
     "read_transform",
     "write_grid_map",
 ]
+
+# Imported when first asked for: clouds of messages are read without PyTorch.
+_LATER = {
+    "FileLayout": "torchelev.io.files.layout",
+    "Frame": "torchelev.io.folders.recording",
+    "GridMapWriter": "torchelev.io.bags",
+    "Intrinsics": "torchelev.io.files.intrinsics",
+    "MappingRun": "torchelev.io.mapping",
+    "Poses": "torchelev.io.poses",
+    "Recording": "torchelev.io.folders.recording",
+    "RecordingError": "torchelev.io.errors",
+    "base_poses": "torchelev.io.mapping",
+    "is_bag": "torchelev.io.bags",
+    "link_poses": "torchelev.io.robot_model",
+    "open_recording": "torchelev.io.folders.recording",
+    "read_body": "torchelev.io.robot_model",
+    "read_cloud": "torchelev.io.clouds",
+    "read_depth": "torchelev.io.depth",
+    "read_grid_map": "torchelev.io.bags",
+    "read_grid_maps": "torchelev.io.bags",
+    "read_intrinsics": "torchelev.io.files.intrinsics",
+    "read_poses": "torchelev.io.poses",
+    "read_transform": "torchelev.io.poses",
+    "write_grid_map": "torchelev.io.bags",
+}
+__getattr__, __dir__ = import_later(__name__, _LATER)

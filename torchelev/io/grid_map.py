@@ -13,14 +13,13 @@ GridMapMsgHelpers):
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
-from torchelev.io.export import take
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
@@ -131,11 +130,28 @@ def to_grid_map(
     is_subset = set(basic_layers) <= set(layers)
     names = ", ".join(layers)
     require(is_subset, "basic_layers", "must be among the layers", list(basic_layers), f"layers are {names}")
-    taken, grid = take(emap, env, layers), emap.cfg.grid
-    center = Point(float(taken.center[0]), float(taken.center[1]))
-    lengths = grid.height * grid.resolution, grid.width * grid.resolution
-    info = GridMapInfo(grid.resolution, *lengths, Pose(center))
-    data = [_to_multi_array(taken.layers[name]) for name in layers]
+    from torchelev.io.export import take  # which needs PyTorch
+
+    taken = take(emap, env, layers)
+    values = {name: taken.layers[name] for name in layers}
+    return grid_map_of(values, taken.center.tolist(), emap.cfg.grid.resolution, basic_layers)
+
+
+def grid_map_of(
+    layers: Mapping[str, NDArray], center: Sequence[float], resolution: float, basic_layers: Sequence[str] = ()
+) -> GridMap:
+    """Return the GridMap of layers (H, W), NaN where unknown.
+
+    Args:
+        layers: by name.
+        center: x, y [m] of the window's centre.
+        resolution: [m] of a cell.
+        basic_layers: those of the layers that must be known for a cell to be valid.
+    """
+    rows, columns = next(iter(layers.values())).shape
+    place = Pose(Point(float(center[0]), float(center[1])))
+    info = GridMapInfo(resolution, rows * resolution, columns * resolution, place)
+    data = [_to_multi_array(layer) for layer in layers.values()]
     return GridMap(info, list(layers), list(basic_layers), data)
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
-from torchelev.io.export import take
 from torchelev.io.grid_map import Point, Pose
 
 if TYPE_CHECKING:
@@ -48,13 +48,34 @@ def to_occupancy_grid(emap: ElevationMap, env: int = 0, min_traversability: floa
     Raises:
         ValueError: the environment does not exist, or `min_traversability` is out of range.
     """
+    from torchelev.io.export import take  # which needs PyTorch
+
+    require_threshold(min_traversability)
+    taken = take(emap, env, ("traversability",))
+    x_min, _, y_min, _ = taken.extent
+    return occupancy_of(taken.layers["traversability"], (x_min, y_min), taken.resolution, min_traversability)
+
+
+def require_threshold(min_traversability: float) -> None:
+    """Refuse a threshold that is no traversability below 1."""
     in_range, hint = 0 <= min_traversability < 1, "the default is 0.5"
     require(in_range, "min_traversability", "must be at least 0 and less than 1", min_traversability, hint)
-    taken = take(emap, env, ("traversability",))
-    t = taken.layers["traversability"]
+
+
+def occupancy_of(
+    traversability: NDArray, corner: Sequence[float], resolution: float, min_traversability: float = 0.5
+) -> OccupancyGrid:
+    """Return the costs of a layer (H, W), NaN where not rated: `to_occupancy_grid`.
+
+    Args:
+        traversability: in [0, 1].
+        corner: x, y [m] of the window's corner with the smallest coordinates.
+        resolution: [m] of a cell.
+        min_traversability: below which the robot must not stand.
+    """
+    t = traversability
     cost = np.round(_HIGHEST * (1 - t) / (1 - min_traversability))
     cost = np.where(t < min_traversability, LETHAL, cost)
     data = np.where(np.isnan(t), UNKNOWN, cost).astype(np.int8)
-    x_min, _, y_min, _ = taken.extent
-    info = MapMetaData(taken.resolution, t.shape[0], t.shape[1], Pose(Point(x_min, y_min)))
+    info = MapMetaData(resolution, t.shape[0], t.shape[1], Pose(Point(float(corner[0]), float(corner[1]))))
     return OccupancyGrid(info, np.ascontiguousarray(data.T).ravel())

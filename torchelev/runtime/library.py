@@ -11,11 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
-from torchelev.kernels.cpu_build import load
-from torchelev.runtime.generate import headers
-from torchelev.runtime.sources import SOURCES
 
 _POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
+
+
+#: fields of `torchelev_statistics`, by whether they are numbers of metres
+STATISTICS = {
+    **dict.fromkeys(
+        (
+            "points_used",
+            *(f"rejected_{gate}" for gate in ("invalid", "range", "body", "overhang", "outside", "outlier", "edge")),
+            "drift_points",
+        ),
+        False,
+    ),
+    **dict.fromkeys(("drift_error", "drift_correction", "disagreement"), True),
+    **dict.fromkeys(("cleared_seen_through", "cleared_other_floors", "cells_bounded"), False),
+}
 
 
 class LibraryError(ValueError):
@@ -30,6 +42,12 @@ class Limits(ctypes.Structure):
     """`torchelev_limits`."""
 
     _fields_ = (("max_points", _COUNT), ("max_sensors", ctypes.c_int32), ("num_threads", ctypes.c_int32))
+
+
+class _Statistics(ctypes.Structure):
+    """`torchelev_statistics`."""
+
+    _fields_ = tuple((name, ctypes.c_double if metres else _COUNT) for name, metres in STATISTICS.items())
 
 
 class _Input(ctypes.Structure):
@@ -49,6 +67,8 @@ def build_library() -> ctypes.CDLL:
     Raises:
         RuntimeError: there is no C++ compiler, or TORCHELEV_NATIVE=0 forbids to build.
     """
+    from torchelev.kernels.cpu_build import load
+
     library = load(*library_parts())
     if library is None:
         raise RuntimeError("libtorchelev: no C++ compiler was found, or TORCHELEV_NATIVE=0; install g++ or clang++")
@@ -57,6 +77,9 @@ def build_library() -> ctypes.CDLL:
 
 def library_parts() -> tuple[tuple[str, ...], dict[str, str], dict[str, str]]:
     """Return sources, constants and headers of the library."""
+    from torchelev.runtime.generate import headers  # which asks Python's declarations, and so needs PyTorch
+    from torchelev.runtime.sources import SOURCES
+
     return SOURCES, {"TORCHELEV_VERSION": '"' + _version() + '"'}, headers()
 
 
@@ -209,6 +232,26 @@ class CMap:
         at = _POINTER(_address(xy)), _COUNT(len(xy))
         self._call("torchelev_map_sample", self._map, _text(name), _text(mode), *at, *places)
         return values, known
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """Position [m] of the window's corner with the smallest x and y."""
+        corner = (ctypes.c_double * 2)()
+        self._call("torchelev_map_corner", self._map, corner)
+        return corner[0], corner[1]
+
+    @functools.cached_property
+    def resolution(self) -> float:
+        """Side of a cell [m]."""
+        side = ctypes.c_double()
+        self._call("torchelev_map_size", self._map, None, None, ctypes.byref(side))
+        return side.value
+
+    def statistics(self) -> dict[str, float]:
+        """Return what the last update did, by name."""
+        found = _Statistics()
+        self._call("torchelev_map_statistics", self._map, ctypes.byref(found))
+        return {name: getattr(found, name) for name in STATISTICS}
 
     def diagnose(self) -> list[str]:
         """Return what looks wrong with the inputs, a sentence each."""

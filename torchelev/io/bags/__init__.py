@@ -5,19 +5,26 @@ Needs ``torchelev[bags]``; no ROS. `bag` reads messages of `files`; `point_cloud
 puts it all together. `grid_maps` writes maps to bags and reads them.
 """
 
-from torchelev.io.bags.bag import Bag, Message, Topic, is_bag
-from torchelev.io.bags.grid_maps import (
-    GridMapWriter,
-    RecordedMap,
-    from_bytes,
-    read_grid_map,
-    read_grid_maps,
-    to_bytes,
-    write_grid_map,
-)
-from torchelev.io.bags.poses.transforms import TransformTree
-from torchelev.io.bags.recording import BagRecording, open_bag
-from torchelev.io.bags.topics import BagRequest
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torchelev.lazy_names import import_later
+
+if TYPE_CHECKING:
+    from torchelev.io.bags.bag import Bag, Message, Topic, is_bag
+    from torchelev.io.bags.grid_maps import (
+        GridMapWriter,
+        RecordedMap,
+        from_bytes,
+        read_grid_map,
+        read_grid_maps,
+        to_bytes,
+        write_grid_map,
+    )
+    from torchelev.io.bags.poses.transforms import TransformTree
+    from torchelev.io.bags.recording import BagRecording, open_bag
+    from torchelev.io.bags.topics import BagRequest
 
 __all__ = [
     "Bag",
@@ -36,3 +43,23 @@ __all__ = [
     "to_bytes",
     "write_grid_map",
 ]
+
+# Imported when first asked for: clouds of messages are read without PyTorch.
+_LATER = {
+    "Bag": "torchelev.io.bags.bag",
+    "BagRecording": "torchelev.io.bags.recording",
+    "BagRequest": "torchelev.io.bags.topics",
+    "GridMapWriter": "torchelev.io.bags.grid_maps",
+    "Message": "torchelev.io.bags.bag",
+    "RecordedMap": "torchelev.io.bags.grid_maps",
+    "Topic": "torchelev.io.bags.bag",
+    "TransformTree": "torchelev.io.bags.poses.transforms",
+    "from_bytes": "torchelev.io.bags.grid_maps",
+    "is_bag": "torchelev.io.bags.bag",
+    "open_bag": "torchelev.io.bags.recording",
+    "read_grid_map": "torchelev.io.bags.grid_maps",
+    "read_grid_maps": "torchelev.io.bags.grid_maps",
+    "to_bytes": "torchelev.io.bags.grid_maps",
+    "write_grid_map": "torchelev.io.bags.grid_maps",
+}
+__getattr__, __dir__ = import_later(__name__, _LATER)
