@@ -1,0 +1,70 @@
+"""Which clouds are fused: the newest of each topic, once its transforms are there; all others are counted."""
+
+import pytest
+
+from torchelev.ros2.intake import Intake
+
+
+def yes(_):
+    return True
+
+
+def no(_):
+    return False
+
+
+def fuse(intake, now=0.0, is_ready=yes):
+    """Take what is ready and fuse it -> (message, dt) of each."""
+    return [(one.message, intake.step(one)) for one in intake.take(now, is_ready)[0]]
+
+
+def test_the_newest_cloud_of_a_topic_wins():
+    intake = Intake(wait=0.2)
+    for k in range(5):
+        intake.offer("a", k, 0.1 * k, now=0.1 * k)
+    assert fuse(intake) == [(4, 0.0)] and fuse(intake) == []
+    assert intake.counts.as_dict() | {"received": 0, "fused": 0, "replaced": 0} == dict.fromkeys(
+        intake.counts.as_dict(), 0
+    )
+    assert (intake.counts.received, intake.counts.fused, intake.counts.replaced) == (5, 1, 4)
+
+
+def test_topics_are_fused_in_the_order_of_their_stamps():
+    intake = Intake(wait=0.2)
+    intake.offer("b", "later", 1.3, 0.0)
+    intake.offer("a", "first", 1.0, 0.0)
+    assert fuse(intake) == [("first", 0.0), ("later", pytest.approx(0.3))]
+
+
+def test_a_cloud_waits_for_its_transforms_and_not_longer():
+    intake = Intake(wait=0.2)
+    intake.offer("a", "early", 1.0, now=5.0)
+    assert intake.take(5.1, no) == ([], [])
+    assert fuse(intake, 5.15) == [("early", 0.0)]
+    intake.offer("a", "lost", 2.0, now=6.0)
+    ready, lost = intake.take(6.3, no)
+    assert ready == [] and [one.message for one in lost] == ["lost"] and intake.counts.without_transform == 1
+    assert intake.take(6.4, yes) == ([], [])
+
+
+def test_repeated_and_late_clouds_are_counted():
+    intake = Intake(wait=0.2)
+    intake.offer("a", 0, 10.0, 0.0)
+    assert fuse(intake) == [(0, 0.0)]
+    intake.offer("a", 0, 10.0, 0.1)
+    assert fuse(intake) == [] and intake.counts.repeated == 1
+    intake.offer("b", 1, 9.7, 0.2)
+    assert fuse(intake) == [(1, 0.0)] and intake.counts.late == 1 and intake.stamp == 10.0
+    intake.offer("a", 2, 10.5, 0.3)
+    assert fuse(intake) == [(2, 0.5)]
+
+
+def test_a_clock_that_jumps_back_starts_over():
+    intake = Intake(wait=0.2)
+    intake.offer("a", 0, 100.0, 0.0)
+    fuse(intake)
+    assert not intake.offer("a", 1, 99.5, 0.1), "a late cloud is no jump"
+    assert intake.offer("a", 2, 3.0, 0.2) and intake.counts.jumps == 1
+    assert fuse(intake) == [(2, 0.0)] and intake.stamp == 3.0
+    intake.offer("a", 3, 3.1, 0.3)
+    assert fuse(intake) == [(3, pytest.approx(0.1))]

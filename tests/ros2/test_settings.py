@@ -1,0 +1,67 @@
+"""The node's parameters: from files, of their types, and refused by name."""
+
+import pytest
+
+from torchelev.ros2.settings import NodeSettings, changeable, make_settings, read_node_file
+
+FILE = """
+map_frame: map
+clouds: [/front, /rear]
+rate_costmap: 5
+map:
+  grid: {resolution: 0.05, length_x: 8.0, length_y: 8.0}
+  drift: null
+"""
+
+
+def test_a_file_has_the_nodes_parameters_and_the_maps_settings(tmp_path):
+    (tmp_path / "robot.yaml").write_text(FILE)
+    settings, cfg = read_node_file(tmp_path / "robot.yaml")
+    assert settings == NodeSettings(map_frame="map", clouds=("/front", "/rear"), rate_costmap=5.0)
+    assert cfg == {"grid": {"resolution": 0.05, "length_x": 8.0, "length_y": 8.0}, "drift": None}
+
+
+@pytest.mark.parametrize("names", [["/**", "ros__parameters"], ["elevation_mapping", "ros__parameters"]])
+def test_a_file_of_ros_is_read_too(tmp_path, names):
+    text = FILE
+    for name in reversed(names):
+        text = f"{name}:\n" + "\n".join(f"  {line}" for line in text.splitlines())
+    (tmp_path / "robot.yaml").write_text(text)
+    (tmp_path / "plain.yaml").write_text(FILE)
+    assert read_node_file(tmp_path / "robot.yaml") == read_node_file(tmp_path / "plain.yaml")
+
+
+def test_an_empty_file_is_all_defaults(tmp_path):
+    (tmp_path / "robot.yaml").write_text("")
+    assert read_node_file(tmp_path / "robot.yaml") == (NodeSettings(), {})
+
+
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        ({"map_fram": "odom"}, "map_fram: is no parameter, got 'map_fram'; there are map, map_frame"),
+        ({"clouds": "/points"}, "clouds: must be a list of names, got '/points'"),
+        ({"clouds": []}, "clouds: must not be empty"),
+        ({"rate_map": "2"}, "rate_map: must be a float, got '2'; such as 2.0"),
+        ({"rate_map": -1.0}, "rate_map: must be finite and not negative, got -1.0"),
+        ({"rate_map": True}, "rate_map: must be a float, got True"),
+        ({"threads": 1.5}, "threads: must be a int, got 1.5"),
+        ({"threads": 0}, "threads: must be at least 1, got 0"),
+        ({"min_traversability": 1.0}, r"min_traversability: must lie in \[0, 1\), got 1.0"),
+        ({"engine": "cuda"}, "engine: must be one of auto, torch, library, got 'cuda'"),
+    ],
+)
+def test_wrong_parameters_are_refused_by_name(tmp_path, values, words):
+    with pytest.raises((ValueError, TypeError), match=words):
+        make_settings(values)
+
+
+def test_errors_name_the_file(tmp_path):
+    (tmp_path / "robot.yaml").write_text("thread: 2\nmap: {}\n")
+    with pytest.raises(ValueError, match=r"robot.yaml: thread: is no parameter"):
+        read_node_file(tmp_path / "robot.yaml")
+
+
+def test_what_may_change_while_it_runs():
+    assert {"rate_map", "layers", "min_traversability", "map_file"} <= changeable()
+    assert not {"clouds", "map_frame", "engine", "threads"} & changeable()

@@ -1,0 +1,92 @@
+"""ROS messages of a node's outputs, and matrices of its transforms. Imports ROS."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from nav_msgs.msg import OccupancyGrid
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension
+
+from torchelev.io import grid_map as plain
+from torchelev.io import occupancy
+from torchelev.ros2.outputs import MapCloud
+
+
+def header_of(frame: str, stamp: float) -> Header:
+    """Return a header of a stamp [s]."""
+    nanoseconds = round(stamp * 1e9)
+    return Header(frame_id=frame, stamp=Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9))
+
+
+def matrix_of(transform: Any) -> NDArray[np.float64]:
+    """Return the matrix (4, 4) of a geometry_msgs/Transform."""
+    p, q = transform.translation, transform.rotation
+    x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / np.linalg.norm([q.x, q.y, q.z, q.w])
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), p.x],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), p.y],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), p.z],
+            [0, 0, 0, 1],
+        ]
+    )
+
+
+def to_occupancy_grid(grid: occupancy.OccupancyGrid, header: Header) -> OccupancyGrid:
+    """Return the message of a costmap."""
+    message = OccupancyGrid(header=header, data=array("b", grid.data.tobytes()))
+    info, origin = message.info, grid.info.origin.position
+    info.map_load_time, info.resolution = header.stamp, grid.info.resolution
+    info.width, info.height = grid.info.width, grid.info.height
+    info.origin.position.x, info.origin.position.y = origin.x, origin.y
+    info.origin.orientation.w = 1.0
+    return message
+
+
+def to_cloud(cloud: MapCloud, header: Header) -> PointCloud2:
+    """Return the message of the map's cells as points."""
+    number, width = len(cloud.data), len(cloud.names)
+    fields = [
+        PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(cloud.names)
+    ]
+    sizes = {"height": 1, "width": number, "point_step": 4 * width, "row_step": 4 * width * number}
+    data = array("B", cloud.data.tobytes())
+    return PointCloud2(header=header, fields=fields, is_bigendian=False, is_dense=True, data=data, **sizes)
+
+
+def to_scan(values: NDArray[np.float32], layout: str) -> Float32MultiArray:
+    """Return the message of a height scan; its dimension is named after the layout."""
+    message = Float32MultiArray(data=array("f", values.tobytes()))
+    message.layout.dim = [MultiArrayDimension(label=layout, size=len(values), stride=len(values))]
+    return message
+
+
+def to_grid_map(grid: plain.GridMap, header: Header) -> Any:
+    """Return the message of a GridMap; ModuleNotFoundError without grid_map_msgs."""
+    from grid_map_msgs.msg import GridMap
+
+    message = GridMap(header=header, layers=grid.layers, basic_layers=grid.basic_layers)
+    info, center = message.info, grid.info.pose.position
+    info.resolution, info.length_x, info.length_y = grid.info.resolution, grid.info.length_x, grid.info.length_y
+    info.pose.position.x, info.pose.position.y, info.pose.orientation.w = center.x, center.y, 1.0
+    for layer in grid.data:
+        entry = Float32MultiArray(data=array("f", layer.data.tobytes()))
+        entry.layout.dim = [MultiArrayDimension(**one._asdict()) for one in layer.layout.dim]
+        message.data.append(entry)
+    return message
+
+
+def to_diagnostics(name: str, values: dict[str, Any], findings: list[str], stamp: Time) -> DiagnosticArray:
+    """Return a status: OK, or WARN with what looks wrong."""
+    level = DiagnosticStatus.WARN if findings else DiagnosticStatus.OK
+    entries = [KeyValue(key=key, value=f"{value:g}") for key, value in values.items()]
+    entries += [KeyValue(key=f"finding {k}", value=text) for k, text in enumerate(findings)]
+    text = findings[0] if findings else "nothing looks wrong"
+    status = DiagnosticStatus(level=level, name=name, message=text, hardware_id="torchelev", values=entries)
+    return DiagnosticArray(header=Header(stamp=stamp), status=[status])

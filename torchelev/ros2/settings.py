@@ -1,0 +1,118 @@
+"""The node's parameters, from a YAML file and from ROS."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+from torchelev.config_files import read_settings
+from torchelev.errors import require
+
+ENGINES = ("auto", "torch", "library")
+
+
+def _setting(default: Any, meaning: str, changeable: bool = False) -> Any:
+    """Return a field with its meaning, as `ros2 param describe` shows it."""
+    return field(default=default, metadata={"meaning": meaning, "changeable": changeable})
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeSettings:
+    """Parameters of the node. Those that are changeable may be set while it runs.
+
+    Raises:
+        ValueError, TypeError: a value has the wrong type or is out of range.
+    """
+
+    map_frame: str = _setting("odom", "fixed frame of the map, z up; odom does not jump, which a map likes better")
+    base_frame: str = _setting("base_link", "frame that the map's window follows")
+    clouds: tuple[str, ...] = _setting(("points",), "topics of sensor_msgs/PointCloud2")
+    transform_wait: float = _setting(0.2, "[s] that a cloud waits for the transforms at its stamp")
+    rate_map: float = _setting(2.0, "[Hz] of ~/map, a grid_map_msgs/GridMap; 0: never", True)
+    rate_points: float = _setting(1.0, "[Hz] of ~/points, the map as a sensor_msgs/PointCloud2; 0: never", True)
+    rate_costmap: float = _setting(1.0, "[Hz] of ~/costmap, a nav_msgs/OccupancyGrid; 0: never", True)
+    rate_height_scan: float = _setting(50.0, "[Hz] of ~/height_scan, a std_msgs/Float32MultiArray; 0: never", True)
+    rate_diagnostics: float = _setting(1.0, "[Hz] of /diagnostics; 0: never", True)
+    layers: tuple[str, ...] = _setting(
+        ("elevation", "variance", "traversability", "upper_bound"), "layers of ~/map and fields of ~/points", True
+    )
+    min_traversability: float = _setting(0.5, "in [0, 1): below it a cell of ~/costmap is lethal", True)
+    height_scan: str = _setting("isaac_lab", "layout of ~/height_scan: isaac_lab, mjlab, legged_gym, or one as JSON")
+    map_file: str = _setting("map.safetensors", "file of ~/save_map and ~/load_map", True)
+    load_on_start: bool = _setting(False, "load map_file when the node starts, if it is there")
+    engine: str = _setting("auto", "torch, library (libtorchelev, without PyTorch), or auto: torch if it is installed")
+    library: str = _setting("", "path of libtorchelev; empty: that of the wheel, or the system's")
+    threads: int = _setting(1, "threads that share an update")
+    max_points: int = _setting(200_000, "points of a cloud at most; of larger ones every k-th is used")
+
+    def __post_init__(self) -> None:
+        for each in dataclasses.fields(self):
+            object.__setattr__(self, each.name, _checked(each.name, getattr(self, each.name), each.default))
+        for name, value in vars(self).items():
+            if name.startswith("rate_") or name == "transform_wait":
+                in_range = 0 <= value < math.inf
+                require(in_range, name, "must be finite and not negative", value, "give Hz; 0: never")
+        in_range = 0 <= self.min_traversability < 1
+        require(in_range, "min_traversability", "must lie in [0, 1)", self.min_traversability, "the default is 0.5")
+        require(self.engine in ENGINES, "engine", f"must be one of {', '.join(ENGINES)}", repr(self.engine), "use auto")
+        for name in ("threads", "max_points"):
+            require(getattr(self, name) >= 1, name, "must be at least 1", getattr(self, name), "see its default")
+        for name in ("map_frame", "base_frame", "clouds", "layers"):
+            require(bool(getattr(self, name)), name, "must not be empty", repr(getattr(self, name)), "name one")
+
+
+def _checked(name: str, value: Any, default: Any) -> Any:
+    """Return a value of the default's type; whole numbers are floats, too, and lists are tuples."""
+    if isinstance(default, tuple):
+        is_list = isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
+        require(is_list, name, "must be a list of names", repr(value), "write [name, name]", TypeError)
+        return tuple(value)
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if isinstance(default, float) and is_number:
+        return float(value)
+    kind = type(default)
+    require(type(value) is kind, name, f"must be a {kind.__name__}", repr(value), f"such as {default!r}", TypeError)
+    return value
+
+
+def read_node_file(path: str | Path) -> tuple[NodeSettings, dict[str, Any]]:
+    """Read a YAML file: the node's parameters, and below `map` the settings of the map.
+
+    A file of ROS, `node_name: {ros__parameters: {...}}`, is read, too.
+
+    Raises:
+        ValueError, TypeError: the file cannot be read, or has a parameter that does not exist or does not fit.
+    """
+    values = read_settings(path)
+    while len(values) == 1 and isinstance(inner := next(iter(values.values())), dict) and "map" not in values:
+        values = inner  # of a node's name, or ros__parameters
+    settings, cfg = split(values)
+    try:
+        return make_settings(settings), cfg
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
+def split(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the node's parameters and the map's settings."""
+    cfg = values.get("map") or {}
+    require(isinstance(cfg, dict), "map", "must be the settings of a map", repr(cfg), "write map: {grid: {...}}")
+    return {name: value for name, value in values.items() if name != "map"}, cfg
+
+
+def make_settings(values: Mapping[str, Any]) -> NodeSettings:
+    """Return settings from a mapping by name; ValueError for one that does not exist."""
+    names = [each.name for each in dataclasses.fields(NodeSettings)]
+    for name in values:
+        require(name in names, name, "is no parameter", repr(name), f"there are map, {', '.join(names)}")
+    return NodeSettings(**values)
+
+
+def changeable() -> set[str]:
+    """Return the names of the parameters that may change while the node runs."""
+    return {each.name for each in dataclasses.fields(NodeSettings) if each.metadata["changeable"]}
