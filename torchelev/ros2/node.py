@@ -47,7 +47,9 @@ class ElevationMappingNode(Node):
         super().__init__("elevation_mapping")
         self.settings = make_settings(self._declare(settings))
         self.engine = make_engine(cfg, self.settings)
+        self._require_layers(self.settings)
         self.intake, self.schedule = Intake(self.settings.transform_wait), outputs.Schedule()
+        self.has_map = False  # something was fused or loaded
         self.buffer = Buffer()
         self._listener = TransformListener(self.buffer, self)
         self._outputs = self._make_outputs()
@@ -78,12 +80,16 @@ class ElevationMappingNode(Node):
         """Take new values of parameters that may change; refuse wrong ones with a sentence."""
         values = {one.name: one.value for one in parameters if one.name in changeable()}
         try:
-            self.settings = dataclasses.replace(self.settings, **values)
-            for name in self.settings.layers:
-                self.engine.layer(name)
+            settings = dataclasses.replace(self.settings, **values)
+            self._require_layers(settings)
         except (ValueError, TypeError) as error:
             return SetParametersResult(successful=False, reason=str(error))
+        self.settings = settings
         return SetParametersResult(successful=True)
+
+    def _require_layers(self, settings: NodeSettings) -> None:
+        for name in settings.layers:
+            self.engine.layer(name)  # raises ValueError for one that is not there
 
     # Clouds ----------------------------------------------------------------------------------------------------------
 
@@ -119,6 +125,7 @@ class ElevationMappingNode(Node):
             T_map_base = self._pose(self.settings.base_frame, Time.from_msg(header.stamp))
             dt = self.intake.step(cloud)
             self.engine.update(points, T_map_sensor, T_map_base, dt)
+            self.has_map = True
         except (CloudError, TransformException, ValueError) as error:
             self.intake.counts.unreadable += 1
             self.get_logger().warning(f"{cloud.topic}: left out a cloud: {error}", throttle_duration_sec=5.0)
@@ -157,15 +164,22 @@ class ElevationMappingNode(Node):
 
     def _publish(self, name: str, publisher: Any, make: Callable[[], Any]) -> None:
         """Publish an output if it is due, there is a map, and somebody listens."""
-        if self.intake.stamp is None or not publisher.get_subscription_count():
+        if not (self.has_map and publisher.get_subscription_count()):
             return
         if self.schedule.is_due(name, getattr(self.settings, f"rate_{name}"), time.monotonic()):
-            message = make()
+            try:
+                message = make()
+            except ValueError as error:  # the map has no such layer
+                self.get_logger().warning(f"~/{name} is not published: {error}", throttle_duration_sec=30.0)
+                return
             if message is not None:
                 publisher.publish(message)
 
     def _header(self) -> Any:
-        return messages.header_of(self.settings.map_frame, self.intake.stamp or 0.0)
+        stamp = self.intake.stamp
+        if stamp is None:  # of a map that was loaded
+            stamp = 1e-9 * self.get_clock().now().nanoseconds
+        return messages.header_of(self.settings.map_frame, stamp)
 
     def _make_map(self) -> Any:
         return messages.to_grid_map(outputs.grid_map(self.engine, self.settings.layers), self._header())
@@ -197,6 +211,7 @@ class ElevationMappingNode(Node):
 
     def _load(self) -> str:
         self.engine.load(Path(self.settings.map_file))
+        self.has_map = True
         return f"loaded {Path(self.settings.map_file).absolute()}"
 
     def _clear(self) -> str:

@@ -1,0 +1,178 @@
+"""A robot in ROS 2: it runs the node as a process, sends clouds and transforms, and hears what is published."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import OccupancyGrid
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Float32MultiArray
+from std_srvs.srv import Trigger
+from tf2_ros import StaticTransformBroadcaster, TransformBroadcaster
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Robot(Node):
+    """What a robot's other nodes do.
+
+    Args:
+        config: file of the node.
+        name: namespace of the robot; "" for none.
+        arguments: more for the node, as after `--ros-args`.
+    """
+
+    def __init__(self, config, name="", arguments=()):
+        super().__init__("driver", namespace=name)
+        self.heard = {}
+        self.prefix = f"{'/' + name if name else ''}/elevation_mapping"
+        self.command = [sys.executable, "-m", "torchelev", "ros2", "--config", str(config), "--ros-args", *arguments]
+        if name:
+            self.command += ["-r", f"__ns:=/{name}"]
+        for topic, kind, qos in [
+            ("costmap", OccupancyGrid, LATCHED),
+            ("points", PointCloud2, 1),
+            ("height_scan", Float32MultiArray, 1),
+        ]:
+            self.create_subscription(kind, f"{self.prefix}/{topic}", self._hear(topic), qos)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
+        self.moving, self.fixed = TransformBroadcaster(self), StaticTransformBroadcaster(self)
+        self.clouds = {}
+        self.log = None
+        self.process = None
+
+    def _hear(self, topic):
+        def keep(message):
+            self.heard[topic] = message
+
+        return keep
+
+    def _diagnose(self, message):
+        status = message.status[0]
+        if status.name == self.prefix:
+            self.heard["status"] = status
+            self.heard["counts"] = {entry.key: entry.value for entry in status.values}
+
+    # The node --------------------------------------------------------------------------------------------------------
+
+    def start(self, log):
+        """Start the node, and wait until it serves."""
+        self.log = log
+        with open(log, "a") as file:
+            self.process = subprocess.Popen(self.command, stdout=file, stderr=file, cwd=os.path.dirname(str(log)))
+        client = self.create_client(Trigger, f"{self.prefix}/clear_map")
+        assert client.wait_for_service(20.0), open(log).read()
+
+    def stop(self, how=signal.SIGINT):
+        self.process.send_signal(how)
+        self.process.wait(10)
+        for topic in list(self.heard):
+            del self.heard[topic]
+
+    def call(self, name):
+        """Call a service; return whether it succeeded, and what it says."""
+        client = self.create_client(Trigger, f"{self.prefix}/{name}")
+        assert client.wait_for_service(5.0)
+        answer = self._answer(client, Trigger.Request())
+        return answer.success, answer.message
+
+    def set(self, **values):
+        """Set parameters; return the reason of the first that is refused, or None."""
+        client = self.create_client(SetParameters, f"{self.prefix}/set_parameters")
+        assert client.wait_for_service(5.0)
+        request = SetParameters.Request(
+            parameters=[Parameter(k, value=v).to_parameter_msg() for k, v in values.items()]
+        )
+        refused = [one.reason for one in self._answer(client, request).results if not one.successful]
+        return refused[0] if refused else None
+
+    def _answer(self, client, request):
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(self, future, timeout_sec=5.0)
+        assert future.done(), open(self.log).read()
+        return future.result()
+
+    def wait(self, holds, seconds=10.0):
+        """Wait until something holds; fail with the node's log if it does not."""
+        end = time.monotonic() + seconds
+        while not holds():
+            assert time.monotonic() < end, (self.heard.get("counts"), open(self.log).read())
+            rclpy.spin_once(self, timeout_sec=0.02)
+
+    def spin(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            rclpy.spin_once(self, timeout_sec=0.01)
+
+    def count(self, name):
+        return int(float(self.heard.get("counts", {}).get(name, 0)))
+
+    # What it sends ---------------------------------------------------------------------------------------------------
+
+    def send_poses(self, stamp, x=0.0, z=0.5):
+        self.moving.sendTransform([_transform(stamp, "odom", "base_link", x, z)])
+        self.fixed.sendTransform([_transform(stamp, "base_link", "lidar", 0.0, 0.3)])
+
+    def send_cloud(self, stamp, height=-0.8, topic="/lidar/points", frame="lidar", seed=0):
+        """Send flat ground at a height [m] below the sensor."""
+        xyz = np.random.default_rng(seed).uniform(-3, 3, (40000, 3)).astype(np.float32)
+        xyz[:, 2] = height
+        self.send(topic, to_cloud(xyz, stamp, frame))
+
+    def send(self, topic, message):
+        if topic not in self.clouds:
+            self.clouds[topic] = self.create_publisher(PointCloud2, topic, qos_profile_sensor_data)
+            self.wait(lambda: self.clouds[topic].get_subscription_count() > 0)
+        self.clouds[topic].publish(message)
+
+    def fuse(self, stamp, **cloud):
+        """Send poses and a cloud until it is fused."""
+        before = self.count("fused")
+        self.send_until(lambda: self.count("fused") > before, stamp, **cloud)
+
+    def send_until(self, holds, stamp, poses=True, **cloud):
+        """Send poses and a cloud until something holds: what is sent by best effort may be lost."""
+        end = time.monotonic() + 15.0
+        while not holds():
+            assert time.monotonic() < end, (self.heard.get("counts"), open(self.log).read())
+            if poses:
+                self.send_poses(stamp)
+                self.spin(0.05)
+            self.send_cloud(stamp, **cloud)
+            self.spin(0.5 if not holds() else 0.0)
+
+
+def _transform(stamp, parent, child, x, z):
+    one = TransformStamped()
+    one.header.stamp.sec, one.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
+    one.header.frame_id, one.child_frame_id = parent, child
+    one.transform.translation.x, one.transform.translation.z, one.transform.rotation.w = x, z, 1.0
+    return one
+
+
+def to_cloud(xyz, stamp, frame):
+    """A PointCloud2 of points (N, 3)."""
+    message = PointCloud2(height=1, width=len(xyz), point_step=12, row_step=12 * len(xyz), data=xyz.tobytes())
+    message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
+    message.header.frame_id = frame
+    message.fields = [PointField(name=n, offset=4 * k, datatype=7, count=1) for k, n in enumerate("xyz")]
+    return message
+
+
+def cells_of(cloud, resolution=0.1):
+    """Heights of a map's cloud by the numbers of their cells."""
+    values = np.frombuffer(cloud.data, np.float32).reshape(cloud.width, -1)
+    keys = np.floor(values[:, :2].astype(np.float64) / resolution).astype(int)
+    return {tuple(key): float(z) for key, z in zip(keys.tolist(), values[:, 2], strict=True)}

@@ -1,0 +1,171 @@
+"""The node in real ROS 2: `make test-ros2`. Skipped where there is no rclpy."""
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+rosbags = pytest.importorskip("rosbags.highlevel")
+
+from rclpy.serialization import deserialize_message  # noqa: E402
+from robot import LATCHED, Robot, cells_of  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
+
+PREPARED = Path(os.environ["TORCHELEV_ROS2_FOLDER"])
+LIBRARY = f"library:={(PREPARED / 'library').read_text()}"
+CONFIG = PREPARED / "robot.yaml"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def context():
+    rclpy.init()
+    yield
+    rclpy.shutdown()
+
+
+@pytest.fixture
+def make_robot(tmp_path):
+    robots = []
+
+    def make(name="", *arguments):
+        robot = Robot(CONFIG, name, ["-p", LIBRARY, *arguments])
+        robots.append(robot)
+        robot.start(tmp_path / f"log{len(robots)}")
+        return robot
+
+    yield make
+    for robot in robots:
+        if robot.process and robot.process.poll() is None:
+            robot.stop()
+        robot.destroy_node()
+
+
+def test_a_bag_through_topics_gives_the_map_of_torchelev_map(make_robot):
+    robot = make_robot()
+    moving, fixed = (
+        robot.create_publisher(TFMessage, "/tf", 100),
+        robot.create_publisher(TFMessage, "/tf_static", LATCHED),
+    )
+    kinds = {"/tf": (TFMessage, moving), "/tf_static": (TFMessage, fixed)}
+    clouds = []
+    with rosbags.AnyReader([PREPARED / "drive"]) as bag:
+        for connection, _, raw in bag.messages():
+            if connection.topic in kinds:
+                kind, publisher = kinds[connection.topic]
+                publisher.publish(deserialize_message(raw, kind))
+                robot.spin(0.003)
+            else:
+                clouds.append(deserialize_message(raw, PointCloud2))
+    robot.spin(0.5)
+    for number, cloud in enumerate(clouds):
+        robot.send("/lidar/points", cloud)
+        robot.wait(lambda: robot.count("fused") == number + 1)  # noqa: B023
+    stamp = clouds[-1].header.stamp
+    robot.heard.pop("points", None)
+    robot.wait(lambda: "points" in robot.heard and robot.heard["points"].header.stamp == stamp)
+    found = cells_of(robot.heard["points"])
+    wanted = np.load(PREPARED / "map.npz", allow_pickle=True)
+    i, j = np.nonzero(np.isfinite(wanted["elevation"]))
+    corner = wanted["map_corner"][0]
+    assert len(found) == len(i) > 2000
+    expected = {(a + corner[0], b + corner[1]): wanted["elevation"][a, b] for a, b in zip(i, j, strict=True)}
+    assert found.keys() == expected.keys()
+    assert max(abs(found[key] - z) for key, z in expected.items()) < 1e-5
+    assert robot.heard["points"].header.frame_id == "odom"
+
+
+def test_outputs_of_flat_ground(make_robot):
+    robot = make_robot()
+    for k in range(3):
+        robot.fuse(1000.0 + 0.1 * k)
+    robot.wait(lambda: {"costmap", "height_scan", "status"} <= robot.heard.keys())
+    grid = robot.heard["costmap"]
+    data = np.array(grid.data).reshape(grid.info.height, grid.info.width)
+    assert data.shape == (80, 80) and grid.info.origin.position.x == pytest.approx(-4.0)
+    assert (data[20:60, 20:60] == 0).mean() > 0.99 and data[0, 0] == -1
+    scan = robot.heard["height_scan"]
+    assert scan.layout.dim[0].label == "isaac_lab"
+    np.testing.assert_allclose(scan.data, np.zeros(187), atol=0.01)  # 0.5 m over the ground, less the offset of 0.5
+    assert robot.heard["status"].level == b"\x00" and robot.heard["status"].message == "nothing looks wrong"
+
+
+def test_missing_transforms_and_unreadable_clouds_are_counted_and_named(make_robot, tmp_path):
+    robot = make_robot()
+    robot.fuse(1000.0)
+    robot.send_until(lambda: robot.count("without_transform") >= 1, 1000.1, frame="nowhere")
+    broken = PointCloud2()
+    broken.header.frame_id, broken.header.stamp.sec = "lidar", 1000
+    broken.header.stamp.nanosec = 50_000_000
+    robot.send_poses(1000.2)
+    robot.spin(0.1)
+    robot.send("/lidar/points", broken)
+    robot.wait(lambda: robot.count("unreadable") >= 1)
+    text = Path(robot.log).read_text()
+    assert "nowhere" in text and "the cloud has no field x, y, z" in text
+    robot.fuse(1000.3)
+
+
+def test_a_clock_that_jumps_back(make_robot):
+    robot = make_robot()
+    for stamp in (1000.0, 1000.1, 1000.2):
+        robot.fuse(stamp)
+    robot.send_until(lambda: robot.count("repeated") >= 1, 1000.2)
+    robot.send_until(lambda: robot.count("jumps") == 1, 5.0)
+    robot.fuse(5.1)
+    robot.fuse(5.2)
+    assert "the clock jumped back" in Path(robot.log).read_text()
+
+
+def test_parameters(make_robot):
+    robot = make_robot()
+    robot.fuse(1000.0)
+    assert robot.set(rate_costmap=20.0, layers=["elevation", "variance"]) is None
+    assert "must be finite and not negative, got -1.0" in robot.set(rate_costmap=-1.0)
+    assert "must lie in [0, 1), got 2.0" in robot.set(min_traversability=2.0)
+    assert "layer: must be one of elevation" in robot.set(layers=["elevaton"])
+    assert "read-only" in robot.set(map_frame="map")
+    robot.heard.pop("points", None)
+    robot.fuse(1000.1)
+    robot.wait(lambda: "points" in robot.heard)
+    assert [field.name for field in robot.heard["points"].fields] == ["x", "y", "z", "variance"]
+
+
+def test_a_node_that_dies_loads_its_map(make_robot, tmp_path):
+    saved = tmp_path / "saved.safetensors"
+    robot = make_robot("", "-p", f"map_file:={saved}", "-p", "load_on_start:=true")
+    robot.fuse(1000.0)
+    robot.wait(lambda: "points" in robot.heard)
+    before = cells_of(robot.heard["points"])
+    assert robot.call("save_map") == (True, f"saved {saved}")
+    robot.stop(signal.SIGKILL)
+    robot.start(robot.log)
+    robot.fuse(1000.1, height=5.0)  # above the exclusion ramp: nothing is fused into it
+    robot.heard.pop("points", None)
+    robot.wait(lambda: "points" in robot.heard)
+    after = cells_of(robot.heard["points"])
+    assert after.keys() == before.keys()
+    assert robot.call("clear_map") == (True, "the map is empty")
+    assert robot.set(map_file=str(tmp_path / "none")) is None
+    success, text = robot.call("load_map")
+    assert not success and "cannot be read" in text
+
+
+def test_two_robots_in_namespaces(make_robot):
+    topics = ["-r", "/lidar/points:=points", "-p", "clouds:=[points]"]
+    robots = [make_robot(name, *topics) for name in ("one", "two")]
+    for k, robot in enumerate(robots):
+        robot.fuse(1000.0, height=-0.8 + 0.1 * k, topic=f"/{('one', 'two')[k]}/points")
+    for k, robot in enumerate(robots):
+        robot.wait(lambda: "points" in robot.heard)  # noqa: B023
+        heights = np.array(list(cells_of(robot.heard["points"]).values()))
+        np.testing.assert_allclose(heights, 0.1 * k, atol=0.01)
+
+
+def test_ctrl_c_ends_it(make_robot):
+    robot = make_robot()
+    robot.stop(signal.SIGINT)
+    assert robot.process.returncode == 0 and "Traceback" not in Path(robot.log).read_text()
