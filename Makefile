@@ -11,7 +11,7 @@ MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests
 EXTRAS := io,bags,odometry,video,view,geo,site,rl,deploy,dev,docs
 MJLAB := .venv-mjlab
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab matrix lint types setup bench quality quality-odometry runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -44,6 +44,17 @@ test-fast: setup  ## run the quick tests, every stage against the reference
 	$(BIN)/python $(PYTEST) -m "not slow"
 
 # mjlab pins its own mujoco and rsl-rl-lib.
+ROS2 := .venv-ros2
+ROS2_PYTHON ?= $(shell ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.12.*/bin/python 2>/dev/null | head -1)
+$(ROS2)/.ready: tests/ros2/with_ros/requirements.txt
+	$(if $(ROS2_PYTHON),$(ROS2_PYTHON),python3.12) -m venv $(ROS2)
+	$(ROS2)/bin/python -m pip install --disable-pip-version-check --quiet --requirement $<
+	@touch $@
+
+test-ros2: setup $(ROS2)/.ready  ## test the node in real ROS 2, Humble and Jazzy of a wheel, which needs Python 3.12; five minutes
+	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
+	$(ROS2)/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared
+
 $(MJLAB)/.ready: pyproject.toml constraints-mjlab.txt
 	@echo "Installing mjlab and PyTorch into $(MJLAB), nowhere else: 2.3 GB."
 	$(PYTHON) -m venv $(MJLAB)

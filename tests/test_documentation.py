@@ -15,6 +15,12 @@ def is_record(node):
     return not node.name.startswith("_") and any("NamedTuple" in mark or "dataclass" in mark for mark in marks)
 
 
+def has_meaning(value):
+    """Whether a field's value is a call with its meaning as an argument, which programs show."""
+    texts = [arg.value for arg in getattr(value, "args", []) if isinstance(arg, ast.Constant)]
+    return any(isinstance(text, str) and " " in text for text in texts)
+
+
 def undocumented(source):
     """Names of the public fields of public records that have no `#:` comment behind them or in the line above."""
     lines, missing = source.split("\n"), []
@@ -22,6 +28,8 @@ def undocumented(source):
     for record in records:
         for field in record.body:
             if not isinstance(field, ast.AnnAssign) or "ClassVar" in ast.unparse(field.annotation):
+                continue
+            if has_meaning(field.value):
                 continue
             behind = lines[field.end_lineno - 1].encode()[field.end_col_offset :].decode()
             above = lines[field.lineno - 2]
@@ -36,7 +44,15 @@ def test_every_field_is_documented():
     assert not missing, "add a `#:` comment: unit, meaning, and of a setting when to change it"
 
 
-@pytest.mark.parametrize("field, names", [("x: int", ["A.x"]), ("x: int  # [m]", ["A.x"]), ("x: int  #: [m]", [])])
+@pytest.mark.parametrize(
+    "field, names",
+    [
+        ("x: int", ["A.x"]),
+        ("x: int  # [m]", ["A.x"]),
+        ("x: int  #: [m]", []),
+        ("x: int = setting(3, '[m] from the sensor')", []),
+    ],
+)
 def test_finds_the_field_that_lacks_one(field, names):
     assert undocumented(f"@dataclass\nclass A:\n    {field}\n") == names
     assert undocumented(f"class A(NamedTuple):\n    {field}\n") == names

@@ -13,13 +13,13 @@ _RESTART = 1.0  # [s] by which a stamp lies before the last one when a clock or 
 class Counts:
     """How many clouds were received and what became of them."""
 
-    received: int = 0
-    fused: int = 0
+    received: int = 0  #: all that arrived
+    fused: int = 0  #: into the map
     replaced: int = 0  #: by a newer one that came before they were fused
     repeated: int = 0  #: had the stamp of one that was fused
     late: int = 0  #: fused, though older than the cloud before
-    without_transform: int = 0
-    unreadable: int = 0
+    without_transform: int = 0  #: waited for it in vain
+    unreadable: int = 0  #: contradicted themselves, or were refused by the map
     jumps: int = 0  #: of a clock, backwards
 
     def as_dict(self) -> dict[str, int]:
@@ -30,8 +30,8 @@ class Counts:
 class Waiting(NamedTuple):
     """A cloud that waits for its transforms."""
 
-    topic: str
-    message: Any
+    topic: str  #: on which it came
+    message: Any  #: the cloud
     stamp: float  #: [s] of the message
     since: float  #: [s] by the node's own clock
 
@@ -44,8 +44,8 @@ class Intake:
         wait: [s] that a cloud waits for its transforms.
     """
 
-    wait: float
-    counts: Counts = field(default_factory=Counts)
+    wait: float  #: [s] that a cloud waits for its transforms
+    counts: Counts = field(default_factory=Counts)  #: of all topics
     _waiting: dict[str, Waiting] = field(default_factory=dict)
     _fused: dict[str, float] = field(default_factory=dict)  # stamp of the last cloud of each topic
     _last: float | None = None  # stamp of the map
