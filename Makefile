@@ -11,7 +11,7 @@ MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests
 EXTRAS := io,bags,odometry,video,view,geo,site,rl,deploy,dev,docs
 MJLAB := .venv-mjlab
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-ros2 bench-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -54,6 +54,10 @@ $(ROS2)/.ready: tests/ros2/with_ros/requirements.txt
 test-ros2: setup $(ROS2)/.ready  ## test the node in real ROS 2, Humble and Jazzy of a wheel, which needs Python 3.12; five minutes
 	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
 	$(ROS2)/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared
+
+bench-ros2: setup $(ROS2)/.ready  ## measure the node in ROS 2 Jazzy: latency, CPU and memory, ten minutes of them overloaded
+	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
+	$(ROS2)/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared measure benchmarks/results/ros2.json 10
 
 $(MJLAB)/.ready: pyproject.toml constraints-mjlab.txt
 	@echo "Installing mjlab and PyTorch into $(MJLAB), nowhere else: 2.3 GB."

@@ -17,7 +17,8 @@ def is_record(node):
 
 def has_meaning(value):
     """Whether a field's value is a call with its meaning as an argument, which programs show."""
-    texts = [arg.value for arg in getattr(value, "args", []) if isinstance(arg, ast.Constant)]
+    args = value.args if isinstance(value, ast.Call) else []
+    texts = [arg.value for arg in args if isinstance(arg, ast.Constant)]
     return any(isinstance(text, str) and " " in text for text in texts)
 
 

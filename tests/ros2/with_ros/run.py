@@ -1,4 +1,7 @@
-"""Run the tests in each ROS 2 and middleware of the wheel isaacsim-ros2: `python run.py FOLDER [pytest's options]`."""
+"""Run the tests in each ROS 2 and middleware of the wheel isaacsim-ros2: `python run.py FOLDER [pytest's options]`.
+
+`python run.py FOLDER measure JSON MINUTES` runs measure.py in Jazzy instead.
+"""
 
 import os
 import subprocess
@@ -43,5 +46,13 @@ def main(prepared: Path, options: list[str]) -> int:
     return bool(failed)
 
 
+def measure(prepared: Path, out: Path, minutes: str) -> int:
+    """Return the exit code of measure.py."""
+    command = [sys.executable, HERE / "measure.py", prepared.resolve(), out.resolve(), minutes]
+    return subprocess.run(command, env=environment("jazzy", "rmw_fastrtps_cpp", prepared)).returncode
+
+
 if __name__ == "__main__":
+    if sys.argv[2:3] == ["measure"]:
+        sys.exit(measure(Path(sys.argv[1]), Path(sys.argv[3]), sys.argv[4]))
     sys.exit(main(Path(sys.argv[1]), sys.argv[2:]))
