@@ -43,11 +43,12 @@ test: setup  ## run all tests, on all cores
 test-fast: setup  ## run the quick tests, every stage against the reference
 	$(BIN)/python $(PYTEST) -m "not slow"
 
-# mjlab pins its own mujoco and rsl-rl-lib.
+# A wheel with ROS 2 Humble and Jazzy for Python 3.12; of Isaac Sim, which it belongs to, nothing is needed.
 ROS2 := .venv-ros2
 ROS2_PYTHON ?= $(shell ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.12.*/bin/python 2>/dev/null | head -1)
 $(ROS2)/.ready: tests/ros2/with_ros/requirements.txt
 	$(if $(ROS2_PYTHON),$(ROS2_PYTHON),python3.12) -m venv $(ROS2)
+	$(ROS2)/bin/python -m pip install --disable-pip-version-check --quiet --no-deps isaacsim-ros2==6.2.0.0
 	$(ROS2)/bin/python -m pip install --disable-pip-version-check --quiet --requirement $<
 	@touch $@
 
@@ -59,6 +60,7 @@ bench-ros2: setup $(ROS2)/.ready  ## measure the node in ROS 2 Jazzy: latency, C
 	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
 	$(ROS2)/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared measure benchmarks/results/ros2.json 10
 
+# mjlab pins its own mujoco and rsl-rl-lib.
 $(MJLAB)/.ready: pyproject.toml constraints-mjlab.txt
 	@echo "Installing mjlab and PyTorch into $(MJLAB), nowhere else: 2.3 GB."
 	$(PYTHON) -m venv $(MJLAB)

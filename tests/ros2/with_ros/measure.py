@@ -64,6 +64,10 @@ def percentiles(ages, begin, end):
             "maps": len(values)}  # fmt: skip
 
 
+def counts_of(robot):
+    return {name: robot.count(name) for name in ("received", "fused", "replaced", "without_transform", "unreadable")}
+
+
 def main(prepared, out, minutes):
     """Measure, print and write JSON."""
     rclpy.init()
@@ -78,7 +82,7 @@ def main(prepared, out, minutes):
     end, (after, resident) = time.monotonic(), robot.used()
     found["10 Hz"] = percentiles(robot.ages, begin, end) | {
         "cpu [%]": round(100 * (after - cpu) / (end - begin), 1), "memory [MB]": [round(memory, 1), round(resident, 1)],
-        **robot.heard["counts"],
+        **counts_of(robot),
     }  # fmt: skip
     rate = 2e3 / max(found["10 Hz"]["p50 [ms]"], 5.0)
     begin, (_, memory) = robot.drive(rate, minutes * MINUTE), robot.used()
@@ -86,7 +90,7 @@ def main(prepared, out, minutes):
     first, last = (begin, begin + 30.0), (end - 30.0, end)
     found["overload"] = {"rate [Hz]": round(rate, 1), "minutes": minutes, "memory [MB]": round(memory, 1),
                          "first 30 s": percentiles(robot.ages, *first), "last 30 s": percentiles(robot.ages, *last),
-                         **robot.heard["counts"]}  # fmt: skip
+                         **counts_of(robot)}  # fmt: skip
     robot.stop()
     rclpy.shutdown()
     Path(out).write_text(json.dumps(found, indent=2) + "\n")
