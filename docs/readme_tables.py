@@ -103,6 +103,25 @@ def _speed() -> str:
     return f"{tables.report(load(SPEED))}\n\n{picture}"
 
 
+def _ros2() -> str:
+    """Tabulate how old maps are when they arrive, by load."""
+    found = load("ros2")
+    usual, overload = found["10 Hz"], found["overload"]
+    rows = {
+        "10 Hz": usual,
+        f"{overload['rate [Hz]']:g} Hz, first 30 s": overload["first 30 s"],
+        f"{overload['rate [Hz]']:g} Hz, last 30 s of {overload['minutes']:g} min": overload["last 30 s"],
+    }
+    lines = [[name, f"{row['p50 [ms]']:.1f}", f"{row['p99 [ms]']:.1f}", str(row["maps"])] for name, row in rows.items()]
+    (before, after), end = usual["memory [MB]"], overload["memory [MB]"]
+    text = (
+        f"CPU at 10 Hz: {usual['cpu [%]']:.0f} % of a core. Memory: {before:.0f} MB, {after:.0f} MB after a minute, "
+        f"{end:.0f} MB at the end. Of {overload['sent']:,} clouds sent in the overload {overload['fused']:,} "
+        "were fused; newer ones took the place of the others, in the middleware or in the node."
+    )
+    return f"{markdown_table(['clouds', 'p50 [ms]', 'p99 [ms]', 'maps'], lines)}\n\n{text}"
+
+
 def _long_run() -> str:
     """Tabulate growth over long runs."""
     return growth.table({name: values for name, values in load("long_run").items() if name in long_run.CASES})
@@ -148,6 +167,7 @@ TABLES = {
     "runtime_replay": _made_by(runtime.replay_table, "runtime_replay"),
     "runtime_spacing": _made_by(spacing.table, "runtime_spacing"),
     "runtime_processors": _made_by(runtime.processors_table, "runtime_processors"),
+    "ros2": _ros2,
     "long_run": _long_run,
     "odometry": _made_by(odometry.table, "odometry"),
     "bags": _made_by(bags.table, "bags", "rows"),

@@ -65,7 +65,6 @@ __all__ = [
 
 # Imported when first asked for: a robot's node may run without PyTorch, and not every map needs them all.
 _LATER = {
-    **{"filters": "", "observations": ""},  # `torchelev.filters.gaussian` works without an import of its own
     "AgingConfig": "torchelev.stages.age.config",
     "BodyConfig": "torchelev.stages.measure.config",
     "Box": "torchelev.robot_body.shapes",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -13,14 +14,16 @@ def import_later(package: str, names: dict[str, str]) -> tuple[Callable[[str], A
 
     Args:
         package: its name.
-        names: the module that each name is imported from; a name that is a module itself maps to "".
+        names: the module that each name is imported from. The package's own modules are found without being named.
     """
 
     def get(name: str) -> Any:
-        if name not in names:
+        if name in names:
+            value = getattr(importlib.import_module(names[name]), name)
+        elif name.startswith("_") or importlib.util.find_spec(f"{package}.{name}") is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}", name=name)
-        where = names[name]
-        value = getattr(importlib.import_module(where), name) if where else importlib.import_module(f"{package}.{name}")
+        else:
+            value = importlib.import_module(f"{package}.{name}")
         setattr(sys.modules[package], name, value)
         return value
 

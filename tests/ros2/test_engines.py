@@ -139,6 +139,13 @@ def test_a_robot_needs_no_pytorch(library):
     assert subprocess.run(command, check=True, capture_output=True, text=True).stdout == "1\n"
 
 
+@pytest.mark.parametrize("kind", ["torch", "library"])
+@pytest.mark.parametrize("layout", ["isaaclab", "[1]", '{"pattern": 3}'])
+def test_a_wrong_layout_is_refused(library, kind, layout):
+    with pytest.raises(ValueError):
+        engine_of(kind, library, height_scan=layout)
+
+
 def test_an_engine_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match="no libtorchelev of this machine"):
         make_engine({}, NodeSettings(engine="library", library=str(tmp_path / "none.so")))

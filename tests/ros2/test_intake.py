@@ -15,13 +15,17 @@ def no(_):
 
 def fuse(intake, now=0.0, is_ready=yes):
     """Take what is ready and fuse it -> (message, dt) of each."""
-    return [(one.message, intake.step(one)) for one in intake.take(now, is_ready)[0]]
+    found = []
+    for one in intake.take(now, is_ready)[0]:
+        found.append((one.message, intake.elapsed(one)))
+        intake.note_fused(one, now)
+    return found
 
 
 def test_the_newest_cloud_of_a_topic_wins():
     intake = Intake(wait=0.2)
     for k in range(5):
-        intake.offer("a", k, 0.1 * k, now=0.1 * k)
+        intake.offer("a", k, 1 + 0.1 * k, now=0.1 * k)
     assert fuse(intake) == [(4, 0.0)] and fuse(intake) == []
     assert intake.counts.as_dict() | {"received": 0, "fused": 0, "replaced": 0} == dict.fromkeys(
         intake.counts.as_dict(), 0
@@ -68,3 +72,40 @@ def test_a_clock_that_jumps_back_starts_over():
     assert fuse(intake) == [(2, 0.0)] and intake.stamp == 3.0
     intake.offer("a", 3, 3.1, 0.3)
     assert fuse(intake) == [(3, pytest.approx(0.1))]
+
+
+def test_a_jump_is_seen_before_anything_was_fused():
+    intake = Intake(wait=0.2)
+    intake.offer("a", 0, 100.0, 0.0)
+    assert intake.offer("a", 1, 3.0, 0.1) and intake.counts.replaced == 1
+    assert fuse(intake) == [(1, 0.0)]
+
+
+def test_clouds_without_a_stamp_are_left_out():
+    intake = Intake(wait=0.2)
+    for stamp in (0.0, -1.0):
+        assert not intake.offer("a", 0, stamp, 0.0)
+    assert fuse(intake) == [] and intake.counts.without_stamp == 2
+
+
+def test_a_cloud_that_the_map_refuses_leaves_its_time_to_the_next():
+    intake = Intake(wait=0.2)
+    intake.offer("a", 0, 1.0, 0.0)
+    fuse(intake)
+    intake.offer("a", 1, 1.5, 0.1)
+    intake.take(0.1, yes)  # and not fused
+    intake.offer("a", 2, 2.0, 0.2)
+    assert fuse(intake) == [(2, 1.0)] and intake.counts.fused == 2
+
+
+def test_a_flow_that_stops_is_named():
+    intake = Intake(wait=0.2)
+    assert intake.findings(0.0)[0].startswith("clouds: none was received: check the parameter clouds")
+    intake.offer("a", 0, 1.0, 0.0)
+    intake.take(1.0, no)
+    assert intake.findings(1.0) == ["clouds: none was fused yet (1 received, 1 without_transform): "
+                                    "check tf, stamps and the sensor"]  # fmt: skip
+    intake.offer("a", 0, 2.0, 2.0)
+    fuse(intake, now=2.0)
+    assert intake.findings(3.9) == []
+    assert "none was fused for 5 s" in intake.findings(7.0)[0]

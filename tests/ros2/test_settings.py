@@ -1,8 +1,10 @@
 """The node's parameters: from files, of their types, and refused by name."""
 
 import pytest
+from click.testing import CliRunner
 
-from torchelev.ros2.settings import NodeSettings, changeable, make_settings, read_node_file
+from torchelev.app.ros2_command import ros2_command
+from torchelev.ros2.settings import NodeSettings, changeable, make_settings, nested, read_node_file, split
 
 FILE = """
 map_frame: map
@@ -42,17 +44,17 @@ def test_an_empty_file_is_all_defaults(tmp_path):
         ({"map_fram": "odom"}, "map_fram: is no parameter, got 'map_fram'; there are map, map_frame"),
         ({"clouds": "/points"}, "clouds: must be a list of names, got '/points'"),
         ({"clouds": []}, "clouds: must not be empty"),
-        ({"rate_map": "2"}, "rate_map: must be a float, got '2'; such as 2.0"),
+        ({"rate_map": "2"}, "rate_map: must be a number, got '2'; such as 2.0"),
         ({"rate_map": -1.0}, "rate_map: must be finite and not negative, got -1.0"),
-        ({"rate_map": True}, "rate_map: must be a float, got True"),
-        ({"threads": 1.5}, "threads: must be a int, got 1.5"),
+        ({"rate_map": True}, "rate_map: must be a number, got True"),
+        ({"threads": 1.5}, "threads: must be a whole number, got 1.5"),
         ({"threads": 0}, "threads: must be at least 1, got 0"),
         ({"min_traversability": 1.0}, r"min_traversability: must lie in \[0, 1\), got 1.0"),
         ({"engine": "cuda"}, "engine: must be one of auto, torch, library, got 'cuda'"),
     ],
 )
 def test_wrong_parameters_are_refused_by_name(tmp_path, values, words):
-    with pytest.raises((ValueError, TypeError), match=words):
+    with pytest.raises(ValueError, match=words):
         make_settings(values)
 
 
@@ -60,6 +62,26 @@ def test_errors_name_the_file(tmp_path):
     (tmp_path / "robot.yaml").write_text("thread: 2\nmap: {}\n")
     with pytest.raises(ValueError, match=r"robot.yaml: thread: is no parameter"):
         read_node_file(tmp_path / "robot.yaml")
+
+
+def test_ros_has_names_with_points_and_parameters_of_its_own(tmp_path):
+    given = {"map.grid.resolution": 0.05, "map.drift.gain": 0.5, "rate_map": 1.0, "use_sim_time": True}
+    assert split(nested(given)) == (
+        {"rate_map": 1.0},
+        {"grid": {"resolution": 0.05}, "drift": {"gain": 0.5}},
+    )
+
+
+def test_one_group_alone_is_no_file_of_ros(tmp_path):
+    (tmp_path / "robot.yaml").write_text("grid: {resolution: 0.05}\n")
+    with pytest.raises(ValueError, match="grid: is no parameter"):
+        read_node_file(tmp_path / "robot.yaml")
+
+
+@pytest.mark.parametrize("arguments", [["robot.yaml"], ["--cofnig", "robot.yaml"]])
+def test_what_is_not_for_ros_is_refused(arguments):
+    found = CliRunner().invoke(ros2_command, arguments)
+    assert found.exit_code == 2 and "what is for ROS follows --ros-args" in found.output
 
 
 def test_what_may_change_while_it_runs():

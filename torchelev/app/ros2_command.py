@@ -45,6 +45,8 @@ What follows --ros-args is for ROS: remappings, namespaces, parameters.
 @click.argument("ros_arguments", nargs=-1, type=click.UNPROCESSED, metavar="[--ros-args ...]")
 def ros2_command(config: Path | None, ros_arguments: tuple[str, ...]) -> None:
     """Run `torchelev ros2`."""
+    if ros_arguments and ros_arguments[0] != "--ros-args":
+        raise click.UsageError(f"no such option or argument: {ros_arguments[0]}; what is for ROS follows --ros-args")
     with user_errors():
         from torchelev.ros2.settings import NodeSettings, read_node_file
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 _RESTART = 1.0  # [s] by which a stamp lies before the last one when a clock or a recording started over
+_SILENCE = 2.0  # [s] without a fused cloud from which a diagnosis says so
 
 
 @dataclass
@@ -18,6 +19,7 @@ class Counts:
     replaced: int = 0  #: by a newer one that came before they were fused
     repeated: int = 0  #: had the stamp of one that was fused
     late: int = 0  #: fused, though older than the cloud before
+    without_stamp: int = 0  #: had a stamp of 0 or below
     without_transform: int = 0  #: waited for it in vain
     unreadable: int = 0  #: contradicted themselves, or were refused by the map
     jumps: int = 0  #: of a clock, backwards
@@ -47,46 +49,70 @@ class Intake:
     wait: float  #: [s] that a cloud waits for its transforms
     counts: Counts = field(default_factory=Counts)  #: of all topics
     _waiting: dict[str, Waiting] = field(default_factory=dict)
+    _offered: dict[str, float] = field(default_factory=dict)  # newest stamp of each topic
     _fused: dict[str, float] = field(default_factory=dict)  # stamp of the last cloud of each topic
     _last: float | None = None  # stamp of the map
+    _active: float | None = None  # [s] by the node's clock, of the last cloud that was fused
 
     def offer(self, topic: str, message: Any, stamp: float, now: float) -> bool:
         """Take a cloud that arrived; return whether a clock jumped back, so that old transforms are void."""
         self.counts.received += 1
-        before = self._fused.get(topic)
-        has_jumped = before is not None and stamp < before - _RESTART
+        if stamp <= 0:
+            self.counts.without_stamp += 1
+            return False
+        has_jumped = stamp < self._offered.get(topic, stamp) - _RESTART
         if has_jumped:
-            self.counts.jumps += 1
-            self._waiting.clear()
-            self._fused.clear()
-            self._last = None
-        elif before is not None and stamp == before:
+            self.start_over()
+        elif stamp == self._fused.get(topic):
             self.counts.repeated += 1
             return False
-        if topic in self._waiting:
-            self.counts.replaced += 1
+        self._offered[topic] = max(stamp, self._offered.get(topic, stamp))
+        self.counts.replaced += topic in self._waiting
         self._waiting[topic] = Waiting(topic, message, stamp, now)
         return has_jumped
+
+    def start_over(self) -> None:
+        """Forget all stamps, as a clock jumped."""
+        self.counts.jumps += 1
+        self.counts.replaced += len(self._waiting)
+        for stamps in (self._waiting, self._offered, self._fused):
+            stamps.clear()
+        self._last = self._active = None
 
     def take(self, now: float, is_ready: Callable[[Waiting], bool]) -> tuple[list[Waiting], list[Waiting]]:
         """Return the clouds whose transforms are there, oldest first, and those that waited in vain."""
         ready = sorted((one for one in self._waiting.values() if is_ready(one)), key=lambda one: one.stamp)
-        lost = [one for one in self._waiting.values() if one not in ready and now - one.since > self.wait]
+        topics = {one.topic for one in ready}
+        lost = [one for one in self._waiting.values() if one.topic not in topics and now - one.since > self.wait]
         for one in (*ready, *lost):
             del self._waiting[one.topic]
         self.counts.without_transform += len(lost)
         return ready, lost
 
-    def step(self, cloud: Waiting) -> float:
-        """Note that a cloud is fused; return the seconds since the one before, 0 for a late one."""
-        dt = 0.0 if self._last is None else cloud.stamp - self._last
-        self.counts.late += dt < 0
+    def elapsed(self, cloud: Waiting) -> float:
+        """Return the seconds from the last fused cloud to this one, 0 for a late one."""
+        return 0.0 if self._last is None else max(0.0, cloud.stamp - self._last)
+
+    def note_fused(self, cloud: Waiting, now: float) -> None:
+        """Note that a cloud is in the map."""
         self.counts.fused += 1
+        self.counts.late += self._last is not None and cloud.stamp < self._last
         self._fused[cloud.topic] = cloud.stamp
         self._last = cloud.stamp if self._last is None else max(self._last, cloud.stamp)
-        return max(0.0, dt)
+        self._active = now
 
     @property
     def stamp(self) -> float | None:
         """Stamp [s] of the map; None before the first cloud."""
         return self._last
+
+    def findings(self, now: float) -> list[str]:
+        """Return what is wrong with the flow of clouds, in a sentence."""
+        counts = self.counts
+        if self._active is not None and now - self._active < _SILENCE:
+            return []
+        if not counts.received:
+            return ["clouds: none was received: check the parameter clouds, and reliable against the publisher's QoS"]
+        for_long = "none was fused yet" if self._active is None else f"none was fused for {now - self._active:.0f} s"
+        losses = ", ".join(f"{number} {name}" for name, number in counts.as_dict().items() if number)
+        return [f"clouds: {for_long} ({losses}): check tf, stamps and the sensor"]

@@ -18,12 +18,6 @@ from torchelev.io import occupancy
 from torchelev.ros2.outputs import MapCloud
 
 
-def header_of(frame: str, stamp: float) -> Header:
-    """Return a header of a stamp [s]."""
-    nanoseconds = round(stamp * 1e9)
-    return Header(frame_id=frame, stamp=Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9))
-
-
 def matrix_of(transform: Any) -> NDArray[np.float64]:
     """Return the matrix (4, 4) of a geometry_msgs/Transform."""
     p, q = transform.translation, transform.rotation
@@ -85,7 +79,9 @@ def to_grid_map(grid: plain.GridMap, header: Header) -> Any:
 def to_diagnostics(name: str, values: dict[str, Any], findings: list[str], stamp: Time) -> DiagnosticArray:
     """Return a status: OK, or WARN with what looks wrong."""
     level = DiagnosticStatus.WARN if findings else DiagnosticStatus.OK
-    entries = [KeyValue(key=key, value=f"{value:g}") for key, value in values.items()]
+    entries = [
+        KeyValue(key=key, value=str(value) if isinstance(value, int) else f"{value:g}") for key, value in values.items()
+    ]
     entries += [KeyValue(key=f"finding {k}", value=text) for k, text in enumerate(findings)]
     text = findings[0] if findings else "nothing looks wrong"
     status = DiagnosticStatus(level=level, name=name, message=text, hardware_id="torchelev", values=entries)

@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rclpy
+from builtin_interfaces.msg import Time as Stamp
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Float32MultiArray
+from std_msgs.msg import Float32MultiArray, Header
 from std_srvs.srv import Trigger
 from tf2_ros import Buffer, TransformException, TransformListener
 
-from torchelev.io.bags.point_cloud import CloudError, read_points
+from torchelev.io.bags.point_cloud import CloudError, read_xyz
 from torchelev.io.bags.scans import clean, stamp_of
 from torchelev.ros2 import messages, outputs
 from torchelev.ros2.engine import thinned
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.intake import Intake, Waiting
-from torchelev.ros2.settings import NodeSettings, changeable, make_settings
+from torchelev.ros2.settings import NodeSettings, changeable, is_of_ros, make_settings, nested, split
 
 _TICK = 0.005  # [s] between looks at what is due
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # late subscribers get the last one
@@ -44,37 +49,51 @@ class ElevationMappingNode(Node):
     """
 
     def __init__(self, settings: NodeSettings, cfg: dict[str, Any]) -> None:
-        super().__init__("elevation_mapping")
-        self.settings = make_settings(self._declare(settings))
-        self.engine = make_engine(cfg, self.settings)
+        super().__init__("elevation_mapping", automatically_declare_parameters_from_overrides=True)
+        given, overrides = self._given()
+        self.settings = make_settings({**dataclasses.asdict(settings), **given})
+        self._declare(given)
+        self.engine = make_engine(_merged(cfg, overrides), self.settings)
         self._require_layers(self.settings)
         self.intake, self.schedule = Intake(self.settings.transform_wait), outputs.Schedule()
-        self.has_map = False  # something was fused or loaded
+        self.stamp: Stamp | None = None  # of the map: of the newest cloud, or of the time when it was loaded
         self.buffer = Buffer()
         self._listener = TransformListener(self.buffer, self)
         self._outputs = self._make_outputs()
         for topic in self.settings.clouds:
-            self.create_subscription(PointCloud2, topic, self._receiver(topic), qos_profile_sensor_data)
+            self.create_subscription(PointCloud2, topic, self._receiver(topic), self._qos())
         for name, act in (("save_map", self._save), ("load_map", self._load), ("clear_map", self._clear)):
             self.create_service(Trigger, f"~/{name}", _service(act))
         self.add_on_set_parameters_callback(self._set)
-        self.create_timer(_TICK, self._work)
+        self.create_timer(_TICK, self._work, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        back = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=True)
+        self._jumps = self.get_clock().create_jump_callback(back, post_callback=lambda _: self._start_over())
         if self.settings.load_on_start and Path(self.settings.map_file).exists():
             self.get_logger().info(self._load())
 
     # Parameters ------------------------------------------------------------------------------------------------------
 
-    def _declare(self, settings: NodeSettings) -> dict[str, Any]:
-        """Declare all parameters; return their values."""
-        values = {}
-        for each in dataclasses.fields(settings):
-            default = getattr(settings, each.name)
+    def _given(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the parameters that ROS was given: the node's, and the map's settings."""
+        given = {name: one.value for name, one in self.get_parameters_by_prefix("").items() if not is_of_ros(name)}
+        return split(nested(given))
+
+    def _declare(self, given: dict[str, Any]) -> None:
+        """Declare all parameters with their meanings."""
+        for each in dataclasses.fields(self.settings):
+            value, read_only = getattr(self.settings, each.name), not each.metadata["changeable"]
             describe = ParameterDescriptor(
-                description=each.metadata["meaning"], read_only=not each.metadata["changeable"]
+                name=each.name, description=each.metadata["meaning"], read_only=read_only, dynamic_typing=True
             )
-            given = list(default) if isinstance(default, tuple) else default
-            values[each.name] = self.declare_parameter(each.name, given, describe).value
-        return values
+            if each.name in given:
+                self.undeclare_parameter(each.name)
+            plain = list(value) if isinstance(value, tuple) else value
+            self.declare_parameter(each.name, plain, describe, ignore_override=True)
+
+    def _qos(self) -> QoSProfile:
+        """Return that of clouds: the newest one only, so that none is fused late."""
+        kind = ReliabilityPolicy.RELIABLE if self.settings.reliable else ReliabilityPolicy.BEST_EFFORT
+        return QoSProfile(depth=1, reliability=kind)
 
     def _set(self, parameters: list[Any]) -> SetParametersResult:
         """Take new values of parameters that may change; refuse wrong ones with a sentence."""
@@ -95,12 +114,27 @@ class ElevationMappingNode(Node):
 
     def _receiver(self, topic: str) -> Callable[[PointCloud2], None]:
         def receive(message: PointCloud2) -> None:
-            if self.intake.offer(topic, message, stamp_of(message.header), time.monotonic()):
-                self.buffer.clear()
-                self.get_logger().warning(f"{topic}: the clock jumped back; transforms from before are forgotten")
+            stamp = stamp_of(message.header)
+            if stamp <= 0:
+                text = f"{topic}: left out a cloud: its stamp must be positive, got {stamp:g}; let its driver set it"
+                self.get_logger().warning(text, throttle_duration_sec=5.0)
+            if self.intake.offer(topic, message, stamp, self._now()):
+                self._forget_transforms()
             self._work()
 
         return receive
+
+    def _now(self) -> float:
+        return 1e-9 * self.get_clock().now().nanoseconds
+
+    def _start_over(self) -> None:
+        """Go on after the node's clock jumped back."""
+        self.intake.start_over()
+        self._forget_transforms()
+
+    def _forget_transforms(self) -> None:
+        self.buffer.clear()
+        self.get_logger().warning("the clock jumped back; transforms from before are forgotten")
 
     def _is_ready(self, cloud: Waiting) -> bool:
         stamp, frames = Time.from_msg(cloud.message.header.stamp), self.settings
@@ -109,7 +143,7 @@ class ElevationMappingNode(Node):
 
     def _work(self) -> None:
         """Fuse the clouds whose transforms are there, and publish what is due."""
-        ready, lost = self.intake.take(time.monotonic(), self._is_ready)
+        ready, lost = self.intake.take(self._now(), self._is_ready)
         for cloud in ready:
             self._fuse(cloud)
         for cloud in lost:
@@ -120,12 +154,13 @@ class ElevationMappingNode(Node):
     def _fuse(self, cloud: Waiting) -> None:
         header = cloud.message.header
         try:
-            points = thinned(read_points(cloud.message, cloud.stamp).points, self.settings.max_points)
+            points = thinned(read_xyz(cloud.message)[0], self.settings.max_points)
             T_map_sensor = self._pose(clean(header.frame_id), Time.from_msg(header.stamp))
             T_map_base = self._pose(self.settings.base_frame, Time.from_msg(header.stamp))
-            dt = self.intake.step(cloud)
-            self.engine.update(points, T_map_sensor, T_map_base, dt)
-            self.has_map = True
+            self.engine.update(points, T_map_sensor, T_map_base, self.intake.elapsed(cloud))
+            self.intake.note_fused(cloud, self._now())
+            if self.intake.stamp == cloud.stamp:
+                self.stamp = header.stamp
         except (CloudError, TransformException, ValueError) as error:
             self.intake.counts.unreadable += 1
             self.get_logger().warning(f"{cloud.topic}: left out a cloud: {error}", throttle_duration_sec=5.0)
@@ -164,7 +199,7 @@ class ElevationMappingNode(Node):
 
     def _publish(self, name: str, publisher: Any, make: Callable[[], Any]) -> None:
         """Publish an output if it is due, there is a map, and somebody listens."""
-        if not (self.has_map and publisher.get_subscription_count()):
+        if not publisher.get_subscription_count() or (self.stamp is None and name != "diagnostics"):
             return
         if self.schedule.is_due(name, getattr(self.settings, f"rate_{name}"), time.monotonic()):
             try:
@@ -176,10 +211,7 @@ class ElevationMappingNode(Node):
                 publisher.publish(message)
 
     def _header(self) -> Any:
-        stamp = self.intake.stamp
-        if stamp is None:  # of a map that was loaded
-            stamp = 1e-9 * self.get_clock().now().nanoseconds
-        return messages.header_of(self.settings.map_frame, stamp)
+        return Header(frame_id=self.settings.map_frame, stamp=self.stamp)
 
     def _make_map(self) -> Any:
         return messages.to_grid_map(outputs.grid_map(self.engine, self.settings.layers), self._header())
@@ -200,8 +232,9 @@ class ElevationMappingNode(Node):
 
     def _make_diagnostics(self) -> DiagnosticArray:
         values = {**self.intake.counts.as_dict(), **self.engine.statistics()}
+        findings = [*self.intake.findings(self._now()), *self.engine.diagnose()]
         stamp = self.get_clock().now().to_msg()
-        return messages.to_diagnostics(self.get_fully_qualified_name(), values, self.engine.diagnose(), stamp)
+        return messages.to_diagnostics(self.get_fully_qualified_name(), values, findings, stamp)
 
     # Services --------------------------------------------------------------------------------------------------------
 
@@ -211,7 +244,7 @@ class ElevationMappingNode(Node):
 
     def _load(self) -> str:
         self.engine.load(Path(self.settings.map_file))
-        self.has_map = True
+        self.stamp = self.get_clock().now().to_msg()
         return f"loaded {Path(self.settings.map_file).absolute()}"
 
     def _clear(self) -> str:
@@ -240,11 +273,27 @@ def spin(settings: NodeSettings, cfg: dict[str, Any], arguments: list[str]) -> N
         cfg: the map's settings.
         arguments: for ROS, such as `--ros-args -r points:=/lidar`.
     """
-    rclpy.init(args=arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # rclpy's own handler ends the spin, not an exception in its midst
     try:
+        rclpy.init(args=arguments)
         node = ElevationMappingNode(settings, cfg)
+    except (ParameterException, RuntimeError) as error:  # what ROS was given
+        raise ValueError(f"--ros-args: {error}") from error
+    try:
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass
+    except Exception:
+        if rclpy.ok():  # else it was shut down in the middle of its work
+            raise
     finally:
         rclpy.try_shutdown()
+
+
+def _merged(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """Return nested settings, of which the second come first."""
+    both = dict(a)
+    for name, value in b.items():
+        old = both.get(name)
+        both[name] = _merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return both

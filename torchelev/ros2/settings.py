@@ -13,6 +13,8 @@ from typing import Any
 from torchelev.config_files import read_settings
 from torchelev.errors import require
 
+_KINDS = {str: "text", float: "a number", int: "a whole number", bool: "true or false"}
+_OF_ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")  # parameters that rclpy declares
 ENGINES = ("auto", "torch", "library")
 
 
@@ -26,12 +28,13 @@ class NodeSettings:
     """Parameters of the node. Those that are changeable may be set while it runs.
 
     Raises:
-        ValueError, TypeError: a value has the wrong type or is out of range.
+        ValueError: a value has the wrong type or is out of range.
     """
 
     map_frame: str = _setting("odom", "fixed frame of the map, z up; odom does not jump, which a map likes better")
     base_frame: str = _setting("base_link", "frame that the map's window follows")
     clouds: tuple[str, ...] = _setting(("points",), "topics of sensor_msgs/PointCloud2")
+    reliable: bool = _setting(False, "subscribe to clouds reliably, which publishers of sensor data may not offer")
     transform_wait: float = _setting(0.2, "[s] that a cloud waits for the transforms at its stamp")
     rate_map: float = _setting(2.0, "[Hz] of ~/map, a grid_map_msgs/GridMap; 0: never", True)
     rate_points: float = _setting(1.0, "[Hz] of ~/points, the map as a sensor_msgs/PointCloud2; 0: never", True)
@@ -70,13 +73,14 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     """Return a value of the default's type; whole numbers are floats, too, and lists are tuples."""
     if isinstance(default, tuple):
         is_list = isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
-        require(is_list, name, "must be a list of names", repr(value), "write [name, name]", TypeError)
+        require(is_list, name, "must be a list of names", repr(value), "write [name, name]")
         return tuple(value)
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     if isinstance(default, float) and is_number:
         return float(value)
     kind = type(default)
-    require(type(value) is kind, name, f"must be a {kind.__name__}", repr(value), f"such as {default!r}", TypeError)
+    rule = f"must be {_KINDS[kind]}"
+    require(type(value) is kind, name, rule, repr(value), f"such as {default!r}")
     return value
 
 
@@ -86,23 +90,41 @@ def read_node_file(path: str | Path) -> tuple[NodeSettings, dict[str, Any]]:
     A file of ROS, `node_name: {ros__parameters: {...}}`, is read, too.
 
     Raises:
-        ValueError, TypeError: the file cannot be read, or has a parameter that does not exist or does not fit.
+        ValueError: the file cannot be read, or has a parameter that does not exist or does not fit.
     """
     values = read_settings(path)
-    while len(values) == 1 and isinstance(inner := next(iter(values.values())), dict) and "map" not in values:
-        values = inner  # of a node's name, or ros__parameters
-    settings, cfg = split(values)
+    inner = next(iter(values.values())) if len(values) == 1 else None
+    if isinstance(inner, dict) and isinstance(inner.get("ros__parameters"), dict):
+        values = inner["ros__parameters"]
     try:
+        settings, cfg = split(values)
         return make_settings(settings), cfg
-    except (ValueError, TypeError) as error:
-        raise type(error)(f"{path}: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def split(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the node's parameters and the map's settings."""
     cfg = values.get("map") or {}
     require(isinstance(cfg, dict), "map", "must be the settings of a map", repr(cfg), "write map: {grid: {...}}")
-    return {name: value for name, value in values.items() if name != "map"}, cfg
+    return {name: value for name, value in values.items() if name != "map" and not is_of_ros(name)}, cfg
+
+
+def is_of_ros(name: str) -> bool:
+    """Return whether rclpy declares a parameter itself."""
+    return name.partition(".")[0] in _OF_ROS
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested dicts from names with points between, as ROS has them."""
+    root: dict[str, Any] = {}
+    for name, value in values.items():
+        *groups, last = name.split(".")
+        group = root
+        for each in groups:
+            group = group.setdefault(each, {})
+        group[last] = value
+    return root
 
 
 def make_settings(values: Mapping[str, Any]) -> NodeSettings:

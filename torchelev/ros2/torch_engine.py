@@ -27,9 +27,8 @@ class TorchEngine:
     def __init__(self, cfg: dict[str, Any], settings: NodeSettings) -> None:
         torch.set_num_threads(settings.threads)
         self._map = ElevationMap(ElevationMapConfig.from_dict(cfg))
-        is_name = settings.height_scan in PRESETS
-        given = {} if is_name else json.loads(settings.height_scan)
-        self._scan = HeightScan.preset(settings.height_scan) if is_name else HeightScan(**given)
+        self._map.compile()  # now, not at the first cloud
+        self._scan = _scan_of(settings.height_scan)
 
     def update(self, points: NDArray, T_map_sensor: NDArray, T_map_base: NDArray, dt: float) -> None:
         """Fuse points (N, 3) of one sensor."""
@@ -76,6 +75,18 @@ class TorchEngine:
             fits, "map_file", "must be a map of the same settings", str(path), "load it with those it was saved with"
         )
         self._map.load_state(saved.state)
+
+
+def _scan_of(layout: str) -> HeightScan:
+    """Return the scan of a preset's name, or of a layout as JSON."""
+    if layout in PRESETS:
+        return HeightScan.preset(layout)
+    try:
+        given = json.loads(layout)
+        return HeightScan(**given)
+    except (ValueError, TypeError) as error:
+        rule = f"must be one of {', '.join(PRESETS)}, or a layout as JSON"
+        raise ValueError(f"height_scan: {rule}, got {layout!r} ({error}); use isaac_lab") from error
 
 
 def _pose(T: NDArray) -> Tensor:

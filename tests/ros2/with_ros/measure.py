@@ -71,7 +71,13 @@ def counts_of(robot):
 def main(prepared, out, minutes):
     """Measure, print and write JSON."""
     rclpy.init()
-    settings = ["rate_points:=1000.0", "layers:=[elevation]", "rate_costmap:=0.0", "rate_height_scan:=0.0"]
+    settings = [
+        "rate_points:=1000.0",
+        "layers:=[elevation]",
+        "rate_costmap:=0.0",
+        "rate_height_scan:=0.0",
+        "rate_diagnostics:=1.0",
+    ]
     robot = Measured(prepared / "robot.yaml", "", [x for s in settings for x in ("-p", s)]
                      + ["-p", f"library:={(prepared / 'library').read_text()}"])  # fmt: skip
     robot.start(prepared / "log")
@@ -85,12 +91,20 @@ def main(prepared, out, minutes):
         **counts_of(robot),
     }  # fmt: skip
     rate = 2e3 / max(found["10 Hz"]["p50 [ms]"], 5.0)
+    robot.spin(1.5)
+    before = counts_of(robot)
     begin, (_, memory) = robot.drive(rate, minutes * MINUTE), robot.used()
-    end = time.monotonic()
-    first, last = (begin, begin + 30.0), (end - 30.0, end)
-    found["overload"] = {"rate [Hz]": round(rate, 1), "minutes": minutes, "memory [MB]": round(memory, 1),
-                         "first 30 s": percentiles(robot.ages, *first), "last 30 s": percentiles(robot.ages, *last),
-                         **counts_of(robot)}  # fmt: skip
+    robot.spin(1.5)
+    end = begin + minutes * MINUTE
+    found["overload"] = {
+        "rate [Hz]": round(rate, 1),
+        "sent": int(rate * minutes * MINUTE),
+        "minutes": minutes,
+        "memory [MB]": round(memory, 1),
+        "first 30 s": percentiles(robot.ages, begin, begin + 30.0),
+        "last 30 s": percentiles(robot.ages, end - 30.0, end),
+        **{name: number - before[name] for name, number in counts_of(robot).items()},
+    }
     robot.stop()
     rclpy.shutdown()
     Path(out).write_text(json.dumps(found, indent=2) + "\n")

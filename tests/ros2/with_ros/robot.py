@@ -144,7 +144,7 @@ class Robot(Node):
 
     def send_until(self, holds, stamp, poses=True, **cloud):
         """Send poses and a cloud until something holds: what is sent by best effort may be lost."""
-        end = time.monotonic() + 15.0
+        end = time.monotonic() + 45.0  # a participant that was killed is missed after 20 s
         while not holds():
             assert time.monotonic() < end, (self.heard.get("counts"), open(self.log).read())
             if poses:

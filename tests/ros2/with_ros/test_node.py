@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,11 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 rosbags = pytest.importorskip("rosbags.highlevel")
+if "TORCHELEV_ROS2_FOLDER" not in os.environ:
+    pytest.skip("run by make test-ros2", allow_module_level=True)
 
 from rclpy.serialization import deserialize_message  # noqa: E402
-from robot import LATCHED, Robot, cells_of  # noqa: E402
+from robot import LATCHED, Robot, cells_of, to_cloud  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
@@ -165,7 +168,60 @@ def test_two_robots_in_namespaces(make_robot):
         np.testing.assert_allclose(heights, 0.1 * k, atol=0.01)
 
 
-def test_ctrl_c_ends_it(make_robot):
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_in_the_middle_of_its_work(make_robot, how):
     robot = make_robot()
-    robot.stop(signal.SIGINT)
-    assert robot.process.returncode == 0 and "Traceback" not in Path(robot.log).read_text()
+    robot.fuse(1000.0)
+    for k in range(5):
+        robot.send_poses(1000.1 + 0.1 * k)
+        robot.send_cloud(1000.1 + 0.1 * k)
+    robot.stop(how)
+    text = Path(robot.log).read_text()
+    assert "Traceback" not in text, text
+
+
+def test_stamps_are_those_of_the_clouds_and_bad_ones_are_refused(make_robot):
+    robot = make_robot()
+    robot.fuse(1700000000.0)
+    cloud = to_cloud(np.zeros((100, 3), np.float32) - 1, 0.0, "lidar")
+    for sec, nanosec in ((-3, 0), (0, 0)):
+        cloud.header.stamp.sec, cloud.header.stamp.nanosec = sec, nanosec
+        robot.send("/lidar/points", cloud)
+    robot.wait(lambda: robot.count("without_stamp") >= 1)
+    robot.send_poses(1700000001.0)
+    robot.spin(0.1)
+    cloud.header.stamp.sec, cloud.header.stamp.nanosec = 1700000000, 123456789
+    robot.send("/lidar/points", cloud)
+    robot.wait(lambda: "points" in robot.heard and robot.heard["points"].header.stamp == cloud.header.stamp)
+
+
+def test_a_node_that_fuses_nothing_says_so(make_robot):
+    robot = make_robot()
+    robot.wait(lambda: "status" in robot.heard)
+    assert robot.heard["status"].level == b"\x01"
+    assert robot.heard["status"].message.startswith("clouds: none was received")
+    robot.send_until(lambda: robot.count("without_transform") >= 1, 1000.0, poses=False, frame="nowhere")
+    robot.wait(lambda: "none was fused yet" in robot.heard["status"].message)
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["-p", "rate_costmap:=often"], "rate_costmap: must be a number, got 'often'"),
+        (["-p", "clouds:=/points"], "clouds: must be a list of names, got '/points'"),
+        (["-p", "bas_frame:=x"], "bas_frame: is no parameter"),
+        (["-p", "map.grid.resolution:=-1.0"], "grid.resolution: must be a positive number, got -1.0"),
+    ],
+)
+def test_what_ros_gives_wrong_is_refused_in_a_sentence(tmp_path, arguments, words):
+    robot = Robot(CONFIG, "", ["-p", LIBRARY, *arguments])
+    done = subprocess.run(robot.command, capture_output=True, text=True, cwd=tmp_path, timeout=30)
+    robot.destroy_node()
+    assert done.returncode != 0 and words in done.stderr and "Traceback" not in done.stderr
+
+
+def test_numbers_and_settings_of_the_map_may_come_from_ros(make_robot):
+    robot = make_robot("", "-p", "rate_costmap:=5", "-p", "map.grid.length_x:=4.0")
+    robot.fuse(1000.0)
+    robot.wait(lambda: "costmap" in robot.heard)
+    assert (robot.heard["costmap"].info.width, robot.heard["costmap"].info.height) == (40, 80)

@@ -33,6 +33,22 @@ def read_points(message: Any, stamp: float, period: float | None = None) -> Clou
     Raises:
         CloudError: x, y or z is missing, the sizes contradict each other, or this is not a PointCloud2.
     """
+    points, fields = read_xyz(message)
+    name = next((name for name in TIME_FIELDS if name in fields), None)
+    if name is None or not len(points):
+        return Cloud(points, None)
+    raw, is_hit = _read_column(message, fields[name]), np.isfinite(points).all(1) & (points != 0).any(1)
+    times = to_seconds(raw, stamp, period, is_hit)
+    note = describe_times(name, raw, times, stamp, period, is_hit)
+    return Cloud(points, times, () if note is None else (note,))
+
+
+def read_xyz(message: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Return the points (N, 3) [m] of a sensor_msgs/PointCloud2, without their times, and its fields by name.
+
+    Raises:
+        CloudError: as `read_points`.
+    """
     if not hasattr(message, "fields") or not hasattr(message, "point_step"):
         kind = type(message).__name__
         raise CloudError(
@@ -44,14 +60,7 @@ def read_points(message: Any, stamp: float, period: float | None = None) -> Clou
         raise CloudError(f"the cloud has no field {', '.join(missing)}; it has {', '.join(fields) or 'none'}")
     columns = [_read_column(message, fields[name]) for name in "xyz"]
     with np.errstate(over="ignore"):  # a missing return may be the largest double
-        points = np.stack([column.astype(np.float32) for column in columns], -1)
-    name = next((name for name in TIME_FIELDS if name in fields), None)
-    if name is None or not len(points):
-        return Cloud(points, None)
-    raw, is_hit = _read_column(message, fields[name]), np.isfinite(points).all(1) & (points != 0).any(1)
-    times = to_seconds(raw, stamp, period, is_hit)
-    note = describe_times(name, raw, times, stamp, period, is_hit)
-    return Cloud(points, times, () if note is None else (note,))
+        return np.stack([column.astype(np.float32) for column in columns], -1), fields
 
 
 def _read_column(message: Any, field: Any) -> NDArray:
