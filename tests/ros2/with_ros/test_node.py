@@ -48,7 +48,9 @@ def make_robot(tmp_path):
 
 
 def test_a_bag_through_topics_gives_the_map_of_torchelev_map(make_robot):
-    robot = make_robot()
+    robot = make_robot("", "-p", "reliable:=true")  # all clouds must arrive
+    robot.clouds["/lidar/points"] = robot.create_publisher(PointCloud2, "/lidar/points", 10)
+    robot.wait(lambda: robot.clouds["/lidar/points"].get_subscription_count() > 0)
     moving, fixed = (
         robot.create_publisher(TFMessage, "/tf", 100),
         robot.create_publisher(TFMessage, "/tf_static", LATCHED),
