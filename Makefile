@@ -56,7 +56,7 @@ test-ros2: setup $(ROS2)/.ready  ## test the node in real ROS 2, Humble and Jazz
 	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
 	$(ROS2)/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared
 
-bench-ros2: setup $(ROS2)/.ready  ## measure the node in ROS 2 Jazzy: latency, CPU and memory, ten minutes of them overloaded
+bench-ros2: setup $(ROS2)/.ready  ## measure the node in ROS 2 Jazzy: latency, CPU and memory, twelve minutes
 	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
 	$(ROS2)/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared measure benchmarks/results/ros2.json 10
 
