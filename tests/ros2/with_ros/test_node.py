@@ -15,6 +15,7 @@ if "TORCHELEV_ROS2_FOLDER" not in os.environ:
 
 from rclpy.serialization import deserialize_message  # noqa: E402
 from robot import LATCHED, Robot, cells_of, to_cloud  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
@@ -227,3 +228,21 @@ def test_numbers_and_settings_of_the_map_may_come_from_ros(make_robot):
     robot.fuse(1000.0)
     robot.wait(lambda: "costmap" in robot.heard)
     assert (robot.heard["costmap"].info.width, robot.heard["costmap"].info.height) == (40, 80)
+
+
+def test_simulated_time_that_starts_over(make_robot):
+    robot = make_robot("", "-p", "use_sim_time:=true")
+    clock = robot.create_publisher(Clock, "/clock", 10)
+    for begin in (100.0, 50.0):
+        before = robot.count("fused")
+        for k in range(1, 30):
+            stamp = begin + 0.05 * k
+            now = Clock()
+            now.clock.sec, now.clock.nanosec = int(stamp), round(stamp % 1 * 1e9)
+            clock.publish(now)
+            robot.send_poses(stamp)
+            robot.spin(0.03)
+            robot.send_cloud(stamp)
+            robot.spin(0.03)
+        robot.wait(lambda: robot.count("fused") > before + 5)  # noqa: B023
+    assert robot.count("jumps") == 1 and robot.count("without_transform") <= 5
