@@ -39,6 +39,9 @@ class Map {
 
     // Points (N, 3) of one sensor, seen from T_map_sensor.
     void update(const std::vector<float>& points, const Pose& T_map_sensor, const Pose& T_map_base, double dt) {
+        if (points.size() % 3)
+            throw std::invalid_argument("points: must be x, y, z of each, got " + std::to_string(points.size()) +
+                                        " numbers; give (N, 3)");
         update({1, int64_t(points.size() / 3), points.data(), T_map_sensor.data(), T_map_base.data(), nullptr, dt,
                 nullptr, nullptr});
     }
@@ -48,11 +51,23 @@ class Map {
     void save(const std::string& path) const { check(torchelev_map_save(map.get(), path.c_str())); }
     void load(const std::string& path) { check(torchelev_map_load(map.get(), path.c_str())); }
 
-    // A layer (H, W), NaN where not known.
+    // H and W, the cells along x and y.
+    std::array<int64_t, 2> size() const {
+        std::array<int64_t, 2> found;
+        check(torchelev_map_size(map.get(), &found[0], &found[1], nullptr));
+        return found;
+    }
+
+    // Position [m] of the window's corner: cell (i, j) spans i to i + 1 cells along x from it, and j to j + 1 along y.
+    std::array<double, 2> corner() const {
+        std::array<double, 2> found;
+        check(torchelev_map_corner(map.get(), found.data()));
+        return found;
+    }
+
+    // A layer (H, W), NaN where not known: cell (i, j) is value i * W + j.
     std::vector<float> layer(const std::string& name) const {
-        int64_t rows, columns;
-        check(torchelev_map_size(map.get(), &rows, &columns, nullptr));
-        std::vector<float> values(size_t(rows * columns));
+        std::vector<float> values(size_t(size()[0] * size()[1]));
         check(torchelev_map_layer(map.get(), name.c_str(), values.data(), values.size()));
         return values;
     }
