@@ -1,5 +1,8 @@
 """The node's parameters: from files, of their types, and refused by name."""
 
+import dataclasses
+from pathlib import Path
+
 import pytest
 from click.testing import CliRunner
 
@@ -87,3 +90,13 @@ def test_what_is_not_for_ros_is_refused(arguments):
 def test_what_may_change_while_it_runs():
     assert {"rate_map", "layers", "min_traversability", "map_file"} <= changeable()
     assert not {"clouds", "map_frame", "engine", "threads"} & changeable()
+
+
+def test_the_page_lists_every_parameter_with_its_default():
+    text = (Path(__file__).parents[2] / "docs" / "howto" / "ros2.md").read_text()
+    for each in dataclasses.fields(NodeSettings):
+        rows = [line for line in text.splitlines() if line.startswith(f"| `{each.name}`")]
+        assert len(rows) == 1 and each.metadata["meaning"] in rows[0], each.name
+        default = f"[{', '.join(each.default)}]" if isinstance(each.default, tuple) else str(each.default)
+        shown = rows[0].split("|")[2].strip(" `")
+        assert shown.replace("_", "").lower() == (default or "''").replace("_", "").lower(), each.name
