@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -11,6 +13,12 @@ from benchmarks import RESULTS
 from torchelev.app.results import write_json
 
 _OUT = click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Output folder.")
+
+
+def _report(found: dict[str, Any], path: Path, table: Callable[[dict[str, Any]], str] | None = None) -> None:
+    """Write what was found, and print it: as JSON, or by a function that tabulates it."""
+    write_json(path, found)
+    click.echo(table(found) if table else json.dumps(found, indent=2))
 
 
 @click.group(help=__doc__)
@@ -26,9 +34,7 @@ def speed(rounds: int, seconds: float, out: Path) -> None:
     """Time start, updates and a loop of 50 Hz, beside Python: runtime_speed.json."""
     from benchmarks.runtime.speed import measure
 
-    found = measure(rounds, seconds)
-    write_json(out / "runtime_speed.json", found)
-    click.echo(json.dumps(found, indent=2))
+    _report(measure(rounds, seconds), out / "runtime_speed.json")
 
 
 @main.command()
@@ -38,9 +44,7 @@ def sanitize(seconds: int, out: Path) -> None:
     """Replay streams and read damaged files under sanitizers: runtime_sanitizers.json."""
     from benchmarks.runtime.proofs import sanitize as prove
 
-    found = prove(seconds)
-    write_json(out / "runtime_sanitizers.json", found)
-    click.echo(json.dumps(found, indent=2))
+    _report(prove(seconds), out / "runtime_sanitizers.json")
 
 
 @main.command()
@@ -49,9 +53,7 @@ def processors(out: Path) -> None:
     """Compare code for other processors, aarch64 emulated by qemu-user: runtime_processors.json."""
     from benchmarks.runtime.proofs import compare_processors
 
-    found = compare_processors()
-    write_json(out / "runtime_processors.json", found)
-    click.echo(json.dumps(found, indent=2))
+    _report(compare_processors(), out / "runtime_processors.json")
 
 
 @main.command()
@@ -60,9 +62,7 @@ def replay(out: Path) -> None:
     """Map the scenes of the accuracy and feature tables by Python and by the library: runtime_replay.json."""
     from benchmarks.runtime.replay import replay as map_by_both
 
-    found = map_by_both()
-    write_json(out / "runtime_replay.json", found)
-    click.echo(json.dumps(found, indent=2))
+    _report(map_by_both(), out / "runtime_replay.json")
 
 
 @main.command()
@@ -71,9 +71,7 @@ def spacing(out: Path) -> None:
     """Read points 0.1 m apart of maps with other cells: runtime_spacing.json."""
     from benchmarks.runtime.spacing import measure, table
 
-    found = measure()
-    write_json(out / "runtime_spacing.json", found)
-    click.echo(table(found))
+    _report(measure(), out / "runtime_spacing.json", table)
 
 
 if __name__ == "__main__":

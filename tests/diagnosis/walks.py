@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.diagnosis.pose_hypotheses import to_quaternion, to_rotation
+from torchelev.frames.quaternions import to_quaternion, to_rotation
 from torchelev.sim import DepthCamera, Lidar, mount, walk
 from torchelev.sim.exact import scenes as library
 

@@ -128,7 +128,7 @@ from torchelev.ros2.settings import NodeSettings
 engine = make_engine({}, NodeSettings(library=sys.argv[1]))
 engine.update(np.zeros((9, 3), np.float32) - 1, np.eye(4), np.eye(4), 0.0)
 outputs.grid_map(engine, ["elevation"]), outputs.costmap(engine, 0.5), outputs.map_cloud(engine, ["elevation"])
-import torchelev.io.bags.point_cloud, torchelev.app.ros2_command
+import torchelev.io.bags.point_cloud, torchelev.app.cli, torchelev.app.ros2_command, torchelev.frames.quaternions
 assert "torch" not in sys.modules
 print(int(np.isfinite(engine.layer("elevation")).sum()))
 """

@@ -11,7 +11,6 @@ from typing import Any
 import click
 
 from torchelev import __version__
-from torchelev.app.mapping.map_command import run_map
 from torchelev.app.mapping.map_help import MAP_HELP
 from torchelev.app.mapping.map_options import map_options
 from torchelev.app.mapping.map_request import MapRequest
@@ -34,6 +33,8 @@ def main() -> None:
 @map_options
 def map_command(**options: Any) -> None:
     """Run `torchelev map`; its help text is `MAP_HELP`."""
+    from torchelev.app.mapping.map_command import run_map
+
     sys.exit(run_map(MapRequest(**options)))
 
 

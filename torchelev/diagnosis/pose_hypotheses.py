@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from torchelev.diagnosis.scan_fit import Fit, Scan, Undo, evaluate, find_plane
 from torchelev.frames.camera_axes import CAMERA_AXES
+from torchelev.frames.quaternions import to_quaternion, to_rotation
 
 _TILTED, _LEVEL = np.cos(np.radians([8.0, 1.5]))  # cosines of the ground's tilt
 _OPTICAL = CAMERA_AXES["optical"]  # takes x right, y down, z forward to x forward, y left, z up
@@ -19,24 +20,6 @@ def _compose(rotation: NDArray, position: NDArray) -> NDArray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, position
     return T
-
-
-def to_quaternion(R: NDArray) -> NDArray:
-    """Return the unit quaternion (w, x, y, z) of a rotation (Bar-Itzhack, 2000)."""
-    K = np.array([
-        [np.trace(R), R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-        [0, R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
-        [0, 0, R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
-        [0, 0, 0, R[2, 2] - R[0, 0] - R[1, 1]],
-    ])  # fmt: skip
-    return np.linalg.eigh(K, UPLO="U")[1][:, -1]
-
-
-def to_rotation(q: NDArray) -> NDArray:
-    """Return the rotation of a unit quaternion (w, x, y, z)."""
-    w, (x, y, z) = q[0], q[1:]
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * skew + 2 * skew @ skew
 
 
 def _keep(scan: Scan) -> tuple[NDArray, NDArray]:

@@ -13,8 +13,26 @@ Isaac Gym (legged_gym), ROS, SciPy     x, y, z, w    ROS: "optical" (`*_optical_
 =====================================  ============  =========================================
 """
 
-from torchelev.frames.camera_axes import change_axes
-from torchelev.frames.constructors import transform, transform_matrix, transform_xyzw
-from torchelev.frames.motion import deskew, interpolate_poses
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torchelev.lazy_names import import_later
+
+if TYPE_CHECKING:
+    from torchelev.frames.camera_axes import change_axes
+    from torchelev.frames.constructors import transform, transform_matrix, transform_xyzw
+    from torchelev.frames.motion import deskew, interpolate_poses
 
 __all__ = ["change_axes", "deskew", "interpolate_poses", "transform", "transform_matrix", "transform_xyzw"]
+
+# Imported when first asked for: `quaternions` need no PyTorch.
+_LATER = {
+    "change_axes": "torchelev.frames.camera_axes",
+    "deskew": "torchelev.frames.motion",
+    "interpolate_poses": "torchelev.frames.motion",
+    "transform": "torchelev.frames.constructors",
+    "transform_matrix": "torchelev.frames.constructors",
+    "transform_xyzw": "torchelev.frames.constructors",
+}
+__getattr__, __dir__ = import_later(__name__, _LATER)

@@ -14,15 +14,15 @@ _SILENCE = 2.0  # [s] without a fused cloud from which a diagnosis says so
 class Counts:
     """How many clouds were received and what became of them."""
 
-    received: int = 0  #: all that arrived
-    fused: int = 0  #: into the map
-    replaced: int = 0  #: by a newer one that came before they were fused
-    repeated: int = 0  #: had the stamp of one that was fused
-    late: int = 0  #: fused, though older than the cloud before
-    without_stamp: int = 0  #: had a stamp of 0 or below
-    without_transform: int = 0  #: waited for it in vain
-    unreadable: int = 0  #: contradicted themselves, or were refused by the map
-    jumps: int = 0  #: of a clock, backwards
+    received: int = 0  #: clouds that arrived
+    fused: int = 0  #: clouds that were added to the map
+    replaced: int = 0  #: clouds that a newer one replaced before they were fused
+    repeated: int = 0  #: clouds with the stamp of one that was fused already
+    late: int = 0  #: fused clouds that were older than the one before
+    without_stamp: int = 0  #: clouds whose stamp was 0 or negative
+    without_transform: int = 0  #: clouds left out because their transforms did not arrive in time
+    unreadable: int = 0  #: clouds that could not be read, or that the map refused
+    jumps: int = 0  #: times that a clock jumped backwards
 
     def as_dict(self) -> dict[str, int]:
         """Return all counts by name."""
@@ -32,7 +32,7 @@ class Counts:
 class Waiting(NamedTuple):
     """A cloud that waits for its transforms."""
 
-    topic: str  #: on which it came
+    topic: str  #: topic of the cloud
     message: Any  #: the cloud
     stamp: float  #: [s] of the message
     since: float  #: [s] by the node's own clock

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension
 
+from torchelev.frames.quaternions import to_rotation
 from torchelev.io import grid_map as plain
 from torchelev.io import occupancy
 from torchelev.ros2.outputs import MapCloud
@@ -21,15 +22,10 @@ from torchelev.ros2.outputs import MapCloud
 def matrix_of(transform: Any) -> NDArray[np.float64]:
     """Return the matrix (4, 4) of a geometry_msgs/Transform."""
     p, q = transform.translation, transform.rotation
-    x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / np.linalg.norm([q.x, q.y, q.z, q.w])
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), p.x],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), p.y],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), p.z],
-            [0, 0, 0, 1],
-        ]
-    )
+    quat = np.array([q.w, q.x, q.y, q.z])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = to_rotation(quat / np.linalg.norm(quat)), (p.x, p.y, p.z)
+    return T
 
 
 def to_occupancy_grid(grid: occupancy.OccupancyGrid, header: Header) -> OccupancyGrid:

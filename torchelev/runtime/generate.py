@@ -39,7 +39,7 @@ FOLDER = Path(__file__).parent / "generated"
 _NOTE = "// Written by `python -m torchelev.runtime.generate`.\n"
 _ONLY_PYTHON = (RobotBody, LearnedTraversabilityConfig)  # settings of these types need Python
 _PLANNING = (RobotConfig,)  # settings that no update reads
-# The filters that the library has: `KINDS` in source/filters/chain.cpp.
+# The filters of the library that have settings: `KINDS` in source/filters/kinds.cpp.
 _FILTERS = ("box", "gaussian", "inpaint_diffusion", "inpaint_minimum", "median")
 _DTYPES = {"float": "F32", "int64_t": "I64", "uint8_t": "U8"}  # of safetensors
 
@@ -183,7 +183,7 @@ def _default_settings() -> str:
 
 
 def _filter_settings() -> Iterator[str]:
-    """Yield a row for each setting of the filters that the library has, with its default."""
+    """Yield a row for each setting of the library's filters, with its default."""
     for name in _FILTERS:
         for setting, parameter in settings_of(name).items():
             usual = "NAN" if parameter.default is None else _number(parameter.default)

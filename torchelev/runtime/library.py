@@ -11,23 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
-
-_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
-
-
-#: fields of `torchelev_statistics`, by whether they are numbers of metres
-STATISTICS = {
-    **dict.fromkeys(
-        (
-            "points_used",
-            *(f"rejected_{gate}" for gate in ("invalid", "range", "body", "overhang", "outside", "outlier", "edge")),
-            "drift_points",
-        ),
-        False,
-    ),
-    **dict.fromkeys(("drift_error", "drift_correction", "disagreement"), True),
-    **dict.fromkeys(("cleared_seen_through", "cleared_other_floors", "cells_bounded"), False),
-}
+from torchelev.runtime.structures import COUNT, POINTER, STATISTICS, Input, Limits, Statistics
 
 
 class LibraryError(ValueError):
@@ -36,29 +20,6 @@ class LibraryError(ValueError):
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
         self.status = status
-
-
-class Limits(ctypes.Structure):
-    """`torchelev_limits`."""
-
-    _fields_ = (("max_points", _COUNT), ("max_sensors", ctypes.c_int32), ("num_threads", ctypes.c_int32))
-
-
-class _Statistics(ctypes.Structure):
-    """`torchelev_statistics`."""
-
-    _fields_ = tuple((name, ctypes.c_double if metres else _COUNT) for name, metres in STATISTICS.items())
-
-
-class _Input(ctypes.Structure):
-    """`torchelev_input`."""
-
-    _fields_ = (
-        *(("num_sensors", ctypes.c_int32), ("num_points", _COUNT)),
-        *((name, _POINTER) for name in ("points", "T_map_sensor", "T_map_base", "T_base_links")),
-        ("dt", ctypes.c_double),
-        *((name, _POINTER) for name in ("variance", "pose_covariance")),
-    )
 
 
 def build_library() -> ctypes.CDLL:
@@ -104,8 +65,8 @@ def _version() -> str:
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
     for name in ("torchelev_last_error", "torchelev_version", "torchelev_map_link_name"):
         getattr(library, name).restype = ctypes.c_char_p
-    library.torchelev_map_tensor.restype = _POINTER
-    library.torchelev_scan_size.restype = library.torchelev_scan_num_feet.restype = _COUNT
+    library.torchelev_map_tensor.restype = POINTER
+    library.torchelev_scan_size.restype = library.torchelev_scan_num_feet.restype = COUNT
     return library
 
 
@@ -149,7 +110,7 @@ class CMap:
         max_sensors: int = 4,
         num_threads: int = 1,
     ) -> None:
-        self._library, self._map = library, _POINTER()
+        self._library, self._map = library, POINTER()
         create = "create_from_text" if "{" in str(config) else "create"
         limits = Limits(max_points, max_sensors, num_threads)
         self._call(f"torchelev_map_{create}", _text(str(config)), ctypes.byref(limits), ctypes.byref(self._map))
@@ -166,7 +127,7 @@ class CMap:
     @functools.cached_property
     def size(self) -> tuple[int, int]:
         """H and W."""
-        rows, columns = _COUNT(), _COUNT()
+        rows, columns = COUNT(), COUNT()
         self._call("torchelev_map_size", self._map, ctypes.byref(rows), ctypes.byref(columns), None)
         return rows.value, columns.value
 
@@ -191,7 +152,7 @@ class CMap:
         variance = _array("variance", variance, np.float32, (S, N))
         covariance = _array("pose_covariance", pose_covariance, np.float64, (S, 6, 6))
         addresses = (_address(value) for value in (points, *poses))
-        entry = _Input(S, N, *addresses, dt, _address(variance), _address(covariance))
+        entry = Input(S, N, *addresses, dt, _address(variance), _address(covariance))
         self._call("torchelev_map_update", self._map, ctypes.byref(entry))
 
     @property
@@ -203,7 +164,7 @@ class CMap:
     def move(self, T_map_base: Any) -> None:
         """Move the window to the robot."""
         pose = _array("T_map_base", T_map_base, np.float64, (4, 4))
-        self._call("torchelev_map_move", self._map, _POINTER(_address(pose)))
+        self._call("torchelev_map_move", self._map, POINTER(_address(pose)))
 
     def reset(self) -> None:
         """Forget everything."""
@@ -212,7 +173,7 @@ class CMap:
     def layer(self, name: str) -> NDArray:
         """Return a layer (H, W), NaN where not known."""
         values = np.empty(self.size, np.float32)
-        address = _POINTER(_address(values))
+        address = POINTER(_address(values))
         self._call("torchelev_map_layer", self._map, _text(name), address, ctypes.c_size_t(values.size))
         return values
 
@@ -228,8 +189,8 @@ class CMap:
         """Return a layer's values at points (M, 2) [m], and where they are known."""
         xy = _array("xy", xy, np.float64, (-1, 2))
         values, known = np.empty(len(xy), np.float32), np.empty(len(xy), bool)
-        places = (_POINTER(_address(array)) for array in (values, known))
-        at = _POINTER(_address(xy)), _COUNT(len(xy))
+        places = (POINTER(_address(array)) for array in (values, known))
+        at = POINTER(_address(xy)), COUNT(len(xy))
         self._call("torchelev_map_sample", self._map, _text(name), _text(mode), *at, *places)
         return values, known
 
@@ -249,7 +210,7 @@ class CMap:
 
     def statistics(self) -> dict[str, float]:
         """Return what the last update did, by name."""
-        found = _Statistics()
+        found = Statistics()
         self._call("torchelev_map_statistics", self._map, ctypes.byref(found))
         return {name: getattr(found, name) for name in STATISTICS}
 
@@ -282,7 +243,7 @@ class _Reader:
     kind: str
 
     def __init__(self, emap: CMap, settings: str) -> None:
-        self._library, self._handle, self._emap = emap._library, _POINTER(), emap
+        self._library, self._handle, self._emap = emap._library, POINTER(), emap
         emap._call(f"torchelev_{self.kind}_create", emap._map, _text(settings), ctypes.byref(self._handle))
 
     def __del__(self) -> None:
@@ -290,7 +251,7 @@ class _Reader:
             getattr(self._library, f"torchelev_{self.kind}_free")(self._handle)
 
     def _read(self, *arrays: NDArray | None) -> None:
-        places = (_POINTER(_address(array)) for array in arrays)
+        places = (POINTER(_address(array)) for array in arrays)
         self._emap._call(f"torchelev_{self.kind}_read", self._handle, self._emap._map, *places)
 
 
@@ -317,7 +278,7 @@ class CImage(_Reader):
 
     def __call__(self, T_map_base: Any) -> NDArray:
         """Return the image (C, H, W)."""
-        shape = (_COUNT * 3)()
+        shape = (COUNT * 3)()
         self._emap._call("torchelev_image_shape", self._handle, shape)
         pose, values = _array("T_map_base", T_map_base, np.float64, (4, 4)), np.empty(tuple(shape), np.float32)
         self._read(pose, values)
