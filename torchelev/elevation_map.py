@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -18,7 +19,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
 from torchelev.diagnosis.update_times import UpdateTimes, timed
-from torchelev.errors import require, require_count
+from torchelev.errors import require, require_count, require_positive
 from torchelev.inputs import checks
 from torchelev.inputs.chunks import make_chunks, run_in_chunks
 from torchelev.inputs.update_inputs import Inputs, check_inputs, placeholder_inputs, require_full_precision, requires_dt
@@ -32,7 +33,7 @@ from torchelev.stages.complete import forget_completed
 from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement
 from torchelev.stages.initialize import METHODS, Site, initialize
 from torchelev.stages.measure.stage import measure
-from torchelev.state import MapState, Measurement, forget, map_layers
+from torchelev.state import MapState, Measurement, forget, forget_cells, map_layers
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -333,10 +334,30 @@ class ElevationMap(ReadableMap):
         """
         require(method in METHODS, "method", f"must be one of {', '.join(METHODS)}", repr(method), "use linear")
         feet = checks.check_feet(feet, self.num_envs, self.device, self.check_values)
+        self._revise(lambda state: initialize(state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance))
+
+    def clear_around(self, center: Float[Tensor, "B 2"], radius: float) -> None:
+        """Forget the cells around a place, such as where the robot was touched, carried, or saw itself.
+
+        Args:
+            center: x, y of each environment, map frame [m]; give float64 far from the origin.
+            radius: cells whose centres lie within it are forgotten [m].
+
+        Raises:
+            TypeError: if `center` is no tensor of floats.
+            ValueError: if a shape does not fit, or the radius is not positive and finite.
+        """
+        center = checks.check_center(center, self.num_envs, self.device, self.check_values)
+        require_positive(radius=radius)
+        away = self.cell_centers() - center[:, None, None].double()
+        cells = torch.linalg.vector_norm(away, dim=-1) <= radius
+        self._revise(lambda state: forget_cells(state, cells))
+
+    def _revise(self, change: Callable[[MapState], MapState]) -> None:
+        """Change the heights besides updates, and rate the map anew."""
         self._derived.clear()
         with torch.no_grad():
-            state = subtract_disagreement(self.measured_state)
-            state = initialize(state, feet, method, self.cfg.grid, self.cfg.fusion.max_variance)
+            state = change(subtract_disagreement(self.measured_state))
             write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
 
     def initialize_from(

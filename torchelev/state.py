@@ -131,6 +131,12 @@ def _fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | N
         values.fill_(blank)
 
 
+def forget_cells(state: MapState, cells: Bool[Tensor, "B H W"]) -> MapState:
+    """Return the state with these cells blank, as if they had never been known."""
+    blank = {name: torch.where(cells, BLANK.get(name, 0), getattr(state, name)) for name in LAYERS}
+    return state._replace(**{name: value.to(getattr(state, name).dtype) for name, value in blank.items()})
+
+
 def partial_state(**layers: Tensor) -> MapState:
     """Return a state of some layers, for functions that read no others."""
     return MapState(**(dict.fromkeys(MapState._fields) | layers))  # type: ignore[arg-type]

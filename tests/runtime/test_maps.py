@@ -361,3 +361,42 @@ def test_another_map_is_refused(library, walked, tmp_path):
     for call in (found.save, found.load):
         with pytest.raises(LibraryError, match=r"cannot be (read|written) \(No such file"):
             call(tmp_path / "none" / "a.safetensors")
+
+
+@pytest.mark.parametrize("method", ["linear", "nearest"])
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_ground_points_and_cleared_cells_as_in_python(library, method, number):
+    emap, found = te.ElevationMap(CONFIGS["default"]), CMap(library, json.dumps(CONFIGS["default"].to_dict()))
+    for points, T_map_sensor, T_map_base, dt in instants(num=2):
+        update(emap, points, T_map_sensor, T_map_base, dt)
+        found.update(*numpy(points, T_map_sensor, T_map_base, dt))
+    feet = np.random.default_rng(number).uniform(-0.8, 0.8, (number, 3)) * [1, 1, 0.1]
+    center, known = np.array([0.3, -0.2]), []
+    tolerance = {"elevation": 1e-5, "traversability": 2e-3}  # a rating by tensors rounds otherwise near level ground
+    for step in ("clear", "initialize"):
+        if step == "clear":
+            emap.clear_around(torch.from_numpy(center)[None], 0.7), found.clear_around(center, 0.7)
+        else:
+            emap.initialize(torch.from_numpy(feet)[None], method), found.initialize(feet, method)
+        for name in LAYERS:
+            wanted = getattr(emap.state, name)[0].numpy()
+            np.testing.assert_allclose(found.tensor(name, wanted.dtype), wanted.ravel(), atol=tolerance.get(name, 3e-4), err_msg=name)
+        known.append(int(emap.validity.sum()))
+        if step == "clear":
+            away = np.linalg.norm(emap.cell_centers()[0].numpy() - center, axis=-1)
+            assert not emap.validity[0].numpy()[away <= 0.7].any()
+    assert 500 < known[0] < known[1]
+
+
+def test_bad_ground_points_and_places_are_refused_in_pythons_sentences(library):
+    emap, found = te.ElevationMap(CONFIGS["default"]), CMap(library, json.dumps(CONFIGS["default"].to_dict()))
+    for feet, method in [(np.zeros((0, 3)), "linear"), (np.full((2, 3), np.nan), "linear"), (np.zeros((2, 3)), "cubic")]:
+        with pytest.raises(ValueError) as wanted:
+            emap.initialize(torch.from_numpy(feet)[None], method)
+        with pytest.raises(LibraryError) as actual:
+            found.initialize(feet, method)
+        assert str(actual.value).split(":")[0] == str(wanted.value).split(":")[0]
+        assert str(actual.value).split("; ")[1] == str(wanted.value).split("; ")[1]
+    for center, radius in [([np.nan, 0], 1.0), ([0, 0], 0.0), ([0, 0], np.inf)]:
+        with pytest.raises(LibraryError, match="center: must be finite|radius: must be positive"):
+            found.clear_around(center, radius)

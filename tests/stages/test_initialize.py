@@ -106,3 +106,29 @@ def test_refuses(feet, method, named):
     with pytest.raises(ValueError, match=named):
         emap.initialize(feet, method=method)
     assert not emap.validity.any()
+
+
+def test_cells_around_a_place_are_forgotten():
+    emap = small_map(2)
+    emap.initialize(torch.from_numpy(random_feet(0)), method="nearest")
+    other = emap.elevation[1].clone()
+    emap.clear_around(torch.tensor([[0.1, 0.0], [50.0, 0.0]]), 0.3)
+    away = np.linalg.norm(emap.cell_centers()[0].numpy() - [0.1, 0.0], axis=-1)
+    assert (emap.validity[0].numpy() == (away > 0.3)).all() and (away <= 0.3).sum() > 10
+    assert torch.equal(emap.elevation[1], other) and bool(emap.validity[1].all())
+    for name in ("elevation", "traversability", "normal_z", "time"):
+        assert bool(torch.isnan(emap.layer(name)[0][torch.from_numpy(away <= 0.3)]).all())
+
+
+@pytest.mark.parametrize(
+    "center, radius, words",
+    [
+        (torch.zeros(2), 1.0, r"center: expected \(1, 2\), got \(2,\)"),
+        (torch.full((1, 2), torch.nan), 1.0, "center: must be finite, got NaN"),
+        (torch.zeros(1, 2), 0.0, "radius: must be a positive number, got 0.0"),
+        (torch.zeros(1, 2), float("nan"), "radius: must be a positive number"),
+    ],
+)
+def test_places_that_do_not_fit_are_refused(center, radius, words):
+    with pytest.raises(ValueError, match=words):
+        small_map(1).clear_around(center, radius)

@@ -191,6 +191,16 @@ def check_xy(name: str, xy: object, num_envs: int, device: torch.device) -> Tens
     return value
 
 
+def check_center(center: object, num_envs: int, device: torch.device, always: bool) -> Tensor:
+    """Return a finite place (B, 2) of each environment."""
+    value = check_tensor("center", center, device, FLOATS)
+    fits = tuple(value.shape) == (num_envs, 2)
+    require(fits, "center", f"expected ({num_envs}, 2)", tuple(value.shape), "give x and y of each environment")
+    if is_readable(value, always):
+        require(bool(torch.isfinite(value).all()), "center", "must be finite", "NaN or inf", "give x and y in metres")
+    return value
+
+
 def check_feet(feet: object, num_envs: int, device: torch.device, always: bool) -> Tensor:
     """Return finite ground points (B, K, 3), at least one per environment."""
     value = check_tensor("feet", feet, device, FLOATS)

@@ -170,6 +170,16 @@ class CMap:
         """Forget everything."""
         self._call("torchelev_map_reset", self._map)
 
+    def initialize(self, feet: Any, method: str = "linear") -> None:
+        """Estimate the unknown cells from ground points (K, 3) [m]."""
+        feet = _array("feet", feet, np.float64, (-1, 3))
+        self._call("torchelev_map_initialize", self._map, POINTER(_address(feet)), COUNT(len(feet)), _text(method))
+
+    def clear_around(self, center: Any, radius: float) -> None:
+        """Forget the cells within a radius [m] of a place (2,) [m]."""
+        center = _array("center", center, np.float64, (2,))
+        self._call("torchelev_map_clear_around", self._map, POINTER(_address(center)), ctypes.c_double(radius))
+
     def layer(self, name: str) -> NDArray:
         """Return a layer (H, W), NaN where not known."""
         values = np.empty(self.size, np.float32)

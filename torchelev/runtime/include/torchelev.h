@@ -119,6 +119,18 @@ torchelev_status torchelev_map_update(torchelev_map* map, const torchelev_input*
 /** Move the window to the robot, T_map_base (4, 4), without new points. */
 torchelev_status torchelev_map_move(torchelev_map* map, const double* T_map_base);
 
+/**
+ * Estimate the unknown cells from ground points, such as the feet that a robot stands on: `ElevationMap.initialize`.
+ *
+ * @param feet (K, 3) [m] map frame.
+ * @param number K.
+ * @param method "linear" fills the convex hull of the feet, "nearest" the whole window.
+ */
+torchelev_status torchelev_map_initialize(torchelev_map* map, const double* feet, int64_t number, const char* method);
+
+/** Forget the cells whose centres lie within a radius [m] of a place (x, y) [m] in the map frame. */
+torchelev_status torchelev_map_clear_around(torchelev_map* map, const double center[2], double radius);
+
 /** Write H and W, the cells along x and y, and the side of a cell [m]. Each pointer may be null. */
 torchelev_status torchelev_map_size(const torchelev_map* map, int64_t* rows, int64_t* columns, double* resolution);
 

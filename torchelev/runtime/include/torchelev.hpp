@@ -48,6 +48,17 @@ class Map {
 
     void move(const Pose& T_map_base) { check(torchelev_map_move(map.get(), T_map_base.data())); }
     void reset() { check(torchelev_map_reset(map.get())); }
+
+    // Estimate the unknown cells from ground points (K, 3) [m], "linear" within their hull, or "nearest".
+    void initialize(const std::vector<double>& feet, const std::string& method = "linear") {
+        check(torchelev_map_initialize(map.get(), feet.data(), int64_t(feet.size() / 3), method.c_str()));
+    }
+
+    // Forget the cells within a radius [m] of a place (x, y) [m].
+    void clear_around(const std::array<double, 2>& center, double radius) {
+        check(torchelev_map_clear_around(map.get(), center.data(), radius));
+    }
+
     void save(const std::string& path) const { check(torchelev_map_save(map.get(), path.c_str())); }
     void load(const std::string& path) { check(torchelev_map_load(map.get(), path.c_str())); }
 

@@ -58,6 +58,8 @@ struct torchelev_map {
     void forget();                               // make the map blank
     void update(const torchelev_input& input);
     void move(const double* T_map_base);
+    void initialize(const double* feet, int64_t number, const std::string& method);
+    void clear_around(double x, double y, double radius);
     // Measure the points of a past update again, into memory that the next update overwrites.
     const Measurement& measure_again(const PastUpdate& past);
     CellValue read(Layer layer, int64_t cell) const;  // a cell of a layer by its number
@@ -70,6 +72,9 @@ struct torchelev_map {
     void find_own(const torchelev_input& input);
     void run(const torchelev_input& input, const Stage* stages, int64_t number);
     void warm_up();
+    template <class Change>
+    void revise(const Change& change);
+    void blank(int64_t cell);
 };
 
 // Refuse matrices (number, 4, 4) that are not given or not rigid, as `check_pose` does.

@@ -125,6 +125,17 @@ torchelev_status torchelev_map_move(torchelev_map* map, const double* T_map_base
     return status_of([&] { given("map", map).move(T_map_base); });
 }
 
+torchelev_status torchelev_map_initialize(torchelev_map* map, const double* feet, int64_t number, const char* method) {
+    return status_of([&] { given("map", map).initialize(feet, number, &given("method", method)); });
+}
+
+torchelev_status torchelev_map_clear_around(torchelev_map* map, const double center[2], double radius) {
+    return status_of([&] {
+        const double* xy = &given("center", center);
+        given("map", map).clear_around(xy[0], xy[1], radius);
+    });
+}
+
 torchelev_status torchelev_map_size(const torchelev_map* map, int64_t* rows, int64_t* columns, double* resolution) {
     return status_of([&] {
         const torchelev_map& m = given("map", map);
