@@ -380,7 +380,8 @@ def test_ground_points_and_cleared_cells_as_in_python(library, method, number):
             emap.initialize(torch.from_numpy(feet)[None], method), found.initialize(feet, method)
         for name in LAYERS:
             wanted = getattr(emap.state, name)[0].numpy()
-            np.testing.assert_allclose(found.tensor(name, wanted.dtype), wanted.ravel(), atol=tolerance.get(name, 3e-4), err_msg=name)
+            actual, atol = found.tensor(name, wanted.dtype), tolerance.get(name, 3e-4)
+            np.testing.assert_allclose(actual, wanted.ravel(), atol=atol, err_msg=name)
         known.append(int(emap.validity.sum()))
         if step == "clear":
             away = np.linalg.norm(emap.cell_centers()[0].numpy() - center, axis=-1)
@@ -390,7 +391,8 @@ def test_ground_points_and_cleared_cells_as_in_python(library, method, number):
 
 def test_bad_ground_points_and_places_are_refused_in_pythons_sentences(library):
     emap, found = te.ElevationMap(CONFIGS["default"]), CMap(library, json.dumps(CONFIGS["default"].to_dict()))
-    for feet, method in [(np.zeros((0, 3)), "linear"), (np.full((2, 3), np.nan), "linear"), (np.zeros((2, 3)), "cubic")]:
+    none, unknown, some = np.zeros((0, 3)), np.full((2, 3), np.nan), np.zeros((2, 3))
+    for feet, method in [(none, "linear"), (unknown, "linear"), (some, "cubic")]:
         with pytest.raises(ValueError) as wanted:
             emap.initialize(torch.from_numpy(feet)[None], method)
         with pytest.raises(LibraryError) as actual:

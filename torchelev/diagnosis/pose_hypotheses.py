@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.diagnosis.scan_fit import Fit, Scan, Undo, evaluate, find_plane
-from torchelev.frames.camera_axes import CAMERA_AXES
+from torchelev.frames.axes import CAMERA_AXES
 from torchelev.frames.quaternions import to_quaternion, to_rotation
 
 _TILTED, _LEVEL = np.cos(np.radians([8.0, 1.5]))  # cosines of the ground's tilt

@@ -1,28 +1,19 @@
-"""The three conventions for a camera's axes, and changes between them."""
+"""Changes between the three conventions for a camera's axes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.frames.arrays import assemble, to_floats
+from torchelev.frames.axes import require_axes, turn
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-#: Rotations R_forward_camera (3, 3): from these axes to x forward, y left, z up.
-CAMERA_AXES = {
-    "forward": np.eye(3),
-    "optical": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
-    "opengl": np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]),
-}
-_R_WANTED_GIVEN = {(g, w): (CAMERA_AXES[w].T @ CAMERA_AXES[g]).tolist() for g in CAMERA_AXES for w in CAMERA_AXES}
 
 
 def change_axes(T_a_camera: Float[Tensor, "*B 4 4"] | ArrayLike, given: str, wanted: str) -> Float[Tensor, "*B 4 4"]:
@@ -48,16 +39,3 @@ def change_axes(T_a_camera: Float[Tensor, "*B 4 4"] | ArrayLike, given: str, wan
     require(T.shape[-2:] == (4, 4), "T_a_camera", "expected (..., 4, 4)", tuple(T.shape), hint)
     axes = turn(T[..., :3, :3].unbind(-1), require_axes("given", given), require_axes("wanted", wanted))
     return assemble(T[..., :3, 3], torch.stack(axes, -1))
-
-
-def turn(xyz: Sequence[Tensor], given: str, wanted: str) -> list[Tensor]:
-    """Return x, y and z of points in other camera axes. Each is one of the given ones or its opposite, exactly."""
-    rows = _R_WANTED_GIVEN[given, wanted]
-    return [next(c if r > 0 else -c for r, c in zip(row, xyz, strict=True) if r) for row in rows]
-
-
-def require_axes(name: str, axes: str) -> str:
-    """Return the name of camera axes; ValueError if there are none of this name."""
-    rule, hint = f"must be one of {', '.join(CAMERA_AXES)}", "give the axes of the camera's pose"
-    require(axes in CAMERA_AXES, name, rule, repr(axes), hint)
-    return axes

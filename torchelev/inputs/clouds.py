@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require, require_count, require_positive
-from torchelev.frames.camera_axes import require_axes, turn
+from torchelev.frames.axes import require_axes, turn
 from torchelev.inputs.checks import require_tensor
 from torchelev.ops.transforms import is_readable
 

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.io.bags.messages.camera_info import choose_matrix
+from torchelev.frames.axes import turn
+from torchelev.io.bags.messages.camera_info import choose_lens, pixel_rays
 from torchelev.io.bags.messages.cloud import Cloud, CloudError, Note
 from torchelev.io.bags.messages.depth_png import decode_depth
 from torchelev.io.bags.messages.raw import as_bytes
@@ -34,10 +35,6 @@ def read_depth_image(message: Any, settings: CameraSettings) -> Cloud:
     Raises:
         CloudError: the image holds no depth, or does not fit its CameraInfo.
     """
-    import torch
-
-    from torchelev.inputs.clouds import depth_to_points
-
     is_compressed = hasattr(message, "format")
     scale = settings.scale
     data = as_bytes(message.data)
@@ -46,9 +43,10 @@ def read_depth_image(message: Any, settings: CameraSettings) -> Cloud:
     if (depth.shape[1], depth.shape[0]) != (camera.width, camera.height):
         actual, expected = f"{depth.shape[1]} x {depth.shape[0]}", f"{camera.width} x {camera.height}"
         raise CloudError(f"the depth image has {actual} pixels, and its CameraInfo {expected}")
-    matrix, note = choose_matrix(camera, settings.topic)
-    K = torch.tensor(matrix, dtype=torch.float32)
-    points = depth_to_points(torch.from_numpy(depth)[None], K, frame=settings.axes)[0].numpy()
+    lens, note = choose_lens(camera, settings.topic)
+    x, y = pixel_rays(lens, *depth.shape)
+    hit = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+    points = np.stack(turn([x * hit, y * hit, hit], "optical", settings.axes), -1).reshape(-1, 3)
     encoding = message.format if is_compressed else message.encoding
     doubt = _doubt(depth, None if "32FC1" in encoding else _SATURATED * (scale or _MILLIMETRES))
     return Cloud(points, None, tuple(found for found in (note, doubt) if found is not None))
