@@ -8,10 +8,11 @@ import pytest
 
 import torchelev as te
 from tests.runtime.test_maps import instants
+from torchelev.frames.quaternions import to_rotation
 from torchelev.io.grid_map import from_grid_map, to_grid_map
 from torchelev.io.occupancy import to_occupancy_grid
 from torchelev.ros2 import outputs
-from torchelev.ros2.engine import thinned
+from torchelev.ros2.engine import Frame, thinned
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.settings import NodeSettings
 from torchelev.runtime.library import build_library
@@ -29,9 +30,9 @@ def engine_of(kind, library, **settings):
     return make_engine(CFG, NodeSettings(engine=kind, library=library, **settings))
 
 
-def walk(engine, num=4):
+def walk(engine, num=4, **more):
     for points, T_map_sensor, T_map_base, dt in instants(1, num):
-        engine.update(points[0].numpy(), T_map_sensor[0].numpy(), T_map_base.numpy(), dt)
+        engine.update(Frame(points[0].numpy(), T_map_sensor[0].numpy(), T_map_base.numpy(), dt, **more))
     return T_map_base.numpy()
 
 
@@ -122,11 +123,12 @@ sys.meta_path.insert(0, Blocked())
 import importlib.util
 importlib.util.find_spec = lambda name, found=importlib.util.find_spec: None if name == "torch" else found(name)
 import numpy as np
-from torchelev.ros2 import outputs
+from torchelev.ros2 import outputs, sensors
+from torchelev.ros2.engine import Frame
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.settings import NodeSettings
 engine = make_engine({}, NodeSettings(library=sys.argv[1]))
-engine.update(np.zeros((9, 3), np.float32) - 1, np.eye(4), np.eye(4), 0.0)
+engine.update(Frame(np.zeros((9, 3), np.float32) - 1, np.eye(4), np.eye(4), 0.0))
 outputs.grid_map(engine, ["elevation"]), outputs.costmap(engine, 0.5), outputs.map_cloud(engine, ["elevation"])
 import torchelev.io.bags.point_cloud, torchelev.app.cli, torchelev.app.ros2_command, torchelev.frames.quaternions
 assert "torch" not in sys.modules
@@ -156,3 +158,117 @@ def test_an_engine_that_is_not_there_is_named(tmp_path):
 def test_settings_of_the_map_are_the_default_config(library):
     engine = make_engine({}, NodeSettings(engine="library", library=library))
     assert engine.window().shape == (te.GridConfig().height, te.GridConfig().width)
+
+
+def test_covariances_and_poses_of_links_reach_both(library):
+    covariance = np.diag([0, 0, 0.01, 0, 0, 0]).astype(float)
+    body = {"capsules": [{"link": "leg", "start": [0, 0, 0], "end": [0, 0, -0.4], "radius": 0.3}]}
+    cfg = CFG | {"sensor": {"body": body}}
+    links, found = np.eye(4)[None], []
+    for kind in ("torch", "library"):
+        engine = make_engine(cfg, NodeSettings(engine=kind, library=library))
+        assert engine.links == ["leg"]
+        walk(engine, 2, pose_covariance=covariance, T_base_links=links)
+        found.append(engine)
+    variances = [engine.layer("variance") for engine in found]
+    assert np.array_equal(*variances, equal_nan=True) and np.nanmin(variances[0]) > 0.005
+    assert found[0].statistics() == found[1].statistics()
+
+
+@pytest.mark.parametrize("kind", ["torch", "library"])
+def test_ground_points_and_cleared_cells(library, kind):
+    engine = engine_of(kind, library)
+    walk(engine, 1)
+    center, known = np.array(engine.window().center), np.isfinite(engine.layer("elevation")).sum()
+    engine.clear_around(center, 0.5)
+    cleared = known - np.isfinite(engine.layer("elevation")).sum()
+    assert 0 < cleared <= np.pi * 0.5**2 / 0.05**2 * 1.1
+    feet = np.append(center, 0.3) + np.array([[0.2, 0.2, 0], [-0.2, 0.2, 0], [0, -0.2, 0]])
+    engine.initialize(feet, "linear")
+    i, j = ((center - engine.window().corner) / 0.05).astype(int)
+    assert engine.layer("elevation")[i, j] == pytest.approx(0.3, abs=1e-5)
+
+
+def test_planes_paths_and_sites_need_pytorch(engines, tmp_path):
+    torch, c = engines
+    for ask in (
+        c.planes,
+        lambda: c.check_path(np.zeros((1, 3)), CORNERS),
+        lambda: c.initialize_from(tmp_path, np.eye(4)),
+    ):
+        with pytest.raises(ValueError, match="needs PyTorch, and the node's engine is the C library"):
+            ask()
+    assert isinstance(torch.planes(), list)
+
+
+CORNERS = np.array([[0.2, 0.1], [0.2, -0.1], [-0.2, -0.1], [-0.2, 0.1]])
+
+
+def ground(heights):
+    """An engine of PyTorch that knows these heights (H, W)."""
+    engine = make_engine(CFG, NodeSettings(engine="torch"))
+    known = torch_tensor(heights)[None]
+    engine._map.state.elevation.copy_(known), engine._map.state.validity.fill_(True)
+    engine._map.state.variance.fill_(1e-4)
+    engine._map.initialize(torch_tensor(np.zeros((1, 1, 3))))  # rates it
+    return engine
+
+
+def torch_tensor(values):
+    import torch
+
+    return torch.as_tensor(values, dtype=torch.float32)
+
+
+def test_paths_over_a_step_are_unsafe_from_there_on():
+    heights = np.zeros((80, 60))
+    heights[50:] = 0.5  # x > 0.5 m
+    engine = ground(heights)
+    path = np.array([[-1.0, 0, 0], [0.0, 0, 0.3], [1.0, 0, 0]])
+    checked = engine.check_path(path, CORNERS)
+    assert not checked.is_safe and checked.unsafe == [2] and "pose 2 cannot be reached safely" in checked.reason
+    assert engine.check_path(path[:2], CORNERS).is_safe and engine.check_path(path[:1], CORNERS).unsafe == []
+
+
+def test_outlines_of_a_table_and_its_floor():
+    heights = np.zeros((80, 60))
+    heights[30:50, 20:40] = 0.4
+    outlines = outputs.outlines(ground(heights).planes())
+    assert [(one.kind, one.region) for one in outlines if one.kind != "inset"] == [
+        ("boundary", 0),
+        ("hole", 0),
+        ("boundary", 1),
+    ]
+    table = next(one.corners for one in outlines if one.kind == "inset" and one.region == 1)
+    assert table[:, 2] == pytest.approx(0.4, abs=1e-3)
+    assert (abs(table[:, 0]) < 0.48).all() and abs(table[:, 0]).max() > 0.4
+
+
+def test_a_part_of_the_map(engines):
+    window = engines[1].window()
+    x, y = window.corner[0] + 1.0, window.corner[1] + 0.5
+    grid = outputs.grid_map(engines[1], ["elevation"], outputs.area_of((x, y), (0.5, 0.4), 0.05))
+    part = from_grid_map(grid)
+    assert part.layers["elevation"].shape == (10, 8)
+    np.testing.assert_allclose(part.center[:2], (x, y), atol=1e-6)
+    whole = engines[1].layer("elevation")
+    assert np.array_equal(part.layers["elevation"], whole[15:25, 6:14], equal_nan=True)
+    edge = from_grid_map(outputs.grid_map(engines[1], ["elevation"], outputs.area_of(window.corner, (1, 1), 0.05)))
+    assert edge.layers["elevation"].shape == (10, 10)
+    with pytest.raises(ValueError, match="has no cells around"):
+        outputs.grid_map(engines[1], ["elevation"], outputs.area_of((x + 50, y), (1, 1), 0.05))
+
+
+def test_a_body_as_solids():
+    capsule = {"link": "leg", "start": [0, 0, 0], "end": [0.3, 0, 0.4], "radius": 0.1}
+    box = {"link": "trunk", "center": [0.1, 0, 0], "half_lengths": [0.3, 0.2, 0.1]}
+    trunk, cylinder, *balls = outputs.solids({"capsules": [capsule], "boxes": [box]}, "base")
+    assert (trunk.link, trunk.kind, trunk.size) == ("trunk", "box", (0.6, 0.4, 0.2))
+    assert [one.kind for one in balls] == ["sphere", "sphere"] and balls[1].position.tolist() == [0.3, 0, 0.4]
+    assert cylinder.size == pytest.approx((0.2, 0.2, 0.5))
+    np.testing.assert_allclose(to_rotation(cylinder.quat_wxyz)[:, 2], [0.6, 0, 0.8], atol=1e-12)
+    (only,) = outputs.solids({"lower": [-0.4, -0.2, 0], "upper": [0.4, 0.2, 0.2]}, "base")
+    assert only.link == "base" and only.position == pytest.approx([0, 0, 0.1]) and only.size == (0.8, 0.4, 0.2)
+    assert outputs.solids(None, "base") == []
+    down = outputs.solids({"capsules": [capsule | {"end": [0, 0, -1]}]}, "base")[0]
+    np.testing.assert_allclose(to_rotation(down.quat_wxyz)[:, 2], [0, 0, -1], atol=1e-12)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,32 @@ class Window(NamedTuple):
         )
 
 
+class Frame(NamedTuple):
+    """The points of one sensor at one instant."""
+
+    points: NDArray[np.float32]  #: (N, 3) [m] sensor frame
+    T_map_sensor: NDArray[np.float64]  #: (4, 4)
+    T_map_base: NDArray[np.float64]  #: (4, 4)
+    dt: float  #: [s] since the last one
+    pose_covariance: NDArray[np.float64] | None = None  #: (6, 6) of the sensor's pose; None: it is exact
+    T_base_links: NDArray[np.float64] | None = None  #: (K, 4, 4) in the order of `Engine.links`; None without links
+
+
+class PathCheck(NamedTuple):
+    """Where a footprint may stand along a path."""
+
+    is_safe: bool  #: all along
+    unsafe: list[int]  #: numbers of the poses that cannot be reached safely
+    reason: str  #: a sentence
+
+
 class Engine(Protocol):
     """What a node asks of a map."""
 
-    def update(self, points: NDArray, T_map_sensor: NDArray, T_map_base: NDArray, dt: float) -> None:
-        """Fuse points (N, 3) of one sensor."""
+    links: list[str]  #: names of the links of the robot's body, whose poses updates take
+
+    def update(self, frame: Frame) -> None:
+        """Fuse the points of one sensor."""
 
     def window(self) -> Window:
         """Return where the cells lie."""
@@ -47,8 +68,23 @@ class Engine(Protocol):
     def diagnose(self) -> list[str]:
         """Return what looks wrong with the inputs."""
 
+    def planes(self) -> list[Any]:
+        """Return the planar regions; ValueError if this engine finds none."""
+
+    def check_path(self, poses: NDArray[np.float64], footprint: NDArray[np.float64]) -> PathCheck:
+        """Move a footprint (V, 2) [m] along poses (T, 3), x, y [m] and yaw [rad]; ValueError if it cannot."""
+
     def reset(self) -> None:
         """Forget everything."""
+
+    def clear_around(self, center: NDArray[np.float64], radius: float) -> None:
+        """Forget the cells within a radius [m] of a place (2,) [m]."""
+
+    def initialize(self, feet: NDArray[np.float64], method: str) -> None:
+        """Estimate the unknown cells from ground points (K, 3) [m]."""
+
+    def initialize_from(self, site: Path, T_map_base: NDArray[np.float64]) -> None:
+        """Start with what a site map knows; ValueError if this engine cannot."""
 
     def save(self, path: Path) -> None:
         """Save the map; ValueError or OSError if this fails."""
@@ -57,6 +93,6 @@ class Engine(Protocol):
         """Load a map that was saved; ValueError or OSError if this fails, and the map is as it was."""
 
 
-def thinned(points: NDArray, most: int) -> NDArray:
+def thinned(points: NDArray, max_points: int) -> NDArray:
     """Return every k-th point, so that there are at most so many."""
-    return points[:: max(1, math.ceil(len(points) / most))]
+    return points[:: max(1, math.ceil(len(points) / max_points))]

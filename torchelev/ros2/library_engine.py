@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from torchelev.config_files import to_json
 from torchelev.errors import require
-from torchelev.ros2.engine import Window
+from torchelev.ros2.engine import Frame, PathCheck, Window
 from torchelev.ros2.settings import NodeSettings
+
+_NEEDS_TORCH = "{}: needs PyTorch, and the node's engine is the C library; install torch, or set engine to torch"
 
 
 def find_library(path: str) -> Path:
@@ -43,10 +45,13 @@ class LibraryEngine:
         library = open_library(find_library(settings.library))
         self._map = CMap(library, json.dumps(to_json(cfg)), settings.max_points, 1, settings.threads)
         self._scan = self._map.scan(settings.height_scan)
+        self.links = self._map.links
 
-    def update(self, points: NDArray, T_map_sensor: NDArray, T_map_base: NDArray, dt: float) -> None:
-        """Fuse points (N, 3) of one sensor."""
-        self._map.update(points[None], T_map_sensor[None], T_map_base, dt)
+    def update(self, frame: Frame) -> None:
+        """Fuse the points of one sensor."""
+        covariance = None if frame.pose_covariance is None else frame.pose_covariance[None]
+        links = {"T_base_links": frame.T_base_links, "pose_covariance": covariance}
+        self._map.update(frame.points[None], frame.T_map_sensor[None], frame.T_map_base, frame.dt, **links)
 
     def window(self) -> Window:
         """Return where the cells lie."""
@@ -68,9 +73,29 @@ class LibraryEngine:
         """Return what looks wrong with the inputs."""
         return self._map.diagnose()
 
+    def planes(self) -> list[Any]:
+        """Refuse: the library finds no planes."""
+        raise ValueError(_NEEDS_TORCH.format("planes"))
+
+    def check_path(self, poses: NDArray[np.float64], footprint: NDArray[np.float64]) -> PathCheck:
+        """Refuse: the library checks no paths."""
+        raise ValueError(_NEEDS_TORCH.format("check_path"))
+
+    def initialize_from(self, site: Path, T_map_base: NDArray[np.float64]) -> None:
+        """Refuse: the library reads no site maps."""
+        raise ValueError(_NEEDS_TORCH.format("initialize_from_site"))
+
     def reset(self) -> None:
         """Forget everything."""
         self._map.reset()
+
+    def clear_around(self, center: NDArray[np.float64], radius: float) -> None:
+        """Forget the cells within a radius [m] of a place (2,) [m]."""
+        self._map.clear_around(center, radius)
+
+    def initialize(self, feet: NDArray[np.float64], method: str) -> None:
+        """Estimate the unknown cells from ground points (K, 3) [m]."""
+        self._map.initialize(feet, method)
 
     def save(self, path: Path) -> None:
         """Save the map."""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.grid_map import GridMap, grid_map_of
 from torchelev.io.occupancy import OccupancyGrid, occupancy_of
-from torchelev.ros2.engine import Engine
+from torchelev.ros2.engine import Engine, Window
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])  # quat_wxyz
 
 
 class MapCloud(NamedTuple):
@@ -20,12 +22,95 @@ class MapCloud(NamedTuple):
     data: NDArray[np.float32]  #: (N, len(names))
 
 
-def grid_map(engine: Engine, layers: Sequence[str]) -> GridMap:
-    """Return layers as a GridMap."""
+class Outline(NamedTuple):
+    """A polygon of a planar region."""
+
+    kind: str  #: "boundary", "hole", or "inset", where a foot may be put
+    region: int  #: from 0 on, the largest first
+    corners: NDArray[np.float64]  #: (K, 3) [m] map frame, the first not repeated
+
+
+class Solid(NamedTuple):
+    """A simple solid of the robot's body."""
+
+    link: str  #: frame that it is fixed to
+    kind: str  #: "box", "cylinder" along z, or "sphere"
+    position: NDArray[np.float64]  #: (3,) [m] of its centre
+    quat_wxyz: NDArray[np.float64]  #: (4,)
+    size: tuple[float, float, float]  #: [m] along its own x, y and z
+
+
+def grid_map(engine: Engine, layers: Sequence[str], area: Window | None = None) -> GridMap:
+    """Return layers as a GridMap, of the cells in an area; None: of all."""
     window = engine.window()
     values = {name: engine.layer(name) for name in layers}
+    if area is not None:
+        rows, columns = area_cells(window, area)
+        values = {name: layer[rows, columns] for name, layer in values.items()}
+        corner = (window.corner[axis] + part.start * window.resolution for axis, part in enumerate((rows, columns)))
+        shape = (rows.stop - rows.start, columns.stop - columns.start)
+        window = Window(tuple(corner), window.resolution, shape)  # type: ignore[arg-type]
     basic = ["elevation"] if "elevation" in values else []
     return grid_map_of(values, window.center, window.resolution, basic)
+
+
+def area_of(center: tuple[float, float], lengths: tuple[float, float], resolution: float) -> Window:
+    """Return an area around a place [m]."""
+    corner = (center[0] - 0.5 * lengths[0], center[1] - 0.5 * lengths[1])
+    return Window(corner, resolution, (round(lengths[0] / resolution), round(lengths[1] / resolution)))
+
+
+def area_cells(window: Window, area: Window) -> tuple[slice, slice]:
+    """Return the rows and columns of a window in an area; ValueError if it has none."""
+    first = [round((area.corner[k] - window.corner[k]) / window.resolution) for k in (0, 1)]
+    parts = [slice(max(0, a), min(size, a + num)) for a, size, num in zip(first, window.shape, area.shape, strict=True)]
+    if any(part.start >= part.stop for part in parts):
+        center, corner = area.center, window.corner
+        raise ValueError(f"the map, whose corner is at {corner} m, has no cells around {center} m")
+    return parts[0], parts[1]
+
+
+def outlines(regions: Sequence[Any]) -> list[Outline]:
+    """Return the polygons of planar regions, the largest region first."""
+    found = []
+    for k, region in enumerate(sorted(regions, key=lambda one: -one.area)):
+        found.append(Outline("boundary", k, region.boundary))
+        found += [Outline("hole", k, hole) for hole in region.holes]
+        found += [Outline("inset", k, inset) for inset in region.inset]
+    return found
+
+
+def solids(body: dict[str, Any] | None, base_frame: str) -> list[Solid]:
+    """Return the shapes of a body, as the map's settings have it, as boxes, cylinders and spheres."""
+    if body is None:
+        return []
+    if "lower" in body:
+        lower, upper = np.array(body["lower"], float), np.array(body["upper"], float)
+        return [Solid(base_frame, "box", (lower + upper) / 2, IDENTITY, tuple((upper - lower).tolist()))]
+    boxes = [
+        Solid(box["link"], "box", np.array(box["center"], float), np.array(box.get("quat_wxyz", IDENTITY), float),
+              tuple(2 * float(half) for half in box["half_lengths"]))  # type: ignore[arg-type]
+        for box in body.get("boxes", ())
+    ]  # fmt: skip
+    return boxes + [solid for capsule in body.get("capsules", ()) for solid in _capsule(capsule)]
+
+
+def _capsule(capsule: dict[str, Any]) -> list[Solid]:
+    """Return a capsule as a cylinder and two spheres."""
+    start, end, width = np.array(capsule["start"], float), np.array(capsule["end"], float), 2 * float(capsule["radius"])
+    axis, link = end - start, capsule["link"]
+    balls = [Solid(link, "sphere", place, IDENTITY, (width, width, width)) for place in (start, end)]
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        return balls[:1]
+    return [Solid(link, "cylinder", (start + end) / 2, _from_z(axis / length), (width, width, length)), *balls]
+
+
+def _from_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return quat_wxyz of the shortest rotation from z to a unit vector."""
+    x, y, z = axis
+    quat = np.array([1 + z, -y, x, 0.0]) if z > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+    return quat / np.linalg.norm(quat)
 
 
 def costmap(engine: Engine, min_traversability: float) -> OccupancyGrid:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from torchelev.config_files import read_settings
-from torchelev.errors import require
+from torchelev.errors import require, require_positive
 
 _KINDS = {str: "text", float: "a number", int: "a whole number", bool: "true or false"}
 _OF_ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")  # parameters that rclpy declares
 ENGINES = ("auto", "torch", "library")
+_METHODS = ("linear", "nearest")  # of `ElevationMap.initialize`
 
 
 def _setting(default: Any, meaning: str, changeable: bool = False) -> Any:
@@ -34,11 +36,17 @@ class NodeSettings:
     map_frame: str = _setting("odom", "fixed frame of the map, z up; odom does not jump, which a map likes better")
     base_frame: str = _setting("base_link", "frame that the map's window follows")
     clouds: tuple[str, ...] = _setting(("points",), "topics of sensor_msgs/PointCloud2")
-    reliable: bool = _setting(False, "subscribe to clouds reliably, which publishers of sensor data may not offer")
-    transform_wait: float = _setting(0.2, "[s] that a cloud waits for the transforms at its stamp")
+    depths: tuple[str, ...] = _setting((), "topics of sensor_msgs/Image: depth, 16UC1 or 32FC1")
+    camera_infos: tuple[str, ...] = _setting((), "their sensor_msgs/CameraInfo; empty: camera_info beside each depth")
+    depth_scale: float = _setting(0.0, "[m] per unit of depth; 0: that of the encoding, millimetres or metres")
+    odometry: str = _setting("", "topic of nav_msgs/Odometry, whose covariance is that of the base's pose; empty: none")
+    deskew: bool = _setting(True, "take motion within a scan out of clouds that have a time for each point", True)
+    reliable: bool = _setting(False, "subscribe to sensors reliably, which their publishers may not offer")
+    transform_wait: float = _setting(0.2, "[s] that a cloud waits for the transforms of its points")
     rate_map: float = _setting(2.0, "[Hz] of ~/map, a grid_map_msgs/GridMap; 0: never", True)
     rate_points: float = _setting(1.0, "[Hz] of ~/points, the map as a sensor_msgs/PointCloud2; 0: never", True)
     rate_costmap: float = _setting(1.0, "[Hz] of ~/costmap, a nav_msgs/OccupancyGrid; 0: never", True)
+    rate_planes: float = _setting(1.0, "[Hz] of ~/planes and ~/polygons, planar regions; 0: never; needs PyTorch", True)
     rate_height_scan: float = _setting(50.0, "[Hz] of ~/height_scan, a std_msgs/Float32MultiArray; 0: never", True)
     rate_diagnostics: float = _setting(1.0, "[Hz] of /diagnostics; 0: never", True)
     layers: tuple[str, ...] = _setting(
@@ -48,6 +56,16 @@ class NodeSettings:
     height_scan: str = _setting("isaac_lab", "layout of ~/height_scan: isaac_lab, mjlab, legged_gym, or one as JSON")
     map_file: str = _setting("map.safetensors", "file of ~/save_map and ~/load_map", True)
     load_on_start: bool = _setting(False, "load map_file when the node starts, if it is there")
+    clear_radius: float = _setting(1.5, "[m] around base_frame that ~/clear_around_robot forgets", True)
+    feet: tuple[str, ...] = _setting((), "frames of the feet, on whose ground ~/initialize puts the first map")
+    foot_height: float = _setting(0.0, "[m] of the feet's frames over the ground that they stand on", True)
+    initialize_method: str = _setting("linear", "of ~/initialize: linear within the feet, or nearest everywhere", True)
+    site: str = _setting("", "file of a site map that ~/initialize_from_site starts from; needs PyTorch", True)
+    footprint: str = _setting(
+        "[[0.35, 0.25], [0.35, -0.25], [-0.35, -0.25], [-0.35, 0.25]]",
+        "[m] corners in base_frame as Nav2 writes them, which ~/check_path moves along a path; needs PyTorch",
+        True,
+    )
     engine: str = _setting("auto", "torch, library (libtorchelev, without PyTorch), or auto: torch if it is installed")
     library: str = _setting("", "path of libtorchelev; empty: that of the wheel, or the system's")
     threads: int = _setting(1, "threads that share an update")
@@ -63,9 +81,22 @@ class NodeSettings:
         in_range = 0 <= self.min_traversability < 1
         require(in_range, "min_traversability", "must lie in [0, 1)", self.min_traversability, "the default is 0.5")
         require(self.engine in ENGINES, "engine", f"must be one of {', '.join(ENGINES)}", repr(self.engine), "use auto")
+        for name in ("depth_scale", "foot_height"):
+            require(math.isfinite(getattr(self, name)), name, "must be finite", getattr(self, name), "see its default")
+        require(self.depth_scale >= 0, "depth_scale", "must not be negative", self.depth_scale, "0.001 for millimetres")
+        require_positive(clear_radius=self.clear_radius)
+        is_method = self.initialize_method in _METHODS
+        rule = f"must be one of {', '.join(_METHODS)}"
+        require(is_method, "initialize_method", rule, repr(self.initialize_method), "use linear")
+        num, expected = len(self.camera_infos), len(self.depths)
+        rule, hint = f"must be none, or one for each of {expected} topics in depths", "give them in their order"
+        require(num in (0, expected), "camera_infos", rule, num, hint)
+        sensors = bool(self.clouds or self.depths)
+        require(sensors, "clouds", "must not be empty without depths", repr(self.clouds), "name a topic")
+        polygon(self.footprint)
         for name in ("threads", "max_points"):
             require(getattr(self, name) >= 1, name, "must be at least 1", getattr(self, name), "see its default")
-        for name in ("map_frame", "base_frame", "clouds", "layers"):
+        for name in ("map_frame", "base_frame", "layers"):
             require(bool(getattr(self, name)), name, "must not be empty", repr(getattr(self, name)), "name one")
 
 
@@ -82,6 +113,19 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     rule = f"must be {_KINDS[kind]}"
     require(type(value) is kind, name, rule, repr(value), f"such as {default!r}")
     return value
+
+
+def polygon(text: str) -> list[list[float]]:
+    """Return the corners (V, 2) [m] of a footprint as Nav2 writes it, "[[x, y], ...]"; ValueError for another text."""
+    try:
+        corners = json.loads(text)
+        is_polygon = len(corners) >= 3 and all(len(corner) == 2 for corner in corners)
+        corners = [[float(value) for value in corner] for corner in corners]
+    except (ValueError, TypeError):
+        is_polygon = False
+    rule, hint = "must be three or more corners", 'write "[[0.3, 0.2], [0.3, -0.2], [-0.3, 0.0]]"'
+    require(is_polygon, "footprint", rule, repr(text), hint)
+    return corners
 
 
 def read_node_file(path: str | Path) -> tuple[NodeSettings, dict[str, Any]]:

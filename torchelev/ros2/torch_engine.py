@@ -17,7 +17,7 @@ from torchelev.errors import require
 from torchelev.io.map_file import load_map, save_map
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.presets import PRESETS
-from torchelev.ros2.engine import Window
+from torchelev.ros2.engine import Frame, PathCheck, Window
 from torchelev.ros2.settings import NodeSettings
 
 
@@ -29,10 +29,14 @@ class TorchEngine:
         self._map = ElevationMap(ElevationMapConfig.from_dict(cfg))
         self._map.compile()  # now, not at the first cloud
         self._scan = _scan_of(settings.height_scan)
+        self.links = list(self._map.cfg.sensor.links)
 
-    def update(self, points: NDArray, T_map_sensor: NDArray, T_map_base: NDArray, dt: float) -> None:
-        """Fuse points (N, 3) of one sensor."""
-        self._map.update(torch.from_numpy(points)[None], _pose(T_map_sensor), _pose(T_map_base), dt)
+    def update(self, frame: Frame) -> None:
+        """Fuse the points of one sensor."""
+        given = {"pose_covariance": frame.pose_covariance, "T_base_links": frame.T_base_links}
+        more = {name: _floats(value) for name, value in given.items() if value is not None}
+        points = torch.from_numpy(frame.points)[None]
+        self._map.update(points, _floats(frame.T_map_sensor), _floats(frame.T_map_base), frame.dt, **more)
 
     def window(self) -> Window:
         """Return where the cells lie."""
@@ -49,7 +53,7 @@ class TorchEngine:
 
     def scan(self, T_map_base: NDArray) -> NDArray[np.float32]:
         """Return the values (P,) of the height scan."""
-        return self._scan(self._map, _pose(T_map_base))[0][0].cpu().numpy()
+        return self._scan(self._map, _floats(T_map_base))[0][0].cpu().numpy()
 
     def statistics(self) -> dict[str, float]:
         """Return what the last update did."""
@@ -59,9 +63,42 @@ class TorchEngine:
         """Return what looks wrong with the inputs."""
         return self._map.diagnose()
 
+    def planes(self) -> list[Any]:
+        """Return the planar regions."""
+        from torchelev.planes import segment  # which few nodes are asked for
+
+        center = self._map.center[0, :2].numpy()
+        return list(segment(self._map.layer("elevation"), self._map.cfg.grid.resolution, center=center)[0].regions)
+
+    def check_path(self, poses: NDArray[np.float64], footprint: NDArray[np.float64]) -> PathCheck:
+        """Move a footprint (V, 2) [m] along poses (T, 3), x, y [m] and yaw [rad]."""
+        from torchelev.planning.path_check import check_path  # which few nodes are asked for
+
+        corners = torch.from_numpy(footprint)
+        samples = _samples(poses, footprint, self._map.cfg.grid.resolution)
+        checked = check_path(self._map, _floats(poses), corners, samples=samples)
+        safe = checked.footprints.safe[0].numpy()
+        # A pose is reached by the samples after the one before.
+        unsafe = [k for k in range(len(poses)) if not safe[max(0, (k - 1) * samples + 1) : k * samples + 1].all()]
+        return PathCheck(not unsafe, unsafe, checked.explain()[0])
+
+    def initialize_from(self, site: Path, T_map_base: NDArray[np.float64]) -> None:
+        """Start with what a site map knows."""
+        from torchelev.site import SiteMap  # which few nodes are asked for
+
+        self._map.initialize_from(SiteMap.open(site, read_only=True), _floats(T_map_base))
+
     def reset(self) -> None:
         """Forget everything."""
         self._map.reset()
+
+    def clear_around(self, center: NDArray[np.float64], radius: float) -> None:
+        """Forget the cells within a radius [m] of a place (2,) [m]."""
+        self._map.clear_around(_floats(center), radius)
+
+    def initialize(self, feet: NDArray[np.float64], method: str) -> None:
+        """Estimate the unknown cells from ground points (K, 3) [m]."""
+        self._map.initialize(_floats(feet), method)
 
     def save(self, path: Path) -> None:
         """Save the map."""
@@ -89,5 +126,16 @@ def _scan_of(layout: str) -> HeightScan:
         raise ValueError(f"height_scan: {rule}, got {layout!r} ({error}); use isaac_lab") from error
 
 
-def _pose(T: NDArray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(T, np.float64))[None]
+def _floats(values: NDArray) -> Tensor:
+    """Return float64 values of one environment."""
+    return torch.from_numpy(np.ascontiguousarray(values, np.float64))[None]
+
+
+def _samples(poses: NDArray[np.float64], footprint: NDArray[np.float64], resolution: float) -> int:
+    """Return how many footprints on each segment keep every corner within a cell from one to the next."""
+    if len(poses) < 2:
+        return 1
+    change = np.diff(poses, axis=0)
+    turn = np.abs((change[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+    distance = np.hypot(change[:, 0], change[:, 1]) + np.hypot(*footprint.T).max() * turn
+    return max(1, int(np.ceil(distance.max() / resolution)))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.io.bags.poses.transforms import TransformTree
 from torchelev.io.bags.scans import Scan
+
+if TYPE_CHECKING:
+    from torchelev.io.bags.poses.transforms import TransformTree
 
 _POSE_STEP, _MAX_POSES = 0.005, 128  # [s] between the poses of a scan, and how many there are at most
 Poses = Callable[[NDArray[np.float64]], NDArray[np.float64]]

@@ -1,0 +1,53 @@
+"""Poses by tf2. Imports ROS."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.time import Time
+from tf2_ros import Buffer, TransformException, TransformListener
+
+from torchelev.ros2.messages import matrix_of
+
+__all__ = ["TransformException", "Transforms"]
+NEWEST = Time()  # tf2 takes time 0 as the newest transform
+
+
+class Transforms:
+    """What tf2 knows of frames in a fixed one.
+
+    Args:
+        node: which listens to /tf and /tf_static.
+        map_frame: the fixed frame.
+    """
+
+    def __init__(self, node: Node, map_frame: str) -> None:
+        self._buffer, self._map = Buffer(), map_frame
+        self._listener = TransformListener(self._buffer, node)
+
+    def has(self, frame: str, stamp: Time, offset: float = 0.0, parent: str = "") -> bool:
+        """Return whether the pose of a frame is known at a stamp, or an offset [s] from it."""
+        return self._buffer.can_transform(parent or self._map, frame, _shifted(stamp, offset))
+
+    def pose(self, frame: str, stamp: Time = NEWEST, parent: str = "") -> NDArray[np.float64]:
+        """Return T_parent_frame (4, 4) at a stamp; TransformException if it is not known. The parent is the map."""
+        return matrix_of(self._buffer.lookup_transform(parent or self._map, frame, stamp).transform)
+
+    def poses(self, frame: str, stamp: Time, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return T_map_frame (M, 4, 4) at offsets (M,) [s] from a stamp, NaN where it is not known."""
+        found = np.full((len(offsets), 4, 4), np.nan)
+        for k, offset in enumerate(offsets.tolist()):
+            time = _shifted(stamp, offset)
+            if self._buffer.can_transform(self._map, frame, time):
+                found[k] = self.pose(frame, time)
+        return found
+
+    def clear(self) -> None:
+        """Forget all transforms, as a clock jumped back."""
+        self._buffer.clear()
+
+
+def _shifted(stamp: Time, offset: float) -> Time:
+    return stamp + Duration(nanoseconds=round(1e9 * offset)) if offset else stamp
