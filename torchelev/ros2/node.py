@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,7 @@ class ElevationMappingNode(Node):
         self.stamp: Stamp | None = None  # of the map: of the newest cloud, or of the time when it was loaded
         self.transforms = Transforms(self, self.settings.map_frame)
         self._covariances = PoseCovariances()
+        self._warned: dict[str, float] = {}
         self._publishers = Publishers(self, cfg.get("sensor", {}).get("body"))
         services = Services(self)
         self._subscribe()
@@ -105,7 +108,7 @@ class ElevationMappingNode(Node):
             stamp = stamp_of(message.header)
             if stamp <= 0:
                 rule = f"its stamp must be positive, got {stamp:g}; let its driver set it"
-                self._warn(f"{sensor.topic}: left out a message: {rule}")
+                self._warn(f"{sensor.topic}: left out a message: {rule}", f"{sensor.topic} stamp")
             sensor.note(stamp)
             if self.intake.offer(sensor.topic, Reading(sensor, message), stamp, self.now()):
                 self._forget_transforms()
@@ -116,6 +119,8 @@ class ElevationMappingNode(Node):
     def _keep_covariance(self, message: Odometry) -> None:
         self._covariances = PoseCovariances(self.settings.odometry)  # the newest alone
         self._covariances.add(message)
+        for note in self._covariances.notes:
+            self._warn(note, "covariance", 60.0)
 
     def now(self) -> float:
         """Return the time [s] by the node's clock."""
@@ -125,8 +130,12 @@ class ElevationMappingNode(Node):
         """Stamp a map that did not come from a cloud."""
         self.stamp = self.get_clock().now().to_msg()
 
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text, throttle_duration_sec=5.0)
+    def _warn(self, text: str, kind: str, pause: float = 5.0) -> None:
+        """Log a warning, unless one of its kind was logged less than a pause [s] ago."""
+        now = time.monotonic()  # rclpy's own throttle tells kinds apart by the line that logs
+        if now - self._warned.get(kind, -math.inf) >= pause:
+            self._warned[kind] = now
+            self.get_logger().warning(text)
 
     def _start_over(self) -> None:
         """Go on after the node's clock jumped back."""
@@ -164,13 +173,14 @@ class ElevationMappingNode(Node):
             self.engine.update(self._frame_of(cloud, clean(header.frame_id), Time.from_msg(header.stamp)))
         except (CloudError, TransformException, ValueError) as error:
             self.intake.counts.unreadable += 1
-            self._warn(f"{cloud.topic}: left out a message: {error}")
+            kind = getattr(error, "kind", type(error).__name__)
+            self._warn(f"{cloud.topic}: left out a message: {error}", f"{cloud.topic} {kind}")
             return
         self.intake.note_fused(cloud, self.now())
         if self.intake.stamp == cloud.stamp:
             self.stamp = header.stamp
         for note in cloud.message.scan.notes:
-            self.get_logger().warning(f"{cloud.topic}: {note.text}", throttle_duration_sec=60.0)
+            self._warn(f"{cloud.topic}: {note.text}", f"{cloud.topic} {note.kind}", 60.0)
 
     def _frame_of(self, cloud: Waiting, sensor: str, stamp: Time) -> Frame:
         """Return the points of a message with all poses."""
@@ -198,7 +208,7 @@ class ElevationMappingNode(Node):
             reason = "tf does not reach the times of all its points; raise transform_wait, or set deskew false"
         except TransformException as error:
             reason = str(error)
-        self._warn(f"{cloud.topic}: left out a message after {wait:g} s: {reason}")
+        self._warn(f"{cloud.topic}: left out a message after {wait:g} s: {reason}", f"{cloud.topic} transform")
 
 
 def spin(settings: NodeSettings, cfg: dict[str, Any], arguments: list[str]) -> None:
