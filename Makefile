@@ -11,7 +11,7 @@ MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests
 EXTRAS := io,bags,odometry,video,view,geo,site,rl,deploy,dev,docs
 MJLAB := .venv-mjlab
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-ros2 bench-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -52,9 +52,20 @@ $(ROS2)/.ready: tests/ros2/with_ros/requirements.txt
 	$(ROS2)/bin/python -m pip install --disable-pip-version-check --quiet --requirement $<
 	@touch $@
 
-test-ros2: setup $(ROS2)/.ready  ## test the node in real ROS 2, Humble and Jazzy of a wheel, which needs Python 3.12; five minutes
+$(ROS2)-torch/.ready: tests/ros2/with_ros/requirements.txt tests/ros2/with_ros/requirements-torch.txt
+	@echo "Installing ROS 2 and a CUDA build of PyTorch into $(ROS2)-torch, nowhere else: 6 GB."
+	$(if $(ROS2_PYTHON),$(ROS2_PYTHON),python3.12) -m venv $(ROS2)-torch
+	$(ROS2)-torch/bin/python -m pip install --disable-pip-version-check --quiet --no-deps isaacsim-ros2==6.2.0.0
+	$(ROS2)-torch/bin/python -m pip install --disable-pip-version-check --quiet $(patsubst %,--requirement %,$^)
+	@touch $@
+
+test-ros2: setup $(ROS2)/.ready  ## test the node in real ROS 2, Humble and Jazzy of a wheel, which needs Python 3.12; eight minutes
 	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
 	$(ROS2)/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared
+
+test-ros2-torch: setup $(ROS2)-torch/.ready  ## the same with PyTorch's map in place of the C library's; twelve minutes
+	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared
+	$(ROS2)-torch/bin/python tests/ros2/with_ros/run.py $(ROS2)/prepared
 
 bench-ros2: setup $(ROS2)/.ready  ## measure the node in ROS 2 Jazzy: latency, CPU and memory, twelve minutes
 	$(BIN)/python -m tests.ros2.with_ros.prepare $(ROS2)/prepared

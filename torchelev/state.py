@@ -133,8 +133,8 @@ def _fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | N
 
 def forget_cells(state: MapState, cells: Bool[Tensor, "B H W"]) -> MapState:
     """Return the state with these cells blank, as if they had never been known."""
-    blank = {name: torch.where(cells, BLANK.get(name, 0), getattr(state, name)) for name in LAYERS}
-    return state._replace(**{name: value.to(getattr(state, name).dtype) for name, value in blank.items()})
+    blank = {name: getattr(state, name).masked_fill(cells, BLANK.get(name, 0)) for name in LAYERS}
+    return state._replace(**blank)  # type: ignore[arg-type]
 
 
 def partial_state(**layers: Tensor) -> MapState:

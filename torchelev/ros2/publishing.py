@@ -65,7 +65,7 @@ class Publishers:
             if self._schedule.is_due(name, getattr(self._node.settings, f"rate_{name}"), time.monotonic()):
                 try:
                     publish()
-                except ValueError as error:  # the map has no such layer, or its engine cannot
+                except (ValueError, ImportError) as error:  # no such layer, or a package is missing
                     text = f"~/{name} is not published: {error}"
                     self._node.get_logger().warning(text, throttle_duration_sec=30.0)
 

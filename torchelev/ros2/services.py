@@ -101,7 +101,7 @@ class Services:
         def call(request: Any, response: Any) -> Any:
             try:
                 act(request, response)
-            except (ValueError, TransformException) as error:
+            except (ValueError, ImportError, TransformException) as error:
                 self._node.get_logger().error(str(error))
             return response
 
@@ -140,7 +140,7 @@ def _trigger(act: Callable[[], str]) -> Callable[[Any, Any], Any]:
     def call(_: Any, response: Any) -> Any:
         try:
             response.success, response.message = True, act()
-        except (ValueError, OSError, TransformException) as error:
+        except (ValueError, OSError, ImportError, TransformException) as error:
             response.success, response.message = False, str(error)
         return response
 

@@ -49,7 +49,7 @@ class TorchEngine:
         try:
             return self._map.layer(name)[0].cpu().numpy()
         except KeyError as error:
-            raise ValueError(str(error)) from error
+            raise ValueError(error.args[0]) from error
 
     def scan(self, T_map_base: NDArray) -> NDArray[np.float32]:
         """Return the values (P,) of the height scan."""

@@ -11,7 +11,8 @@ import time
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PolygonStamped, TransformStamped
+from grid_map_msgs.msg import GridMap
 from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
@@ -21,8 +22,18 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray
 from std_srvs.srv import Trigger
 from tf2_ros import StaticTransformBroadcaster, TransformBroadcaster
+from visualization_msgs.msg import MarkerArray
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TOPICS = {
+    "map": (GridMap, LATCHED),
+    "costmap": (OccupancyGrid, LATCHED),
+    "body": (MarkerArray, LATCHED),
+    "points": (PointCloud2, 1),
+    "height_scan": (Float32MultiArray, 1),
+    "planes": (MarkerArray, 1),
+    "polygons": (PolygonStamped, 100),
+}
 
 
 class Robot(Node):
@@ -36,26 +47,29 @@ class Robot(Node):
 
     def __init__(self, config, name="", arguments=()):
         super().__init__("driver", namespace=name)
-        self.heard = {}
+        self.heard, self.kept = {}, []
         self.prefix = f"{'/' + name if name else ''}/elevation_mapping"
         self.command = [sys.executable, "-m", "torchelev", "ros2", "--config", str(config), "--ros-args", *arguments]
         if name:
             self.command += ["-r", f"__ns:=/{name}"]
-        for topic, kind, qos in [
-            ("costmap", OccupancyGrid, LATCHED),
-            ("points", PointCloud2, 1),
-            ("height_scan", Float32MultiArray, 1),
-        ]:
-            self.create_subscription(kind, f"{self.prefix}/{topic}", self._hear(topic), qos)
+        for topic in ("costmap", "points", "height_scan"):
+            self.listen(topic)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
         self.moving, self.fixed = TransformBroadcaster(self), StaticTransformBroadcaster(self)
         self.clouds = {}
         self.log = None
         self.process = None
 
+    def listen(self, topic):
+        """Hear what the node publishes on one of its topics: the newest in `heard`, all of them in `kept`."""
+        kind, qos = TOPICS[topic]
+        self.create_subscription(kind, f"{self.prefix}/{topic}", self._hear(topic), qos)
+
     def _hear(self, topic):
         def keep(message):
             self.heard[topic] = message
+            if topic == "polygons":
+                self.kept.append(message)
 
         return keep
 
@@ -75,6 +89,9 @@ class Robot(Node):
         client = self.create_client(Trigger, f"{self.prefix}/clear_map")
         assert client.wait_for_service(20.0), open(log).read()
 
+    def is_alive(self):
+        return self.process is None or self.process.poll() is None
+
     def stop(self, how=signal.SIGINT):
         self.process.send_signal(how)
         self.process.wait(10)
@@ -82,11 +99,15 @@ class Robot(Node):
             del self.heard[topic]
 
     def call(self, name):
-        """Call a service; return whether it succeeded, and what it says."""
-        client = self.create_client(Trigger, f"{self.prefix}/{name}")
-        assert client.wait_for_service(5.0)
-        answer = self._answer(client, Trigger.Request())
+        """Call a Trigger; return whether it succeeded, and what it says."""
+        answer = self.ask(name, Trigger)
         return answer.success, answer.message
+
+    def ask(self, name, kind, **request):
+        """Call a service of a kind; return its answer."""
+        client = self.create_client(kind, f"{self.prefix}/{name}")
+        assert client.wait_for_service(5.0)
+        return self._answer(client, kind.Request(**request))
 
     def set(self, **values):
         """Set parameters; return the reason of the first that is refused, or None."""
@@ -108,7 +129,7 @@ class Robot(Node):
         """Wait until something holds; fail with the node's log if it does not."""
         end = time.monotonic() + seconds
         while not holds():
-            assert time.monotonic() < end, (self.heard.get("counts"), open(self.log).read())
+            assert self.is_alive() and time.monotonic() < end, (self.heard.get("counts"), open(self.log).read())
             rclpy.spin_once(self, timeout_sec=0.02)
 
     def spin(self, seconds):
@@ -122,18 +143,19 @@ class Robot(Node):
     # What it sends ---------------------------------------------------------------------------------------------------
 
     def send_poses(self, stamp, x=0.0, z=0.5):
-        self.moving.sendTransform([_transform(stamp, "odom", "base_link", x, z)])
-        self.fixed.sendTransform([_transform(stamp, "base_link", "lidar", 0.0, 0.3)])
+        self.moving.sendTransform([transform(stamp, "odom", "base_link", x, z)])
+        self.fixed.sendTransform([transform(stamp, "base_link", "lidar", 0.0, 0.3)])
 
-    def send_cloud(self, stamp, height=-0.8, topic="/lidar/points", frame="lidar", seed=0):
-        """Send flat ground at a height [m] below the sensor."""
-        xyz = np.random.default_rng(seed).uniform(-3, 3, (40000, 3)).astype(np.float32)
-        xyz[:, 2] = height
-        self.send(topic, to_cloud(xyz, stamp, frame))
+    def send_cloud(self, stamp, height=-0.8, topic="/lidar/points", frame="lidar", points=None):
+        """Send points (N, 3) [m]; by default flat ground at a height [m] below the sensor."""
+        if points is None:
+            points = np.random.default_rng(0).uniform(-3, 3, (40000, 3)).astype(np.float32)
+            points[:, 2] = height
+        self.send(topic, to_cloud(points, stamp, frame))
 
     def send(self, topic, message):
         if topic not in self.clouds:
-            self.clouds[topic] = self.create_publisher(PointCloud2, topic, qos_profile_sensor_data)
+            self.clouds[topic] = self.create_publisher(type(message), topic, qos_profile_sensor_data)
             self.wait(lambda: self.clouds[topic].get_subscription_count() > 0)
         self.clouds[topic].publish(message)
 
@@ -146,7 +168,7 @@ class Robot(Node):
         """Send poses and a cloud until something holds: what is sent by best effort may be lost."""
         end = time.monotonic() + 45.0  # a participant that was killed is missed after 20 s
         while not holds():
-            assert time.monotonic() < end, (self.heard.get("counts"), open(self.log).read())
+            assert self.is_alive() and time.monotonic() < end, (self.heard.get("counts"), open(self.log).read())
             if poses:
                 self.send_poses(stamp)
                 self.spin(0.05)
@@ -154,11 +176,13 @@ class Robot(Node):
             self.spin(0.5 if not holds() else 0.0)
 
 
-def _transform(stamp, parent, child, x, z):
+def transform(stamp, parent, child, x, z, y=0.0):
+    """A TransformStamped without rotation."""
     one = TransformStamped()
     one.header.stamp.sec, one.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
     one.header.frame_id, one.child_frame_id = parent, child
-    one.transform.translation.x, one.transform.translation.z, one.transform.rotation.w = x, z, 1.0
+    place = one.transform.translation
+    place.x, place.y, place.z, one.transform.rotation.w = x, y, z, 1.0
     return one
 
 

@@ -38,8 +38,8 @@ def main(prepared: Path, options: list[str]) -> int:
     for distribution in ("humble", "jazzy"):
         for middleware in ("rmw_fastrtps_cpp", "rmw_cyclonedds_cpp"):
             print(f"{distribution}, {middleware}", flush=True)
-            command = [sys.executable, "-m", "pytest", "-q", "--noconftest", "-c", os.devnull, "-p", "no:cacheprovider"]
-            command += ["--import-mode=importlib", str(HERE / "test_node.py"), *options]
+            command = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "-p", "no:cacheprovider"]
+            command += [f"--confcutdir={HERE}", "--import-mode=importlib", str(HERE), *options]
             if subprocess.run(command, env=environment(distribution, middleware, prepared), cwd=prepared).returncode:
                 failed.append(f"{distribution}, {middleware}")
     print("all passed" if not failed else f"failed: {'; '.join(failed)}")

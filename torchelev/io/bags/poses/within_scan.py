@@ -60,8 +60,8 @@ def move_to_stamp(scan: Scan, poses: Poses, max_extrapolation: float = 0.0) -> N
     k = np.clip(np.searchsorted(stamps, scan.times, side="right") - 1, 0, len(stamps) - 2)
     u = (scan.times - stamps[k]) / (stamps[k + 1] - stamps[k])
     is_inside = (scan.times >= stamps[0] - max_extrapolation) & (scan.times <= stamps[-1] + max_extrapolation)
-    u = np.where(is_inside, u, np.nan).astype(np.float32)[:, None]
-    return (1 - u) * _seen_from(T, k, scan.points) + u * _seen_from(T, k + 1, scan.points)
+    share = np.where(is_inside, u, np.nan).astype(np.float32)[:, None]
+    return (1 - share) * _seen_from(T, k, scan.points) + share * _seen_from(T, k + 1, scan.points)
 
 
 def _seen_from(T: NDArray[np.float32], k: NDArray[np.int64], points: NDArray[np.float32]) -> NDArray[np.float32]:
