@@ -51,7 +51,26 @@ def test_both_give_the_same(engines):
         assert np.array_equal(torch.layer(name), c.layer(name), equal_nan=True) and np.isfinite(c.layer(name)).any()
     T = walk(engine_of("library", build_library()._name), 1)
     assert torch.scan(T).tobytes() == c.scan(T).tobytes() and len(c.scan(T)) == 187
-    assert torch.diagnose() == c.diagnose()
+    assert torch.diagnose() == [] == c.diagnose()
+
+
+def test_pytorchs_diagnosis_runs_beside_updates(library, monkeypatch):
+    engine, c = (engine_of(kind, library) for kind in ("torch", "library"))
+    millimetres = Frame(
+        1e3 * np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32), np.eye(4), np.eye(4), 0.1
+    )
+    for one in (engine, c):
+        one.update(millimetres)
+    assert engine.diagnose() == []
+    engine._diagnosis._running.result(timeout=20)
+    assert engine.diagnose() == engine._map.diagnose() != []
+    assert "millimetres" in engine.diagnose()[0] and engine.diagnose()[0] == c.diagnose()[0]
+    engine.reset()
+    assert engine.diagnose() != [], "for some seconds"
+    monkeypatch.setattr(engine._diagnosis, "PAUSE", 0.0)
+    engine.diagnose()
+    engine._diagnosis._running.result(timeout=20)
+    assert engine.diagnose() == []
 
 
 @pytest.mark.parametrize("k", [0, 1], ids=["torch", "library"])

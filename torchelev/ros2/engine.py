@@ -66,7 +66,7 @@ class Engine(Protocol):
         """Return what the last update did."""
 
     def diagnose(self) -> list[str]:
-        """Return what looks wrong with the inputs."""
+        """Return what looks wrong with the inputs, or looked so some seconds ago."""
 
     def planes(self) -> list[Any]:
         """Return the planar regions; ValueError if this engine finds none."""

@@ -141,7 +141,9 @@ def _trigger(act: Callable[[], str]) -> Callable[[Any, Any], Any]:
         try:
             response.success, response.message = True, act()
         except (ValueError, OSError, ImportError, TransformException) as error:
-            response.success, response.message = False, str(error)
+            is_file = isinstance(error, OSError) and error.filename is not None
+            text = f"{error.filename}: {str(error.strerror).lower()}" if is_file else str(error)  # type: ignore[union-attr]
+            response.success, response.message = False, text
         return response
 
     return call

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import math
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
+from torchelev.diagnosis.causes import diagnose
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.io.map_file import load_map, save_map
@@ -19,6 +24,28 @@ from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.presets import PRESETS
 from torchelev.ros2.engine import Frame, PathCheck, Window
 from torchelev.ros2.settings import NodeSettings
+from torchelev.state import map_layers
+
+
+class Diagnosis:
+    """Diagnoses a map beside its updates: it takes 100 ms, in which a policy would wait for its height scan."""
+
+    PAUSE = 5.0  #: [s] from one to the next
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1)
+        self._running: Future[list[str]] | None = None
+        self._began, self._findings = -math.inf, list[str]()
+
+    def findings(self, emap: ElevationMap) -> list[str]:
+        """Return what the last one found, and begin the next one if it is time."""
+        if self._running is not None and self._running.done():
+            self._findings, self._running = self._running.result(), None
+        if self._running is None and time.monotonic() - self._began >= self.PAUSE:
+            self._began = time.monotonic()
+            copies = map_layers(Tensor.clone, emap.measured_state), copy.deepcopy(emap._history)
+            self._running = self._pool.submit(diagnose, emap.cfg, *copies)
+        return self._findings
 
 
 class TorchEngine:
@@ -29,6 +56,7 @@ class TorchEngine:
         self._map = ElevationMap(ElevationMapConfig.from_dict(cfg))
         self._map.compile()  # now, not at the first cloud
         self._scan = _scan_of(settings.height_scan)
+        self._diagnosis = Diagnosis()
         self.links = list(self._map.cfg.sensor.links)
 
     def update(self, frame: Frame) -> None:
@@ -60,8 +88,8 @@ class TorchEngine:
         return {name: value.item() for name, value in self._map.statistics._asdict().items()}
 
     def diagnose(self) -> list[str]:
-        """Return what looks wrong with the inputs."""
-        return self._map.diagnose()
+        """Return what looks wrong with the inputs, as of some seconds ago."""
+        return self._diagnosis.findings(self._map)
 
     def planes(self) -> list[Any]:
         """Return the planar regions."""
