@@ -7,12 +7,10 @@ import yaml
 
 from tests.docs.markdown import DOCS, code_blocks
 from torchelev import ElevationMap, ElevationMapConfig, filters
+from torchelev.ros2 import outputs
 from torchelev.ros2.settings import NodeSettings, make_settings, split
 
 PAGE = (DOCS / "howto/from_elevation_mapping.md").read_text()
-OUTPUTS = {"map", "points", "costmap", "height_scan", "planes", "polygons", "body"}
-TRIGGERS = {"save_map", "load_map", "clear_map", "clear_around_robot", "initialize", "initialize_from_site"}
-SERVICES = TRIGGERS | {"get_submap", "check_path"}
 
 
 def here():
@@ -33,7 +31,7 @@ def test_settings_of_the_map_exist():
 
 
 def test_parameters_topics_and_services_exist():
-    assert set(re.findall(r"~/(\w+)", PAGE)) <= OUTPUTS | SERVICES
+    assert set(re.findall(r"~/(\w+)", PAGE)) <= outputs.TOPICS.keys() | outputs.SERVICES
     parameters = {each.name for each in dataclasses.fields(NodeSettings)}
     known = parameters | set(filters.FILTERS) | {"validity"}
     assert not set(re.findall(r"`([a-z]\w*)`", here())) - known

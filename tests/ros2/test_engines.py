@@ -12,7 +12,7 @@ from torchelev.frames.quaternions import to_rotation
 from torchelev.io.grid_map import from_grid_map, to_grid_map
 from torchelev.io.occupancy import to_occupancy_grid
 from torchelev.ros2 import outputs
-from torchelev.ros2.engine import Frame, thinned
+from torchelev.ros2.engine import SensorInput, thinned
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.settings import NodeSettings
 from torchelev.runtime.library import build_library
@@ -32,7 +32,7 @@ def engine_of(kind, library, **settings):
 
 def walk(engine, num=4, **more):
     for points, T_map_sensor, T_map_base, dt in instants(1, num):
-        engine.update(Frame(points[0].numpy(), T_map_sensor[0].numpy(), T_map_base.numpy(), dt, **more))
+        engine.update(SensorInput(points[0].numpy(), T_map_sensor[0].numpy(), T_map_base.numpy(), dt, **more))
     return T_map_base.numpy()
 
 
@@ -56,7 +56,7 @@ def test_both_give_the_same(engines):
 
 def test_pytorchs_diagnosis_runs_beside_updates(library, monkeypatch):
     engine, c = (engine_of(kind, library) for kind in ("torch", "library"))
-    millimetres = Frame(
+    millimetres = SensorInput(
         1e3 * np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32), np.eye(4), np.eye(4), 0.1
     )
     for one in (engine, c):
@@ -143,11 +143,11 @@ import importlib.util
 importlib.util.find_spec = lambda name, found=importlib.util.find_spec: None if name == "torch" else found(name)
 import numpy as np
 from torchelev.ros2 import outputs, sensors
-from torchelev.ros2.engine import Frame
+from torchelev.ros2.engine import SensorInput
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.settings import NodeSettings
 engine = make_engine({}, NodeSettings(library=sys.argv[1]))
-engine.update(Frame(np.zeros((9, 3), np.float32) - 1, np.eye(4), np.eye(4), 0.0))
+engine.update(SensorInput(np.zeros((9, 3), np.float32) - 1, np.eye(4), np.eye(4), 0.0))
 outputs.grid_map(engine, ["elevation"]), outputs.costmap(engine, 0.5), outputs.map_cloud(engine, ["elevation"])
 import torchelev.io.bags.point_cloud, torchelev.app.cli, torchelev.app.ros2_command, torchelev.frames.quaternions
 assert "torch" not in sys.modules
@@ -203,7 +203,7 @@ def test_ground_points_and_cleared_cells(library, kind):
     cleared = known - np.isfinite(engine.layer("elevation")).sum()
     assert 0 < cleared <= np.pi * 0.5**2 / 0.05**2 * 1.1
     feet = np.append(center, 0.3) + np.array([[0.2, 0.2, 0], [-0.2, 0.2, 0], [0, -0.2, 0]])
-    engine.initialize(feet, "linear")
+    engine.initialize(feet, "linear", np.eye(4))
     i, j = ((center - engine.window().corner) / 0.05).astype(int)
     assert engine.layer("elevation")[i, j] == pytest.approx(0.3, abs=1e-5)
 
@@ -212,7 +212,7 @@ def test_planes_paths_and_sites_need_pytorch(engines, tmp_path):
     torch, c = engines
     for ask in (
         c.planes,
-        lambda: c.check_path(np.zeros((1, 3)), CORNERS),
+        lambda: c.check_path(np.zeros((1, 3)), CORNERS, None),
         lambda: c.initialize_from(tmp_path, np.eye(4)),
     ):
         with pytest.raises(ValueError, match="needs PyTorch, and the node's engine is the C library"):
@@ -244,21 +244,44 @@ def test_paths_over_a_step_are_unsafe_from_there_on():
     heights[50:] = 0.5  # x > 0.5 m
     engine = ground(heights)
     path = np.array([[-1.0, 0, 0], [0.0, 0, 0.3], [1.0, 0, 0]])
-    checked = engine.check_path(path, CORNERS)
-    assert not checked.is_safe and checked.unsafe == [2] and "pose 2 cannot be reached safely" in checked.reason
-    assert engine.check_path(path[:2], CORNERS).is_safe and engine.check_path(path[:1], CORNERS).unsafe == []
+    answer = engine.check_path(path, CORNERS, None)
+    assert not answer.is_safe and answer.unsafe == [2] and "pose 2 cannot be reached safely" in answer.reason
+    for safe in (path[:2], path[:1]):
+        answer = engine.check_path(safe, CORNERS, None)
+        assert answer.is_safe and answer.unsafe == [] and answer.reason == "every footprint along the path is safe"
+    with pytest.raises(ValueError, match="path: must need at most 20000 footprints"):
+        engine.check_path(path * 1e6, CORNERS, None)
+    assert engine.check_path(path[:1], 5 * CORNERS, None).is_safe, "however wide"
+
+
+def test_unknown_ground_is_safe_only_where_the_robot_stands():
+    engine = make_engine(CFG, NodeSettings(engine="torch"))
+    here, T = np.zeros((1, 3)), np.eye(4)
+    assert engine.check_path(here, CORNERS, None).unsafe == [0]
+    assert engine.check_path(here, CORNERS, T).is_safe
+    T[:2, 3] = 1.0
+    assert not engine.check_path(here, CORNERS, T).is_safe
+    assert engine.check_path(here + [1, 1, 0], CORNERS, T).is_safe
+
+
+@pytest.mark.parametrize("kind", ["torch", "library"])
+def test_the_first_ground_is_where_the_robot_is(library, kind):
+    engine = engine_of(kind, library)
+    T = np.eye(4)
+    T[:2, 3] = 30.0, -20.0
+    feet = np.array([[0.2, 0.2, 0.1], [-0.2, 0.2, 0.1], [0, -0.2, 0.1]]) + [30, -20, 0]
+    engine.initialize(feet, "linear", T)
+    np.testing.assert_allclose(engine.window().center, (30, -20), atol=0.05)
+    heights = engine.layer("elevation")
+    assert np.isfinite(heights).sum() > 20 and np.nanmax(abs(heights - 0.1)) < 1e-4
 
 
 def test_outlines_of_a_table_and_its_floor():
     heights = np.zeros((80, 60))
     heights[30:50, 20:40] = 0.4
-    outlines = outputs.outlines(ground(heights).planes())
-    assert [(one.kind, one.region) for one in outlines if one.kind != "inset"] == [
-        ("boundary", 0),
-        ("hole", 0),
-        ("boundary", 1),
-    ]
-    table = next(one.corners for one in outlines if one.kind == "inset" and one.region == 1)
+    outlines = outputs.make_outlines(ground(heights).planes())
+    assert [one.kind for one in outlines if one.kind != "inset"] == ["boundary", "hole", "boundary"]
+    table = outlines[-1].corners
     assert table[:, 2] == pytest.approx(0.4, abs=1e-3)
     assert (abs(table[:, 0]) < 0.48).all() and abs(table[:, 0]).max() > 0.4
 
@@ -281,13 +304,17 @@ def test_a_part_of_the_map(engines):
 def test_a_body_as_solids():
     capsule = {"link": "leg", "start": [0, 0, 0], "end": [0.3, 0, 0.4], "radius": 0.1}
     box = {"link": "trunk", "center": [0.1, 0, 0], "half_lengths": [0.3, 0.2, 0.1]}
-    trunk, cylinder, *balls = outputs.solids({"capsules": [capsule], "boxes": [box]}, "base")
+    trunk, cylinder, *balls = outputs.make_solids({"capsules": [capsule], "boxes": [box]}, "base")
     assert (trunk.link, trunk.kind, trunk.size) == ("trunk", "box", (0.6, 0.4, 0.2))
     assert [one.kind for one in balls] == ["sphere", "sphere"] and balls[1].position.tolist() == [0.3, 0, 0.4]
     assert cylinder.size == pytest.approx((0.2, 0.2, 0.5))
     np.testing.assert_allclose(to_rotation(cylinder.quat_wxyz)[:, 2], [0.6, 0, 0.8], atol=1e-12)
-    (only,) = outputs.solids({"lower": [-0.4, -0.2, 0], "upper": [0.4, 0.2, 0.2]}, "base")
+    (only,) = outputs.make_solids({"lower": [-0.4, -0.2, 0], "upper": [0.4, 0.2, 0.2]}, "base")
     assert only.link == "base" and only.position == pytest.approx([0, 0, 0.1]) and only.size == (0.8, 0.4, 0.2)
-    assert outputs.solids(None, "base") == []
-    down = outputs.solids({"capsules": [capsule | {"end": [0, 0, -1]}]}, "base")[0]
+    assert outputs.make_solids(None, "base") == []
+    default = te.BodyConfig()
+    for body in ({}, {"lower": list(default.lower)}):
+        (box,) = outputs.make_solids(body, "base")
+        assert box.size == pytest.approx(np.subtract(default.upper, default.lower))
+    down = outputs.make_solids({"capsules": [capsule | {"end": [0, 0, -1]}]}, "base")[0]
     np.testing.assert_allclose(to_rotation(down.quat_wxyz)[:, 2], [0, 0, -1], atol=1e-12)

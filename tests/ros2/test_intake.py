@@ -17,7 +17,7 @@ def fuse(intake, now=0.0, is_ready=yes):
     """Take what is ready and fuse it -> (message, dt) of each."""
     found = []
     for one in intake.take(now, is_ready)[0]:
-        found.append((one.message, intake.elapsed(one)))
+        found.append((one.reading, intake.elapsed(one)))
         intake.note_fused(one, now)
     return found
 
@@ -47,7 +47,7 @@ def test_a_cloud_waits_for_its_transforms_and_not_longer():
     assert fuse(intake, 5.15) == [("early", 0.0)]
     intake.offer("a", "lost", 2.0, now=6.0)
     ready, lost = intake.take(6.3, no)
-    assert ready == [] and [one.message for one in lost] == ["lost"] and intake.counts.without_transform == 1
+    assert ready == [] and [one.reading for one in lost] == ["lost"] and intake.counts.without_transform == 1
     assert intake.take(6.4, yes) == ([], [])
 
 

@@ -13,22 +13,13 @@ import pytest
 import yaml
 
 from torchelev import ElevationMapConfig
+from torchelev.ros2.outputs import SERVICES, TOPICS
 from torchelev.ros2.settings import read_node_file
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "examples/ros2/torchelev_ros"
-# What the node publishes below its own name: type and durability, as in torchelev/ros2/publishing.py.
-TOPICS = {
-    "points": ("PointCloud2", "Volatile"),
-    "map": ("GridMap", "Transient Local"),
-    "costmap": ("Map", "Transient Local"),
-    "planes": ("MarkerArray", "Volatile"),
-    "body": ("MarkerArray", "Transient Local"),
-    "height_scan": (None, "Volatile"),
-    "polygons": (None, "Volatile"),
-}
+DISPLAYS = {"OccupancyGrid": "Map"}  # RViz's name where it is not that of the message
 NODE = "elevation_mapping"
-SERVICES = {"save_map", "load_map", "clear_map", "clear_around_robot", "initialize", "initialize_from_site"}
 
 
 def displays():
@@ -63,8 +54,9 @@ def test_rviz_shows_what_the_node_publishes_with_its_durability():
     for each in found:
         name = each["Topic"]["Value"]
         assert name.startswith(f"{NODE}/"), "relative, so that it follows the namespace"
-        kind, durability = TOPICS[name.removeprefix(f"{NODE}/")]
-        assert each["Class"].rpartition("/")[2] == kind
+        topic = TOPICS[name.removeprefix(f"{NODE}/")]
+        kind, durability = topic.type.rpartition("/")[2], "Transient Local" if topic.is_latched else "Volatile"
+        assert each["Class"].rpartition("/")[2] == DISPLAYS.get(kind, kind)
         assert each["Topic"]["Durability Policy"] == durability and each["Topic"]["Reliability Policy"] == "Reliable"
     assert "rviz_default_plugins/TF" in [each["Class"] for each in rviz["Displays"]]
 

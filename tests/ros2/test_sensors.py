@@ -41,11 +41,11 @@ def test_motion_within_a_scan_is_taken_out(far, first):
     seen = np.einsum("nij,nj->ni", T[:, :3, :3], wall) + T[:, :3, 3]
     reading = Reading(Sensor("lidar"), timed_cloud(seen, times))
     points = reading.points(True, lambda at: driving(at, far=far))
-    assert reading.span(True) == pytest.approx((min(first, 0), max(first + 0.1, 0)), abs=1e-6)
+    assert reading.find_span(True) == pytest.approx((min(first, 0), max(first + 0.1, 0)), abs=1e-6)
     np.testing.assert_allclose(points, wall, atol=1e-3)
     assert abs(seen - wall).max() > 0.1
     np.testing.assert_allclose(reading.points(False, None), seen, atol=1e-5)
-    assert reading.span(False) == (0.0, 0.0)
+    assert reading.find_span(False) == (0.0, 0.0)
 
 
 def test_points_without_a_pose_are_unknown_and_too_few_poses_are_said():
@@ -68,11 +68,11 @@ def test_depth_images_wait_for_their_camera():
     sensor = Sensor("/depth/image_rect_raw", is_depth=True)
     with pytest.raises(CloudError, match="no CameraInfo was received; see the parameter camera_infos"):
         Reading(sensor, image).points(True, driving)
-    assert Reading(sensor, image).span(True) == (0.0, 0.0)
+    assert Reading(sensor, image).find_span(True) == (0.0, 0.0)
     sensor.camera = Stub(height=2, width=3, k=np.array([1.0, 0, 1, 0, 1, 0, 0, 0, 1]), p=np.zeros(12), d=())
     points = Reading(sensor, image).points(True, driving)
     assert points[:3].tolist() == [[-2, 0, 2], [0, 0, 2], [2, 0, 2]]
-    assert Reading(Sensor("d", True, 1e-4, sensor.camera), image).scan.points[0, 2] == pytest.approx(0.2)
+    assert Reading(Sensor("d", True, 1e-4, sensor.camera), image).cloud.points[0, 2] == pytest.approx(0.2)
 
 
 def test_the_period_of_a_topic_is_known_after_some_messages():
@@ -87,6 +87,6 @@ def test_the_period_of_a_topic_is_known_after_some_messages():
 
 def test_a_message_that_contradicts_itself_is_read_when_it_is_needed():
     reading = Reading(Sensor("lidar"), Stub(header=header(), fields=[], point_step=4, data=b""))
-    assert reading.span(True) == (0.0, 0.0)
+    assert reading.find_span(True) == (0.0, 0.0)
     with pytest.raises(CloudError, match="no field x, y, z"):
         reading.points(True, driving)

@@ -7,7 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from torchelev.app.ros2_command import ros2_command
-from torchelev.ros2.settings import NodeSettings, changeable, make_settings, nested, read_node_file, split
+from torchelev.ros2.outputs import SERVICES, TOPICS
+from torchelev.ros2.settings import NodeSettings, make_settings, nest, read_node_file, split
 
 FILE = """
 map_frame: map
@@ -69,7 +70,7 @@ def test_errors_name_the_file(tmp_path):
 
 def test_ros_has_names_with_points_and_parameters_of_its_own(tmp_path):
     given = {"map.grid.resolution": 0.05, "map.drift.gain": 0.5, "rate_map": 1.0, "use_sim_time": True}
-    assert split(nested(given)) == (
+    assert split(nest(given)) == (
         {"rate_map": 1.0},
         {"grid": {"resolution": 0.05}, "drift": {"gain": 0.5}},
     )
@@ -88,8 +89,8 @@ def test_what_is_not_for_ros_is_refused(arguments):
 
 
 def test_what_may_change_while_it_runs():
-    assert {"rate_map", "layers", "min_traversability", "map_file"} <= changeable()
-    assert not {"clouds", "map_frame", "engine", "threads"} & changeable()
+    assert {"rate_map", "layers", "min_traversability", "map_file"} <= list_changeable()
+    assert not {"clouds", "map_frame", "engine", "threads"} & list_changeable()
 
 
 def test_the_page_lists_every_parameter_with_its_default():
@@ -100,3 +101,22 @@ def test_the_page_lists_every_parameter_with_its_default():
         default = f"[{', '.join(each.default)}]" if isinstance(each.default, tuple) else str(each.default)
         shown = rows[0].split("|")[2].strip(" `")
         assert shown.replace("_", "").lower() == (default or "''").replace("_", "").lower(), each.name
+
+
+@pytest.mark.parametrize(
+    "footprint",
+    ["", "[]", "[[0, 0], [1, 1]]", "[[0, 0], [1, 1], [2, 2]]", '["12", "34", "56"]', "[[0, 0], [1, 0], [NaN, 1]]"],
+)
+def test_footprints_that_are_none_are_refused(footprint):
+    with pytest.raises(ValueError, match="footprint: must"):
+        NodeSettings(footprint=footprint)
+
+
+def test_the_page_lists_every_topic_and_service_with_its_type():
+    text = (Path(__file__).parents[2] / "docs" / "howto" / "ros2.md").read_text()
+    for name, kind in [(name, topic.type) for name, topic in TOPICS.items()] + list(SERVICES.items()):
+        rows = [line for line in text.splitlines() if line.startswith(f"| `~/{name}` |")]
+        package, _, short = kind.split("/")
+        assert len(rows) == 1 and f"{package}/{short}" in rows[0], name
+        if name in TOPICS:
+            assert ("transient local" in rows[0]) == TOPICS[name].is_latched

@@ -26,7 +26,7 @@ class Window(NamedTuple):
         )
 
 
-class Frame(NamedTuple):
+class SensorInput(NamedTuple):
     """The points of one sensor at one instant."""
 
     points: NDArray[np.float32]  #: (N, 3) [m] sensor frame
@@ -37,7 +37,7 @@ class Frame(NamedTuple):
     T_base_links: NDArray[np.float64] | None = None  #: (K, 4, 4) in the order of `Engine.links`; None without links
 
 
-class PathCheck(NamedTuple):
+class PathAnswer(NamedTuple):
     """Where a footprint may stand along a path."""
 
     is_safe: bool  #: all along
@@ -50,7 +50,7 @@ class Engine(Protocol):
 
     links: list[str]  #: names of the links of the robot's body, whose poses updates take
 
-    def update(self, frame: Frame) -> None:
+    def update(self, given: SensorInput) -> None:
         """Fuse the points of one sensor."""
 
     def window(self) -> Window:
@@ -71,8 +71,13 @@ class Engine(Protocol):
     def planes(self) -> list[Any]:
         """Return the planar regions; ValueError if this engine finds none."""
 
-    def check_path(self, poses: NDArray[np.float64], footprint: NDArray[np.float64]) -> PathCheck:
-        """Move a footprint (V, 2) [m] along poses (T, 3), x, y [m] and yaw [rad]; ValueError if it cannot."""
+    def check_path(
+        self, poses: NDArray[np.float64], footprint: NDArray[np.float64], T_map_base: NDArray[np.float64] | None
+    ) -> PathAnswer:
+        """Move a footprint (V, 2) [m] along poses (T, 3), x, y [m] and yaw [rad]; ValueError if it cannot.
+
+        Unknown cells count as passable where the robot stands, at T_map_base; None: nowhere.
+        """
 
     def reset(self) -> None:
         """Forget everything."""
@@ -80,8 +85,8 @@ class Engine(Protocol):
     def clear_around(self, center: NDArray[np.float64], radius: float) -> None:
         """Forget the cells within a radius [m] of a place (2,) [m]."""
 
-    def initialize(self, feet: NDArray[np.float64], method: str) -> None:
-        """Estimate the unknown cells from ground points (K, 3) [m]."""
+    def initialize(self, feet: NDArray[np.float64], method: str, T_map_base: NDArray[np.float64]) -> None:
+        """Estimate the unknown cells around the robot from ground points (K, 3) [m]."""
 
     def initialize_from(self, site: Path, T_map_base: NDArray[np.float64]) -> None:
         """Start with what a site map knows; ValueError if this engine cannot."""

@@ -33,7 +33,7 @@ class Waiting(NamedTuple):
     """A cloud that waits for its transforms."""
 
     topic: str  #: topic of the cloud
-    message: Any  #: the cloud
+    reading: Any  #: the cloud, see `sensors.Reading`
     stamp: float  #: [s] of the message
     since: float  #: [s] by the node's own clock
 
@@ -54,7 +54,7 @@ class Intake:
     _last: float | None = None  # stamp of the map
     _active: float | None = None  # [s] by the node's clock, of the last cloud that was fused
 
-    def offer(self, topic: str, message: Any, stamp: float, now: float) -> bool:
+    def offer(self, topic: str, reading: Any, stamp: float, now: float) -> bool:
         """Take a cloud that arrived; return whether a clock jumped back, so that old transforms are void."""
         self.counts.received += 1
         if stamp <= 0:
@@ -68,7 +68,7 @@ class Intake:
             return False
         self._offered[topic] = max(stamp, self._offered.get(topic, stamp))
         self.counts.replaced += topic in self._waiting
-        self._waiting[topic] = Waiting(topic, message, stamp, now)
+        self._waiting[topic] = Waiting(topic, reading, stamp, now)
         return has_jumped
 
     def start_over(self) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchelev.config_files import to_json
 from torchelev.errors import require
-from torchelev.ros2.engine import Frame, PathCheck, Window
+from torchelev.ros2.engine import PathAnswer, SensorInput, Window
 from torchelev.ros2.settings import NodeSettings
 
 _NEEDS_TORCH = "{}: needs PyTorch, and the node's engine is the C library; install torch, or set engine to torch"
@@ -47,11 +47,11 @@ class LibraryEngine:
         self._scan = self._map.scan(settings.height_scan)
         self.links = self._map.links
 
-    def update(self, frame: Frame) -> None:
+    def update(self, given: SensorInput) -> None:
         """Fuse the points of one sensor."""
-        covariance = None if frame.pose_covariance is None else frame.pose_covariance[None]
-        links = {"T_base_links": frame.T_base_links, "pose_covariance": covariance}
-        self._map.update(frame.points[None], frame.T_map_sensor[None], frame.T_map_base, frame.dt, **links)
+        covariance = None if given.pose_covariance is None else given.pose_covariance[None]
+        more = {"T_base_links": given.T_base_links, "pose_covariance": covariance}
+        self._map.update(given.points[None], given.T_map_sensor[None], given.T_map_base, given.dt, **more)
 
     def window(self) -> Window:
         """Return where the cells lie."""
@@ -77,7 +77,9 @@ class LibraryEngine:
         """Refuse: the library finds no planes."""
         raise ValueError(_NEEDS_TORCH.format("planes"))
 
-    def check_path(self, poses: NDArray[np.float64], footprint: NDArray[np.float64]) -> PathCheck:
+    def check_path(
+        self, poses: NDArray[np.float64], footprint: NDArray[np.float64], T_map_base: NDArray[np.float64] | None
+    ) -> PathAnswer:
         """Refuse: the library checks no paths."""
         raise ValueError(_NEEDS_TORCH.format("check_path"))
 
@@ -93,8 +95,9 @@ class LibraryEngine:
         """Forget the cells within a radius [m] of a place (2,) [m]."""
         self._map.clear_around(center, radius)
 
-    def initialize(self, feet: NDArray[np.float64], method: str) -> None:
-        """Estimate the unknown cells from ground points (K, 3) [m]."""
+    def initialize(self, feet: NDArray[np.float64], method: str, T_map_base: NDArray[np.float64]) -> None:
+        """Estimate the unknown cells around the robot from ground points (K, 3) [m]."""
+        self._map.move(T_map_base)
         self._map.initialize(feet, method)
 
     def save(self, path: Path) -> None:

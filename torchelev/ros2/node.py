@@ -27,17 +27,18 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from torchelev.io.bags.covariance import PoseCovariances
 from torchelev.io.bags.messages.cloud import CloudError
 from torchelev.io.bags.scans import clean, stamp_of
-from torchelev.ros2.engine import Frame, thinned
+from torchelev.ros2.engine import SensorInput, thinned
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.intake import Intake, Waiting
 from torchelev.ros2.parameters import merged_parameters
 from torchelev.ros2.publishing import Publishers
 from torchelev.ros2.sensors import Reading, Sensor
 from torchelev.ros2.services import Services
-from torchelev.ros2.settings import NodeSettings, changeable
+from torchelev.ros2.settings import NodeSettings, list_changeable
 from torchelev.ros2.transforms import TransformException, Transforms
 
 _TICK = 0.005  # [s] between looks at what is due
+_RECENT = 1.0  # [s] by which the covariance of a pose may be older than a cloud
 
 
 class ElevationMappingNode(Node):
@@ -58,9 +59,9 @@ class ElevationMappingNode(Node):
         self.intake = Intake(self.settings.transform_wait)
         self.stamp: Stamp | None = None  # of the map: of the newest cloud, or of the time when it was loaded
         self.transforms = Transforms(self, self.settings.map_frame)
-        self._covariances = PoseCovariances()
+        self._odometry = PoseCovariances(), -math.inf  # the newest covariance, and its stamp [s]
         self._warned: dict[str, float] = {}
-        self._publishers = Publishers(self, cfg.get("sensor", {}).get("body"))
+        self.outputs = Publishers(self, cfg.get("sensor", {}).get("body"))
         services = Services(self)
         self._subscribe()
         self.add_on_set_parameters_callback(self._set)
@@ -74,7 +75,10 @@ class ElevationMappingNode(Node):
 
     def _set(self, parameters: list[Any]) -> SetParametersResult:
         """Take new values of parameters that may change; refuse wrong ones with a sentence."""
-        values = {one.name: one.value for one in parameters if one.name in changeable()}
+        values = {one.name: one.value for one in parameters if one.name in list_changeable()}
+        of_map = next((one.name for one in parameters if one.name.startswith("map.")), None)
+        if of_map is not None:
+            return SetParametersResult(successful=False, reason=f"{of_map}: settings of the map need a restart")
         try:
             settings = dataclasses.replace(self.settings, **values)
             self._require_layers(settings)
@@ -93,10 +97,11 @@ class ElevationMappingNode(Node):
         settings = self.settings
         kind = ReliabilityPolicy.RELIABLE if settings.reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=1, reliability=kind)  # the newest one only, so that none is fused late
-        for topic in settings.clouds:
+        for topic in map(self.resolve_topic_name, settings.clouds):
             self.create_subscription(PointCloud2, topic, self._receiver(Sensor(topic)), qos)
-        infos = settings.camera_infos or [f"{topic.rpartition('/')[0]}/camera_info" for topic in settings.depths]
-        for topic, info in zip(settings.depths, infos, strict=True):
+        depths = [self.resolve_topic_name(topic) for topic in settings.depths]
+        infos = settings.camera_infos or [f"{topic.rpartition('/')[0]}/camera_info" for topic in depths]
+        for topic, info in zip(depths, infos, strict=True):
             sensor = Sensor(topic, is_depth=True, scale=settings.depth_scale or None)
             self.create_subscription(Image, topic, self._receiver(sensor), qos)
             self.create_subscription(CameraInfo, info, lambda message, to=sensor: setattr(to, "camera", message), qos)
@@ -117,10 +122,24 @@ class ElevationMappingNode(Node):
         return receive
 
     def _keep_covariance(self, message: Odometry) -> None:
-        self._covariances = PoseCovariances(self.settings.odometry)  # the newest alone
-        self._covariances.add(message)
-        for note in self._covariances.notes:
+        """Keep the newest covariance, if it is that of the base in the map's frame."""
+        frames, expected = (
+            (message.header.frame_id, message.child_frame_id),
+            (self.settings.map_frame, self.settings.base_frame),
+        )
+        if tuple(map(clean, frames)) != expected:
+            rule = f"its frames must be {' and '.join(expected)}, got {' and '.join(frames)}"
+            self._warn(f"{self.settings.odometry}: its covariance is not used: {rule}", "odometry", 60.0)
+            return
+        self._odometry = PoseCovariances(self.settings.odometry), stamp_of(message.header)
+        self._odometry[0].add(message)
+        for note in self._odometry[0].notes:
             self._warn(note, "covariance", 60.0)
+
+    def _covariance_at(self, stamp: float, lever: Any) -> Any:
+        """Return the covariance (6, 6) of a sensor's pose, see `PoseCovariances.of_sensor`; None if none is recent."""
+        known, of = self._odometry
+        return known.of_sensor(stamp, lever) if abs(stamp - of) <= _RECENT else None
 
     def now(self) -> float:
         """Return the time [s] by the node's clock."""
@@ -143,7 +162,7 @@ class ElevationMappingNode(Node):
         self._forget_transforms()
 
     def _forget_transforms(self) -> None:
-        self.transforms.clear()
+        self.transforms.forget()
         self.get_logger().warning("the clock jumped back; transforms from before are forgotten")
 
     # Updates ---------------------------------------------------------------------------------------------------------
@@ -155,22 +174,22 @@ class ElevationMappingNode(Node):
             self._fuse(cloud)
         for cloud in lost:
             self._explain(cloud)
-        self._publishers.publish()
+        self.outputs.publish()
 
     def _is_ready(self, cloud: Waiting) -> bool:
         """Return whether all transforms are there: at the stamp, and of each point's time."""
-        header, base = cloud.message.message.header, self.settings.base_frame
+        header, base = cloud.reading.message.header, self.settings.base_frame
         stamp, sensor = Time.from_msg(header.stamp), clean(header.frame_id)
         if not all(self.transforms.has(name, stamp) for name in (sensor, base)):
             return False
         if not all(self.transforms.has(link, stamp, parent=base) for link in self.engine.links):
             return False
-        return all(self.transforms.has(sensor, stamp, time) for time in cloud.message.span(self.settings.deskew))
+        return all(self.transforms.has(sensor, stamp, time) for time in cloud.reading.find_span(self.settings.deskew))
 
     def _fuse(self, cloud: Waiting) -> None:
-        header = cloud.message.message.header
+        header = cloud.reading.message.header
         try:
-            self.engine.update(self._frame_of(cloud, clean(header.frame_id), Time.from_msg(header.stamp)))
+            self.engine.update(self._input_of(cloud, clean(header.frame_id), Time.from_msg(header.stamp)))
         except (CloudError, TransformException, ValueError) as error:
             self.intake.counts.unreadable += 1
             kind = getattr(error, "kind", type(error).__name__)
@@ -179,26 +198,26 @@ class ElevationMappingNode(Node):
         self.intake.note_fused(cloud, self.now())
         if self.intake.stamp == cloud.stamp:
             self.stamp = header.stamp
-        for note in cloud.message.scan.notes:
+        for note in cloud.reading.cloud.notes:
             self._warn(f"{cloud.topic}: {note.text}", f"{cloud.topic} {note.kind}", 60.0)
 
-    def _frame_of(self, cloud: Waiting, sensor: str, stamp: Time) -> Frame:
+    def _input_of(self, cloud: Waiting, sensor: str, stamp: Time) -> SensorInput:
         """Return the points of a message with all poses."""
         base, links = self.settings.base_frame, self.engine.links
-        points = cloud.message.points(self.settings.deskew, lambda times: self.transforms.poses(sensor, stamp, times))
+        points = cloud.reading.points(self.settings.deskew, lambda times: self.transforms.poses(sensor, stamp, times))
         T_map_sensor, T_map_base = self.transforms.pose(sensor, stamp), self.transforms.pose(base, stamp)
-        return Frame(
+        return SensorInput(
             thinned(points, self.settings.max_points),
             T_map_sensor,
             T_map_base,
             self.intake.elapsed(cloud),
-            self._covariances.of_sensor(cloud.stamp, T_map_sensor[:3, 3] - T_map_base[:3, 3]),
+            self._covariance_at(cloud.stamp, T_map_sensor[:3, 3] - T_map_base[:3, 3]),
             np.array([self.transforms.pose(link, stamp, base) for link in links]) if links else None,
         )
 
     def _explain(self, cloud: Waiting) -> None:
-        """Say which transform a message waited for in vain."""
-        header, wait = cloud.message.message.header, self.settings.transform_wait
+        """Say which transform of a message did not arrive in time."""
+        header, wait = cloud.reading.message.header, self.settings.transform_wait
         stamp, base = Time.from_msg(header.stamp), self.settings.base_frame
         try:
             for name in (clean(header.frame_id), base):
@@ -233,4 +252,5 @@ def spin(settings: NodeSettings, cfg: dict[str, Any], arguments: list[str]) -> N
         if rclpy.ok():  # else it was shut down in the middle of its work
             raise
     finally:
+        node.destroy_node()
         rclpy.try_shutdown()

@@ -10,9 +10,36 @@ from numpy.typing import NDArray
 
 from torchelev.io.grid_map import GridMap, grid_map_of
 from torchelev.io.occupancy import OccupancyGrid, occupancy_of
+from torchelev.robot_body.shapes import Box, Capsule
 from torchelev.ros2.engine import Engine, Window
+from torchelev.stages.measure.config import BodyConfig
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])  # quat_wxyz
+
+
+class Topic(NamedTuple):
+    """What is published on a topic."""
+
+    type: str  #: of its messages
+    is_latched: bool = False  #: late subscribers get the last message: transient local
+
+
+#: below the node's name
+TOPICS = {
+    "map": Topic("grid_map_msgs/msg/GridMap", is_latched=True),
+    "points": Topic("sensor_msgs/msg/PointCloud2"),
+    "costmap": Topic("nav_msgs/msg/OccupancyGrid", is_latched=True),
+    "height_scan": Topic("std_msgs/msg/Float32MultiArray"),
+    "planes": Topic("visualization_msgs/msg/MarkerArray"),
+    "polygons": Topic("geometry_msgs/msg/PolygonStamped"),
+    "body": Topic("visualization_msgs/msg/MarkerArray", is_latched=True),
+}
+TRIGGERS = ("save_map", "load_map", "clear_map", "clear_around_robot", "initialize", "initialize_from_site")
+#: below the node's name, with their types
+SERVICES = dict.fromkeys(TRIGGERS, "std_srvs/srv/Trigger") | {
+    "get_submap": "grid_map_msgs/srv/GetGridMap",
+    "check_path": "nav2_msgs/srv/IsPathValid",
+}
 
 
 class MapCloud(NamedTuple):
@@ -26,7 +53,6 @@ class Outline(NamedTuple):
     """A polygon of a planar region."""
 
     kind: str  #: "boundary", "hole", or "inset", where a foot may be put
-    region: int  #: from 0 on, the largest first
     corners: NDArray[np.float64]  #: (K, 3) [m] map frame, the first not repeated
 
 
@@ -70,40 +96,42 @@ def area_cells(window: Window, area: Window) -> tuple[slice, slice]:
     return parts[0], parts[1]
 
 
-def outlines(regions: Sequence[Any]) -> list[Outline]:
+def make_outlines(regions: Sequence[Any]) -> list[Outline]:
     """Return the polygons of planar regions, the largest region first."""
     found = []
-    for k, region in enumerate(sorted(regions, key=lambda one: -one.area)):
-        found.append(Outline("boundary", k, region.boundary))
-        found += [Outline("hole", k, hole) for hole in region.holes]
-        found += [Outline("inset", k, inset) for inset in region.inset]
+    for region in sorted(regions, key=lambda one: -one.area):
+        found.append(Outline("boundary", region.boundary))
+        found += [Outline("hole", hole) for hole in region.holes]
+        found += [Outline("inset", inset) for inset in region.inset]
     return found
 
 
-def solids(body: dict[str, Any] | None, base_frame: str) -> list[Solid]:
+def make_solids(body: dict[str, Any] | None, base_frame: str) -> list[Solid]:
     """Return the shapes of a body, as the map's settings have it, as boxes, cylinders and spheres."""
     if body is None:
         return []
-    if "lower" in body:
-        lower, upper = np.array(body["lower"], float), np.array(body["upper"], float)
+    if not {"capsules", "boxes"} & body.keys():
+        box = BodyConfig(**body)
+        lower, upper = np.array(box.lower), np.array(box.upper)
         return [Solid(base_frame, "box", (lower + upper) / 2, IDENTITY, tuple((upper - lower).tolist()))]
-    boxes = [
-        Solid(box["link"], "box", np.array(box["center"], float), np.array(box.get("quat_wxyz", IDENTITY), float),
-              tuple(2 * float(half) for half in box["half_lengths"]))  # type: ignore[arg-type]
-        for box in body.get("boxes", ())
-    ]  # fmt: skip
-    return boxes + [solid for capsule in body.get("capsules", ()) for solid in _capsule(capsule)]
+    capsules, boxes = (body.get(kind, ()) for kind in ("capsules", "boxes"))
+    found = [_box(Box(**each)) for each in boxes]
+    return found + [solid for each in capsules for solid in _capsule(Capsule(**each))]
 
 
-def _capsule(capsule: dict[str, Any]) -> list[Solid]:
+def _box(box: Box) -> Solid:
+    x, y, z = box.half_lengths
+    return Solid(box.link, "box", np.array(box.center), np.array(box.quat_wxyz), (2 * x, 2 * y, 2 * z))
+
+
+def _capsule(capsule: Capsule) -> list[Solid]:
     """Return a capsule as a cylinder and two spheres."""
-    start, end, width = np.array(capsule["start"], float), np.array(capsule["end"], float), 2 * float(capsule["radius"])
-    axis, link = end - start, capsule["link"]
-    balls = [Solid(link, "sphere", place, IDENTITY, (width, width, width)) for place in (start, end)]
-    length = float(np.linalg.norm(axis))
-    if length < 1e-9:
+    start, end, width = np.array(capsule.start), np.array(capsule.end), 2 * capsule.radius
+    balls = [Solid(capsule.link, "sphere", place, IDENTITY, (width, width, width)) for place in (start, end)]
+    if capsule.length < 1e-9:
         return balls[:1]
-    return [Solid(link, "cylinder", (start + end) / 2, _from_z(axis / length), (width, width, length)), *balls]
+    turn = _from_z((end - start) / capsule.length)
+    return [Solid(capsule.link, "cylinder", (start + end) / 2, turn, (width, width, capsule.length)), *balls]
 
 
 def _from_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:

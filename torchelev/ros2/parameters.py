@@ -8,7 +8,7 @@ from typing import Any
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
-from torchelev.ros2.settings import NodeSettings, is_of_ros, make_settings, nested, split
+from torchelev.ros2.settings import NodeSettings, is_of_ros, make_settings, nest, split
 
 
 def merged_parameters(node: Node, settings: NodeSettings, cfg: dict[str, Any]) -> tuple[NodeSettings, dict[str, Any]]:
@@ -18,7 +18,7 @@ def merged_parameters(node: Node, settings: NodeSettings, cfg: dict[str, Any]) -
         ValueError: a value does not fit, or there is no such parameter.
     """
     given = {name: one.value for name, one in node.get_parameters_by_prefix("").items() if not is_of_ros(name)}
-    own, of_map = split(nested(given))
+    own, of_map = split(nest(given))
     settings = make_settings({**dataclasses.asdict(settings), **own})
     for each in dataclasses.fields(settings):
         if each.name in own:
@@ -39,7 +39,7 @@ def _declare(node: Node, each: dataclasses.Field[Any], value: Any) -> None:
 
 
 def _merged(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Return nested settings, of which the second come first."""
+    """Return the first settings updated by the second, group by group."""
     both = dict(a)
     for name, value in b.items():
         old = both.get(name)

@@ -20,7 +20,7 @@ from torchelev.ros2.transforms import TransformException
 if TYPE_CHECKING:
     from torchelev.ros2.node import ElevationMappingNode
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # late subscribers get the last one
+_LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
 _MANY = 100  # polygons of one map that wait in the middleware
 
 
@@ -31,23 +31,35 @@ class Publishers:
         self._node, self._schedule = node, outputs.Schedule()
         self._makers: dict[str, tuple[list[Any], Callable[[], None]]] = {}
         self._offer("points", self._make_points, PointCloud2)
-        self._offer("costmap", self._make_costmap, OccupancyGrid, LATCHED)
+        self._offer("costmap", self._make_costmap, OccupancyGrid)
         self._offer("height_scan", self._make_scan, Float32MultiArray)
-        self._offer("diagnostics", self._make_diagnostics, DiagnosticArray, topic="/diagnostics")
-        self._planes = node.create_publisher(MarkerArray, "~/planes", 1)
-        self._polygons = node.create_publisher(PolygonStamped, "~/polygons", _MANY)
+        self._offer(
+            "diagnostics",
+            self._make_diagnostics,
+            DiagnosticArray,
+            node.create_publisher(DiagnosticArray, "/diagnostics", 1),
+        )
+        self._planes, self._polygons = (
+            self._publisher("planes", MarkerArray),
+            self._publisher("polygons", PolygonStamped),
+        )
         self._makers["planes"] = [self._planes, self._polygons], self._make_planes
         try:
             from grid_map_msgs.msg import GridMap
         except ModuleNotFoundError:
             node.get_logger().warning("no grid_map_msgs: ~/map is not published; install ros-$ROS_DISTRO-grid-map-msgs")
         else:
-            self._offer("map", self._make_map, GridMap, LATCHED)
-        self._body = node.create_publisher(MarkerArray, "~/body", LATCHED)  # kept from garbage collection
-        self._body.publish(messages.to_body_markers(outputs.solids(body, node.settings.base_frame)))
+            self._offer("map", self._make_map, GridMap)
+        solids = outputs.make_solids(body, node.settings.base_frame)
+        self._publisher("body", MarkerArray).publish(messages.to_body_markers(solids))
 
-    def _offer(self, name: str, make: Callable[[], Any], kind: Any, qos: Any = 1, topic: str = "") -> None:
-        publisher = self._node.create_publisher(kind, topic or f"~/{name}", qos)
+    def _publisher(self, name: str, kind: Any) -> Any:
+        durability = _LATCHED if outputs.TOPICS[name].is_latched else DurabilityPolicy.VOLATILE
+        depth = _MANY if name == "polygons" else 1
+        return self._node.create_publisher(kind, f"~/{name}", QoSProfile(depth=depth, durability=durability))
+
+    def _offer(self, name: str, make: Callable[[], Any], kind: Any, publisher: Any = None) -> None:
+        publisher = publisher or self._publisher(name, kind)
 
         def publish() -> None:
             message = make()
@@ -91,7 +103,7 @@ class Publishers:
         return messages.to_scan(self._node.engine.scan(T_map_base), self._node.settings.height_scan)
 
     def _make_planes(self) -> None:
-        found = outputs.outlines(self._node.engine.planes())
+        found = outputs.make_outlines(self._node.engine.planes())
         self._planes.publish(messages.to_plane_markers(found, self._header()))
         for outline in found:
             if outline.kind == "inset":

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchelev.io.bags.messages.cloud import CloudError
 from torchelev.io.bags.messages.depth_image import CameraSettings
-from torchelev.io.bags.poses.within_scan import Poses, move_to_stamp, span
+from torchelev.io.bags.poses.within_scan import Poses, find_span, move_to_stamp
 from torchelev.io.bags.scans import Scan, read_scan
 
 _FEW, _MANY = 4, 16  # stamps from which a period is known, and from how many
@@ -59,14 +59,14 @@ class Reading:
     message: Any  #: the message
 
     @cached_property
-    def scan(self) -> Scan:
+    def cloud(self) -> Scan:
         """Its points; CloudError as `Sensor.read`."""
         return self.sensor.read(self.message)
 
-    def span(self, deskew: bool) -> tuple[float, float]:
+    def find_span(self, deskew: bool) -> tuple[float, float]:
         """Return the first and the last time [s] from the stamp at which poses are needed; 0, 0 if it is not read."""
         try:
-            return span(self.scan) if deskew else (0.0, 0.0)
+            return find_span(self.cloud) if deskew else (0.0, 0.0)
         except CloudError:  # said when it is fused
             return 0.0, 0.0
 
@@ -80,11 +80,11 @@ class Reading:
         Raises:
             CloudError: as `Sensor.read`, or there are too few poses within the scan.
         """
-        if not deskew or self.scan.times is None:
-            return self.scan.points
-        moved = move_to_stamp(self.scan, poses)
+        if not deskew or self.cloud.times is None:
+            return self.cloud.points
+        moved = move_to_stamp(self.cloud, poses)
         if moved is None:
-            first, last = span(self.scan)
+            first, last = find_span(self.cloud)
             times = f"from {first:.3g} to {last:.3g} s from its stamp"
             raise CloudError(
                 f"tf has too few poses {times} to take out the motion within the scan; or set deskew false"

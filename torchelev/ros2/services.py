@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,12 +11,15 @@ import numpy as np
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+from torchelev.errors import require
 from torchelev.ros2 import messages, outputs
-from torchelev.ros2.settings import polygon
-from torchelev.ros2.transforms import TransformException
+from torchelev.ros2.settings import read_footprint
+from torchelev.ros2.transforms import NEWEST, TransformException
 
 if TYPE_CHECKING:
     from torchelev.ros2.node import ElevationMappingNode
+
+_ERRORS = (ValueError, OSError, ImportError, TransformException)  # of a request, which must not end the node
 
 
 class Services:
@@ -23,15 +27,8 @@ class Services:
 
     def __init__(self, node: ElevationMappingNode) -> None:
         self._node = node
-        acts = {
-            "save_map": self.save,
-            "load_map": self.load,
-            "clear_map": self._clear,
-            "clear_around_robot": self._clear_around,
-            "initialize": self._initialize,
-            "initialize_from_site": self._initialize_from_site,
-        }
-        for name, act in acts.items():
+        acts = (self.save, self.load, self._forget, self._clear_around, self._initialize, self._initialize_from_site)
+        for name, act in zip(outputs.TRIGGERS, acts, strict=True):
             node.create_service(Trigger, f"~/{name}", _trigger(act))
         self._serve_submaps()
         self._serve_path_checks()
@@ -51,7 +48,7 @@ class Services:
         self._node.stamp_now()
         return f"loaded {path.absolute()}"
 
-    def _clear(self) -> str:
+    def _forget(self) -> str:
         self._node.engine.reset()
         return "the map is empty"
 
@@ -66,7 +63,10 @@ class Services:
         if not settings.feet:
             raise ValueError("feet: must name the frames of the feet, got none; set the parameter feet")
         places = np.array([self._node.transforms.pose(name)[:3, 3] for name in settings.feet])
-        self._node.engine.initialize(places - [0, 0, settings.foot_height], settings.initialize_method)
+        T_map_base = self._node.transforms.pose(settings.base_frame)
+        self._node.engine.initialize(places - [0, 0, settings.foot_height], settings.initialize_method, T_map_base)
+        if not np.isfinite(self._node.engine.layer("elevation")).any():
+            raise ValueError("feet: must stand in the map's window, got none of its cells; check base_frame and feet")
         self._node.stamp_now()
         return f"the ground below {', '.join(settings.feet)} is in the map"
 
@@ -101,8 +101,8 @@ class Services:
         def call(request: Any, response: Any) -> Any:
             try:
                 act(request, response)
-            except (ValueError, ImportError, TransformException) as error:
-                self._node.get_logger().error(str(error))
+            except _ERRORS as error:
+                self._node.get_logger().error(_text_of(error))
             return response
 
         return call
@@ -110,8 +110,10 @@ class Services:
     def _get_submap(self, request: Any, response: Any) -> None:
         self._require_frame(request.frame_id)
         resolution = self._node.engine.window().resolution
-        lengths = (request.length_x, request.length_y)
-        area = outputs.area_of((request.position_x, request.position_y), lengths, resolution)
+        center, lengths = (request.position_x, request.position_y), (request.length_x, request.length_y)
+        hint = "give metres in the map's frame"
+        require(all(map(math.isfinite, (*center, *lengths))), "request", "must be finite", (center, lengths), hint)
+        area = outputs.area_of(center, lengths, resolution)
         layers = list(request.layers) or self._node.settings.layers
         grid = outputs.grid_map(self._node.engine, layers, area)
         stamp = self._node.stamp or self._node.get_clock().now().to_msg()
@@ -122,16 +124,19 @@ class Services:
         response.is_valid = False
         self._require_frame(request.path.header.frame_id)
         poses = np.array([messages.xy_yaw_of(one.pose) for one in request.path.poses]).reshape(-1, 3)
-        if not len(poses):
-            raise ValueError("path: must have a pose, got none; the planner found no path")
-        checked = self._node.engine.check_path(poses, np.array(polygon(self._node.settings.footprint)))
+        require(len(poses) > 0, "path", "must have a pose", "none", "the planner found no path")
+        require(bool(np.isfinite(poses).all()), "path", "must be finite", "NaN or inf", "check the planner")
+        settings, transforms = self._node.settings, self._node.transforms
+        is_placed = transforms.has(settings.base_frame, NEWEST)
+        T_map_base = transforms.pose(settings.base_frame) if is_placed else None
+        checked = self._node.engine.check_path(poses, np.array(read_footprint(settings.footprint)), T_map_base)
         response.is_valid, response.invalid_pose_indices = checked.is_safe, checked.unsafe
         self._node.get_logger().info(f"check_path: {checked.reason}")
 
     def _require_frame(self, frame: str) -> None:
         expected = self._node.settings.map_frame
-        if frame not in ("", expected):
-            raise ValueError(f"frame_id: must be {expected}, got {frame!r}; transform it first, or leave it empty")
+        hint = "transform it first, or leave it empty"
+        require(frame in ("", expected), "frame_id", f"must be {expected}", repr(frame), hint)
 
 
 def _trigger(act: Callable[[], str]) -> Callable[[Any, Any], Any]:
@@ -140,10 +145,13 @@ def _trigger(act: Callable[[], str]) -> Callable[[Any, Any], Any]:
     def call(_: Any, response: Any) -> Any:
         try:
             response.success, response.message = True, act()
-        except (ValueError, OSError, ImportError, TransformException) as error:
-            is_file = isinstance(error, OSError) and error.filename is not None
-            text = f"{error.filename}: {str(error.strerror).lower()}" if is_file else str(error)  # type: ignore[union-attr]
-            response.success, response.message = False, text
+        except _ERRORS as error:
+            response.success, response.message = False, _text_of(error)
         return response
 
     return call
+
+
+def _text_of(error: Exception) -> str:
+    is_file = isinstance(error, OSError) and error.filename is not None and error.strerror is not None
+    return f"{error.filename}: {error.strerror.lower()}" if is_file else str(error)  # type: ignore[attr-defined]

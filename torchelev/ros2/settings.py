@@ -33,7 +33,7 @@ class NodeSettings:
         ValueError: a value has the wrong type or is out of range.
     """
 
-    map_frame: str = _setting("odom", "fixed frame of the map, z up; odom does not jump, which a map likes better")
+    map_frame: str = _setting("odom", "fixed frame of the map, z up; use one that does not jump, such as odom")
     base_frame: str = _setting("base_link", "frame that the map's window follows")
     clouds: tuple[str, ...] = _setting(("points",), "topics of sensor_msgs/PointCloud2")
     depths: tuple[str, ...] = _setting((), "topics of sensor_msgs/Image: depth, 16UC1 or 32FC1")
@@ -57,10 +57,10 @@ class NodeSettings:
     map_file: str = _setting("map.safetensors", "file of ~/save_map and ~/load_map", True)
     load_on_start: bool = _setting(False, "load map_file when the node starts, if it is there")
     clear_radius: float = _setting(1.5, "[m] around base_frame that ~/clear_around_robot forgets", True)
-    feet: tuple[str, ...] = _setting((), "frames of the feet, on whose ground ~/initialize puts the first map")
+    feet: tuple[str, ...] = _setting((), "frames of the feet; ~/initialize starts the map from the ground below them")
     foot_height: float = _setting(0.0, "[m] of the feet's frames over the ground that they stand on", True)
     initialize_method: str = _setting("linear", "of ~/initialize: linear within the feet, or nearest everywhere", True)
-    site: str = _setting("", "file of a site map that ~/initialize_from_site starts from; needs PyTorch", True)
+    site: str = _setting("", "folder of a site map that ~/initialize_from_site starts from; needs PyTorch", True)
     footprint: str = _setting(
         "[[0.35, 0.25], [0.35, -0.25], [-0.35, -0.25], [-0.35, 0.25]]",
         "[m] corners in base_frame as Nav2 writes them, which ~/check_path moves along a path; needs PyTorch",
@@ -76,8 +76,8 @@ class NodeSettings:
             object.__setattr__(self, each.name, _checked(each.name, getattr(self, each.name), each.default))
         for name, value in vars(self).items():
             if name.startswith("rate_") or name == "transform_wait":
-                in_range = 0 <= value < math.inf
-                require(in_range, name, "must be finite and not negative", value, "give Hz; 0: never")
+                hint = "give seconds" if name == "transform_wait" else "give Hz; 0: never"
+                require(0 <= value < math.inf, name, "must be finite and not negative", value, hint)
         in_range = 0 <= self.min_traversability < 1
         require(in_range, "min_traversability", "must lie in [0, 1)", self.min_traversability, "the default is 0.5")
         require(self.engine in ENGINES, "engine", f"must be one of {', '.join(ENGINES)}", repr(self.engine), "use auto")
@@ -93,7 +93,7 @@ class NodeSettings:
         require(num in (0, expected), "camera_infos", rule, num, hint)
         sensors = bool(self.clouds or self.depths)
         require(sensors, "clouds", "must not be empty without depths", repr(self.clouds), "name a topic")
-        polygon(self.footprint)
+        read_footprint(self.footprint)
         for name in ("threads", "max_points"):
             require(getattr(self, name) >= 1, name, "must be at least 1", getattr(self, name), "see its default")
         for name in ("map_frame", "base_frame", "layers"):
@@ -115,17 +115,21 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     return value
 
 
-def polygon(text: str) -> list[list[float]]:
+def read_footprint(text: str) -> list[list[float]]:
     """Return the corners (V, 2) [m] of a footprint as Nav2 writes it, "[[x, y], ...]"; ValueError for another text."""
+    hint = 'write "[[0.3, 0.2], [0.3, -0.2], [-0.3, 0.0]]"'
     try:
         corners = json.loads(text)
+        numbers = [value for corner in corners for value in corner]
         is_polygon = len(corners) >= 3 and all(len(corner) == 2 for corner in corners)
-        corners = [[float(value) for value in corner] for corner in corners]
+        is_finite = all(type(value) in (int, float) and math.isfinite(value) for value in numbers)
     except (ValueError, TypeError):
-        is_polygon = False
-    rule, hint = "must be three or more corners", 'write "[[0.3, 0.2], [0.3, -0.2], [-0.3, 0.0]]"'
-    require(is_polygon, "footprint", rule, repr(text), hint)
-    return corners
+        is_polygon = is_finite = False
+    require(is_polygon and is_finite, "footprint", "must be three or more corners of two numbers", repr(text), hint)
+    pairs = zip(corners, corners[1:] + corners[:1], strict=True)
+    area = 0.5 * abs(sum(a[0] * b[1] - b[0] * a[1] for a, b in pairs))
+    require(area > 1e-6, "footprint", "must have an area", repr(text), hint)
+    return [[float(value) for value in corner] for corner in corners]
 
 
 def read_node_file(path: str | Path) -> tuple[NodeSettings, dict[str, Any]]:
@@ -159,7 +163,7 @@ def is_of_ros(name: str) -> bool:
     return name.partition(".")[0] in _OF_ROS
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+def nest(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested dicts from names with points between, as ROS has them."""
     root: dict[str, Any] = {}
     for name, value in values.items():
@@ -179,6 +183,6 @@ def make_settings(values: Mapping[str, Any]) -> NodeSettings:
     return NodeSettings(**values)
 
 
-def changeable() -> set[str]:
+def list_changeable() -> set[str]:
     """Return the names of the parameters that may change while the node runs."""
     return {each.name for each in dataclasses.fields(NodeSettings) if each.metadata["changeable"]}

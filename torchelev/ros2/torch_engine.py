@@ -22,9 +22,11 @@ from torchelev.errors import require
 from torchelev.io.map_file import load_map, save_map
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.presets import PRESETS
-from torchelev.ros2.engine import Frame, PathCheck, Window
+from torchelev.ros2.engine import PathAnswer, SensorInput, Window
 from torchelev.ros2.settings import NodeSettings
 from torchelev.state import map_layers
+
+_MAX_FOOTPRINTS = 20_000  # of a path, a second or two
 
 
 class Diagnosis:
@@ -59,12 +61,12 @@ class TorchEngine:
         self._diagnosis = Diagnosis()
         self.links = list(self._map.cfg.sensor.links)
 
-    def update(self, frame: Frame) -> None:
+    def update(self, given: SensorInput) -> None:
         """Fuse the points of one sensor."""
-        given = {"pose_covariance": frame.pose_covariance, "T_base_links": frame.T_base_links}
-        more = {name: _floats(value) for name, value in given.items() if value is not None}
-        points = torch.from_numpy(frame.points)[None]
-        self._map.update(points, _floats(frame.T_map_sensor), _floats(frame.T_map_base), frame.dt, **more)
+        known = {"pose_covariance": given.pose_covariance, "T_base_links": given.T_base_links}
+        more = {name: _floats(value) for name, value in known.items() if value is not None}
+        points = torch.from_numpy(given.points)[None]
+        self._map.update(points, _floats(given.T_map_sensor), _floats(given.T_map_base), given.dt, **more)
 
     def window(self) -> Window:
         """Return where the cells lie."""
@@ -98,17 +100,25 @@ class TorchEngine:
         center = self._map.center[0, :2].numpy()
         return list(segment(self._map.layer("elevation"), self._map.cfg.grid.resolution, center=center)[0].regions)
 
-    def check_path(self, poses: NDArray[np.float64], footprint: NDArray[np.float64]) -> PathCheck:
+    def check_path(
+        self, poses: NDArray[np.float64], footprint: NDArray[np.float64], T_map_base: NDArray[np.float64] | None
+    ) -> PathAnswer:
         """Move a footprint (V, 2) [m] along poses (T, 3), x, y [m] and yaw [rad]."""
-        from torchelev.planning.path_check import check_path  # which few nodes are asked for
+        from torchelev.planning.footprint import FootprintConfig  # which few nodes are asked for
+        from torchelev.planning.path_check import check_path
+        from torchelev.planning.standing import place_footprint
 
         corners = torch.from_numpy(footprint)
-        samples = _samples(poses, footprint, self._map.cfg.grid.resolution)
-        checked = check_path(self._map, _floats(poses), corners, samples=samples)
+        standing = torch.full((1, len(footprint), 2), torch.nan, dtype=torch.float64)  # it is not known where it stands
+        if T_map_base is not None:
+            standing = place_footprint(self._map, corners, _floats(T_map_base)[:, None])[:, 0]
+        cfg = FootprintConfig(max_extent=2.01 * float(np.hypot(*footprint.T).max()))
+        samples = _count_samples(poses, footprint, self._map.cfg.grid.resolution)
+        checked = check_path(self._map, _floats(poses), corners, cfg, samples=samples, standing=standing)
         safe = checked.footprints.safe[0].numpy()
         # A pose is reached by the samples after the one before.
         unsafe = [k for k in range(len(poses)) if not safe[max(0, (k - 1) * samples + 1) : k * samples + 1].all()]
-        return PathCheck(not unsafe, unsafe, checked.explain()[0])
+        return PathAnswer(not unsafe, unsafe, checked.explain()[0])
 
     def initialize_from(self, site: Path, T_map_base: NDArray[np.float64]) -> None:
         """Start with what a site map knows."""
@@ -124,8 +134,11 @@ class TorchEngine:
         """Forget the cells within a radius [m] of a place (2,) [m]."""
         self._map.clear_around(_floats(center), radius)
 
-    def initialize(self, feet: NDArray[np.float64], method: str) -> None:
-        """Estimate the unknown cells from ground points (K, 3) [m]."""
+    def initialize(self, feet: NDArray[np.float64], method: str, T_map_base: NDArray[np.float64]) -> None:
+        """Estimate the unknown cells around the robot from ground points (K, 3) [m]."""
+        links = {"T_base_links": torch.eye(4).repeat(1, len(self.links), 1, 1)} if self.links else {}
+        nothing, T = torch.full((1, 1, 3), torch.nan), _floats(T_map_base)
+        self._map.update(nothing, T, T, 0.0, **links)  # moves the window
         self._map.initialize(_floats(feet), method)
 
     def save(self, path: Path) -> None:
@@ -159,11 +172,19 @@ def _floats(values: NDArray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float64))[None]
 
 
-def _samples(poses: NDArray[np.float64], footprint: NDArray[np.float64], resolution: float) -> int:
-    """Return how many footprints on each segment keep every corner within a cell from one to the next."""
+def _count_samples(poses: NDArray[np.float64], footprint: NDArray[np.float64], resolution: float) -> int:
+    """Return how many footprints on each segment keep every corner within a cell from one to the next.
+
+    Raises:
+        ValueError: the poses are so far apart that the footprints would be too many.
+    """
     if len(poses) < 2:
         return 1
     change = np.diff(poses, axis=0)
     turn = np.abs((change[:, 2] + np.pi) % (2 * np.pi) - np.pi)
     distance = np.hypot(change[:, 0], change[:, 1]) + np.hypot(*footprint.T).max() * turn
-    return max(1, int(np.ceil(distance.max() / resolution)))
+    samples = max(1, math.ceil(distance.max() / resolution))
+    hint = "give poses every few centimetres, as planners do"
+    fits, rule = samples * len(poses) <= _MAX_FOOTPRINTS, f"must need at most {_MAX_FOOTPRINTS} footprints"
+    require(fits, "path", rule, samples * len(poses), hint)
+    return samples

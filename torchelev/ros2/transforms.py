@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.time import Time
 from tf2_ros import Buffer, TransformException, TransformListener
@@ -29,7 +28,8 @@ class Transforms:
 
     def has(self, frame: str, stamp: Time, offset: float = 0.0, parent: str = "") -> bool:
         """Return whether the pose of a frame is known at a stamp, or an offset [s] from it."""
-        return self._buffer.can_transform(parent or self._map, frame, _shifted(stamp, offset))
+        time = _shifted(stamp, offset)
+        return time is not None and self._buffer.can_transform(parent or self._map, frame, time)
 
     def pose(self, frame: str, stamp: Time = NEWEST, parent: str = "") -> NDArray[np.float64]:
         """Return T_parent_frame (4, 4) at a stamp; TransformException if it is not known. The parent is the map."""
@@ -40,14 +40,16 @@ class Transforms:
         found = np.full((len(offsets), 4, 4), np.nan)
         for k, offset in enumerate(offsets.tolist()):
             time = _shifted(stamp, offset)
-            if self._buffer.can_transform(self._map, frame, time):
+            if time is not None and self._buffer.can_transform(self._map, frame, time):
                 found[k] = self.pose(frame, time)
         return found
 
-    def clear(self) -> None:
+    def forget(self) -> None:
         """Forget all transforms, as a clock jumped back."""
         self._buffer.clear()
 
 
-def _shifted(stamp: Time, offset: float) -> Time:
-    return stamp + Duration(nanoseconds=round(1e9 * offset)) if offset else stamp
+def _shifted(stamp: Time, offset: float) -> Time | None:
+    """Return the time at an offset [s] from a stamp; None before 0, where simulated time begins."""
+    time = stamp.nanoseconds + round(1e9 * offset)
+    return Time(nanoseconds=time, clock_type=stamp.clock_type) if time > 0 else None

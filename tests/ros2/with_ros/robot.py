@@ -24,15 +24,13 @@ from std_srvs.srv import Trigger
 from tf2_ros import StaticTransformBroadcaster, TransformBroadcaster
 from visualization_msgs.msg import MarkerArray
 
+from torchelev.ros2 import outputs
+
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+KINDS = (GridMap, PointCloud2, OccupancyGrid, Float32MultiArray, MarkerArray, PolygonStamped, MarkerArray)
 TOPICS = {
-    "map": (GridMap, LATCHED),
-    "costmap": (OccupancyGrid, LATCHED),
-    "body": (MarkerArray, LATCHED),
-    "points": (PointCloud2, 1),
-    "height_scan": (Float32MultiArray, 1),
-    "planes": (MarkerArray, 1),
-    "polygons": (PolygonStamped, 100),
+    name: (kind, LATCHED if topic.is_latched else 100 if name == "polygons" else 1)
+    for (name, topic), kind in zip(outputs.TOPICS.items(), KINDS, strict=True)
 }
 
 

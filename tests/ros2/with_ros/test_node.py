@@ -97,13 +97,14 @@ def test_a_clock_that_jumps_back(make_robot):
 
 
 def test_parameters(make_robot):
-    robot = make_robot()
+    robot = make_robot("", "-p", "map.grid.length_x:=4.0")
     robot.fuse(1000.0)
     assert robot.set(rate_costmap=20.0, layers=["elevation", "variance"]) is None
     assert "must be finite and not negative, got -1.0" in robot.set(rate_costmap=-1.0)
     assert "must lie in [0, 1), got 2.0" in robot.set(min_traversability=2.0)
     assert robot.set(layers=["elevaton"]).startswith("layer: must be ")
     assert "read-only" in robot.set(map_frame="map")
+    assert robot.set(**{"map.grid.length_x": 3.0}) == "map.grid.length_x: settings of the map need a restart"
     robot.heard.pop("points", None)
     robot.fuse(1000.1)
     robot.wait(lambda: "points" in robot.heard)

@@ -54,7 +54,7 @@ def test_grid_map_is_the_map_and_a_submap_is_a_part_of_it(make_robot):
     part = from_grid_map(robot.ask("get_submap", GetGridMap, **asked, layers=["elevation"]).map)
     assert part.layers["elevation"].shape == (6, 4)
     np.testing.assert_allclose(part.layers["elevation"], 0.4, atol=0.01)
-    for wrong in ({"frame_id": "map"}, {"position_x": 90.0}, {"layers": ["elevaton"]}):
+    for wrong in ({"frame_id": "map"}, {"position_x": 90.0}, {"layers": ["elevaton"]}, {"length_x": float("inf")}):
         assert list(robot.ask("get_submap", GetGridMap, **asked | wrong).map.layers) == []
     text = Path(robot.log).read_text()
     for words in ("frame_id: must be odom, got 'map'", "has no cells around", "layer: must be "):
@@ -64,15 +64,26 @@ def test_grid_map_is_the_map_and_a_submap_is_a_part_of_it(make_robot):
 def test_covariance_of_odometry_is_in_the_variances(make_robot):
     robot = make_robot("", "-p", "odometry:=/odom", "-p", "layers:=[elevation, variance]")
     odometry = Odometry()
-    odometry.header.frame_id, odometry.child_frame_id = "odom", "base_link"
+    odometry.header.frame_id, odometry.child_frame_id = "world", "base_link"
+    odometry.header.stamp.sec = 1000
     odometry.pose.covariance[14] = 0.04  # [m^2] of z
-    for _ in range(3):
-        robot.send("/odom", odometry)
-        robot.spin(0.05)
-    robot.fuse(1000.0)
-    robot.wait(lambda: "points" in robot.heard)
-    values = np.frombuffer(robot.heard["points"].data, np.float32).reshape(-1, 4)
-    assert values[:, 3].min() > 0.04
+
+    def least_variance(stamp):
+        for _ in range(3):
+            robot.send("/odom", odometry)
+            robot.spin(0.05)
+        robot.fuse(stamp)
+        robot.heard.pop("points", None)
+        robot.wait(lambda: "points" in robot.heard)
+        return np.frombuffer(robot.heard["points"].data, np.float32).reshape(-1, 4)[:, 3].min()
+
+    assert least_variance(1000.0) < 0.01
+    assert "frames must be odom and base_link, got world and base_link" in Path(robot.log).read_text()
+    assert robot.call("clear_map")[0]
+    odometry.header.frame_id = "odom"
+    assert least_variance(1000.1) > 0.04
+    assert robot.call("clear_map")[0]
+    assert least_variance(1005.0) < 0.01, "an old covariance"
 
 
 def test_points_on_the_robots_links_are_left_out_and_its_shapes_shown(make_robot, tmp_path, prepared):
@@ -150,6 +161,8 @@ def test_paths_are_checked(make_robot):
     onto = robot.ask("check_path", IsPathValid, path=path_of(-0.5, 0.0, 1.0))
     assert not onto.is_valid and list(onto.invalid_pose_indices) == [2]
     assert not robot.ask("check_path", IsPathValid, path=path_of()).is_valid
+    assert not robot.ask("check_path", IsPathValid, path=path_of(float("inf"))).is_valid
+    assert not robot.ask("check_path", IsPathValid, path=path_of(20.0)).is_valid, "never seen"
     text = Path(robot.log).read_text()
     assert "every footprint along the path is safe" in text and "path: must have a pose, got none" in text
 

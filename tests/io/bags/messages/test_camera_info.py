@@ -1,5 +1,6 @@
 """Rays are those of P where images are rectified, else those of K without the distortion, which is said."""
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -43,7 +44,8 @@ def test_a_camera_without_focal_length_is_refused():
         (RAW, P, LENS, "/depth/image_rect_raw", "", 60.0),  # rectified, and its matrix is known
         (K, np.zeros(12), LENS, "/depth/image_rect", "not removed: the topic's name says that", 60.0),
         (ZERO, P, LENS, "/depth/image_raw", "not removed: K is missing", 60.0),
-        (RAW, P, (1.0, 2.0), "/depth/image_raw", "not removed: its model '' is not known", 60.0),
+        (RAW, P, (1.0, 2.0), "/depth/image_raw", "not removed: its model '' with 2 coefficients is not known", 60.0),
+        (RAW, P, LENS, "/direct/image", "which is removed", 48.0),
         (RAW, P, np.zeros(5), "/depth/image_raw", "", 60.0),
         (RAW, P, (1e-5, 0, 0, 0), "/depth/image_raw", "", 60.0),
     ],
@@ -80,3 +82,10 @@ def distorted(x, y, D, model):
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
     return u, y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+
+
+def test_a_distortion_without_opencv_is_refused(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    lens, _ = choose_lens(camera(K, P, (0.123, 0.0, 0.0, 0.0)), "/depth/image_raw")
+    with pytest.raises(CloudError, match="which only OpenCV removes: install opencv-python-headless"):
+        pixel_rays(lens, 7, 9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,21 +47,26 @@ def choose_lens(camera: Any, topic: str = "") -> tuple[Lens, Note | None]:
     if not given:
         raise CloudError("the CameraInfo holds no calibration: the focal lengths of both P and K are not positive")
     lens = _lens(next(iter(given.values())))
-    if not (np.abs(D) > _DISTORTED).any() or ("rect" in topic and "P" in given):
+    if not (np.abs(D) > _DISTORTED).any() or (_is_rectified(topic) and "P" in given):
         return lens, None
     text = f"the CameraInfo has a distortion, coefficients up to {np.abs(D).max():.3g}"
     model = getattr(camera, "distortion_model", "")
-    if "rect" in topic or "K" not in given or model not in _MODELS or len(D) not in _NUM_COEFFICIENTS:
-        text = f"{text}, which is not removed: {_why_not(topic, given, model)}"
+    if _is_rectified(topic) or "K" not in given or model not in _MODELS or len(D) not in _NUM_COEFFICIENTS:
+        text = f"{text}, which is not removed: {_why_not(topic, given, model, len(D))}"
         return lens, Note(f"{text}; depth images are taken as rectified", "distortion")
     note = Note(f"{text}, which is removed: without rect in the topic's name, images are not rectified", "distortion")
     return _lens(K)._replace(distortion=tuple(D.tolist()), is_fisheye=model in _FISHEYE), note
 
 
-def _why_not(topic: str, given: dict[str, Any], model: str) -> str:
-    if "rect" in topic:
+def _is_rectified(topic: str) -> bool:
+    """Return whether a topic's name says that its images are rectified."""
+    return re.search(r"(^|[/_])rect", topic) is not None
+
+
+def _why_not(topic: str, given: dict[str, Any], model: str, number: int) -> str:
+    if _is_rectified(topic):
         return "the topic's name says that images are rectified, but P, their matrix, is missing"
-    return "K is missing" if "K" not in given else f"its model {model!r} is not known"
+    return "K is missing" if "K" not in given else f"its model {model!r} with {number} coefficients is not known"
 
 
 @functools.lru_cache(maxsize=8)
@@ -70,8 +76,11 @@ def pixel_rays(lens: Lens, height: int, width: int) -> tuple[NDArray[np.float32]
     v, u = np.mgrid[:height, :width].astype(np.float64)
     if not lens.distortion:
         return ((u - cx) / fx).astype(np.float32), ((v - cy) / fy).astype(np.float32)
-    import cv2  # few cameras need it
-
+    try:
+        import cv2  # which few cameras need
+    except ModuleNotFoundError as error:
+        text = "the lens has a distortion, which only OpenCV removes: install opencv-python-headless"
+        raise CloudError(f"{text}, or give the topic of rectified images") from error
     pixels, matrix = np.stack([u, v], -1).reshape(-1, 1, 2), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     coefficients = np.array(lens.distortion)
     if lens.is_fisheye:

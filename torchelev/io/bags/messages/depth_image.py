@@ -78,4 +78,6 @@ def _doubt(depth: NDArray[np.float32], saturated: float | None) -> Note | None:
     if median >= _NEAREST and not (median > _FARTHEST if saturated else near > _FARTHEST_FLOAT):
         return None
     text = f"half of the depths are {'below' if median < _NEAREST else 'beyond'} {median:.3g} m, unlikely for a camera"
-    return Note(f"{text}; if their unit is another one, give the metres per unit by --depth-scale", "depths")
+    return Note(
+        f"{text}; if their unit is another one, give its metres: --depth-scale, or the parameter depth_scale", "depths"
+    )

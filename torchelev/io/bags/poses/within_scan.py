@@ -26,7 +26,7 @@ def hold_still(tree: TransformTree, map_frame: str, scan: Scan) -> NDArray[np.fl
     )
 
 
-def span(scan: Scan) -> tuple[float, float]:
+def find_span(scan: Scan) -> tuple[float, float]:
     """Return the first and the last time [s] from the stamp at which a pose of the sensor is needed."""
     known = np.zeros(1) if scan.times is None else scan.times[np.isfinite(scan.times)]
     return min(float(known.min()), 0.0), max(float(known.max()), 0.0)
@@ -47,7 +47,7 @@ def move_to_stamp(scan: Scan, poses: Poses, max_extrapolation: float = 0.0) -> N
         The points (N, 3) [m], NaN where no pose is known; None if that at the stamp is not, or fewer than two are.
     """
     assert scan.times is not None
-    first, last = span(scan)
+    first, last = find_span(scan)
     num = int(np.clip(np.ceil((last - first) / _POSE_STEP) + 1, 2, _MAX_POSES))
     stamps = np.linspace(first, last, num)
     *known, at_stamp = poses(np.append(stamps, 0.0))
