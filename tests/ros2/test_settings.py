@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from torchelev.app.ros2_command import ros2_command
 from torchelev.ros2.outputs import SERVICES, TOPICS
-from torchelev.ros2.settings import NodeSettings, make_settings, nest, read_node_file, split
+from torchelev.ros2.settings import NodeSettings, list_changeable, make_settings, nest, read_node_file, split
 
 FILE = """
 map_frame: map
