@@ -10,8 +10,10 @@ MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests
 	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
 EXTRAS := io,bags,odometry,video,view,geo,site,rl,deploy,dev,docs
 MJLAB := .venv-mjlab
+ISAACLAB := .venv-isaaclab
+NEWTON := .venv-newton
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-isaaclab bench-isaaclab test-newton test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -35,7 +37,7 @@ demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
 # Workers and the programs that they start share the cores: threads that wait busily would hold them up.
-test test-fast test-library test-mjlab: export OMP_WAIT_POLICY = PASSIVE
+test test-fast test-library test-mjlab test-isaaclab test-newton: export OMP_WAIT_POLICY = PASSIVE
 
 test: setup  ## run all tests, on all cores
 	$(BIN)/python $(PYTEST)
@@ -78,6 +80,30 @@ $(MJLAB)/.ready: pyproject.toml constraints-mjlab.txt
 	$(MJLAB)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints-mjlab.txt \
 		--editable . mjlab pytest hypothesis
 	@touch $@
+
+$(NEWTON)/.ready: pyproject.toml constraints.txt
+	@echo "Installing Newton, Warp and PyTorch into $(NEWTON), nowhere else: 1.5 GB."
+	$(PYTHON) -m venv $(NEWTON)
+	$(NEWTON)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--editable . newton==1.8.0 warp-lang==1.19.0 pytest hypothesis scipy
+	@touch $@
+
+test-newton: $(NEWTON)/.ready  ## run maps in Newton, in the environment .venv-newton; two minutes, of which Warp compiles one
+	$(NEWTON)/bin/python -m pytest tests/integrations/test_newton_simulator.py
+
+# Isaac Lab needs Python 3.12 and pins torch, newton, warp and rsl-rl-lib; of Isaac Sim, nothing is needed.
+$(ISAACLAB)/.ready: pyproject.toml
+	@echo "Installing Isaac Lab 3.0.0 and a CUDA build of PyTorch into $(ISAACLAB), nowhere else: 7.8 GB, five minutes."
+	$(if $(ROS2_PYTHON),$(ROS2_PYTHON),python3.12) -m venv $(ISAACLAB)
+	$(ISAACLAB)/bin/python -m pip install --quiet --disable-pip-version-check --editable . isaaclab==3.0.0 pytest hypothesis
+	@touch $@
+
+test-isaaclab: $(ISAACLAB)/.ready  ## run the observation term in Isaac Lab 3.0.0, in the environment .venv-isaaclab; three minutes
+	$(ISAACLAB)/bin/python -m pytest --disable-warnings tests/integrations/isaaclab
+
+bench-isaaclab: setup $(ISAACLAB)/.ready  ## compare the term with Isaac Lab's own height scan, and time both, two minutes
+	$(ISAACLAB)/bin/python -W ignore -m benchmarks.quality.isaac_lab
+	$(BIN)/python -m docs.readme_tables
 
 test-mjlab: $(MJLAB)/.ready  ## run the observation term in mjlab, in the environment .venv-mjlab
 	$(MJLAB)/bin/python -m pytest tests/integrations/test_mjlab_simulator.py
@@ -133,4 +159,4 @@ docs: setup  ## build the documentation in docs/_build/html, warnings as errors;
 	@echo "Open docs/_build/html/index.html"
 
 clean:  ## remove what the targets made
-	rm -rf $(VENV) $(MJLAB) $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks
+	rm -rf $(VENV) $(MJLAB) $(ISAACLAB) $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks
