@@ -20,6 +20,7 @@ import training
 from benchmarks.gpu import report as gpu
 from benchmarks.quality import mjlab_task, pose_covariance
 from benchmarks.quality.changes import report as changes
+from benchmarks.quality.isaac_lab import report as isaac_lab
 from benchmarks.quality.odometry import report as odometry
 from benchmarks.quality.real import completed, merged
 from benchmarks.runtime import report as runtime
@@ -193,6 +194,7 @@ TABLES = {
     "sensors": _made_by(sensors.table, "sensors", "cases"),
     "sight": _made_by(sight.table, "sight", "rows"),
     "mjlab": _made_by(mjlab_task.table, "mjlab"),
+    "isaac_lab": _made_by(isaac_lab.table, "isaac_lab"),
     "self_filter_walking": _made_by(walking.table, "self_filter", "walking"),
     "postprocessing": _postprocessing,
     "occlusion": _occlusion,

@@ -39,7 +39,7 @@ class Environment:
         self.tile_ids = torch.arange(num_envs)
         self.origins = self.tile_ids[:, None] * torch.tensor([10.0, -10.0, 0.0], dtype=torch.float64)
         self.camera = MountedSensor(DepthCamera(width=80, height=60, max_range=5.0), mount(pitch_deg=35, x=0.3, z=0.2))
-        self.sim, self.walked, self.common_step_counter = SimpleNamespace(mj_model=None), 0.0, -1
+        self.sim, self.walked, self.common_step_counter = SimpleNamespace(mj_model=None, forward=lambda: None), 0.0, -1
         self.step()
 
     def step(self, distance=0.05):

@@ -18,7 +18,7 @@ class Env:
 
     def __init__(self, num_envs=3, step_dt=0.02, **scene):
         self.num_envs, self.device, self.step_dt, self.common_step_counter = num_envs, "cpu", step_dt, 0
-        self.scene, self.sim = Scene(scene), SimpleNamespace(mj_model=None)
+        self.scene, self.sim = Scene(scene), SimpleNamespace(mj_model=None, forward=lambda: None)
 
 
 class Scene(dict):

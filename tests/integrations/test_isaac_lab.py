@@ -196,6 +196,8 @@ def test_a_step_does_not_wait_for_the_device(monkeypatch):
          "'sensor' must be a RayCaster or a camera, got SimpleNamespace"),
         (Version(2).camera("rgb"), {}, ValueError, r"'sensor' must have one of .*, got \['rgb'\]"),
         (Version(2).camera(depth_clipping_behavior="max"), {}, ValueError, "must not report misses as its maximum"),
+        (Version(3).camera(renderer_cfg=SimpleNamespace(depth_clipping_behavior="max")), {}, ValueError,
+         "must not report misses as its maximum"),
         (Version(2).camera(update_latest_camera_pose=False), {}, ValueError, "must report its current pose"),
     ],
 )  # fmt: skip
@@ -204,6 +206,52 @@ def test_refuses_what_does_not_fit(sensor, params, error, words):
         build(
             isaac_lab.MapObservation, Env(robot=Version(2).robot(), sensor=sensor), **{"sensor_cfg": "sensor"} | params
         )
+
+
+def test_refuses_an_environment_that_does_not_count_its_steps(version):
+    """As Isaac Lab's ManagerBasedEnv, which is not for reinforcement learning."""
+    env = Env(robot=version.robot(), sensor=version.camera())
+    del env.common_step_counter
+    with pytest.raises(TypeError, match="env: must count its steps .*, got Env; use ManagerBasedRLEnv"):
+        build(isaac_lab.MapObservation, env, sensor_cfg="sensor")
+
+
+def test_an_episode_begins_after_the_links_are_at_the_new_place(version):
+    """Newton moves them with the next step; a camera that is read before would see the old place."""
+    env = Env(robot=version.robot(), sensor=version.camera())
+    forwarded = []
+    env.sim.forward = lambda: forwarded.append(env.common_step_counter)
+    term, observe, _ = build(isaac_lab.MapObservation, env, sensor_cfg="sensor")
+    observe()
+    assert forwarded == []
+    term.reset(torch.tensor([1]))
+    assert forwarded == [0]
+
+
+@pytest.mark.parametrize("order, wrong", [("wxyz", "xyzw"), ("xyzw", "wxyz")])
+@pytest.mark.parametrize("poses", [[Rotation.identity()] * B, TILTED])
+def test_refuses_an_order_that_contradicts_heading_and_gravity(order, wrong, poses):
+    version = Version(2 if order == "wxyz" else 3)
+    robot = version.robot()
+    robot.data.root_link_quat_w = version.quat(poses)
+    R = torch.from_numpy(np.stack([pose.as_matrix() for pose in poses])).float()
+    robot.data.heading_w = version.array(torch.atan2(R[:, 1, 0], R[:, 0, 0]))
+    robot.data.projected_gravity_b = version.array(-R[:, 2])
+    robot.data.GRAVITY_VEC_W = version.array(torch.tensor([[0.0, 0.0, -9.81]]).expand(B, 3))
+    env = Env(robot=robot, sensor=version.caster())
+    build(type("Right", (isaac_lab.MapObservation,), {"quaternions": order}), env, sensor_cfg="sensor")
+    with pytest.raises(ValueError, match=f"quaternions: must be the order .*, got '{wrong}'; leave it None"):
+        build(type("Wrong", (isaac_lab.MapObservation,), {"quaternions": wrong}), env, sensor_cfg="sensor")
+
+
+def test_refuses_a_sensor_inside_the_robot(version):
+    around = torch.nn.functional.normalize(torch.randn(B, 50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    env = {"robot": version.robot()}
+    inside = version.caster(hits=BASE[:, None] + 0.1 * around, global_world_only=False)
+    with pytest.raises(ValueError, match="'sensor' must see more than the robot .* set global_world_only=True"):
+        build(isaac_lab.MapObservation, Env(**env, sensor=inside), sensor_cfg="sensor")
+    low = version.caster(hits=BASE[:, None] - 0.1 * around.abs(), global_world_only=False)  # near the ground
+    build(isaac_lab.MapObservation, Env(**env, sensor=low), sensor_cfg="sensor")
 
 
 def test_refuses_parallel_rays(version):

@@ -3,8 +3,8 @@
     height_scan = ObservationTermCfg(
         func=MapObservation, params={"sensor_cfg": SceneEntityCfg("camera"), "standing_height": 0.5})
 
-Written from the documentation and code of Isaac Lab 2.3 and 3.0, and run against stand-ins of their interfaces: not
-tried with the simulator itself. docs/howto/isaac_lab.md has the whole config.
+Tried in Isaac Lab 3.0.0 with its Newton backend, and run against stand-ins of the documented interface of 2.3.
+docs/howto/isaac_lab.md has the whole config and the results.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ else:  # the manager refuses classes that are not derived from it
 
 #: images of distances, and along what they are measured, as `depth_to_points` calls it
 DEPTHS = {"distance_to_image_plane": "z", "depth": "z", "distance_to_camera": "ray"}
+ENCLOSED = 0.5  #: [m] a sensor whose hits all lie within this distance is inside the robot
 
 
 class MapObservation(MapTerm, ManagerTermBase):
@@ -61,12 +62,21 @@ class MapObservation(MapTerm, ManagerTermBase):
     def __init__(self, cfg: Any, env: Any) -> None:
         if ManagerTermBase is not object:
             ManagerTermBase.__init__(self, cfg, env)
+        rule, hint = "must count its steps in common_step_counter", "use ManagerBasedRLEnv"
+        require(hasattr(env, "common_step_counter"), "env", rule, type(env).__name__, hint, TypeError)
         sensors = to_names("sensor_cfg", cfg.params.get("sensor_cfg"))
         (asset,) = to_names("asset_cfg", cfg.params.get("asset_cfg", "robot"))
         robot = find(env.scene, "asset_cfg", asset, env.scene.keys())
         source = IsaacLabSource(sensors, asset, _find_order(type(self).quaternions, robot))
         source.check(env, require_cadence(cfg.params.get("update_every", 1)) * env.step_dt)
         self._set_up(cfg, env, source)
+        self._sim = env.sim
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Forget the maps of environments that begin anew, whose robots stand at their new places already."""
+        super().reset(env_ids)
+        # Within a step nothing else moves their links before sensors measure: a camera would see the old place.
+        self._sim.forward()
 
     def __call__(
         self,
@@ -90,6 +100,8 @@ class IsaacLabSource:
 
     def check(self, env: Any, period: float) -> None:
         """Refuse sensors that are missing or do not fit, or that measure less often than every `period` [s]."""
+        data = env.scene[self.asset_name].data
+        _check_order(self.quaternions, data, self.read_base(env))
         for name in self.sensor_names:
             sensor = find(env.scene, "sensor_cfg", name, env.scene.sensors)
             check = _check_camera if _is_camera(sensor) else _check_rays
@@ -155,13 +167,28 @@ def _find_depth(sensor: Any) -> str:
     return next((name for name in DEPTHS if name in sensor.cfg.data_types), "")
 
 
+def _check_order(quaternions: str, data: Any, T_map_base: Float[Tensor, "B 4 4"]) -> None:
+    """Refuse an order of quaternions that contradicts what the robot's data say of its heading or of gravity."""
+    if not hasattr(data, "heading_w") or not hasattr(data, "projected_gravity_b"):
+        return
+    R, given = T_map_base[:, :3, :3], to_tensor(data.heading_w)
+    heading = torch.stack([given.cos(), given.sin()], -1)
+    down = torch.nn.functional.normalize(to_tensor(data.GRAVITY_VEC_W), dim=-1)
+    gravity = (R * down[:, :, None]).sum(1)  # in the base frame
+    is_upright = (gravity - to_tensor(data.projected_gravity_b).nan_to_num()).abs() < 0.1  # NaN without gravity
+    is_ahead = (torch.nn.functional.normalize(R[:, :2, 0], dim=-1) - heading).abs() < 0.1
+    rule = "must be the order in which the robot's data give them, with their heading_w and projected_gravity_b"
+    require(bool(is_upright.all() & is_ahead.all()), "quaternions", rule, repr(quaternions), "leave it None")
+
+
 def _check_camera(name: str, sensor: Any) -> None:
     cfg = sensor.cfg
     rule, hint = f"{name!r} must have one of {', '.join(DEPTHS)}", 'set data_types=["distance_to_image_plane"]'
     require(_find_depth(sensor) != "", "sensor_cfg", rule, repr(cfg.data_types), hint)
-    clipping = getattr(cfg, "depth_clipping_behavior", "none")
+    parts = (cfg, getattr(cfg, "renderer_cfg", None))  # Isaac Lab 3 moves the setting of a rendered camera
+    clips = any(getattr(part, "depth_clipping_behavior", "none") == "max" for part in parts)
     rule, hint = f"{name!r} must not report misses as its maximum distance", 'set depth_clipping_behavior="none"'
-    require(clipping != "max", "sensor_cfg", rule, f"depth_clipping_behavior={clipping!r}", hint)
+    require(not clips, "sensor_cfg", rule, "depth_clipping_behavior='max'", hint)
     rule, hint = f"{name!r} must report its current pose", "set update_latest_camera_pose=True"
     follows = getattr(cfg, "update_latest_camera_pose", True)
     require(follows, "sensor_cfg", rule, f"update_latest_camera_pose={follows!r}", hint)
@@ -172,6 +199,21 @@ def _check_rays(name: str, sensor: Any) -> None:
     kind = type(sensor).__name__
     require(hasattr(sensor, "ray_starts"), "sensor_cfg", rule, kind, hint, TypeError)
     require_one_origin("sensor_cfg", name, to_tensor(sensor.ray_starts))
+    if getattr(sensor.cfg, "global_world_only", True) is False:
+        _check_surroundings(name, sensor)
+
+
+def _check_surroundings(name: str, sensor: Any) -> None:
+    """Refuse a ray caster whose rays all end close by, also above it: they start inside the robot, which Newton shows.
+
+    Measures once.
+    """
+    data = sensor.data
+    offset = to_tensor(data.ray_hits_w) - to_tensor(data.pos_w)[:, None]
+    is_enclosed = (torch.linalg.vector_norm(offset, dim=-1) < ENCLOSED).all() & (offset[..., 2] > 0).any()
+    rule = f"{name!r} must see more than the robot that carries it"
+    hint = "set global_world_only=True, or an offset that places the sensor outside of the robot's shapes"
+    require(not bool(is_enclosed), "sensor_cfg", rule, f"hits within {ENCLOSED} m all around", hint)
 
 
 def _align(T_map_sensor: Float[Tensor, "B 4 4"], cfg: Any) -> Float[Tensor, "B 3 3"]:

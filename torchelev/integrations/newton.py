@@ -87,7 +87,7 @@ class NewtonMaps:
     """One map for each world of a model.
 
     Args:
-        model: of B worlds, such as of `ModelBuilder.replicate`. The map frame is the worlds' frame, turned about x if y
+        model: of B worlds, as its builder replicates them. The map frame is the worlds' frame, turned about x if y
             is up.
         base: label of the body that carries the sensors, in each world.
         sensors: read at each update as one measurement.
