@@ -37,7 +37,7 @@ from torchelev.ros2.services import Services
 from torchelev.ros2.settings import NodeSettings, list_changeable
 from torchelev.ros2.transforms import TransformException, Transforms
 
-_TICK = 0.005  # [s] between looks at what is due
+_SHORTEST, _LONGEST = 0.005, 0.1  # [s] between looks at what is due
 _RECENT = 1.0  # [s] by which the covariance of a pose may be older than a cloud
 
 
@@ -56,20 +56,31 @@ class ElevationMappingNode(Node):
         self.settings, cfg = merged_parameters(self, settings, cfg)
         self.engine = make_engine(cfg, self.settings)
         self._require_layers(self.settings)
-        self.intake = Intake(self.settings.transform_wait)
+        topics = (*self.settings.clouds, *self.settings.depths)
+        self.intake = Intake(map(self.resolve_topic_name, topics), self.settings.transform_wait)
         self.stamp: Stamp | None = None  # of the map: of the newest cloud, or of the time when it was loaded
-        self.transforms = Transforms(self, self.settings.map_frame)
+        self.transforms = Transforms(self, self.settings.map_frame, self._fuse_waiting)
         self._odometry = PoseCovariances(), -math.inf  # the newest covariance, and its stamp [s]
         self._warned: dict[str, float] = {}
         self.outputs = Publishers(self, cfg.get("sensor", {}).get("body"))
         services = Services(self)
         self._subscribe()
         self.add_on_set_parameters_callback(self._set)
-        self.create_timer(_TICK, self._work, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = self.create_timer(_LONGEST, self._work, clock=Clock(clock_type=ClockType.STEADY_TIME))
         back = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=True)
         self._jumps = self.get_clock().create_jump_callback(back, post_callback=lambda _: self._start_over())
         if self.settings.load_on_start and Path(self.settings.map_file).exists():
+            self._load_first(services)
+        grid, names = self.engine.window(), ", ".join(map(self.resolve_topic_name, topics))
+        size = f"{grid.shape[0]} x {grid.shape[1]} cells of {grid.resolution:g} m"
+        self.get_logger().info(f"{type(self.engine).__name__}: {size} in {self.settings.map_frame}, from {names}")
+
+    def _load_first(self, services: Services) -> None:
+        """Load the map that was saved. A file that does not fit must not end a node that is started again and again."""
+        try:
             self.get_logger().info(services.load())
+        except (ValueError, OSError) as error:
+            self.get_logger().error(f"load_on_start: the map starts empty: {error}")
 
     # Parameters ------------------------------------------------------------------------------------------------------
 
@@ -89,7 +100,10 @@ class ElevationMappingNode(Node):
 
     def _require_layers(self, settings: NodeSettings) -> None:
         for name in settings.layers:
-            self.engine.layer(name)  # raises ValueError for one that is not there
+            try:
+                self.engine.layer(name)
+            except ValueError as error:
+                raise ValueError(f"layers: {str(error).partition(': ')[2]}") from error
 
     # Sensors ---------------------------------------------------------------------------------------------------------
 
@@ -168,16 +182,27 @@ class ElevationMappingNode(Node):
     # Updates ---------------------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """Fuse the clouds whose transforms are there, and publish what is due."""
+        """Fuse what is ready, publish what is due, and look again when the next output is."""
+        self._fuse_waiting()
+        rate = self.outputs.publish()
+        period = min(_LONGEST, max(_SHORTEST, 1 / rate)) if rate > 0 else _LONGEST
+        if self._timer.timer_period_ns != round(1e9 * period):
+            self._timer.timer_period_ns = round(1e9 * period)
+
+    def _fuse_waiting(self) -> None:
+        """Fuse the clouds whose transforms are there."""
+        if not self.intake.is_waiting:
+            return
         ready, lost = self.intake.take(self.now(), self._is_ready)
         for cloud in ready:
             self._fuse(cloud)
         for cloud in lost:
             self._explain(cloud)
-        self.outputs.publish()
 
     def _is_ready(self, cloud: Waiting) -> bool:
         """Return whether all transforms are there: at the stamp, and of each point's time."""
+        if cloud.reading.sensor.lacks_camera:
+            return False
         header, base = cloud.reading.message.header, self.settings.base_frame
         stamp, sensor = Time.from_msg(header.stamp), clean(header.frame_id)
         if not all(self.transforms.has(name, stamp) for name in (sensor, base)):
@@ -225,6 +250,8 @@ class ElevationMappingNode(Node):
             for link in self.engine.links:
                 self.transforms.pose(link, stamp, base)
             reason = "tf does not reach the times of all its points; raise transform_wait, or set deskew false"
+            if cloud.reading.sensor.lacks_camera:
+                reason = "no CameraInfo was received; see the parameter camera_infos"
         except TransformException as error:
             reason = str(error)
         self._warn(f"{cloud.topic}: left out a message after {wait:g} s: {reason}", f"{cloud.topic} transform")

@@ -14,6 +14,7 @@ from torchelev.robot_body.shapes import Box, Capsule
 from torchelev.ros2.engine import Engine, Window
 from torchelev.stages.measure.config import BodyConfig
 
+_EARLY = 0.9  # part of a period after which an output may be made: looks at what is due are as far apart
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])  # quat_wxyz
 
 
@@ -165,7 +166,7 @@ class Schedule:
 
     def is_due(self, name: str, rate: float, now: float) -> bool:
         """Return whether an output of this rate [Hz] is due, and note that it is made."""
-        if rate <= 0 or now - self._last.get(name, -1e18) < 1 / rate - 1e-6:
+        if rate <= 0 or now - self._last.get(name, -1e18) < _EARLY / rate:
             return False
         last = self._last.get(name, now)
         # In step with the rate, unless more than a period was missed.

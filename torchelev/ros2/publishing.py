@@ -68,18 +68,22 @@ class Publishers:
 
         self._makers[name] = [publisher], publish
 
-    def publish(self) -> None:
-        """Publish what is due, if there is a map, and somebody listens."""
+    def publish(self) -> float:
+        """Publish what is due, if there is a map, and somebody listens; return the highest rate [Hz] that is asked for."""
+        highest = 0.0
         for name, (publishers, publish) in self._makers.items():
             is_heard = any(one.get_subscription_count() for one in publishers)
             if not is_heard or (self._node.stamp is None and name != "diagnostics"):
                 continue
-            if self._schedule.is_due(name, getattr(self._node.settings, f"rate_{name}"), time.monotonic()):
+            rate = getattr(self._node.settings, f"rate_{name}")
+            highest = max(highest, rate)
+            if self._schedule.is_due(name, rate, time.monotonic()):
                 try:
                     publish()
                 except (ValueError, ImportError) as error:  # no such layer, or a package is missing
                     text = f"~/{name} is not published: {error}"
                     self._node.get_logger().warning(text, throttle_duration_sec=30.0)
+        return highest
 
     def _header(self) -> Header:
         return Header(frame_id=self._node.settings.map_frame, stamp=self._node.stamp)

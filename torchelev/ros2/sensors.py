@@ -36,6 +36,11 @@ class Sensor:
         self._stamps.append(stamp)
 
     @property
+    def lacks_camera(self) -> bool:
+        """Whether a CameraInfo is missing without which depth images are no points."""
+        return self.is_depth and self.camera is None
+
+    @property
     def period(self) -> float | None:
         """Time between two messages [s]; None: not known yet."""
         if len(self._stamps) < _FEW:
@@ -46,7 +51,7 @@ class Sensor:
         """Return the points of a message; CloudError if it contradicts itself, or has no CameraInfo yet."""
         if not self.is_depth:
             return read_scan(message, period=self.period)
-        if self.camera is None:
+        if self.lacks_camera:
             raise CloudError("no CameraInfo was received; see the parameter camera_infos")
         return read_scan(message, CameraSettings(self.camera, self.topic, self.scale))
 

@@ -113,6 +113,7 @@ class Services:
         center, lengths = (request.position_x, request.position_y), (request.length_x, request.length_y)
         hint = "give metres in the map's frame"
         require(all(map(math.isfinite, (*center, *lengths))), "request", "must be finite", (center, lengths), hint)
+        require(min(lengths) > 0, "length_x, length_y", "must be positive", lengths, hint)
         area = outputs.area_of(center, lengths, resolution)
         layers = list(request.layers) or self._node.settings.layers
         grid = outputs.grid_map(self._node.engine, layers, area)

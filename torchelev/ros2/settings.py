@@ -17,6 +17,7 @@ from torchelev.errors import require, require_positive
 _KINDS = {str: "text", float: "a number", int: "a whole number", bool: "true or false"}
 _OF_ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")  # parameters that rclpy declares
 ENGINES = ("auto", "torch", "library")
+_HIGHEST = 1000.0  # rate [Hz], and wait [s]
 _METHODS = ("linear", "nearest")  # of `ElevationMap.initialize`
 
 
@@ -50,11 +51,15 @@ class NodeSettings:
     rate_height_scan: float = _setting(50.0, "[Hz] of ~/height_scan, a std_msgs/Float32MultiArray; 0: never", True)
     rate_diagnostics: float = _setting(1.0, "[Hz] of /diagnostics; 0: never", True)
     layers: tuple[str, ...] = _setting(
-        ("elevation", "variance", "traversability", "upper_bound"), "layers of ~/map and fields of ~/points", True
+        ("elevation", "variance", "traversability", "upper_bound"),
+        "layers of ~/map and fields of ~/points, whose z is the elevation",
+        True,
     )
     min_traversability: float = _setting(0.5, "in [0, 1): below it a cell of ~/costmap is lethal", True)
     height_scan: str = _setting("isaac_lab", "layout of ~/height_scan: isaac_lab, mjlab, legged_gym, or one as JSON")
-    map_file: str = _setting("map.safetensors", "file of ~/save_map and ~/load_map", True)
+    map_file: str = _setting(
+        "map.safetensors", "file of ~/save_map and ~/load_map, seen from where the node was started", True
+    )
     load_on_start: bool = _setting(False, "load map_file when the node starts, if it is there")
     clear_radius: float = _setting(1.5, "[m] around base_frame that ~/clear_around_robot forgets", True)
     feet: tuple[str, ...] = _setting((), "frames of the feet; ~/initialize starts the map from the ground below them")
@@ -63,7 +68,7 @@ class NodeSettings:
     site: str = _setting("", "folder of a site map that ~/initialize_from_site starts from; needs PyTorch", True)
     footprint: str = _setting(
         "[[0.35, 0.25], [0.35, -0.25], [-0.35, -0.25], [-0.35, 0.25]]",
-        "[m] corners in base_frame as Nav2 writes them, which ~/check_path moves along a path; needs PyTorch",
+        "[m] corners in base_frame, a text as in Nav2, which ~/check_path moves along a path; needs PyTorch",
         True,
     )
     engine: str = _setting("auto", "torch, library (libtorchelev, without PyTorch), or auto: torch if it is installed")
@@ -77,7 +82,7 @@ class NodeSettings:
         for name, value in vars(self).items():
             if name.startswith("rate_") or name == "transform_wait":
                 hint = "give seconds" if name == "transform_wait" else "give Hz; 0: never"
-                require(0 <= value < math.inf, name, "must be finite and not negative", value, hint)
+                require(0 <= value <= _HIGHEST, name, f"must lie in [0, {_HIGHEST:g}]", value, hint)
         in_range = 0 <= self.min_traversability < 1
         require(in_range, "min_traversability", "must lie in [0, 1)", self.min_traversability, "the default is 0.5")
         require(self.engine in ENGINES, "engine", f"must be one of {', '.join(ENGINES)}", repr(self.engine), "use auto")
@@ -91,13 +96,21 @@ class NodeSettings:
         num, expected = len(self.camera_infos), len(self.depths)
         rule, hint = f"must be none, or one for each of {expected} topics in depths", "give them in their order"
         require(num in (0, expected), "camera_infos", rule, num, hint)
+        for name in ("map_frame", "base_frame"):
+            object.__setattr__(self, name, getattr(self, name).lstrip("/"))  # as tf2 names frames
+        topics = (*self.clouds, *self.depths)
+        is_once, hint = len(set(topics)) == len(topics), "name each once"
+        require(is_once, "clouds, depths", "must not repeat a topic", ", ".join(topics), hint)
         sensors = bool(self.clouds or self.depths)
         require(sensors, "clouds", "must not be empty without depths", repr(self.clouds), "name a topic")
         read_footprint(self.footprint)
         for name in ("threads", "max_points"):
             require(getattr(self, name) >= 1, name, "must be at least 1", getattr(self, name), "see its default")
-        for name in ("map_frame", "base_frame", "layers"):
+        for name in ("map_frame", "base_frame", "layers", "map_file"):
             require(bool(getattr(self, name)), name, "must not be empty", repr(getattr(self, name)), "name one")
+        for name in ("clouds", "depths", "camera_infos", "layers", "feet"):
+            value = getattr(self, name)
+            require(all(value), name, "must not have an empty name", list(value), "leave it out")
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:

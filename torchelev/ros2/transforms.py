@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
@@ -20,11 +23,12 @@ class Transforms:
     Args:
         node: which listens to /tf and /tf_static.
         map_frame: the fixed frame.
+        on_arrival: called after transforms arrived.
     """
 
-    def __init__(self, node: Node, map_frame: str) -> None:
+    def __init__(self, node: Node, map_frame: str, on_arrival: Callable[[], None]) -> None:
         self._buffer, self._map = Buffer(), map_frame
-        self._listener = TransformListener(self._buffer, node)
+        self._listener = _Listener(self._buffer, node, on_arrival)
 
     def has(self, frame: str, stamp: Time, offset: float = 0.0, parent: str = "") -> bool:
         """Return whether the pose of a frame is known at a stamp, or an offset [s] from it."""
@@ -47,6 +51,19 @@ class Transforms:
     def forget(self) -> None:
         """Forget all transforms, as a clock jumped back."""
         self._buffer.clear()
+
+
+class _Listener(TransformListener):
+    """Listens to tf2, and says so."""
+
+    def __init__(self, buffer: Buffer, node: Node, on_arrival: Callable[[], None]) -> None:
+        self._on_arrival = on_arrival
+        super().__init__(buffer, node)
+
+    def callback(self, data: Any) -> None:
+        """Take transforms of /tf."""
+        super().callback(data)
+        self._on_arrival()
 
 
 def _shifted(stamp: Time, offset: float) -> Time | None:

@@ -12,7 +12,6 @@ CONFIG = """
 map_frame: odom
 base_frame: base_link
 clouds: [/lidar/points]
-depths: [/camera/depth/image_raw]
 rate_diagnostics: 200.0
 rate_points: 200.0
 map: {grid: {resolution: 0.1, length_x: 8.0, length_y: 8.0}}

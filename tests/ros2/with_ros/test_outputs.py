@@ -54,10 +54,21 @@ def test_grid_map_is_the_map_and_a_submap_is_a_part_of_it(make_robot):
     part = from_grid_map(robot.ask("get_submap", GetGridMap, **asked, layers=["elevation"]).map)
     assert part.layers["elevation"].shape == (6, 4)
     np.testing.assert_allclose(part.layers["elevation"], 0.4, atol=0.01)
-    for wrong in ({"frame_id": "map"}, {"position_x": 90.0}, {"layers": ["elevaton"]}, {"length_x": float("inf")}):
+    for wrong in (
+        {"frame_id": "map"},
+        {"position_x": 90.0},
+        {"layers": ["elevaton"]},
+        {"length_x": float("inf")},
+        {"length_x": 0.0},
+    ):
         assert list(robot.ask("get_submap", GetGridMap, **asked | wrong).map.layers) == []
     text = Path(robot.log).read_text()
-    for words in ("frame_id: must be odom, got 'map'", "has no cells around", "layer: must be "):
+    for words in (
+        "frame_id: must be odom, got 'map'",
+        "has no cells around",
+        "layer: must be ",
+        "length_x, length_y: must be positive",
+    ):
         assert words in text
 
 
