@@ -97,7 +97,7 @@ class Intake:
         return any(self._waiting.values())
 
     def take(self, now: float, is_ready: Callable[[Waiting], bool]) -> tuple[list[Waiting], list[Waiting]]:
-        """Return the newest cloud of each topic whose transforms are there, oldest first, and those that waited too long."""
+        """Return the newest cloud of each topic that is ready, oldest first, and those that waited too long."""
         ready, lost = [], []
         for waiting in self._waiting.values():
             number = next((k for k in reversed(range(len(waiting))) if is_ready(waiting[k])), None)

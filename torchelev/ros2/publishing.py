@@ -69,7 +69,7 @@ class Publishers:
         self._makers[name] = [publisher], publish
 
     def publish(self) -> float:
-        """Publish what is due, if there is a map, and somebody listens; return the highest rate [Hz] that is asked for."""
+        """Publish what is due, if there is a map and somebody listens; return the highest rate [Hz] asked for."""
         highest = 0.0
         for name, (publishers, publish) in self._makers.items():
             is_heard = any(one.get_subscription_count() for one in publishers)

@@ -52,13 +52,13 @@ class NodeSettings:
     rate_diagnostics: float = _setting(1.0, "[Hz] of /diagnostics; 0: never", True)
     layers: tuple[str, ...] = _setting(
         ("elevation", "variance", "traversability", "upper_bound"),
-        "layers of ~/map and fields of ~/points, whose z is the elevation",
+        "layers of ~/map and of ~/points, where elevation is z",
         True,
     )
     min_traversability: float = _setting(0.5, "in [0, 1): below it a cell of ~/costmap is lethal", True)
     height_scan: str = _setting("isaac_lab", "layout of ~/height_scan: isaac_lab, mjlab, legged_gym, or one as JSON")
     map_file: str = _setting(
-        "map.safetensors", "file of ~/save_map and ~/load_map, seen from where the node was started", True
+        "map.safetensors", "file of ~/save_map and ~/load_map, from the folder of the start on", True
     )
     load_on_start: bool = _setting(False, "load map_file when the node starts, if it is there")
     clear_radius: float = _setting(1.5, "[m] around base_frame that ~/clear_around_robot forgets", True)

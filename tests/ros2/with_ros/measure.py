@@ -81,8 +81,13 @@ def main(prepared, out, minutes):
     robot = Measured(prepared / "robot.yaml", "", [x for s in settings for x in ("-p", s)]
                      + ["-p", f"library:={(prepared / 'library').read_text()}"])  # fmt: skip
     robot.start(prepared / "log")
+    cpu, _ = robot.used()
+    begin = time.monotonic()
+    robot.spin(10.0)
+    idle = round(100 * (robot.used()[0] - cpu) / (time.monotonic() - begin), 1)
     robot.drive(10.0, 5.0)
     found = {"ros": os.environ["ROS_DISTRO"], "middleware": os.environ["RMW_IMPLEMENTATION"], "points": POINTS}
+    found["idle cpu [%]"] = idle
     cpu, memory = robot.used()
     begin = robot.drive(10.0, MINUTE)
     end, (after, resident) = time.monotonic(), robot.used()
