@@ -100,12 +100,12 @@ class Intake:
         """Return the newest cloud of each topic that is ready, oldest first, and those that waited too long."""
         ready, lost = [], []
         for waiting in self._waiting.values():
-            number = next((k for k in reversed(range(len(waiting))) if is_ready(waiting[k])), None)
-            if number is not None:
-                ready.append(waiting[number])
-                self.counts.replaced += number
-                for _ in range(number + 1):
-                    waiting.popleft()
+            newest = None
+            while waiting and is_ready(waiting[0]):  # transforms arrive in the order of their stamps
+                self.counts.replaced += newest is not None
+                newest = waiting.popleft()
+            if newest is not None:
+                ready.append(newest)
             while waiting and now - waiting[0].since > self.wait:
                 lost.append(waiting.popleft())
         self.counts.without_transform += len(lost)

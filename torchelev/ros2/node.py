@@ -59,7 +59,7 @@ class ElevationMappingNode(Node):
         topics = (*self.settings.clouds, *self.settings.depths)
         self.intake = Intake(map(self.resolve_topic_name, topics), self.settings.transform_wait)
         self.stamp: Stamp | None = None  # of the map: of the newest cloud, or of the time when it was loaded
-        self.transforms = Transforms(self, self.settings.map_frame, self._fuse_waiting)
+        self.transforms = Transforms(self, self.settings.map_frame)
         self._odometry = PoseCovariances(), -math.inf  # the newest covariance, and its stamp [s]
         self._warned: dict[str, float] = {}
         self.outputs = Publishers(self, cfg.get("sensor", {}).get("body"))
@@ -182,12 +182,13 @@ class ElevationMappingNode(Node):
     # Updates ---------------------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """Fuse what is ready, publish what is due, and look again when the next output is."""
+        """Fuse what is ready, publish what is due, and look again soon, if a cloud waits, or when an output is due."""
         self._fuse_waiting()
         rate = self.outputs.publish()
-        period = min(_LONGEST, max(_SHORTEST, 1 / rate)) if rate > 0 else _LONGEST
+        period = _SHORTEST if self.intake.is_waiting else min(_LONGEST, max(_SHORTEST, 1 / rate)) if rate else _LONGEST
         if self._timer.timer_period_ns != round(1e9 * period):
             self._timer.timer_period_ns = round(1e9 * period)
+            self._timer.reset()
 
     def _fuse_waiting(self) -> None:
         """Fuse the clouds whose transforms are there."""
@@ -279,5 +280,6 @@ def spin(settings: NodeSettings, cfg: dict[str, Any], arguments: list[str]) -> N
         if rclpy.ok():  # else it was shut down in the middle of its work
             raise
     finally:
+        node.transforms.close()
         node.destroy_node()
         rclpy.try_shutdown()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
@@ -21,14 +18,16 @@ class Transforms:
     """What tf2 knows of frames in a fixed one.
 
     Args:
-        node: which listens to /tf and /tf_static.
+        node: beside which another one listens to /tf and /tf_static.
         map_frame: the fixed frame.
-        on_arrival: called after transforms arrived.
     """
 
-    def __init__(self, node: Node, map_frame: str, on_arrival: Callable[[], None]) -> None:
+    def __init__(self, node: Node, map_frame: str) -> None:
         self._buffer, self._map = Buffer(), map_frame
-        self._listener = _Listener(self._buffer, node, on_arrival)
+        # A thread and a node of its own: robots send hundreds of transforms a second, also while the map is updated.
+        arguments = ["--ros-args", "-r", f"__node:={node.get_name()}_tf"]  # not the name that the node was given
+        self._node = Node(f"{node.get_name()}_tf", namespace=node.get_namespace(), cli_args=arguments)
+        self._listener = TransformListener(self._buffer, self._node, spin_thread=True)
 
     def has(self, frame: str, stamp: Time, offset: float = 0.0, parent: str = "") -> bool:
         """Return whether the pose of a frame is known at a stamp, or an offset [s] from it."""
@@ -48,22 +47,15 @@ class Transforms:
                 found[k] = self.pose(frame, time)
         return found
 
+    def close(self) -> None:
+        """Stop listening."""
+        self._listener.executor.shutdown()
+        self._listener.dedicated_listener_thread.join(timeout=2.0)
+        self._node.destroy_node()
+
     def forget(self) -> None:
         """Forget all transforms, as a clock jumped back."""
         self._buffer.clear()
-
-
-class _Listener(TransformListener):
-    """Listens to tf2, and says so."""
-
-    def __init__(self, buffer: Buffer, node: Node, on_arrival: Callable[[], None]) -> None:
-        self._on_arrival = on_arrival
-        super().__init__(buffer, node)
-
-    def callback(self, data: Any) -> None:
-        """Take transforms of /tf."""
-        super().callback(data)
-        self._on_arrival()
 
 
 def _shifted(stamp: Time, offset: float) -> Time | None:
