@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from threading import Thread
+
 import numpy as np
+import rclpy
 from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.time import Time
 from tf2_ros import Buffer, TransformException, TransformListener
@@ -27,7 +31,18 @@ class Transforms:
         # A thread and a node of its own: robots send hundreds of transforms a second, also while the map is updated.
         arguments = ["--ros-args", "-r", f"__node:={node.get_name()}_tf"]  # not the name that the node was given
         self._node = Node(f"{node.get_name()}_tf", namespace=node.get_namespace(), cli_args=arguments)
-        self._listener = TransformListener(self._buffer, self._node, spin_thread=True)
+        self._listener = TransformListener(self._buffer, self._node)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._thread = Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        try:
+            self._executor.spin()
+        except Exception:
+            if rclpy.ok():  # else it was shut down in the middle of its work
+                raise
 
     def has(self, frame: str, stamp: Time, offset: float = 0.0, parent: str = "") -> bool:
         """Return whether the pose of a frame is known at a stamp, or an offset [s] from it."""
@@ -49,8 +64,8 @@ class Transforms:
 
     def close(self) -> None:
         """Stop listening."""
-        self._listener.executor.shutdown()
-        self._listener.dedicated_listener_thread.join(timeout=2.0)
+        self._executor.shutdown()
+        self._thread.join(timeout=2.0)
         self._node.destroy_node()
 
     def forget(self) -> None:
