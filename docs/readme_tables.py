@@ -116,8 +116,9 @@ def _ros2() -> str:
     lines = [[name, f"{row['p50 [ms]']:.1f}", f"{row['p99 [ms]']:.1f}", str(row["maps"])] for name, row in rows.items()]
     (before, after), end = usual["memory [MB]"], overload["memory [MB]"]
     text = (
-        f"CPU: {found['idle cpu [%]']:.0f} % of a core without clouds, {usual['cpu at default rates [%]']:.0f} % at 10 Hz "
-        f"with ~/points at its default rate, {usual['cpu [%]']:.0f} % above, where it is published 200 times a second. "
+        f"CPU: {found['idle cpu [%]']:.0f} % of a core without clouds, {usual['cpu at default rates [%]']:.0f} % at "
+        f"10 Hz with ~/points at its default rate, {usual['cpu [%]']:.0f} % above, where it is published 200 times a "
+        "second. "
         f"Memory: {before:.0f} MB, {after:.0f} MB after a minute, "
         f"{end:.0f} MB at the end. Of {overload['sent']:,} clouds sent in the overload {overload['fused']:,} "
         "were fused; newer ones took the place of the others, in the middleware or in the node."
