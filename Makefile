@@ -38,7 +38,7 @@ demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
 # Workers and the programs that they start share the cores: threads that wait busily would hold them up.
-test test-fast test-library test-mjlab test-isaaclab test-newton: export OMP_WAIT_POLICY = PASSIVE
+test test-fast test-library test-mjlab test-isaaclab test-newton test-genesis: export OMP_WAIT_POLICY = PASSIVE
 
 test: setup  ## run all tests, on all cores
 	$(BIN)/python $(PYTEST)
@@ -170,4 +170,4 @@ docs: setup  ## build the documentation in docs/_build/html, warnings as errors;
 	@echo "Open docs/_build/html/index.html"
 
 clean:  ## remove what the targets made
-	rm -rf $(VENV) $(MJLAB) $(ISAACLAB) $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks
+	rm -rf $(VENV) $(MJLAB) $(ISAACLAB) $(NEWTON) $(GENESIS) $(ROS2) $(ROS2)-torch $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks

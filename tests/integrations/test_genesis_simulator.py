@@ -7,28 +7,18 @@ import torch
 
 pytest.importorskip("genesis", reason="needs genesis-world: make test-genesis")
 
-from tests.docs.markdown import DOCS, code_blocks
+from tests.docs.markdown import DOCS, code_blocks, run_blocks
+from tests.integrations.box_on_plane import errors
 from torchelev.integrations.genesis import GenesisMaps
 
 
 @pytest.fixture(scope="module")
 def page():
     """What the page's code made."""
-    space: dict = {}
-    for block in code_blocks((DOCS / "howto/genesis.md").read_text()):
-        if block.language == "python":
-            exec(compile(block.code, "genesis.md", "exec"), space)
-    return SimpleNamespace(**space)
-
-
-def errors(maps, env):
-    """Errors [m] of the map's heights but at the walls of the box."""
-    elevation, xy = maps.emap.layer("elevation")[env], maps.emap.cell_centers()[env]
-    x, y = (xy[..., 0] - 1).abs(), xy[..., 1].abs()
-    is_top = (x < 0.3) & (y < 0.5)
-    is_wall = ((x - 0.3).abs() < 0.06) & (y < 0.56) | ((y - 0.5).abs() < 0.06) & (x < 0.36)
-    known = ~elevation.isnan() & ~is_wall
-    return (elevation - torch.where(is_top, 0.2, 0.0))[known].abs()
+    path = DOCS / "howto/genesis.md"
+    return SimpleNamespace(
+        **run_blocks(path, [one for one in code_blocks(path.read_text()) if one.language == "python"])
+    )
 
 
 @pytest.mark.parametrize("names", [("lidar",), ("camera",), ("lidar", "camera")])

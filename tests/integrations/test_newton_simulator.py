@@ -9,7 +9,8 @@ pytest.importorskip("newton", reason="needs newton: make test-newton")
 import newton
 import warp as wp
 
-from tests.docs.markdown import DOCS, code_blocks
+from tests.docs.markdown import DOCS, code_blocks, run_blocks
+from tests.integrations.box_on_plane import errors
 from torchelev import ElevationMapConfig, GridConfig, HeightScan
 from torchelev.integrations.newton import NewtonCamera, NewtonLidar, NewtonMaps
 from torchelev.sim import HeightField, Lidar, surface_of
@@ -57,16 +58,6 @@ def make_model(up="z", worlds=3, leg=False, ground="box"):
     state = model.state()
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
     return model, state
-
-
-def errors(maps, world=0):
-    """Errors [m] of the map's heights but at the walls of the box, and how many cells are known."""
-    elevation, xy = maps.emap.layer("elevation")[world], maps.emap.cell_centers()[world]
-    x, y = (xy[..., 0] - 1).abs(), xy[..., 1].abs()
-    is_top = (x < 0.3) & (y < 0.5)
-    is_wall = ((x - 0.3).abs() < 0.06) & (y < 0.56) | ((y - 0.5).abs() < 0.06) & (x < 0.36)
-    known = ~elevation.isnan() & ~is_wall
-    return (elevation - torch.where(is_top, 0.2, 0.0))[known].abs()
 
 
 @pytest.mark.parametrize("sensors", [[LIDAR], [CAMERA], [LIDAR, CAMERA]], ids=["lidar", "camera", "both"])
@@ -225,7 +216,5 @@ def test_axes_and_rays_that_do_not_fit_are_refused():
 
 def test_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    space: dict = {}
-    for block in code_blocks((DOCS / "howto/newton.md").read_text()):
-        if block.language == "python":
-            exec(compile(block.code, "newton.md", "exec"), space)
+    path = DOCS / "howto/newton.md"
+    run_blocks(path, [block for block in code_blocks(path.read_text()) if block.language == "python"])

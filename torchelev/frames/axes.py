@@ -9,7 +9,7 @@ import numpy as np
 
 from torchelev.errors import require
 
-Values = TypeVar("Values")
+Values = TypeVar("Values", bound=Any)
 
 #: Rotations R_forward_camera (3, 3): from these axes to x forward, y left, z up.
 CAMERA_AXES = {
@@ -23,11 +23,7 @@ _R_WANTED_GIVEN = {(g, w): (CAMERA_AXES[w].T @ CAMERA_AXES[g]).tolist() for g in
 def turn(xyz: Sequence[Values], given: str, wanted: str) -> list[Values]:
     """Return x, y and z of points in other camera axes. Each is one of the given ones or its opposite, exactly."""
     rows = _R_WANTED_GIVEN[given, wanted]
-    return [next(c if r > 0 else _opposite(c) for r, c in zip(row, xyz, strict=True) if r) for row in rows]
-
-
-def _opposite(values: Any) -> Any:
-    return -values
+    return [next(c if r > 0 else -c for r, c in zip(row, xyz, strict=True) if r) for row in rows]
 
 
 def require_axes(name: str, axes: str) -> str:

@@ -23,6 +23,7 @@ from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.errors import require, require_count, require_positive
 from torchelev.frames import transform_xyzw
 from torchelev.integrations.newton_casts import CameraCast, RayCast
+from torchelev.integrations.step_map import Cloud, join
 
 try:
     import newton
@@ -121,7 +122,6 @@ class NewtonMaps:
         self._T_body_base = torch.eye(4, **like) if T_body_base is None else T_body_base.to(**like)
         own = None if keep_own else _find_own(model, self._bodies.tolist())
         self._readers = [_Reader(model, one, None if own is None else own.to(self._device)) for one in sensors]
-        self._num_points = max(reader.num_points for reader in self._readers)
         self.emap = ElevationMap(cfg, num_envs=model.world_count, device=self._device)
         self.T_map_base = self._read_base(model)
         up = self.T_map_base[:, 2, 2].min().item()
@@ -142,14 +142,16 @@ class NewtonMaps:
         with _shared_stream(self._device):
             self.model.bvh_refit_shapes(state)
             self.T_map_base = self._read_base(state)
-            clouds = [reader.read(state, self._T_world_base()) for reader in self._readers]
-            T_map_sensor = torch.stack([self.T_map_base @ reader.T_base_sensor for reader in self._readers], 1)
-            points = torch.stack([_padded(cloud, self._num_points) for cloud in clouds], 1)
-            self.emap.update(points, T_map_sensor, self.T_map_base, dt)
+            cloud = join([self._read_cloud(reader, state) for reader in self._readers])
+            self.emap.update(cloud.points, cloud.T_map_sensor, self.T_map_base, dt)
 
     def reset(self, worlds: Int[Tensor, "K"] | None = None, *, mask: Bool[Tensor, "B"] | None = None) -> None:
         """Forget the maps of worlds that begin anew, by number or by mask; without both, of all."""
         self.emap.reset(worlds, mask=mask)
+
+    def _read_cloud(self, reader: _Reader, state: newton.State) -> Cloud:
+        points = reader.read(state, self._T_world_base())
+        return Cloud(points[:, None], (self.T_map_base @ reader.T_base_sensor)[:, None])
 
     def _T_world_base(self) -> Float[Tensor, "B 4 4"]:  # noqa: N802
         return self._T_map_world.mT @ self.T_map_base  # a rotation
@@ -179,11 +181,6 @@ class _Reader:
         )
         self.rays = self._cast.rays.to(device)
 
-    @property
-    def num_points(self) -> int:
-        """Number of rays."""
-        return len(self.rays)
-
     def read(self, state: newton.State, T_world_base: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B R 3"]:
         """Return the points [m] in the sensor's frame, NaN where a ray returns nothing."""
         distance, is_hit, is_own = self._hits(state, T_world_base)
@@ -201,10 +198,6 @@ class _Reader:
         if self.own is None:
             return distance, is_hit, torch.zeros_like(is_hit)
         return distance, is_hit, self.own.gather(1, shape.clamp(0, self.own.shape[1] - 1))
-
-
-def _padded(points: Float[Tensor, "B R 3"], number: int) -> Float[Tensor, "B N 3"]:
-    return torch.nn.functional.pad(points, (0, 0, 0, number - points.shape[1]), value=torch.nan)
 
 
 def _find_bodies(model: newton.Model, label: str) -> np.ndarray:

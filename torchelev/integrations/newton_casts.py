@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.frames.axes import CAMERA_AXES
+from torchelev.frames import change_axes
+from torchelev.frames.axes import turn
 
 try:
     import newton
@@ -58,17 +59,16 @@ class CameraCast:
         self._camera = newton.sensors.SensorCamera(model, load_textures=False)
         self._camera_rays = self._camera.compute_camera_rays_pinhole(*size, camera_fov=sensor.fov, device=model.device)
         directions = wp.to_torch(self._camera_rays)[:, :, 0, 1].reshape(-1, 3)
-        R = torch.from_numpy(CAMERA_AXES["opengl"]).to(directions)
-        self.rays = (directions / -directions[:, 2:]) @ R.T  # to x forward; 1 m along the axis
+        at_1_m = directions / -directions[:, 2:]  # along the axis
+        self.rays = torch.stack(turn(at_1_m.unbind(-1), "opengl", "forward"), -1)
         self._depth = self._camera.allocate_image_depth_forward(B, *size)
         self._shapes = self._camera.allocate_image_shape_index(B, *size)
         self._poses = torch.zeros(B, 7, device=directions.device)
-        self._R = R.double()
 
     def __call__(self, state: newton.State, T: Float[Tensor, "B 4 4"]) -> tuple[Tensor, Tensor]:
         """Return depths [m] and numbers of the shapes, (B, R)."""
         self._poses[:, :3] = T[:, :3, 3]
-        self._poses[:, 3:] = _quat_xyzw(T[:, :3, :3] @ self._R)
+        self._poses[:, 3:] = _quat_xyzw(change_axes(T, "forward", "opengl")[:, :3, :3])
         poses = wp.from_torch(self._poses, dtype=wp.transformf)
         images = {"forward_depth_image": self._depth, "shape_index_image": self._shapes}
         self._camera.update(state, poses, self._camera_rays, **images)

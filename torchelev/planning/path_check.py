@@ -95,14 +95,12 @@ def check_path(
         _require_fits(polygon, cfg.max_extent)
     require_count("samples", samples, "give 8")
     is_empty = _is_empty(given)
-    shift, turn = given[:, 1:, :2] - given[:, :-1, :2], _wrap_angle(given[:, 1:, 2:] - given[:, :-1, 2:])
-    radius = torch.linalg.vector_norm(polygon, dim=-1).amax()
-    # No vertex moves farther than the base does and the farthest vertex turns.
-    distance = torch.linalg.vector_norm(shift, dim=-1) + radius * turn[..., 0].abs()
-    step = torch.where(is_empty[:, None], 0.0, distance / (samples * emap.cfg.grid.resolution))
+    change = _find_changes(given)
+    step = _find_cells(change, polygon, emap.cfg.grid.resolution) / samples
+    step = torch.where(is_empty[:, None], 0.0, step)
     if is_readable(poses, emap.check_values):
         _require_close(torch.where(is_empty[:, None, None], 0.0, given), step, samples)
-    places = _interpolate(given, torch.cat([shift, turn], -1), samples)
+    places = _interpolate(given, change, samples)
     # An empty path lies nowhere: so far away that nothing is known.
     nowhere = 2 * MAX_CELL_OFFSET * emap.cfg.grid.resolution
     polygons = torch.where(is_empty[:, None, None, None], nowhere, transform_polygon(polygon, places))
@@ -112,6 +110,31 @@ def check_path(
     safe = footprints.safe & torch.cat([is_close.new_ones(len(is_close), 1), is_close], 1)
     first_unsafe = _find_first_unsafe(safe, samples)
     return PathCheck(safe.all(1), first_unsafe, places, footprints._replace(safe=safe), limits_of(emap.cfg))
+
+
+def count_samples(
+    emap: ElevationMap, poses: Float[Tensor, "B T 3"] | Float[Tensor, "B T 4 4"], footprint: Float[Tensor, "V 2"]
+) -> int:
+    """Return the fewest `samples` with which `check_path` takes these poses. The host waits for the device.
+
+    Raises:
+        ValueError, TypeError: for a wrong shape, dtype or device.
+    """
+    given, polygon = check_poses(emap, poses), check_polygon(emap, footprint)
+    cells = _find_cells(_find_changes(given), polygon, emap.cfg.grid.resolution)
+    return max(1, math.ceil(float(cells.max()))) if cells.numel() else 1
+
+
+def _find_changes(given: Float[Tensor, "B T 3"]) -> Float[Tensor, "B T-1 3"]:
+    """Return the shift [m] and the shorter turn [rad] from each pose to the next."""
+    change = given[:, 1:] - given[:, :-1]
+    return torch.cat([change[..., :2], _wrap_angle(change[..., 2:])], -1)
+
+
+def _find_cells(change: Tensor, polygon: Tensor, resolution: float) -> Float[Tensor, "B T-1"]:
+    """Return how many cells a vertex moves at most: no farther than the base does and the farthest vertex turns."""
+    radius = torch.linalg.vector_norm(polygon, dim=-1).amax()
+    return (torch.linalg.vector_norm(change[..., :2], dim=-1) + radius * change[..., 2].abs()) / resolution
 
 
 def _is_empty(poses: Float[Tensor, "B T 3"]) -> Bool[Tensor, "B"]:

@@ -21,15 +21,6 @@ def make_engine(cfg: dict[str, Any], settings: NodeSettings) -> Engine:
     Raises:
         ValueError: the settings of the map do not fit, or the engine is not installed.
     """
-    try:
-        return _make(cfg, settings)
-    except ValueError as error:
-        if str(error).startswith(("layout:", "scan:")):
-            raise ValueError(f"height_scan: {str(error).partition(': ')[2]}") from error
-        raise
-
-
-def _make(cfg: dict[str, Any], settings: NodeSettings) -> Engine:
     has_torch = importlib.util.find_spec("torch") is not None
     if settings.engine == "torch" or (settings.engine == "auto" and has_torch):
         hint = "install PyTorch, or set engine to library"

@@ -44,7 +44,10 @@ class LibraryEngine:
 
         library = open_library(find_library(settings.library))
         self._map = CMap(library, json.dumps(to_json(cfg)), settings.max_points, 1, settings.threads)
-        self._scan = self._map.scan(settings.height_scan)
+        try:
+            self._scan = self._map.scan(settings.height_scan)
+        except ValueError as error:  # it calls the parameter a layout
+            raise ValueError(f"height_scan: {str(error).partition(': ')[2]}") from error
         self.links = self._map.links
 
     def update(self, given: SensorInput) -> None:

@@ -185,7 +185,8 @@ class ElevationMappingNode(Node):
         """Fuse what is ready, publish what is due, and look again soon, if a cloud waits, or when an output is due."""
         self._fuse_waiting()
         rate = self.outputs.publish()
-        period = _SHORTEST if self.intake.is_waiting else min(_LONGEST, max(_SHORTEST, 1 / rate)) if rate else _LONGEST
+        highest = math.inf if self.intake.is_waiting else max(rate, 1 / _LONGEST)
+        period = max(_SHORTEST, 1 / highest)
         if self._timer.timer_period_ns != round(1e9 * period):
             self._timer.timer_period_ns = round(1e9 * period)
             self._timer.reset()

@@ -33,16 +33,10 @@ class Publishers:
         self._offer("points", self._make_points, PointCloud2)
         self._offer("costmap", self._make_costmap, OccupancyGrid)
         self._offer("height_scan", self._make_scan, Float32MultiArray)
-        self._offer(
-            "diagnostics",
-            self._make_diagnostics,
-            DiagnosticArray,
-            node.create_publisher(DiagnosticArray, "/diagnostics", 1),
-        )
-        self._planes, self._polygons = (
-            self._publisher("planes", MarkerArray),
-            self._publisher("polygons", PolygonStamped),
-        )
+        diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 1)
+        self._offer("diagnostics", self._make_diagnostics, DiagnosticArray, diagnostics)
+        self._planes = self._publisher("planes", MarkerArray)
+        self._polygons = self._publisher("polygons", PolygonStamped)
         self._makers["planes"] = [self._planes, self._polygons], self._make_planes
         try:
             from grid_map_msgs.msg import GridMap

@@ -68,12 +68,16 @@ class Reading:
         """Its points; CloudError as `Sensor.read`."""
         return self.sensor.read(self.message)
 
-    def find_span(self, deskew: bool) -> tuple[float, float]:
-        """Return the first and the last time [s] from the stamp at which poses are needed; 0, 0 if it is not read."""
+    @cached_property
+    def _span(self) -> tuple[float, float]:
         try:
-            return find_span(self.cloud) if deskew else (0.0, 0.0)
+            return find_span(self.cloud)
         except CloudError:  # said when it is fused
             return 0.0, 0.0
+
+    def find_span(self, deskew: bool) -> tuple[float, float]:
+        """Return the first and the last time [s] from the stamp at which poses are needed; 0, 0 if it is not read."""
+        return self._span if deskew else (0.0, 0.0)
 
     def points(self, deskew: bool, poses: Poses) -> NDArray[np.float32]:
         """Return the points (N, 3) [m] as seen from the sensor's place at the stamp.
@@ -89,7 +93,7 @@ class Reading:
             return self.cloud.points
         moved = move_to_stamp(self.cloud, poses)
         if moved is None:
-            first, last = find_span(self.cloud)
+            first, last = self._span
             times = f"from {first:.3g} to {last:.3g} s from its stamp"
             raise CloudError(
                 f"tf has too few poses {times} to take out the motion within the scan; or set deskew false"

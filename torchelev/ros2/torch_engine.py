@@ -105,7 +105,7 @@ class TorchEngine:
     ) -> PathAnswer:
         """Move a footprint (V, 2) [m] along poses (T, 3), x, y [m] and yaw [rad]."""
         from torchelev.planning.footprint import FootprintConfig  # which few nodes are asked for
-        from torchelev.planning.path_check import check_path
+        from torchelev.planning.path_check import check_path, count_samples
         from torchelev.planning.standing import place_footprint
 
         corners = torch.from_numpy(footprint)
@@ -113,8 +113,14 @@ class TorchEngine:
         if T_map_base is not None:
             standing = place_footprint(self._map, corners, _floats(T_map_base)[:, None])[:, 0]
         cfg = FootprintConfig(max_extent=2.01 * float(np.hypot(*footprint.T).max()))
-        samples = _count_samples(poses, footprint, self._map.cfg.grid.resolution)
-        checked = check_path(self._map, _floats(poses), corners, cfg, samples=samples, standing=standing)
+        path = _floats(poses)
+        samples = count_samples(self._map, path, corners)
+        hint, rule = (
+            "give poses every few centimetres, as planners do",
+            f"must need at most {_MAX_FOOTPRINTS} footprints",
+        )
+        require(samples * len(poses) <= _MAX_FOOTPRINTS, "path", rule, samples * len(poses), hint)
+        checked = check_path(self._map, path, corners, cfg, samples=samples, standing=standing)
         safe = checked.footprints.safe[0].numpy()
         # A pose is reached by the samples after the one before.
         unsafe = [k for k in range(len(poses)) if not safe[max(0, (k - 1) * samples + 1) : k * samples + 1].all()]
@@ -170,21 +176,3 @@ def _scan_of(layout: str) -> HeightScan:
 def _floats(values: NDArray) -> Tensor:
     """Return float64 values of one environment."""
     return torch.from_numpy(np.ascontiguousarray(values, np.float64))[None]
-
-
-def _count_samples(poses: NDArray[np.float64], footprint: NDArray[np.float64], resolution: float) -> int:
-    """Return how many footprints on each segment keep every corner within a cell from one to the next.
-
-    Raises:
-        ValueError: the poses are so far apart that the footprints would be too many.
-    """
-    if len(poses) < 2:
-        return 1
-    change = np.diff(poses, axis=0)
-    turn = np.abs((change[:, 2] + np.pi) % (2 * np.pi) - np.pi)
-    distance = np.hypot(change[:, 0], change[:, 1]) + np.hypot(*footprint.T).max() * turn
-    samples = max(1, math.ceil(distance.max() / resolution))
-    hint = "give poses every few centimetres, as planners do"
-    fits, rule = samples * len(poses) <= _MAX_FOOTPRINTS, f"must need at most {_MAX_FOOTPRINTS} footprints"
-    require(fits, "path", rule, samples * len(poses), hint)
-    return samples

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from threading import Thread
 
 import numpy as np
@@ -58,7 +59,9 @@ class Transforms:
         found = np.full((len(offsets), 4, 4), np.nan)
         for k, offset in enumerate(offsets.tolist()):
             time = _shifted(stamp, offset)
-            if time is not None and self._buffer.can_transform(self._map, frame, time):
+            if time is None:
+                continue
+            with suppress(TransformException):
                 found[k] = self.pose(frame, time)
         return found
 
