@@ -10,11 +10,12 @@ MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests
 	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
 EXTRAS := io,bags,odometry,video,view,geo,site,rl,deploy,dev,docs
 MJLAB := .venv-mjlab
+MUJOCO := .venv-mujoco
 ISAACLAB := .venv-isaaclab
 NEWTON := .venv-newton
 GENESIS := .venv-genesis
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-odometry runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -38,7 +39,7 @@ demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
 # Workers and the programs that they start share the cores: threads that wait busily would hold them up.
-test test-fast test-library test-mjlab test-isaaclab test-newton test-genesis: export OMP_WAIT_POLICY = PASSIVE
+test test-fast test-library test-mjlab test-mujoco test-isaaclab test-newton test-genesis: export OMP_WAIT_POLICY = PASSIVE
 
 test: setup  ## run all tests, on all cores
 	$(BIN)/python $(PYTEST)
@@ -86,7 +87,7 @@ $(NEWTON)/.ready: pyproject.toml constraints.txt
 	@echo "Installing Newton, Warp and PyTorch into $(NEWTON), nowhere else: 1.5 GB."
 	$(PYTHON) -m venv $(NEWTON)
 	$(NEWTON)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--editable . newton==1.8.0 warp-lang==1.19.0 pytest hypothesis scipy
+		--editable . newton==1.8.0 warp-lang==1.19.0 matplotlib pillow pytest hypothesis scipy
 	@touch $@
 
 test-newton: $(NEWTON)/.ready  ## run maps in Newton, in the environment .venv-newton; two minutes, of which Warp compiles one
@@ -115,6 +116,20 @@ $(GENESIS)/.ready: pyproject.toml constraints.txt
 
 test-genesis: $(GENESIS)/.ready  ## run maps in Genesis, in the environment .venv-genesis; four minutes, of which it compiles three
 	$(GENESIS)/bin/python -m pytest tests/integrations/test_genesis_simulator.py
+
+$(MUJOCO)/.ready: pyproject.toml constraints.txt
+	@echo "Installing MuJoCo Warp and PyTorch into $(MUJOCO), nowhere else: 1.5 GB."
+	$(PYTHON) -m venv $(MUJOCO)
+	$(MUJOCO)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--editable '.[gym]' mujoco==4.0.0 mujoco-warp==4.0.0 warp-lang==1.19.0 pytest hypothesis scipy
+	@touch $@
+
+test-mujoco: $(MUJOCO)/.ready  ## run MuJoCo 4.0 and maps of MuJoCo Warp's worlds, in the environment .venv-mujoco
+	$(MUJOCO)/bin/python -m pytest tests/integrations/test_mujoco.py tests/integrations/test_mujoco_warp_simulator.py
+
+train-mjlab: $(MJLAB)/.ready  ## train in mjlab's rough task with the map and the ideal scan, half an hour of two cores
+	$(MJLAB)/bin/python -W ignore -m benchmarks.quality.mjlab_training
+	$(BIN)/python -m docs.readme_tables
 
 test-mjlab: $(MJLAB)/.ready  ## run the observation term in mjlab, in the environment .venv-mjlab
 	$(MJLAB)/bin/python -m pytest tests/integrations/test_mjlab_simulator.py

@@ -2,11 +2,11 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
 from tests.docs.markdown import DOCS, code_blocks, run_blocks
+from torchelev import depth_to_points
 
 
 @pytest.fixture(scope="module")
@@ -20,12 +20,12 @@ def test_nothing_beyond_the_range_of_rays_and_rangefinder(names):
     # The base looks up by 20 degrees: at the sky, and at ground far away.
     data.qpos[3:7] = math.cos(-math.radians(10)), 0.0, math.sin(-math.radians(10)), 0.0
     names["mujoco"].mj_forward(model, data)
-    reach = np.linalg.norm(names["observe"](model, data)[0], axis=1)
-    assert np.nanmax(reach) < names["MAX_RANGE"] and np.isnan(reach).sum() > 100
-    depth, seen = data.sensor("depth").data, names["measure_depth"](data)[0][0].double()
+    reach = torch.linalg.vector_norm(names["rays"].points(data), dim=-1)
+    assert reach[reach.isfinite()].max() < names["MAX_RANGE"] and reach.isnan().sum() > 100
+    depth, seen = data.sensor("depth").data, names["depth"](data)
     assert (depth > names["MAX_RANGE"]).sum() > 100 and (depth < 0).sum() > 100
-    hit = seen.isfinite().all(-1)
-    assert int(hit.sum()) == ((depth > 0) & (depth < names["MAX_RANGE"])).sum() > 1000
-    world = seen[hit] @ torch.from_numpy(data.camera("depth").xmat.reshape(3, 3)).T
-    z = world[:, 2] + data.camera("depth").xpos[2]
+    assert int(seen.isfinite().sum()) == ((depth > 0) & (depth < names["MAX_RANGE"])).sum() > 1000
+    points = depth_to_points(seen[None], names["pinhole"](58.0, names["width"], names["height"]))[0]
+    T = names["T_map_sensor"](data)
+    z = (points.double() @ T[:3, :3].T + T[:3, 3])[seen.flatten().isfinite(), 2]
     assert z.min() > -1e-6 and z.max() < 0.2 + 1e-6 and (z.abs() < 1e-6).sum() > 1000  # the floor and the box

@@ -1,4 +1,7 @@
-"""Stand-ins of what the terms read of mjlab and Isaac Lab: names and shapes from their documentation and code."""
+"""Stand-ins of what the terms read of mjlab and Isaac Lab, for tests without these simulators.
+
+They stand for the documented names and shapes; of Isaac Lab 2.3, which needs Isaac Sim, there is nothing else here.
+"""
 
 import math
 from types import SimpleNamespace
@@ -18,7 +21,13 @@ class Env:
 
     def __init__(self, num_envs=3, step_dt=0.02, **scene):
         self.num_envs, self.device, self.step_dt, self.common_step_counter = num_envs, "cpu", step_dt, 0
-        self.scene, self.sim = Scene(scene), SimpleNamespace(mj_model=None, forward=lambda: None)
+        self.scene, self.sim = Scene(scene), SimpleNamespace(mj_model=mujoco_model(), forward=lambda: None)
+
+
+def mujoco_model(**more):
+    """What the term for mjlab reads of a MuJoCo model: a ground in geom group 0, and a robot in group 2."""
+    geoms = {"geom_group": np.array([0, 2]), "geom_bodyid": np.array([0, 1]), "body_rootid": np.array([0, 1])}
+    return SimpleNamespace(**geoms, **more)
 
 
 class Scene(dict):
@@ -68,20 +77,21 @@ def quat_wxyz(rotations):
 
 
 def mjlab_robot(position, rotations):
-    return SimpleNamespace(data=SimpleNamespace(root_link_pos_w=position, root_link_quat_w=quat_wxyz(rotations)))
+    data = SimpleNamespace(root_link_pos_w=position, root_link_quat_w=quat_wxyz(rotations))
+    return SimpleNamespace(data=data, indexing=SimpleNamespace(root_body_id=1))
 
 
 class Pattern:
     """A pattern of mjlab: `generate_rays` returns starts and directions (N, 3) in the frame."""
 
-    def __init__(self, starts):
-        self.starts = starts
+    def __init__(self, starts, length):
+        self.starts, self.length = starts, length
 
     def generate_rays(self, mj_model, device):
-        return self.starts, torch.tensor([[0.0, 0.0, -1.0]]).expand(len(self.starts), 3)
+        return self.starts, torch.tensor([[0.0, 0.0, -self.length]]).expand(len(self.starts), 3)
 
 
-def mjlab_rays(frame_pos, hits, starts=None):
+def mjlab_rays(frame_pos, hits, starts=None, length=1.0, groups=(0,)):
     """mjlab's RayCastSensor with F frames (B, F, 3) of N rays (B, F, N, 3); hits that are NaN are misses.
 
     A miss has distance -1 and lies at its ray's origin.
@@ -90,7 +100,8 @@ def mjlab_rays(frame_pos, hits, starts=None):
     distances = (hits - frame_pos[:, :, None]).norm(dim=-1).nan_to_num(-1.0).flatten(1)
     hit_pos = torch.where(hits.isnan(), frame_pos[:, :, None], hits).flatten(1, 2)
     data = SimpleNamespace(distances=distances, hit_pos_w=hit_pos, frame_pos_w=frame_pos)
-    cfg = SimpleNamespace(pattern=Pattern(torch.zeros(N, 3) if starts is None else starts))
+    pattern = Pattern(torch.zeros(N, 3) if starts is None else starts, length)
+    cfg = SimpleNamespace(pattern=pattern, include_geom_groups=groups)
     return SimpleNamespace(cfg=cfg, data=data, num_frames=F, num_rays_per_frame=N)
 
 

@@ -9,6 +9,8 @@ pytest.importorskip("genesis", reason="needs genesis-world: make test-genesis")
 
 from tests.docs.markdown import DOCS, code_blocks, run_blocks
 from tests.integrations.box_on_plane import errors
+from tests.integrations.examples import run_example
+from tests.integrations.host import no_sync
 from torchelev.integrations.genesis import GenesisMaps
 
 
@@ -59,3 +61,17 @@ def test_sensors_that_do_not_fit_are_refused(page, options):
         GenesisMaps(page.robot.links[0], [SimpleNamespace(_options=None, _link=None)])
     with pytest.raises(ValueError, match="sensors: must not be empty"):
         GenesisMaps(page.robot.links[0], [])
+
+
+def test_a_step_does_not_wait_for_the_device(page):
+    maps = GenesisMaps(page.robot.links[0], [page.lidar, page.camera], page.cfg)
+    maps.update(0.02)
+    page.scan(maps.emap, maps.T_map_base)
+    with no_sync():
+        maps.update(0.02)
+        page.scan(maps.emap, maps.T_map_base)
+        maps.reset(mask=torch.tensor([True, False]))
+
+
+def test_the_example_runs(tmp_path):
+    assert "height scans (3, 187)" in run_example("genesis_maps", tmp_path)

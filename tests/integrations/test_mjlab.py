@@ -1,5 +1,6 @@
 """The term for mjlab against stand-ins of its sensors; `make test-mjlab` runs it in the simulator."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,7 @@ from tests.integrations.simulators import (
     look_down,
     mjlab_rays,
     mjlab_robot,
+    mujoco_model,
     pinhole,
 )
 from torchelev import HeightScan
@@ -36,11 +38,11 @@ def ground():
     return base()[:, 2] - HEIGHTS
 
 
-def with_rays(hits=None, frames=None, starts=None):
+def with_rays(hits=None, frames=None, **settings):
     frames = base()[:, None] if frames is None else frames
     hits = ground_hits(base(), ground())[:, None] if hits is None else hits
     robot = mjlab_robot(base(), TILTED)
-    return Env(robot=robot, rays=mjlab_rays(frames, hits, starts))
+    return Env(robot=robot, rays=mjlab_rays(frames, hits, **settings))
 
 
 def begin(env, **params):
@@ -85,6 +87,47 @@ def test_each_frame_is_a_sensor_of_its_own():
     torch.testing.assert_close(values[:, 93], HEIGHTS / 5, atol=1e-4, rtol=0)  # the middle one
 
 
+def test_unknown_points_read_the_miss_value():
+    hits = ground_hits(base(), ground(), half=0.3)[:, None]
+    _, values = begin(with_rays(hits), sensor_name="rays", miss_value=1.5)
+    grid = values.view(B, 11, 17)
+    torch.testing.assert_close(grid[:, 5, 8], HEIGHTS / 5, atol=1e-4, rtol=0)
+    assert (grid[:, :, [0, 16]] == 1.5 / 5).all()
+
+
+class FootScan(mjlab.MapObservation):
+    """The height of two feet over the ground below them."""
+
+    read = HeightScan.feet(num_feet=2, rings=((0.0, 1),))
+
+
+def feet():
+    """A sensor with a frame for each of two feet, 0.05 and 0.1 m above the ground."""
+    offset = torch.tensor([[[0.2, 0.1, 0.05], [-0.2, -0.1, 0.1]]])
+    frames = torch.cat([base()[:, :2], ground()[:, None]], -1)[:, None] + offset
+    return mjlab_rays(frames, torch.full((B, 2, 1, 3), torch.nan))
+
+
+def test_a_scan_around_feet_reads_below_the_frames_of_a_sensor():
+    env = with_rays()
+    env.scene["feet"] = feet()
+    params = {"sensor_name": "rays", "feet_sensor_name": "feet"}
+    term, observe, blank = build(FootScan, env, **params)
+    assert blank.shape == (B, 2)
+    term.reset(torch.arange(B))
+    torch.testing.assert_close(observe(), torch.tensor([[0.05, 0.1]]).expand(B, 2), atol=1e-3, rtol=0)
+    assert term.emap is build(mjlab.MapObservation, env, sensor_name="rays")[0].emap  # terms share their maps
+
+
+def test_refuses_feet_that_do_not_fit():
+    env = with_rays()
+    for name, words in (("feet", "must be one of rays"), ("rays", "'rays' must have a frame for each of the 2 feet")):
+        with pytest.raises(ValueError, match=f"feet_sensor_name: {words}"):
+            build(FootScan, env, sensor_name="rays", feet_sensor_name=name)
+    with pytest.raises(TypeError, match="feet_sensor_name: must name a part of the scene"):
+        build(FootScan, env, sensor_name="rays")
+
+
 def depth_camera(height=24, width=32, fovy=70.0, types=("depth",), sensorsize=(0.0, 0.0)):
     """A camera of mjlab 0.1 m above each base, pitched down by 40 degrees, and the simulation that it is part of."""
     directions, _ = pinhole(fovy, height, width)
@@ -101,8 +144,8 @@ def depth_camera(height=24, width=32, fovy=70.0, types=("depth",), sensorsize=(0
         cam_xmat=torch.stack([torch.zeros(B, 3, 3), torch.from_numpy(np.stack(rotations)).float()], 1),
     )
     model = SimpleNamespace(cam_fovy=torch.tensor([[45.0, fovy]]))
-    mj_model = SimpleNamespace(cam_sensorsize=np.array([[0.0, 0.0], sensorsize]))
-    cfg = SimpleNamespace(data_types=types, orthographic=False)
+    mj_model = mujoco_model(cam_sensorsize=np.array([[0.0, 0.0], sensorsize]))
+    cfg = SimpleNamespace(data_types=types, orthographic=False, enabled_geom_groups=(0,))
     sensor = SimpleNamespace(cfg=cfg, camera_idx=1, data=SimpleNamespace(depth=image))
     env = Env(robot=mjlab_robot(base(), TILTED), camera=sensor)
     env.sim = SimpleNamespace(data=data, model=model, mj_model=mj_model)
@@ -147,16 +190,18 @@ def test_a_step_does_not_wait_for_the_device(monkeypatch):
     class Term(mjlab.MapObservation):
         read = HeightScan.mjlab()  # it keeps its points as a fake tensor
 
-    monkeypatch.setattr(mjlab, "require_one_origin", lambda *args: None)
+    monkeypatch.setattr(mjlab, "_check_rays", lambda *args: None)
     with FakeTensorMode():
         pose = SimpleNamespace(root_link_pos_w=torch.zeros(B, 3), root_link_quat_w=torch.zeros(B, 4))
         rays = mjlab_rays(torch.zeros(B, 2, 3), torch.zeros(B, 2, 50, 3))
-        image = SimpleNamespace(cfg=SimpleNamespace(data_types=("depth",), orthographic=False), camera_idx=0)
+        settings = SimpleNamespace(data_types=("depth",), orthographic=False, enabled_geom_groups=(0,))
+        image = SimpleNamespace(cfg=settings, camera_idx=0)
         image.data = SimpleNamespace(depth=torch.zeros(B, 6, 8, 1))
-        env = Env(robot=SimpleNamespace(data=pose), rays=rays, camera=image)
+        robot = SimpleNamespace(data=pose, indexing=SimpleNamespace(root_body_id=1))
+        env = Env(robot=robot, rays=rays, camera=image)
         data = SimpleNamespace(cam_xpos=torch.zeros(B, 1, 3), cam_xmat=torch.zeros(B, 1, 3, 3))
         model = SimpleNamespace(cam_fovy=torch.zeros(B, 1))
-        env.sim = SimpleNamespace(data=data, model=model, mj_model=SimpleNamespace(cam_sensorsize=np.zeros((1, 2))))
+        env.sim = SimpleNamespace(data=data, model=model, mj_model=mujoco_model(cam_sensorsize=np.zeros((1, 2))))
         term, observe, _ = build(Term, env, sensor_name=["rays", "camera"])
         for ids in (torch.zeros(2, dtype=torch.int64), slice(None), None):
             term.reset(ids)
@@ -175,6 +220,12 @@ def test_a_step_does_not_wait_for_the_device(monkeypatch):
         (lambda: with_rays(starts=torch.rand(1681, 3)), {"sensor_name": "rays"}, ValueError,
          "sensor_name: the rays of 'rays' must start at one point, as those of cameras and lidars do, got starts that"),
         (lambda: with_rays(starts=torch.full((1681, 3), 0.1)), {"sensor_name": "rays"}, ValueError, "one point"),
+        (lambda: with_rays(length=2.0), {"sensor_name": "rays"}, ValueError,
+         "sensor_name: the rays of 'rays' must have unit vectors as directions, got lengths from 2 to 2; divide"),
+        (lambda: with_rays(groups=(2, 3)), {"sensor_name": "rays"}, ValueError,
+         r"sensor_name: 'rays' must see more than the robot itself, got geom groups \(2, 3\)"),
+        (with_rays, {"sensor_name": "rays", "miss_value": math.inf}, ValueError,
+         "miss_value: must be a finite number .m., got inf"),
         (lambda: depth_camera(types=("rgb",)), {"sensor_name": "camera"}, ValueError,
          r"sensor_name: 'camera' must measure depth, got \('rgb',\)"),
         (lambda: depth_camera(sensorsize=(0.1, 0.1)), {"sensor_name": "camera"}, ValueError, "given by fovy"),

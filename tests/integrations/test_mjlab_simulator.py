@@ -8,9 +8,21 @@ import torch
 
 pytest.importorskip("mjlab", reason="needs mjlab: make test-mjlab")
 
+from mjlab.envs import mdp
+from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
+from mjlab.sensor import (
+    CameraSensorCfg,
+    ObjRef,
+    PinholeCameraPatternCfg,
+    RayCastSensorCfg,
+    RingPatternCfg,
+    TerrainHeightSensorCfg,
+)
+
 from benchmarks.quality import mjlab_task
 from tests.docs.markdown import DOCS, code_blocks
-from torchelev import MapImage
+from tests.integrations.examples import run_example
+from torchelev import HeightScan, MapImage
 from torchelev.integrations.mjlab import MapObservation
 
 
@@ -73,9 +85,6 @@ class Picture(MapObservation):
 
 
 def test_a_rendered_depth_image_shows_what_the_rays_show():
-    from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
-    from mjlab.sensor import CameraSensorCfg
-
     cfg = mjlab_task.make_config(num_envs=2)
     camera = {"parent_body": "robot/trunk", "pos": (0.28, 0.0, 0.06), "quat": (0.6409, 0.2988, -0.2988, -0.6409)}
     image = {"fovy": 58.0, "width": 64, "height": 48, "data_types": ("depth",), "enabled_geom_groups": (0,)}
@@ -94,6 +103,103 @@ def test_a_rendered_depth_image_shows_what_the_rays_show():
     actor, picture = mjlab_task.find_term(env), mjlab_task.find_term(env, "depth_camera", "map")
     assert actor.emap is picture.emap
     env.close()
+
+
+class FootScan(MapObservation):
+    """The height of each foot over the map, at the rays of the task's `foot_height_scan`."""
+
+    read = HeightScan.feet(rings=((0.0, 1), (0.04, 4)))
+
+
+@dataclasses.dataclass
+class Stretched:
+    """A pattern whose directions are no unit vectors."""
+
+    def generate_rays(self, mj_model, device):
+        starts, directions = PinholeCameraPatternCfg(8, 6, 58.0).generate_rays(mj_model, device)
+        return starts, 2 * directions
+
+
+@pytest.fixture(scope="module")
+def many_frames():
+    """Robots with eyes ahead and behind, and a sole below each foot, after 30 steps; what the terms read is noted."""
+    cfg = mjlab_task.make_config(num_envs=4)
+    ground, feet = {"include_geom_groups": (0,)}, cfg.scene.sensors[1].frame
+
+    def add_eyes(spec):
+        mjlab_task.add_camera(spec)
+        quat = (0.6409, 0.2988, 0.2988, 0.6409)  # the same, turned by half a turn about z
+        spec.body("robot/trunk").add_site(name="robot/rear_eye", pos=(-0.28, 0.0, 0.06), quat=quat)
+
+    cfg.scene.spec_fn = add_eyes
+    eyes = tuple(ObjRef(type="site", name=name, entity="robot") for name in ("eye", "rear_eye"))
+    pinhole = PinholeCameraPatternCfg(width=48, height=36, fovy=58.0)
+    cfg.scene.sensors += (
+        RayCastSensorCfg(name="eyes", frame=eyes, pattern=pinhole, max_distance=4.0, **ground),
+        TerrainHeightSensorCfg(
+            name="soles", frame=feet, pattern=RingPatternCfg(rings=()), ray_alignment="world", **ground
+        ),
+        RayCastSensorCfg(name="stretched", frame=eyes[0], pattern=Stretched(), **ground),
+        RayCastSensorCfg(name="inwards", frame=eyes[0], pattern=pinhole, include_geom_groups=(2, 3)),
+    )
+    both = {"sensor_name": ["eyes", "soles"], "standing_height": 0.3}
+    params = {
+        "eyes": (MapObservation, {"sensor_name": "eyes"}),
+        "missed": (MapObservation, both | {"miss_value": 0.7}),
+        "feet": (FootScan, both | {"feet_sensor_name": "foot_height_scan"}),
+    }
+    for name, (func, given) in params.items():
+        cfg.observations[name] = ObservationGroupCfg(terms={"map": ObservationTermCfg(func=func, params=given)})
+    env, generator, noted = mjlab_task.make_env(cfg), torch.Generator().manual_seed(0), []
+    for _ in range(30):
+        groups, *_ = env.step(0.3 * torch.randn(4, 12, generator=generator))
+        ideal = {"feet": env.scene["foot_height_scan"].data.heights, "scan": mdp.height_scan(env, "terrain_scan")}
+        noted.append(groups | {f"ideal_{name}": values.clone() for name, values in ideal.items()})
+    yield (
+        env,
+        {name: torch.stack([step[name] for step in noted]) for name in noted[0] if name not in ("actor", "critic")},
+    )
+    env.close()
+
+
+def test_each_frame_of_a_sensor_measures(many_frames):
+    env, noted = many_frames
+    term = mjlab_task.find_term(env, "eyes", "map")
+    values, valid = term.read(term.emap, term.maps.source.read_base(env))
+    ahead, behind = valid.view(4, 11, 17)[:, :, 12:], valid.view(4, 11, 17)[:, :, :5]
+    assert ahead.float().mean() > 0.3 and behind.float().mean() > 0.3
+    assert (5 * values - noted["ideal_scan"][-1])[valid].abs().median() < 1e-3
+
+
+def test_the_height_of_the_feet_is_that_of_the_terrain_height_sensor(many_frames):
+    ours, ideal = (many_frames[1][name] for name in ("feet", "ideal_feet"))
+    assert ours.shape[1:] == (4, 20) and ideal.shape[1:] == (4, 4)
+    lowest = ours.unflatten(-1, (4, 5)).amin(-1)
+    error, of_other_feet = ((feet - ideal).abs() for feet in (lowest, lowest.flip(-1)))
+    assert error.quantile(0.99) < 2e-3
+    assert error.quantile(0.9) < 0.2 * of_other_feet.quantile(0.9)
+
+
+def test_unknown_points_read_the_miss_value(many_frames):
+    env, noted = many_frames
+    term = mjlab_task.find_term(env, "missed", "map")
+    _, valid = term.read(term.emap, term.maps.source.read_base(env))
+    assert 0.1 < valid.float().mean() < 0.9
+    torch.testing.assert_close(noted["missed"][-1][~valid], torch.full(((~valid).sum(),), 0.7 / 5))
+    assert (noted["missed"][-1][valid] != 0.7 / 5).all()
+
+
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        ("stretched", "the rays of 'stretched' must have unit vectors as directions, got lengths from 2 to 2"),
+        ("inwards", r"'inwards' must see more than the robot itself, got geom groups \(2, 3\)"),
+        ("foot_height_scan", "the rays of 'foot_height_scan' must start at one point"),
+    ],
+)
+def test_refuses_patterns_and_groups_that_do_not_fit(many_frames, name, words):
+    with pytest.raises(ValueError, match=f"sensor_name: {words}"):
+        MapObservation(ObservationTermCfg(func=MapObservation, params={"sensor_name": name}), many_frames[0])
 
 
 def test_the_config_of_the_page_is_this_one():
@@ -133,7 +239,9 @@ def test_mjlab_s_training_script_takes_the_config(tmp_path):
     ],
 )
 def test_refuses_sensors_that_do_not_fit(env, params, words):
-    from mjlab.managers import ObservationTermCfg
-
     with pytest.raises((ValueError, TypeError), match=words):
         MapObservation(ObservationTermCfg(func=MapObservation, params=params), env)
+
+
+def test_the_example_runs(tmp_path):
+    assert "observation (8, 187)" in run_example("mjlab_term", tmp_path)

@@ -11,6 +11,8 @@ import warp as wp
 
 from tests.docs.markdown import DOCS, code_blocks, run_blocks
 from tests.integrations.box_on_plane import errors
+from tests.integrations.examples import run_example
+from tests.integrations.host import no_sync
 from torchelev import ElevationMapConfig, GridConfig, HeightScan
 from torchelev.integrations.newton import NewtonCamera, NewtonLidar, NewtonMaps
 from torchelev.sim import HeightField, Lidar, surface_of
@@ -218,3 +220,20 @@ def test_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = DOCS / "howto/newton.md"
     run_blocks(path, [block for block in code_blocks(path.read_text()) if block.language == "python"])
+
+
+def test_a_step_does_not_wait_for_the_device():
+    model, state = make_model()
+    maps, scan = NewtonMaps(model, "base", [LIDAR, CAMERA], CFG), HeightScan.isaac_lab()
+    maps.update(state, 0.02)
+    scan(maps.emap, maps.T_map_base)
+    with no_sync():
+        maps.update(state, 0.02)
+        scan(maps.emap, maps.T_map_base)
+        maps.reset(mask=torch.tensor([True, False, False]))
+    with pytest.raises(AssertionError, match="waits for the device"), no_sync():
+        maps.T_map_base.max().item()
+
+
+def test_the_example_runs(tmp_path):
+    assert "height scans (3, 187)" in run_example("newton_maps", tmp_path)

@@ -45,8 +45,9 @@ class GenesisMaps:
             rule, hint = "must return points in the sensor's frame", "leave return_points and return_world_frame out"
             given = f"return_points={options.return_points}, return_world_frame={options.return_world_frame}"
             require(options.return_points and not options.return_world_frame, "sensors", rule, given, hint)
-        self._base, self._sensors = base, tuple(sensors)
         self.T_map_base = _pose_of(base)
+        offsets = (self.T_map_base.new_tensor(sensor._options.pos_offset) for sensor in sensors)
+        self._base, self._sensors = base, tuple(zip(sensors, offsets, strict=True))
         self.emap = ElevationMap(cfg, num_envs=len(self.T_map_base), device=self.T_map_base.device)
 
     def update(self, dt: float | Float[Tensor, "B"]) -> None:
@@ -56,7 +57,7 @@ class GenesisMaps:
             dt: time since the last update [s]; 0 where an environment was just reset.
         """
         self.T_map_base = _pose_of(self._base)
-        cloud = join([_read(sensor) for sensor in self._sensors])
+        cloud = join([_read(sensor, offset) for sensor, offset in self._sensors])
         self.emap.update(cloud.points, cloud.T_map_sensor, self.T_map_base, dt)
 
     def reset(self, env_ids: Int[Tensor, "K"] | None = None, *, mask: Bool[Tensor, "B"] | None = None) -> None:
@@ -69,12 +70,12 @@ def _pose_of(link: Any) -> Float[Tensor, "B 4 4"]:
     return transform(link.get_pos().reshape(-1, 3).double(), link.get_quat().reshape(-1, 4).double())
 
 
-def _read(sensor: Any) -> Cloud:
+def _read(sensor: Any, offset: Float[Tensor, "3"]) -> Cloud:
     """Return the points of a sensor: from its place, along the axes of its link; (0, 0, 0) where nothing was hit."""
     found, T = sensor.read(), _pose_of(sensor._link)
     B = len(T)
     points, distance = found.points.reshape(B, -1, 3), found.distances.reshape(B, -1)
     is_miss = distance == sensor._options.no_hit_value
     T_map_sensor = T.clone()
-    T_map_sensor[:, :3, 3] += T[:, :3, :3] @ T.new_tensor(sensor._options.pos_offset)
+    T_map_sensor[:, :3, 3] += T[:, :3, :3] @ offset
     return Cloud(points.masked_fill(is_miss[..., None], torch.nan)[:, None], T_map_sensor[:, None])

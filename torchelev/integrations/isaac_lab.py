@@ -3,14 +3,14 @@
     height_scan = ObservationTermCfg(
         func=MapObservation, params={"sensor_cfg": SceneEntityCfg("camera"), "standing_height": 0.5})
 
-Tried in Isaac Lab 3.0.0 with its Newton backend, and run against stand-ins of the documented interface of 2.3.
+Tried in Isaac Lab 3.0.0 with its Newton backend; of 2.3, which needs Isaac Sim, it follows the documentation.
 docs/howto/isaac_lab.md has the whole config and the results.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -47,6 +47,8 @@ class MapObservation(MapTerm, ManagerTermBase):
     - asset_cfg: `SceneEntityCfg` of the robot, whose root link is the base; "robot" if left out.
     - update_every: control steps from one update to the next, for instance the sensor's `update_period` / `step_dt`.
     - standing_height: height of the base over flat ground [m], which an empty map reads.
+    - feet_cfg: `SceneEntityCfg` of the robot with the feet as its `body_names`, for a `read` around feet,
+      `HeightScan.feet`.
 
     Further settings are class attributes: `quaternions` here, and `read`, `map_cfg` and `with_validity` of `MapTerm`.
     By default it reads `HeightScan.isaac_lab()`, which includes the offset of 0.5 m and the clip of +-1 m.
@@ -67,7 +69,8 @@ class MapObservation(MapTerm, ManagerTermBase):
         sensors = to_names("sensor_cfg", cfg.params.get("sensor_cfg"))
         (asset,) = to_names("asset_cfg", cfg.params.get("asset_cfg", "robot"))
         robot = find(env.scene, "asset_cfg", asset, env.scene.keys())
-        source = IsaacLabSource(sensors, asset, _find_order(type(self).quaternions, robot))
+        feet = _find_feet(getattr(type(self).read, "num_feet", 0), cfg.params.get("feet_cfg"))
+        source = IsaacLabSource(sensors, asset, _find_order(type(self).quaternions, robot), feet)
         source.check(env, require_cadence(cfg.params.get("update_every", 1)) * env.step_dt)
         self._set_up(cfg, env, source)
         self._sim = env.sim
@@ -85,6 +88,7 @@ class MapObservation(MapTerm, ManagerTermBase):
         asset_cfg: Any = "robot",
         update_every: int = 1,
         standing_height: float | None = None,
+        feet_cfg: Any = None,
     ) -> Tensor:
         """Return the observation (B, ...), a fresh tensor without NaN."""
         return self._observe(env)
@@ -97,6 +101,8 @@ class IsaacLabSource:
     sensor_names: tuple[str, ...]  #: ray casters and cameras, read as one measurement
     asset_name: str  #: the robot
     quaternions: str  #: "wxyz" or "xyzw"
+    #: ids of the feet's bodies; terms that differ in them share their maps
+    feet: tuple[int, ...] = field(default=(), compare=False)
 
     def check(self, env: Any, period: float) -> None:
         """Refuse sensors that are missing or do not fit, or that measure less often than every `period` [s]."""
@@ -115,6 +121,11 @@ class IsaacLabSource:
         """Return T_map_base, the pose of the robot's root link."""
         robot = env.scene[self.asset_name].data
         return self._pose(robot.root_link_pos_w, robot.root_link_quat_w)
+
+    def read_feet(self, env: Any) -> Float[Tensor, "B K 3"]:
+        """Return the positions of the feet [m], map frame."""
+        positions = to_tensor(env.scene[self.asset_name].data.body_link_pos_w)
+        return torch.stack([positions[:, body] for body in self.feet], 1)
 
     def read_cloud(self, env: Any) -> Cloud:
         """Return the sensors' latest points."""
@@ -156,6 +167,18 @@ def _find_order(given: str | None, robot: Any) -> str:
     is_order, hint = given in (None, "wxyz", "xyzw"), "leave it None, or set the order of your version"
     require(is_order, "quaternions", "must be 'wxyz', 'xyzw' or None", repr(given), hint)
     return given or ("wxyz" if isinstance(robot.data.root_link_quat_w, Tensor) else "xyzw")
+
+
+def _find_feet(num_feet: int, feet_cfg: Any) -> tuple[int, ...]:
+    """Return the ids of the feet's bodies, which the manager has found by their names."""
+    if not num_feet:
+        return ()
+    ids = getattr(feet_cfg, "body_ids", ())
+    feet = tuple(ids) if isinstance(ids, list | tuple) else ()
+    rule = f"must name the {num_feet} feet of read"
+    hint = 'give SceneEntityCfg("robot", body_names=...) of the feet'
+    require(len(feet) == num_feet, "feet_cfg", rule, f"{len(feet)} bodies", hint)
+    return feet
 
 
 def _is_camera(sensor: Any) -> bool:

@@ -9,9 +9,10 @@ Tried with mjlab 1.6.0, which is not imported here. docs/howto/mjlab.md has the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,6 +37,9 @@ class MapObservation(MapTerm):
     - entity_name: the robot, whose root link is the base.
     - update_every: control steps from one update to the next.
     - standing_height: height of the base over flat ground [m], which an empty map reads.
+    - miss_value: what unknown points read [m], as mjlab's `height_scan` has it for rays that miss; None: `read.fill`.
+    - feet_sensor_name: a `TerrainHeightSensor` or another `RayCastSensor` whose frames are the feet, for a `read`
+      around feet, `HeightScan.feet`.
 
     Further settings are class attributes: `read`, `map_cfg` and `with_validity` of `MapTerm`. By default it reads
     `HeightScan.mjlab()`, which includes the scale of 1/5 of the rough velocity task: give the term no scale or noise.
@@ -49,8 +53,10 @@ class MapObservation(MapTerm):
     def __init__(self, cfg: Any, env: Any) -> None:
         sensors = to_names("sensor_name", cfg.params.get("sensor_name"))
         (entity,) = to_names("entity_name", cfg.params.get("entity_name", "robot"))
-        source = MjlabSource(sensors, entity)
-        source.check(env)
+        num_feet = getattr(type(self).read, "num_feet", 0)
+        (feet,) = to_names("feet_sensor_name", cfg.params.get("feet_sensor_name")) if num_feet else (None,)
+        source = MjlabSource(sensors, entity, feet)
+        source.check(env, num_feet)
         self._set_up(cfg, env, source)
 
     def __call__(
@@ -60,6 +66,8 @@ class MapObservation(MapTerm):
         entity_name: str = "robot",
         update_every: int = 1,
         standing_height: float | None = None,
+        miss_value: float | None = None,
+        feet_sensor_name: str | None = None,
     ) -> Tensor:
         """Return the observation (B, ...), a fresh tensor without NaN."""
         return self._observe(env)
@@ -71,14 +79,22 @@ class MjlabSource:
 
     sensor_names: tuple[str, ...]  #: ray-cast and camera sensors, read as one measurement
     entity_name: str  #: the robot
+    #: a ray-cast sensor whose frames are the feet; terms that differ in it share their maps
+    feet_sensor_name: str | None = field(default=None, compare=False)
 
-    def check(self, env: Any) -> None:
+    def check(self, env: Any, num_feet: int = 0) -> None:
         """Refuse sensors and entities that are missing or do not fit."""
-        find(env.scene, "entity_name", self.entity_name, env.scene.entities)
+        robot = find(env.scene, "entity_name", self.entity_name, env.scene.entities)
         for name in self.sensor_names:
             sensor = find(env.scene, "sensor_name", name, env.scene.sensors)
             check = _check_rays if _casts_rays(sensor) else _check_camera
             check(env, name, sensor)
+            _require_ground(env, name, sensor, robot)
+        if self.feet_sensor_name is not None:
+            feet = find(env.scene, "feet_sensor_name", self.feet_sensor_name, env.scene.sensors)
+            actual, hint = getattr(feet, "num_frames", 0), "set its frame to one ObjRef for each foot"
+            rule = f"{self.feet_sensor_name!r} must have a frame for each of the {num_feet} feet of read"
+            require(actual == num_feet, "feet_sensor_name", rule, f"{actual} frames", hint)
 
     def read_base(self, env: Any) -> Float[Tensor, "B 4 4"]:
         """Return T_map_base; mjlab's quaternions are w x y z."""
@@ -89,6 +105,10 @@ class MjlabSource:
         """Return the sensors' points of the last control step."""
         return join([self._read_sensor(env, env.scene[name]) for name in self.sensor_names])
 
+    def read_feet(self, env: Any) -> Float[Tensor, "B K 3"]:
+        """Return the positions of the feet [m], map frame."""
+        return env.scene[self.feet_sensor_name].data.frame_pos_w
+
     def _read_sensor(self, env: Any, sensor: Any) -> Cloud:
         return _read_rays(sensor) if _casts_rays(sensor) else _read_depth(env, sensor)
 
@@ -98,8 +118,12 @@ def _casts_rays(sensor: Any) -> bool:
 
 
 def _check_rays(env: Any, name: str, sensor: Any) -> None:
-    starts, _ = sensor.cfg.pattern.generate_rays(env.sim.mj_model, env.device)
+    starts, directions = sensor.cfg.pattern.generate_rays(env.sim.mj_model, env.device)
     require_one_origin("sensor_name", name, torch.cat([starts, torch.zeros_like(starts[:1])]))
+    lengths = torch.linalg.vector_norm(directions, dim=-1)
+    rule, hint = f"the rays of {name!r} must have unit vectors as directions", "divide them by their norms"
+    actual = f"lengths from {lengths.min():.3g} to {lengths.max():.3g}"
+    require(bool(((lengths - 1).abs() < 1e-3).all()), "sensor_name", rule, actual, hint)
 
 
 def _check_camera(env: Any, name: str, sensor: Any) -> None:
@@ -113,6 +137,19 @@ def _check_camera(env: Any, name: str, sensor: Any) -> None:
     is_plain = not any(size) and not sensor.cfg.orthographic
     rule, hint = f"{name!r} must be a perspective camera given by fovy", "leave out sensorsize and orthographic"
     require(is_plain, "sensor_name", rule, f"sensorsize {size}, orthographic={sensor.cfg.orthographic}", hint)
+
+
+def _require_ground(env: Any, name: str, sensor: Any, robot: Any) -> None:
+    """Refuse a sensor whose groups of geoms hold the robot's alone."""
+    model, cfg = env.sim.mj_model, sensor.cfg
+    groups = cfg.include_geom_groups if _casts_rays(sensor) else cfg.enabled_geom_groups
+    is_seen = np.isin(model.geom_group, range(6) if groups is None else groups)
+    is_own = model.body_rootid[model.geom_bodyid] == model.body_rootid[robot.indexing.root_body_id]
+    rule, hint = (
+        f"{name!r} must see more than the robot itself",
+        "give it the group of the terrain's geoms, by default 0",
+    )
+    require(bool((is_seen & ~is_own).any()), "sensor_name", rule, f"geom groups {groups}", hint)
 
 
 def _read_rays(sensor: Any) -> Cloud:

@@ -35,6 +35,9 @@ class Source(Protocol):
     def read_base(self, env: Any) -> Float[Tensor, "B 4 4"]:
         """Return T_map_base, the pose of each robot's base."""
 
+    def read_feet(self, env: Any) -> Float[Tensor, "B K 3"]:
+        """Return the positions of the feet [m], map frame; only asked for by a scan around feet."""
+
 
 class StepMap:
     """The maps of an environment's B robots.

@@ -16,11 +16,12 @@ pytest.importorskip("isaaclab", reason="needs Isaac Lab: make test-isaaclab")
 from isaaclab.managers import ObservationTermCfg, SceneEntityCfg
 from isaaclab.utils import to_dict
 from isaaclab.utils.math import matrix_from_quat, quat_apply
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.quality.isaac_lab import task
 from benchmarks.quality.mjlab_task import compare
 from tests.docs.markdown import DOCS, code_blocks
+from tests.integrations.examples import run_example
+from tests.integrations.host import no_sync
 from torchelev import ElevationMap, HeightScan
 from torchelev.integrations.isaac_lab import MapObservation, to_tensor
 
@@ -220,28 +221,9 @@ def test_quaternions_are_x_y_z_w(env, terms):
     torch.testing.assert_close(forward, ahead, atol=1e-5, rtol=0)
 
 
-class NoSync(TorchDispatchMode):
-    """Refuse what would wait for a GPU: to read a value, or a shape that depends on values."""
-
-    FORBIDDEN = ("_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "unique")
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name = func.overloadpacket.__name__
-        assert name not in self.FORBIDDEN, f"{name} waits for the device"
-        is_masked = name in ("index", "index_put", "index_put_") and any(
-            index is not None and index.dtype == torch.bool for index in args[1]
-        )
-        assert not is_masked, f"{name} with a mask waits for the device"
-        return func(*args, **(kwargs or {}))
-
-
-def test_a_step_does_not_read_values(env, terms, monkeypatch):
-    """As far as a CPU shows it: on CPUs alone values are checked, and C++ does what other devices leave to PyTorch."""
-    for name, module in list(sys.modules.items()):
-        if name.startswith("torchelev.") and hasattr(module, "is_readable"):
-            monkeypatch.setattr(module, "is_readable", lambda *args: False)
+def test_a_step_does_not_wait_for_the_device(env, terms):
     step(env)
-    with NoSync():
+    with no_sync():
         with pytest.raises(AssertionError, match="waits for the device"):
             torch.ones(1).item()
         for name in ("camera", "both", "rendered"):
@@ -327,3 +309,7 @@ def test_the_config_of_the_page_is_this_one():
     for term in terms:
         del term["params"]["standing_height"]
     assert terms[0] == terms[1]
+
+
+def test_the_example_runs(tmp_path):
+    assert "observation (8, 187)" in run_example("isaac_lab_term", tmp_path)
