@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchelev.channels.config import ChannelConfigs, parse_channels
 from torchelev.completion.config import CompletionConfig
 from torchelev.config_files import from_json, read_settings, without_header, write_settings
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.layers import LAYERS
 from torchelev.stages.age.config import AgingConfig
 from torchelev.stages.compensate.config import DriftConfig
 from torchelev.stages.fusion.config import FusionConfig
@@ -57,6 +59,8 @@ class ElevationMapConfig:
     #: the layers `completed` and `completed_std`: predicted ground where no sensor saw it; None: none
     completion: CompletionConfig | None = None
     filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
+    #: what each cell holds besides its height, by name: `ChannelConfig`, or the word of a kind with its defaults
+    channels: ChannelConfigs = field(default_factory=ChannelConfigs)
 
     def __post_init__(self) -> None:
         if isinstance(self.filters, list):
@@ -64,8 +68,10 @@ class ElevationMapConfig:
         hint = "give (FilterConfig(layer=..., filter=...), ...)"
         is_chain = _is_chain(self.filters)
         require(is_chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), hint, TypeError)
+        taken = (*LAYERS, "completed", "completed_std", *(step.layer for step in self.filters))
+        object.__setattr__(self, "channels", parse_channels(self.channels, taken))
         for name, annotation in setting_types(type(self)).items():  # type: ignore[arg-type]
-            if name == "filters":
+            if name in ("filters", "channels"):
                 continue
             value, kinds = getattr(self, name), typing.get_args(annotation) or (annotation,)
             rule = f"must be {' or '.join('None' if kind is type(None) else f'a {kind.__name__}' for kind in kinds)}"
@@ -92,8 +98,10 @@ class ElevationMapConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as nested plain dicts, as YAML files and `state_dict` hold it."""
-        filters = [step.to_dict() for step in self.filters]
-        return dataclasses.asdict(dataclasses.replace(self, filters=())) | {"filters": filters}
+        values = dataclasses.asdict(dataclasses.replace(self, filters=()))
+        if not values["channels"]:
+            del values["channels"]
+        return values | {"filters": [step.to_dict() for step in self.filters]}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ElevationMapConfig:
@@ -107,12 +115,16 @@ class ElevationMapConfig:
         """
         if isinstance(values, dict):
             values = without_header(values)
-        if not isinstance(values, dict) or "filters" not in values:
+        if not isinstance(values, dict):
             return _build(cls, values, "config")
-        from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them
+        stages = {name: value for name, value in values.items() if name not in ("filters", "channels")}
+        own: dict[str, Any] = {"channels": values["channels"]} if values.get("channels") else {}
+        if "filters" in values:
+            from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them
 
-        stages = {name: value for name, value in values.items() if name != "filters"}
-        return dataclasses.replace(_build(cls, stages, "config"), filters=filters_from_list(values["filters"]))
+            own["filters"] = filters_from_list(values["filters"])
+        cfg = _build(cls, stages, "config")
+        return dataclasses.replace(cfg, **own) if own else cfg
 
     def save(self, path: str | Path) -> None:
         """Write all settings as JSON, by group and name, with a version.

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchelev import pipeline
+from torchelev.channels.config import ChannelConfigs
+from torchelev.channels.inputs import check_features
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
@@ -27,6 +29,7 @@ from torchelev.kernels.choose import Backend, choose
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import is_readable, require_reverse_mode
+from torchelev.painted_map import PaintedMap
 from torchelev.pipeline import rate, update_by_tensors, update_in_place, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
@@ -43,7 +46,7 @@ if TYPE_CHECKING:
     from torchelev.traversability.weight_file import Weights
 
 
-class ElevationMap(ReadableMap):
+class ElevationMap(PaintedMap, ReadableMap):
     """B robot-centric elevation maps on one device.
 
     Args:
@@ -85,7 +88,7 @@ class ElevationMap(ReadableMap):
         self.update_times = UpdateTimes()
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
-        self._update_cfg = dataclasses.replace(cfg, completion=None, filters=())
+        self._update_cfg = dataclasses.replace(cfg, completion=None, filters=(), channels=ChannelConfigs())
         self._key = pipeline.register_stages(self._update_cfg)
         self._history = InputHistory()
         with torch.inference_mode(False):
@@ -107,6 +110,7 @@ class ElevationMap(ReadableMap):
         variance: Float[Tensor, "B *S N"] | None = None,
         T_base_links: Float[Tensor, "B K 4 4"] | None = None,
         pose_covariance: Float[Tensor, "B *S 6 6"] | None = None,
+        features: Mapping[str, Float[Tensor, "B *S N C"]] | None = None,
     ) -> None:
         """Fuse one cloud per environment into its map.
 
@@ -130,12 +134,16 @@ class ElevationMap(ReadableMap):
                 rotations about the map's axes [rad], as in a ROS Odometry message. It adds J Sigma J^T to the variance
                 of each point's height, J = (0, 0, 1, r_y, -r_x, 0) with r from the sensor to the point; the layer
                 `variance` then holds what the pose's errors add. None: poses are exact.
+            features: what each point brings for the channels of the config, by name: (B, N, C) or (B, S, N, C), NaN
+                where a point brings nothing. Colours are from 0 to 1, or uint8; probabilities of classes sum to 1.
 
         Raises:
             TypeError: if `dt` is missing, or an argument has the wrong type or dtype. Nothing has changed then.
             ValueError: if a shape, device or value is wrong. Nothing has changed then.
+            KeyError: if `features` names a channel that is not there. Nothing has changed then.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
+        brought = check_features(features, points, self.cfg.channels, self.device)
         state = self.state
         self._history.add(inputs, state.statistics.drift_correction)
         self._derived.clear()
@@ -149,6 +157,9 @@ class ElevationMap(ReadableMap):
         if before is not None:
             with torch.no_grad():
                 write(state, self._write_back(before, state))
+        if self.channels is not None:
+            noise = (self.cfg.sensor.noise_factor, self.cfg.sensor.noise_floor)
+            self.channels.update(self.state, inputs.dt, inputs, brought, noise)
         if self.cfg.completion is not None and self.cfg.completion.when == "update":
             self._complete()
 
@@ -303,6 +314,8 @@ class ElevationMap(ReadableMap):
         self.num_resets.add_(self._choose(env_ids, mask))
         with torch.no_grad():
             forget(self.state, self.cfg.grid, env_ids, mask)
+        if self.channels is not None:
+            self.channels.forget(env_ids, mask)
 
     def _check_choice(self, env_ids: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         require(env_ids is None or mask is None, "env_ids, mask", "exclude each other", "both", "give one of them")
@@ -359,6 +372,7 @@ class ElevationMap(ReadableMap):
         with torch.no_grad():
             state = change(subtract_disagreement(self.measured_state))
             write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
+        self._sync_channels()
 
     def initialize_from(
         self,
@@ -394,6 +408,7 @@ class ElevationMap(ReadableMap):
             write(self.state, subtract_disagreement(self.state))
             state = site.fill_state(self, T_map_base, chosen)
             write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
+        self._sync_channels()
 
     # Diagnosis ------------------------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchelev.channels.module import Channels
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.inputs import checks
@@ -60,6 +61,7 @@ class ReadableMap(MapBuffers):
         for net in (self.head, self.completion_net):
             if net is not None:
                 net.to(device)
+        self.channels = Channels(cfg.channels, cfg.grid, num_envs, device) if cfg.channels else None
         self.filters = self._make_filters()
         self._derived: dict[str, Layer] = {}  # layers that completion and filters made of the current state
 
@@ -101,7 +103,8 @@ class ReadableMap(MapBuffers):
 
     @property
     def _own_layers(self) -> tuple[str, ...]:
-        return (*LAYERS, *(() if self.completion_net is None else COMPLETED))
+        channels = () if self.channels is None else self.channels.layers
+        return (*LAYERS, *(() if self.completion_net is None else COMPLETED), *channels)
 
     def layer(self, name: str, *, state: MapState | None = None) -> Float[Tensor, "B H W"]:
         """Return a layer as a fresh tensor, NaN where unknown.
@@ -116,17 +119,37 @@ class ReadableMap(MapBuffers):
           standard deviation of that. Known in the whole window of an environment that knows any elevation, unknown in
           the others. Computed once, and kept until the map changes; with `state`, each time, and differentiable in the
           state and in the weights of `completion_net`.
+        - a channel's, or `<channel>.<component>` of one with several, such as "rgb.red". The channel of several
+          components itself is (B, C, H, W). Unknown where no point, and no image, said anything of the ground.
         - a configured filter's: computed when read, with the layers that it needs, and kept until the map changes.
 
         Args:
-            name: one of `layers`.
+            name: one of `layers`, or a channel.
             state: state to read; None: the map's own.
 
         Raises:
             KeyError: if there is no such layer.
         """
+        if name in self.cfg.channels and name not in self.layers:
+            vectors, known = self.read_channel(name, state)
+            return torch.where(known[..., None], vectors, torch.nan).movedim(-1, 1)
         values, known = self.read_layer(name, state)
         return torch.where(known, values, torch.nan)
+
+    def read_channel(
+        self, name: str, state: MapState | None = None
+    ) -> tuple[Float[Tensor, "B H W C"], Bool[Tensor, "B H W"]]:
+        """Return the values of a channel, and where they are known; errors as of `layer`."""
+        require(name in self.cfg.channels, "layer", "must be a channel", repr(name), "see cfg.channels", KeyError)
+        assert self.channels is not None
+        if state is None:
+            self._sync_channels()
+        return self.channels.read(name, self.state if state is None else state)
+
+    def _sync_channels(self) -> None:
+        """Make channels follow what changed besides updates, such as cells that were forgotten."""
+        if self.channels is not None:
+            self.channels.update(self.state)
 
     def read_layer(self, name: str, state: MapState | None = None) -> Layer:
         """Return a layer's values and mask, for code that computes with both; arguments and errors as of `layer`.
@@ -148,6 +171,10 @@ class ReadableMap(MapBuffers):
         require(name in self._own_layers, "layer", "must be a layer's name", repr(name), hint, KeyError)
         if name in COMPLETED:
             return self._complete(state)[name]
+        if name not in LAYERS:
+            channel = name.split(".")[0]
+            values, known = self.read_channel(channel, state)
+            return values[..., self.cfg.channels[channel].components(channel).index(name)], known
         return LAYERS[name](self.state if state is None else state)
 
     def _complete(self, state: MapState | None = None) -> dict[str, Layer]:

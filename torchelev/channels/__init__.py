@@ -1,0 +1,1 @@
+"""Channels: what a map holds of each cell besides its height, such as colours, classes and features."""

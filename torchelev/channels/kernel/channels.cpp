@@ -1,0 +1,226 @@
+// Channels that follow their maps, and take in what points bring, in place: module.py.
+
+#include <cstring>
+#include <limits>
+#include <vector>
+
+#include "channels/kernel/equation.h"
+#include "kernels/threads.h"
+
+namespace {
+
+constexpr float NOT_KNOWN = std::numeric_limits<float>::quiet_NaN();
+constexpr float NEVER = std::numeric_limits<float>::infinity();
+
+// `_Channel` of native.py.
+struct Channel {
+    float *values, *weight, *age;  // (B, H, W, C), (B, H, W), (B, H, W) or null
+    const float* features;         // (B, M, C), null if the update brings none
+    int64_t C;
+    int32_t kind;
+    float rate, half_life, max_age, tolerance;  // half_life: infinite for none
+};
+
+// `_Update` of native.py.
+struct Update {
+    const float* points;          // (B, S, N, 3) [m] sensor frame
+    const double* T_map_sensor;   // (B, S, 4, 4)
+    const float* variance;        // (B, S, N) [m^2], or null
+    const float *dt, *drift;      // (B) [s], (B) [m] or null
+    const int64_t* corner_now;    // (B, 2)
+    const float* elevation;       // (B, H, W) [m]
+    const uint8_t* validity;      // (B, H, W)
+    int64_t* corner;              // (B, 2)
+    float* height;                // (B, H, W) [m]
+    const Channel* channels;      // (K)
+    int64_t B, S, N, H, W, K;
+    double resolution;
+    float noise_factor, noise_floor;
+};
+
+// Give cell (i, j) of H x W cells of C values what was at (i, j) + by, or `blank` if that lies outside.
+void move(float* layer, int64_t H, int64_t W, int64_t C, const int64_t* by, float blank) {
+    const int64_t offset = by[0] * W + by[1], size = H * W;
+    const int64_t begin = std::clamp(-offset, int64_t(0), size), end = std::clamp(size - offset, begin, size);
+    std::memmove(layer + begin * C, layer + (begin + offset) * C, (end - begin) * C * sizeof(float));
+    const int64_t first = std::clamp(-by[1], int64_t(0), W), last = std::clamp(W - by[1], first, W);
+    const int64_t top = std::clamp(-by[0], int64_t(0), H), bottom = std::clamp(H - by[0], top, H);
+    std::fill(layer, layer + top * W * C, blank), std::fill(layer + bottom * W * C, layer + size * C, blank);
+    if (first == 0 && last == W) return;
+    for (int64_t row = top * W; row < bottom * W; row += W) {
+        std::fill(layer + row * C, layer + (row + first) * C, blank);
+        std::fill(layer + (row + last) * C, layer + (row + W) * C, blank);
+    }
+}
+
+// Memory of one thread.
+struct Scratch {
+    std::vector<int32_t> slot;             // cell of each point, -1 for none
+    std::vector<float> distance, weight;   // [m] from the cell's elevation; POINT / sigma^2
+    std::vector<float> rise;               // of each cell [m] since the last update, NaN where it is not known
+    std::vector<float> sum;                // of each cell: C values, and the total of the weights
+};
+
+class Map {
+  public:
+    Map(const Update& u, int64_t b, int num_threads, Scratch& own)
+        : u(u), b(b), own(own), cells(u.H * u.W), parts{num_threads, num_threads} {}
+
+    void run() {
+        follow();
+        bool has_points = false;
+        for (int64_t k = 0; k < u.K; k++) has_points |= u.channels[k].features != nullptr;
+        if (!has_points) return;
+        locate();
+        for (int64_t k = 0; k < u.K; k++)
+            if (u.channels[k].features) fuse(u.channels[k]);
+    }
+
+  private:
+    const Update& u;
+    const int64_t b;
+    Scratch& own;
+    const int64_t cells;
+    const Parts parts;
+
+    void follow() {
+        int64_t shift[2];
+        for (int axis = 0; axis < 2; axis++) {
+            const int64_t now = u.corner_now[2 * b + axis], largest = std::max(u.H, u.W);
+            shift[axis] = std::clamp(now - u.corner[2 * b + axis], -largest, largest);
+            u.corner[2 * b + axis] = now;
+        }
+        const bool moves = shift[0] || shift[1];
+        float* height = u.height + b * cells;
+        if (moves) move(height, u.H, u.W, 1, shift, NOT_KNOWN);
+        const float* elevation = u.elevation + b * cells;
+        const uint8_t* known = u.validity + b * cells;
+        const float drift = u.drift ? u.drift[b] : 0;
+        own.rise.resize(cells);
+        parts(cells, [&](int64_t, int64_t begin, int64_t end) {
+            for (int64_t c = begin; c < end; c++) {
+                const float now = known[c] ? elevation[c] : NOT_KNOWN;
+                own.rise[c] = std::fabs(now - (height[c] + drift));
+                height[c] = now;
+            }
+        });
+        for (int64_t k = 0; k < u.K; k++) {
+            const Channel& channel = u.channels[k];
+            if (moves) {
+                move(channel.values + b * cells * channel.C, u.H, u.W, channel.C, shift, 0);
+                move(channel.weight + b * cells, u.H, u.W, 1, shift, 0);
+                if (channel.age) move(channel.age + b * cells, u.H, u.W, 1, shift, 0);
+            }
+            parts(cells, [&](int64_t, int64_t begin, int64_t end) { keep(channel, begin, end); });
+        }
+    }
+
+    // Age the cells of a channel, and forget those whose ground is another one.
+    void keep(const Channel& channel, int64_t begin, int64_t end) {
+        const float dt = u.dt[b], share = channel.half_life < NEVER ? std::exp2(-dt / channel.half_life) : 1.0f;
+        float* values = channel.values + b * cells * channel.C;
+        float* weight = channel.weight + b * cells;
+        float* age = channel.age ? channel.age + b * cells : nullptr;
+        for (int64_t c = begin; c < end; c++) {
+            if (age) age[c] += dt;
+            if (own.rise[c] <= channel.tolerance && !(age && age[c] > channel.max_age)) continue;
+            if (age) age[c] = 0;
+            if (weight[c] == 0) continue;
+            weight[c] = 0;
+            std::fill(values + c * channel.C, values + (c + 1) * channel.C, 0.0f);
+        }
+        if (share == 1) return;
+        for (int64_t c = begin; c < end; c++) weight[c] *= share;
+        if (channel.kind == channels::CLASS)
+            for (int64_t n = begin * channel.C; n < end * channel.C; n++) values[n] *= share;
+    }
+
+    void locate() {
+        const int64_t M = u.S * u.N;
+        own.slot.resize(M), own.distance.resize(M), own.weight.resize(M);
+        for (int64_t s = 0; s < u.S; s++) {
+            const double* T = u.T_map_sensor + 16 * (b * u.S + s);
+            bool is_sound = true;
+            for (int n = 0; n < 12; n++) is_sound &= std::isfinite(T[n]);
+            float R[9], t[3];
+            for (int row = 0; row < 3; row++) {
+                const double corner = row < 2 ? double(u.corner[2 * b + row]) * u.resolution : 0;
+                for (int k = 0; k < 3; k++) R[3 * row + k] = float(T[4 * row + k]);
+                t[row] = float(T[4 * row + 3] - corner);
+            }
+            parts(u.N, [&](int64_t, int64_t begin, int64_t end) {
+                for (int64_t n = begin; n < end; n++) own.slot[s * u.N + n] = is_sound ? find(s, n, R, t) : -1;
+            });
+        }
+    }
+
+    // Return the cell of a point, -1 if it speaks for none, and note how it does.
+    int32_t find(int64_t s, int64_t n, const float* R, const float* t) {
+        const int64_t place = (b * u.S + s) * u.N + n, m = s * u.N + n;
+        const float* p = u.points + 3 * place;
+        const float d2 = p[0] * p[0] + p[1] * p[1] + p[2] * p[2];
+        if (!(d2 < NEVER)) return -1;
+        const float resolution = float(u.resolution);
+        const float i = std::floor((R[0] * p[0] + R[1] * p[1] + R[2] * p[2] + t[0]) / resolution);
+        const float j = std::floor((R[3] * p[0] + R[4] * p[1] + R[5] * p[2] + t[1]) / resolution);
+        if (!(i >= 0 && i < float(u.H) && j >= 0 && j < float(u.W))) return -1;
+        const int32_t c = int32_t(i) * int32_t(u.W) + int32_t(j);
+        if (!u.validity[b * cells + c]) return -1;
+        const float z = R[6] * p[0] + R[7] * p[1] + R[8] * p[2] + t[2];
+        const float variance = u.variance ? u.variance[place] : u.noise_factor * d2 + u.noise_floor;
+        own.distance[m] = std::fabs(z - u.elevation[b * cells + c]);
+        own.weight[m] = variance > 0 ? channels::POINT / variance : 0;
+        return c;
+    }
+
+    void fuse(const Channel& channel) {
+        own.sum.resize(cells * (channel.C + 1));
+        // Each thread has cells of its own, and looks for their points.
+        parts(cells, [&](int64_t, int64_t begin, int64_t end) {
+            if (channel.C == 1) fuse_cells<1>(channel, begin, end);
+            else if (channel.C == 3) fuse_cells<3>(channel, begin, end);
+            else fuse_cells<0>(channel, begin, end);
+        });
+    }
+
+    // Fuse the points of cells `begin` to `end`; SIZE is C, or 0 for any.
+    template <int SIZE> void fuse_cells(const Channel& channel, int64_t begin, int64_t end) {
+        const int64_t C = SIZE ? SIZE : channel.C, M = u.S * u.N, stride = C + 1;
+        const bool weighted = channels::is_weighted(channel.kind), is_maximum = channel.kind == channels::MAXIMUM;
+        float* const sums = own.sum.data();
+        std::fill(sums + begin * stride, sums + end * stride, 0.0f);
+        const float* x = channel.features + b * M * C;
+        for (int64_t m = 0; m < M; m++, x += C) {
+            const int32_t c = own.slot[m];
+            if (c < begin || c >= end || !(own.distance[m] <= channel.tolerance)) continue;
+            float largest = 0;  // NaN or inf where a value is
+            for (int64_t k = 0; k < C; k++) largest += x[k] * 0;
+            const float w = weighted ? own.weight[m] : 1.0f;
+            if (largest != 0 || !(w > 0)) continue;
+            float* sum = sums + c * stride;
+            for (int64_t k = 0; k < C; k++)
+                sum[k] = !is_maximum ? sum[k] + w * x[k] : sum[C] > 0 ? std::max(sum[k], x[k]) : x[k];
+            sum[C] += w;
+        }
+        float *values = channel.values + b * cells * C, *weight = channel.weight + b * cells;
+        for (int64_t c = begin; c < end; c++) {
+            const float* sum = sums + c * stride;
+            if (!(sum[C] > 0)) continue;
+            for (int64_t k = 0; k < C; k++)
+                values[c * C + k] =
+                    channels::combine(channel.kind, values[c * C + k], weight[c], sum[k], sum[C], channel.rate);
+            weight[c] += sum[C];
+            if (channel.age) channel.age[b * cells + c] = 0;
+        }
+    }
+};
+
+}  // namespace
+
+extern "C" int update_channels(const Update* u, int num_threads) {
+    return code_of([&] {
+        const auto make = [] { return Scratch(); };
+        for_environments(u->B, num_threads, make,
+                         [&](int64_t b, int threads, Scratch& own) { Map(*u, b, threads, own).run(); });
+    });
+}

@@ -1,0 +1,98 @@
+"""Channels in C++ (`channels.cpp`), for updates of float32 on a CPU: the same values as by tensors."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.channels.config import KINDS, ChannelConfig
+from torchelev.channels.state import Channel, Ground
+from torchelev.grid import GridConfig
+from torchelev.kernels.cpu_build import call, load
+from torchelev.ops.transforms import can_compute_unseen
+from torchelev.state import MapState
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from torchelev.inputs.update_inputs import Inputs
+
+LIBRARY: tuple[str, dict[str, str]] = ("channels/kernel/channels.cpp", {})
+
+
+class _Channel(ctypes.Structure):
+    """`Channel` of channels.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("values", "weight", "age", "features")),
+        ("C", ctypes.c_int64),
+        ("kind", ctypes.c_int32),
+        *((name, ctypes.c_float) for name in ("rate", "half_life", "max_age", "tolerance")),
+    )
+
+
+_MAPS = ("points", "T_map_sensor", "variance", "dt", "drift", "corner_now", "elevation", "validity", "corner", "height")
+
+
+class _Update(ctypes.Structure):
+    """`Update` of channels.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in (*_MAPS, "channels")),
+        *((name, ctypes.c_int64) for name in "BSNHWK"),
+        ("resolution", ctypes.c_double),
+        *((name, ctypes.c_float) for name in ("noise_factor", "noise_floor")),
+    )
+
+
+def can_update(channels: Mapping[str, Channel], state: MapState) -> bool:
+    """Return whether `update_in_cpp` takes these: float32 on a CPU, with nothing to differentiate or to trace."""
+    tensors = (state.elevation, *(channel.values for channel in channels.values()))
+    is_single = all(value.dtype == torch.float32 for value in tensors)
+    return is_single and can_compute_unseen(tensors) and load(*LIBRARY) is not None
+
+
+def update_in_cpp(
+    channels: Mapping[str, Channel],
+    configs: Mapping[str, ChannelConfig],
+    ground: Ground,
+    state: MapState,
+    grid: GridConfig,
+    dt: Float[Tensor, "B"] | None,
+    inputs: Inputs | None,
+    features: Mapping[str, Float[Tensor, "B M C"]],
+    noise: tuple[float, float],
+) -> None:
+    """Follow the maps, and fuse what points bring, in place; arguments as of `Channels.update`."""
+    library = load(*LIBRARY)
+    assert library is not None, "asked without `can_update`"
+    B = len(ground.corner)
+    drift = None if dt is None else state.statistics.drift_correction
+    dt = torch.zeros(B) if dt is None else dt.float()
+    brought = {name: x.contiguous() for name, x in features.items()}
+    points = T = variance = None
+    S = N = 0
+    if inputs is not None and brought:
+        (S, N), points = inputs.points.shape[1:3], inputs.points.float()
+        T, variance = inputs.T_map_sensor.double(), inputs.variance
+        variance = None if variance is None else variance.float()
+    maps = (points, T, variance, dt, drift, state.corner, state.elevation, state.validity, ground.corner, ground.height)
+    read = [None if value is None else value.contiguous() for value in maps]
+    structs = (_Channel * len(channels))(
+        *(_struct(channel, configs[name], brought.get(name)) for name, channel in channels.items())
+    )
+    addresses = (None if value is None else value.data_ptr() for value in read)
+    sizes = (B, S, N, grid.height, grid.width, len(channels))
+    update = _Update(*addresses, ctypes.addressof(structs), *sizes, grid.resolution, *noise)
+    call(library.update_channels, ctypes.byref(update), torch.get_num_threads())
+
+
+def _struct(channel: Channel, cfg: ChannelConfig, features: Tensor | None) -> _Channel:
+    addresses = (None if value is None else value.data_ptr() for value in (*channel, features))
+    ages = (math.inf if age is None else age for age in (cfg.half_life, cfg.max_age))
+    return _Channel(*addresses, cfg.size, KINDS.index(cfg.kind), cfg.rate, *ages, cfg.tolerance)

@@ -1,0 +1,99 @@
+"""The methods of a map that read images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchelev.channels import fuse
+from torchelev.channels.module import Channels
+from torchelev.channels.paint import Picture, fuse_view, look, require_mode, sample
+from torchelev.channels.views import can_paint, paint_in_cpp
+from torchelev.config import ElevationMapConfig
+from torchelev.state import MapState
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+class PaintedMap:
+    """What `ElevationMap` takes from images. It is mixed into a module with these attributes."""
+
+    cfg: ElevationMapConfig
+    num_envs: int
+    channels: Channels | None
+    state: MapState
+    device: torch.device
+    _sync_channels: Callable[[], None]
+
+    def paint(
+        self,
+        image: Float[Tensor, "B *V C h w"],
+        K: Float[Tensor, "*B 3 3"],
+        T_map_camera: Float[Tensor, "B *V 4 4"],
+        channels: str | Sequence[str],
+        *,
+        distortion: Sequence[float] | Float[Tensor, "*B D"] | None = None,
+        mode: str = "bilinear",
+        margin: float = 0.1,
+    ) -> None:
+        """Fuse what cameras see of the ground into channels: each cell takes the pixel that shows its centre.
+
+        A cell that the map hides takes none, nor one that is not known. Each camera counts as a point of a
+        `ChannelConfig`.
+
+        Args:
+            image: (B, C, h, w), or (B, V, C, h, w) of V cameras, NaN where a pixel says nothing. Colours are from 0 to
+                1, or uint8; probabilities of classes sum to 1.
+            K: intrinsics [pixels], (3, 3), (B, 3, 3) or (B, V, 3, 3); (0, 0) is the centre of the first pixel.
+            T_map_camera: optical frame (x right, y down, z forward) to map frame, (B, 4, 4) or (B, V, 4, 4).
+            channels: name of the channel, or of several in the order of the image's C components.
+            distortion: k1, k2, p1, p2 and, if there are more, k3, and k4, k5, k6, as OpenCV has them; (D,), (B, D) or
+                (B, V, D). None: pictures without distortion.
+            mode: "bilinear" or "nearest"; labels want the nearest.
+            margin: a cell is hidden if the line from the camera to it passes more than this below the elevation [m].
+
+        Raises:
+            KeyError: if there is no such channel. Nothing has changed then.
+            TypeError, ValueError: if an argument does not fit. Nothing has changed then.
+        """
+        require_mode(mode)
+        picture = Picture(image, K, T_map_camera, channels, distortion, self.cfg.channels, self.num_envs, self.device)
+        assert self.channels is not None
+        self._sync_channels()
+        view = look(picture, self.state, self.cfg.grid, margin)
+        with torch.no_grad():
+            for name, part in picture.values().items():
+                channel, cfg = self.channels.channel(name), self.cfg.channels[name]
+                if can_paint(channel):
+                    paint_in_cpp(channel, part, view, mode, cfg)
+                else:
+                    self.channels.write(name, fuse_view(channel, sample(part, view, mode), view, cfg))
+
+    def painted(
+        self,
+        image: Float[Tensor, "B *V C h w"],
+        K: Float[Tensor, "*B 3 3"],
+        T_map_camera: Float[Tensor, "B *V 4 4"],
+        channel: str,
+        *,
+        distortion: Sequence[float] | Float[Tensor, "*B D"] | None = None,
+        mode: str = "bilinear",
+        margin: float = 0.1,
+    ) -> tuple[Float[Tensor, "B C H W"], Bool[Tensor, "B H W"]]:
+        """Return what a channel would be after `paint`, and where it is known; differentiable in the image.
+
+        A network that makes the image can be trained through the map. Arguments and errors are those of `paint`.
+        """
+        require_mode(mode)
+        picture = Picture(image, K, T_map_camera, channel, distortion, self.cfg.channels, self.num_envs, self.device)
+        assert self.channels is not None
+        self._sync_channels()
+        view, cfg = look(picture, self.state, self.cfg.grid, margin), self.cfg.channels[channel]
+        before = self.channels.channel(channel)
+        before = before._replace(values=before.values.clone(), weight=before.weight.clone())
+        values, known = fuse.read(fuse_view(before, sample(picture.image, view, mode), view, cfg), cfg)
+        return values.movedim(-1, 1), known & self.state.validity
