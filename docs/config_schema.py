@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from docs.extensions.fields import comments
+from torchelev.channels.config import DTYPES, KINDS, ChannelConfig, ChannelConfigs
 from torchelev.completion.config import WHEN
 from torchelev.config import ElevationMapConfig, setting_types
 from torchelev.config_files import SCHEMA_NAME, VERSION, VERSION_NAME, to_json
@@ -29,7 +30,7 @@ _FILTERS = {
         },
     },
 }
-_CHOICES: dict[str, Any] = {"when": list(WHEN)}
+_CHOICES: dict[str, Any] = {"when": list(WHEN), "kind": list(KINDS), "dtype": list(DTYPES)}
 _NUMBER = {"anyOf": [{"type": "number"}, {"enum": ["inf", "-inf"]}]}
 _SIMPLE: dict[Any, dict[str, Any]] = {
     float: {"$ref": "#/$defs/number"},
@@ -77,6 +78,8 @@ def _type(hint: Any) -> dict[str, Any]:
         return {}
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
         return {"anyOf": [_type(option) for option in typing.get_args(hint)]}
+    if hint is ChannelConfigs:
+        return {"type": "object", "additionalProperties": {"anyOf": [{"enum": list(KINDS)}, _group(ChannelConfig)]}}
     if dataclasses.is_dataclass(hint):
         return _group(hint)
     if typing.get_origin(hint) in (tuple, list):

@@ -50,6 +50,8 @@ FILLED = "inpaint_diffusion"
 # In an order in which each reads layers that stand before it.
 SHOWN = {
     **{name: Shown() for name in FILTERS if name.startswith("inpaint")},
+    **{f"em_cupy_{name}": Shown() for name in ("min_filter", "max_filter", "smooth_filter", "inpainting")},
+    "em_cupy_erosion": Shown(FILLED),
     "fill_from": Shown(("elevation", "upper_bound")),
     **{name: Shown(FILLED) for name in ("gaussian", "box", "median", "dilation", "erosion", "opening", "closing")},
     "maximum": Shown(("inpaint_minimum", "inpaint_nearest")),

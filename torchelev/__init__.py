@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from torchelev.lazy_names import import_later
 
 if TYPE_CHECKING:
+    from torchelev.channels.config import ChannelConfig
     from torchelev.completion.config import CompletionConfig
     from torchelev.completion.net import CompletionNet
     from torchelev.config import ElevationMapConfig
@@ -35,6 +36,7 @@ __all__ = [
     "BodyConfig",
     "Box",
     "Capsule",
+    "ChannelConfig",
     "CompletionConfig",
     "CompletionNet",
     "DriftConfig",
@@ -69,6 +71,7 @@ _LATER = {
     "BodyConfig": "torchelev.stages.measure.config",
     "Box": "torchelev.robot_body.shapes",
     "Capsule": "torchelev.robot_body.shapes",
+    "ChannelConfig": "torchelev.channels.config",
     "CompletionConfig": "torchelev.completion.config",
     "CompletionNet": "torchelev.completion.net",
     "DriftConfig": "torchelev.stages.compensate.config",

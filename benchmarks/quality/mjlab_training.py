@@ -25,7 +25,7 @@ import torch
 
 from benchmarks import RESULTS
 from benchmarks.quality import mjlab_task
-from torchelev.app.results import machine, write_json
+from torchelev.app.results import machine, markdown_table, write_json
 from torchelev.viz.style import make_figure, save, styled
 
 SCANS = {"ideal": "ideal scan", "map": "map of the depth camera"}
@@ -136,30 +136,32 @@ class Training:
 def plot(result: dict[str, Any], path: Path) -> Any:
     """Draw reward and length of the episodes over the iterations, both trainings side by side."""
     figure = make_figure(9, 3.4)
-    kinds = {"reward_per_s": "reward per second", "episode_s": "length of an episode [s]"}
+    kinds = {"reward_per_s": "reward per second", "episode_s": "length of the last 100 episodes [s]"}
     for place, (name, title) in enumerate(kinds.items()):
         axes = figure.add_subplot(1, 2, place + 1)
         for scan, color in zip(SCANS, ("0.5", "C0"), strict=True):
             values = [row[name] for row in result["curves"][scan]]
             axes.plot(range(1, len(values) + 1), values, color=color, linewidth=1.2, label=SCANS[scan])
         axes.set(xlabel="iteration", title=title)
-        axes.legend(loc="lower right")
+        if place == 0:
+            axes.legend(loc="lower right")
     save(figure, path)
     return figure
 
 
-def summarize(result: dict[str, Any], last: int = 20) -> str:
-    """Return the ends of both curves as a sentence."""
+def table(result: dict[str, Any], last: int = 20) -> str:
+    """Tabulate the ends of both curves, over the last iterations that both have."""
     common = min(len(curve) for curve in result["curves"].values())
     last = min(last, common)
-    parts = []
+    rows = []
     for scan, name in SCANS.items():
-        rows = result["curves"][scan][common - last : common]
-        reward, episode = (sum(row[key] for row in rows) / last for key in ("reward_per_s", "episode_s"))
-        parts.append(
-            f"{name}: {len(result['curves'][scan])} iterations, {reward:.2f} per s, episodes of {episode:.1f} s"
-        )
-    return f"The last {last} iterations that both have ({common - last + 1} to {common}): " + "; ".join(parts) + "."
+        curve = result["curves"][scan]
+        ends = [sum(row[key] for row in curve[common - last : common]) / last for key in ("reward_per_s", "episode_s")]
+        rows.append([name, str(len(curve)), *(f"{end:.2f}" for end in ends)])
+    head = ["the actor reads", "iterations", "reward per second", "length of an episode [s]"]
+    robots, steps = result["num_envs"], result["curves"]["map"][0]["steps"] // result["num_envs"]
+    which = f"Means of iterations {common - last + 1} to {common}"
+    return f"{markdown_table(head, rows)}\n\n{which}; {robots} robots, {steps} steps an iteration, one seed."
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -193,7 +195,7 @@ def main(arguments: list[str] | None = None) -> None:
     }
     write_json(RESULTS / "mjlab_training.json", result)
     plot(result, RESULTS / "mjlab_training.svg")
-    print(summarize(result))
+    print(table(result))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,13 @@ The stages of the map update and its traversability are not filters; see `torche
 from torchelev.filters.chain import FilterChain, FilterConfig
 from torchelev.filters.distances.distance import signed_distance
 from torchelev.filters.distances.distance_field import SignedDistanceField
+from torchelev.filters.em_cupy import (
+    em_cupy_erosion,
+    em_cupy_inpainting,
+    em_cupy_max_filter,
+    em_cupy_min_filter,
+    em_cupy_smooth_filter,
+)
 from torchelev.filters.expressions.expression import Expression, expression
 from torchelev.filters.extrema import closing, dilation, erosion, maximum, minimum, opening
 from torchelev.filters.geometry import (
@@ -55,6 +62,11 @@ __all__ = [
     "closing",
     "curvature",
     "dilation",
+    "em_cupy_erosion",
+    "em_cupy_inpainting",
+    "em_cupy_max_filter",
+    "em_cupy_min_filter",
+    "em_cupy_smooth_filter",
     "erosion",
     "expression",
     "fill_from",

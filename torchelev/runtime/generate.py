@@ -147,7 +147,7 @@ def _settings(cfg: Any, prefix: str) -> Iterator[str]:
 def _kind(name: str, kinds: list[Any]) -> str:
     if name == "filters":
         return "CHAIN"
-    if name == "completion":
+    if name in ("completion", "channels"):
         return "ONLY_PYTHON"
     if any(kind in _PLANNING for kind in kinds):
         return "IGNORED"

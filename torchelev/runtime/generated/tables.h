@@ -71,6 +71,7 @@ constexpr Setting SETTINGS[] = {
     {"traversability.robot", IGNORED, true, true, {}},
     {"completion", ONLY_PYTHON, true, true, {}},
     {"filters", CHAIN, false, false, {}},
+    {"channels", ONLY_PYTHON, false, false, {}},
 };
 
 constexpr Tensor STATE[] = {
@@ -162,6 +163,11 @@ constexpr const char* ALL_FILTERS[] = {
     "closing",
     "curvature",
     "dilation",
+    "em_cupy_erosion",
+    "em_cupy_inpainting",
+    "em_cupy_max_filter",
+    "em_cupy_min_filter",
+    "em_cupy_smooth_filter",
     "erosion",
     "expression",
     "fill_from",

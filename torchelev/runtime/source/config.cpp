@@ -76,7 +76,7 @@ void Config::read_setting(size_t k, const Json& value) {
         return;
     }
     if (setting.kind == ONLY_PYTHON) {
-        REQUIRE(value.kind == Json::NUL, where, "needs Python: this library has no completion", value.describe(),
+        REQUIRE(value.kind == Json::NUL, where, "needs Python: this library has no " + std::string(setting.name), value.describe(),
                 "leave it out, or run the map in Python", TORCHELEV_UNSUPPORTED);
         return;
     }

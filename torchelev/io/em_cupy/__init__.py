@@ -1,0 +1,76 @@
+"""Configs of elevation_mapping_cupy, for maps of torchelev.
+
+    found = load_config("core_param.yaml", "plugin_config.yaml", "sensor_parameter.yaml")
+    emap = ElevationMap(found.cfg)
+    for note in found.notes:
+        print(note)
+
+Read against its `main` at 20a8a26 and `ros2_py` at e54a941. docs/howto/from_elevation_mapping.md has topics and
+services.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchelev.config import ElevationMapConfig
+from torchelev.config_files import read_settings
+from torchelev.io.em_cupy.channels import GROUPS, read_channels
+from torchelev.io.em_cupy.parameters import NODE_PARAMETERS, read_parameters
+from torchelev.io.em_cupy.plugins import PLUGINS, is_plugin, read_plugins
+
+
+class Converted(NamedTuple):
+    """A config that was read."""
+
+    cfg: ElevationMapConfig  #: with filters and channels
+    notes: tuple[str, ...]  #: a sentence for each parameter that has no equal here, or another meaning
+
+
+def load_config(
+    core: str | Path,
+    plugins: str | Path | None = None,
+    sensor: str | Path | None = None,
+    *,
+    channels: Iterable[str] = (),
+) -> Converted:
+    """Read the config of elevation_mapping_cupy.
+
+    Settings that mean the same are taken over, also in other units. What has another meaning keeps its default here,
+    and what has no equal is left out; a note says so.
+
+    Args:
+        core: core_param.yaml, of ROS 1 or ROS 2; a later file's settings replace those of an earlier one.
+        plugins: plugin_config.yaml; the plugins become `cfg.filters`.
+        sensor: file with the sensors and their channels, such as <robot>_sensor_parameter.yaml.
+        channels: names of channels that sensors send, as `channel_info` does; those that a fusion names are known.
+
+    Raises:
+        ValueError: a file cannot be read, holds a parameter or plugin that the package does not have, or a value that
+            does not fit.
+    """
+    given: dict[str, Any] = {}
+    for path in (core, plugins, sensor):
+        if path is not None:
+            given |= _settings_of(path)
+    names = [name for name in given if name in PLUGINS or is_plugin(given[name])]
+    filters, plugin_notes = read_plugins({name: given.pop(name) for name in names})
+    fusions = {name: given.pop(name) for name in GROUPS if name in given}
+    average_weight = float(given.get("average_weight", 0.5))
+    parsed, channel_notes = read_channels(fusions, tuple(channels), average_weight)
+    settings, notes = read_parameters(given)
+    cfg = ElevationMapConfig.from_dict(settings | {"filters": [step.to_dict() for step in filters]})
+    values = cfg.to_dict() | {"channels": parsed}
+    return Converted(ElevationMapConfig.from_dict(values), (*notes, *plugin_notes, *channel_notes))
+
+
+def _settings_of(path: str | Path) -> dict[str, Any]:
+    """Return the settings of a file, those of ROS 2 without the names of nodes around them."""
+    values = read_settings(path)
+    while len(values) == 1 and isinstance(inner := next(iter(values.values())), dict) and not is_plugin(inner):
+        if next(iter(values)) in (*PLUGINS, *GROUPS, *NODE_PARAMETERS):
+            break
+        values = inner
+    return values

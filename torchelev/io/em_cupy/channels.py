@@ -1,0 +1,56 @@
+"""The channels that points and images bring, by how they are fused."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from torchelev.channels.config import ChannelConfig
+from torchelev.errors import require
+
+GROUPS = ("pointcloud_channel_fusions", "image_channel_fusions")
+
+
+class Fusion(NamedTuple):
+    """What becomes of a fusion."""
+
+    settings: dict[str, Any]  #: of the `ChannelConfig`
+    note: str = ""  #: what differs
+
+
+KINDS_THERE: dict[str, Fusion] = {
+    "color": Fusion({"kind": "color"}, "is the mean over all updates here, that of the newest there"),
+    "average": Fusion({"kind": "exponential", "rate": 1.0}, "outliers do not count here; there they do in the sum"),
+    "exponential": Fusion({"kind": "exponential", "rate": 0.7}),
+    "class_average": Fusion({"kind": "exponential"}, "is one channel for each class"),
+    "class_bayesian": Fusion(
+        {"kind": "mean"}, 'is one channel for each class; give ChannelConfig(kind="class", names=...) for all of them'
+    ),
+    "class_max": Fusion({"kind": "exponential", "rate": 1.0}, "keeps the probability of this class alone"),
+    "bayesian_inference": Fusion({"kind": "mean"}, "its prior starts anew with each update there"),
+}
+
+
+def read_channels(
+    fusions: Mapping[str, Any], sent: tuple[str, ...], average_weight: float
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the channels: those that a fusion names, and those that sensors send, by the first rule that fits."""
+    channels: dict[str, Any] = {}
+    notes: list[str] = []
+    for group in GROUPS:
+        rules = {str(pattern): str(kind) for pattern, kind in (fusions.get(group) or {}).items()}
+        named = [name for name in rules if name.isidentifier() and name not in ("default", "none")]
+        for name in dict.fromkeys((*named, *sent)):
+            rule = next((kind for pattern, kind in rules.items() if re.fullmatch(pattern, name)), rules.get("default"))
+            if rule is None or rule == "none" or name in channels:
+                continue
+            require(
+                rule in KINDS_THERE, f"{group}.{name}", f"must be one of {', '.join(KINDS_THERE)}", rule, "correct it"
+            )
+            kind = KINDS_THERE[rule]
+            settings = kind.settings | ({"rate": 1 - average_weight} if rule == "class_average" else {})
+            channels[name] = ChannelConfig(**settings)
+            if kind.note:
+                notes.append(f"channel {name}, {rule}: {kind.note}")
+    return channels, notes

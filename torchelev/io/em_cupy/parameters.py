@@ -1,0 +1,152 @@
+"""The parameters of core_param.yaml: what they are called here, and what differs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from torchelev.errors import require
+
+NODE = "is a setting of the node: see docs/howto/from_elevation_mapping.md"
+GONE = "has no equal"
+
+
+class Rule(NamedTuple):
+    """What becomes of a parameter."""
+
+    here: str = ""  #: setting here, dotted; "" for none
+    note: str = ""  #: what differs; "" if it means the same
+    convert: Callable[[Any], Any] | None = None  #: its value here; None: the default stays
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _taken(here: str, note: str = "") -> Rule:
+    return Rule(here, note, _same)
+
+
+def _kept(here: str, note: str) -> Rule:
+    return Rule(here, f"{note}; the default of {here} is kept")
+
+
+#: Parameters of core_param.yaml by name. Switches and lengths of the grid are converted apart.
+PARAMETERS: dict[str, Rule] = {
+    "resolution": _taken("grid.resolution"),
+    "map_length": _taken("grid.length_x"),
+    "sensor_noise_factor": _kept(
+        "sensor.noise_factor", "grows with the squared depth, and is compared as a standard deviation"
+    ),
+    "mahalanobis_thresh": _kept("fusion.gate", "is in multiples of the variance there, in standard deviations here"),
+    "outlier_variance": _kept("fusion.outlier_variance", "is added for each outlier there, for a whole scan here"),
+    "time_variance": _kept("aging.variance_rate", "is added by a timer there, per second here"),
+    "update_variance_fps": _kept("aging.variance_rate", "is the rate of a timer"),
+    "max_variance": _kept("fusion.max_variance", "deletes cells above it there, and is a cap here"),
+    "initial_variance": _kept("fusion.max_variance", "is the variance of unknown cells there, which have none here"),
+    "initialized_variance": _kept("fusion.max_variance", "is what initialised cells get; here they get the largest"),
+    "min_valid_distance": _taken("sensor.min_distance"),
+    "max_height_range": _taken("sensor.exclusion.height"),
+    "ramped_height_range_a": _taken("sensor.exclusion.slope"),
+    "ramped_height_range_b": _taken(
+        "sensor.exclusion.distance", "counts from the map's centre there, from the sensor here"
+    ),
+    "ramped_height_range_c": _taken("sensor.exclusion.offset"),
+    "max_drift": _taken("drift.max_drift"),
+    "drift_compensation_alpha": _taken("drift.gain"),
+    "min_height_drift_cnt": Rule("drift.min_points", "", int),
+    "drift_compensation_variance_inlier": _kept("drift.max_variance", "is halved, and is that of another variance"),
+    "drift_compensation_variance_inler": Rule("", "is misspelled there, and without effect"),
+    "traversability_inlier": _kept("drift.min_traversability", "is that of another rating"),
+    "position_noise_thresh": Rule("", f"{GONE}: drift is compensated for standing robots, too"),
+    "orientation_noise_thresh": Rule("", f"{GONE}: drift is compensated for standing robots, too"),
+    "position_lowpass_alpha": Rule("", f"{GONE}: motion is not detected"),
+    "orientation_lowpass_alpha": Rule("", f"{GONE}: motion is not detected"),
+    "wall_num_thresh": Rule("fusion.edges.min_points", "acts only where points spread wider than their noise", int),
+    "max_ray_length": _taken("raycast.max_range"),
+    "cleanup_cos_thresh": _taken("raycast.min_incidence"),
+    "cleanup_step": Rule("", f"{GONE}: one accepted ray removes a cell; see raycast.min_time and raycast.min_support"),
+    "overlap_clear_range_xy": Rule("overlap.radius", "is a side there, and a radius here: halved", lambda v: v / 2),
+    "overlap_clear_range_z": _taken("overlap.height", "counts from the sensor there, from the robot here"),
+    "dilation_size": _kept("traversability", "is that of another rating"),
+    "use_chainer": _kept("traversability", "chooses what runs another rating"),
+    "weight_file": _kept("traversability", "holds weights of another rating"),
+    "checker_layer": Rule("", f"{GONE}: planning.check_path has limits of the robot"),
+    "safe_thresh": Rule("", f"{GONE}: planning.check_path has limits of the robot"),
+    "safe_min_thresh": Rule("", f"{GONE}: planning.check_path has limits of the robot"),
+    "max_unsafe_n": Rule("", f"{GONE}: planning.check_path has limits of the robot"),
+    "use_only_above_for_upper_bound": Rule("", f"{GONE}: every upper bound counts"),
+    "dilation_size_initialize": Rule("", f"{GONE}: emap.initialize fills the hull of the feet, or the window"),
+    "initialize_method": Rule("", "is an argument of emap.initialize"),
+    "time_interval": Rule("", f"{GONE}: the layer time is exact"),
+    "average_weight": Rule("", "is the rate of channels of kind class_average"),
+    "enable_normal": Rule("", f"{GONE}: normals are layers, computed with each update"),
+    "enable_normal_color": Rule("", f"{GONE}: normals are layers"),
+}
+
+
+#: Switches: the group that is left out, of which nothing else remains.
+SWITCHES = {
+    "enable_edge_sharpen": "fusion.edges",
+    "enable_visibility_cleanup": "raycast",
+    "enable_drift_compensation": "drift",
+    "enable_overlap_clearance": "overlap",
+}
+#: Of the node, or of memory that this library does not have.
+NODE_PARAMETERS = frozenset(
+    "subscribers publishers map_frame base_frame corrected_map_frame pose_topic update_pose_fps map_acquire_fps "
+    "publish_statistics_fps enable_pointcloud_publishing enable_drift_corrected_TF_publishing initialize_frame_id "
+    "initialize_tf_offset initialize_tf_grid_size use_initializer_at_start plugin_config_file map_topic odom_frame "
+    "pointcloud_topics recordable_fps cell_n data_type min_filter_size min_filter_iteration use_sim_time".split()
+)
+
+
+def read_parameters(given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return nested settings, and the notes."""
+    notes: list[str] = []
+    settings: dict[str, Any] = {}
+    known = (*PARAMETERS, *SWITCHES, *NODE_PARAMETERS)
+    for name, value in given.items():
+        hint = "correct it, or remove it"
+        require(name in known, name, "is no parameter of elevation_mapping_cupy", repr(value), hint)
+        if name in SWITCHES:
+            if not value:
+                _set(settings, SWITCHES[name], None)
+        elif name in NODE_PARAMETERS:
+            notes.append(f"{name} {NODE}")
+        else:
+            rule = PARAMETERS[name]
+            if rule.convert is not None:
+                _set(settings, rule.here, _convert(name, value, rule))
+            if rule.note:
+                notes.append(f"{name} = {value}: {rule.note}")
+    if "grid" in settings:
+        notes += _square(settings["grid"])
+    return settings, notes
+
+
+def _convert(name: str, value: Any, rule: Rule) -> Any:
+    assert rule.convert is not None
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    require(is_number, name, "must be a number", repr(value), "give a number without quotes")
+    return rule.convert(value)
+
+
+def _set(settings: dict[str, Any], path: str, value: Any) -> None:
+    """Set a dotted setting, unless its group is switched off."""
+    *groups, name = path.split(".")
+    for group in groups:
+        inner = settings.setdefault(group, {})
+        if inner is None:
+            return
+        settings = inner
+    settings[name] = value
+
+
+def _square(grid: dict[str, Any]) -> list[str]:
+    """Make the window a square of whole cells, in place; return a note if that changed its length."""
+    resolution, length = grid.get("resolution", 0.04), grid.get("length_x", 8.0)
+    cells = round(length / resolution)
+    grid |= {"resolution": resolution, "length_x": cells * resolution, "length_y": cells * resolution}
+    changed = abs(cells * resolution - length) > 1e-6
+    return [f"map_length = {length}: became {cells * resolution:g} m, {cells} whole cells"] if changed else []
