@@ -18,7 +18,7 @@ from typing import Any
 import benchmarks
 import training
 from benchmarks.gpu import report as gpu
-from benchmarks.quality import mjlab_task, mjlab_training, pose_covariance
+from benchmarks.quality import classes, mjlab_task, mjlab_training, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.quality.isaac_lab import report as isaac_lab
 from benchmarks.quality.odometry import report as odometry
@@ -29,6 +29,7 @@ from benchmarks.self_filter import __main__ as self_filter
 from benchmarks.self_filter import walking
 from benchmarks.speed import (
     bags,
+    channels,
     completion,
     encoders,
     growth,
@@ -197,6 +198,8 @@ TABLES = {
     "sensors": _made_by(sensors.table, "sensors", "cases"),
     "sight": _made_by(sight.table, "sight", "rows"),
     "mjlab": _made_by(mjlab_task.table, "mjlab"),
+    "channels": _made_by(channels.table, "channels"),
+    "classes": _made_by(classes.table, "classes"),
     "mjlab_training": _made_by(mjlab_training.table, "mjlab_training"),
     "isaac_lab": _made_by(isaac_lab.table, "isaac_lab"),
     "self_filter_walking": _made_by(walking.table, "self_filter", "walking"),

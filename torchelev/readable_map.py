@@ -144,7 +144,10 @@ class ReadableMap(MapBuffers):
         assert self.channels is not None
         if state is None:
             self._sync_channels()
-        return self.channels.read(name, self.state if state is None else state)
+            return self.channels.read(name, self.state)
+        rule, actual = f"must be of all {self.num_envs} maps, as channels are no part of it", len(state.validity)
+        require(actual == self.num_envs, "state", rule, actual, "leave it out, and choose the environment afterwards")
+        return self.channels.read(name, state)
 
     def _sync_channels(self) -> None:
         """Make channels follow what changed besides updates, such as cells that were forgotten."""

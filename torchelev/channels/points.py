@@ -34,9 +34,10 @@ def find_speakers(inputs: Inputs, state: MapState, grid: GridConfig, noise: tupl
     corner = torch.nn.functional.pad(state.corner.double() * grid.resolution, (0, 1))
     origin = (T[..., :3, 3].double() - corner[:, None]).float()  # from the window's corner, and from z = 0
     x, y, z = ((T[..., None, k, :3].float() * p).sum(-1) + origin[..., k, None] for k in range(3))
-    i, j = (torch.floor(value / grid.resolution) for value in (x, y))
+    i, j = (torch.floor(value * (1 / grid.resolution)) for value in (x, y))
     inside = finite & (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
-    slot = torch.where(inside, i.nan_to_num() * grid.width + j.nan_to_num(), 0.0).to(torch.int64).flatten(1)
+    i, j = (torch.where(inside, value, 0.0).to(torch.int64) for value in (i, j))
+    slot = (i * grid.width + j).flatten(1)
     elevation, validity = (layer.flatten(1).gather(1, slot) for layer in (state.elevation, state.validity))
     if inputs.variance is None:
         variance = noise[0] * p.square().sum(-1) + noise[1]

@@ -63,7 +63,7 @@ def follow(
         weight = weight * share
         values = values * share[..., None].to(values.dtype) if cfg.kind == "class" else values
     if age is not None and cfg.max_age is not None:
-        age = age + dt[:, None, None]
+        age = torch.where(weight > 0, age + dt[:, None, None], 0.0)
         is_same = is_same & (age <= cfg.max_age)
     return Channel(
         torch.where(is_same[..., None], values, 0.0),

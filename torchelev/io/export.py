@@ -84,9 +84,12 @@ def take(emap: ElevationMap, env: int = 0, layers: Sequence[str] | None = None) 
         ValueError: the environment does not exist.
     """
     require(0 <= env < emap.num_envs, "env", f"must lie in [0, {emap.num_envs})", env, "environments count from 0")
-    state = map_layers(lambda value: value[env : env + 1], emap.state)  # or filters would run for all environments
     names = emap.layers if layers is None else layers
-    arrays = {name: as_array(emap.layer(name, state=state)[0]) for name in names}
+    if emap.channels is None:
+        state = map_layers(lambda value: value[env : env + 1], emap.state)  # or filters would run for all environments
+        arrays = {name: as_array(emap.layer(name, state=state)[0]) for name in names}
+    else:  # channels are no part of a state
+        arrays = {name: as_array(emap.layer(name)[env]) for name in names}
     center = as_array(emap.center[env])
     return SavedMap(arrays, emap.cfg.grid.resolution, center, emap.cfg.to_dict())
 
@@ -108,7 +111,7 @@ def save_npz(path: str | Path, emap: ElevationMap, env: int = 0) -> None:
         WriteError: the file cannot be written; an existing one is left as it was.
     """
     saved = take(emap, env)
-    write_npz(path, saved, map_arrays(emap, map_layers(lambda value: value[env : env + 1], emap.state)))
+    write_npz(path, saved, map_arrays(emap, slice(env, env + 1)))
 
 
 def write_npz(path: str | Path, saved: SavedMap, whole: dict[str, Any] | None = None) -> None:

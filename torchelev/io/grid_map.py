@@ -110,12 +110,13 @@ def to_grid_map(
 ) -> GridMap:
     """Copy layers of one environment to a GridMap, in float32, NaN where unknown.
 
-    The pose is the window's centre with z = 0, as in GridMap's own converter.
+    The pose is the window's centre with z = 0, as in GridMap's own converter. The channel of a colour becomes one
+    layer, whose floats hold the bits 0x00RRGGBB, as RViz reads them.
 
     Args:
         emap: the map.
         env: the environment.
-        layers: names as in `ElevationMap.layer`.
+        layers: names as in `ElevationMap.layer`; of channels with several components, those of the components.
         basic_layers: those of the layers that must be known for a cell to be valid.
 
     Returns:
@@ -123,7 +124,8 @@ def to_grid_map(
 
     Raises:
         KeyError: a layer does not exist.
-        ValueError: the environment does not exist, or a basic layer is not among the layers.
+        ValueError: the environment does not exist, a basic layer is not among the layers, or a layer is a channel of
+            several components that is no colour.
     """
     is_sequence = not isinstance(layers, str)
     require(is_sequence, "layers", "must be a sequence of names", repr(layers), f"give ({layers!r},)")
@@ -133,8 +135,25 @@ def to_grid_map(
     from torchelev.io.export import take  # which needs PyTorch
 
     taken = take(emap, env, layers)
-    values = {name: taken.layers[name] for name in layers}
+    values = {name: _flat(name, taken.layers[name], emap) for name in layers}
     return grid_map_of(values, taken.center.tolist(), emap.cfg.grid.resolution, basic_layers)
+
+
+def _flat(name: str, values: NDArray, emap: ElevationMap) -> NDArray:
+    """Return a layer (H, W): a colour (3, H, W) packed, all else as it is."""
+    if values.ndim == 2:
+        return values
+    cfg = emap.cfg.channels[name]
+    hint = f"give {', '.join(cfg.components(name))}"
+    require(cfg.kind == "color", "layers", "must have one value for each cell", f"{name!r} with {cfg.size}", hint)
+    return pack_colors(values)
+
+
+def pack_colors(rgb: NDArray) -> NDArray[np.float32]:
+    """Return colours (3, H, W) from 0 to 1 as floats whose bits are 0x00RRGGBB; NaN stays NaN."""
+    red, green, blue = np.round(255 * np.nan_to_num(rgb).clip(0, 1)).astype(np.uint32)
+    packed = (red << 16 | green << 8 | blue).view(np.float32)
+    return np.where(np.isnan(rgb).any(0), np.float32(np.nan), packed)
 
 
 def grid_map_of(

@@ -35,8 +35,9 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     """Write a whole map, with all environments, its config and its precision, as an `.npz` without pickled objects.
 
     The arrays are `header` (JSON: format, version, dtype, config), each field of `MapState` by its name, each field of
-    `Statistics` as `last_<name>`, and the weights of a learned head as `head_<name>`, of a completion network as
-    `completion_net_<name>`. As in the map's state, unknown cells have validity 0, not NaN.
+    `Statistics` as `last_<name>`, what channels hold as `channels_<name>`, and the weights of a learned head as
+    `head_<name>`, of a completion network as `completion_net_<name>`. As in the map's state, unknown cells have
+    validity 0, not NaN.
 
     Args:
         path: the file to write, under this name as it is.
@@ -46,15 +47,16 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
         WriteError: the file cannot be written; an existing one is left as it was.
     """
     with atomic_file(path) as file:  # a file object: numpy appends .npz to names that lack it
-        np.savez_compressed(file, **map_arrays(emap, emap.state))
+        np.savez_compressed(file, **map_arrays(emap))
 
 
-def map_arrays(emap: ElevationMap, state: MapState) -> dict[str, Any]:
-    """Return the arrays of `save_map` for a state of a map."""
+def map_arrays(emap: ElevationMap, envs: slice = slice(None)) -> dict[str, Any]:
+    """Return the arrays of `save_map` for some environments of a map."""
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
     header |= {name: None if net is None else net.config for name, net in _nets(emap).items()}
-    arrays = {name: as_array(value) for name, value in (name_tensors(state) | _weights(emap)).items()}
+    of_environments = {name: value[envs] for name, value in (name_tensors(emap.state) | _channels(emap)).items()}
+    arrays = {name: as_array(value) for name, value in (of_environments | _weights(emap)).items()}
     return {"header": np.array(json.dumps(header)), **arrays}
 
 
@@ -95,6 +97,9 @@ def load_map(
     if header["version"] < VERSION:
         state = rate(state, emap.cfg, None if emap.head is None else emap.head.weights)
     emap.load_state(state)
+    B = len(arrays["corner"])
+    for name, value in _channels(emap).items():
+        value.copy_(torch.from_numpy(_array(path, arrays, name, value, (B, *value.shape[1:])))[ids])
     return emap
 
 
@@ -107,6 +112,12 @@ def _weights(emap: ElevationMap) -> dict[str, Tensor]:
     """Return the weights of the map's networks by the names of their arrays."""
     nets = {name: net for name, net in _nets(emap).items() if net is not None}
     return {f"{name}_{key}": value for name, net in nets.items() for key, value in net.state_dict().items()}
+
+
+def _channels(emap: ElevationMap) -> dict[str, Tensor]:
+    """Return the buffers of the map's channels by the names of their arrays."""
+    buffers = () if emap.channels is None else emap.channels.named_buffers()
+    return {f"channels_{name}": value for name, value in buffers}
 
 
 def as_array(value: Tensor) -> NDArray:

@@ -10,6 +10,8 @@
 namespace {
 
 constexpr float NOT_KNOWN = std::numeric_limits<float>::quiet_NaN();
+constexpr int64_t AHEAD = 16;  // points ahead of which memory is fetched
+constexpr int64_t BLOCK = 64;  // cells or points that are looked at together
 constexpr float NEVER = std::numeric_limits<float>::infinity();
 
 // `_Channel` of native.py.
@@ -55,10 +57,34 @@ void move(float* layer, int64_t H, int64_t W, int64_t C, const int64_t* by, floa
 
 // Memory of one thread.
 struct Scratch {
-    std::vector<int32_t> slot;             // cell of each point, -1 for none
+    std::vector<int32_t> slot;             // cell of each point
+    std::vector<std::vector<int32_t>> points;  // that speak for a cell: of each part of them, by the range of the cell
+    std::vector<int64_t> count;                // of the points of each list
     std::vector<float> distance, weight;   // [m] from the cell's elevation; POINT / sigma^2
     std::vector<float> rise;               // of each cell [m] since the last update, NaN where it is not known
     std::vector<float> sum;                // of each cell: C values, and the total of the weights
+};
+
+// Where a sensor's points lie in the window, and how much they count.
+struct Frame {
+    float R[9], t[3], cells_per_meter, H, W, noise_factor, noise_floor;
+    int32_t width;
+
+    Frame(const float* rotation, const float* origin, float per_meter, int32_t H, int32_t W, float factor, float floor)
+        : cells_per_meter(per_meter), H(float(H)), W(float(W)), noise_factor(factor), noise_floor(floor), width(W) {
+        std::copy(rotation, rotation + 9, R), std::copy(origin, origin + 3, t);
+    }
+
+    // Find the cell of a point, -1 out of the window, its height, and POINT / sigma^2.
+    void place(float x, float y, float z, int32_t& cell, float& height, float& weight) const {
+        const float d2 = x * x + y * y + z * z;
+        const float i = std::floor((R[0] * x + R[1] * y + R[2] * z + t[0]) * cells_per_meter);
+        const float j = std::floor((R[3] * x + R[4] * y + R[5] * z + t[1]) * cells_per_meter);
+        const bool inside = (d2 < NEVER) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
+        cell = inside ? int32_t(inside ? i : 0) * width + int32_t(inside ? j : 0) : -1;
+        height = R[6] * x + R[7] * y + R[8] * z + t[2];
+        weight = channels::POINT / (noise_factor * d2 + noise_floor);
+    }
 };
 
 class Map {
@@ -121,13 +147,20 @@ class Map {
         float* values = channel.values + b * cells * channel.C;
         float* weight = channel.weight + b * cells;
         float* age = channel.age ? channel.age + b * cells : nullptr;
-        for (int64_t c = begin; c < end; c++) {
-            if (age) age[c] += dt;
-            if (own.rise[c] <= channel.tolerance && !(age && age[c] > channel.max_age)) continue;
-            if (age) age[c] = 0;
-            if (weight[c] == 0) continue;
-            weight[c] = 0;
-            std::fill(values + c * channel.C, values + (c + 1) * channel.C, 0.0f);
+        for (int64_t first = begin; first < end; first += BLOCK) {
+            const int64_t last = std::min(first + BLOCK, end);
+            int lost = 0;  // mostly 0: then the block is left as it is
+            for (int64_t c = first; c < last; c++) {
+                if (age) age[c] = weight[c] != 0 ? age[c] + dt : 0;
+                const bool stays = own.rise[c] <= channel.tolerance && !(age && age[c] > channel.max_age);
+                lost += !stays & (weight[c] != 0);
+            }
+            for (int64_t c = first; lost && c < last; c++) {
+                if (own.rise[c] <= channel.tolerance && !(age && age[c] > channel.max_age)) continue;
+                weight[c] = 0;
+                if (age) age[c] = 0;
+                std::fill(values + c * channel.C, values + (c + 1) * channel.C, 0.0f);
+            }
         }
         if (share == 1) return;
         for (int64_t c = begin; c < end; c++) weight[c] *= share;
@@ -138,6 +171,9 @@ class Map {
     void locate() {
         const int64_t M = u.S * u.N;
         own.slot.resize(M), own.distance.resize(M), own.weight.resize(M);
+        own.points.resize(parts.number * parts.number);
+        own.count.assign(parts.number * parts.number, 0);
+        for (std::vector<int32_t>& list : own.points) list.resize(M);
         for (int64_t s = 0; s < u.S; s++) {
             const double* T = u.T_map_sensor + 16 * (b * u.S + s);
             bool is_sound = true;
@@ -148,59 +184,71 @@ class Map {
                 for (int k = 0; k < 3; k++) R[3 * row + k] = float(T[4 * row + k]);
                 t[row] = float(T[4 * row + 3] - corner);
             }
-            parts(u.N, [&](int64_t, int64_t begin, int64_t end) {
-                for (int64_t n = begin; n < end; n++) own.slot[s * u.N + n] = is_sound ? find(s, n, R, t) : -1;
+            if (!is_sound) continue;
+            parts(u.N, [&](int64_t part, int64_t begin, int64_t end) {
+                for (int64_t n = begin; n < end; n += BLOCK) find(s, part, n, std::min(n + BLOCK, end), R, t);
             });
         }
     }
 
-    // Return the cell of a point, -1 if it speaks for none, and note how it does.
-    int32_t find(int64_t s, int64_t n, const float* R, const float* t) {
-        const int64_t place = (b * u.S + s) * u.N + n, m = s * u.N + n;
-        const float* p = u.points + 3 * place;
-        const float d2 = p[0] * p[0] + p[1] * p[1] + p[2] * p[2];
-        if (!(d2 < NEVER)) return -1;
-        const float resolution = float(u.resolution);
-        const float i = std::floor((R[0] * p[0] + R[1] * p[1] + R[2] * p[2] + t[0]) / resolution);
-        const float j = std::floor((R[3] * p[0] + R[4] * p[1] + R[5] * p[2] + t[1]) / resolution);
-        if (!(i >= 0 && i < float(u.H) && j >= 0 && j < float(u.W))) return -1;
-        const int32_t c = int32_t(i) * int32_t(u.W) + int32_t(j);
-        if (!u.validity[b * cells + c]) return -1;
-        const float z = R[6] * p[0] + R[7] * p[1] + R[8] * p[2] + t[2];
-        const float variance = u.variance ? u.variance[place] : u.noise_factor * d2 + u.noise_floor;
-        own.distance[m] = std::fabs(z - u.elevation[b * cells + c]);
-        own.weight[m] = variance > 0 ? channels::POINT / variance : 0;
-        return c;
+    // Find the cells of points `begin` to `end`, a part of those of sensor s, and how they speak for them.
+    void find(int64_t s, int64_t part, int64_t begin, int64_t end, const float* R, const float* t) {
+        const float* p = u.points + 3 * ((b * u.S + s) * u.N + begin);
+        const float* variance = u.variance ? u.variance + (b * u.S + s) * u.N + begin : nullptr;
+        const int64_t m = s * u.N + begin, number = end - begin;
+        float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, height[BLOCK], share[BLOCK];
+        int32_t cell[BLOCK];
+        for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
+        const Frame frame(R, t, float(1 / u.resolution), int32_t(u.H), int32_t(u.W), u.noise_factor, u.noise_floor);
+        for (int64_t n = 0; n < BLOCK; n++) frame.place(x[n], y[n], z[n], cell[n], height[n], share[n]);
+        for (int64_t n = 0; variance && n < number; n++) share[n] = variance[n] > 0 ? channels::POINT / variance[n] : 0;
+        int32_t* slot = own.slot.data() + m;
+        float *distance = own.distance.data() + m, *weight = own.weight.data() + m;
+        const float* elevation = u.elevation + b * cells;
+        const uint8_t* known = u.validity + b * cells;
+        for (int64_t n = 0; n < number; n++) {
+            const int64_t c = std::max(cell[n], 0);
+            slot[n] = cell[n], weight[n] = share[n];
+            distance[n] = std::fabs(height[n] - elevation[c]);
+            const int64_t range = ((c + 1) * parts.number - 1) / cells;  // as `Parts` divides the cells
+            const int64_t list = part * parts.number + range;
+            own.points[list][own.count[list]] = int32_t(m + n);
+            own.count[list] += (cell[n] >= 0) & (known[c] != 0);
+        }
     }
 
     void fuse(const Channel& channel) {
-        own.sum.resize(cells * (channel.C + 1));
-        // Each thread has cells of its own, and looks for their points.
-        parts(cells, [&](int64_t, int64_t begin, int64_t end) {
-            if (channel.C == 1) fuse_cells<1>(channel, begin, end);
-            else if (channel.C == 3) fuse_cells<3>(channel, begin, end);
-            else fuse_cells<0>(channel, begin, end);
+        if (int64_t(own.sum.size()) < cells * (channel.C + 1)) own.sum.resize(cells * (channel.C + 1));
+        parts(cells, [&](int64_t range, int64_t begin, int64_t end) {
+            if (channel.C == 1) fuse_cells<1>(channel, range, begin, end);
+            else if (channel.C == 3) fuse_cells<3>(channel, range, begin, end);
+            else fuse_cells<0>(channel, range, begin, end);
         });
     }
 
-    // Fuse the points of cells `begin` to `end`; SIZE is C, or 0 for any.
-    template <int SIZE> void fuse_cells(const Channel& channel, int64_t begin, int64_t end) {
+    // Fuse the points of cells `begin` to `end`, a range of them; SIZE is C, or 0 for any.
+    template <int SIZE> void fuse_cells(const Channel& channel, int64_t range, int64_t begin, int64_t end) {
         const int64_t C = SIZE ? SIZE : channel.C, M = u.S * u.N, stride = C + 1;
         const bool weighted = channels::is_weighted(channel.kind), is_maximum = channel.kind == channels::MAXIMUM;
         float* const sums = own.sum.data();
         std::fill(sums + begin * stride, sums + end * stride, 0.0f);
-        const float* x = channel.features + b * M * C;
-        for (int64_t m = 0; m < M; m++, x += C) {
-            const int32_t c = own.slot[m];
-            if (c < begin || c >= end || !(own.distance[m] <= channel.tolerance)) continue;
-            float largest = 0;  // NaN or inf where a value is
-            for (int64_t k = 0; k < C; k++) largest += x[k] * 0;
-            const float w = weighted ? own.weight[m] : 1.0f;
-            if (largest != 0 || !(w > 0)) continue;
-            float* sum = sums + c * stride;
-            for (int64_t k = 0; k < C; k++)
-                sum[k] = !is_maximum ? sum[k] + w * x[k] : sum[C] > 0 ? std::max(sum[k], x[k]) : x[k];
-            sum[C] += w;
+        const float* const features = channel.features + b * M * C;
+        for (int64_t part = 0; part < parts.number; part++) {
+            const int32_t* points = own.points[part * parts.number + range].data();
+            const int64_t number = own.count[part * parts.number + range];
+            for (int64_t n = 0; n < number; n++) {
+                if (n + AHEAD < number) __builtin_prefetch(sums + own.slot[points[n + AHEAD]] * stride, 1);
+                const int64_t m = points[n];
+                const float* x = features + m * C;
+                float zero = 0;  // NaN where a value is not finite
+                for (int64_t k = 0; k < C; k++) zero += x[k] * 0;
+                const float w = weighted ? own.weight[m] : 1.0f;
+                if (!(own.distance[m] <= channel.tolerance) || zero != 0 || !(w > 0)) continue;
+                float* sum = sums + own.slot[m] * stride;
+                for (int64_t k = 0; k < C; k++)
+                    sum[k] = !is_maximum ? sum[k] + w * x[k] : sum[C] > 0 ? std::max(sum[k], x[k]) : x[k];
+                sum[C] += w;
+            }
         }
         float *values = channel.values + b * cells * C, *weight = channel.weight + b * cells;
         for (int64_t c = begin; c < end; c++) {
@@ -219,8 +267,9 @@ class Map {
 
 extern "C" int update_channels(const Update* u, int num_threads) {
     return code_of([&] {
-        const auto make = [] { return Scratch(); };
-        for_environments(u->B, num_threads, make,
-                         [&](int64_t b, int threads, Scratch& own) { Map(*u, b, threads, own).run(); });
+        for_environments(u->B, num_threads, [&](int64_t b, int threads) {
+            static thread_local Scratch own;  // kept: pages that are new each time would take as long as the points
+            Map(*u, b, threads, own).run();
+        });
     });
 }
