@@ -7,11 +7,12 @@ import json
 import re
 import types
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from docs.extensions.fields import comments
-from torchelev.channels.config import DTYPES, KINDS, ChannelConfig, ChannelConfigs
+from torchelev.channels.config import DTYPES, KINDS, ChannelConfig
 from torchelev.completion.config import WHEN
 from torchelev.config import ElevationMapConfig, setting_types
 from torchelev.config_files import SCHEMA_NAME, VERSION, VERSION_NAME, to_json
@@ -78,7 +79,7 @@ def _type(hint: Any) -> dict[str, Any]:
         return {}
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
         return {"anyOf": [_type(option) for option in typing.get_args(hint)]}
-    if hint is ChannelConfigs:
+    if typing.get_origin(hint) is Mapping:
         return {"type": "object", "additionalProperties": {"anyOf": [{"enum": list(KINDS)}, _group(ChannelConfig)]}}
     if dataclasses.is_dataclass(hint):
         return _group(hint)

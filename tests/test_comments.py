@@ -20,7 +20,8 @@ SKIPPED: tuple[str, ...] = ()
 #: Names of other programs and libraries that the code itself does not use.
 FOREIGN = {
     "__wrapped__",
-    *("CameraSensor", "RayCastSensor"),  # mjlab
+    *("CameraSensor", "RayCastSensor", "TerrainHeightSensor"),  # mjlab
+    *("channel_info", "ros2_py", "max_filter", "smooth_filter", "inpainting"),  # elevation_mapping_cupy
     *("LidarPatternCfg", "RayCaster", "RayCasterCamera", "TiledCamera", "quat_w_opengl", "quat_w_world"),  # Isaac Lab
     *("mdp.height_scan", "measured_points_x", "measured_points_y"),  # Isaac Lab, legged_gym
     *("cam_quat", "mj_kinematics"),  # MuJoCo

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import types
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,7 +61,7 @@ class ElevationMapConfig:
     completion: CompletionConfig | None = None
     filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
     #: what each cell holds besides its height, by name: `ChannelConfig`, or the word of a kind with its defaults
-    channels: ChannelConfigs = field(default_factory=ChannelConfigs)
+    channels: Mapping[str, Any] = field(default_factory=ChannelConfigs)
 
     def __post_init__(self) -> None:
         if isinstance(self.filters, list):
@@ -99,8 +100,8 @@ class ElevationMapConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the config as nested plain dicts, as YAML files and `state_dict` hold it."""
         values = dataclasses.asdict(dataclasses.replace(self, filters=()))
-        if not values["channels"]:
-            del values["channels"]
+        channels = dict(values.pop("channels"))
+        values |= {"channels": channels} if channels else {}
         return values | {"filters": [step.to_dict() for step in self.filters]}
 
     @classmethod
@@ -118,7 +119,7 @@ class ElevationMapConfig:
         if not isinstance(values, dict):
             return _build(cls, values, "config")
         stages = {name: value for name, value in values.items() if name not in ("filters", "channels")}
-        own: dict[str, Any] = {"channels": values["channels"]} if values.get("channels") else {}
+        own: dict[str, Any] = {"channels": values["channels"]} if values.get("channels") is not None else {}
         if "filters" in values:
             from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchelev import pipeline
 from torchelev.channels.config import ChannelConfigs
 from torchelev.channels.inputs import check_features
+from torchelev.channels.views import build_libraries
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.forks import survive_forks
 from torchelev.diagnosis.history import InputHistory
@@ -24,7 +25,14 @@ from torchelev.diagnosis.update_times import UpdateTimes, timed
 from torchelev.errors import require, require_count, require_positive
 from torchelev.inputs import checks
 from torchelev.inputs.chunks import make_chunks, run_in_chunks
-from torchelev.inputs.update_inputs import Inputs, check_inputs, placeholder_inputs, require_full_precision, requires_dt
+from torchelev.inputs.update_inputs import (
+    Inputs,
+    check_inputs,
+    placeholder_inputs,
+    require_full_precision,
+    requires_dt,
+    takes_features,
+)
 from torchelev.kernels.choose import Backend, choose
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
@@ -35,7 +43,7 @@ from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
 from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement
 from torchelev.stages.initialize import METHODS, Site, initialize
-from torchelev.stages.measure.stage import measure
+from torchelev.stages.measure.stage import find_points_on_robot, measure, time_step
 from torchelev.state import MapState, Measurement, forget, forget_cells, map_layers
 
 if TYPE_CHECKING:
@@ -98,7 +106,7 @@ class ElevationMap(PaintedMap, ReadableMap):
 
     # Updating -------------------------------------------------------------------------------------------------------
 
-    @requires_dt
+    @takes_features
     @timed
     def update(
         self,
@@ -143,7 +151,7 @@ class ElevationMap(PaintedMap, ReadableMap):
             KeyError: if `features` names a channel that is not there. Nothing has changed then.
         """
         inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
-        brought = check_features(features, points, self.cfg.channels, self.device)
+        given = check_features(features, points, self.cfg.channels, self.device)
         state = self.state
         self._history.add(inputs, state.statistics.drift_correction)
         self._derived.clear()
@@ -158,8 +166,8 @@ class ElevationMap(PaintedMap, ReadableMap):
             with torch.no_grad():
                 write(state, self._write_back(before, state))
         if self.channels is not None:
-            noise = (self.cfg.sensor.noise_factor, self.cfg.sensor.noise_floor)
-            self.channels.update(self.state, inputs.dt, inputs, brought, noise)
+            own = find_points_on_robot(inputs, self.cfg.sensor) if given else None
+            self.channels.update(self.state, time_step(inputs.dt, torch.float32), inputs, own, given)
         if self.cfg.completion is not None and self.cfg.completion.when == "update":
             self._complete()
 
@@ -294,6 +302,8 @@ class ElevationMap(PaintedMap, ReadableMap):
         weights = None if self._weights is None else self._weights.detached()
         with torch.inference_mode():
             self._run_stages(map_layers(torch.zeros_like, self.state), inputs, weights)
+        if self.channels is not None and is_readable(self.elevation):
+            build_libraries()
 
     # Starting over --------------------------------------------------------------------------------------------------
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,6 +13,7 @@ from torchelev.channels.module import Channels
 from torchelev.channels.paint import Picture, fuse_view, look, require_mode, sample
 from torchelev.channels.views import can_paint, paint_in_cpp
 from torchelev.config import ElevationMapConfig
+from torchelev.layers import Layer
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ class PaintedMap:
     channels: Channels | None
     state: MapState
     device: torch.device
-    _sync_channels: Callable[[], None]
+    _derived: dict[str, Layer]  # of filters, which may read channels
 
     def paint(
         self,
@@ -53,7 +54,7 @@ class PaintedMap:
             channels: name of the channel, or of several in the order of the image's C components.
             distortion: k1, k2, p1, p2 and, if there are more, k3, and k4, k5, k6, as OpenCV has them; (D,), (B, D) or
                 (B, V, D). None: pictures without distortion.
-            mode: "bilinear" or "nearest"; labels want the nearest.
+            mode: "bilinear" or "nearest"; use "nearest" for labels.
             margin: a cell is hidden if the line from the camera to it passes more than this below the elevation [m].
 
         Raises:
@@ -63,8 +64,8 @@ class PaintedMap:
         require_mode(mode)
         picture = Picture(image, K, T_map_camera, channels, distortion, self.cfg.channels, self.num_envs, self.device)
         assert self.channels is not None
-        self._sync_channels()
         view = look(picture, self.state, self.cfg.grid, margin)
+        self._derived.clear()
         with torch.no_grad():
             for name, part in picture.values().items():
                 channel, cfg = self.channels.channel(name), self.cfg.channels[name]
@@ -91,7 +92,6 @@ class PaintedMap:
         require_mode(mode)
         picture = Picture(image, K, T_map_camera, channel, distortion, self.cfg.channels, self.num_envs, self.device)
         assert self.channels is not None
-        self._sync_channels()
         view, cfg = look(picture, self.state, self.cfg.grid, margin), self.cfg.channels[channel]
         before = self.channels.channel(channel)
         before = before._replace(values=before.values.clone(), weight=before.weight.clone())

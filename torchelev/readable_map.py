@@ -58,10 +58,12 @@ class ReadableMap(MapBuffers):
         with torch.inference_mode(False):  # inference tensors could not be trained or written outside of that mode
             self.head = make_head(cfg.traversability, cfg.grid, head)
             self.completion_net = make_completion_net(cfg.completion, completion_net)
+            self.channels = None
+            if cfg.channels:
+                self.channels = Channels(cfg.channels, cfg.grid, cfg.sensor, num_envs, device)
         for net in (self.head, self.completion_net):
             if net is not None:
                 net.to(device)
-        self.channels = Channels(cfg.channels, cfg.grid, num_envs, device) if cfg.channels else None
         self.filters = self._make_filters()
         self._derived: dict[str, Layer] = {}  # layers that completion and filters made of the current state
 
@@ -142,17 +144,30 @@ class ReadableMap(MapBuffers):
         """Return the values of a channel, and where they are known; errors as of `layer`."""
         require(name in self.cfg.channels, "layer", "must be a channel", repr(name), "see cfg.channels", KeyError)
         assert self.channels is not None
-        if state is None:
-            self._sync_channels()
-            return self.channels.read(name, self.state)
-        rule, actual = f"must be of all {self.num_envs} maps, as channels are no part of it", len(state.validity)
-        require(actual == self.num_envs, "state", rule, actual, "leave it out, and choose the environment afterwards")
-        return self.channels.read(name, state)
+        if state is not None:
+            rule, actual = f"must be of all {self.num_envs} maps, as channels are no part of it", len(state.validity)
+            require(
+                actual == self.num_envs, "state", rule, actual, "leave it out, and choose the environment afterwards"
+            )
+        values, known = self.channels.read(name, state)
+        return values, known & (self.state if state is None else state).validity
+
+    def load_state(self, state: MapState) -> None:
+        """Copy a state into the buffers, such as one that `forward` returned; channels keep what fits its ground.
+
+        Args:
+            state: state of the same grid and number of environments; its values are converted to the map's dtype.
+
+        Raises:
+            ValueError: if a tensor of the state has another shape.
+        """
+        super().load_state(state)
+        self._sync_channels()
 
     def _sync_channels(self) -> None:
         """Make channels follow what changed besides updates, such as cells that were forgotten."""
         if self.channels is not None:
-            self.channels.update(self.state)
+            self.channels.follow(self.state)
 
     def read_layer(self, name: str, state: MapState | None = None) -> Layer:
         """Return a layer's values and mask, for code that computes with both; arguments and errors as of `layer`.

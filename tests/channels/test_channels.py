@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
+from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, GridConfig, SensorConfig
 from torchelev.channels import module
 from torchelev.channels.config import KINDS, ChannelConfig
 
@@ -153,6 +153,25 @@ def test_points_above_the_ground_do_not_speak_for_it():
     assert at_cell(emap, "grass") == pytest.approx(1.0)
 
 
+def test_points_that_the_map_leaves_out_count_for_no_channel():
+    body = BodyConfig(lower=(-0.2, -0.2, -1.2), upper=(0.2, 0.2, 0.2))
+    sensor = SensorConfig(body=body, min_distance=0.3, max_distance=1.5)
+    cfg = ElevationMapConfig(grid=GRID, sensor=sensor, channels={"grass": ChannelConfig(kind="maximum")})
+    places = {"ground": (0.55, 0.05, -1.0), "foot": (0.05, 0.05, -1.0), "far": (1.35, 0.85, -1.0)}
+    for name, where in places.items():
+        emap = ElevationMap(cfg)
+        others = torch.tensor([[0.35, -0.35, -1.0]])
+        emap.state.elevation.zero_(), emap.state.validity.fill_(True)
+        points = torch.cat([torch.tensor([where]), others])[None]
+        emap.update(points, pose(), pose(), dt=0.1, features={"grass": torch.tensor([[7.0, torch.nan]])})
+        assert bool((emap.layer("grass") == 7.0).any()) == (name == "ground"), name
+    for variance in (0.0, -1.0, math.inf, math.nan):
+        emap = make(grass=ChannelConfig(kind="maximum"))
+        see(emap, {"grass": [1.0]})
+        see(emap, {"grass": [9.0]}, variance=torch.tensor([[variance]]))
+        assert at_cell(emap, "grass") == 1.0
+
+
 def test_what_forgets_a_cell_forgets_its_channels():
     emap = make(grass=ChannelConfig())
     see(emap, {"grass": [1.0]})
@@ -228,15 +247,15 @@ def test_cpp_computes_what_tensors_define(monkeypatch):
 
 
 def test_features_have_gradients_by_the_definition():
-    from torchelev.channels.fuse import Speakers, accumulate, combine, read
+    from torchelev.channels.fuse import GroundPoints, accumulate, combine, read
     from torchelev.channels.state import blank_channel
 
     for kind in KINDS:
         cfg = ChannelConfig(kind=kind, size=3 if kind == "color" else 2)
         x = torch.rand(1, 4, cfg.size, dtype=torch.float64, requires_grad=True)
         ones = torch.ones(1, 4, dtype=torch.float64)
-        speakers = Speakers(torch.tensor([[0, 0, 1, 3]]), ones > 0, 0 * ones, 1e-4 * ones)
-        added, total = accumulate(x, speakers, 4, cfg)
+        points = GroundPoints(torch.tensor([[0, 0, 1, 3]]), ones > 0, 0 * ones, 1e-4 * ones)
+        added, total = accumulate(x, points, 4, cfg)
         blank = blank_channel(cfg, (1, 2, 2), "cpu")
         new = combine(blank, added.view(1, 2, 2, -1), total.view(1, 2, 2), cfg)
         read(new, cfg)[0][0, 0].sum().backward()
@@ -273,6 +292,40 @@ def test_channels_are_saved_and_copied_with_the_map():
     assert "channels" not in ElevationMapConfig().to_dict()
 
 
+def test_checkpoints_load_as_weights_alone(tmp_path):
+    emap = make(rgb="color", terrain=ChannelConfig(kind="class", names=("mud", "stone")))
+    see(emap, {"rgb": [[0.1, 0.2, 0.3]], "terrain": [[1.0, 0.0]]})
+    torch.save(emap.state_dict(), tmp_path / "map.pt")
+    again = ElevationMap(emap.cfg)
+    again.load_state_dict(torch.load(tmp_path / "map.pt"))
+    assert at_cell(again, "rgb.green") == pytest.approx(0.2)
+
+
+def test_maps_made_in_inference_mode_are_reset_outside_of_it():
+    with torch.inference_mode():
+        emap = make(grass=ChannelConfig())
+        see(emap, {"grass": [1.0]})
+    emap.reset(torch.tensor([0]))
+    assert math.isnan(at_cell(emap, "grass"))
+
+
+def test_channels_of_another_state_lie_where_its_ground_does():
+    emap = make(grass=ChannelConfig())
+    see(emap, {"grass": [3.0]})
+    nothing = torch.full((1, 1, 3), torch.nan)
+    moved = emap(emap.state, emap.measure(nothing, pose(0.4), pose(0.4), dt=0.1))
+    before, after = (emap.layer("grass", state=state)[0].isfinite().nonzero()[0] for state in (emap.state, moved))
+    assert (before - after).tolist() == [4, 0]
+    gone = emap.state._replace(validity=torch.zeros_like(emap.state.validity))
+    assert emap.layer("grass", state=gone).isnan().all() and at_cell(emap, "grass") == 3.0
+
+
+def test_configs_are_equal_in_any_order():
+    a = ElevationMapConfig(channels={"a": "mean", "b": "color"})
+    b = ElevationMapConfig(channels={"b": "color", "a": "mean"})
+    assert a == b and hash(a) == hash(b)
+
+
 def test_configs_with_channels_are_written_and_read(tmp_path):
     cfg = ElevationMapConfig(grid=GRID, channels={"rgb": "color", "terrain": ChannelConfig(kind="class", size=3)})
     cfg.save(tmp_path / "map.json")
@@ -300,6 +353,13 @@ def test_configs_with_channels_are_written_and_read(tmp_path):
         ({"a": {"names": ["x", "x"]}}, ValueError, "channel.names: must be different words without dots"),
         ({"a": {"rate": 0.0}}, ValueError, "channel.rate: must lie in .0, 1., got 0.0"),
         ({"a": {"half_life": -1.0}}, ValueError, "channel.half_life: must be a positive number"),
+        (
+            {"a": {"kind": "class", "size": 2, "dtype": "float16"}},
+            ValueError,
+            "channel.dtype: must be float32 for counts",
+        ),
+        ({"a": {"names": "road"}}, ValueError, "cfg.channels..a..: channel.names: must be a list of names, got 'road'"),
+        ({"a": {"rate": "fast"}}, ValueError, "channel.rate: must lie in .0, 1., got 'fast'"),
         ({"a": {"dtype": "int8"}}, ValueError, "channel.dtype: must be one of float32, float16, got 'int8'"),
     ],
 )

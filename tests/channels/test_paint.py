@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig, painted_map
+from torchelev import ElevationMap, ElevationMapConfig, FilterConfig, GridConfig, painted_map
 from torchelev.channels import camera, paint
 from torchelev.channels.config import KINDS, ChannelConfig
 from torchelev.frames import change_axes
@@ -165,6 +165,23 @@ def test_painted_is_what_paint_does():
     after = emap.layer("rgb")
     assert torch.equal(known, after[:, 0].isfinite())
     torch.testing.assert_close(values[:, :, known[0]], after[:, :, known[0]], atol=1e-5, rtol=0)
+
+
+def test_filters_of_a_channel_are_computed_anew():
+    double = FilterConfig(layer="double", filter="expression", settings={"formula": "2 * grass"})
+    cfg = ElevationMapConfig(grid=GRID, channels={"grass": ChannelConfig(kind="maximum")}, filters=(double,))
+    emap = ElevationMap(cfg)
+    emap.load_state(make().state)
+    for value in (1.0, 3.0):
+        emap.paint(torch.full((1, 1, H, W), value), K, look(), "grass")
+        assert emap.layer("double").nan_to_num().max().item() == pytest.approx(2 * value)
+
+
+def test_a_camera_far_away_takes_no_time_and_sees_nothing():
+    emap, T = make(grass=ChannelConfig()), look()
+    T[:, 0, 3] = 1e8
+    emap.paint(torch.ones(1, 1, H, W), K, T, "grass")
+    assert emap.layer("grass").isnan().all()
 
 
 @pytest.mark.parametrize(

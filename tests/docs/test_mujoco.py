@@ -25,7 +25,7 @@ def test_nothing_beyond_the_range_of_rays_and_rangefinder(names):
     depth, seen = data.sensor("depth").data, names["depth"](data)
     assert (depth > names["MAX_RANGE"]).sum() > 100 and (depth < 0).sum() > 100
     assert int(seen.isfinite().sum()) == ((depth > 0) & (depth < names["MAX_RANGE"])).sum() > 1000
-    points = depth_to_points(seen[None], names["pinhole"](58.0, names["width"], names["height"]))[0]
+    points = depth_to_points(seen[None], names["pinhole"](torch.tensor(58.0), names["width"], names["height"]))[0]
     T = names["T_map_sensor"](data)
     z = (points.double() @ T[:3, :3].T + T[:3, 3])[seen.flatten().isfinite(), 2]
     assert z.min() > -1e-6 and z.max() < 0.2 + 1e-6 and (z.abs() < 1e-6).sum() > 1000  # the floor and the box

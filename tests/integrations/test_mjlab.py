@@ -160,7 +160,7 @@ def test_depth_images_show_the_ground():
 
 
 def test_the_principal_point_lies_between_the_middle_pixels():
-    K = mjlab._intrinsics(torch.tensor([70.0]), 24, 32)[0]
+    K = mjlab.pinhole(torch.tensor([70.0]), 32, 24)[0]
     directions, focal = pinhole(70.0, 24, 32)
     u, v = np.meshgrid(np.arange(32), np.arange(24))
     pixels = np.stack([u.ravel(), v.ravel(), np.ones(24 * 32)], -1)

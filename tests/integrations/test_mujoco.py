@@ -92,7 +92,7 @@ def test_rays_return_nothing_beyond_the_range_and_at_the_robot(scene, rays):
         (lambda m: MujocoRays(m, "base", RAYS[0], torch.eye(4)), r"directions: must be vectors \(N, 3\), got \(3,\)"),
         (lambda m: MujocoRays(m, "base", RAYS, torch.eye(4), -1.0), "max_distance: must be a positive number, got"),
         (lambda m: MujocoCamera(m, "ear", 8, 6), "camera: must name a camera of the model, got 'ear'"),
-        (lambda m: MujocoCamera(m, "map", 8, 6), "camera: must be a perspective camera given by fovy, got 'map'"),
+        (lambda m: MujocoCamera(m, "map", 8, 6), "camera: 'map' must be a perspective camera given by fovy"),
         (lambda m: height_field(m, "hill"), "name: must name a height field of the model, got 'hill'"),
     ],
 )  # fmt: skip

@@ -126,5 +126,5 @@ def test_refuses_what_does_not_fit(worlds):
         WarpRays(*args, "dog", RAYS, PLACE)
     with pytest.raises(ValueError, match="directions: must be unit vectors, got lengths from 2 to 2"):
         WarpRays(*args, "base", 2 * RAYS, PLACE)
-    with pytest.raises(ValueError, match="camera: must be a perspective camera given by fovy, got 'map'"):
+    with pytest.raises(ValueError, match="camera: 'map' must be a perspective camera given by fovy"):
         WarpCamera(*args, "map", 8, 6)

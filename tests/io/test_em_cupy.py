@@ -153,7 +153,7 @@ def test_every_rule_names_a_setting_that_exists():
     for name, rule in PARAMETERS.items():
         if rule.convert is not None:
             group = settings
-            for part in rule.here.split("."):
+            for part in rule.setting.split("."):
                 assert part in group, name
                 group = group[part]
         assert rule.note or rule.convert, name

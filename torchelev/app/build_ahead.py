@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 
+from torchelev.channels.native import LIBRARY as CHANNELS
+from torchelev.channels.views import LIBRARY as VIEWS
 from torchelev.completion.completion_kernel import library_of
 from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
@@ -28,7 +30,8 @@ def main() -> None:
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(register_stages(ElevationMapConfig())).parts
     completion = library_of(CompletionNet.from_pretrained().weights)
-    for library in (stages, completion, CASTING, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, OWN_POINTS, SCANS, library_parts()):
+    others = (CASTING, CHANNELS, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, OWN_POINTS, SCANS, VIEWS)
+    for library in (stages, completion, *others, library_parts()):
         for path in build_ahead(*library):
             print(path.name)
     for name in ("torchelev.h", "torchelev.hpp"):

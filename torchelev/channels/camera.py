@@ -119,12 +119,12 @@ def hidden(
     high = torch.where(state.validity, state.elevation.float(), -torch.inf).flatten(1)
     height = T_map_camera[..., 2, 3].float()[..., None, None]
     result = torch.zeros(torch.broadcast_shapes(x.shape, y.shape), dtype=torch.bool, device=x.device)
-    for k in range(1, int(steps.max())):
-        share = (k / steps).clamp(max=1.0)
+    for back in range(1, max(grid.height, grid.width)):  # what lies farther back is out of the window
+        share = (steps - back).clamp(min=0) / steps
         i = torch.floor(at[..., 0, None, None] + share * x)
         j = torch.floor(at[..., 1, None, None] + share * y)
-        inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width) & (k < steps)
-        slot = torch.where(inside, i * grid.width + j, 0).to(torch.int64)
+        inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width) & (back < steps)
+        slot = torch.where(inside, i, 0).to(torch.int64) * grid.width + torch.where(inside, j, 0).to(torch.int64)
         ground = high[:, None].expand(*slot.shape[:2], -1).gather(2, slot.flatten(2)).view(slot.shape)
         result |= inside & (ground > height + share * z + margin)
     return result

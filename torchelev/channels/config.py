@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from torchelev.errors import require, require_positive
+from torchelev.errors import require
 
 KINDS = ("mean", "exponential", "maximum", "color", "class", "class_average", "feature")  # `Kind` of equation.h
 DTYPES = ("float32", "float16")
@@ -50,6 +51,8 @@ class ChannelConfig:
     dtype: str = "float32"  #: of what is stored, "float32" or "float16"
 
     def __post_init__(self) -> None:
+        is_list = isinstance(self.names, list | tuple)
+        require(is_list, "channel.names", "must be a list of names", repr(self.names), 'give ("grass", "stone")')
         object.__setattr__(self, "names", tuple(self.names))
         require(self.kind in KINDS, "channel.kind", f"must be one of {', '.join(KINDS)}", repr(self.kind), "use mean")
         require(
@@ -70,11 +73,22 @@ class ChannelConfig:
         require(has_classes, "channel.size", "must be two or more of classes", size, 'give names=("grass", "stone")')
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "size", size)
-        require(0 < self.rate <= 1, "channel.rate", "must lie in (0, 1]", self.rate, "give 0.7")
-        require_positive(**{"channel.tolerance": self.tolerance, "channel.prior": self.prior})
-        for name in ("half_life", "max_age"):
-            if getattr(self, name) is not None:
-                require_positive(**{f"channel.{name}": getattr(self, name)})
+        fits, hint = self.kind != "class" or self.dtype == "float32", "use float32"
+        require(fits, "channel.dtype", "must be float32 for counts, which float16 cannot hold", self.dtype, hint)
+        self._require_number("rate", "must lie in (0, 1]", "give 0.7", 1.0)
+        for name, unit in (
+            ("tolerance", "metres"),
+            ("prior", "points"),
+            ("half_life", "seconds"),
+            ("max_age", "seconds"),
+        ):
+            if getattr(self, name) is not None or name in ("tolerance", "prior"):
+                self._require_number(name, "must be a positive number", f"give {unit}")
+
+    def _require_number(self, name: str, rule: str, hint: str, most: float = math.inf) -> None:
+        value = getattr(self, name)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        require(is_number and 0 < value <= most, f"channel.{name}", rule, repr(value), hint)
 
     @property
     def is_weighted(self) -> bool:
@@ -92,7 +106,7 @@ class ChannelConfigs(dict[str, ChannelConfig]):
     """The channels of a map by name. It can be hashed, and is not to be changed."""
 
     def __hash__(self) -> int:  # type: ignore[override]
-        return hash(tuple(self.items()))
+        return hash(frozenset(self.items()))
 
 
 def parse_channels(channels: Any, layers: tuple[str, ...]) -> ChannelConfigs:
@@ -127,4 +141,7 @@ def _parse(name: str, value: Any) -> ChannelConfig:
         require(
             setting in known, f"{where}.{setting}", "is not a setting", repr(setting), f"there are {', '.join(known)}"
         )
-    return ChannelConfig(**settings)
+    try:
+        return ChannelConfig(**settings)
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"{where}: {error}") from error

@@ -16,25 +16,25 @@ if TYPE_CHECKING:
 POINT = 1e-4  # [m^2] variance of a height that counts as one point
 
 
-class Speakers(NamedTuple):
-    """The points that speak for the ground of their cells."""
+class GroundPoints(NamedTuple):
+    """The points of an update that may lie on the ground of their cells."""
 
     slot: Int[Tensor, "B M"]  #: flat number of the cell; any cell where it does not count
-    counts: Bool[Tensor, "B M"]  #: the point lies on the ground that the map shows, in the window
+    counts: Bool[Tensor, "B M"]  #: the point lies over a known cell, and is one that the sensor measures
     distance: Float[Tensor, "B M"]  #: [m] of its height from the cell's elevation
     variance: Float[Tensor, "B M"]  #: [m^2] of its height
 
 
 def accumulate(
-    x: Float[Tensor, "B M C"], speakers: Speakers, num_cells: int, cfg: ChannelConfig
+    x: Float[Tensor, "B M C"], points: GroundPoints, num_cells: int, cfg: ChannelConfig
 ) -> tuple[Float[Tensor, "B cells C"], Float[Tensor, "B cells"]]:
     """Return sum w_i x_i, or the largest x_i of a maximum, and sum w_i of each cell; a point with a NaN is left out."""
-    counts = speakers.counts & (speakers.distance <= cfg.tolerance) & x.isfinite().all(-1)
-    weight = POINT / speakers.variance if cfg.is_weighted else torch.ones_like(speakers.variance)
+    counts = points.counts & (points.distance <= cfg.tolerance) & x.isfinite().all(-1)
+    weight = POINT / points.variance if cfg.is_weighted else torch.ones_like(points.variance)
     weight = torch.where(counts, weight, 0.0)
     x = torch.where(counts[..., None], x, 0.0)
-    total = weight.new_zeros(len(x), num_cells).scatter_add(1, speakers.slot, weight)
-    index = speakers.slot[..., None].expand_as(x)
+    total = weight.new_zeros(len(x), num_cells).scatter_add(1, points.slot, weight)
+    index = points.slot[..., None].expand_as(x)
     blank = x.new_zeros(len(x), num_cells, x.shape[-1])
     if cfg.kind == "maximum":
         low = torch.where(counts[..., None], x, -torch.inf)
@@ -48,8 +48,8 @@ def combine(
     """Return a channel with what `accumulate` found fused into its cells; equations in `ChannelConfig`."""
     is_seen = total > 0
     v, W = channel.values.to(added.dtype), channel.weight
-    is_first, some = (W <= 0)[..., None], torch.where(is_seen, total, 1.0)[..., None]
-    mean = added / some
+    is_first = (W <= 0)[..., None]
+    mean = added / torch.where(is_seen, total, 1.0)[..., None]
     if cfg.is_weighted:
         new = v + (mean - v) * (total / torch.where(is_seen, W + total, 1.0))[..., None]
     elif cfg.kind == "class":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchelev.channels.config import ChannelConfig, ChannelConfigs
+from torchelev.channels.config import ChannelConfig
 from torchelev.errors import require
 from torchelev.inputs.checks import FLOATS, check_tensor
 from torchelev.ops.transforms import is_readable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _TOLERANCE = 1e-2  # of sums of probabilities, which may come in half precision
 
 
-def find_channel(name: object, channels: ChannelConfigs, argument: str) -> ChannelConfig:
+def find_channel(name: object, channels: Mapping[str, ChannelConfig], argument: str) -> ChannelConfig:
     """Return the channel of this name; KeyError if there is none."""
     known = ", ".join(channels) or "none: give the config channels={...}"
     require(name in channels, argument, f"must name channels of the map: {known}", repr(name), "correct it", KeyError)
@@ -27,7 +27,7 @@ def find_channel(name: object, channels: ChannelConfigs, argument: str) -> Chann
 
 
 def check_features(
-    features: Any, points: Tensor, channels: ChannelConfigs, device: torch.device
+    features: Any, points: Tensor, channels: Mapping[str, ChannelConfig], device: torch.device
 ) -> dict[str, Float[Tensor, "B M C"]]:
     """Return the values of the points by channel, in float32.
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
 from torchelev.channels import fuse
-from torchelev.channels.config import ChannelConfigs
+from torchelev.channels.config import ChannelConfig
 from torchelev.channels.native import can_update, update_in_cpp
-from torchelev.channels.points import find_speakers, floats_of
-from torchelev.channels.state import Channel, Ground, blank_channel, follow
+from torchelev.channels.points import match_points
+from torchelev.channels.state import Channel, Ground, blank_channel, follow, known_elevation
 from torchelev.grid import GridConfig
 from torchelev.ops.moving import move_layers
 from torchelev.state import MapState, blank_corner
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
     from torchelev.inputs.update_inputs import Inputs
+    from torchelev.stages.measure.config import SensorConfig
 
 
 class Channels(nn.Module):
@@ -28,6 +30,7 @@ class Channels(nn.Module):
     Args:
         cfg: settings by name.
         grid: the windows of the maps.
+        sensor: noise and range of points.
         num_envs: number of maps, B.
         device: device of the maps.
     """
@@ -35,9 +38,16 @@ class Channels(nn.Module):
     corner: Tensor
     height: Tensor
 
-    def __init__(self, cfg: ChannelConfigs, grid: GridConfig, num_envs: int, device: torch.device | str) -> None:
+    def __init__(
+        self,
+        cfg: Mapping[str, ChannelConfig],
+        grid: GridConfig,
+        sensor: SensorConfig,
+        num_envs: int,
+        device: torch.device | str,
+    ) -> None:
         super().__init__()
-        self.cfg, self.grid = cfg, grid
+        self.cfg, self.grid, self.sensor = cfg, grid, sensor
         size = (num_envs, grid.height, grid.width)
         self.register_buffer("corner", torch.tensor(blank_corner(grid), device=device).repeat(num_envs, 1))
         self.register_buffer("height", torch.full(size, torch.nan, device=device))
@@ -50,68 +60,74 @@ class Channels(nn.Module):
         return Channel(*(cast("Tensor", getattr(self, f"{name}_{part}")) for part in Channel._fields))
 
     @torch.no_grad()
+    def follow(self, state: MapState) -> None:
+        """Follow a change of the maps besides an update, such as cells that were forgotten."""
+        self._change(state, None, None, None, {})
+
+    @torch.no_grad()
     def update(
         self,
         state: MapState,
-        dt: Float[Tensor, "B"] | None = None,
-        inputs: Inputs | None = None,
-        features: dict[str, Float[Tensor, "B M C"]] | None = None,
-        noise: tuple[float, float] = (0.0, 1.0),
+        dt: Float[Tensor, "B"],
+        inputs: Inputs,
+        own: Bool[Tensor, "B S N"] | None,
+        features: Mapping[str, Float[Tensor, "B M C"]],
     ) -> None:
-        """Follow the maps, and fuse what points bring.
+        """Follow an update of the maps, and fuse what its points bring.
 
         Args:
-            state: of the maps, after an update or another change.
-            dt: time since the last call [s]; None: no time has passed, and the maps did not drift.
+            state: of the maps after it.
+            dt: time since the last update [s], finite and not negative.
             inputs: of the update.
-            features: values of its points by channel.
-            noise: see `find_speakers`.
+            own: points on the robot.
+            features: values of the points by channel.
         """
-        channels = {name: self.channel(name) for name in self.cfg}
-        ground, brought = Ground(self.corner, self.height), features or {}
-        if can_update(channels, state):
-            update_in_cpp(channels, self.cfg, ground, state, self.grid, dt, inputs, brought, noise)
-        else:
-            self._update_by_tensors(channels, state, dt, inputs, brought, noise)
+        self._change(state, dt, inputs, own, features)
 
-    def _update_by_tensors(
+    def _change(
         self,
-        channels: dict[str, Channel],
         state: MapState,
         dt: Tensor | None,
         inputs: Inputs | None,
-        features: dict[str, Tensor],
-        noise: tuple[float, float],
+        own: Tensor | None,
+        features: Mapping[str, Tensor],
     ) -> None:
-        """Do the same by tensors: the definition."""
-        ground, shift, elapsed = self._move_ground(state, dt)
-        elevation, size = floats_of(state), (self.grid.height, self.grid.width)
-        speakers = find_speakers(inputs, state, self.grid, noise) if features and inputs is not None else None
-        for name, channel in channels.items():
-            cfg = self.cfg[name]
-            new = follow(channel, ground, elevation, shift, elapsed, cfg)
-            if speakers is not None and name in features:
-                added, total = fuse.accumulate(features[name], speakers, self.grid.num_cells, cfg)
+        """Do the work of `follow`, with None for dt and inputs, and of `update`."""
+        channels = {name: self.channel(name) for name in self.cfg}
+        if can_update(channels, state):
+            ground = Ground(self.corner, self.height)
+            given = (self.grid, self.sensor, dt, inputs, own, features)
+            update_in_cpp(channels, self.cfg, ground, state, *given)
+            return
+        ground_points = None
+        if inputs is not None and features:
+            ground_points = match_points(inputs, own, state, self.grid, self.sensor)
+        for name in channels:
+            cfg, size = self.cfg[name], (self.grid.height, self.grid.width)
+            new = self._followed(name, state, dt)
+            if ground_points is not None and name in features:
+                added, total = fuse.accumulate(features[name], ground_points, self.grid.num_cells, cfg)
                 new = fuse.combine(new, added.unflatten(1, size), total.unflatten(1, size), cfg)
             self.write(name, new)
         self.corner.copy_(state.corner)
-        self.height.copy_(elevation)
+        self.height.copy_(known_elevation(state))
+
+    def _followed(self, name: str, state: MapState, dt: Tensor | None) -> Channel:
+        """Return a channel that has followed the maps to a state; dt is None besides updates."""
+        largest = max(self.grid.height, self.grid.width)
+        shift = (state.corner - self.corner).clamp(-largest, largest)
+        height = move_layers({"height": self.height}, shift, {"height": torch.nan})["height"]
+        if dt is not None:
+            height = height + state.statistics.drift_correction.float()[:, None, None]
+        elapsed = height.new_zeros(len(height)) if dt is None else dt.float()
+        ground = Ground(state.corner, height)
+        return follow(self.channel(name), ground, known_elevation(state), shift, elapsed, self.cfg[name])
 
     def write(self, name: str, new: Channel) -> None:
         """Copy a channel into the buffers."""
         for stored, value in zip(self.channel(name), new, strict=True):
             if stored is not None and value is not None:
                 stored.copy_(value)
-
-    def _move_ground(self, state: MapState, dt: Tensor | None) -> tuple[Ground, Tensor, Tensor]:
-        """Return the ground that channels belong to in the map's window, by how many cells that moved, and dt."""
-        largest = max(self.grid.height, self.grid.width)
-        shift = (state.corner - self.corner).clamp(-largest, largest)
-        height = move_layers({"height": self.height}, shift, {"height": torch.nan})["height"]
-        if dt is None:
-            return Ground(state.corner, height), shift, height.new_zeros(len(height))
-        height = height + state.statistics.drift_correction.float()[:, None, None]
-        return Ground(state.corner, height), shift, dt.float()
 
     @torch.no_grad()
     def forget(self, env_ids: Tensor | None, mask: Bool[Tensor, "B"] | None) -> None:
@@ -130,7 +146,7 @@ class Channels(nn.Module):
         """The names of all components, each a layer of the map."""
         return tuple(layer for name, cfg in self.cfg.items() for layer in cfg.components(name))
 
-    def read(self, name: str, state: MapState) -> tuple[Float[Tensor, "B H W C"], Bool[Tensor, "B H W"]]:
-        """Return the values of a channel, and where the map has them."""
-        values, known = fuse.read(self.channel(name), self.cfg[name])
-        return values, known & state.validity
+    def read(self, name: str, state: MapState | None) -> tuple[Float[Tensor, "B H W C"], Bool[Tensor, "B H W"]]:
+        """Return the values of a channel, and where it has them: of the maps, or as these cells of another state."""
+        channel = self.channel(name) if state is None else self._followed(name, state, None)
+        return fuse.read(channel, self.cfg[name])

@@ -18,9 +18,10 @@ from torchelev.ops.transforms import can_compute_unseen
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
     from torchelev.inputs.update_inputs import Inputs
+    from torchelev.stages.measure.config import SensorConfig
 
 LIBRARY: tuple[str, dict[str, str]] = ("channels/kernel/channels.cpp", {})
 
@@ -36,7 +37,10 @@ class _Channel(ctypes.Structure):
     )
 
 
-_MAPS = ("points", "T_map_sensor", "variance", "dt", "drift", "corner_now", "elevation", "validity", "corner", "height")
+_MAPS = (
+    *("points", "T_map_sensor", "variance", "own", "dt", "drift"),
+    *("corner_now", "elevation", "validity", "corner", "height"),
+)
 
 
 class _Update(ctypes.Structure):
@@ -46,15 +50,15 @@ class _Update(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in (*_MAPS, "channels")),
         *((name, ctypes.c_int64) for name in "BSNHWK"),
         ("resolution", ctypes.c_double),
-        *((name, ctypes.c_float) for name in ("noise_factor", "noise_floor")),
+        *((name, ctypes.c_float) for name in ("noise_factor", "noise_floor", "min_distance", "max_distance")),
     )
 
 
 def can_update(channels: Mapping[str, Channel], state: MapState) -> bool:
     """Return whether `update_in_cpp` takes these: float32 on a CPU, with nothing to differentiate or to trace."""
     tensors = (state.elevation, *(channel.values for channel in channels.values()))
-    is_single = all(value.dtype == torch.float32 for value in tensors)
-    return is_single and can_compute_unseen(tensors) and load(*LIBRARY) is not None
+    is_plain = all(value.dtype == torch.float32 and value.is_contiguous() for value in tensors)
+    return is_plain and can_compute_unseen(tensors) and load(*LIBRARY) is not None
 
 
 def update_in_cpp(
@@ -63,32 +67,34 @@ def update_in_cpp(
     ground: Ground,
     state: MapState,
     grid: GridConfig,
+    sensor: SensorConfig,
     dt: Float[Tensor, "B"] | None,
     inputs: Inputs | None,
+    own: Bool[Tensor, "B S N"] | None,
     features: Mapping[str, Float[Tensor, "B M C"]],
-    noise: tuple[float, float],
 ) -> None:
     """Follow the maps, and fuse what points bring, in place; arguments as of `Channels.update`."""
     library = load(*LIBRARY)
     assert library is not None, "asked without `can_update`"
     B = len(ground.corner)
     drift = None if dt is None else state.statistics.drift_correction
-    dt = torch.zeros(B) if dt is None else dt.float()
-    brought = {name: x.contiguous() for name, x in features.items()}
-    points = T = variance = None
+    given = {name: x.contiguous() for name, x in features.items()} if inputs is not None else {}
+    cloud: list[Tensor | None] = [None] * 4
     S = N = 0
-    if inputs is not None and brought:
-        (S, N), points = inputs.points.shape[1:3], inputs.points.float()
-        T, variance = inputs.T_map_sensor.double(), inputs.variance
-        variance = None if variance is None else variance.float()
-    maps = (points, T, variance, dt, drift, state.corner, state.elevation, state.validity, ground.corner, ground.height)
-    read = [None if value is None else value.contiguous() for value in maps]
+    if inputs is not None and given:
+        S, N = inputs.points.shape[1:3]
+        variance = None if inputs.variance is None else inputs.variance.float()
+        cloud = [inputs.points.float(), inputs.T_map_sensor.double(), variance, own]
+    times = [torch.zeros(B) if dt is None else dt.float(), drift]
+    maps = [state.corner, state.elevation, state.validity]
+    read = [None if value is None else value.contiguous() for value in (*cloud, *times, *maps)]
     structs = (_Channel * len(channels))(
-        *(_struct(channel, configs[name], brought.get(name)) for name, channel in channels.items())
+        *(_struct(channel, configs[name], given.get(name)) for name, channel in channels.items())
     )
-    addresses = (None if value is None else value.data_ptr() for value in read)
+    addresses = (None if value is None else value.data_ptr() for value in (*read, *ground))
     sizes = (B, S, N, grid.height, grid.width, len(channels))
-    update = _Update(*addresses, ctypes.addressof(structs), *sizes, grid.resolution, *noise)
+    limits = (sensor.noise_factor, sensor.noise_floor, sensor.min_distance, sensor.max_distance)
+    update = _Update(*addresses, ctypes.addressof(structs), *sizes, grid.resolution, *limits)
     call(library.update_channels, ctypes.byref(update), torch.get_num_threads())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -9,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.channels import camera, fuse
-from torchelev.channels.config import ChannelConfig, ChannelConfigs
+from torchelev.channels.config import ChannelConfig
 from torchelev.channels.inputs import find_channel, require_values
 from torchelev.channels.state import Channel
 from torchelev.channels.views import can_look, look_in_cpp
@@ -54,11 +55,13 @@ class Picture:
         T_map_camera: Any,
         channels: Any,
         distortion: Any,
-        configs: ChannelConfigs,
+        configs: Mapping[str, ChannelConfig],
         num_envs: int,
         device: torch.device,
     ) -> None:
-        names = (channels,) if isinstance(channels, str) else tuple(channels)
+        names = (channels,) if isinstance(channels, str) else tuple(channels or ())
+        is_list, hint = 0 < len(names) == len(set(names)), 'give "rgb", or several names, each once'
+        require(is_list, "channels", "must name one channel or several", repr(channels), hint)
         self.channels = {name: find_channel(name, configs, "channels") for name in names}
         C = sum(cfg.size for cfg in self.channels.values())
         self.image = _check_image(image, self.channels, C, num_envs, device)
@@ -101,10 +104,11 @@ def _check_intrinsics(K: Any, size: torch.Size, device: torch.device) -> Float[T
     if is_readable(value):
         focal, center = value.detach()[..., (0, 1), (0, 1)], value.detach()[..., :2, 2]
         limit = center.new_tensor([w, h])
-        fits = bool((focal > 0).all() and ((center > 0) & (center < limit)).all())
+        good = (focal > 0).all(-1) & ((center > 0) & (center < limit)).all(-1)
         rule = f"must have positive focal lengths and its centre in the image of {w} x {h} pixels"
-        actual, hint = value.reshape(-1, 3, 3)[0].tolist(), "scale K as the image was scaled"
-        require(fits, "K", rule, actual, hint)
+        if not good.all():
+            first = value.reshape(-1, 3, 3)[int(good.flatten().int().argmin())].tolist()
+            require(False, "K", rule, first, "scale K as the image was scaled")
     return value.expand(B, V, 3, 3)
 
 
@@ -130,7 +134,7 @@ def look(picture: Picture, state: MapState, grid: GridConfig, margin: float) -> 
 
 
 def sample(image: Float[Tensor, "B V C h w"], view: camera.View, mode: str) -> Float[Tensor, "B V H W C"]:
-    """Read the pixels of a view, NaN where they show nothing of the cell. Differentiable in the image."""
+    """Read the pixels of a view; arbitrary where nothing is seen. Differentiable in the image."""
     h, w = image.shape[-2:]
     place = (2 * view.uv + 1) / view.uv.new_tensor([w, h]) - 1
     place = torch.where(view.seen[..., None], place, 0.0)

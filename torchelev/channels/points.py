@@ -1,4 +1,4 @@
-"""Which points speak for the ground of which cell: the definition by tensors."""
+"""Which points lie on the ground of which cell: the definition by tensors."""
 
 from __future__ import annotations
 
@@ -7,25 +7,30 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchelev.channels.fuse import Speakers
+from torchelev.channels.fuse import GroundPoints
 from torchelev.grid import GridConfig
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool
 
     from torchelev.inputs.update_inputs import Inputs
+    from torchelev.stages.measure.config import SensorConfig
 
 
-def find_speakers(inputs: Inputs, state: MapState, grid: GridConfig, noise: tuple[float, float]) -> Speakers:
+def match_points(
+    inputs: Inputs, own: Bool[Tensor, "B S N"] | None, state: MapState, grid: GridConfig, sensor: SensorConfig
+) -> GroundPoints:
     """Find the cell of each point, and how far its height is from the cell's elevation after the update.
+
+    Left out are points that are not finite or whose variance is not, out of the sensor's range, or on the robot.
 
     Args:
         inputs: of the update; M = S * N points.
-        state: of the maps after it.
+        own: points on the robot.
+        state: of the maps after the update.
         grid: the window.
-        noise: alpha_d and noise_floor [m^2] of sigma^2 = alpha_d d^2 + noise_floor (paper, Sec. II-A), for points
-            without variances of their own.
+        sensor: noise sigma^2 = alpha_d d^2 + noise_floor (paper, Sec. II-A) of points without variances, and the range.
     """
     points, T = inputs.points.float(), inputs.T_map_sensor
     finite = points.isfinite().all(-1) & T.isfinite().flatten(2).all(2)[..., None]
@@ -35,17 +40,17 @@ def find_speakers(inputs: Inputs, state: MapState, grid: GridConfig, noise: tupl
     origin = (T[..., :3, 3].double() - corner[:, None]).float()  # from the window's corner, and from z = 0
     x, y, z = ((T[..., None, k, :3].float() * p).sum(-1) + origin[..., k, None] for k in range(3))
     i, j = (torch.floor(value * (1 / grid.resolution)) for value in (x, y))
-    inside = finite & (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
+    inside = (i >= 0) & (i < grid.height) & (j >= 0) & (j < grid.width)
     i, j = (torch.where(inside, value, 0.0).to(torch.int64) for value in (i, j))
     slot = (i * grid.width + j).flatten(1)
     elevation, validity = (layer.flatten(1).gather(1, slot) for layer in (state.elevation, state.validity))
-    if inputs.variance is None:
-        variance = noise[0] * p.square().sum(-1) + noise[1]
-    else:
-        variance = torch.where(inputs.variance > 0, inputs.variance.float(), torch.inf)
-    return Speakers(slot, inside.flatten(1) & validity, (z.flatten(1) - elevation).abs(), variance.flatten(1))
-
-
-def floats_of(state: MapState) -> Float[Tensor, "B H W"]:
-    """Return the elevation in float32, NaN where it is not known."""
-    return torch.where(state.validity, state.elevation, torch.nan).float()
+    d2 = p.square().sum(-1)
+    counts = finite & inside & (d2 >= sensor.min_distance**2) & (d2 <= sensor.max_distance**2)
+    variance = sensor.noise_factor * d2 + sensor.noise_floor
+    if inputs.variance is not None:
+        variance = inputs.variance.float()
+        counts = counts & (variance > 0) & variance.isfinite()
+    if own is not None:
+        counts = counts & ~own
+    variance = torch.where(counts, variance, 1.0).flatten(1)
+    return GroundPoints(slot, counts.flatten(1) & validity, (z.flatten(1) - elevation).abs(), variance)

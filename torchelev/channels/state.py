@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchelev.channels.config import ChannelConfig
-from torchelev.ops.moving import move_layers
+from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -74,8 +73,21 @@ def follow(
 
 def move_channel(channel: Channel, shift: Int[Tensor, "B 2"]) -> Channel:
     """Return a channel whose window moved by whole cells; entering cells are blank."""
-    parts: Mapping[str, Tensor] = {str(k): part for k, part in enumerate(channel.values.unbind(-1))}
-    rest = {"weight": channel.weight} | ({} if channel.age is None else {"age": channel.age})
-    moved = move_layers(dict(parts) | rest, shift, {})
-    values = torch.stack([moved[name] for name in parts], -1)
-    return Channel(values, moved["weight"], moved.get("age"))
+    H, W = channel.weight.shape[1:]
+    i = torch.arange(H, device=shift.device)[None, :, None] + shift[:, 0, None, None]
+    j = torch.arange(W, device=shift.device)[None, None, :] + shift[:, 1, None, None]
+    stays = (i >= 0) & (i < H) & (j >= 0) & (j < W)
+    place = (i.clamp(0, H - 1) * W + j.clamp(0, W - 1)).flatten(1)
+
+    def moved(values: Tensor) -> Tensor:
+        given = values.flatten(1, 2) if values.ndim == 4 else values.flatten(1)[..., None]
+        found = given.gather(1, place[..., None].expand(-1, -1, given.shape[-1])).view(values.shape)
+        return torch.where(stays[..., None] if values.ndim == 4 else stays, found, 0.0)
+
+    age = None if channel.age is None else moved(channel.age)
+    return Channel(moved(channel.values), moved(channel.weight), age)
+
+
+def known_elevation(state: MapState) -> Float[Tensor, "B H W"]:
+    """Return the elevation [m] in float32, NaN where it is not known."""
+    return torch.where(state.validity, state.elevation, torch.nan).float()

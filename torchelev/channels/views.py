@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.channels.camera import View, largest_radius
 from torchelev.channels.config import KINDS, ChannelConfig
+from torchelev.channels.native import LIBRARY as UPDATES
 from torchelev.channels.state import Channel
 from torchelev.grid import GridConfig
 from torchelev.kernels.cpu_build import call, load
@@ -43,10 +44,16 @@ class _Painting(ctypes.Structure):
     )
 
 
+def build_libraries() -> None:
+    """Build what updates and paintings of channels run on, if there is a compiler."""
+    for library in (LIBRARY, UPDATES):
+        load(*library)
+
+
 def can_paint(channel: Channel) -> bool:
     """Return whether `paint_in_cpp` takes the channel."""
-    is_single = channel.values.dtype == torch.float32
-    return is_single and is_readable(channel.values) and load(*LIBRARY) is not None
+    is_plain = channel.values.dtype == torch.float32 and channel.values.is_contiguous()
+    return is_plain and is_readable(channel.values) and load(*LIBRARY) is not None
 
 
 def paint_in_cpp(
@@ -97,7 +104,7 @@ def look_in_cpp(
 
 def _pack(
     state: MapState, grid: GridConfig, K: Tensor, T: Tensor, distortion: Tensor | None
-) -> Float[Tensor, "B V 27"]:
+) -> Float[Tensor, "B V 26"]:
     """Return the cameras as `Camera` of camera.h."""
     first = (state.corner.double() + 0.5) * grid.resolution
     place = torch.cat([first[:, None] - T[..., :2, 3].double(), T[..., 2, 3, None].double()], -1)

@@ -5,8 +5,6 @@ Filters of this library do the same without their limits: `inpaint_minimum`, `bo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -15,9 +13,6 @@ from torch import Tensor
 from torchelev.errors import require, require_count
 from torchelev.filters.registry import register
 from torchelev.layers import Layer
-
-if TYPE_CHECKING:
-    pass
 
 _LEVELS = 255  # of the images that its filters make of a layer
 

@@ -35,7 +35,7 @@ class Inputs(NamedTuple):
 
 
 class TakesInputs(Protocol[_ResultOut]):
-    """The signature of `update` and `measure`.
+    """The signature of `measure`.
 
     `dt` is required but follows `T_map_base`, which may be left out. Two overloads make type checkers ask for it.
     """
@@ -65,9 +65,47 @@ class TakesInputs(Protocol[_ResultOut]):
     ) -> _ResultOut: ...
 
 
+class TakesFeatures(Protocol):
+    """The signature of `update`.
+
+    As `TakesInputs`, with what points bring for channels.
+    """
+
+    @overload
+    def __call__(
+        self,
+        points: Tensor,
+        T_map_sensor: Tensor,
+        T_map_base: Tensor | None,
+        dt: float | Tensor,
+        *,
+        variance: Tensor | None = None,
+        T_base_links: Tensor | None = None,
+        pose_covariance: Tensor | None = None,
+        features: Any = None,  # a Mapping, but other arguments come as dicts of tensors
+    ) -> None: ...
+    @overload
+    def __call__(
+        self,
+        points: Tensor,
+        T_map_sensor: Tensor,
+        *,
+        dt: float | Tensor,
+        variance: Tensor | None = None,
+        T_base_links: Tensor | None = None,
+        pose_covariance: Tensor | None = None,
+        features: Any = None,  # a Mapping, but other arguments come as dicts of tensors
+    ) -> None: ...
+
+
 def requires_dt(method: Callable[..., _Result]) -> TakesInputs[_Result]:
     """Return the method unchanged, typed such that type checkers require `dt`."""
     return cast(TakesInputs[_Result], method)
+
+
+def takes_features(method: Callable[..., None]) -> TakesFeatures:
+    """Return `update` unchanged, typed such that type checkers require `dt`."""
+    return cast(TakesFeatures, method)
 
 
 def check_inputs(

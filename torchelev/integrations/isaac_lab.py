@@ -69,7 +69,7 @@ class MapObservation(MapTerm, ManagerTermBase):
         sensors = to_names("sensor_cfg", cfg.params.get("sensor_cfg"))
         (asset,) = to_names("asset_cfg", cfg.params.get("asset_cfg", "robot"))
         robot = find(env.scene, "asset_cfg", asset, env.scene.keys())
-        feet = _find_feet(getattr(type(self).read, "num_feet", 0), cfg.params.get("feet_cfg"))
+        feet = _find_feet(getattr(type(self).read, "num_feet", 0), cfg.params.get("feet_cfg"), asset)
         source = IsaacLabSource(sensors, asset, _find_order(type(self).quaternions, robot), feet)
         source.check(env, require_cadence(cfg.params.get("update_every", 1)) * env.step_dt)
         self._set_up(cfg, env, source)
@@ -169,16 +169,17 @@ def _find_order(given: str | None, robot: Any) -> str:
     return given or ("wxyz" if isinstance(robot.data.root_link_quat_w, Tensor) else "xyzw")
 
 
-def _find_feet(num_feet: int, feet_cfg: Any) -> tuple[int, ...]:
+def _find_feet(num_feet: int, feet_cfg: Any, asset: str) -> tuple[int, ...]:
     """Return the ids of the feet's bodies, which the manager has found by their names."""
     if not num_feet:
         return ()
-    ids = getattr(feet_cfg, "body_ids", ())
-    feet = tuple(ids) if isinstance(ids, list | tuple) else ()
-    rule = f"must name the {num_feet} feet of read"
-    hint = 'give SceneEntityCfg("robot", body_names=...) of the feet'
-    require(len(feet) == num_feet, "feet_cfg", rule, f"{len(feet)} bodies", hint)
-    return feet
+    ids: Any = getattr(feet_cfg, "body_ids", None)
+    name = getattr(feet_cfg, "name", None)
+    fits = isinstance(ids, list | tuple) and len(ids) == num_feet and name == asset
+    rule = f"must name the {num_feet} feet of read among the bodies of {asset!r}"
+    hint = f"give SceneEntityCfg({asset!r}, body_names=...) of the feet"
+    require(fits, "feet_cfg", rule, f"bodies {ids!r} of {name!r}", hint)
+    return tuple(ids)
 
 
 def _is_camera(sensor: Any) -> bool:

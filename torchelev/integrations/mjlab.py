@@ -20,7 +20,15 @@ from torchelev import HeightScan, depth_to_points
 from torchelev.errors import require
 from torchelev.frames import transform, transform_matrix
 from torchelev.integrations.map_term import MapTerm, Reader
-from torchelev.integrations.scene import find, require_one_origin, to_names
+from torchelev.integrations.scene import (
+    find,
+    own_geoms,
+    pinhole,
+    require_one_origin,
+    require_plain_camera,
+    require_unit,
+    to_names,
+)
 from torchelev.integrations.step_map import Cloud, join, to_cloud
 
 if TYPE_CHECKING:
@@ -37,7 +45,8 @@ class MapObservation(MapTerm):
     - entity_name: the robot, whose root link is the base.
     - update_every: control steps from one update to the next.
     - standing_height: height of the base over flat ground [m], which an empty map reads.
-    - miss_value: what unknown points read [m], as mjlab's `height_scan` has it for rays that miss; None: `read.fill`.
+    - miss_value: what unknown points read [m], as mjlab's `height_scan` has it for rays that miss; None: as `read`
+      fills them.
     - feet_sensor_name: a `TerrainHeightSensor` or another `RayCastSensor` whose frames are the feet, for a `read`
       around feet, `HeightScan.feet`.
 
@@ -120,10 +129,7 @@ def _casts_rays(sensor: Any) -> bool:
 def _check_rays(env: Any, name: str, sensor: Any) -> None:
     starts, directions = sensor.cfg.pattern.generate_rays(env.sim.mj_model, env.device)
     require_one_origin("sensor_name", name, torch.cat([starts, torch.zeros_like(starts[:1])]))
-    lengths = torch.linalg.vector_norm(directions, dim=-1)
-    rule, hint = f"the rays of {name!r} must have unit vectors as directions", "divide them by their norms"
-    actual = f"lengths from {lengths.min():.3g} to {lengths.max():.3g}"
-    require(bool(((lengths - 1).abs() < 1e-3).all()), "sensor_name", rule, actual, hint)
+    require_unit("sensor_name", f"the rays of {name!r} must have unit vectors as directions", directions)
 
 
 def _check_camera(env: Any, name: str, sensor: Any) -> None:
@@ -133,10 +139,9 @@ def _check_camera(env: Any, name: str, sensor: Any) -> None:
     types = sensor.cfg.data_types
     rule, hint = f"{name!r} must measure depth", 'set data_types=("depth",) of CameraSensorCfg'
     require("depth" in types, "sensor_name", rule, repr(types), hint)
-    size = [float(length) for length in env.sim.mj_model.cam_sensorsize[sensor.camera_idx]]
-    is_plain = not any(size) and not sensor.cfg.orthographic
-    rule, hint = f"{name!r} must be a perspective camera given by fovy", "leave out sensorsize and orthographic"
-    require(is_plain, "sensor_name", rule, f"sensorsize {size}, orthographic={sensor.cfg.orthographic}", hint)
+    rule, hint = f"{name!r} must be a perspective camera given by fovy", "leave out orthographic"
+    require(not sensor.cfg.orthographic, "sensor_name", rule, "orthographic=True", hint)
+    require_plain_camera("sensor_name", name, env.sim.mj_model, sensor.camera_idx)
 
 
 def _require_ground(env: Any, name: str, sensor: Any, robot: Any) -> None:
@@ -144,7 +149,7 @@ def _require_ground(env: Any, name: str, sensor: Any, robot: Any) -> None:
     model, cfg = env.sim.mj_model, sensor.cfg
     groups = cfg.include_geom_groups if _casts_rays(sensor) else cfg.enabled_geom_groups
     is_seen = np.isin(model.geom_group, range(6) if groups is None else groups)
-    is_own = model.body_rootid[model.geom_bodyid] == model.body_rootid[robot.indexing.root_body_id]
+    is_own = own_geoms(model, robot.indexing.root_body_id)
     rule, hint = (
         f"{name!r} must see more than the robot itself",
         "give it the group of the terrain's geoms, by default 0",
@@ -163,15 +168,8 @@ def _read_depth(env: Any, sensor: Any) -> Cloud:
     """Return the points of a depth image along the optical axis, in MuJoCo's camera axes; a miss has depth 0."""
     camera, data = sensor.camera_idx, env.sim.data
     depth = sensor.data.depth.squeeze(-1)
-    points = depth_to_points(depth, _intrinsics(env.sim.model.cam_fovy[:, camera], *depth.shape[1:]), frame="opengl")
+    points = depth_to_points(
+        depth, pinhole(env.sim.model.cam_fovy[:, camera], depth.shape[2], depth.shape[1]), frame="opengl"
+    )
     T_map_camera = transform_matrix(data.cam_xpos[:, camera], data.cam_xmat[:, camera])
     return Cloud(points[:, None], T_map_camera[:, None])
-
-
-def _intrinsics(fovy: Float[Tensor, "B"], height: int, width: int) -> Float[Tensor, "B 3 3"]:
-    """Return K [pixels] of cameras with a vertical field of view [deg]; the centre lies between the middle pixels."""
-    focal = height / (2 * torch.tan(torch.deg2rad(fovy) / 2))
-    K = torch.eye(3, dtype=focal.dtype, device=focal.device).repeat(len(focal), 1, 1)
-    K[:, 0, 0] = K[:, 1, 1] = focal
-    K[:, 0, 2], K[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
-    return K

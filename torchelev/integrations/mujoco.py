@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchelev.errors import require, require_positive
 from torchelev.frames import change_axes, transform_matrix
+from torchelev.integrations.scene import own_geoms, pinhole, require_plain_camera, require_unit
 from torchelev.sim import HeightField, surface_of
 
 try:
@@ -56,7 +57,7 @@ class MujocoRays:
     ) -> None:
         require_positive(max_distance=max_distance)
         self.model, self.body, self.max_distance = model, find_body(model, body), max_distance
-        self.directions = require_unit(directions).double().cpu()
+        self.directions = check_directions(directions).double().cpu()
         self.T_body_sensor = T_body_sensor.double().cpu()
         self._is_own = own_geoms(model, self.body)
 
@@ -110,7 +111,7 @@ class MujocoCamera:
         require_positive(max_distance=max_distance)
         self.camera, self.max_distance = find_camera(model, camera), max_distance
         #: K (3, 3) [pixels], which `MapFeed` takes as `intrinsics`
-        self.intrinsics = pinhole(float(model.cam_fovy[self.camera]), width, height)
+        self.intrinsics = pinhole(torch.tensor(model.cam_fovy[self.camera], dtype=torch.float64), width, height)
         self._renderer = mujoco.Renderer(model, height, width)
         self._renderer.enable_depth_rendering()
         self._options = mujoco.MjvOption()
@@ -155,32 +156,16 @@ def find_body(model: mujoco.MjModel, name: str) -> int:
 def find_camera(model: mujoco.MjModel, name: str) -> int:
     """Return the number of a perspective camera that is given by fovy; ValueError if there is none."""
     number = _find(model, mujoco.mjtObj.mjOBJ_CAMERA, "camera", "camera", name)
-    is_plain = not model.cam_sensorsize[number].any() and not model.cam_projection[number]
-    rule, hint = "must be a perspective camera given by fovy", "leave out sensorsize and orthographic"
-    require(bool(is_plain), "camera", rule, repr(name), hint)
+    require_plain_camera("camera", name, model, number)
     return number
 
 
-def own_geoms(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """Return which geoms belong to the tree of bodies of the robot that `body` is part of, (geoms,) bool."""
-    return model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
-
-
-def require_unit(directions: Float[Tensor, "N 3"]) -> Tensor:
-    """Return directions of rays if they are unit vectors, by which distances count; ValueError if not."""
+def check_directions(directions: Float[Tensor, "N 3"]) -> Tensor:
+    """Return directions of rays; ValueError unless they are unit vectors."""
     fits = directions.ndim == 2 and directions.shape[1] == 3
     require(fits, "directions", "must be vectors (N, 3)", tuple(directions.shape), "give one for each ray")
-    lengths = torch.linalg.vector_norm(directions.double(), dim=-1)
-    actual = f"lengths from {float(lengths.min()):.3g} to {float(lengths.max()):.3g}"
-    is_unit = bool(((lengths - 1).abs() < 1e-4).all())
-    require(is_unit, "directions", "must be unit vectors", actual, "divide them by their norms")
+    require_unit("directions", "must be unit vectors", directions)
     return directions
-
-
-def pinhole(fovy: float, width: int, height: int) -> Float[Tensor, "3 3"]:
-    """Return K [pixels] of a vertical field of view [deg]; the centre lies between the middle pixels."""
-    f = height / 2 / np.tan(np.radians(fovy) / 2)
-    return torch.tensor([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, argument: str, what: str, name: str) -> int:

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from torchelev.errors import require_positive
 from torchelev.frames import change_axes, transform_matrix
-from torchelev.integrations.mujoco import find_body, find_camera, own_geoms, pinhole, require_unit
+from torchelev.integrations.mujoco import check_directions, find_body, find_camera
+from torchelev.integrations.scene import own_geoms, pinhole
 
 try:
     import mujoco_warp
@@ -60,7 +61,7 @@ class WarpRays:
         require_positive(max_distance=max_distance)
         self.model, self.data, self.body, self.max_distance = model, data, find_body(mj_model, body), max_distance
         device = torch.device(str(wp.device_to_torch(data.xpos.device)))
-        self.directions = require_unit(directions).float().to(device)
+        self.directions = check_directions(directions).float().to(device)
         self.T_body_sensor = T_body_sensor.float().to(device)
         # Geom -1 is a miss: it reads the last entry.
         is_ground = torch.from_numpy(~own_geoms(mj_model, self.body))
@@ -126,12 +127,12 @@ class WarpCamera:
         self.model, self.data, self.max_distance = model, data, max_distance
         self.camera = find_camera(mj_model, camera)
         #: K (3, 3) [pixels], which `MapFeed` takes as `intrinsics`
-        self.intrinsics = pinhole(float(mj_model.cam_fovy[self.camera]), width, height)
+        self.intrinsics = pinhole(torch.tensor(mj_model.cam_fovy[self.camera], dtype=torch.float64), width, height)
         options: dict[str, Any] = {"render_rgb": False, "render_depth": True, "enabled_geom_groups": list(groups)}
         self._context = mujoco_warp.create_render_context(
             mj_model, data.nworld, (width, height), cam_active=[camera], **options
         )
-        # Not `get_depth`, which clamps to its scale: what is farther would become a wall.
+        # Not mujoco_warp.get_depth, which clamps to its scale: what is farther would become a wall.
         self._depth = _shared(self._context.depth_data).view(data.nworld, height, width)
 
     def T_map_sensor(self) -> Float[Tensor, "B 4 4"]:

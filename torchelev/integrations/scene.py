@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from torchelev.errors import require
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 def to_names(parameter: str, value: Any) -> tuple[str, ...]:
@@ -37,3 +42,33 @@ def require_one_origin(parameter: str, name: str, starts: Tensor) -> None:
     rule = f"the rays of {name!r} must start at one point, as those of cameras and lidars do"
     hint = "give it a pinhole or lidar pattern; parallel rays from above see the ground through everything"
     require(spread < 1e-6, parameter, rule, f"starts that are up to {spread:.3g} m apart", hint)
+
+
+def require_unit(parameter: str, rule: str, directions: Tensor) -> None:
+    """Refuse directions (..., 3) that are no unit vectors, in whose lengths a simulator may count distances."""
+    lengths = torch.linalg.vector_norm(directions.double(), dim=-1)
+    actual = f"lengths from {float(lengths.min()):.3g} to {float(lengths.max()):.3g}"
+    require(bool(((lengths - 1).abs() < 1e-3).all()), parameter, rule, actual, "divide them by their norms")
+
+
+def own_geoms(model: Any, body: int) -> np.ndarray:
+    """Return which geoms of a MuJoCo model belong to the tree of bodies that `body` is part of, (geoms,) bool."""
+    return model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+
+
+def require_plain_camera(parameter: str, name: str, model: Any, camera: int) -> None:
+    """Refuse a camera of a MuJoCo model that is not a perspective one given by fovy."""
+    size = [float(length) for length in model.cam_sensorsize[camera]]
+    is_parallel = bool(getattr(model, "cam_projection", [0] * (camera + 1))[camera])
+    rule, hint = f"{name!r} must be a perspective camera given by fovy", "leave out sensorsize and orthographic"
+    actual = f"sensorsize {size}, orthographic={is_parallel}"
+    require(not any(size) and not is_parallel, parameter, rule, actual, hint)
+
+
+def pinhole(fovy: Float[Tensor, "*B"], width: int, height: int) -> Float[Tensor, "*B 3 3"]:
+    """Return K [pixels] of vertical fields of view [deg]; the centre lies between the middle pixels."""
+    focal = height / (2 * torch.tan(torch.deg2rad(fovy) / 2))
+    K = torch.eye(3, dtype=focal.dtype, device=focal.device).expand(*focal.shape, 3, 3).clone()
+    K[..., 0, 0] = K[..., 1, 1] = focal
+    K[..., 0, 2], K[..., 1, 2] = (width - 1) / 2, (height - 1) / 2
+    return K

@@ -36,7 +36,7 @@ struct Camera {
     }
 };
 
-// The ground of one map, H x W cells of one metre; -inf where it is not known.
+// The ground of one map of H x W cells; -inf where it is not known.
 struct Ground {
     const float* high;  // [m]
     int64_t H, W;
@@ -45,8 +45,10 @@ struct Ground {
     // below the ground between its ends, looked at once for each cell along its longer side.
     bool hides(float i, float j, float z, float di, float dj, float dz, float margin) const {
         const float steps = std::fmax(std::fmax(std::ceil(std::fabs(di)), std::ceil(std::fabs(dj))), 1.0f);
-        for (int k = 1; k < int(steps); k++) {
-            const float share = float(k) / steps, a = std::floor(i + share * di), b = std::floor(j + share * dj);
+        const int64_t most = H > W ? H : W;  // what lies farther back is out of the window
+        for (int64_t back = 1; back < most && float(back) < steps; back++) {
+            const float share = (steps - float(back)) / steps;
+            const float a = std::floor(i + share * di), b = std::floor(j + share * dj);
             if (!(a >= 0 && a < float(H) && b >= 0 && b < float(W))) continue;
             if (high[int64_t(a) * W + int64_t(b)] > z + share * dz + margin) return true;
         }

@@ -28,6 +28,7 @@ struct Update {
     const float* points;          // (B, S, N, 3) [m] sensor frame
     const double* T_map_sensor;   // (B, S, 4, 4)
     const float* variance;        // (B, S, N) [m^2], or null
+    const uint8_t* own;           // (B, S, N) points on the robot, or null
     const float *dt, *drift;      // (B) [s], (B) [m] or null
     const int64_t* corner_now;    // (B, 2)
     const float* elevation;       // (B, H, W) [m]
@@ -37,7 +38,7 @@ struct Update {
     const Channel* channels;      // (K)
     int64_t B, S, N, H, W, K;
     double resolution;
-    float noise_factor, noise_floor;
+    float noise_factor, noise_floor, min_distance, max_distance;  // of the sensor [m]
 };
 
 // Give cell (i, j) of H x W cells of C values what was at (i, j) + by, or `blank` if that lies outside.
@@ -58,7 +59,7 @@ void move(float* layer, int64_t H, int64_t W, int64_t C, const int64_t* by, floa
 // Memory of one thread.
 struct Scratch {
     std::vector<int32_t> slot;             // cell of each point
-    std::vector<std::vector<int32_t>> points;  // that speak for a cell: of each part of them, by the range of the cell
+    std::vector<std::vector<int32_t>> points;  // over known cells: of each part of them, by the range of the cell
     std::vector<int64_t> count;                // of the points of each list
     std::vector<float> distance, weight;   // [m] from the cell's elevation; POINT / sigma^2
     std::vector<float> rise;               // of each cell [m] since the last update, NaN where it is not known
@@ -67,11 +68,13 @@ struct Scratch {
 
 // Where a sensor's points lie in the window, and how much they count.
 struct Frame {
-    float R[9], t[3], cells_per_meter, H, W, noise_factor, noise_floor;
+    float R[9], t[3], cells_per_meter, H, W, noise_factor, noise_floor, nearest2, farthest2;
     int32_t width;
 
-    Frame(const float* rotation, const float* origin, float per_meter, int32_t H, int32_t W, float factor, float floor)
-        : cells_per_meter(per_meter), H(float(H)), W(float(W)), noise_factor(factor), noise_floor(floor), width(W) {
+    Frame(const Update& u, const float* rotation, const float* origin)
+        : cells_per_meter(float(1 / u.resolution)), H(float(u.H)), W(float(u.W)), noise_factor(u.noise_factor),
+          noise_floor(u.noise_floor), nearest2(u.min_distance * u.min_distance),
+          farthest2(u.max_distance * u.max_distance), width(int32_t(u.W)) {
         std::copy(rotation, rotation + 9, R), std::copy(origin, origin + 3, t);
     }
 
@@ -80,7 +83,7 @@ struct Frame {
         const float d2 = x * x + y * y + z * z;
         const float i = std::floor((R[0] * x + R[1] * y + R[2] * z + t[0]) * cells_per_meter);
         const float j = std::floor((R[3] * x + R[4] * y + R[5] * z + t[1]) * cells_per_meter);
-        const bool inside = (d2 < NEVER) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
+        const bool inside = (d2 >= nearest2) & (d2 <= farthest2) & (d2 < NEVER) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
         cell = inside ? int32_t(inside ? i : 0) * width + int32_t(inside ? j : 0) : -1;
         height = R[6] * x + R[7] * y + R[8] * z + t[2];
         weight = channels::POINT / (noise_factor * d2 + noise_floor);
@@ -191,7 +194,7 @@ class Map {
         }
     }
 
-    // Find the cells of points `begin` to `end`, a part of those of sensor s, and how they speak for them.
+    // Find the cells of points `begin` to `end`, a part of those of sensor s, and how much they count.
     void find(int64_t s, int64_t part, int64_t begin, int64_t end, const float* R, const float* t) {
         const float* p = u.points + 3 * ((b * u.S + s) * u.N + begin);
         const float* variance = u.variance ? u.variance + (b * u.S + s) * u.N + begin : nullptr;
@@ -199,9 +202,14 @@ class Map {
         float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, height[BLOCK], share[BLOCK];
         int32_t cell[BLOCK];
         for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
-        const Frame frame(R, t, float(1 / u.resolution), int32_t(u.H), int32_t(u.W), u.noise_factor, u.noise_floor);
+        const Frame frame(u, R, t);
         for (int64_t n = 0; n < BLOCK; n++) frame.place(x[n], y[n], z[n], cell[n], height[n], share[n]);
-        for (int64_t n = 0; variance && n < number; n++) share[n] = variance[n] > 0 ? channels::POINT / variance[n] : 0;
+        for (int64_t n = 0; variance && n < number; n++) {
+            const bool is_sound = variance[n] > 0 && variance[n] < NEVER;
+            share[n] = channels::POINT / variance[n], cell[n] = is_sound ? cell[n] : -1;
+        }
+        const uint8_t* is_own = u.own ? u.own + (b * u.S + s) * u.N + begin : nullptr;
+        for (int64_t n = 0; is_own && n < number; n++) cell[n] = is_own[n] ? -1 : cell[n];
         int32_t* slot = own.slot.data() + m;
         float *distance = own.distance.data() + m, *weight = own.weight.data() + m;
         const float* elevation = u.elevation + b * cells;
@@ -243,7 +251,7 @@ class Map {
                 float zero = 0;  // NaN where a value is not finite
                 for (int64_t k = 0; k < C; k++) zero += x[k] * 0;
                 const float w = weighted ? own.weight[m] : 1.0f;
-                if (!(own.distance[m] <= channel.tolerance) || zero != 0 || !(w > 0)) continue;
+                if (!(own.distance[m] <= channel.tolerance) || zero != 0) continue;
                 float* sum = sums + own.slot[m] * stride;
                 for (int64_t k = 0; k < C; k++)
                     sum[k] = !is_maximum ? sum[k] + w * x[k] : sum[C] > 0 ? std::max(sum[k], x[k]) : x[k];

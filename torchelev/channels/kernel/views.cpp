@@ -8,6 +8,8 @@
 #include "channels/kernel/equation.h"
 #include "kernels/threads.h"
 
+static_assert(sizeof(channels::Camera) == 26 * sizeof(float), "as `_pack` of views.py");
+
 // `_Views` of views.py.
 struct Views {
     const channels::Camera* cameras;  // (B, V)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from torchelev.config import ElevationMapConfig
 from torchelev.config_files import read_settings
+from torchelev.errors import require
 from torchelev.io.em_cupy.channels import GROUPS, read_channels
 from torchelev.io.em_cupy.parameters import NODE_PARAMETERS, read_parameters
 from torchelev.io.em_cupy.plugins import PLUGINS, is_plugin, read_plugins
@@ -58,12 +59,13 @@ def load_config(
     names = [name for name in given if name in PLUGINS or is_plugin(given[name])]
     filters, plugin_notes = read_plugins({name: given.pop(name) for name in names})
     fusions = {name: given.pop(name) for name in GROUPS if name in given}
-    average_weight = float(given.get("average_weight", 0.5))
+    average_weight = given.get("average_weight", 0.5)
+    is_share = isinstance(average_weight, int | float) and 0 <= average_weight < 1
+    require(is_share, "average_weight", "must lie in [0, 1)", repr(average_weight), "give 0.5")
     parsed, channel_notes = read_channels(fusions, tuple(channels), average_weight)
     settings, notes = read_parameters(given)
-    cfg = ElevationMapConfig.from_dict(settings | {"filters": [step.to_dict() for step in filters]})
-    values = cfg.to_dict() | {"channels": parsed}
-    return Converted(ElevationMapConfig.from_dict(values), (*notes, *plugin_notes, *channel_notes))
+    settings |= {"filters": [step.to_dict() for step in filters], "channels": parsed}
+    return Converted(ElevationMapConfig.from_dict(settings), (*notes, *plugin_notes, *channel_notes))
 
 
 def _settings_of(path: str | Path) -> dict[str, Any]:

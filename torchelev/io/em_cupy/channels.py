@@ -19,7 +19,7 @@ class Fusion(NamedTuple):
     note: str = ""  #: what differs
 
 
-KINDS_THERE: dict[str, Fusion] = {
+FUSIONS: dict[str, Fusion] = {
     "color": Fusion({"kind": "color"}, "is the mean over all updates here, that of the newest there"),
     "average": Fusion({"kind": "exponential", "rate": 1.0}, "outliers do not count here; there they do in the sum"),
     "exponential": Fusion({"kind": "exponential", "rate": 0.7}),
@@ -45,10 +45,8 @@ def read_channels(
             rule = next((kind for pattern, kind in rules.items() if re.fullmatch(pattern, name)), rules.get("default"))
             if rule is None or rule == "none" or name in channels:
                 continue
-            require(
-                rule in KINDS_THERE, f"{group}.{name}", f"must be one of {', '.join(KINDS_THERE)}", rule, "correct it"
-            )
-            kind = KINDS_THERE[rule]
+            require(rule in FUSIONS, f"{group}.{name}", f"must be one of {', '.join(FUSIONS)}", rule, "correct it")
+            kind = FUSIONS[rule]
             settings = kind.settings | ({"rate": 1 - average_weight} if rule == "class_average" else {})
             channels[name] = ChannelConfig(**settings)
             if kind.note:

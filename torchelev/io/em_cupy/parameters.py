@@ -14,21 +14,21 @@ GONE = "has no equal"
 class Rule(NamedTuple):
     """What becomes of a parameter."""
 
-    here: str = ""  #: setting here, dotted; "" for none
+    setting: str = ""  #: the setting here, dotted; "" for none
     note: str = ""  #: what differs; "" if it means the same
-    convert: Callable[[Any], Any] | None = None  #: its value here; None: the default stays
+    convert: Callable[[Any], Any] | None = None  #: its value as that setting; None: the default stays
 
 
 def _same(value: Any) -> Any:
     return value
 
 
-def _taken(here: str, note: str = "") -> Rule:
-    return Rule(here, note, _same)
+def _taken(setting: str, note: str = "") -> Rule:
+    return Rule(setting, note, _same)
 
 
-def _kept(here: str, note: str) -> Rule:
-    return Rule(here, f"{note}; the default of {here} is kept")
+def _kept(setting: str, note: str) -> Rule:
+    return Rule(setting, f"{note}; the default of {setting} is kept")
 
 
 #: Parameters of core_param.yaml by name. Switches and lengths of the grid are converted apart.
@@ -79,7 +79,11 @@ PARAMETERS: dict[str, Rule] = {
     "dilation_size_initialize": Rule("", f"{GONE}: emap.initialize fills the hull of the feet, or the window"),
     "initialize_method": Rule("", "is an argument of emap.initialize"),
     "time_interval": Rule("", f"{GONE}: the layer time is exact"),
-    "average_weight": Rule("", "is the rate of channels of kind class_average"),
+    "average_weight": Rule("", "becomes rate = 1 - average_weight of channels of class_average"),
+    "cell_n": Rule("", "follows from resolution and map_length"),
+    "data_type": Rule("", f"{GONE}: maps are float32, or of the dtype that emap.to gives"),
+    "min_filter_size": Rule("", "is without effect there"),
+    "min_filter_iteration": Rule("", "is without effect there"),
     "enable_normal": Rule("", f"{GONE}: normals are layers, computed with each update"),
     "enable_normal_color": Rule("", f"{GONE}: normals are layers"),
 }
@@ -97,7 +101,7 @@ NODE_PARAMETERS = frozenset(
     "subscribers publishers map_frame base_frame corrected_map_frame pose_topic update_pose_fps map_acquire_fps "
     "publish_statistics_fps enable_pointcloud_publishing enable_drift_corrected_TF_publishing initialize_frame_id "
     "initialize_tf_offset initialize_tf_grid_size use_initializer_at_start plugin_config_file map_topic odom_frame "
-    "pointcloud_topics recordable_fps cell_n data_type min_filter_size min_filter_iteration use_sim_time".split()
+    "pointcloud_topics recordable_fps use_sim_time".split()
 )
 
 
@@ -117,7 +121,7 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]
         else:
             rule = PARAMETERS[name]
             if rule.convert is not None:
-                _set(settings, rule.here, _convert(name, value, rule))
+                _set(settings, rule.setting, _convert(name, value, rule))
             if rule.note:
                 notes.append(f"{name} = {value}: {rule.note}")
     if "grid" in settings:
@@ -146,6 +150,8 @@ def _set(settings: dict[str, Any], path: str, value: Any) -> None:
 def _square(grid: dict[str, Any]) -> list[str]:
     """Make the window a square of whole cells, in place; return a note if that changed its length."""
     resolution, length = grid.get("resolution", 0.04), grid.get("length_x", 8.0)
+    for name, value in (("resolution", resolution), ("map_length", length)):
+        require(value > 0, name, "must be positive", value, "give metres")
     cells = round(length / resolution)
     grid |= {"resolution": resolution, "length_x": cells * resolution, "length_y": cells * resolution}
     changed = abs(cells * resolution - length) > 1e-6

@@ -53,6 +53,8 @@ def read_plugins(plugins: Mapping[str, Any]) -> tuple[list[FilterConfig], list[s
     filters: list[FilterConfig] = []
     notes: list[str] = []
     for name, value in plugins.items():
+        is_group = isinstance(value, Mapping) and isinstance(value.get("extra_params") or {}, Mapping)
+        require(is_group, name, "must be a group of settings", repr(value), "give layer_name and extra_params")
         require(name in PLUGINS, name, f"must be a plugin: {', '.join(PLUGINS)}", name, "write it as a filter")
         if not value.get("enable", True):
             continue

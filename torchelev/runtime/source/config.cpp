@@ -76,7 +76,9 @@ void Config::read_setting(size_t k, const Json& value) {
         return;
     }
     if (setting.kind == ONLY_PYTHON) {
-        REQUIRE(value.kind == Json::NUL, where, "needs Python: this library has no " + std::string(setting.name), value.describe(),
+        const bool is_empty = value.kind == Json::OBJECT && value.members.empty() && std::string(setting.name) == "channels";
+        REQUIRE(value.kind == Json::NUL || is_empty, where,
+                "needs Python: this library has no " + std::string(setting.name), value.describe(),
                 "leave it out, or run the map in Python", TORCHELEV_UNSUPPORTED);
         return;
     }
