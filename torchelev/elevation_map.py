@@ -43,7 +43,7 @@ from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed
 from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement
 from torchelev.stages.initialize import METHODS, Site, initialize
-from torchelev.stages.measure.stage import find_points_on_robot, measure, time_step
+from torchelev.stages.measure.stage import find_own, measure, time_step
 from torchelev.state import MapState, Measurement, forget, forget_cells, map_layers
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ class ElevationMap(PaintedMap, ReadableMap):
             with torch.no_grad():
                 write(state, self._write_back(before, state))
         if self.channels is not None:
-            own = find_points_on_robot(inputs, self.cfg.sensor) if given else None
+            own = find_own(inputs, self.cfg.sensor) if given else None
             self.channels.update(self.state, time_step(inputs.dt, torch.float32), inputs, own, given)
         if self.cfg.completion is not None and self.cfg.completion.when == "update":
             self._complete()

@@ -217,7 +217,9 @@ def every_kind():
 @pytest.mark.slow(2)
 def test_cpp_computes_what_tensors_define(monkeypatch):
     """Points of two sensors, some of which are not finite, over windows that move and ground that changes."""
-    maps = [make(num_envs=3, **every_kind()) for _ in range(2)]
+    body = BodyConfig(lower=(-0.5, -0.3, -2.0), upper=(0.4, 0.3, 0.5))
+    cfg = ElevationMapConfig(grid=GRID, sensor=SensorConfig(body=body), channels=every_kind())
+    maps = [ElevationMap(cfg, num_envs=3) for _ in range(2)]
     generator = torch.Generator().manual_seed(0)
     can_update = module.can_update
     assert can_update({"a": maps[0].channels.channel("of_mean")}, maps[0].state), "without C++, this compares nothing"

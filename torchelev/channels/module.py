@@ -79,7 +79,7 @@ class Channels(nn.Module):
             state: of the maps after it.
             dt: time since the last update [s], finite and not negative.
             inputs: of the update.
-            own: points on the robot.
+            own: points on the robot's links; those in its box are found here.
             features: values of the points by channel.
         """
         self._change(state, dt, inputs, own, features)

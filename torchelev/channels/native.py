@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchelev.channels.config import KINDS, ChannelConfig
+from torchelev.channels.points import box_of
 from torchelev.channels.state import Channel, Ground
 from torchelev.grid import GridConfig
 from torchelev.kernels.cpu_build import call, load
@@ -38,7 +39,7 @@ class _Channel(ctypes.Structure):
 
 
 _MAPS = (
-    *("points", "T_map_sensor", "variance", "own", "dt", "drift"),
+    *("points", "T_map_sensor", "variance", "own", "T_base_sensor", "box", "dt", "drift"),
     *("corner_now", "elevation", "validity", "corner", "height"),
 )
 
@@ -79,12 +80,14 @@ def update_in_cpp(
     B = len(ground.corner)
     drift = None if dt is None else state.statistics.drift_correction
     given = {name: x.contiguous() for name, x in features.items()} if inputs is not None else {}
-    cloud: list[Tensor | None] = [None] * 4
+    cloud: list[Tensor | None] = [None] * 6
     S = N = 0
     if inputs is not None and given:
         S, N = inputs.points.shape[1:3]
         variance = None if inputs.variance is None else inputs.variance.float()
-        cloud = [inputs.points.float(), inputs.T_map_sensor.double(), variance, own]
+        T_base_sensor, *corners = box_of(inputs, sensor) or (None,)
+        box = torch.tensor(corners) if corners else None
+        cloud = [inputs.points.float(), inputs.T_map_sensor.double(), variance, own, T_base_sensor, box]
     times = [torch.zeros(B) if dt is None else dt.float(), drift]
     maps = [state.corner, state.elevation, state.validity]
     read = [None if value is None else value.contiguous() for value in (*cloud, *times, *maps)]

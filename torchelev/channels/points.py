@@ -12,7 +12,7 @@ from torchelev.grid import GridConfig
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool
+    from jaxtyping import Bool, Float
 
     from torchelev.inputs.update_inputs import Inputs
     from torchelev.stages.measure.config import SensorConfig
@@ -27,7 +27,7 @@ def match_points(
 
     Args:
         inputs: of the update; M = S * N points.
-        own: points on the robot.
+        own: points on the robot's links.
         state: of the maps after the update.
         grid: the window.
         sensor: noise sigma^2 = alpha_d d^2 + noise_floor (paper, Sec. II-A) of points without variances, and the range.
@@ -52,5 +52,30 @@ def match_points(
         counts = counts & (variance > 0) & variance.isfinite()
     if own is not None:
         counts = counts & ~own
+    box = box_of(inputs, sensor)
+    if box is not None:
+        T_base_sensor, lower, upper = box
+        inside_box = torch.ones_like(counts)
+        for axis in range(3):
+            rotation, place = T_base_sensor[..., None, axis, :3].float(), T_base_sensor[..., axis, 3, None].float()
+            coordinate = (rotation * p).sum(-1) + place
+            inside_box = inside_box & (coordinate >= lower[axis]) & (coordinate <= upper[axis])
+        counts = counts & ~inside_box
     variance = torch.where(counts, variance, 1.0).flatten(1)
     return GroundPoints(slot, counts.flatten(1) & validity, (z.flatten(1) - elevation).abs(), variance)
+
+
+def box_of(
+    inputs: Inputs, sensor: SensorConfig
+) -> tuple[Float[Tensor, "B S 4 4"], tuple[float, ...], tuple[float, ...]] | None:
+    """Return T_base_sensor, and the corners [m] of the robot's box in the base frame; None without a box or a base."""
+    lower, upper = getattr(sensor.body, "lower", None), getattr(sensor.body, "upper", None)
+    if lower is None or upper is None or inputs.T_map_base is None:
+        return None
+    T_map_base, T_map_sensor = inputs.T_map_base.double()[:, None], inputs.T_map_sensor.double()
+    R = T_map_base[..., :3, :3].mT  # the inverse of a rotation
+    T_base_sensor = T_map_sensor.clone()
+    T_base_sensor[..., :3, :3] = R @ T_map_sensor[..., :3, :3]
+    difference = T_map_sensor[..., :3, 3] - T_map_base[..., :3, 3]  # before the rotation: far from the origin, too
+    T_base_sensor[..., :3, 3] = (R @ difference[..., None])[..., 0]
+    return T_base_sensor, lower, upper

@@ -28,7 +28,9 @@ struct Update {
     const float* points;          // (B, S, N, 3) [m] sensor frame
     const double* T_map_sensor;   // (B, S, 4, 4)
     const float* variance;        // (B, S, N) [m^2], or null
-    const uint8_t* own;           // (B, S, N) points on the robot, or null
+    const uint8_t* own;           // (B, S, N) points on the robot's links, or null
+    const double* T_base_sensor;  // (B, S, 4, 4), or null without a box
+    const float* box;             // (2, 3) [m] lower and upper corner of the robot's box, base frame, or null
     const float *dt, *drift;      // (B) [s], (B) [m] or null
     const int64_t* corner_now;    // (B, 2)
     const float* elevation;       // (B, H, W) [m]
@@ -76,6 +78,16 @@ struct Frame {
           noise_floor(u.noise_floor), nearest2(u.min_distance * u.min_distance),
           farthest2(u.max_distance * u.max_distance), width(int32_t(u.W)) {
         std::copy(rotation, rotation + 9, R), std::copy(origin, origin + 3, t);
+    }
+
+    // Return whether a point lies in a box of the base frame, where the sensor is at `place`.
+    static bool is_inside(const float* turn, const float* place, const float* box, float x, float y, float z) {
+        bool inside = true;
+        for (int axis = 0; axis < 3; axis++) {
+            const float c = turn[3 * axis] * x + turn[3 * axis + 1] * y + turn[3 * axis + 2] * z + place[axis];
+            inside &= (c >= box[axis]) & (c <= box[3 + axis]);
+        }
+        return inside;
     }
 
     // Find the cell of a point, -1 out of the window, its height, and POINT / sigma^2.
@@ -207,6 +219,17 @@ class Map {
         for (int64_t n = 0; variance && n < number; n++) {
             const bool is_sound = variance[n] > 0 && variance[n] < NEVER;
             share[n] = channels::POINT / variance[n], cell[n] = is_sound ? cell[n] : -1;
+        }
+        if (u.box) {
+            const double* T = u.T_base_sensor + 16 * (b * u.S + s);
+            float turn[9], place[3], box[6];
+            for (int row = 0; row < 3; row++) {
+                for (int k = 0; k < 3; k++) turn[3 * row + k] = float(T[4 * row + k]);
+                place[row] = float(T[4 * row + 3]);
+            }
+            std::copy(u.box, u.box + 6, box);
+            for (int64_t n = 0; n < BLOCK; n++)
+                cell[n] = Frame::is_inside(turn, place, box, x[n], y[n], z[n]) ? -1 : cell[n];
         }
         const uint8_t* is_own = u.own ? u.own + (b * u.S + s) * u.N + begin : nullptr;
         for (int64_t n = 0; is_own && n < number; n++) cell[n] = is_own[n] ? -1 : cell[n];

@@ -235,16 +235,3 @@ def find_own(inputs: Inputs, cfg: SensorConfig) -> Bool[Tensor, "B S N"] | None:
             return own
     sensed = gate_range(inputs.points.float(), None, sound, cfg)
     return on_links(sensed, T_map_sensor, T_map_base, T_base_links, cfg.body)
-
-
-def find_points_on_robot(inputs: Inputs, cfg: SensorConfig) -> Bool[Tensor, "B S N"] | None:
-    """Return which points of an update's inputs lie on the robot, in its box or on its links; None without a body."""
-    if not isinstance(cfg.body, BodyConfig) or inputs.T_map_base is None:
-        return find_own(inputs, cfg)
-    sound, T_map_sensor, T_map_base, _ = sound_poses(inputs.T_map_sensor, inputs.T_map_base, None)
-    assert T_map_base is not None
-    base = T_map_base[:, :3, 3].double()
-    sensed = gate_range(inputs.points.float(), None, sound, cfg)
-    origin = (T_map_sensor[..., :3, 3].double() - base[:, None]).float()
-    position = transform(sensed, T_map_sensor[..., :3, :3].float(), origin).position.transpose(1, 2)
-    return inside_body(position, T_map_base, torch.zeros_like(base).float(), cfg.body).view(sensed.x.shape)
