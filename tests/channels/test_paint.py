@@ -207,7 +207,12 @@ def test_a_camera_far_away_takes_no_time_and_sees_nothing():
         (
             {"K": 10 * K},
             ValueError,
-            "K: must have positive focal lengths and its centre in the image of 80 x 60 pixels",
+            "K: must have positive focal lengths and its centre in the middle of the image of 80 x 60",
+        ),
+        (
+            {"K": K * torch.tensor([[0.5], [0.5], [1.0]])},
+            ValueError,
+            "K: must have positive focal lengths and its centre",
         ),
         ({"K": K[:2]}, ValueError, r"K: expected \(3, 3\), \(1, 3, 3\) or \(1, 1, 3, 3\), got \(2, 3\)"),
         ({"T_map_camera": torch.zeros(1, 4, 4)}, ValueError, "T_map_camera: must be rigid"),
