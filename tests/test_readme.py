@@ -46,3 +46,15 @@ def test_its_python_runs_from_the_first_block_to_the_last():
     blocks = [block for block in code_blocks(README.read_text()) if block.language == "python"]
     assert len(blocks) >= 5
     run_blocks(README, blocks)
+
+
+def test_the_table_of_stacks_is_the_one_of_the_docs():
+    def rows(text):
+        return [line for line in text.splitlines() if line.startswith("|")]
+
+    readme, install = (path.read_text() for path in (ROOT / "README.md", ROOT / "docs/install.md"))
+    ours = rows(readme.split("## Does it fit?")[1].split("\n## ")[0])
+    assert len(ours) > 10
+    assert [row.replace("](docs/howto/", "](howto/") for row in ours] == rows(
+        install.split("## Simulators and stacks")[1]
+    )
