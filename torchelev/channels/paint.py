@@ -105,7 +105,8 @@ def _check_intrinsics(K: Any, size: torch.Size, device: torch.device) -> Float[T
         focal, center = value.detach()[..., (0, 1), (0, 1)], value.detach()[..., :2, 2]
         limit = center.new_tensor([w, h])
         # Of an image of half or twice the size, the centre would lie outside of the middle half.
-        good = (focal > 0).all(-1) & ((center > limit / 4) & (center < 3 * limit / 4)).all(-1)
+        last_row = (value.detach()[..., 2, :] == value.new_tensor([0.0, 0.0, 1.0])).all(-1)
+        good = last_row & (focal > 0).all(-1) & ((center > limit / 4) & (center < 3 * limit / 4)).all(-1)
         rule = f"must have positive focal lengths and its centre in the middle of the image of {w} x {h} pixels"
         if not good.all():
             first = value.reshape(-1, 3, 3)[int(good.flatten().int().argmin())].tolist()
