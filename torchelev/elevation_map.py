@@ -17,6 +17,7 @@ from torch import Tensor
 from torchelev import pipeline
 from torchelev.channels.config import ChannelConfigs
 from torchelev.channels.inputs import check_features
+from torchelev.channels.painted_map import PaintedMap
 from torchelev.channels.views import build_libraries
 from torchelev.config import ElevationMapConfig
 from torchelev.diagnosis.forks import survive_forks
@@ -37,7 +38,6 @@ from torchelev.kernels.choose import Backend, choose
 from torchelev.map_buffers import without_shared_memory
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import is_readable, require_reverse_mode
-from torchelev.painted_map import PaintedMap
 from torchelev.pipeline import rate, update_by_tensors, update_in_place, write
 from torchelev.readable_map import ReadableMap
 from torchelev.stages.complete import forget_completed

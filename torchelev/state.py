@@ -116,12 +116,12 @@ def forget(state: MapState, grid: GridConfig, env_ids: Tensor | None, mask: Tens
         env_ids, mask = mask.nonzero()[:, 0], None  # mostly few: a mask would be read for every cell of all
     for name, value in (state._asdict() | state.statistics._asdict()).items():
         if name not in ("corner", "statistics"):
-            _fill(value, BLANK.get(name, 0), env_ids, mask)
+            fill(value, BLANK.get(name, 0), env_ids, mask)
     for corner, number in zip(state.corner.unbind(1), blank_corner(grid), strict=True):
-        _fill(corner, number, env_ids, mask)
+        fill(corner, number, env_ids, mask)
 
 
-def _fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | None) -> None:
+def fill(values: Tensor, blank: float, env_ids: Tensor | None, mask: Tensor | None) -> None:
     """Set the values (B, ...) of some environments, in place: those of the ids or of the mask, or all."""
     if env_ids is not None:
         values.index_fill_(0, env_ids, blank)

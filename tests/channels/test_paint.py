@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchelev import ElevationMap, ElevationMapConfig, FilterConfig, GridConfig, painted_map
-from torchelev.channels import camera, paint
+from torchelev import ElevationMap, ElevationMapConfig, FilterConfig, GridConfig
+from torchelev.channels import camera, paint, painted_map
 from torchelev.channels.config import KINDS, ChannelConfig
 from torchelev.frames import change_axes
 from torchelev.sim import mount

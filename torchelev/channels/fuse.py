@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchelev.channels.config import ChannelConfig
 from torchelev.channels.state import Channel
+from torchelev.ops.scatter import cell_sums, highest_per_cell
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -33,13 +34,11 @@ def accumulate(
     weight = POINT / points.variance if cfg.is_weighted else torch.ones_like(points.variance)
     weight = torch.where(counts, weight, 0.0)
     x = torch.where(counts[..., None], x, 0.0)
-    total = weight.new_zeros(len(x), num_cells).scatter_add(1, points.slot, weight)
-    index = points.slot[..., None].expand_as(x)
-    blank = x.new_zeros(len(x), num_cells, x.shape[-1])
+    *sums, total = cell_sums(points.slot, torch.stack([*(weight * c for c in x.unbind(-1)), weight]), num_cells)
     if cfg.kind == "maximum":
-        low = torch.where(counts[..., None], x, -torch.inf)
-        return (blank - torch.inf).scatter_reduce(1, index, low, "amax"), total
-    return blank.scatter_add(1, index, weight[..., None] * x), total
+        components = torch.where(counts[..., None], x, -torch.inf).unbind(-1)
+        sums = [highest_per_cell(points.slot, component, num_cells) for component in components]
+    return torch.stack(sums, -1), total
 
 
 def combine(

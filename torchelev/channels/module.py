@@ -15,7 +15,7 @@ from torchelev.channels.points import match_points
 from torchelev.channels.state import Channel, Ground, blank_channel, follow, known_elevation
 from torchelev.grid import GridConfig
 from torchelev.ops.moving import move_layers
-from torchelev.state import MapState, blank_corner
+from torchelev.state import MapState, blank_corner, fill
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -134,12 +134,8 @@ class Channels(nn.Module):
         """Forget all channels of some environments, or of all."""
         for name in self.cfg:
             for part in self.channel(name):
-                if part is not None and env_ids is not None:
-                    part.index_fill_(0, env_ids, 0)
-                elif part is not None and mask is not None:
-                    part.masked_fill_(mask.view(-1, *[1] * (part.ndim - 1)), 0)
-                elif part is not None:
-                    part.zero_()
+                if part is not None:
+                    fill(part, 0, env_ids, mask)
 
     @property
     def layers(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.channels.config import ChannelConfig
+from torchelev.ops.moving import sources
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -73,16 +74,13 @@ def follow(
 
 def move_channel(channel: Channel, shift: Int[Tensor, "B 2"]) -> Channel:
     """Return a channel whose window moved by whole cells; entering cells are blank."""
-    H, W = channel.weight.shape[1:]
-    i = torch.arange(H, device=shift.device)[None, :, None] + shift[:, 0, None, None]
-    j = torch.arange(W, device=shift.device)[None, None, :] + shift[:, 1, None, None]
-    stays = (i >= 0) & (i < H) & (j >= 0) & (j < W)
-    place = (i.clamp(0, H - 1) * W + j.clamp(0, W - 1)).flatten(1)
+    place, entering = sources(shift, *channel.weight.shape[1:])
+    place = place.flatten(1)
 
     def moved(values: Tensor) -> Tensor:
         given = values.flatten(1, 2) if values.ndim == 4 else values.flatten(1)[..., None]
         found = given.gather(1, place[..., None].expand(-1, -1, given.shape[-1])).view(values.shape)
-        return torch.where(stays[..., None] if values.ndim == 4 else stays, found, 0.0)
+        return torch.where(entering[..., None] if values.ndim == 4 else entering, 0.0, found)
 
     age = None if channel.age is None else moved(channel.age)
     return Channel(moved(channel.values), moved(channel.weight), age)

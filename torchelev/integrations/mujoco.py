@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchelev.errors import require, require_positive
 from torchelev.frames import change_axes, transform_matrix
-from torchelev.integrations.scene import own_geoms, pinhole, require_plain_camera, require_unit
+from torchelev.integrations.scene import check_directions, own_geoms, pinhole, require_plain_camera
 from torchelev.sim import HeightField, surface_of
 
 try:
@@ -158,14 +158,6 @@ def find_camera(model: mujoco.MjModel, name: str) -> int:
     number = _find(model, mujoco.mjtObj.mjOBJ_CAMERA, "camera", "camera", name)
     require_plain_camera("camera", name, model, number)
     return number
-
-
-def check_directions(directions: Float[Tensor, "N 3"]) -> Tensor:
-    """Return directions of rays; ValueError unless they are unit vectors."""
-    fits = directions.ndim == 2 and directions.shape[1] == 3
-    require(fits, "directions", "must be vectors (N, 3)", tuple(directions.shape), "give one for each ray")
-    require_unit("directions", "must be unit vectors", directions)
-    return directions
 
 
 def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, argument: str, what: str, name: str) -> int:

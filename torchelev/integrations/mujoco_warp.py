@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchelev.errors import require_positive
 from torchelev.frames import change_axes, transform_matrix
-from torchelev.integrations.mujoco import check_directions, find_body, find_camera
-from torchelev.integrations.scene import own_geoms, pinhole
+from torchelev.integrations.mujoco import find_body, find_camera
+from torchelev.integrations.scene import check_directions, own_geoms, pinhole
 
 try:
     import mujoco_warp

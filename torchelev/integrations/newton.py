@@ -23,6 +23,7 @@ from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.errors import require, require_count, require_positive
 from torchelev.frames import transform_xyzw
 from torchelev.integrations.newton_casts import CameraCast, RayCast
+from torchelev.integrations.scene import check_directions
 from torchelev.integrations.step_map import Cloud, join
 
 try:
@@ -56,10 +57,7 @@ class NewtonLidar:
     max_distance: float = 30.0  #: [m] beyond which a ray returns nothing
 
     def __post_init__(self) -> None:
-        length = torch.linalg.vector_norm(self.directions, dim=-1)
-        is_unit, hint = bool(((length - 1).abs() < 1e-4).all()), "divide them by their norms"
-        rule = "must be unit vectors (R, 3)"
-        require(is_unit and self.directions.ndim == 2, "directions", rule, f"{tuple(self.directions.shape)}", hint)
+        check_directions(self.directions)
         require_positive(max_distance=self.max_distance)
 
 

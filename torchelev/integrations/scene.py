@@ -44,11 +44,19 @@ def require_one_origin(parameter: str, name: str, starts: Tensor) -> None:
     require(spread < 1e-6, parameter, rule, f"starts that are up to {spread:.3g} m apart", hint)
 
 
+def check_directions(directions: Float[Tensor, "N 3"]) -> Tensor:
+    """Return directions of rays; ValueError unless they are unit vectors."""
+    fits = directions.ndim == 2 and directions.shape[1] == 3
+    require(fits, "directions", "must be vectors (N, 3)", tuple(directions.shape), "give one for each ray")
+    require_unit("directions", "must be unit vectors", directions)
+    return directions
+
+
 def require_unit(parameter: str, rule: str, directions: Tensor) -> None:
     """Refuse directions (..., 3) that are no unit vectors, in whose lengths a simulator may count distances."""
     lengths = torch.linalg.vector_norm(directions.double(), dim=-1)
     actual = f"lengths from {float(lengths.min()):.3g} to {float(lengths.max()):.3g}"
-    require(bool(((lengths - 1).abs() < 1e-3).all()), parameter, rule, actual, "divide them by their norms")
+    require(bool(((lengths - 1).abs() < 1e-4).all()), parameter, rule, actual, "divide them by their norms")
 
 
 def own_geoms(model: Any, body: int) -> np.ndarray:

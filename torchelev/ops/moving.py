@@ -13,7 +13,7 @@ from torchelev.ops.indexing import read
 from torchelev.ops.transforms import is_readable
 
 if TYPE_CHECKING:
-    from jaxtyping import Int
+    from jaxtyping import Bool, Int
 
 HOST_ENVIRONMENTS = 4  # up to so many environments copying beats gathering
 
@@ -37,14 +37,18 @@ def move_layers(layers: dict[str, Tensor], shift: Int[Tensor, "B 2"], blank: dic
 
 def _gathered(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:
     """Shift layers by gathering."""
-    H, W = layers[0].shape[1:]
-    i = torch.arange(H, device=shift.device)[None, :, None] + shift[:, 0, None, None]
-    j = torch.arange(W, device=shift.device)[None, None, :] + shift[:, 1, None, None]
-    entering = (i < 0) | (i >= H) | (j < 0) | (j >= W)
-    index = i.clamp(0, H - 1) * W + j.clamp(0, W - 1)
+    index, entering = sources(shift, *layers[0].shape[1:])
     values = [read(layer, index) for layer in layers]
     blanked = [torch.where(entering, blank, value) for value, blank in zip(values, blanks, strict=True)]
     return [value.to(layer.dtype) for value, layer in zip(blanked, layers, strict=True)]
+
+
+def sources(shift: Int[Tensor, "B 2"], H: int, W: int) -> tuple[Int[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
+    """Return the flat number of the cell that each cell gets its value from, any one where it enters, and where."""
+    i = torch.arange(H, device=shift.device)[None, :, None] + shift[:, 0, None, None]
+    j = torch.arange(W, device=shift.device)[None, None, :] + shift[:, 1, None, None]
+    entering = (i < 0) | (i >= H) | (j < 0) | (j >= W)
+    return i.clamp(0, H - 1) * W + j.clamp(0, W - 1), entering
 
 
 def moved(layers: list[Tensor], shift: Tensor, blanks: list[float]) -> list[Tensor]:

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchelev.channels import fuse
+from torchelev.channels.camera import View
 from torchelev.channels.module import Channels
 from torchelev.channels.paint import Picture, fuse_view, look, require_mode, sample
 from torchelev.channels.views import can_paint, paint_in_cpp
-from torchelev.config import ElevationMapConfig
 from torchelev.layers import Layer
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
+
+    from torchelev.config import ElevationMapConfig
 
 
 class PaintedMap:
@@ -61,10 +63,8 @@ class PaintedMap:
             KeyError: if there is no such channel. Nothing has changed then.
             TypeError, ValueError: if an argument does not fit. Nothing has changed then.
         """
-        require_mode(mode)
-        picture = Picture(image, K, T_map_camera, channels, distortion, self.cfg.channels, self.num_envs, self.device)
+        picture, view = self._look(image, K, T_map_camera, channels, distortion, mode, margin)
         assert self.channels is not None
-        view = look(picture, self.state, self.cfg.grid, margin)
         self._derived.clear()
         with torch.no_grad():
             for name, part in picture.values().items():
@@ -89,11 +89,18 @@ class PaintedMap:
 
         A network that makes the image can be trained through the map. Arguments and errors are those of `paint`.
         """
-        require_mode(mode)
-        picture = Picture(image, K, T_map_camera, channel, distortion, self.cfg.channels, self.num_envs, self.device)
+        picture, view = self._look(image, K, T_map_camera, channel, distortion, mode, margin)
         assert self.channels is not None
-        view, cfg = look(picture, self.state, self.cfg.grid, margin), self.cfg.channels[channel]
+        cfg = self.cfg.channels[channel]
         before = self.channels.channel(channel)
         before = before._replace(values=before.values.clone(), weight=before.weight.clone())
         values, known = fuse.read(fuse_view(before, sample(picture.image, view, mode), view, cfg), cfg)
         return values.movedim(-1, 1), known & self.state.validity
+
+    def _look(
+        self, image: Any, K: Any, T_map_camera: Any, channels: Any, distortion: Any, mode: str, margin: float
+    ) -> tuple[Picture, View]:
+        """Check the arguments of `paint`; return the images, and which pixel shows each cell."""
+        require_mode(mode)
+        picture = Picture(image, K, T_map_camera, channels, distortion, self.cfg.channels, self.num_envs, self.device)
+        return picture, look(picture, self.state, self.cfg.grid, margin)
