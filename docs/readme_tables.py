@@ -18,7 +18,7 @@ from typing import Any
 import benchmarks
 import training
 from benchmarks.gpu import report as gpu
-from benchmarks.quality import classes, mjlab_task, mjlab_training, pose_covariance
+from benchmarks.quality import classes, em_cupy, mjlab_task, mjlab_training, pose_covariance
 from benchmarks.quality.changes import report as changes
 from benchmarks.quality.isaac_lab import report as isaac_lab
 from benchmarks.quality.odometry import report as odometry
@@ -200,6 +200,7 @@ TABLES = {
     "mjlab": _made_by(mjlab_task.table, "mjlab"),
     "channels": _made_by(channels.table, "channels"),
     "classes": _made_by(classes.table, "classes"),
+    "em_cupy": _made_by(em_cupy.table, "em_cupy"),
     "mjlab_training": _made_by(mjlab_training.table, "mjlab_training"),
     "isaac_lab": _made_by(isaac_lab.table, "isaac_lab"),
     "self_filter_walking": _made_by(walking.table, "self_filter", "walking"),

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from torchelev.robot import RobotConfig
     from torchelev.robot_body.shapes import Box, Capsule, RobotBody
     from torchelev.stages.age.config import AgingConfig
-    from torchelev.stages.compensate.config import DriftConfig
-    from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
-    from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
-    from torchelev.stages.overlap.config import OverlapConfig
-    from torchelev.stages.surface.config import SurfaceConfig
-    from torchelev.stages.visibility.config import RaycastConfig
+    from torchelev.stages.compensate.config import DriftConfig, InlierConfig
+    from torchelev.stages.fusion.config import AveragingConfig, EdgeConfig, FusionConfig
+    from torchelev.stages.measure.config import BodyConfig, DepthConfig, ExclusionConfig, SensorConfig
+    from torchelev.stages.overlap.config import OverlapConfig, SquareConfig
+    from torchelev.stages.surface.config import SurfaceConfig, UpperBoundConfig
+    from torchelev.stages.visibility.config import RaycastConfig, SteppingConfig
     from torchelev.state import MapState, Measurement, Statistics
     from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig
     from torchelev.traversability.net import TraversabilityNet
@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "AgingConfig",
+    "AveragingConfig",
     "BodyConfig",
     "Box",
     "Capsule",
     "ChannelConfig",
     "CompletionConfig",
     "CompletionNet",
+    "DepthConfig",
     "DriftConfig",
     "EdgeConfig",
     "ElevationMap",
@@ -48,6 +50,7 @@ __all__ = [
     "FusionConfig",
     "GridConfig",
     "HeightScan",
+    "InlierConfig",
     "LearnedTraversabilityConfig",
     "MapImage",
     "MapState",
@@ -57,10 +60,13 @@ __all__ = [
     "RobotBody",
     "RobotConfig",
     "SensorConfig",
+    "SquareConfig",
     "Statistics",
+    "SteppingConfig",
     "SurfaceConfig",
     "TraversabilityConfig",
     "TraversabilityNet",
+    "UpperBoundConfig",
     "depth_to_points",
     "voxel_filter",
 ]
@@ -68,12 +74,14 @@ __all__ = [
 # Imported when first asked for: a robot's node may run without PyTorch, and not every map needs them all.
 _LATER = {
     "AgingConfig": "torchelev.stages.age.config",
+    "AveragingConfig": "torchelev.stages.fusion.config",
     "BodyConfig": "torchelev.stages.measure.config",
     "Box": "torchelev.robot_body.shapes",
     "Capsule": "torchelev.robot_body.shapes",
     "ChannelConfig": "torchelev.channels.config",
     "CompletionConfig": "torchelev.completion.config",
     "CompletionNet": "torchelev.completion.net",
+    "DepthConfig": "torchelev.stages.measure.config",
     "DriftConfig": "torchelev.stages.compensate.config",
     "EdgeConfig": "torchelev.stages.fusion.config",
     "ElevationMap": "torchelev.elevation_map",
@@ -83,6 +91,7 @@ _LATER = {
     "FusionConfig": "torchelev.stages.fusion.config",
     "GridConfig": "torchelev.grid",
     "HeightScan": "torchelev.observations.height_scan",
+    "InlierConfig": "torchelev.stages.compensate.config",
     "LearnedTraversabilityConfig": "torchelev.traversability.heads",
     "MapImage": "torchelev.observations.map_image",
     "MapState": "torchelev.state",
@@ -92,10 +101,13 @@ _LATER = {
     "RobotBody": "torchelev.robot_body.shapes",
     "RobotConfig": "torchelev.robot",
     "SensorConfig": "torchelev.stages.measure.config",
+    "SquareConfig": "torchelev.stages.overlap.config",
     "Statistics": "torchelev.state",
+    "SteppingConfig": "torchelev.stages.visibility.config",
     "SurfaceConfig": "torchelev.stages.surface.config",
     "TraversabilityConfig": "torchelev.traversability.heads",
     "TraversabilityNet": "torchelev.traversability.net",
+    "UpperBoundConfig": "torchelev.stages.surface.config",
     "depth_to_points": "torchelev.inputs.clouds",
     "voxel_filter": "torchelev.inputs.clouds",
 }

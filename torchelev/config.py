@@ -20,6 +20,7 @@ from torchelev.layers import LAYERS
 from torchelev.stages.age.config import AgingConfig
 from torchelev.stages.compensate.config import DriftConfig
 from torchelev.stages.fusion.config import FusionConfig
+from torchelev.stages.like_em_cupy import settings_like_em_cupy
 from torchelev.stages.measure.config import SensorConfig
 from torchelev.stages.overlap.config import OverlapConfig
 from torchelev.stages.surface.config import SurfaceConfig
@@ -126,6 +127,24 @@ class ElevationMapConfig:
             own["filters"] = filters_from_list(values["filters"])
         cfg = _build(cls, stages, "config")
         return dataclasses.replace(cfg, **own) if own else cfg
+
+    @classmethod
+    def like_em_cupy(cls, weights: str | Path | None = None, **parameters: float) -> ElevationMapConfig:
+        """Return the config of a map that computes as elevation_mapping_cupy does where that differs from the paper.
+
+        Points are gated by the variance and averaged, rays lower a cell's validity step by step, drift is corrected by
+        a share. docs/howto/from_elevation_mapping.md has the equations and what differs still. Tensors update it.
+
+        Args:
+            weights: .npz of its traversability filter, see `PaperFilter.from_npz`. It also chooses the cells that
+                measure the drift. None: the analytic head rates.
+            parameters: of its core_param.yaml, by their names there, such as `resolution=0.04`; what is left out has
+                the value of that file. `torchelev.io.em_cupy.load_config` reads whole files.
+
+        Raises:
+            ValueError: for a parameter that has no meaning here, or a value that is out of range.
+        """
+        return cls.from_dict(settings_like_em_cupy(parameters, weights))
 
     def save(self, path: str | Path) -> None:
         """Write all settings as JSON, by group and name, with a version.

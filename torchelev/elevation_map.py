@@ -97,6 +97,7 @@ class ElevationMap(PaintedMap, ReadableMap):
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
         self._update_cfg = dataclasses.replace(cfg, completion=None, filters=(), channels=ChannelConfigs())
+        self._only_by_tensors = pipeline.only_by_tensors(cfg)
         self._key = pipeline.register_stages(self._update_cfg)
         self._history = InputHistory()
         with torch.inference_mode(False):
@@ -118,6 +119,7 @@ class ElevationMap(PaintedMap, ReadableMap):
         variance: Float[Tensor, "B *S N"] | None = None,
         T_base_links: Float[Tensor, "B K 4 4"] | None = None,
         pose_covariance: Float[Tensor, "B *S 6 6"] | None = None,
+        moving: bool | Bool[Tensor, "B"] | None = None,
         features: Mapping[str, Float[Tensor, "B *S N C"]] | None = None,
     ) -> None:
         """Fuse one cloud per environment into its map.
@@ -142,6 +144,8 @@ class ElevationMap(PaintedMap, ReadableMap):
                 rotations about the map's axes [rad], as in a ROS Odometry message. It adds J Sigma J^T to the variance
                 of each point's height, J = (0, 0, 1, r_y, -r_x, 0) with r from the sensor to the point; the layer
                 `variance` then holds what the pose's errors add. None: poses are exact.
+            moving: whether the robot moves, a bool or (B,): the height of one that stands does not drift, and is not
+                corrected. None: all move.
             features: what each point brings for the channels of the config, by name: (B, N, C) or (B, S, N, C), NaN
                 where a point brings nothing. Colours are from 0 to 1, or uint8; probabilities of classes sum to 1.
 
@@ -150,8 +154,9 @@ class ElevationMap(PaintedMap, ReadableMap):
             ValueError: if a shape, device or value is wrong. Nothing has changed then.
             KeyError: if `features` names a channel that is not there. Nothing has changed then.
         """
-        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
-        given = check_features(features, points, self.cfg.channels, self.device)
+        given = (points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance, moving)
+        inputs = self._check_inputs(*given)
+        brought = check_features(features, points, self.cfg.channels, self.device)
         state = self.state
         self._history.add(inputs, state.statistics.drift_correction)
         self._derived.clear()
@@ -166,8 +171,8 @@ class ElevationMap(PaintedMap, ReadableMap):
             with torch.no_grad():
                 write(state, self._write_back(before, state))
         if self.channels is not None:
-            own = find_own(inputs, self.cfg.sensor) if given else None
-            self.channels.update(self.state, time_step(inputs.dt, torch.float32), inputs, own, given)
+            own = find_own(inputs, self.cfg.sensor) if brought else None
+            self.channels.update(self.state, time_step(inputs.dt, torch.float32), inputs, own, brought)
         if self.cfg.completion is not None and self.cfg.completion.when == "update":
             self._complete()
 
@@ -205,9 +210,11 @@ class ElevationMap(PaintedMap, ReadableMap):
         variance: Float[Tensor, "B *S N"] | None = None,
         T_base_links: Float[Tensor, "B K 4 4"] | None = None,
         pose_covariance: Float[Tensor, "B *S 6 6"] | None = None,
+        moving: bool | Bool[Tensor, "B"] | None = None,
     ) -> Measurement:
         """Return the measurement of a cloud, for `forward`. Arguments and errors are those of `update`."""
-        inputs = self._check_inputs(points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
+        given = (points, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance, moving)
+        inputs = self._check_inputs(*given)
         return measure(*inputs, self.cfg.grid, self.cfg.sensor, self.elevation.dtype)
 
     def forward(self, state: MapState, measurement: Measurement) -> MapState:
@@ -252,7 +259,7 @@ class ElevationMap(PaintedMap, ReadableMap):
     @property
     def backend(self) -> Backend:
         """What runs `update`, and why it is not a faster backend."""
-        return choose(self.elevation, self._key)
+        return choose(self.elevation, self._key, self._only_by_tensors)
 
     def compile(self) -> str:  # type: ignore[override]
         """Build what `update` runs on, so that the first one does not; return in a sentence what that is.
@@ -330,7 +337,7 @@ class ElevationMap(PaintedMap, ReadableMap):
     def _check_choice(self, env_ids: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         require(env_ids is None or mask is None, "env_ids, mask", "exclude each other", "both", "give one of them")
         if mask is not None:
-            mask = checks.check_mask(mask, self.num_envs, self.device)
+            mask = checks.check_mask("mask", mask, self.num_envs, self.device)
         if env_ids is not None:
             env_ids = checks.check_env_ids(env_ids, self.num_envs, self.device, self.check_values)
         return env_ids, mask

@@ -15,6 +15,7 @@ from torchelev.kernels.cpu_update import CpuUpdate, as_inputs
 from torchelev.kernels.cuda_update import CudaUpdate
 from torchelev.stages.age.kernel import KERNEL as AGE
 from torchelev.stages.age.stage import age
+from torchelev.stages.by_tensors import ByTensors
 from torchelev.stages.compensate.kernel import KERNEL as COMPENSATE
 from torchelev.stages.compensate.stage import compensate
 from torchelev.stages.disagreement.kernel import KERNEL as DISAGREEMENT
@@ -132,10 +133,23 @@ def cuda_stages(cfg: ElevationMapConfig) -> CudaUpdate:
     return CudaUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig())
 
 
+def only_by_tensors(cfg: ElevationMapConfig) -> str:
+    """Return in a clause why no compiled code runs the stages of a config; empty where it does."""
+    for group in ("sensor", "drift", "fusion", "raycast", "overlap", "surface"):
+        for name, value in vars(getattr(cfg, group) or object).items():
+            if isinstance(value, ByTensors):
+                return f"no compiled code computes {group}.{name}"
+    return ""
+
+
 @functools.lru_cache(maxsize=256)
 def register_stages(cfg: ElevationMapConfig) -> int:
-    """Return the key of the C++ stages for a config; they are built when they first run."""
-    return cpu_update.register(CpuUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig()))
+    """Return the key of the C++ stages for a config; they are built when they first run. -1 if only tensors run it."""
+    return (
+        -1
+        if only_by_tensors(cfg)
+        else cpu_update.register(CpuUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig()))
+    )
 
 
 def write(stored: MapState, new: MapState) -> None:

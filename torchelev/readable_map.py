@@ -22,6 +22,7 @@ from torchelev.stages.complete import (
 )
 from torchelev.stages.disagreement.stage import without_disagreement
 from torchelev.stages.surface.stage import rate_surface
+from torchelev.stages.surface.upper_bound import require_filter
 from torchelev.state import MapState
 from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_rating, make_head
 from torchelev.traversability.rating import Rating
@@ -56,6 +57,7 @@ class ReadableMap(MapBuffers):
     ) -> None:
         super().__init__(cfg, num_envs, device)
         with torch.inference_mode(False):  # inference tensors could not be trained or written outside of that mode
+            require_filter(cfg.surface)
             self.head = make_head(cfg.traversability, cfg.grid, head)
             self.completion_net = make_completion_net(cfg.completion, completion_net)
             self.channels = None

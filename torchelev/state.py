@@ -81,6 +81,7 @@ class Measurement(NamedTuple):
     rejected_overhang: Int[Tensor, "B"]  #: see `Statistics`
     noise: Float[Tensor, "B M"] | None = None  #: [m^2] of the variance, what the pose does not add; None: all of it
     pose_covariance: Float[Tensor, "B 3 3"] | None = None  #: [m^2] of the first sensor's position
+    moving: Bool[Tensor, "B"] | None = None  #: the robot moves, and its height may drift; None: all do
 
 
 LAYERS = MapState._fields[4:-1]  # (B, H, W)

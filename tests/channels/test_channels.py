@@ -222,7 +222,9 @@ def test_cpp_computes_what_tensors_define(monkeypatch):
     maps = [ElevationMap(cfg, num_envs=3) for _ in range(2)]
     generator = torch.Generator().manual_seed(0)
     can_update = module.can_update
-    assert can_update({"a": maps[0].channels.channel("of_mean")}, maps[0].state), "without C++, this compares nothing"
+    assert can_update({"a": maps[0].channels.channel("of_mean")}, maps[0].state, maps[0].cfg.sensor), (
+        "without C++, this compares nothing"
+    )
     for frame in range(8):
         points = 1.5 * torch.randn(3, 2, 1500, 3, generator=generator)
         points[..., 2] = (

@@ -31,9 +31,9 @@ def clone(state):
     return map_layers(torch.clone, state)
 
 
-def inputs_of(emap, points, T_map_sensor, T_map_base, dt=0.3, variance=None, links=None, covariance=None):
+def inputs_of(emap, points, T_map_sensor, T_map_base, dt=0.3, variance=None, links=None, covariance=None, moving=None):
     return check_inputs(
-        *(points, T_map_sensor, T_map_base, dt, variance, links, covariance),
+        *(points, T_map_sensor, T_map_base, dt, variance, links, covariance, moving),
         *(emap.num_envs, emap.device, torch.float32, emap.cfg.sensor.links, False),
     )
 

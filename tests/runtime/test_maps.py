@@ -147,7 +147,7 @@ def test_tensors_agree(library):
         with torch.no_grad():
             points, T_map_sensor, T_map_base, dt = instant
             base = None if T_map_base is None else T_map_base[None]
-            inputs = emap._check_inputs(points[None], T_map_sensor[None], base, dt, None, None, None)
+            inputs = emap._check_inputs(points[None], T_map_sensor[None], base, dt, None, None, None, None)
             update_by_tensors(emap.state, inputs, emap.cfg, None)
         found.update(*numpy(*instant))
     same = found.tensor("validity", bool) == emap.state.validity.numpy().ravel()

@@ -79,7 +79,7 @@ class Channels(nn.Module):
             state: of the maps after it.
             dt: time since the last update [s], finite and not negative.
             inputs: of the update.
-            own: points on the robot's links; those in its box are found here.
+            own: points on the robot's links, for C++; those in its box are found here.
             features: values of the points by channel.
         """
         self._change(state, dt, inputs, own, features)
@@ -94,14 +94,14 @@ class Channels(nn.Module):
     ) -> None:
         """Do the work of `follow`, with None for dt and inputs, and of `update`."""
         channels = {name: self.channel(name) for name in self.cfg}
-        if can_update(channels, state):
+        if can_update(channels, state, self.sensor):
             ground = Ground(self.corner, self.height)
             given = (self.grid, self.sensor, dt, inputs, own, features)
             update_in_cpp(channels, self.cfg, ground, state, *given)
             return
         ground_points = None
         if inputs is not None and features:
-            ground_points = match_points(inputs, own, state, self.grid, self.sensor)
+            ground_points = match_points(inputs, state, self.grid, self.sensor)
         for name in channels:
             cfg, size = self.cfg[name], (self.grid.height, self.grid.width)
             new = self._followed(name, state, dt)

@@ -16,6 +16,8 @@ from torchelev.channels.state import Channel, Ground
 from torchelev.grid import GridConfig
 from torchelev.kernels.cpu_build import call, load
 from torchelev.ops.transforms import can_compute_unseen
+from torchelev.stages.by_tensors import ByTensors
+from torchelev.stages.measure.stage import anchor_of
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -39,7 +41,7 @@ class _Channel(ctypes.Structure):
 
 
 _MAPS = (
-    *("points", "T_map_sensor", "variance", "own", "T_base_sensor", "box", "dt", "drift"),
+    *("points", "T_map_sensor", "variance", "own", "T_base_sensor", "box", "anchor", "dt", "drift"),
     *("corner_now", "elevation", "validity", "corner", "height"),
 )
 
@@ -55,8 +57,10 @@ class _Update(ctypes.Structure):
     )
 
 
-def can_update(channels: Mapping[str, Channel], state: MapState) -> bool:
+def can_update(channels: Mapping[str, Channel], state: MapState, sensor: SensorConfig) -> bool:
     """Return whether `update_in_cpp` takes these: float32 on a CPU, with nothing to differentiate or to trace."""
+    if isinstance(sensor, ByTensors):
+        return False
     tensors = (state.elevation, *(channel.values for channel in channels.values()))
     is_plain = all(value.dtype == torch.float32 and value.is_contiguous() for value in tensors)
     return is_plain and can_compute_unseen(tensors) and load(*LIBRARY) is not None
@@ -80,14 +84,16 @@ def update_in_cpp(
     B = len(ground.corner)
     drift = None if dt is None else state.statistics.drift_correction
     given = {name: x.contiguous() for name, x in features.items()} if inputs is not None else {}
-    cloud: list[Tensor | None] = [None] * 6
+    cloud: list[Tensor | None] = [None] * 7
     S = N = 0
     if inputs is not None and given:
         S, N = inputs.points.shape[1:3]
         variance = None if inputs.variance is None else inputs.variance.float()
         T_base_sensor, *corners = box_of(inputs, sensor) or (None,)
+        followed = inputs.T_map_sensor[:, 0] if inputs.T_map_base is None else inputs.T_map_base
+        anchor = anchor_of(torch.where(followed.isfinite(), followed, 0.0)[:, :3, 3], grid.resolution)
         box = torch.tensor(corners) if corners else None
-        cloud = [inputs.points.float(), inputs.T_map_sensor.double(), variance, own, T_base_sensor, box]
+        cloud = [inputs.points.float(), inputs.T_map_sensor.double(), variance, own, T_base_sensor, box, anchor]
     times = [torch.zeros(B) if dt is None else dt.float(), drift]
     maps = [state.corner, state.elevation, state.validity]
     read = [None if value is None else value.contiguous() for value in (*cloud, *times, *maps)]

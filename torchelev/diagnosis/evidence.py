@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torchelev.diagnosis.history import InputHistory, PastUpdate
 from torchelev.diagnosis.pose_hypotheses import explain
 from torchelev.diagnosis.scan_fit import Fit, Scan
 from torchelev.grid import cell_centers
+from torchelev.inputs.update_inputs import Inputs
 from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState, Measurement
 
@@ -153,11 +154,8 @@ def gather_evidence(cfg: ElevationMapConfig, state: MapState, history: InputHist
 
 def _measure_again(cfg: ElevationMapConfig, update: PastUpdate, env: int) -> Measurement:
     """Return one environment's measurement of an update's thinned points."""
-    inputs = [None if value is None else value[env, None] for value in update.inputs]
-    points, T_map_sensor, T_map_base, dt, variance, T_base_links, covariance = inputs
-    assert points is not None and T_map_sensor is not None and dt is not None
-    poses = (T_map_sensor, T_map_base, dt, variance, T_base_links, covariance)
-    return measure(points, *poses, cfg.grid, cfg.sensor, torch.float32)
+    of_env: Any = (None if value is None else value[env, None] for value in update.inputs)
+    return measure(*Inputs(*of_env), cfg.grid, cfg.sensor, torch.float32)
 
 
 def _count_near(cfg: ElevationMapConfig, state: MapState, update: PastUpdate, env: int) -> int:

@@ -96,4 +96,5 @@ def _thin(inputs: Inputs) -> Inputs:
             variance=None if inputs.variance is None else copy(inputs.variance[:, :, ::step]),
             T_base_links=None if inputs.T_base_links is None else copy(inputs.T_base_links),
             pose_covariance=None if inputs.pose_covariance is None else copy(inputs.pose_covariance),
+            moving=None if inputs.moving is None else copy(inputs.moving),
         )

@@ -172,11 +172,11 @@ def check_env_ids(env_ids: object, num_envs: int, device: torch.device, always: 
     return value
 
 
-def check_mask(mask: object, num_envs: int, device: torch.device) -> Tensor:
+def check_mask(name: str, mask: object, num_envs: int, device: torch.device) -> Tensor:
     """Return a mask (B,) of environments."""
-    value = check_tensor("mask", mask, device, (torch.bool,))
+    value = check_tensor(name, mask, device, (torch.bool,))
     fits = tuple(value.shape) == (num_envs,)
-    require(fits, "mask", f"expected ({num_envs},)", tuple(value.shape), "give one bool per environment")
+    require(fits, name, f"expected ({num_envs},)", tuple(value.shape), "give one bool per environment")
     return value
 
 

@@ -16,7 +16,7 @@ from torchelev.inputs import checks
 from torchelev.ops.transforms import is_readable, require_reverse_mode
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 _Result = TypeVar("_Result")
 _ResultOut = TypeVar("_ResultOut", covariant=True)
@@ -32,6 +32,7 @@ class Inputs(NamedTuple):
     variance: Float[Tensor, "B S N"] | None  #: [m^2] of each point's height; None: the noise model's
     T_base_links: Float[Tensor, "B K 4 4"] | None  #: poses of the links of `sensor.body`; None: it has none
     pose_covariance: Float[Tensor, "B S 6 6"] | None = None  #: of each sensor's pose; None: poses are exact
+    moving: Bool[Tensor, "B"] | None = None  #: environments whose height may drift; None: all
 
 
 class TakesInputs(Protocol[_ResultOut]):
@@ -51,6 +52,7 @@ class TakesInputs(Protocol[_ResultOut]):
         variance: Tensor | None = None,
         T_base_links: Tensor | None = None,
         pose_covariance: Tensor | None = None,
+        moving: bool | Tensor | None = None,
     ) -> _ResultOut: ...
     @overload
     def __call__(
@@ -62,6 +64,7 @@ class TakesInputs(Protocol[_ResultOut]):
         variance: Tensor | None = None,
         T_base_links: Tensor | None = None,
         pose_covariance: Tensor | None = None,
+        moving: bool | Tensor | None = None,
     ) -> _ResultOut: ...
 
 
@@ -82,6 +85,7 @@ class TakesFeatures(Protocol):
         variance: Tensor | None = None,
         T_base_links: Tensor | None = None,
         pose_covariance: Tensor | None = None,
+        moving: bool | Tensor | None = None,
         features: Any = None,  # a Mapping, but other arguments come as dicts of tensors
     ) -> None: ...
     @overload
@@ -94,6 +98,7 @@ class TakesFeatures(Protocol):
         variance: Tensor | None = None,
         T_base_links: Tensor | None = None,
         pose_covariance: Tensor | None = None,
+        moving: bool | Tensor | None = None,
         features: Any = None,  # a Mapping, but other arguments come as dicts of tensors
     ) -> None: ...
 
@@ -116,6 +121,7 @@ def check_inputs(
     variance: Any,
     T_base_links: Any,
     pose_covariance: Any,
+    moving: Any,
     num_envs: int,
     device: torch.device,
     dtype: torch.dtype,
@@ -144,7 +150,10 @@ def check_inputs(
     T_base_links = _check_links(T_base_links, links, T_map_base is not None, B, device, check_values)
     if pose_covariance is not None:
         pose_covariance = _check_covariance(pose_covariance, B, S, device, check_values)
-    return Inputs(cloud, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance)
+    if moving is not None:
+        given = torch.full((num_envs,), moving, device=device) if isinstance(moving, bool) else moving
+        moving = checks.check_mask("moving", given, num_envs, device)
+    return Inputs(cloud, T_map_sensor, T_map_base, dt, variance, T_base_links, pose_covariance, moving)
 
 
 def _check_covariance(

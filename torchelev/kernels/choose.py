@@ -28,12 +28,12 @@ class Backend(NamedTuple):
         return f"{self.name}: updates run by {what}" + (f", as {self.reason}" if self.reason else "")
 
 
-def choose(layer: Tensor, key: int) -> Backend:
+def choose(layer: Tensor, key: int, only_by_tensors: str = "") -> Backend:
     """Return the backend for maps with such a layer (B, H, W): asked once per update.
 
-    `key` is that of the compiled stages for a CPU.
+    `key` is that of the compiled stages for a CPU; `only_by_tensors` says why there are none for the config.
     """
-    reason = _why_tensors(layer, key)
+    reason = only_by_tensors or _why_tensors(layer, key)
     return Backend("TORCH", reason) if reason else Backend("CUDA" if layer.is_cuda else "CPU", "")
 
 

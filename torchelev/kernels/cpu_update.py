@@ -31,6 +31,7 @@ class Inputs(NamedTuple):
     T_base_links: Float64[Tensor, "B K 4 4"] | None  #: poses of the links of the robot's body
     own: Bool[Tensor, "B S N"] | None  #: points on the robot's links
     pose_covariance: Float[Tensor, "B S 6 6"] | None  #: of each sensor's pose
+    moving: Bool[Tensor, "B"] | None  #: environments whose height may drift
 
 
 class Sizes(ctypes.Structure):
@@ -158,6 +159,6 @@ def as_inputs(values: Mapping[str, Tensor | None]) -> Inputs:
 
 
 _KINDS = {
-    name: torch.bool if name == "own" else torch.float64 if name.startswith("T_") else torch.float32
+    name: torch.bool if name in ("own", "moving") else torch.float64 if name.startswith("T_") else torch.float32
     for name in Inputs._fields
 }

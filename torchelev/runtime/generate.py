@@ -28,6 +28,7 @@ from torchelev.pipeline import KERNELS, ORDER, TENSORS
 from torchelev.plane_fit import MAX_RADIUS
 from torchelev.robot import RobotConfig
 from torchelev.robot_body.shapes import RobotBody
+from torchelev.stages.by_tensors import ByTensors
 from torchelev.stages.fusion.config import MAX_REFINEMENTS
 from torchelev.stages.visibility.accepted_rays import NEAR
 from torchelev.stages.visibility.config import MAX_CELLS
@@ -147,7 +148,7 @@ def _settings(cfg: Any, prefix: str) -> Iterator[str]:
 def _kind(name: str, kinds: list[Any]) -> str:
     if name == "filters":
         return "CHAIN"
-    if name in ("completion", "channels"):
+    if name in ("completion", "channels") or any(isinstance(k, type) and issubclass(k, ByTensors) for k in kinds):
         return "ONLY_PYTHON"
     if any(kind in _PLANNING for kind in kinds):
         return "IGNORED"

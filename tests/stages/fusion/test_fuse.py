@@ -51,6 +51,7 @@ def reference_fuse(state, points, variances, used, origins, b, cfg):
         settled = max((v[0] for v in window if v[2] >= cfg.max_support / 2), default=-np.inf)
         challengers = sum(float(state.challenger_support[b][a]) > 0 for a in [c, *inside])
         settings = dict(dataclasses.asdict(cfg), shown=shown, settled=settled, challengers=challengers)
+        del settings["averaging"]
         results[c] = reference.fuse_cell(cell, by_cell.get(c, []), 0.1, **settings)
     return results
 

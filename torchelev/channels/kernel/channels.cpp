@@ -12,6 +12,7 @@ namespace {
 constexpr float NOT_KNOWN = std::numeric_limits<float>::quiet_NaN();
 constexpr int64_t AHEAD = 16;  // points ahead of which memory is fetched
 constexpr int64_t BLOCK = 64;  // cells or points that are looked at together
+constexpr int64_t FAR = int64_t(1) << 22;  // [cells] whole numbers up to it fit a float
 constexpr float NEVER = std::numeric_limits<float>::infinity();
 
 // `_Channel` of native.py.
@@ -31,6 +32,7 @@ struct Update {
     const uint8_t* own;           // (B, S, N) points on the robot's links, or null
     const double* T_base_sensor;  // (B, S, 4, 4), or null without a box
     const float* box;             // (2, 3) [m] lower and upper corner of the robot's box, base frame, or null
+    const int64_t* anchor;        // (B, 2) cell that points count from
     const float *dt, *drift;      // (B) [s], (B) [m] or null
     const int64_t* corner_now;    // (B, 2)
     const float* elevation;       // (B, H, W) [m]
@@ -70,14 +72,16 @@ struct Scratch {
 
 // Where a sensor's points lie in the window, and how much they count.
 struct Frame {
-    float R[9], t[3], cells_per_meter, H, W, noise_factor, noise_floor, nearest2, farthest2;
+    float R[9], t[3], first[2], resolution, H, W, noise_factor, noise_floor, nearest2, farthest2;
     int32_t width;
 
-    Frame(const Update& u, const float* rotation, const float* origin)
-        : cells_per_meter(float(1 / u.resolution)), H(float(u.H)), W(float(u.W)), noise_factor(u.noise_factor),
+    Frame(const Update& u, int64_t b, const float* rotation, const float* origin)
+        : resolution(float(u.resolution)), H(float(u.H)), W(float(u.W)), noise_factor(u.noise_factor),
           noise_floor(u.noise_floor), nearest2(u.min_distance * u.min_distance),
           farthest2(u.max_distance * u.max_distance), width(int32_t(u.W)) {
         std::copy(rotation, rotation + 9, R), std::copy(origin, origin + 3, t);
+        for (int axis = 0; axis < 2; axis++)
+            first[axis] = float(std::clamp(u.anchor[2 * b + axis] - u.corner[2 * b + axis], -FAR, FAR));
     }
 
     // Return whether a point lies in a box of the base frame, where the sensor is at `place`.
@@ -93,8 +97,9 @@ struct Frame {
     // Find the cell of a point, -1 out of the window, its height, and POINT / sigma^2.
     void place(float x, float y, float z, int32_t& cell, float& height, float& weight) const {
         const float d2 = x * x + y * y + z * z;
-        const float i = std::floor((R[0] * x + R[1] * y + R[2] * z + t[0]) * cells_per_meter);
-        const float j = std::floor((R[3] * x + R[4] * y + R[5] * z + t[1]) * cells_per_meter);
+        // As `Window::slot`: a point on the border of two cells belongs to that whose height it measures.
+        const float i = std::floor((R[0] * x + R[1] * y + R[2] * z + t[0]) / resolution) + first[0];
+        const float j = std::floor((R[3] * x + R[4] * y + R[5] * z + t[1]) / resolution) + first[1];
         const bool inside = (d2 >= nearest2) & (d2 <= farthest2) & (d2 < NEVER) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
         cell = inside ? int32_t(inside ? i : 0) * width + int32_t(inside ? j : 0) : -1;
         height = R[6] * x + R[7] * y + R[8] * z + t[2];
@@ -195,7 +200,7 @@ class Map {
             for (int n = 0; n < 12; n++) is_sound &= std::isfinite(T[n]);
             float R[9], t[3];
             for (int row = 0; row < 3; row++) {
-                const double corner = row < 2 ? double(u.corner[2 * b + row]) * u.resolution : 0;
+                const double corner = row < 2 ? double(u.anchor[2 * b + row]) * u.resolution : 0;
                 for (int k = 0; k < 3; k++) R[3 * row + k] = float(T[4 * row + k]);
                 t[row] = float(T[4 * row + 3] - corner);
             }
@@ -214,7 +219,7 @@ class Map {
         float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, height[BLOCK], share[BLOCK];
         int32_t cell[BLOCK];
         for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
-        const Frame frame(u, R, t);
+        const Frame frame(u, b, R, t);
         for (int64_t n = 0; n < BLOCK; n++) frame.place(x[n], y[n], z[n], cell[n], height[n], share[n]);
         for (int64_t n = 0; variance && n < number; n++) {
             const bool is_sound = variance[n] > 0 && variance[n] < NEVER;

@@ -19,7 +19,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.config_files import read_settings
 from torchelev.errors import require
 from torchelev.io.em_cupy.channels import GROUPS, read_channels
-from torchelev.io.em_cupy.parameters import NODE_PARAMETERS, read_parameters
+from torchelev.io.em_cupy.parameters import NODE_PARAMETERS, read_parameters, read_same_parameters
 from torchelev.io.em_cupy.plugins import PLUGINS, is_plugin, read_plugins
 
 
@@ -36,17 +36,20 @@ def load_config(
     sensor: str | Path | None = None,
     *,
     channels: Iterable[str] = (),
+    same_heights: bool = False,
 ) -> Converted:
     """Read the config of elevation_mapping_cupy.
 
     Settings that mean the same are taken over, also in other units. What has another meaning keeps its default here,
-    and what has no equal is left out; a note says so.
+    and what has no equal is left out; a note says so. With `same_heights`, the map computes as that package does, see
+    `ElevationMapConfig.like_em_cupy`: then nearly all parameters mean the same.
 
     Args:
         core: core_param.yaml, of ROS 1 or ROS 2; a later file's settings replace those of an earlier one.
         plugins: plugin_config.yaml; the plugins become `cfg.filters`.
         sensor: file with the sensors and their channels, such as <robot>_sensor_parameter.yaml.
         channels: names of channels that sensors send, as `channel_info` does; those that a fusion names are known.
+        same_heights: compute heights, bounds and validity as elevation_mapping_cupy does; else as the paper.
 
     Raises:
         ValueError: a file cannot be read, holds a parameter or plugin that the package does not have, or a value that
@@ -63,7 +66,7 @@ def load_config(
     is_share = isinstance(average_weight, int | float) and 0 <= average_weight < 1
     require(is_share, "average_weight", "must lie in [0, 1)", repr(average_weight), "give 0.5")
     parsed, channel_notes = read_channels(fusions, tuple(channels), average_weight)
-    settings, notes = read_parameters(given)
+    settings, notes = read_same_parameters(given) if same_heights else read_parameters(given)
     settings |= {"filters": [step.to_dict() for step in filters], "channels": parsed}
     return Converted(ElevationMapConfig.from_dict(settings), (*notes, *plugin_notes, *channel_notes))
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from torchelev.errors import require
+from torchelev.stages.like_em_cupy import DEFAULTS, settings_like_em_cupy
 
 NODE = "is a setting of the node: see docs/howto/from_elevation_mapping.md"
 GONE = "has no equal"
@@ -58,10 +59,10 @@ PARAMETERS: dict[str, Rule] = {
     "drift_compensation_variance_inlier": _kept("drift.max_variance", "is halved, and is that of another variance"),
     "drift_compensation_variance_inler": Rule("", "is misspelled there, and without effect"),
     "traversability_inlier": _kept("drift.min_traversability", "is that of another rating"),
-    "position_noise_thresh": Rule("", f"{GONE}: drift is compensated for standing robots, too"),
-    "orientation_noise_thresh": Rule("", f"{GONE}: drift is compensated for standing robots, too"),
-    "position_lowpass_alpha": Rule("", f"{GONE}: motion is not detected"),
-    "orientation_lowpass_alpha": Rule("", f"{GONE}: motion is not detected"),
+    "position_noise_thresh": Rule("", f"{GONE}: give update(moving=False) while the robot stands"),
+    "orientation_noise_thresh": Rule("", f"{GONE}: give update(moving=False) while the robot stands"),
+    "position_lowpass_alpha": Rule("", f"{GONE}: give update(moving=False) while the robot stands"),
+    "orientation_lowpass_alpha": Rule("", f"{GONE}: give update(moving=False) while the robot stands"),
     "wall_num_thresh": Rule("fusion.edges.min_points", "acts only where points spread wider than their noise", int),
     "max_ray_length": _taken("raycast.max_range"),
     "cleanup_cos_thresh": _taken("raycast.min_incidence"),
@@ -89,6 +90,11 @@ PARAMETERS: dict[str, Rule] = {
 }
 
 
+WITHOUT_WEIGHTS = (
+    "weight_file: without the weights as .npz, the analytic head rates, and chooses the cells that measure the drift; "
+    "see docs/howto/from_elevation_mapping.md"
+)
+
 #: Switches: the group that is left out, of which nothing else remains.
 SWITCHES = {
     "enable_edge_sharpen": "fusion.edges",
@@ -103,6 +109,19 @@ NODE_PARAMETERS = frozenset(
     "initialize_tf_offset initialize_tf_grid_size use_initializer_at_start plugin_config_file map_topic odom_frame "
     "pointcloud_topics recordable_fps use_sim_time".split()
 )
+
+
+def read_same_parameters(given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return the nested settings of a map that computes as elevation_mapping_cupy does, and the notes."""
+    same = {name: value for name, value in given.items() if name in DEFAULTS}
+    same = {name: bool(value) if name in SWITCHES else value for name, value in same.items()}
+    path = given.get("weight_file")
+    weights = path if isinstance(path, str) and path.endswith(".npz") else None
+    taken = {*DEFAULTS, *(["weight_file"] if weights else [])}
+    _, notes = read_parameters({name: value for name, value in given.items() if name not in taken})
+    if weights is None:
+        notes.append(WITHOUT_WEIGHTS)
+    return settings_like_em_cupy(same, weights), notes + _length_note(same)
 
 
 def read_parameters(given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -154,5 +173,12 @@ def _square(grid: dict[str, Any]) -> list[str]:
         require(value > 0, name, "must be positive", value, "give metres")
     cells = round(length / resolution)
     grid |= {"resolution": resolution, "length_x": cells * resolution, "length_y": cells * resolution}
+    return _length_note({"resolution": resolution, "map_length": length})
+
+
+def _length_note(given: Mapping[str, Any]) -> list[str]:
+    """Return a note if a map of these parameters is not whole cells long."""
+    resolution, length = (given.get(name, DEFAULTS[name]) for name in ("resolution", "map_length"))
+    cells = round(length / resolution)
     changed = abs(cells * resolution - length) > 1e-6
     return [f"map_length = {length}: became {cells * resolution:g} m, {cells} whole cells"] if changed else []

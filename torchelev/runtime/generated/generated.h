@@ -97,6 +97,7 @@ struct Inputs {
     double* T_base_links;
     uint8_t* own;
     float* pose_covariance;
+    uint8_t* moving;
     Inputs at(int64_t b, const Sizes& n) const {
         Inputs one = *this;
         if (points) one.points += b * n.S * n.N * 3;
@@ -107,6 +108,7 @@ struct Inputs {
         if (T_base_links) one.T_base_links += b * n.K * 4 * 4;
         if (own) one.own += b * n.S * n.N;
         if (pose_covariance) one.pose_covariance += b * n.S * 6 * 6;
+        if (moving) one.moving += b * 1;
         return one;
     }
 };

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchelev.errors import require
+from torchelev.errors import require, require_positive
+from torchelev.stages.by_tensors import ByTensors
+
+
+@dataclass(frozen=True, kw_only=True)
+class InlierConfig(ByTensors):
+    """Points that measure the drift as in elevation_mapping_cupy: see `compensate_by_inliers`. By tensors."""
+
+    gate_per_variance: float = 2.0  #: [1/m] a point counts if |z - h| < gate_per_variance * sigma_m^2
+
+    def __post_init__(self) -> None:
+        require_positive(**{"drift.inliers.gate_per_variance": self.gate_per_variance})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +30,7 @@ class DriftConfig:
     min_points: int = 50  #: points that must measure the drift; raise it where few flat cells are in view
     max_drift: float = 0.1  #: [m] a larger mean error is not corrected
     gain: float = 1.0  #: the paper adds the whole mean error
+    inliers: InlierConfig | None = None  #: in place of `max_error`, `gate` and `relief`; None: see `compensate`
 
     def __post_init__(self) -> None:
         require(0 < self.gain <= 1, "drift.gain", "must lie in (0, 1]", self.gain, "the paper's value is 1")

@@ -133,7 +133,9 @@ bool compensate(Update& u) {
         std::memcpy(&error, errors + k, sizeof(float) * count), noise = load(&m.noise[k], count);
         totals.add(k, drift::is_near_mean(error, splat(first_mean), noise, s), error, noise + s.relief_square);
     });
-    const float mean = near.mean(), correction = drift::correction(mean, near.number, s);
+    const float mean = near.mean();
+    const bool applies = drift::applies(mean, near.number, u.inputs.moving, s);
+    const float correction = applies ? s.gain * mean : 0;
     const Statistics& to = u.state.statistics;
     if (m.sensors == 1) {
         const float error_variance = near.mean_noise() / float(std::max<int64_t>(near.number, 1));
@@ -142,7 +144,7 @@ bool compensate(Update& u) {
     }
     if (correction != 0) shift_heights(u, correction);
     *to.drift_points = near.number, *to.drift_error = mean, *to.drift_correction = correction;
-    return near.number >= s.min_points && absolute(mean) <= s.max_drift;
+    return applies;
 }
 
 }  // namespace

@@ -49,7 +49,9 @@ extern "C" __global__ void find_drift(Update u) {
     }
     near = near.of_block();
     if (threadIdx.x) return;
-    const float mean = near.mean(), correction = drift::correction(mean, near.number, s);
+    const float mean = near.mean();
+    const bool applies = drift::applies(mean, near.number, u.inputs.at(b, u.sizes).moving, s);
+    const float correction = applies ? s.gain * mean : 0;
     const Statistics to = map.statistics;
     if (u.sizes.S == 1) {
         const float error_variance = near.mean_noise() / float(near.number > 1 ? near.number : 1);
@@ -73,10 +75,10 @@ extern "C" __global__ void share_pose_error(Update u) {
     known = sum_of_block(known, reinterpret_cast<double*>(block_memory()));
     if (threadIdx.x) return;
     const Statistics& to = map.statistics;
-    const bool applies = s.has_drift && *to.drift_points >= s.min_points && absolute(*to.drift_error) <= s.max_drift;
-    const bool follows = applies || known == 0;
+    const Inputs in = u.inputs.at(b, u.sizes);
+    const bool follows = known == 0 || (s.has_drift && drift::applies(*to.drift_error, *to.drift_points, in.moving, s));
     *scan.shared = follows ? 0 : map.pose_covariance[8];
-    const float* given = u.inputs.at(b, u.sizes).pose_covariance;
+    const float* given = in.pose_covariance;
     for (int row = 0; row < 3; row++)
         for (int k = 0; k < 3; k++)
             map.pose_covariance[3 * row + k] = !follows && (row == 2 || k == 2) ? 0 : given[6 * row + k];

@@ -24,9 +24,9 @@ template <class V> INLINE auto is_near_mean(V error, V mean, V noise, const Comp
     return square(error - mean) <= s.gate_square * (noise + s.relief_square);
 }
 
-// The correction [m] that so many points with this mean error make.
-INLINE float correction(float mean, int64_t number, const CompensateSettings& s) {
-    return number >= s.min_points && absolute(mean) <= s.max_drift ? s.gain * mean : 0;
+// Whether the mean error of so many points is corrected; `moves` is null where the caller says nothing of it.
+INLINE bool applies(float mean, int64_t number, const uint8_t* moves, const CompensateSettings& s) {
+    return number >= s.min_points && absolute(mean) <= s.max_drift && (!moves || *moves);
 }
 
 }  // namespace drift

@@ -9,6 +9,7 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import NOWHERE, count
 from torchelev.stages.cells import cells_of, center_offsets
 from torchelev.stages.compensate.config import DriftConfig
+from torchelev.stages.compensate.inliers import compensate_by_inliers
 from torchelev.stages.disagreement.stage import compare_scans, compare_sensors
 from torchelev.stages.pose_error import share_pose_error
 from torchelev.state import MapState, Measurement, tally
@@ -38,6 +39,8 @@ def compensate(
     of their mean. No correction if n < min_points or |e| > max_drift, or without `cfg`. Notes by how much scans, or the
     sensors of one, disagree. No variance grows beyond `max_variance` [m^2].
     """
+    if cfg is not None and cfg.inliers is not None:
+        return compensate_by_inliers(state, m, grid, cfg, cfg.inliers, min_traversability)
     if m.origin.shape[1] > 1:
         state = tally(state, disagreement=compare_sensors(state, m, grid))
     if cfg is None:
@@ -59,6 +62,8 @@ def compensate(
     counts = counts & ((error - mean[:, None]).square() <= cfg.gate**2 * (noise + cfg.relief**2))
     number, mean = count(counts), masked_mean(error, counts)
     applies = (number >= cfg.min_points) & (mean.abs() <= cfg.max_drift)
+    if m.moving is not None:
+        applies = applies & m.moving
     correction = torch.where(applies, cfg.gain * mean, 0.0)
     shift = correction[:, None, None]
     if m.origin.shape[1] == 1:

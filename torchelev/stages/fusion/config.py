@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchelev.errors import require, require_count
+from torchelev.stages.by_tensors import ByTensors
 
 MAX_REFINEMENTS = 100  # after some thirty, float32 has no digits left
 
@@ -39,6 +40,25 @@ class EdgeConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AveragingConfig(ByTensors):
+    """Averaged fusion as elevation_mapping_cupy computes it: see `average`. Tensors update maps with it."""
+
+    gate_per_variance: float = 2.0  #: [1/m] a point is an outlier if |z - h| > gate_per_variance * sigma_m^2
+    variance_per_outlier: float = 0.01  #: [m^2] added to a cell's variance for each outlier
+    unknown_variance: float = 1000.0  #: [m^2] of a cell that is not known, when its first points come
+    wall_points: int | None = 20  #: a cell with more points ignores those below its elevation; None: it averages all
+
+    def __post_init__(self) -> None:
+        for name in ("gate_per_variance", "unknown_variance"):
+            value, hint = getattr(self, name), "see its default"
+            require(0 < value < math.inf, f"fusion.averaging.{name}", "must be positive and finite", value, hint)
+        added, hint = self.variance_per_outlier, "give 0.01"
+        require(0 <= added < math.inf, "fusion.averaging.variance_per_outlier", "must not be negative", added, hint)
+        if self.wall_points is not None:
+            require_count("fusion.averaging.wall_points", self.wall_points, "give 20, or None")
+
+
+@dataclass(frozen=True, kw_only=True)
 class FusionConfig:
     """Kalman update and outlier gate."""
 
@@ -52,6 +72,7 @@ class FusionConfig:
     max_above_per_scan: int = 2  #: of those points, how many one scan adds: a single bad scan is no obstacle
     max_variance: float = 1.0  #: [m^2] a cell's variance grows no larger
     edges: EdgeConfig | None = EdgeConfig()  #: walls and steps kept sharp; None: every cell averages its points
+    averaging: AveragingConfig | None = None  #: in place of all of the above but `max_variance`; None: see `fuse`
 
     def __post_init__(self) -> None:
         fits, hint = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"

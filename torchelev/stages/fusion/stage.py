@@ -7,6 +7,7 @@ from typing import Any
 from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.stages.cells import cells_of
+from torchelev.stages.fusion.average import average
 from torchelev.stages.fusion.config import FusionConfig
 from torchelev.stages.fusion.points import CellLayers, HitPoints
 from torchelev.stages.fusion.update import update_all
@@ -38,6 +39,8 @@ def fuse(
     variance, as in the paper. It replaces the cell's estimate once the count falls below zero, or once enough points
     above the cell agree with each other (`challenge`): a new obstacle appears soon, even on settled ground.
     """
+    if cfg.averaging is not None:
+        return average(state, m, grid, cfg.averaging, cfg.max_variance)
     cells = cells_of(state, m, grid)
     noise = m.variance if m.noise is None else m.noise
     points = HitPoints(m.points, noise, relative_variance(state, m), m.origin, cells)

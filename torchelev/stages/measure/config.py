@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from torchelev.errors import require
 from torchelev.robot_body.shapes import RobotBody
+from torchelev.stages.by_tensors import ByTensors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +29,18 @@ class ExclusionConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DepthConfig(ByTensors):
+    """A camera's noise and ramp as elevation_mapping_cupy computes them. Tensors update maps with it."""
+
+    factor: float = 0.05  #: added to sigma_p^2: factor * z^2, with z along the sensor's own z axis
+    ramp_from_center: bool = True  #: the ramp's `distance` counts from the window's centre, not from the sensor
+
+    def __post_init__(self) -> None:
+        good, hint = 0 <= self.factor < math.inf, "give 0.05"
+        require(good, "sensor.depth.factor", "must be finite and not negative", self.factor, hint)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorConfig:
     """Noise model and gates of the points."""
 
@@ -38,6 +52,7 @@ class SensorConfig:
     exclusion: ExclusionConfig | None = ExclusionConfig()
     #: the robot itself, whose points are ignored: a box in the base frame, or the shapes of its links; None: none are
     body: BodyConfig | RobotBody | None = None
+    depth: DepthConfig | None = None  #: noise that grows with the depth; None: with the distance alone
 
     def __post_init__(self) -> None:
         require(self.noise_factor >= 0, "sensor.noise_factor", "must not be negative", self.noise_factor, "give 1e-4")

@@ -15,6 +15,7 @@ from torchelev.robot_body import own_kernel
 from torchelev.robot_body.shapes import RobotBody
 from torchelev.stages.measure.body import inside_body, on_robot, rotate
 from torchelev.stages.measure.config import BodyConfig, ExclusionConfig, SensorConfig
+from torchelev.stages.measure.depth import add_depth_noise, from_ramp
 from torchelev.stages.pose_error import project_covariance
 from torchelev.state import Measurement
 
@@ -130,11 +131,13 @@ def gate_points(
     base: Tensor | None,
     own: Bool[Tensor, "B S N"] | None,
     cfg: SensorConfig,
+    resolution: float,
 ) -> Gates:
     """Leave out points on the robot's body and above the ramp; set sigma_p^2 = alpha_d d^2 + noise_floor."""
     relative, position = mapped.relative.transpose(1, 2), mapped.position.transpose(1, 2)
     if variance is None:
-        variance = (cfg.noise_factor * sensed.distance2 + cfg.noise_floor).flatten(1)
+        noise = cfg.noise_factor * sensed.distance2 + cfg.noise_floor
+        variance = add_depth_noise(noise, sensed.z, cfg.depth).flatten(1)
     else:
         variance = torch.where(sensed.finite, variance, 1.0).flatten(1)
     body = overhang = torch.zeros_like(mapped.in_range)
@@ -143,7 +146,8 @@ def gate_points(
     elif isinstance(cfg.body, BodyConfig) and base is not None and T_map_base is not None:
         body = mapped.in_range & inside_body(position, T_map_base, base, cfg.body)
     if cfg.exclusion is not None:
-        overhang = mapped.in_range & ~body & above_ramp(relative, cfg.exclusion)
+        place = from_ramp(position, relative, base, cfg.depth, resolution)
+        overhang = mapped.in_range & ~body & above_ramp(place, cfg.exclusion)
     return Gates(variance, mapped.in_range & ~body & ~overhang, mapped.in_range & ~body)
 
 
@@ -165,6 +169,7 @@ def measure(
     variance: Float[Tensor, "B S N"] | None,
     T_base_links: Float[Tensor, "B K 4 4"] | None,
     pose_covariance: Float[Tensor, "B S 6 6"] | None,
+    moving: Bool[Tensor, "B"] | None,
     grid: GridConfig,
     cfg: SensorConfig,
     dtype: torch.dtype,
@@ -186,7 +191,7 @@ def measure(
     own = None
     if isinstance(cfg.body, RobotBody) and T_map_base is not None and T_base_links is not None:
         own = on_links(sensed, T_map_sensor, T_map_base, T_base_links, cfg.body)
-    gates = gate_points(sensed, mapped, variance, T_map_base, base, own, cfg)
+    gates = gate_points(sensed, mapped, variance, T_map_base, base, own, cfg, grid.resolution)
     total, noise, of_position = gates.variance, None, None
     if pose_covariance is not None:
         total, noise = gates.variance + project_covariance(mapped.relative, pose_covariance, dtype), gates.variance
@@ -207,6 +212,7 @@ def measure(
         rejected_overhang=casts - used,
         noise=noise,
         pose_covariance=of_position,
+        moving=moving,
     )
 
 

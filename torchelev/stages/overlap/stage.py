@@ -12,6 +12,7 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.stages.cells import center_offsets
 from torchelev.stages.overlap.config import OverlapConfig
+from torchelev.stages.overlap.square import clear_square
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ def clear_other_floors(state: MapState, m: Measurement, grid: GridConfig, cfg: O
     radius) at distance d: a slope is no other floor. What lies below the base is no upper floor. Skipped without a base
     pose or `cfg`. A cell's upper bound goes too when it belongs to another floor. The window is centred on the base.
     """
+    if cfg is not None and cfg.square is not None:
+        return clear_square(state, m, grid, cfg.square)
     if m.base is None or cfg is None:
         return state
     x, y = center_offsets(state, m, grid)

@@ -7,9 +7,23 @@ from dataclasses import dataclass
 
 from torchelev.errors import require
 from torchelev.grid import GridConfig
+from torchelev.stages.by_tensors import ByTensors
 from torchelev.stages.visibility.polar_table import PolarGrid
 
 MAX_CELLS = 2**14  # that rays count up to: C++ counts the places of the polar table in 32 bits
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteppingConfig(ByTensors):
+    """Rays that are followed by steps, as elevation_mapping_cupy does: see `clear_by_steps`. By tensors."""
+
+    validity_per_ray: float = 0.1  #: taken off a cell's validity by a ray of `max_range`; shorter rays take more
+    variance_per_ray: float = 0.01  #: [m^2] added to a cell's variance by each ray that passes below it
+
+    def __post_init__(self) -> None:
+        for name in ("validity_per_ray", "variance_per_ray"):
+            value, argument = getattr(self, name), f"raycast.steps.{name}"
+            require(0 <= value < math.inf, argument, "must be finite and not negative", value, "see its default")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +35,7 @@ class RaycastConfig:
     max_range: float | None = None  #: [m] rays count up to here; None: 1.1 half-diagonals of the window
     min_support: float = 3.0  #: points that agree with a cell, or one beside it, for rays that end there to be accepted
     gate: float = 3.0  #: a ray so many standard deviations below ground that is known is a wrong return
+    steps: SteppingConfig | None = None  #: rays lower validities step by step, see there; None: the lowest ray decides
 
     def __post_init__(self) -> None:
         require(self.min_time >= 0, "raycast.min_time", "must not be negative", self.min_time, "give seconds")
@@ -31,6 +46,10 @@ class RaycastConfig:
         require(reach, "raycast.max_range", "must be positive and finite", self.max_range, "give metres, or None")
         support = 0 <= self.min_support < math.inf
         require(support, "raycast.min_support", "must be finite and not negative", self.min_support, "give points")
+
+    def reach(self, grid: GridConfig) -> float:
+        """Return how far [m] rays count."""
+        return self.max_range or 0.55 * math.hypot(grid.length_x, grid.length_y)
 
     def require_grid(self, grid: GridConfig) -> None:
         """Refuse rays that reach over more cells than the polar table can have."""

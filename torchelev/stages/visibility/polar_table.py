@@ -38,7 +38,7 @@ class PolarGrid(NamedTuple):
     @classmethod
     def of(cls, grid: GridConfig, cfg: RaycastConfig) -> PolarGrid:
         """Choose the table's size for a window."""
-        reach = math.ceil((cfg.max_range or 0.55 * math.hypot(grid.length_x, grid.length_y)) / grid.resolution)
+        reach = math.ceil(cfg.reach(grid) / grid.resolution)
         # 8 % to spare, of which the approximated azimuth below takes 3: it widens some bins.
         azimuths = 2 * math.ceil(max(16.0, 1.08 * 2 * math.pi * reach) / 2)
         bins = BREADTH * azimuths / (2 * math.pi)

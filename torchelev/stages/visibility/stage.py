@@ -23,6 +23,7 @@ from torchelev.stages.visibility.lowest_rays import (
 )
 from torchelev.stages.visibility.polar_table import PolarGrid
 from torchelev.stages.visibility.rays import height_margin, sensor_rays
+from torchelev.stages.visibility.steps import clear_by_steps
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ def clear_seen_through(state: MapState, m: Measurement, grid: GridConfig, cfg: R
     """
     if cfg is None:
         return state
+    if cfg.steps is not None:
+        return clear_by_steps(state, m, grid, cfg, cfg.steps)
     polar, before = PolarGrid.of(grid, cfg), state.validity
     for s in range(m.origin.shape[1]):
         rays = sensor_rays(m, s)
