@@ -118,6 +118,12 @@ def surrounding_cells(uv: Float[Tensor, "B M 2"], mode: str) -> tuple[Tensor, Te
     return i, j, torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], 1)
 
 
+def containing_cells(uv: Float[Tensor, "B M 2"], grid: GridConfig) -> tuple[Int[Tensor, "B M"], Bool[Tensor, "B M"]]:
+    """Return the flat number of the cell that holds each point [cells], and whether the point is in the window."""
+    corners = _find_corners(uv, grid, "nearest")
+    return corners.cell, corners.counts
+
+
 def _find_corners(uv: Tensor, grid: GridConfig, mode: str) -> _Corners:
     finite = torch.isfinite(uv).all(-1, keepdim=True)
     far = min(1e6, torch.finfo(uv.dtype).max)

@@ -28,7 +28,7 @@ from torchelev.traversability.heads import LearnedTraversabilityConfig, learned_
 from torchelev.traversability.rating import Rating
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     from torchelev.completion.net import CompletionNet
     from torchelev.filters.chain import FilterChain
@@ -141,9 +141,15 @@ class ReadableMap(MapBuffers):
         return torch.where(known, values, torch.nan)
 
     def read_channel(
-        self, name: str, state: MapState | None = None
-    ) -> tuple[Float[Tensor, "B H W C"], Bool[Tensor, "B H W"]]:
-        """Return the values of a channel, and where they are known; errors as of `layer`."""
+        self, name: str, state: MapState | None = None, cell: Int[Tensor, "B M"] | None = None
+    ) -> tuple[Float[Tensor, "B *cells C"], Bool[Tensor, "B *cells"]]:
+        """Return the values of a channel, and where they are known; errors as of `layer`.
+
+        Args:
+            name: of the channel.
+            state: state to read; None: the map's own.
+            cell: flat numbers i * W + j of the cells to read; None: all, as (B, H, W).
+        """
         require(name in self.cfg.channels, "layer", "must be a channel", repr(name), "see cfg.channels", KeyError)
         assert self.channels is not None
         if state is not None:
@@ -151,8 +157,9 @@ class ReadableMap(MapBuffers):
             require(
                 actual == self.num_envs, "state", rule, actual, "leave it out, and choose the environment afterwards"
             )
-        values, known = self.channels.read(name, state)
-        return values, known & (self.state if state is None else state).validity
+        values, known = self.channels.read(name, state, cell)
+        validity = (self.state if state is None else state).validity
+        return values, known & (validity if cell is None else validity.flatten(1).gather(1, cell))
 
     def load_state(self, state: MapState) -> None:
         """Copy a state into the buffers, such as one that `forward` returned; channels keep what fits its ground.

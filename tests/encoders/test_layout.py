@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.helpers import mapped, pose
-from torchelev import HeightScan, MapImage
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
 from torchelev.encoders import AttentionConfig, MapLayout
 from torchelev.encoders.layout import describe_points
 
@@ -50,6 +50,17 @@ def test_values_and_validity_of_a_scan_are_one_group_or_two():
     assert (stacked.groups, stacked.channels, stacked.validity) == (("map",), 2, 1)
     two = find(values.shape[1:], {"known": valid.shape[1:]}, **settings, validity="known")
     assert (two.groups, two.channels, two.validity) == (("map", "known"), 2, 1)
+
+
+def test_a_scan_with_channels_is_one_group_of_as_many_rows():
+    scan = HeightScan.grid(length_x=0.4, length_y=0.2, channels=("rgb", "heat"))
+    cfg = ElevationMapConfig(
+        grid=GridConfig(resolution=0.1, length_x=2, length_y=2), channels=dict(rgb="color", heat="mean")
+    )
+    values, valid = scan(ElevationMap(cfg), pose())
+    assert values.shape[1:] == scan.shape_on(cfg) == (5, 15)
+    layout = find(torch.cat([values, valid], 1).shape[1:], points=scan, validity=5)
+    assert (layout.channels, layout.validity, layout.coordinates.shape) == (10, 5, (2, 1, 15))
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ QUICK = {
     "many_robots": "--num-envs 8 --steps 3",
     "mujoco_depth_camera": "--steps 30",
     "own_head": "--batches 1 --steps 2",
+    "plan_around_water": "--quick",
     "planning": "--quick",
     "robot_50hz": "--seconds 1 --eager",
     "world_map": "--steps 20",
@@ -74,6 +75,11 @@ def check_planning(out):
     assert wide.startswith("as wide as the robot") and "every footprint along the path is safe" in wide
 
 
+def check_around_water(out):
+    heights, classes = (numbers(line) for line in out.splitlines())  # length, and metres of grass, mud and water
+    assert heights[3] > 1.5 and classes[3] == 0 and 0.5 < classes[2] < 1.6 and classes[0] > heights[0] + 0.5
+
+
 def check_own_head(out):
     from training.traversability.train import main
 
@@ -99,6 +105,7 @@ CHECKS = {
     "many_robots": lambda out: bool(re.search(r"8 robots, 768 points each(.|\n)* robots per second", out)),
     "mujoco_depth_camera": check_mujoco,
     "own_head": check_own_head,
+    "plan_around_water": check_around_water,
     "planning": check_planning,
     "world_map": check_world_map,
     "robot_50hz": lambda out: 0 < numbers(out)[0] <= 51 and "p99" in out,

@@ -1,6 +1,7 @@
 """The map in gymnasium's observations: whose episode it is of, in every autoreset mode; kinds of arrays; refusals."""
 
 import copy
+import dataclasses
 import doctest
 import pickle
 
@@ -385,6 +386,16 @@ def test_values_and_validity_are_stacked():
     observation, _ = env.reset(seed=0)
     assert observation["map"].shape == (2, 3) and observation["map"].dtype == np.float32
     np.testing.assert_allclose(observation["map"], [[0.1, 0.1, 0.0], [1, 1, 0]], atol=1e-6)
+
+
+def test_validity_follows_the_rows_of_a_scan_with_channels():
+    cfg = dataclasses.replace(CONFIG, channels={"rgb": "color"})
+    scan = HeightScan.isaac_lab(channels=("rgb",), channel_fill=0.5)
+    env = VectorElevationMapObservation(grounds(AutoresetMode.NEXT_STEP), **(VECTOR | {"cfg": cfg}), read=scan)
+    observation, _ = env.reset(seed=0)
+    values, valid = scan(env.emap, torch.from_numpy(poses(env.env)))
+    assert observation["map"].shape == (3, 8, 187) and valid[:, 0].any() and (values[:, 1:] == 0.5).all()
+    np.testing.assert_array_equal(observation["map"], torch.cat([values, valid.float()], 1))
 
 
 @pytest.mark.parametrize("scan", [HeightScan.isaac_lab(), MapImage(length_x=1.0, length_y=0.8)])

@@ -1,5 +1,6 @@
 """What all terms do: read as an observation, keep no view of the map, and refuse settings that do not fit."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import pytest
@@ -57,6 +58,16 @@ def test_appends_the_validity():
     assert values.shape == (2, 374)
     assert valid.any(-1).tolist() == [False, True]
     torch.testing.assert_close(values, torch.cat([expected, valid.float()], -1))
+
+
+def test_appends_the_validity_to_each_row_of_a_scan_with_channels():
+    cfg = dataclasses.replace(CFG, channels={"rgb": "color"})
+    values, term, _ = observe(HeightScan.mjlab(channels=("rgb",), channel_fill=0.5), with_validity=True, map_cfg=cfg)
+    assert values.shape == (2, 8, 187)
+    expected, valid = HeightScan.mjlab()(term.emap, term.maps.source.read_base(None))
+    torch.testing.assert_close(values[:, 0], expected)
+    assert torch.equal(values[:, 4], valid.float()) and valid.any()
+    assert (values[:, 1:4] == 0.5).all() and not values[:, 5:].any()
 
 
 def test_reads_an_image():

@@ -14,6 +14,7 @@ SCANS = [
     HeightScan.legged_gym(),
     HeightScan.feet(),
     HeightScan.grid(fill="lowest"),
+    HeightScan.grid(fill="lowest", channels=("rgb", "terrain.stone")),
 ]
 
 
@@ -22,8 +23,8 @@ def test_a_layout_survives_json_and_fits_its_own_scan(scan):
     require_layout(scan, json.loads(json.dumps(scan_layout(scan), allow_nan=False)))
 
 
-@pytest.mark.parametrize("first", range(5))
-@pytest.mark.parametrize("second", range(5))
+@pytest.mark.parametrize("first", range(6))
+@pytest.mark.parametrize("second", range(6))
 def test_every_other_preset_is_refused(first, second):
     if first != second:
         with pytest.raises(ValueError, match="height_scan"):
@@ -40,6 +41,17 @@ def test_a_setting_that_differs_is_named_with_both_values(setting, value):
     other = dataclasses.replace(trained, **{setting: value})
     with pytest.raises(ValueError, match=rf"height_scan.{setting}: must be .*build the scan with {setting}="):
         require_layout(other, scan_layout(trained))
+
+
+def test_channels_are_named_only_where_they_are_read():
+    """A policy that reads heights alone keeps its layout of before there were channels."""
+    assert not {"channels", "channel_fill"} & scan_layout(SCANS[0]).keys()
+    for setting, value in (("channels", ("rgb",)), ("channel_fill", -1.0)):
+        other = dataclasses.replace(SCANS[5], **{setting: value})
+        with pytest.raises(ValueError, match=rf"height_scan.{setting}: must be .*build the scan with {setting}="):
+            require_layout(other, json.loads(json.dumps(scan_layout(SCANS[5]))))
+    with pytest.raises(ValueError, match="height_scan.channel_fill"):
+        require_layout(SCANS[4], scan_layout(SCANS[5]))
 
 
 def test_noise_and_reach_do_not_matter():

@@ -74,6 +74,24 @@ def run(tmp_path):
     return folder
 
 
+def test_a_recording_refuses_channels_by_name():
+    grid = te.GridConfig(resolution=0.05, length_x=3, length_y=3)
+    plain, colored = te.ElevationMapConfig(grid=grid), te.ElevationMapConfig(grid=grid, channels={"rgb": "color"})
+    for group in (te.HeightScan.grid(channels=("rgb",)), te.MapImage(channels=("rgb",))):
+        words = r"groups.scan.channels: must read no channels, which bundles do not hold, got \('rgb',\)"
+        with pytest.raises(ValueError, match=words):
+            Recorder(te.ElevationMap(plain), {"body": NAMES, "scan": group})
+    with pytest.raises(ValueError, match="emap.cfg.channels: must be empty, as bundles hold heights alone"):
+        Recorder(te.ElevationMap(colored), {"body": NAMES})
+
+
+def test_a_run_that_reads_channels_is_refused(run, tmp_path):
+    described = json.loads((run / OBSERVATION).read_text())
+    described["groups"][1]["layout"]["channels"] = ["rgb"]
+    (run / OBSERVATION).write_text(json.dumps(described))
+    assert "groups.scan.channels: must read no channels" in invoke("export", run, "--out", tmp_path / "out", code=2)
+
+
 def invoke(*arguments, code=0):
     result = CliRunner().invoke(main, [str(argument) for argument in arguments])
     assert result.exit_code == code, result.output

@@ -51,6 +51,7 @@ def test_images(maps, name):
         ('{"layers": ["height"]}', "image.layers: must be one of elevation"),
         ('{"layers": ["elevation", "elevation"]}', "must name each channel once"),
         ('{"layers": ["completed"]}', "needs Python"),
+        ('{"channels": ["rgb"]}', "image.channels: needs Python"),
         ('{"layers": []}', "image.layers: must be some of"),
         ('{"length_x": 1.63}', "length_x: must be a whole number of times 0.05 m, got 32.6 times; try 1.65"),
         ('{"resolution": 0}', "resolution: must be a positive number"),

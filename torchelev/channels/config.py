@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,6 +127,24 @@ def parse_channels(channels: Any, layers: tuple[str, ...]) -> ChannelConfigs:
         rule = "must have names that are words, and no layers of the map"
         require(is_free, "cfg.channels", rule, repr(name), "rename it")
     return ChannelConfigs({name: _parse(name, value) for name, value in channels.items()})
+
+
+def expand_names(names: Iterable[str], channels: Mapping[str, ChannelConfig], argument: str) -> tuple[str, ...]:
+    """Return the layers that names of channels, or of their components, stand for; errors call the names `argument`.
+
+    Raises:
+        KeyError: a name is neither.
+    """
+    hint = f"there are {', '.join(channels) or 'none: give the config channels={...}'}"
+    layers: list[str] = []
+    for name in names:
+        channel = name.split(".")[0]
+        require(channel in channels, argument, "must name channels of the map", repr(name), hint, KeyError)
+        components = channels[channel].components(channel)
+        is_known, rule = name == channel or name in components, f"must be components of {channel}"
+        require(is_known, argument, rule, repr(name), f"there are {', '.join(components)}", KeyError)
+        layers.extend(components if name == channel else (name,))
+    return tuple(layers)
 
 
 def _parse(name: str, value: Any) -> ChannelConfig:

@@ -62,7 +62,7 @@ def combine(
     return Channel(values, W + total, age)
 
 
-def read(channel: Channel, cfg: ChannelConfig) -> tuple[Float[Tensor, "B H W C"], Bool[Tensor, "B H W"]]:
+def read(channel: Channel, cfg: ChannelConfig) -> tuple[Float[Tensor, "B *cells C"], Bool[Tensor, "B *cells"]]:
     """Return what a channel says of each cell, and where it says something."""
     known, v = channel.weight > 0, channel.values.float()
     if cfg.kind == "class":

@@ -12,13 +12,13 @@ from torchelev.channels import fuse
 from torchelev.channels.config import ChannelConfig
 from torchelev.channels.native import can_update, update_in_cpp
 from torchelev.channels.points import match_points
-from torchelev.channels.state import Channel, Ground, blank_channel, follow, known_elevation
+from torchelev.channels.state import Channel, Ground, blank_channel, follow, known_elevation, read_cells
 from torchelev.grid import GridConfig
 from torchelev.ops.moving import move_layers
 from torchelev.state import MapState, blank_corner, fill
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     from torchelev.inputs.update_inputs import Inputs
     from torchelev.stages.measure.config import SensorConfig
@@ -142,7 +142,15 @@ class Channels(nn.Module):
         """The names of all components, each a layer of the map."""
         return tuple(layer for name, cfg in self.cfg.items() for layer in cfg.components(name))
 
-    def read(self, name: str, state: MapState | None) -> tuple[Float[Tensor, "B H W C"], Bool[Tensor, "B H W"]]:
-        """Return the values of a channel, and where it has them: of the maps, or as these cells of another state."""
+    def read(
+        self, name: str, state: MapState | None, cell: Int[Tensor, "B M"] | None = None
+    ) -> tuple[Float[Tensor, "B *cells C"], Bool[Tensor, "B *cells"]]:
+        """Return the values of a channel, and where it has them: of the maps, or as these cells of another state.
+
+        Args:
+            name: of the channel.
+            state: of the maps; None: the last one that was followed.
+            cell: flat numbers of the cells to read; None: all, as (B, H, W).
+        """
         channel = self.channel(name) if state is None else self._followed(name, state, None)
-        return fuse.read(channel, self.cfg[name])
+        return fuse.read(channel if cell is None else read_cells(channel, cell), self.cfg[name])

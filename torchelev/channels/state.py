@@ -86,6 +86,13 @@ def move_channel(channel: Channel, shift: Int[Tensor, "B 2"]) -> Channel:
     return Channel(moved(channel.values), moved(channel.weight), age)
 
 
+def read_cells(channel: Channel, cell: Int[Tensor, "B M"]) -> Channel:
+    """Return a channel of the cells with these flat numbers: values (B, M, C) and weight (B, M), without an age."""
+    values, weight = channel.values.flatten(1, 2), channel.weight.flatten(1)
+    found = values.gather(1, cell[..., None].expand(-1, -1, values.shape[-1]))
+    return Channel(found, weight.gather(1, cell), None)
+
+
 def known_elevation(state: MapState) -> Float[Tensor, "B H W"]:
     """Return the elevation [m] in float32, NaN where it is not known."""
     return torch.where(state.validity, state.elevation, torch.nan).float()

@@ -37,7 +37,8 @@ class MapFeed:
         T_map_base: env -> (B, 4, 4), base frame to map frame; the map's window follows the base.
         T_base_links: env -> (B, K, 4, 4), poses of the links; required if `cfg.sensor.body` is a RobotBody.
         dt: duration of one step [s].
-        read: (emap, T_map_base) -> observation (B, ...), or values and validity, which are stacked to (B, 2, ...).
+        read: (emap, T_map_base) -> observation (B, ...), or values and validity, which are stacked to (B, 2, ...);
+            those of a `HeightScan` with channels follow each other: (B, 2 (1 + C), P).
             None: `DEFAULT_READ`, the elevation relative to the base and its validity every 0.1 m of 1.6 x 1.0 m.
         cfg: config of the map.
         device: device of the map.
@@ -104,7 +105,8 @@ class MapFeed:
         values = self.reader(self.emap, T_map_base)
         if isinstance(values, tuple) and all(isinstance(value, Tensor) for value in values):
             # Values and validity, as height scans return them.
-            values = torch.stack([value.float() for value in values], 1)
+            join = torch.cat if getattr(self.reader, "channels", ()) else torch.stack  # both have rows of channels
+            values = join([value.float() for value in values], 1)
         B = self.emap.num_envs
         fits = isinstance(values, Tensor) and values.ndim > 1 and values.shape[0] == B
         actual = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__

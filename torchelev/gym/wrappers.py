@@ -130,8 +130,9 @@ class ElevationMapObservation(_MapObservation, gymnasium.Wrapper):
         T_base_links: env -> (K, 4, 4), poses of the links; required if `cfg.sensor.body` is a RobotBody.
         dt: duration of one step [s].
         read: (emap, T_map_base) -> (B, ...), such as a `torchelev.MapImage`; or values and validity, such as a
-            `HeightScan`, which are stacked to (B, 2, ...). Here B = 1. Values that are not finite become 0. None: the
-            elevation relative to the base and its validity, every 0.1 m of 1.6 x 1.0 m around the base.
+            `HeightScan`, which are stacked to (B, 2, ...); those of a scan with channels follow each other,
+            (B, 2 (1 + C), P). Here B = 1. Values that are not finite become 0. None: the elevation relative to the base
+            and its validity, every 0.1 m of 1.6 x 1.0 m around the base.
         cfg: config of the map.
         device: device of the map.
         key: key of the map in the observation.

@@ -30,7 +30,7 @@ class MapTerm:
     #: a HeightScan, a MapImage, or a function of your own, (emap, T_map_base) -> (B, ...)
     read: ClassVar[Reader]
     map_cfg: ClassVar[ElevationMapConfig] = DEFAULT_CFG  #: config of the maps
-    #: True appends the validity of a height scan, (B, P) becomes (B, 2 P)
+    #: True appends the validity of a height scan: (B, P) becomes (B, 2 P), with channels (B, C, P) becomes (B, 2 C, P)
     with_validity: ClassVar[bool] = False
 
     maps: StepMap  #: the maps, and the simulator that they are of
@@ -65,7 +65,7 @@ class MapTerm:
             T_map_base = self.maps.source.read_base(env)
         values = self._reader(emap, T_map_base, *self._read_feet(env))
         if isinstance(values, tuple):
-            values = torch.cat([part.float() for part in values], -1) if self.with_validity else values[0]
+            values = torch.cat([part.float() for part in values], 1) if self.with_validity else values[0]
         _check_shape(values, emap.num_envs)
         return torch.where(values.isfinite(), values, 0.0).float()
 

@@ -27,6 +27,9 @@ class HeightScan(ScanSettings):
 
     value = scale * clip(z - elevation - nominal_height + noise, -clip, clip) with z [m] of the base or foot, map frame.
 
+    With `channels`, such as `HeightScan.grid(channels=("rgb", "terrain.stone"))`, the values are (B, 1 + C, P): the
+    heights, then a row for each component of the map's channels.
+
     Build one with `isaac_lab`, `mjlab`, `legged_gym`, `grid`, `points` or `feet`. All of them take the fields of
     `ScanSettings` as further keyword arguments, such as `fill`, the rule for unknown cells. A scan does not
     change; `dataclasses.replace` returns one with other settings.
@@ -189,11 +192,12 @@ class HeightScan(ScanSettings):
         *,
         noise: bool | Float[Tensor, "B P"] = False,
         state: MapState | None = None,
-    ) -> tuple[Float[Tensor, "B P"], Bool[Tensor, "B P"]]:
+    ) -> tuple[Float[Tensor, "B *rows P"], Bool[Tensor, "B *rows P"]]:
         """Read the scan of each environment.
 
-        Differentiable in the state and, in bilinear mode, in T_map_base and feet. The first call on a
-        device copies the pattern there: make one before you capture a CUDA graph.
+        The heights are differentiable in the state and, in bilinear mode, in T_map_base and feet; channels, which are
+        read in single cells, are constants. The first call on a device copies the pattern there: make one before you
+        capture a CUDA graph.
 
         Args:
             emap: the maps.
@@ -203,11 +207,14 @@ class HeightScan(ScanSettings):
             state: the state to read; None: that of the maps.
 
         Returns:
-            Values, and whether the elevation at each point is known. The values are fresh tensors without NaN: unknown
-            cells are filled.
+            Values, and whether the elevation at each point is known, (B, P) both. With `channels` both are
+            (B, 1 + C, P), of which row 0 is that of the heights and the others are those of the C components in the
+            order of `channels`, each known where its channel is: `.flatten(1)` for a policy that takes (B, D). The
+            values are fresh tensors without NaN: unknown cells are filled.
 
         Raises:
             ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the pattern.
+            KeyError: if the maps lack one of `channels`.
         """
         return read_scan(self, emap, T_map_base, feet, noise, state)
 

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, whole_cells
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer
 from torchelev.observations import image_kernel, patterns
+from torchelev.observations.channel_reading import count_rows, parse_channels, read_channels
 from torchelev.observations.fill import read_points, require_mode
 from torchelev.observations.image_kernel import Channels
 from torchelev.observations.inputs import check_base
@@ -33,15 +35,18 @@ class MapImage:
     """Read the map around the base as images (B, C, H, W), for convolutional policies.
 
     H = length_x / resolution and W = length_y / resolution. Index [i, j]: i grows with +x, j with +y; the centre of a
-    pixel is at offset + (i + 0.5 - H / 2, j + 0.5 - W / 2) * resolution. Unknown pixels are 0 in every channel.
+    pixel is at offset + (i + 0.5 - H / 2, j + 0.5 - W / 2) * resolution. Unknown pixels are 0 in every layer.
 
-    Channels:
+    Layers:
 
     - "elevation" and "upper_bound" [m], above the ground `nominal_height` below the base
     - "completed" [m] likewise, and "completed_std" [m]: maps whose config has a `CompletionConfig` predict them
     - "validity", 1 where the elevation is known
     - "variance" [m^2]
     - "traversability", 0 (bad) to 1 (good)
+
+    After them come the components of `channels`, such as `MapImage(channels=("rgb", "terrain.stone"))`, each read in
+    the cell that holds the pixel's centre.
 
     Raises:
         ValueError: for a setting out of range.
@@ -51,24 +56,28 @@ class MapImage:
     length_y: float = 1.6  #: [m] along y, a whole number of pixels
     resolution: float = 0.05  #: [m] side of a pixel
     offset: tuple[float, float] = (0.0, 0.0)  #: [m] centre of the image (x, y), base frame
-    layers: tuple[str, ...] = ("elevation", "validity", "upper_bound", "traversability")  #: channels, in this order
+    layers: tuple[str, ...] = ("elevation", "validity", "upper_bound", "traversability")  #: in this order
+    #: of the map's config, after the layers: "rgb" for all its components, or "terrain.stone" for one
+    channels: tuple[str, ...] = ()
+    channel_fill: float = 0.0  #: value of channels in pixels where they are unknown
     #: "yaw" turns the image with the base's heading; "base" turns it in 3D and drops z; "world" only moves it
     alignment: str = "yaw"
     mode: str = "bilinear"  #: how the map is read: "bilinear", "nearest" or "minimum", as of `HeightScan`
     nominal_height: float = 0.0  #: [m] of the base over flat ground: that ground then has elevation 0
-    shape: tuple[int, int, int] = field(init=False)  #: (C, H, W), for the policy's input layer
+    _size: tuple[int, int] = field(init=False, repr=False, compare=False)  # H and W
     _pattern: Pattern = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         H, W = (whole_cells(name, getattr(self, name), self.resolution) for name in ("length_x", "length_y"))
-        are_channels = len(self.layers) > 0 and all(name in CHANNELS for name in self.layers)
-        hint = "correct their names"
-        require(are_channels, "layers", f"must be some of {', '.join(CHANNELS)}", repr(self.layers), hint)
+        object.__setattr__(self, "channels", parse_channels(self.channels, self.channel_fill))
+        are_layers = len(self.layers) > 0 and all(name in CHANNELS for name in self.layers)
+        hint = "correct their names, or give those of the map's channels as channels=(...)"
+        require(are_layers, "layers", f"must be some of {', '.join(CHANNELS)}", repr(self.layers), hint)
         require_mode(self.mode)
         require(math.isfinite(self.nominal_height), "nominal_height", "must be finite", self.nominal_height, "give 0")
         axes = zip(self.offset, (H, W), strict=True)
         x, y = (patterns.space_around(middle, count, self.resolution) for middle, count in axes)
-        object.__setattr__(self, "shape", (len(self.layers), H, W))
+        object.__setattr__(self, "_size", (H, W))
         points = patterns.parse_points(patterns.order_y_fastest(x, y))
         object.__setattr__(self, "_pattern", Pattern(points, self.alignment))
 
@@ -77,7 +86,7 @@ class MapImage:
     ) -> Float[Tensor, "B C H W"]:
         """Read an image around the base of each environment.
 
-        Differentiable in the state and, in bilinear mode, in T_map_base.
+        Its layers are differentiable in the state and, in bilinear mode, in T_map_base; channels are constants.
 
         Args:
             emap: the maps.
@@ -89,7 +98,7 @@ class MapImage:
 
         Raises:
             ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the image.
-            KeyError: for a channel "completed" or "completed_std" of maps without completion.
+            KeyError: for "completed" or "completed_std" of maps without completion, or channels that the maps lack.
         """
         grid = emap.cfg.grid
         self._pattern.require_inside(grid)
@@ -106,7 +115,35 @@ class MapImage:
         else:
             bound = {"upper_bound": emap.read_layer("upper_bound", state)} if "upper_bound" in self.layers else {}
             images = self._read_in_torch(layers | bound, current, grid, T_map_base)
-        return images.unflatten(-1, self.shape[1:])
+        if self.channels:
+            uv = self._place(T_map_base, current, grid)
+            rows, _ = read_channels(self.channels, self.channel_fill, emap, uv, state)
+            images = torch.cat([images, rows], 1)
+        return images.unflatten(-1, self._size)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(C, H, W), for the policy's input layer; of an image with channels, `shape_on` returns it.
+
+        Raises:
+            ValueError: if there are channels, whose number of components the map's config says.
+        """
+        hint = "use shape_on(cfg) with the config of the maps"
+        require(not self.channels, "shape", "must be of an image without channels", self.channels, hint)
+        return (len(self.layers), *self._size)
+
+    def shape_on(self, cfg: ElevationMapConfig) -> tuple[int, int, int]:
+        """Return (C, H, W) on maps of a config, for the policy's input layer.
+
+        Raises:
+            KeyError: if a channel is not there.
+        """
+        return (len(self.layers) + count_rows(self.channels, cfg), *self._size)
+
+    def _place(self, T_map_base: Tensor, state: MapState, grid: GridConfig) -> Float[Tensor, "B M 2"]:
+        """Return the centres of the pixels, in cells from the window's corner."""
+        base, dtype = T_map_base[:, None, :3, 3], state.elevation.dtype
+        return self._pattern.place(T_map_base, base, state.corner, grid.resolution, dtype)
 
     @property
     def _read_alone(self) -> list[str]:
@@ -129,9 +166,8 @@ class MapImage:
         self, layers: dict[str, Layer], state: MapState, grid: GridConfig, T_map_base: Tensor
     ) -> Float[Tensor, "B C M"]:
         """Read the channels of layers by tensors: this is the definition."""
-        base = T_map_base[:, None, :3, 3]
-        uv = self._pattern.place(T_map_base, base, state.corner, grid.resolution, state.elevation.dtype)
-        reference = base[..., 2].to(uv.dtype) - self.nominal_height
+        uv = self._place(T_map_base, state, grid)
+        reference = T_map_base[:, None, 2, 3].to(uv.dtype) - self.nominal_height
         read = dict(zip(layers, read_points(list(layers.values()), uv, grid, self.mode), strict=True))
         images = torch.stack([_channel(name, read, reference) for name in self.layers], 1)
         return torch.where(torch.isfinite(reference)[:, None], images, 0.0)

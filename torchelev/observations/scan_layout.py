@@ -12,15 +12,17 @@ from torchelev.observations.scan_settings import ScanSettings
 
 # Noise belongs to training, reach to the map's window; the placement follows from the pattern.
 _LEFT_OUT = ("noise", "noise_after_clip", "reach", "placement")
+_CHANNELS = ("channels", "channel_fill")  # which layouts of policies that read heights alone do not name
 _DIGITS = 6  # of a pattern's coordinates [m]
 
 
 def scan_layout(scan: ScanSettings) -> dict[str, Any]:
-    """Describe a scan by its points in their order, offset, clip, scale and fill, as values that JSON can hold.
+    """Describe a scan by its points in their order, offset, clip, scale, fill and channels, as values of JSON.
 
     Store it with a policy, and check it with `require_layout` where the policy is deployed.
     """
-    names = [field.name for field in dataclasses.fields(scan) if field.name not in _LEFT_OUT]
+    left_out = (*_LEFT_OUT, *(() if scan.channels else _CHANNELS))
+    names = [field.name for field in dataclasses.fields(scan) if field.name not in left_out]
     pattern = [[round(x, _DIGITS), round(y, _DIGITS)] for x, y in scan.pattern]
     return {name: pattern if name == "pattern" else to_json(getattr(scan, name)) for name in names}
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.layers import Layer
+from torchelev.observations.channel_reading import read_channels
 from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, filled_layers, read_points
 from torchelev.observations.inputs import ScanInputs, check_base, check_feet, draw_noise
 from torchelev.observations.patterns import to_cells
 from torchelev.observations.scan_kernel import can_read, read_in_cpp
 from torchelev.observations.scan_settings import ScanSettings
 from torchelev.state import MapState
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 def read_scan(
@@ -24,7 +30,7 @@ def read_scan(
     noise: bool | Tensor,
     state: MapState | None,
 ) -> Layer:
-    """Read the values (B, P) of a scan, and whether the elevation at each point is known: see `HeightScan`."""
+    """Read the values of a scan, (B, P) or with channels (B, 1 + C, P), and where they are known: see `HeightScan`."""
     scan.placement.require_inside(emap.cfg.grid)
     T_map_base = check_base(emap, T_map_base)
     if scan.num_feet:
@@ -36,9 +42,22 @@ def read_scan(
     inputs = ScanInputs(current, emap.cfg.grid, T_map_base, feet, draws)
     fill = scan.original if scan.fill == ORIGINAL else scan.fill
     if can_read(fill, inputs):
-        return read_in_cpp(scan, fill, _value_of_unknown(scan, fill), inputs)
-    filled = filled_layers(fill, emap, state, scan.placement.half_extent(inputs.grid), scan.inpaint_rings)
-    return _read(scan, fill, filled, inputs)
+        heights = read_in_cpp(scan, fill, _value_of_unknown(scan, fill), inputs)
+    else:
+        filled = filled_layers(fill, emap, state, scan.placement.half_extent(inputs.grid), scan.inpaint_rings)
+        heights = _read(scan, fill, filled, inputs)
+    if not scan.channels:
+        return heights
+    channels = read_channels(scan.channels, scan.channel_fill, emap, _place(scan, inputs), state)
+    values, valid = (torch.cat([height[:, None], rows], 1) for height, rows in zip(heights, channels, strict=True))
+    return values, valid
+
+
+def _place(scan: ScanSettings, inputs: ScanInputs) -> Float[Tensor, "B P 2"]:
+    """Return the points of a scan, in cells from the window's corner."""
+    origin = inputs.T_map_base[:, None, :3, 3] if inputs.feet is None else inputs.feet
+    state = inputs.state
+    return scan.placement.place(inputs.T_map_base, origin, state.corner, inputs.grid.resolution, state.elevation.dtype)
 
 
 def _read(scan: ScanSettings, fill: str | float, layers: list[Layer], inputs: ScanInputs) -> Layer:
@@ -47,7 +66,7 @@ def _read(scan: ScanSettings, fill: str | float, layers: list[Layer], inputs: Sc
     dtype = state.elevation.dtype
     base = inputs.T_map_base[:, None, :3, 3]
     origin = base if inputs.feet is None else inputs.feet
-    uv = scan.placement.place(inputs.T_map_base, origin, state.corner, grid.resolution, dtype)
+    uv = _place(scan, inputs)
     base_uv, base_z = to_cells(base, state.corner, grid.resolution, dtype), base[..., 2].to(dtype)
     query = Query(uv, base_uv, base_z, scan.placement.half_extent(grid), grid)
     z = origin[..., 2:].to(dtype)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from torchelev.config import ElevationMapConfig
 from torchelev.errors import require, require_positive
+from torchelev.observations.channel_reading import count_rows, parse_channels
 from torchelev.observations.fill import FILLS, ORIGINAL, require_fill, require_mode
 from torchelev.observations.patterns import Pattern, Points, parse_points
 
@@ -30,6 +32,9 @@ class ScanSettings:
 
     Points for which "lowest", "upper_bound", "inpaint" or "completed" have no height read as with "base".
 
+    `channels` adds what else the map holds at the points, each read in the cell that holds the point, without scale,
+    clip and noise: the heights are then the first of 1 + C rows.
+
     Raises:
         ValueError: for a setting out of range.
     """
@@ -50,6 +55,9 @@ class ScanSettings:
     noise_after_clip: bool = False  #: True adds the noise after the clip, as legged_gym does, not before it
     num_feet: int = 0  #: number of feet with a pattern around each; 0 puts one pattern around the base
     reach: float = 0.0  #: [m] largest horizontal distance of a foot from the base: the window must hold its pattern
+    #: of the map's config, by name: "rgb" for all its components, or "terrain.stone" for one
+    channels: tuple[str, ...] = ()
+    channel_fill: float = 0.0  #: value of channels in cells where they are unknown
     placement: Pattern = field(init=False, repr=False, compare=False)  #: the pattern as it moves with the robot
 
     def __post_init__(self) -> None:
@@ -69,6 +77,7 @@ class ScanSettings:
             self._require_number(name, (int, float), "must be a finite number of at least 0", 0)
         for name in ("num_feet", "inpaint_rings"):
             self._require_number(name, (int,), "must be an int of at least 0", 0)
+        object.__setattr__(self, "channels", parse_channels(self.channels, self.channel_fill))
         object.__setattr__(self, "placement", Pattern(self.pattern, self.alignment, self.reach))
 
     def _require_number(self, name: str, types: tuple[type[int] | type[float], ...], rule: str, minimum: float) -> None:
@@ -78,5 +87,14 @@ class ScanSettings:
 
     @property
     def num_points(self) -> int:
-        """P, the number of values of each environment."""
+        """P, the number of points of each environment, and of its values in a scan without channels."""
         return len(self.pattern) * max(1, self.num_feet)
+
+    def shape_on(self, cfg: ElevationMapConfig) -> tuple[int, ...]:
+        """Return the shape of each environment's values on maps of a config: (P,), or (1 + C, P) with channels.
+
+        Raises:
+            KeyError: if a channel is not there.
+        """
+        rows = (1 + count_rows(self.channels, cfg),) if self.channels else ()
+        return (*rows, self.num_points)

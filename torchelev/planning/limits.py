@@ -28,12 +28,16 @@ ROUNDING = 1e-3  # [m], [rad] by which ground may exceed a limit
 
 
 class Limit(IntEnum):
-    """A limit of the robot that ground exceeds; `NONE` where its rating, or that it is unknown, makes it impassable."""
+    """What makes ground impassable whatever its rating; `NONE`: its rating does, or that it is unknown.
+
+    STEP, SLOPE and CLEARANCE are limits of the robot, CLASS is a forbidden class of `TraversalCostConfig.class_costs`.
+    """
 
     NONE = 0
     STEP = 1
     SLOPE = 2
     CLEARANCE = 3
+    CLASS = 4
 
 
 class Limits(NamedTuple):

@@ -59,11 +59,12 @@ _LIMITS = {
     Limit.STEP: "; there, steps are higher than the robot can overcome",
     Limit.SLOPE: "; there, the ground is steeper than the robot can climb",
     Limit.CLEARANCE: "; there, the ground would touch the robot's belly",
+    Limit.CLASS: "; there, the ground is too likely of a class that class_costs forbids",
 }
 
 
 def explain(reason: int, limit: int) -> str:
-    """Return a reason, and the limit of the robot that is part of it, as a sentence."""
+    """Return a reason, and the limit that is part of it, as a sentence."""
     return Reason(reason).sentence + _LIMITS[Limit(limit)]
 
 
@@ -126,7 +127,7 @@ def find_limit(
     start: Endpoint,
     goal: Endpoint,
 ) -> Int[Tensor, "B"]:
-    """Return the `Limit` of the robot that the most ground exceeds where a path ends, int64.
+    """Return the `Limit` that the most ground exceeds where a path ends, int64.
 
     This ground is the goal, what encloses the start, or the border of what can be reached from the goal.
 

@@ -12,10 +12,15 @@ from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default
 from torchelev.ops.transforms import is_readable
 from torchelev.planning.cost_to_go import cost_to_go, descend
-from torchelev.planning.limits import find_exceeded
 from torchelev.planning.path_reason import Endpoint, explain, find_limit, find_reason, read_cell
 from torchelev.planning.standing import mark_standing_cells
-from torchelev.planning.traversal_cost import TraversalCostConfig, cost_within, mark_disc, widen
+from torchelev.planning.traversal_cost import (
+    TraversalCostConfig,
+    cost_within,
+    find_obstruction,
+    mark_disc,
+    widen,
+)
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -32,7 +37,7 @@ class Path(NamedTuple):
     #: number of waypoints without the repeated ones; 0 if the start is outside the window
     count: Int[Tensor, "B"]  # type: ignore[assignment]
     reason: Int[Tensor, "B"]  #: why the path ends where it does, a `Reason`; `explain` puts it into words
-    limit: Int[Tensor, "B"]  #: the `limits.Limit` of the robot that the ground exceeds there, if any
+    limit: Int[Tensor, "B"]  #: the `limits.Limit` that makes the ground there impassable, if any
 
     def poses(self, chord: float = 0.4) -> Float[Tensor, "B K 3"]:
         """Return x, y [m] and yaw [rad] of each waypoint, for `check_path`.
@@ -82,7 +87,8 @@ def plan(
 ) -> Path:
     """Find the cheapest path from start to goal over the cells of each map, by `traversal_cost`.
 
-    No path leads over ground beyond the robot's step, slope or clearance (`planning.limits`), whatever its rating.
+    No path leads over ground beyond the robot's step, slope or clearance (`planning.limits`), whatever its rating, nor
+    over ground of a class that `TraversalCostConfig.class_costs` forbids.
     The cell of the start is passable even if it is rated impassable: a robot may leave such ground, and `check_path`
     reports it. Cells of unknown traversability below the robot are passable too (`torchelev.planning.standing`).
 
@@ -103,13 +109,14 @@ def plan(
         ValueError, TypeError: for a wrong shape, dtype or device. On a CPU, or with the map's `check_values`, also for
             a start or goal outside the window or not finite; elsewhere, where reading them would make the host wait,
             the path does not reach its goal.
+        KeyError: for a channel or class of `class_costs` that the map lacks.
     """
     cfg, grid = given_or_default(TraversalCostConfig, cfg), emap.cfg.grid
     current = emap.state if state is None else state
     start, goal = (_find_cell(emap, *point, current) for point in (("start_xy", start_xy), ("goal_xy", goal_xy)))
     max_cells = 2 * (grid.height + grid.width) if max_cells is None else max_cells
-    exceeded = find_exceeded(current, emap.cfg)
-    cost = cost_within(exceeded, emap, cfg, confidence=confidence, start=start.cell, standing=standing, state=state)
+    found = find_obstruction(emap, cfg, state)
+    cost = cost_within(found, emap, cfg, confidence=confidence, start=start.cell, standing=standing, state=state)
     target = mark_disc(goal.cell, cost, 0.0) & (start.is_inside & goal.is_inside)[:, None, None]
     value = cost_to_go(cost, target, resolution=grid.resolution, rounds=rounds)
     path = descend(value, cost, start.cell, resolution=grid.resolution, max_cells=max_cells)
@@ -121,7 +128,7 @@ def plan(
         radius = cfg.stand_radius / grid.resolution
         below = mark_disc(start.cell, cost, radius) if standing is None else mark_standing_cells(emap, standing, state)
         reason = find_reason(cost, value, rated, below, start, goal, reached)
-        wide = [widen(cells, round(cfg.inflation_radius / grid.resolution)) for cells in exceeded]
+        wide = [widen(cells, round(cfg.inflation_radius / grid.resolution)) for cells in found.exceeded]
         limit = find_limit(reason, cost, value, wide, below, start, goal)
     xy = (path.cells + current.corner[:, None]).double().add(0.5) * grid.resolution
     num_steps = (path.cells[:, 1:] != path.cells[:, :-1]).any(-1).sum(1)

@@ -1,12 +1,11 @@
-"""The cost of crossing a cell: from the traversability of known ground, and from the upper bound of unknown ground."""
+"""The cost of crossing a cell: by traversability and class of known ground, by the upper bound of unknown ground."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default
 from torchelev.layers import Layer
 from torchelev.ops.windows import padded, window_maximum
+from torchelev.planning.class_costs import Costs, parse_costs, rate_classes
 from torchelev.planning.inclination import compute_inclination
 from torchelev.planning.limits import find_exceeded
 from torchelev.planning.standing import mark_standing_cells
@@ -47,23 +47,29 @@ class TraversalCostConfig:
     #: [m] by which impassable ground grows: half the robot's width, or 0 if the ratings include the robot's size
     inflation_radius: float = 0.0
     stand_radius: float = 0.4  #: [m] around the start, unknown ground is passable unless `standing` is given
+    #: factors on the cost of a metre by channel and class, such as {"terrain": {"mud": 3.0, "water": math.inf}}; inf
+    #: forbids a class, and a class without a factor counts 1
+    class_costs: Costs = field(default_factory=dict, hash=False)
+    max_forbidden: float = 0.3  #: probability of forbidden classes, together, above which ground is impassable
+    unknown_class_cost: float = 1.0  #: factor on the cost of ground whose class is unknown
 
     def __post_init__(self) -> None:
         is_bool = isinstance(self.cross_unknown, bool)
         require(is_bool, "cost.cross_unknown", "must be a bool", repr(self.cross_unknown), "give True or False")
         is_layer, rule = self.unknown_layer in UNKNOWN_LAYERS, f"must be one of {', '.join(UNKNOWN_LAYERS)}"
         require(is_layer, "cost.unknown_layer", rule, repr(self.unknown_layer), "use upper_bound")
-        for field in fields(self):
-            if field.name == "unknown_layer":
-                continue
-            value = getattr(self, field.name)
+        object.__setattr__(self, "class_costs", parse_costs(self.class_costs))
+        for name in (each.name for each in fields(self) if each.name not in ("unknown_layer", "class_costs")):
+            value = getattr(self, name)
             in_range = isinstance(value, int | float) and 0 <= value < math.inf
-            require(in_range, f"cost.{field.name}", "must be at least 0", repr(value), "leave it out for its default")
+            require(in_range, f"cost.{name}", "must be at least 0", repr(value), "leave it out for its default")
         in_range = self.min_traversability <= 1
         require(in_range, "cost.min_traversability", "must lie in [0, 1]", self.min_traversability, "give 0.3")
         in_range = 0 < self.max_inclination < math.pi / 2
         require(in_range, "cost.max_inclination", "must lie between 0 and pi / 2", self.max_inclination, "give radians")
-        require_positive(**{"cost.inclination_distance": self.inclination_distance})
+        require(self.max_forbidden < 1, "cost.max_forbidden", "must lie in [0, 1)", self.max_forbidden, "give 0.3")
+        for name in ("inclination_distance", "unknown_class_cost"):
+            require_positive(**{f"cost.{name}": getattr(self, name)})
 
 
 def traversal_cost(
@@ -83,6 +89,7 @@ def traversal_cost(
         only elevation or its bound: 1 + w_a a / max_a + w_c         impassable where a > max_inclination or unknown
         nothing known:               impassable
         beyond the robot's limits:   impassable, whatever the rating (`planning.limits`)
+        of a class with a cost:      times the factor, or impassable if forbidden (`class_costs.rate_classes`)
 
     Behind an edge, rays that passed over it bound the unseen ground from above. The nearer the robot is, the steeper it
     looks down, and ground that its rays still miss falls away more steeply than they do. So a steep bound indicates a
@@ -99,28 +106,46 @@ def traversal_cost(
         state: the state to read; None: that of the maps.
 
     Returns:
-        The costs: at least 1, inf where impassable.
+        The costs: at least 1 without `class_costs`, else positive; inf where impassable.
 
     Raises:
-        ValueError, TypeError: for a wrong shape, dtype or device, or a map without traversability.
-        KeyError: for `unknown_layer="completed"` of a map without completion.
+        ValueError, TypeError: for a wrong shape, dtype or device, a map without traversability, or a channel of
+            `class_costs` that is not one of classes.
+        KeyError: for `unknown_layer="completed"` of a map without completion, or a channel or class of `class_costs`
+            that the map lacks.
     """
+    cfg = given_or_default(TraversalCostConfig, cfg)
+    found = find_obstruction(emap, cfg, state)
+    return cost_within(found, emap, cfg, confidence=confidence, start=start, standing=standing, state=state)
+
+
+class Obstruction(NamedTuple):
+    """What makes cells impassable, or their cost another, whatever their rating."""
+
+    exceeded: list[Bool[Tensor, "B H W"]]  #: the cells beyond each `Limit`, in their order
+    factor: Float[Tensor, "B H W"] | None  #: on the cost of each cell; None: 1
+
+
+def find_obstruction(emap: ElevationMap, cfg: TraversalCostConfig, state: MapState | None = None) -> Obstruction:
+    """Find the cells beyond the robot's limits and those of forbidden classes, and the factors of the others."""
     exceeded = find_exceeded(emap.state if state is None else state, emap.cfg)
-    return cost_within(exceeded, emap, cfg, confidence=confidence, start=start, standing=standing, state=state)
+    if not cfg.class_costs:
+        return Obstruction(exceeded, None)
+    rating = rate_classes(emap, cfg.class_costs, cfg.max_forbidden, cfg.unknown_class_cost, state)
+    return Obstruction([*exceeded, rating.is_forbidden], rating.factor)
 
 
 def cost_within(
-    exceeded: Sequence[Bool[Tensor, "B H W"]],
+    found: Obstruction,
     emap: ElevationMap,
-    cfg: TraversalCostConfig | None = None,
+    cfg: TraversalCostConfig,
     *,
     confidence: Float[Tensor, "B H W"] | None = None,
     start: Int[Tensor, "B 2"] | None = None,
     standing: Float[Tensor, "B V 2"] | None = None,
     state: MapState | None = None,
 ) -> Float[Tensor, "B H W"]:
-    """Compute `traversal_cost`, given the cells beyond each of the robot's limits (`limits.find_exceeded`)."""
-    cfg = given_or_default(TraversalCostConfig, cfg)
+    """Compute `traversal_cost`, given what `find_obstruction` returned."""
     hint = "give ElevationMapConfig a TraversabilityConfig"
     require(emap.cfg.traversability is not None, "traversability", "must not be switched off", "None", hint)
     given, state = state, emap.state if state is None else state
@@ -133,8 +158,9 @@ def cost_within(
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
     rated, bound = (emap.read_layer(name, given) for name in ("traversability", cfg.unknown_layer))
     below = None if standing is None else mark_standing_cells(emap, standing, state)
-    beyond = functools.reduce(torch.logical_or, exceeded)
-    return cost_of_layers(rated, bound, emap.cfg.grid.resolution, cfg, confidence, start, below, beyond)
+    beyond = functools.reduce(torch.logical_or, found.exceeded)
+    resolution = emap.cfg.grid.resolution
+    return cost_of_layers(rated, bound, resolution, cfg, confidence, start, below, beyond, found.factor)
 
 
 def cost_of_layers(
@@ -146,6 +172,7 @@ def cost_of_layers(
     start: Int[Tensor, "B 2"] | None = None,
     standing: Bool[Tensor, "B H W"] | None = None,
     exceeded: Bool[Tensor, "B H W"] | None = None,
+    factor: Float[Tensor, "B H W"] | None = None,
 ) -> Float[Tensor, "B H W"]:
     """Compute `traversal_cost` from layers. Values of cells that are not known are ignored.
 
@@ -158,7 +185,8 @@ def cost_of_layers(
         confidence: confidence of the traversability, 0 to 1; None: 1.
         start: cell (i, j) on which each robot stands.
         standing: the cells on which the robots stand now.
-        exceeded: the cells beyond a limit of the robots.
+        exceeded: the cells beyond a limit of the robots, or of a forbidden class.
+        factor: on the cost of each cell, positive; None: 1.
     """
     t, is_rated = rated
     doubt = torch.zeros_like(t) if confidence is None else 1 - confidence.to(t.dtype).nan_to_num(0.0).clamp(0, 1)
@@ -169,6 +197,8 @@ def cost_of_layers(
         unknown_cost = 1 + cfg.weight_confidence + cfg.weight_inclination / cfg.max_inclination * angle
         is_gentle = is_inclined & ~is_rated & (angle <= cfg.max_inclination)
         cost = torch.where(is_gentle, unknown_cost, cost)
+    if factor is not None:
+        cost = cost * factor.to(cost.dtype)
     if standing is None and start is not None:
         standing = mark_disc(start, cost, cfg.stand_radius / resolution)
     if standing is not None:

@@ -15,7 +15,8 @@ from torchelev.observations.scan_layout import scan_layout
 #: of a group: the names of its entries if the robot gives them itself, else what reads the map
 Group = HeightScan | MapImage | Sequence[str]
 
-_IMAGE_SETTINGS = [field.name for field in dataclasses.fields(MapImage) if field.init]
+_CHANNELS = ("channels", "channel_fill")  # which `require_heights` refuses
+_IMAGE_SETTINGS = [field.name for field in dataclasses.fields(MapImage) if field.init and field.name not in _CHANNELS]
 
 
 def shape_of(group: Group) -> tuple[int, ...]:
@@ -44,8 +45,16 @@ def scan_settings(scan: HeightScan) -> dict[str, Any]:
 
 
 def image_settings(image: MapImage) -> dict[str, Any]:
-    """Return the settings of an image by name."""
+    """Return the settings of an image by name, as the C library takes them."""
     return {name: getattr(image, name) for name in _IMAGE_SETTINGS}
+
+
+def require_heights(groups: Mapping[str, Group]) -> None:
+    """Refuse groups that read channels, which neither recordings nor the C library hold."""
+    for name, group in groups.items():
+        channels = group.channels if isinstance(group, HeightScan | MapImage) else ()
+        rule, hint = "must read no channels, which bundles do not hold", "leave channels out"
+        require(not channels, f"groups.{name}.channels", rule, channels, hint)
 
 
 def from_json(where: str, rows: Any) -> dict[str, Group]:
@@ -56,7 +65,9 @@ def from_json(where: str, rows: Any) -> dict[str, Group]:
     """
     is_list = isinstance(rows, list) and all(isinstance(row, dict) and "name" in row for row in rows) and len(rows) > 0
     require(is_list, where, "must be a list of groups with names", type(rows).__name__, "export the run again")
-    return {row["name"]: _group(f"{where}, {row['name']}", row) for row in rows}
+    groups = {row["name"]: _group(f"{where}, {row['name']}", row) for row in rows}
+    require_heights(groups)
+    return groups
 
 
 def _group(where: str, row: dict[str, Any]) -> Group:

@@ -46,10 +46,16 @@ class Recorder:
         groups: the observation groups in the policy's order: the names of the entries that the robot gives itself, or
             the `HeightScan` or `MapImage` that reads the map.
         env: the environment to record.
+
+    Raises:
+        ValueError: there is no such environment, the map has channels, or a group reads them.
     """
 
     def __init__(self, emap: ElevationMap, groups: Mapping[str, Group], env: int = 0) -> None:
         require(0 <= env < emap.num_envs, "env", f"must be from 0 to {emap.num_envs - 1}", env, "give an environment")
+        observation_groups.require_heights(groups)
+        channels, hint = tuple(emap.cfg.channels), "record a map without channels"
+        require(not channels, "emap.cfg.channels", "must be empty, as bundles hold heights alone", channels, hint)
         self.emap, self.groups, self.env = emap, dict(groups), env
         self._updates: list[dict[str, np.ndarray]] = []
         self._steps: list[dict[str, np.ndarray]] = []

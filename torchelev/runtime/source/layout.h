@@ -30,7 +30,12 @@ class Layout {
     Layout(const std::string& name, const std::string& text, std::initializer_list<const char*> keys)
         : name(name), root(JsonReader::read(text, name)) {
         REQUIRE(root.kind == Json::OBJECT, name, "must be a mapping", root.type(), "see torchelev.h");
-        for (const auto& [key, value] : root.members) place_of(name + "." + key, key, keys);
+        for (const auto& [key, value] : root.members) {
+            const bool is_of_channels = key == "channels" || key == "channel_fill";
+            REQUIRE(!is_of_channels, named(key), "needs Python: this library has no channels", value.describe(),
+                    "leave it out", TORCHELEV_UNSUPPORTED);
+            place_of(named(key), key, keys);
+        }
     }
 
     std::string named(const std::string& key) const { return name + "." + key; }
