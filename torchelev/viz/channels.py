@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import matplotlib
@@ -16,14 +16,13 @@ from torchelev.viz.style import COLORS
 _FURTHER = "tab20"  #: colour map of the classes after the first ones
 
 
-def shown_channels(config: Mapping[str, Any], layers: Mapping[str, NDArray]) -> dict[str, ChannelConfig]:
-    """Return the channels of colours and of classes whose components are among the layers, by name.
+def shown_channels(config: Mapping[str, Any], layers: Collection[str]) -> dict[str, ChannelConfig]:
+    """Return what `choose_channels` does, with the config of a map as a dict."""
+    return choose_channels(parse_channels(config.get("channels") or {}, ()), layers)
 
-    Args:
-        config: of the map, as a dict.
-        layers: by name.
-    """
-    channels = parse_channels(config.get("channels") or {}, ())
+
+def choose_channels(channels: Mapping[str, ChannelConfig], layers: Collection[str]) -> dict[str, ChannelConfig]:
+    """Return the channels of colours and of classes whose components are among the layers, by name."""
     return {
         name: cfg
         for name, cfg in channels.items()
