@@ -10,6 +10,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.channels.config import ChannelConfig
 from torchelev.errors import require
 from torchelev.io.export import take
 from torchelev.output_files import atomic_file
@@ -57,13 +58,20 @@ def save_geotiff(
     check_epsg(epsg)
     channels = {name: cfg.components(name) for name, cfg in emap.cfg.channels.items()}
     names = [part for name in (emap.layers if layers is None else layers) for part in channels.get(name, (name,))]
-    colors = [part for name, cfg in emap.cfg.channels.items() if cfg.kind == "color" for part in channels[name]]
     taken = take(emap, env, names)
     bands = np.stack([np.flipud(taken.layers[name].T) for name in names]).astype(np.float32)
     x_min, _, _, y_max = taken.extent
     north_west = x_min + origin[0], y_max + origin[1]
-    roles = {name: _COLORS[k % 3] for k, name in enumerate(colors)}
+    roles = color_roles(emap.cfg.channels)
     write_bands(path, bands, bands.shape[1:], names, taken.resolution, north_west, epsg, colors=roles)
+
+
+def color_roles(channels: Mapping[str, ChannelConfig]) -> dict[str, str]:
+    """Return which components of channels are Red, Green or Blue, by their names."""
+    colors = {name: cfg for name, cfg in channels.items() if cfg.kind == "color"}
+    return {
+        part: role for name, cfg in colors.items() for part, role in zip(cfg.components(name), _COLORS, strict=True)
+    }
 
 
 def check_epsg(epsg: object) -> None:
