@@ -96,6 +96,40 @@ def test_what_was_measured_last_replaces_averages():
     assert value(site, "wet") == pytest.approx(4.0)  # 0.5 * 3 + 0.5 * 5
 
 
+def test_what_another_robot_measured_later_stays():
+    first, second = small_map(channels=CHANNELS), small_map(channels=CHANNELS)
+    site = SiteMap(resolution=0.1, channels=CHANNELS)
+    look(first, {"wet": torch.full((1, 1, 1), 1.0)})
+    site.merge(first, align=False, time=1.0)
+    look(second, {"wet": torch.full((1, 1, 1), 2.0)})
+    site.merge(second, align=False, time=2.0)
+    look(first, None)  # heights alone
+    site.merge(first, align=False, time=3.0)
+    assert value(site, "wet") == 2.0
+
+
+def test_a_robot_that_comes_back_brings_new_evidence():
+    emap, site = small_map(channels=CHANNELS), SiteMap(resolution=0.1, channels=CHANNELS)
+    everywhere = torch.cartesian_prod(torch.arange(-0.55, 0.6, 0.1), torch.arange(-0.45, 0.5, 0.1))[None]
+    for x, heat in ((0.0, 1.0), (5.0, 7.0), (0.0, 4.0)):
+        look(emap, {"heat": torch.full((1, everywhere.shape[1], 1), heat)}, x=x, points=everywhere)
+        site.merge(emap, align=False)
+    assert value(site, "heat") == pytest.approx(2.5, abs=1e-4)
+    assert value(site, "heat", (5.05, 0.05)) == pytest.approx(7.0, abs=1e-4)
+
+
+def test_what_contradicts_the_elevation_is_left_out():
+    emap, site = small_map(num_envs=2, channels=CHANNELS), SiteMap(resolution=0.1, channels=CHANNELS)
+    nan = float("nan")
+    for _ in range(20):
+        look(emap, {"heat": torch.ones(2, 1, 1)}, points=torch.tensor([[[0.05, 0.05]], [[nan, nan]]]))
+    higher = torch.tensor([[[nan, nan]], [[0.05, 0.05]]])
+    look(emap, {"heat": torch.full((2, 1, 1), 9.0)}, height=0.3, points=higher)
+    site.merge(emap, align=False)
+    assert value(site, "elevation") == pytest.approx(0.0, abs=0.01) and value(site, "other_elevation") > 0.2
+    assert value(site, "heat") == pytest.approx(1.0, abs=1e-5)
+
+
 def test_an_obstacle_brings_its_own_and_a_robot_without_the_channel_forgets():
     emap, site = small_map(channels=CHANNELS), SiteMap(resolution=0.1, channels=CHANNELS)
     look(emap, {"heat": torch.ones(1, 1, 1)})
@@ -114,12 +148,16 @@ def test_an_obstacle_brings_its_own_and_a_robot_without_the_channel_forgets():
 
 
 def test_after_a_reset_a_robot_brings_new_evidence():
-    emap, site = small_map(channels=CHANNELS), SiteMap(resolution=0.1, channels=CHANNELS)
+    """The first robot is reset and counts once more; what the second one knows stays its own."""
+    emap, site = small_map(num_envs=2, channels=CHANNELS), SiteMap(resolution=0.1, channels=CHANNELS)
     for number in (1.0, 4.0):
-        look(emap, {"heat": torch.full((1, 1, 1), number)})
+        look(emap, {"heat": torch.full((2, 1, 1), number)})
         site.merge(emap, align=False)
-        emap.reset()
-    assert value(site, "heat") == pytest.approx(2.5, abs=1e-5)
+        emap.reset(torch.tensor([0]))
+    assert value(site, "heat") == pytest.approx(2.5, abs=1e-5)  # two of each
+    look(emap, {"heat": torch.full((2, 1, 1), 5.0)})
+    site.merge(emap, align=False)
+    assert value(site, "heat") == pytest.approx((1 + 4 + 5 + 1 + 4 + 5) / 6, abs=1e-5)
 
 
 def test_images_count_without_new_points():

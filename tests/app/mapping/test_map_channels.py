@@ -95,6 +95,9 @@ def test_labels_of_a_bag(run, tmp_path, size):
         assert value_at(saved, x, y, "semantic.stone") == pytest.approx(0.9, abs=1e-4)  # (4 + 1/2) / (4 + 1)
         assert value_at(saved, x, -y, "semantic.grass") == pytest.approx(0.9, abs=1e-4)
     assert np.isnan(value_at(saved, -1.0, 0.5, "semantic.grass")), "behind the camera"
+    border = np.array([value_at(saved, 2.0, y, "semantic.stone") for y in np.arange(-0.45, 0.5, 0.1)])
+    counts = 5 * border - 0.5  # of four whole labels: none is blended at the border
+    np.testing.assert_allclose(counts, counts.round(), atol=1e-3)
     known = np.isfinite(saved.layers["semantic.stone"])
     assert 100 < known.sum() < 0.4 * known.size
 

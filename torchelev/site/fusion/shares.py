@@ -52,7 +52,7 @@ def read_shares(
         resolution: [m].
     """
     known, shares = windows.known, {}
-    if emap.channels is None:
+    if emap.channels is None or not channels:
         return {}
     place = torch.arange(known.elevation.numel(), device=known.elevation.device)
     above = rise(known, alignment, place // known.elevation[0].numel(), place, resolution)
