@@ -59,10 +59,7 @@ def read_shares(
     height = known.elevation.float() - above.view_as(known.elevation)
     time = (known.now[:, None, None] - known.age).float()
     for name in channels.configs.keys() & emap.cfg.channels.keys():
-        values, weight, _ = (
-            None if part is None else part.to(height.device).float() for part in emap.channels.channel(name)
-        )
-        assert values is not None and weight is not None
+        values, weight = (part.to(height.device).float() for part in emap.channels.channel(name)[:2])
         weight = torch.where(known.is_known, weight, 0.0)
         shares[name] = Share(known.corner.clone(), height, time, values.clone(), weight)
     return shares
