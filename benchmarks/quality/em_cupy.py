@@ -152,7 +152,7 @@ def table(result: dict[str, Any]) -> str:
     ]
     head = [f"{kind}: {key.replace('_', ' ')}" for kind in ("one step", "run") for key in COLUMNS]
     own, usual = (f"{result['milliseconds'][name]:.1f}" for name in ("like_em_cupy", "default"))
-    note = f"An update with {BPEARL:,} points: {own} ms, and {usual} by default; one robot, {result['threads']} threads."
+    note = f"An update with {BPEARL:,} points: {own} ms, {usual} by default; one robot, {result['threads']} threads."
     return f"{markdown_table(['scene', *head], rows)}\n\n{note}"
 
 

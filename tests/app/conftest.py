@@ -53,9 +53,10 @@ def at_scan(monkeypatch):
 
 
 class Shown(list):
-    """What a page drew: snapshots, and what came with them. Ctrl-C is pressed at the last one of `most`."""
+    """The page, and what it drew: snapshots, and what came with them. Ctrl-C is pressed at the last one of `most`."""
 
     most = math.inf
+    page = None
 
 
 @pytest.fixture
@@ -68,6 +69,7 @@ def shown(monkeypatch):
     class Page(live.Page):
         def draw(self, snapshot, *args):
             shown.append((snapshot, *args))
+            shown.page = self
             super().draw(snapshot, *args)
             if len(shown) == shown.most:
                 raise KeyboardInterrupt

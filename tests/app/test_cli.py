@@ -35,7 +35,7 @@ def options_by_group(text):
 @pytest.mark.parametrize(("command", "others"), [("map", ["out", "grid-map", "video", "every"]), ("view", ["host"])])
 def test_options_are_listed_by_group(run, command, others):
     groups = options_by_group(run(command, "--help")[1])
-    assert groups["Recording"] == ["poses", "extrinsics", "depth-scale", "depth-axes"]
+    assert groups["Recording"] == ["poses", "extrinsics", "depth-scale", "depth-axes", "colour"]
     assert groups["Map"] == ["resolution", "size", "fixed", "device", "config"]
     assert {"intrinsics", "dt"} <= set(groups["Folders of files"])
     assert {"points", "tf"} <= set(groups["Bags"])

@@ -50,6 +50,15 @@ def test_a_saved_map(run, port, shown, tmp_path, save):
     assert np.array_equal(shown[0][0].map.layers["elevation"], expected, equal_nan=True)
 
 
+def test_channels_of_a_saved_map(run, port, shown, tmp_path):
+    from tests.viz.live.test_page import mapped_channels  # which needs viser
+
+    emap, *_ = mapped_channels()
+    export.save_npz(tmp_path / "saved.npz", emap)
+    assert run("view", "saved.npz", "--port", port)[0] == 0
+    assert list(shown.page._channels) == ["rgb", "terrain"]
+
+
 @pytest.mark.slow(3)
 def test_without_a_recording_the_demo_walks(run, port, shown):
     shown.most = 3

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from torchelev import ChannelConfig, ElevationMap, ElevationMapConfig, FilterConfig, GridConfig
+from torchelev.io import read_grid_map, write_grid_map
 from torchelev.io.export import load_npz, save_npz, take
 from torchelev.io.grid_map import from_grid_map, pack_colors, to_grid_map
 from torchelev.io.map_file import load_map, save_map
@@ -58,6 +59,13 @@ def test_colours_of_a_grid_map_are_packed(emap):
         ValueError, match="layers: must have one value for each cell, got 'dino' with 2; give dino.0, dino.1"
     ):
         to_grid_map(emap, layers=("dino",))
+
+
+def test_a_recorded_map_has_packed_colours(emap, tmp_path):
+    write_grid_map(tmp_path / "map.mcap", emap, env=1)
+    layers = read_grid_map(tmp_path / "map.mcap").layers
+    known = ~np.isnan(layers["rgb"])
+    assert layers["rgb"][known].view(np.uint32).tolist() == [0x00FF33] and "rgb.green" in layers
 
 
 def test_packed_colours_by_hand():

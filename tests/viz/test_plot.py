@@ -78,5 +78,5 @@ def test_draws_maps_without_a_known_cell_and_of_one_height(tmp_path):
 def test_refuses_what_is_no_layer():
     with pytest.raises(ValueError, match="at least one Panel"):
         draw_layers([], extent=EXTENT)
-    with pytest.raises(ValueError, match=r"panel 'time': expected values \(H, W\), got \(1, 3, 3\)"):
-        draw_layers([Panel(title="time", values=np.zeros((1, 3, 3)))], extent=EXTENT)
+    with pytest.raises(ValueError, match=r"panel 'time': expected values \(H, W\) or \(H, W, 3\), got \(1, 3, 4\)"):
+        draw_layers([Panel(title="time", values=np.zeros((1, 3, 4)))], extent=EXTENT)

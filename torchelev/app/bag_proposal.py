@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator
 
 from torchelev.io import RecordingError
 from torchelev.io.bags import Bag, BagRecording, BagRequest, Topic, open_bag
+from torchelev.io.bags.colors import field_names
 from torchelev.io.bags.poses.clocks import ClockError
 from torchelev.io.bags.poses.reading import ODOMETRY, POSE, TRANSFORMS
 from torchelev.io.bags.scans import CLOUDS, IMAGES, LIDARS
+from torchelev.io.point_colors import color_fields
+
+_LABELS = re.compile("semantic|label|segment", re.IGNORECASE)
 
 
 def propose(bag: Bag) -> list[str]:
@@ -22,9 +27,19 @@ def propose(bag: Bag) -> list[str]:
             first = first or error
             continue
         warnings = [f"warning: {note}" for note in recording.pose_notes]
-        return ["to map it", f"  {_command(bag, recording, request)}", *warnings]
+        return ["to map it", f"  {_command(bag, recording, request)}", *_propose_channels(bag, request), *warnings]
     found = ["it cannot be mapped without more options:", f"  {first}"]
     return [*found, *_propose_odometry(bag)]
+
+
+def _propose_channels(bag: Bag, request: BagRequest) -> list[str]:
+    """Return a line for colours of the points, and one for a topic of images that may hold class labels."""
+    lines = []
+    if any(color_fields(field_names(bag, topic)) for topic in request.clouds):
+        lines.append("the points have colours, which --colour maps")
+    images = [topic.name for topic in bag.topics if topic.type in IMAGES and topic.num]
+    named = next((name for name in images if _LABELS.search(name)), None)
+    return lines + ([] if named is None else [f"class labels are mapped with --semantic {named}"])
 
 
 def _propose_odometry(bag: Bag) -> list[str]:

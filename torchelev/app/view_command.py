@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
@@ -18,10 +18,11 @@ from torchelev.app.user_error import user_errors
 from torchelev.io import Frame, MappingRun
 
 if TYPE_CHECKING:
+    from torchelev.channels.config import ChannelConfig
     from torchelev.io.export import SavedMap
     from torchelev.viz.live import Page, Player
 
-_MakePage = Callable[[str, tuple[str, ...]], "Page"]
+_MakePage = Callable[[str, tuple[str, ...], "Mapping[str, ChannelConfig]"], "Page"]
 
 
 def run_view(request: MapRequest | None, host: str, port: int, is_paused: bool) -> None:
@@ -34,10 +35,10 @@ def run_view(request: MapRequest | None, host: str, port: int, is_paused: bool) 
         is_paused: wait at the first scan.
     """
 
-    def make_page(title: str, layers: tuple[str, ...]) -> Page:
+    def make_page(title: str, layers: tuple[str, ...], channels: Mapping[str, ChannelConfig]) -> Page:
         from torchelev.viz.live import Page
 
-        page = Page(title, layers, host=host, port=port)
+        page = Page(title, layers, host=host, port=port, channels=channels)
         closing.callback(page.stop)
         click.echo(f"open      {page.url}   (Ctrl-C ends)")
         return page
@@ -60,7 +61,7 @@ def _view_recording(make_page: _MakePage, request: MapRequest, is_paused: bool) 
 
     with open_scans(request) as (scans, options):
         emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
-        page = make_page(request.recording.resolve().name, emap.layers)
+        page = make_page(request.recording.resolve().name, emap.layers, emap.cfg.channels)
         player, show = Player(page, len(scans), not is_paused), ShowScans()
         stopped = fuse_all(MappingRun(emap), scans, options, between=lambda run, frame: show(player, run, frame))
         if stopped is not None and not isinstance(stopped, KeyboardInterrupt) and player.num_shown:
@@ -94,7 +95,7 @@ def _view_demo(make_page: _MakePage, is_paused: bool) -> None:
 
     demo = DemoWalk()
     emap = demo.emap
-    player = Player(make_page("demo", emap.layers), len(demo), not is_paused)
+    player = Player(make_page("demo", emap.layers, emap.cfg.channels), len(demo), not is_paused)
     for scan in demo:
         scene = scan.T_map_base, scan.T_map_sensor, scan.points
         player.show(take_snapshot(emap, *scene, layers=emap.layers, time=scan.time))
@@ -111,10 +112,11 @@ def _refuse_options(request: MapRequest) -> None:
 
 
 def _view_map(make_page: _MakePage, path: Path) -> None:
+    from torchelev.viz.channels import shown_channels
     from torchelev.viz.live import Snapshot
 
     saved = _read_map(path)
-    page = make_page(path.name, tuple(saved.layers))
+    page = make_page(path.name, tuple(saved.layers), shown_channels(saved.config, saved.layers))
     page.draw(Snapshot(saved), f"{saved.resolution:g} m cells, {' x '.join(map(str, _shape(saved)))}")
     page.wait()
 

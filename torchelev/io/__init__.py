@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torchelev.io.files.intrinsics import Intrinsics, read_intrinsics
     from torchelev.io.files.layout import FileLayout
     from torchelev.io.folders.recording import Frame, Recording, open_recording
+    from torchelev.io.labels import LabelImage
     from torchelev.io.mapping import MappingRun, base_poses
     from torchelev.io.poses import Poses, read_poses, read_transform
     from torchelev.io.robot_model import link_poses, read_body
@@ -29,6 +30,7 @@ __all__ = [
     "Frame",
     "GridMapWriter",
     "Intrinsics",
+    "LabelImage",
     "MappingRun",
     "Poses",
     "Recording",
@@ -54,6 +56,7 @@ _LATER = {
     "Frame": "torchelev.io.folders.recording",
     "GridMapWriter": "torchelev.io.bags",
     "Intrinsics": "torchelev.io.files.intrinsics",
+    "LabelImage": "torchelev.io.labels",
     "MappingRun": "torchelev.io.mapping",
     "Poses": "torchelev.io.poses",
     "Recording": "torchelev.io.folders.recording",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
@@ -10,6 +10,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.channels.config import ChannelConfig
 from torchelev.errors import require
 from torchelev.io.export import take
 from torchelev.output_files import atomic_file
@@ -22,6 +23,7 @@ _PIXEL_SCALE, _TIE_POINT, _GEO_KEYS, _GDAL_METADATA, _GDAL_NODATA = 33550, 33922
 _MODEL_TYPE, _RASTER_TYPE, _PROJECTED_CRS = 1024, 1025, 3072
 _PROJECTED, _PIXEL_IS_AREA = 1, 1
 _SHORT, _DOUBLE, _ASCII = 3, 12, 2
+_COLORS = ("Red", "Green", "Blue")
 
 
 def save_geotiff(
@@ -35,13 +37,14 @@ def save_geotiff(
 ) -> None:
     """Write layers of one environment as bands of a GeoTIFF, float32, NaN where unknown.
 
-    The map frame's x must point east and its y north, as in ROS (REP 103). Rows run from north to south.
+    The map frame's x must point east and its y north, as in ROS (REP 103). Rows run from north to south. A channel of
+    several components is a band for each; those of colours, from 0 to 1, are marked as red, green and blue.
 
     Args:
         path: of the file.
         emap: the map.
         env: the environment.
-        layers: names as in `ElevationMap.layer`, in the order of the bands; None: all of them.
+        layers: names as in `ElevationMap.layer`, in the order of the bands, or of channels; None: all of them.
         epsg: code of the projected coordinate system, such as 32632 for UTM zone 32N; None: none is written.
         origin: easting and northing [m] of the map frame's origin in it.
 
@@ -53,12 +56,22 @@ def save_geotiff(
     import tifffile  # noqa: F401  # before the layers are read
 
     check_epsg(epsg)
-    names = list(emap.layers if layers is None else layers)
+    channels = {name: cfg.components(name) for name, cfg in emap.cfg.channels.items()}
+    names = [part for name in (emap.layers if layers is None else layers) for part in channels.get(name, (name,))]
     taken = take(emap, env, names)
     bands = np.stack([np.flipud(taken.layers[name].T) for name in names]).astype(np.float32)
     x_min, _, _, y_max = taken.extent
     north_west = x_min + origin[0], y_max + origin[1]
-    write_bands(path, bands, bands.shape[1:], names, taken.resolution, north_west, epsg)
+    roles = color_roles(emap.cfg.channels)
+    write_bands(path, bands, bands.shape[1:], names, taken.resolution, north_west, epsg, colors=roles)
+
+
+def color_roles(channels: Mapping[str, ChannelConfig]) -> dict[str, str]:
+    """Return which components of channels are Red, Green or Blue, by their names."""
+    colors = {name: cfg for name, cfg in channels.items() if cfg.kind == "color"}
+    return {
+        part: role for name, cfg in colors.items() for part, role in zip(cfg.components(name), _COLORS, strict=True)
+    }
 
 
 def check_epsg(epsg: object) -> None:
@@ -76,6 +89,7 @@ def write_bands(
     north_west: tuple[float, float],
     epsg: int | None,
     block: int | None = None,
+    colors: Mapping[str, str] | None = None,
 ) -> None:
     """Write bands as a GeoTIFF, rows from north to south.
 
@@ -88,10 +102,11 @@ def write_bands(
         north_west: easting and northing [m] of the first pixel's outer corner.
         epsg: code of the projected coordinate system; None: none is written.
         block: pixels on the side of a block, a multiple of 16; None: `bands` is an array.
+        colors: Red, Green or Blue of the bands, by name, that hold colours.
     """
     import tifffile
 
-    tags = _make_tags(names, resolution, north_west, epsg)
+    tags = _make_tags(_describe(names, colors or {}), resolution, north_west, epsg)
     options: dict[str, Any] = dict(photometric="minisblack", metadata=None, shape=(len(names), *shape))
     if len(names) > 1:
         options["planarconfig"] = "separate"
@@ -101,7 +116,7 @@ def write_bands(
         tifffile.imwrite(file, bands, dtype=np.float32, compression="zlib", extratags=tags, **options)
 
 
-def _make_tags(names: Sequence[str], resolution: float, north_west: tuple[float, float], epsg: int | None) -> list:
+def _make_tags(description: str, resolution: float, north_west: tuple[float, float], epsg: int | None) -> list:
     keys = {_MODEL_TYPE: _PROJECTED, _RASTER_TYPE: _PIXEL_IS_AREA}
     crs = (
         [] if epsg is None else [_geo_keys({**keys, _PROJECTED_CRS: epsg})]
@@ -110,7 +125,7 @@ def _make_tags(names: Sequence[str], resolution: float, north_west: tuple[float,
         *crs,
         (_PIXEL_SCALE, _DOUBLE, 3, (resolution, resolution, 0.0), True),
         (_TIE_POINT, _DOUBLE, 6, (0.0, 0.0, 0.0, *north_west, 0.0), True),
-        (_GDAL_METADATA, _ASCII, 0, _describe(names), True),
+        (_GDAL_METADATA, _ASCII, 0, description, True),
         (_GDAL_NODATA, _ASCII, 0, "nan", True),
     ]
 
@@ -123,10 +138,15 @@ def _geo_keys(keys: dict[int, int]) -> tuple:
     return _GEO_KEYS, _SHORT, len(numbers), tuple(numbers), True
 
 
-def _describe(names: Sequence[str]) -> str:
-    """Return the names of the bands as GDAL writes them."""
+def _describe(names: Sequence[str], colors: Mapping[str, str]) -> str:
+    """Return the names of the bands, and which of them are colours, as GDAL writes them."""
     items = [
         f'<Item name="DESCRIPTION" sample="{k}" role="description">{escape(name)}</Item>'
         for k, name in enumerate(names)
+    ]
+    items += [
+        f'<Item name="COLORINTERP" sample="{k}" role="colorinterp">{colors[name]}</Item>'
+        for k, name in enumerate(names)
+        if name in colors
     ]
     return f"<GDALMetadata>{''.join(items)}</GDALMetadata>"

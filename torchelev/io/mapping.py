@@ -11,14 +11,19 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.io.folders.recording import Frame
+from torchelev.io.labels import LabelImage, to_probabilities
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
 
+COLOR, SEMANTIC = "rgb", "semantic"  # channels of the points' colours and of the images' labels
+
+
 class MappingRun:
     """Build one map from a recording and keep statistics.
 
+    The channel rgb of a map takes the colours of the points, and semantic the images of labels, where frames have them.
     If `add` raises, the map still holds all scans added before.
 
     Args:
@@ -62,10 +67,26 @@ class MappingRun:
         base = None if T_map_base is None else self._to_tensor(T_map_base)
         start = time.perf_counter()
         covariance = None if frame.pose_covariance is None else self._to_tensor(frame.pose_covariance)
-        self.emap.update(points, self._to_tensor(frame.T_map_sensor), base, dt=frame.dt, pose_covariance=covariance)
+        T_map_sensor, colors = self._to_tensor(frame.T_map_sensor), self._colors(frame)
+        self.emap.update(points, T_map_sensor, base, dt=frame.dt, pose_covariance=covariance, features=colors)
         self._count(len(frame.points))  # reading the statistics waits for a GPU to finish
         self.update_ms.append(1e3 * (time.perf_counter() - start))
         self.sensor_xy.append(frame.T_map_sensor[:2, 3].copy())  # a view would keep what the pose was computed from
+        for image in frame.images:
+            self._paint(image)
+
+    def _colors(self, frame: Frame) -> dict[str, torch.Tensor] | None:
+        """Return what the points bring for the channel of colours; None: nothing, or there is none."""
+        if frame.colors is None or COLOR not in self.emap.cfg.channels:
+            return None
+        return {COLOR: torch.from_numpy(frame.colors)[None].to(self.emap.device)}
+
+    def _paint(self, image: LabelImage) -> None:
+        if SEMANTIC in self.emap.cfg.channels:
+            num_classes, K = self.emap.cfg.channels[SEMANTIC].size, self._to_tensor(image.K)
+            pixels = torch.from_numpy(to_probabilities(image.labels, num_classes))[None].to(self.emap.device)
+            T, lens = self._to_tensor(image.T_map_camera), image.distortion or None
+            self.emap.paint(pixels, K, T, SEMANTIC, distortion=lens, mode="nearest")
 
     def _to_tensor(self, pose: NDArray[np.float64]) -> torch.Tensor:
         return torch.from_numpy(pose)[None].to(self.emap.device)

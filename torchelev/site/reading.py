@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.layers import surrounding_cells, weighted_mean
+from torchelev.site.channels import SiteChannels
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
 
@@ -37,21 +38,28 @@ class Clock(NamedTuple):
     rate: float  #: [m^2/s] at which variances grow
 
 
-def check_layers(layers: Sequence[str] | None) -> tuple[str, ...]:
+def check_layers(layers: Sequence[str] | None, channels: SiteChannels) -> tuple[str, ...]:
     """Return names of layers; None: all. TypeError if they are not a list, KeyError if one does not exist."""
     is_list, hint = not isinstance(layers, str), f"give [{layers!r}]"
     require(is_list, "layers", "must be a list of names", repr(layers), hint, TypeError)
-    return LAYERS if layers is None else tuple(check_layer("layers", name) for name in layers)
+    if layers is None:
+        return (*LAYERS, *channels.layers)
+    configs = channels.configs
+    parts = [part for name in layers for part in (configs[name].components(name) if name in configs else (name,))]
+    return tuple(check_layer("layers", name, channels) for name in parts)
 
 
-def check_layer(argument: str, name: str) -> str:
+def check_layer(argument: str, name: str, channels: SiteChannels) -> str:
     """Return the name of a layer; KeyError if it does not exist."""
-    require(name in LAYERS, argument, f"must be one of {', '.join(LAYERS)}", repr(name), "check its spelling", KeyError)
+    names = (*LAYERS, *channels.layers)
+    require(name in names, argument, f"must be one of {', '.join(names)}", repr(name), "check its spelling", KeyError)
     return name
 
 
-def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock) -> Tensor:
+def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock, channels: SiteChannels) -> Tensor:
     """Compute a layer from the stored ones, NaN where unknown."""
+    if name in channels.layers:
+        return channels.compute(name, stored)
     first, *others = (stored[source] for source in _SOURCES[name])
     if name.endswith("variance"):
         return first + clock.rate * (clock.time - others[0])
@@ -62,17 +70,23 @@ def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock) -> Tensor:
     return (~first.isnan()).to(first.dtype) if name == "validity" else first
 
 
-def sources_of(names: Sequence[str]) -> list[str]:
+def sources_of(names: Sequence[str], tiles: Tiles) -> list[str]:
     """Return the stored layers that these layers are computed from."""
-    return [layer for layer in STORED if any(layer in _SOURCES[name] for name in names)]
+    channels = tiles.channels
+    used = {
+        source
+        for name in names
+        for source in (_SOURCES[name] if name in _SOURCES else channels.sources(channels.channel_of(name)))
+    }
+    return [layer for layer in tiles.layers if layer in used]
 
 
 def read_area(
     tiles: Tiles, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str], clock: Clock
 ) -> dict[str, Float[Tensor, "H W"]]:
     """Return layers of the cells from `corner` on, on the CPU; NaN where unknown."""
-    sources = sources_of(names)
-    rows = [STORED.index(source) for source in sources]
+    sources = sources_of(names, tiles)
+    rows = [tiles.layers.index(source) for source in sources]
     area = torch.full((len(sources), *size), torch.nan)
     for tile in _tiles_of(corner, size):
         if tile in tiles:
@@ -81,7 +95,7 @@ def read_area(
             within = tuple(slice(t.start - s, t.stop - s) for t, s in zip(to, start, strict=True))
             area[:, to[0], to[1]] = tiles.read([tile])[rows, 0, within[0], within[1]].cpu()
     stored = dict(zip(sources, area, strict=True))
-    return {name: compute_layer(name, stored, clock) for name in names}
+    return {name: compute_layer(name, stored, clock, tiles.channels) for name in names}
 
 
 def _tiles_of(corner: tuple[int, int], size: tuple[int, int]) -> list[tuple[int, int]]:
@@ -107,9 +121,10 @@ def sample_tiles(
     """
     finite = (cells.abs() < _FARTHEST).all(1)  # NaN is not
     i, j, weight = surrounding_cells(torch.where(finite[:, None], cells, 0.0)[None], mode)
-    sources = sources_of([name])
+    sources = sources_of([name], tiles)
     found = tiles.look_up(locate(i.flatten().long(), j.flatten().long()), sources)
-    values = compute_layer(name, dict(zip(sources, found, strict=True)), clock).view(weight.shape)
+    stored = dict(zip(sources, found, strict=True))
+    values = compute_layer(name, stored, clock, tiles.channels).view(weight.shape)
     weight = torch.where(values.isnan() | ~finite, 0.0, weight)
     mean, valid = weighted_mean(values.nan_to_num(nan=0.0), weight)
     return mean[0].float(), valid[0]

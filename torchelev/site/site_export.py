@@ -14,10 +14,10 @@ import numpy as np
 
 from torchelev.errors import message, require
 from torchelev.io.export import SavedMap, triangulate, write_npz, write_ply
-from torchelev.io.geotiff import check_epsg, write_bands
+from torchelev.io.geotiff import check_epsg, color_roles, write_bands
 from torchelev.output_files import MARK, atomic_file, require_writable
 from torchelev.site.reading import sources_of
-from torchelev.site.tiles import LAYERS, TILE, Tiles
+from torchelev.site.tiles import TILE, Tiles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,6 +39,7 @@ class Area(NamedTuple):
     layers: tuple[str, ...]  #: names
     resolution: float  #: [m]
     copy: Copy  #: reads a part of it
+    colors: dict[str, str]  #: layers that are Red, Green or Blue
 
 
 class Place(NamedTuple):
@@ -63,7 +64,7 @@ def choose_area(
         cells = [value / resolution for value in extent]
         sides = [[math.floor(cells[k] + _ROUNDING), math.ceil(cells[k + 1] - _ROUNDING)] for k in (0, 2)]
     (x, x_end), (y, y_end) = sides
-    return Area((x, y), (x_end - x, y_end - y), layers, resolution, copy)
+    return Area((x, y), (x_end - x, y_end - y), layers, resolution, copy, color_roles(tiles.channels.configs))
 
 
 def export(path: str | Path, area: Area, place: Place) -> None:
@@ -82,7 +83,7 @@ def export(path: str | Path, area: Area, place: Place) -> None:
 
 def _find_border(tiles: Tiles, layers: tuple[str, ...], axis: int, is_end: bool) -> int:
     """Return the number of the first known cell along an axis, or one past the last; reads tiles at that end only."""
-    rows = [LAYERS.index(source) for source in sources_of(layers)]
+    rows = [tiles.layers.index(source) for source in sources_of(layers, tiles)]
     for line in sorted({tile[axis] for tile in tiles}, reverse=is_end):
         chosen = [tile for tile in tiles if tile[axis] == line]
         known = np.zeros(TILE, bool)
@@ -130,7 +131,8 @@ def _import(suffix: str) -> None:
 
 def _write_tif(path: str | Path, area: Area, place: Place) -> None:
     north_west = _find_north_west(area, place)
-    write_bands(path, _read_blocks(area), area.size[::-1], area.layers, area.resolution, north_west, place.epsg, _BLOCK)
+    blocks, shape = _read_blocks(area), area.size[::-1]
+    write_bands(path, blocks, shape, area.layers, area.resolution, north_west, place.epsg, _BLOCK, area.colors)
 
 
 def _find_north_west(area: Area, place: Place) -> tuple[float, float]:

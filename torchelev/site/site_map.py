@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,10 @@ from torchelev.errors import require, require_positive
 from torchelev.inputs import checks
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
+from torchelev.site.channels import SiteChannels
 from torchelev.site.fusion.align import align
 from torchelev.site.fusion.merge import Merged, MergeReport, merge_windows
+from torchelev.site.fusion.shares import Change, find_changes, read_shares
 from torchelev.site.fusion.windows import (
     Alignment,
     Contribution,
@@ -39,7 +41,7 @@ from torchelev.site.readable_site import ReadableSite
 from torchelev.site.shared.collective import gather_windows, open_shared, shared_transaction
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import Tiles, locate
+from torchelev.site.tiles import LAYERS, Tiles, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
 from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
@@ -82,6 +84,9 @@ class SiteMap(ReadableSite):
         keyframes: keep the contributions of each merge, so that `move_keyframes` can correct poses later: 32 bytes for
             each cell of the windows and merge, less what compression saves on disk. Holds from the first merge on; a
             site on disk that has keyframes continues to keep them.
+        channels: keep these channels of the maps that are merged, as of `ElevationMapConfig(channels=...)`: 4 bytes for
+            each cell and component, and 4 for the weight. Settings of ageing are of no use. Holds from the first merge
+            on; a site on disk that has channels continues to keep them.
 
     Attributes:
         resolution: [m].
@@ -90,7 +95,8 @@ class SiteMap(ReadableSite):
     Raises:
         ValueError: the resolution is not positive or not that of the site at `path`, or there is something else; the
             group is not initialised, or its ranks open the site differently; or `keyframes` are to be kept by a group,
-            or by a site that was begun without.
+            or by a site that was begun without; or `channels` are to be kept beside keyframes or by a group, or are
+            others than those of the site at `path`.
         ModuleNotFoundError: tensorstore is missing.
     """
 
@@ -105,30 +111,39 @@ class SiteMap(ReadableSite):
         device: torch.device | str = "cpu",
         group: ProcessGroup | None = None,
         keyframes: bool = False,
+        channels: Mapping[str, Any] | None = None,
     ) -> None:
-        self._ranks = Ranks(group)
+        self._ranks, wanted = Ranks(group), SiteChannels(channels, LAYERS)
         self._ranks.exchange("SiteMap", lambda: {"same": self._set_up(resolution, path, cfg)})
-        self._store = None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution)
+        self._store = None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution, wanted)
         self._keyframes = KeyframeLog(self._store) if keyframes else None
-        self._begin(device)
-        self._check_keyframes(keyframes)
+        self._begin(device, wanted)
+        self._check_keyframes(keyframes, wanted)
         self._agree_on_id()
 
-    def _begin(self, device: torch.device | str) -> None:
+    def _begin(self, device: torch.device | str, channels: SiteChannels | None = None) -> None:
         """Start with what is stored, or with nothing."""
-        self._tiles = Tiles(self._store, self.cfg.cache_tiles, device)
+        if self._store is not None:  # of a site without channels, there may be no such attribute
+            channels = SiteChannels(self._store.attributes.get("channels"), LAYERS)
+        self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._num_commits, self._interrupted = 0, None
         self._read_attributes()
 
-    def _check_keyframes(self, wanted: bool) -> None:
-        """Raise ValueError unless the site can keep keyframes as wanted."""
+    def _check_keyframes(self, wanted: bool, channels: SiteChannels) -> None:
+        """Raise ValueError unless the site can keep keyframes and channels as wanted."""
         kept, hint = self._keyframes is not None, "begin another"
+        own = self._tiles.channels
         try:
             require(kept or not wanted, "keyframes", "must be kept from the first merge on", "a site without", hint)
             hint = "merge in one process, or without keyframes"
             require(not kept or self._ranks.size == 1, "keyframes, group", "exclude each other", "both", hint)
+            is_alone, hint = not (kept or self._ranks.size > 1), "keep one of them"
+            require(not own or is_alone, "channels, keyframes and group", "exclude each other", "several", hint)
+            rule, actual = "must be kept from the first merge on", ", ".join(channels.layers)
+            require(not channels or own.configs == channels.configs, "channels", rule, actual,
+                    f"leave them out: the site has {', '.join(own.layers) or 'none'}")  # fmt: skip
         except ValueError:
             self.close()
             raise
@@ -202,7 +217,9 @@ class SiteMap(ReadableSite):
         First, the robots' heights are aligned with each other and with the site, as each has its own drift. Then their
         cells are fused by their variances; a robot's earlier share of a cell is replaced, so that nothing counts twice.
         Heights that contradict each other are kept apart: the site says the newer one once it is about as sure, and
-        the layers `other_elevation`, `other_variance` and `other_time` hold the one that it contradicts.
+        the layers `other_elevation`, `other_variance` and `other_time` hold the one that it contradicts. Channels that
+        the site keeps are those of its elevation: means by weight, counts of classes added up, the largest of maxima,
+        and of "exponential" and "class_average" what was measured last. Maps may lack channels that the site keeps.
 
         Args:
             emap: the map, of the site's resolution. The site recognises it, not copies of it.
@@ -219,8 +236,8 @@ class SiteMap(ReadableSite):
 
         Raises:
             TypeError: `emap` is not an ElevationMap, or `time` is not a number.
-            ValueError: `emap` has another resolution, `time` is not in seconds, or the site is read-only or closed.
-                Nothing has changed then.
+            ValueError: `emap` has another resolution or a channel of another kind, `time` is not in seconds, or the
+                site is read-only or closed. Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
             LostRankError: of a group, another rank has ended; the site is as it was before.
         """
@@ -241,10 +258,12 @@ class SiteMap(ReadableSite):
         alignment = Alignment(*(value[own] for value in all_aligned))
         new = self._record(windows, alignment, T_map_base, now)
         keyframes = torch.full_like(state.elapsed, -1) if new is None else new.ids
-        contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes)
+        shares = read_shares(emap, windows, alignment, self._tiles.channels, self.resolution)
+        changes = find_changes(shares, contribution)
+        contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes)._replace(shares=shares)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _contributions.setdefault(emap, {})[self._id] = contribution
-        contradictions = self._fuse(all_windows, all_aligned, now, new)[own]
+        contradictions = self._fuse(all_windows, all_aligned, now, new, changes)[own]
         _contributions.setdefault(emap, {})[self._id] = contribution
         self._raise_interrupted()
         return MergeReport(*alignment, count(windows.is_new), contradictions)
@@ -286,6 +305,7 @@ class SiteMap(ReadableSite):
         actual, hint = type(emap).__name__, "give an ElevationMap"
         require(isinstance(emap, ElevationMap), "emap", "must be an ElevationMap", actual, hint, TypeError)
         self.require_resolution(emap)
+        self._tiles.channels.require_fit(emap)
         self._require_writable()
 
     def _require_writable(self) -> None:
@@ -327,11 +347,13 @@ class SiteMap(ReadableSite):
         rows, number, time = self._keyframes.rows, self._keyframes.num_merges, self._epoch + max(self._time, now)
         return record(windows, alignment, T_map_base, rows, number, time, self.resolution)
 
-    def _fuse(self, windows: Windows, alignment: Alignment, now: float, new: Recorded | None) -> Int[Tensor, "B"]:
+    def _fuse(
+        self, windows: Windows, alignment: Alignment, now: float, new: Recorded | None, changes: dict[str, Change]
+    ) -> Int[Tensor, "B"]:
         """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
         rate, time = self._clock.rate, max(self._time, now)
         if self._keyframes is None or new is None:
-            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg)
+            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes)
             return self._write(parts, time, len(windows.known.corner))
         parts = merge_recorded(self._tiles, self._keyframes.rows, new, self.resolution, rate, self.cfg)
         contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1)
@@ -439,6 +461,7 @@ class SiteMap(ReadableSite):
         own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}
         own["num_commits"] = self._num_commits + 1
         merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
+        own["channels"] = self._tiles.channels.attributes
         return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
     def _read_attributes(self) -> None:

@@ -12,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchelev.site.channels import SiteChannels
+
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
@@ -78,14 +80,27 @@ class Tiles:
         storage: where all tiles are; None: in memory alone.
         capacity: how many stay in memory if there is a storage.
         device: that holds them.
+        channels: of the site; None: there are none.
+
+    Attributes:
+        channels: of the site.
+        layers: names of the L layers: `LAYERS`, and those of the channels.
     """
 
-    def __init__(self, storage: Storage | None, capacity: int, device: torch.device | str) -> None:
+    def __init__(
+        self,
+        storage: Storage | None,
+        capacity: int,
+        device: torch.device | str,
+        channels: SiteChannels | None = None,
+    ) -> None:
+        self.channels = SiteChannels(None, LAYERS) if channels is None else channels
+        self.layers = (*LAYERS, *self.channels.stored)
         self._storage, self._capacity = storage, capacity
         self._slots: OrderedDict[Tile, int] = OrderedDict()
         self._free: list[int] = []
         with torch.inference_mode(False):  # written by reading, in inference mode and outside of it, and by merging
-            self.values = torch.empty(len(LAYERS), 0, TILE, TILE, device=device)
+            self.values = torch.empty(len(self.layers), 0, TILE, TILE, device=device)
 
     @property
     def device(self) -> torch.device:
@@ -108,7 +123,7 @@ class Tiles:
     def read(self, tiles: Sequence[Tile]) -> Float[Tensor, "L n T T"]:
         """Return copies of tiles, NaN where unknown."""
         if not any(tile in self for tile in tiles):
-            return self.values.new_full((len(LAYERS), len(tiles), TILE, TILE), torch.nan)
+            return self.values.new_full((len(self.layers), len(tiles), TILE, TILE), torch.nan)
         slots = self._fetch(tiles)  # before `values`, which it may replace
         return self.values.index_select(1, slots)
 
@@ -119,7 +134,7 @@ class Tiles:
     def look_up(self, located: Located, layers: Sequence[str]) -> Float[Tensor, "l K"]:
         """Return layers of cells, NaN where unknown."""
         values = self.values.new_full((len(layers), len(located.place)), torch.nan)
-        rows = [LAYERS.index(layer) for layer in layers]
+        rows = [self.layers.index(layer) for layer in layers]
         stored = [k for k, tile in enumerate(located.tiles) if tile in self]
         step = len(stored) if self._storage is None else self._capacity
         for start in range(0, len(stored), max(step, 1)):
@@ -163,7 +178,7 @@ class Tiles:
 
     def _load(self, tiles: list[Tile]) -> Tensor:
         if self._storage is None or not any(tile in self._storage.tiles for tile in tiles):
-            return self.values.new_full((len(LAYERS), len(tiles), TILE, TILE), torch.nan)
+            return self.values.new_full((len(self.layers), len(tiles), TILE, TILE), torch.nan)
         return torch.from_numpy(self._storage.read(tiles)).to(self.device).transpose(0, 1)
 
     def _make_room(self, needed: int, used: int) -> None:
@@ -177,6 +192,6 @@ class Tiles:
             old, most = self.values, math.inf if self._storage is None else self._capacity
             size = max(old.shape[1] + short, int(min(2 * old.shape[1], most)))
             with torch.inference_mode(False):
-                self.values = torch.empty(len(LAYERS), size, TILE, TILE, device=old.device)
+                self.values = torch.empty(len(self.layers), size, TILE, TILE, device=old.device)
             self.values[:, : old.shape[1]] = old
             self._free += range(old.shape[1], size)

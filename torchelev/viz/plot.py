@@ -7,14 +7,17 @@ window nor changes the calling program's backend.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from torchelev.output_files import atomic_file
@@ -30,11 +33,14 @@ class Panel:
     """
 
     title: str  #: above the panel
-    values: NDArray  #: (H, W), as from `ElevationMap.layer`: i grows with +x, j with +y, NaN where unknown
+    #: (H, W), as from `ElevationMap.layer`: i grows with +x, j with +y, NaN where unknown; or (H, W, 3), colours of the
+    #: cells from 0 to 1
+    values: NDArray
     unit: str = ""  #: of the values, beside the colour bar
     cmap: str = HEIGHTS  #: name of a matplotlib colour map
     vmin: float | None = None  #: value of the lowest colour; None: the 1st percentile
     vmax: float | None = None  #: value of the highest colour; None: the 99th percentile
+    legend: Mapping[str, Any] = field(default_factory=dict)  #: of colours: name -> (3,) its colour
 
 
 def save_layers(
@@ -55,7 +61,7 @@ def save_layers(
         title: above all panels.
 
     Raises:
-        ValueError: if there is no panel, or a panel's values are not (H, W).
+        ValueError: if there is no panel, or a panel's values are neither (H, W) nor (H, W, 3).
     """
     figure = draw_layers(panels, extent=extent, path_xy=path_xy, title=title)
     with atomic_file(path) as file:
@@ -91,8 +97,9 @@ def _check_panels(panels: Sequence[Panel]) -> None:
     if not panels:
         raise ValueError("panels: expected at least one Panel, got none")
     for panel in panels:
-        if np.ndim(panel.values) != 2:
-            raise ValueError(f"panel '{panel.title}': expected values (H, W), got {np.shape(panel.values)}")
+        shape = np.shape(panel.values)
+        if len(shape) != 2 and not (len(shape) == 3 and shape[-1] == 3):
+            raise ValueError(f"panel '{panel.title}': expected values (H, W) or (H, W, 3), got {shape}")
 
 
 def _arrange(count: int) -> tuple[int, int]:
@@ -112,18 +119,39 @@ def _panel_size(extent: tuple[float, float, float, float]) -> tuple[float, float
 
 
 def _draw_panel(figure: Figure, ax: Axes, panel: Panel, extent, path_xy: NDArray | None) -> None:
-    values = np.ma.masked_invalid(np.asarray(panel.values, dtype=float))
-    vmin, vmax = color_limits(panel, values)
     ax.set_facecolor(UNKNOWN_COLOR)
-    # The map's first index is x, imshow's runs down: transposed and with the origin below, x runs right and y up.
-    image = ax.imshow(
-        values.T, origin="lower", extent=extent, cmap=panel.cmap, vmin=vmin, vmax=vmax, interpolation="nearest"
-    )
+    values = np.asarray(panel.values, dtype=float)
+    image = _draw_colors(ax, values, extent) if values.ndim == 3 else _draw_values(ax, panel, values, extent)
     if path_xy is not None and len(path_xy):
         _draw_path(ax, np.asarray(path_xy, dtype=float))
     ax.set(xlim=extent[:2], ylim=extent[2:], title=panel.title)
     bar = figure.colorbar(image, ax=ax, pad=0.02)
     bar.set_label(f"[{panel.unit}]" if panel.unit else "")
+    if values.ndim == 3:
+        bar.ax.set_visible(False)  # its place stays, so that all panels have one size
+        _draw_legend(ax, panel.legend)
+
+
+def _draw_values(ax: Axes, panel: Panel, values: NDArray, extent) -> AxesImage:
+    masked = np.ma.masked_invalid(values)
+    vmin, vmax = color_limits(panel, masked)
+    # The map's first index is x, imshow's runs down: transposed and with the origin below, x runs right and y up.
+    return ax.imshow(
+        masked.T, origin="lower", extent=extent, cmap=panel.cmap, vmin=vmin, vmax=vmax, interpolation="nearest"
+    )
+
+
+def _draw_colors(ax: Axes, values: NDArray, extent) -> AxesImage:
+    known = np.isfinite(values).all(-1, keepdims=True)
+    rgba = np.concatenate([np.nan_to_num(values), known], -1)
+    return ax.imshow(rgba.swapaxes(0, 1), origin="lower", extent=extent, interpolation="nearest")
+
+
+def _draw_legend(ax: Axes, colors: Mapping[str, Any]) -> None:
+    if colors:
+        patches = [Patch(facecolor=tuple(color), label=name) for name, color in colors.items()]
+        box: dict[str, Any] = {"frameon": True, "framealpha": 0.8, "fontsize": 8, "handlelength": 1.0}
+        ax.legend(handles=patches, loc="lower left", **box)
 
 
 def color_limits(panel: Panel, values: np.ma.MaskedArray) -> tuple[float, float]:

@@ -209,15 +209,21 @@ class Writer:
         self.bag.close()
 
 
-def make_cloud(writer, points, times, header, dtype="f4", order="xyz", pad=0, bigendian=False, rows=1, time="t") -> Any:
-    """A PointCloud2 with fields in this order, `pad` bytes between them and after each row, of `rows` rows."""
+def make_cloud(
+    writer, points, times, header, dtype="f4", order="xyz", pad=0, bigendian=False, rows=1, time="t", colors=None
+) -> Any:
+    """A PointCloud2 with fields in this order, `pad` bytes between them and after each row, of `rows` rows.
+
+    `colors` are further fields: name -> (N,) float32, uint32 or uint8.
+    """
     end = ">" if bigendian else "<"
-    codes = {"f4": 7, "f8": 8, "u4": 6}
+    codes = {"f4": 7, "f8": 8, "u4": 6, "u1": 2}
     columns = {name: (dtype, points[:, "xyz".index(name)]) for name in order}
     if times is not None and time == "t":
         columns["t"] = ("u4", np.round((times - times.min()) * 1e9))
     elif times is not None:
         columns["timestamp"] = ("f8", header.stamp.sec + 1e-9 * header.stamp.nanosec + times)
+    columns |= {name: (values.dtype.str[1:], values) for name, values in (colors or {}).items()}
     offsets, size = {}, pad
     for name, (code, _) in columns.items():
         offsets[name], size = size, size + int(code[1]) + pad

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from torchelev.viz.live.colors import Limits, choose_limits, colorize, describe, legend, shown_layers
+from torchelev import ChannelConfig
+from torchelev.viz.live.colors import (
+    Limits,
+    channel_legend,
+    choose_limits,
+    colorize,
+    colorize_channel,
+    describe,
+    legend,
+    shown_layers,
+)
 
 
 def test_limits_stay_while_they_are_about_right():
@@ -34,3 +44,17 @@ def test_the_variance_is_shown_as_a_standard_deviation():
     shown = shown_layers({"variance": np.array([0.04]), "time": np.array([2.0])})
     assert shown["standard deviation"] == 0.2 and "variance" not in shown
     assert describe("time", 2.0) == "2.00 s" and describe("time", np.nan) == "unknown"
+
+
+def test_channels_have_true_colours_and_those_of_classes():
+    rgb = np.array([[[1.0, np.nan]], [[0.5, np.nan]], [[0.0, np.nan]]])
+    assert colorize_channel(ChannelConfig(kind="color"), rgb).tolist() == [[[255, 128, 0, 255], [217, 217, 217, 255]]]
+    terrain = ChannelConfig(kind="class", names=("grass & moss", "stone", "mud"))
+    parts = np.array([[[0.8, 0.1]], [[0.1, 0.1]], [[0.1, 0.8]]])
+    colors = colorize_channel(terrain, parts)[0, :, :3].tolist()
+    text = channel_legend("terrain", terrain, parts)
+    assert colors[0] != colors[1]
+    for name, (r, g, b) in zip(("grass &amp; moss", "mud"), colors, strict=True):
+        assert f'rgb({r}, {g}, {b})"></span> {name}<' in text
+    assert "stone" not in text and "most probable class" in text
+    assert "rgb, as seen" in channel_legend("rgb", ChannelConfig(kind="color"), rgb)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import mapped, pose, wait_for
+from tests.viz.live.test_page import mapped_channels
 from torchelev.viz.live import LiveView, Page
 
 
@@ -29,6 +30,16 @@ def test_it_shows_the_robot_that_was_chosen(emap, port, capsys):
     assert f"http://localhost:{port}" in capsys.readouterr().out
     assert (shown == emap.layer("elevation")[0].numpy())[shown == shown].all()
     assert (other == emap.layer("elevation")[2].numpy())[other == other].all()
+
+
+def test_the_components_of_a_chosen_channel_are_copied(port):
+    emap, T, _ = mapped_channels()
+    with LiveView(emap, port=port, max_share=1.0) as view:
+        view.page._layer.value = "rgb"
+        wait_for(lambda: view.show(T))
+        wait_for(lambda: view.num_drawn == 1)
+        assert "rgb, as seen" in view.page._legend.content
+        assert "rgb.red" in view.page._last.map.layers and "heat" not in view.page._last.map.layers
 
 
 def test_after_the_loop_another_robot_can_be_chosen_until_ctrl_c(emap, port):

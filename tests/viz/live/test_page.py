@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.helpers import pose, seen_from, small_map
+from torchelev import ChannelConfig
 from torchelev.viz.live import Page, take_snapshot
 
 
@@ -22,6 +23,23 @@ def mapped_step():
     for _ in range(3):
         emap.update(seen_from(T, ground), T, T, 0.1)
     return emap, T, ground
+
+
+def mapped_channels():
+    """The step in colours, classes and a number: red grass below, green stone above."""
+    channels = {"rgb": "color", "terrain": ChannelConfig(kind="class", names=("grass", "stone")), "heat": "mean"}
+    emap = small_map(cells=(20, 16), channels=channels)
+    _, T, ground = mapped_step()
+    upper = torch.tensor(ground[:, 0] > 0).float()[None]
+    zero = torch.zeros_like(upper)
+    features = {
+        "rgb": torch.stack([1 - upper, upper, zero], -1),
+        "terrain": torch.stack([1 - upper, upper], -1),
+        "heat": upper,
+    }
+    for _ in range(3):
+        emap.update(seen_from(T, ground), T, T, 0.1, features=features)
+    return emap, T, features
 
 
 @pytest.fixture
@@ -69,6 +87,33 @@ def test_the_legend_follows_the_layer(page):
     assert "elevation [m]" in page._legend.content
     page._layer.value = "standard deviation"
     assert "standard deviation [m]" in page._legend.content
+
+
+def test_channels_colour_the_surface(port):
+    """Colours and classes can be chosen as a whole, scalars by a colour map; a snapshot without them shows heights."""
+    emap, T, features = mapped_channels()
+    page = Page("test", emap.layers, port=port, channels=emap.cfg.channels)
+    try:
+        assert {"rgb", "terrain", "terrain.stone", "heat"} <= set(page._layer.options)
+        seen = []
+        page._scene.draw = lambda snapshot, colors, path, parts: seen.append(colors)
+        page.draw(take_snapshot(emap, T, T, layers=emap.layers))
+        for name, words in (("rgb", "rgb, as seen"), ("terrain", "most probable class"), ("heat", "heat")):
+            page._layer.value = name
+            assert words in page._legend.content
+        rgb, terrain = seen[1], seen[2]
+        assert rgb[2, 2].tolist() == [255, 0, 0, 255] and rgb[-3, 2].tolist() == [0, 255, 0, 255]
+        assert (terrain[2, 2] != terrain[-3, 2]).any()
+        page._layer.value = "rgb"
+        asked = []
+        page.on_change = lambda: asked.append(page.layer)
+        page.draw(take_snapshot(emap, T, T))
+        assert "elevation [m]" in page._legend.content
+        page._layer.value = "traversability"
+        page._layer.value = "terrain"
+        assert asked == ["terrain"], "for a snapshot with it, as this one lacks it"
+    finally:
+        page.stop()
 
 
 def test_a_click_says_the_values_of_the_cell(page):

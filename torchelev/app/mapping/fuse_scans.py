@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.app.interrupts import defer_interrupts
+from torchelev.app.mapping.map_channels import add_channels
+from torchelev.channels.config import ChannelConfig
 from torchelev.io import Frame, MappingRun
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ class MapOptions:
     sensor_height: float | None  #: [m] above the base, an alternative to T_base_sensor; None: unknown
     fixed: bool  #: keep the window in place
     has_base: bool = False  #: each scan comes with the pose of the base
+    channels: Mapping[str, ChannelConfig] = field(default_factory=dict)  #: for what the recording brings beside heights
 
     @property
     def knows_base(self) -> bool:
@@ -42,6 +45,7 @@ def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> Ele
         raise ValueError("config.sensor.body: recordings hold no poses of links; give one box, lower and upper")
     if config.sensor.body is not None and options.T_base_sensor is None and not options.has_base:
         raise ValueError("config.sensor.body: the body box turns with the robot's base; give --extrinsics")
+    config = add_channels(config, options.channels)
     if not options.knows_base:
         config = replace(config, overlap=None)
     try:

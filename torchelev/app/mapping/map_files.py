@@ -107,5 +107,5 @@ def _save_picture(path: Path, run: MappingRun, title: str) -> None:
     from torchelev.viz.plot import save_layers
 
     saved = take(run.emap)
-    panels = choose_panels(saved.layers, tuple(step.layer for step in run.emap.cfg.filters))
+    panels = choose_panels(saved, tuple(step.layer for step in run.emap.cfg.filters))
     save_layers(path, panels, extent=saved.extent, path_xy=np.array(run.sensor_xy), title=title)

@@ -42,6 +42,14 @@ _OPTIONS: list[Callable[[Any], Any]] = [
         help="Axes of the frame of depth images: optical (z forward, y down), forward (x forward, z up; simulators) or "
         "opengl (z backward, y up).  [default: optical]",
     ),
+    _recording(
+        "--colour",
+        "--color",
+        "colour",
+        is_flag=True,
+        help="Fuse the colours of the points into the channel rgb: fields rgb, rgba, or red, green, blue of clouds in "
+        "bags, .pcd and .ply files.",
+    ),
     _folder("--intrinsics", type=_PATH, metavar="FILE", help="Camera of depth images: text or YAML, fx, fy, cx, cy."),
     _folder(
         "--dt",
@@ -87,6 +95,19 @@ _OPTIONS: list[Callable[[Any], Any]] = [
         multiple=True,
         metavar="TOPIC",
         help="CameraInfo of the depth images, once or for each --depth.  [default: the one beside them]",
+    ),
+    _bag(
+        "--semantic",
+        metavar="TOPIC",
+        help="Images of class labels, mono8 or 16UC1, which are painted into the channel semantic; the largest number "
+        "of the type is no class.",
+    ),
+    _bag("--semantic-info", metavar="TOPIC", help="CameraInfo of --semantic.  [default: the one beside it]"),
+    _bag(
+        "--classes",
+        metavar="NAMES",
+        help="Names of the labels 0, 1, ... of --semantic, such as grass,stone,mud.  [default: numbers, as many as "
+        "there are]",
     ),
     _bag("--map-frame", metavar="FRAME", help="Frame in which the map is built, such as odom."),
     _bag("--base-frame", metavar="FRAME", help="Frame that the map follows, such as base_link."),

@@ -32,7 +32,11 @@ class MapRequest:
     depth: tuple[str, ...] = ()  #: topics of a bag's depth images
     camera_info: tuple[str, ...] = ()  #: topics of the CameraInfo of a bag's depth images
     depth_scale: float | None = None  #: [m] per unit of depth; None: the recording's, or that of the encoding
+    colour: bool = False  #: fuse the colours of the points
     depth_axes: Literal["optical", "forward", "opengl"] | None = None  #: of the frame of depth images; None: optical
+    semantic: str | None = None  #: topic of a bag's images of class labels
+    semantic_info: str | None = None  #: topic of its CameraInfo; None: the one beside it
+    classes: str | None = None  #: names of the labels 0, 1, ..., with commas between; None: numbers
     map_frame: str | None = None  #: frame of a bag in which the map is built
     base_frame: str | None = None  #: frame of a bag that the window follows
     tf: tuple[str, ...] = ()  #: topics of a bag's transforms; (): /tf and /tf_static, or those of the scans' namespace

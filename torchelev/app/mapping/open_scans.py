@@ -12,6 +12,7 @@ import click
 from numpy.typing import NDArray
 
 from torchelev.app.mapping.fuse_scans import MapOptions, Scans, show_progress
+from torchelev.app.mapping.map_channels import require_colors, wanted_channels
 from torchelev.app.mapping.map_request import MapRequest
 from torchelev.io import FileLayout, Recording, base_poses, is_bag, open_recording, read_transform
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 _PLAIN = MapRequest(recording=Path())
 _ONLY_BAGS = (
     "points", "depth", "camera_info", "map_frame", "base_frame", "tf", "rays_from", "clock_offset", "stamps",
-    "start", "end", "odometry", "imu", "save_poses",
+    "start", "end", "odometry", "imu", "save_poses", "semantic", "semantic_info", "classes",
 )  # fmt: skip
 _ONLY_FOLDERS = (
     "intrinsics", "dt", "sensor_height", "bin_layout", "quaternions", "time_unit", "pcd_frame", "poses_of",
@@ -51,7 +52,12 @@ def open_scans(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
 def _open_folder(request: MapRequest) -> tuple[Recording, MapOptions]:
     mount = None if request.extrinsics is None else read_transform(request.extrinsics)
     _check(request, mount)
-    options = MapOptions(T_base_sensor=mount, sensor_height=request.sensor_height, fixed=request.fixed)
+    options = MapOptions(
+        T_base_sensor=mount,
+        sensor_height=request.sensor_height,
+        fixed=request.fixed,
+        channels=wanted_channels(request.colour),
+    )
     layout = FileLayout(
         bin=request.bin_layout,
         quaternions=request.quaternions,
@@ -70,6 +76,8 @@ def _open_folder(request: MapRequest) -> tuple[Recording, MapOptions]:
     if request.poses_of == "base" and mount is not None:
         scans = scans.apply_mount(mount)
     scans = scans.with_bases(base_poses(scans.T_map_sensor, mount, request.sensor_height))
+    if request.colour:
+        require_colors(scans)
     if scans.note:
         click.echo(f"warning: {scans.note}", err=True)
     return scans, options
@@ -98,6 +106,7 @@ def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
 
     _refuse_file_options(request)
     _require_odometry(request)
+    _require_semantic(request)
     with Bag(request.recording) as bag:
         scans = open_bag(bag, _to_bag_request(request), lambda m: show_progress(m, "reading poses", "message"))
         if bag.unread:
@@ -108,7 +117,14 @@ def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
             _save_poses(request.save_poses, scans)
         printed = list(scans.pose_notes)
         _warn(printed)
-        options = MapOptions(T_base_sensor=None, sensor_height=None, fixed=request.fixed, has_base=scans.has_base)
+        num_classes = None if scans.labels is None else scans.labels.num_classes
+        options = MapOptions(
+            T_base_sensor=None,
+            sensor_height=None,
+            fixed=request.fixed,
+            has_base=scans.has_base,
+            channels=wanted_channels(request.colour, num_classes, _class_names(request)),
+        )
         try:
             yield scans, options
         finally:
@@ -120,6 +136,20 @@ def _require_odometry(request: MapRequest) -> None:
     for name in ("imu", "save_poses"):
         if getattr(request, name) is not None and request.odometry is None:
             raise ValueError(f"--{name.replace('_', '-')}: only with --odometry; give --odometry kiss-icp")
+
+
+def _require_semantic(request: MapRequest) -> None:
+    """Refuse options that only --semantic reads, and names that are none."""
+    for name in ("semantic_info", "classes"):
+        if getattr(request, name) is not None and request.semantic is None:
+            raise ValueError(f"--{name.replace('_', '-')}: only with --semantic; give --semantic TOPIC")
+    names = _class_names(request)
+    if request.classes is not None and (len(names) < 2 or not all(names)):
+        raise ValueError(f"--classes {request.classes}: must name two classes or more; give grass,stone")
+
+
+def _class_names(request: MapRequest) -> tuple[str, ...]:
+    return () if request.classes is None else tuple(name.strip() for name in request.classes.split(","))
 
 
 def _save_poses(path: Path, scans: BagRecording) -> None:
@@ -158,6 +188,10 @@ def _to_bag_request(request: MapRequest) -> BagRequest:
         end=request.end,
         odometry=request.odometry,
         imu=request.imu,
+        colors=request.colour,
+        semantic=request.semantic,
+        semantic_info=request.semantic_info,
+        classes=_class_names(request),
     )
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchelev.io import MappingRun
 
 if TYPE_CHECKING:
+    from torchelev.io.export import SavedMap
     from torchelev.viz.plot import Panel
 
 _MIN_USED = 0.01  # of the finite points; with fewer, the map does not show the recorded place
@@ -66,11 +66,12 @@ def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]
     return notes
 
 
-def choose_panels(layers: dict[str, NDArray], filters: Sequence[str] = ()) -> list[Panel]:
-    """Return panels of the four main layers (H, W) and of filters; heights share one colour scale."""
+def choose_panels(saved: SavedMap, filters: Sequence[str] = ()) -> list[Panel]:
+    """Return panels of the four main layers, of colours and classes, and of filters; heights share one colour scale."""
     from torchelev.viz.plot import Panel
     from torchelev.viz.style import DEVIATIONS, RATINGS
 
+    layers = saved.layers
     elevation, traversability = layers["elevation"], layers["traversability"]
     known = elevation[np.isfinite(elevation)]
     low, high = (float(v) for v in np.percentile(known, [1, 99])) if known.size else (None, None)
@@ -79,5 +80,18 @@ def choose_panels(layers: dict[str, NDArray], filters: Sequence[str] = ()) -> li
         Panel(title="standard deviation", values=np.sqrt(layers["variance"]), unit="m", cmap=DEVIATIONS, vmin=0.0),
         Panel(title="traversability", values=traversability, unit="0 to 1", cmap=RATINGS, vmin=0.0, vmax=1.0),
         Panel(title="upper bound", values=layers["upper_bound"], unit="m", vmin=low, vmax=high),
+        *_channel_panels(saved),
         *(Panel(title=name, values=layers[name]) for name in filters),
     ]
+
+
+def _channel_panels(saved: SavedMap) -> Iterator[Panel]:
+    """Yield a panel of true colours for each channel of colours, and of the most probable class for each of classes."""
+    from torchelev.viz.channels import channel_colors, class_legend, shown_channels
+    from torchelev.viz.plot import Panel
+
+    for name, cfg in shown_channels(saved.config, saved.layers).items():
+        parts = np.stack([saved.layers[part] for part in cfg.components(name)])
+        colors, is_color = channel_colors(cfg, parts), cfg.kind == "color"
+        legend = {} if is_color else class_legend(cfg, parts)
+        yield Panel(title=name if is_color else f"most probable {name}", values=colors, legend=legend)

@@ -32,7 +32,9 @@ def find_cameras(bag: Bag, types: dict[str, Topic], request: BagRequest) -> dict
     if infos and len(infos) not in (1, len(depths)):
         reason = f"{len(infos)} topics of CameraInfo are given for {len(depths)} topics of depth images"
         raise RecordingError(bag.path, reason, "give --camera-info once, or once for each --depth, in their order")
-    named = list(infos) * (len(depths) if len(infos) == 1 else 1) or [_camera_info(bag, types, d) for d in depths]
+    named = list(infos) * (len(depths) if len(infos) == 1 else 1) or [
+        camera_info(bag, types, d, "--camera-info") for d in depths
+    ]
     cameras = {}
     for depth, info in zip(depths, named, strict=True):
         if info not in types or types[info].type != CAMERA:
@@ -53,15 +55,15 @@ def doubt_axes(camera: CameraSettings | None, frame: str, T_map_sensor: NDArray[
     return f"a camera with the axes of {frame} looks up: if its x axis points forward, give --depth-axes forward"
 
 
-def _camera_info(bag: Bag, types: dict[str, Topic], depth: str) -> str:
-    """Return the topic of CameraInfo that belongs to depth images by its name."""
+def camera_info(bag: Bag, types: dict[str, Topic], images: str, option: str) -> str:
+    """Return the topic of CameraInfo that belongs to a topic of images by its name; `option` names another."""
     # compressedDepth adds a level: /camera/depth/image_rect_raw/compressedDepth; librealsense: .../Depth_0/image/data
-    folders = [depth.rsplit("/", level)[0] for level in (1, 2)]
+    folders = [images.rsplit("/", level)[0] for level in (1, 2)]
     names = [f"{folders[0]}/camera_info", f"{folders[1]}/camera_info", f"{folders[1]}/info/camera_info"]
     found = next((name for name in names if name in types), None)
     if found is None:
-        hint = f"name one with --camera-info; topics of CameraInfo are {_infos(types)}"
-        raise RecordingError(bag.path, f"{depth} has no camera_info beside it", hint)
+        hint = f"name one with {option}; topics of CameraInfo are {_infos(types)}"
+        raise RecordingError(bag.path, f"{images} has no camera_info beside it", hint)
     return found
 
 

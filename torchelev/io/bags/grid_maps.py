@@ -39,7 +39,7 @@ class GridMapWriter:
     Args:
         path: `.bag` for ROS 1; `.mcap` or `.db3` for a file of ROS 2; without suffix for a folder of ROS 2. The bag
             appears there when the writer is closed.
-        layers: names as in `ElevationMap.layer`; None: all of them.
+        layers: names as in `ElevationMap.layer`; None: all of them, and packed colours.
         topic: of the GridMaps.
         frame: of the maps.
         occupancy_topic: of OccupancyGrids from the traversability, see `to_occupancy_grid`; None: none are written.
@@ -83,12 +83,17 @@ class GridMapWriter:
             KeyError: a layer does not exist.
             ValueError: the environment does not exist.
         """
-        layers = emap.layers if self.layers is None else self.layers
+        layers = _all_layers(emap) if self.layers is None else self.layers
         message = _to_message(self._bag, to_grid_map(emap, env, layers, ("elevation",)), stamp, self.frame)
         self._bag.write(self.topic, GRID_MAP, stamp, message)
         if self.occupancy_topic is not None:
             grid = _to_occupancy_message(self._bag, emap, env, stamp, self.frame)
             self._bag.write(self.occupancy_topic, _OCCUPANCY, stamp, grid)
+
+
+def _all_layers(emap: ElevationMap) -> tuple[str, ...]:
+    """Return all layers, and the channels of colours, which RViz reads packed."""
+    return (*emap.layers, *(name for name, cfg in emap.cfg.channels.items() if cfg.kind == "color"))
 
 
 def write_grid_map(
@@ -108,7 +113,7 @@ def write_grid_map(
         path: see `GridMapWriter`.
         emap: the map.
         env: the environment.
-        layers: names as in `ElevationMap.layer`; None: all of them.
+        layers: names as in `ElevationMap.layer`; None: all of them, and packed colours.
         topic: of the GridMap.
         frame: of the map.
         stamp: [s] at which it was made.
@@ -120,7 +125,7 @@ def write_grid_map(
         FileExistsError: there is a folder of this name.
         ModuleNotFoundError: rosbags is missing.
     """
-    to_grid_map(emap, env, emap.layers if layers is None else layers)  # raises before there is a file
+    to_grid_map(emap, env, _all_layers(emap) if layers is None else layers)  # raises before there is a file
     with GridMapWriter(path, layers, topic, frame, occupancy_topic) as writer:
         writer.write(emap, stamp, env)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from torchelev.io.bags.messages.cloud import Cloud, CloudError
 from torchelev.io.bags.messages.raw import as_bytes
+from torchelev.io.point_colors import color_fields, to_colors
 from torchelev.io.point_times import TIME_FIELDS, describe_times, to_seconds
 
 __all__ = ["Cloud", "CloudError", "read_points", "to_seconds"]
@@ -17,7 +18,7 @@ __all__ = ["Cloud", "CloudError", "read_points", "to_seconds"]
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
-def read_points(message: Any, stamp: float, period: float | None = None) -> Cloud:
+def read_points(message: Any, stamp: float, period: float | None = None, colors: bool = False) -> Cloud:
     """Return the points of a sensor_msgs/PointCloud2.
 
     Fields may have any order, padding, byte order and type; rows may be padded, too. Times are a field named t, time,
@@ -29,18 +30,28 @@ def read_points(message: Any, stamp: float, period: float | None = None) -> Clou
         message: the message.
         stamp: [s] of its header.
         period: [s] between two messages; None: unknown, a scan takes 2 s at most.
+        colors: read the colours of the points, too, if they have any.
 
     Raises:
         CloudError: x, y or z is missing, the sizes contradict each other, or this is not a PointCloud2.
     """
     points, fields = read_xyz(message)
+    rgb = _read_colors(message, fields) if colors else None
     name = next((name for name in TIME_FIELDS if name in fields), None)
     if name is None or not len(points):
-        return Cloud(points, None)
+        return Cloud(points, None, colors=rgb)
     raw, is_hit = _read_column(message, fields[name]), np.isfinite(points).all(1) & (points != 0).any(1)
     times = to_seconds(raw, stamp, period, is_hit)
     note = describe_times(name, raw, times, stamp, period, is_hit)
-    return Cloud(points, times, () if note is None else (note,))
+    return Cloud(points, times, () if note is None else (note,), rgb)
+
+
+def _read_colors(message: Any, fields: dict[str, Any]) -> NDArray[np.float32] | None:
+    names = color_fields(fields)
+    try:
+        return to_colors([_read_column(message, fields[name]) for name in names]) if names else None
+    except ValueError as error:
+        raise CloudError(f"{', '.join(names)}: {error}") from error
 
 
 def read_xyz(message: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:

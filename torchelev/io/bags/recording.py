@@ -10,18 +10,22 @@ from numpy.typing import NDArray
 
 from torchelev.io.bags.bag import Bag, Message
 from torchelev.io.bags.cameras import doubt_axes, find_cameras
+from torchelev.io.bags.colors import require_colors
+from torchelev.io.bags.labels import LabelTopic, attach_images
 from torchelev.io.bags.order import order_by_stamp
 from torchelev.io.bags.periods import find_period
 from torchelev.io.bags.point_cloud import CloudError
 from torchelev.io.bags.poses.clocks import SettingWatch
+from torchelev.io.bags.poses.missing import require_frames, require_way
 from torchelev.io.bags.poses.placing import Placed, place_poses
 from torchelev.io.bags.poses.reading import time_of
 from torchelev.io.bags.poses.transforms import FrameError
 from torchelev.io.bags.poses.within_scan import hold_still
-from torchelev.io.bags.scans import Scan, read_scan
+from torchelev.io.bags.scans import Scan, clean, read_scan
 from torchelev.io.bags.topics import BagRequest, choose_topics
 from torchelev.io.errors import RecordingError
 from torchelev.io.folders.recording import Frame
+from torchelev.io.labels import LabelImage
 from torchelev.io.notes import Reasons
 
 _MAX_GAP = 1.0  # [s] between two poses without a warning
@@ -38,6 +42,7 @@ class BagRecording:
         rays_from: the frame at which the rays start of clouds that are in the map's frame already; "" for other clouds.
         has_base: whether the base is another frame than the sensor's, so that the sensor's place on the robot is known.
         topics: of the scans.
+        labels: topic of images of class labels; None: none was asked for.
         skipped: number of scans that were left out when it was last read, by reason.
         notes: what is not used of the scans' messages.
     """
@@ -47,11 +52,17 @@ class BagRecording:
         self.topics = choose_topics(bag, types, request)
         self._num = sum(types[name].num for name in self.topics)
         self._cameras = find_cameras(bag, types, request)
+        if request.colors:
+            require_colors(bag, [name for name in self.topics if name not in self._cameras])
+        self.labels = None if request.semantic is None else LabelTopic(bag, types, request, show)
         self._periods = {name: find_period(bag, name) for name in self.topics if name not in self._cameras}
         self._placed: Placed = place_poses(bag, request, self.topics, _MAX_GAP, show)
         self._request, self.tree = request, self._placed.tree
         self.map_frame, self.base_frame, self.rays_from = self._placed.map, self._placed.base, self._placed.rays_from
         self.has_base = self.base_frame != self._placed.sensor
+        if self.labels is not None:
+            require_frames(bag, request, self.tree, [self.labels.frame])
+            require_way(bag.path, self.tree, self.map_frame, self.labels.frame)
         self.skipped, self.notes, self._watch = Reasons(), Reasons(), SettingWatch(self._placed.clock)
 
     def __len__(self) -> int:
@@ -99,11 +110,18 @@ class BagRecording:
 
     def __iter__(self) -> Iterator[Frame | None]:
         """Yield a frame for each message of a sensor: None where it has to be left out, see `skipped`."""
+        return attach_images(self._read())
+
+    def _read(self) -> Iterator[Frame | LabelImage | None]:
+        """Yield scans and images of labels in the order of their stamps; None for a scan that has to be left out."""
         self.skipped.clear()
         self.notes.clear()
         self._watch = SettingWatch(self._placed.clock)
         last: float | None = None
-        for message in order_by_stamp(self._messages(), self.topics, self._time_of):
+        for message in order_by_stamp(self._messages(), self._all_topics, self._time_of):
+            if self.labels is not None and message.topic == self.labels.name:
+                yield from self._to_labels(self.labels, message)
+                continue
             try:
                 frame = self._to_frame(message, last)
             except CloudError as error:
@@ -118,7 +136,26 @@ class BagRecording:
     def _messages(self) -> Iterator[Message]:
         """Read the scans that were recorded in the time that is mapped."""
         start, end = self._placed.span
-        return (message for message in self._bag.read(self.topics) if start <= message.time <= end)
+        return (message for message in self._bag.read(self._all_topics) if start <= message.time <= end)
+
+    @property
+    def _all_topics(self) -> list[str]:
+        return [*self.topics, *([] if self.labels is None else [self.labels.name])]
+
+    def _to_labels(self, labels: LabelTopic, message: Message) -> list[LabelImage]:
+        """Return an image of labels; [], and noted, if it cannot be used."""
+        frame, now = clean(message.data.header.frame_id), np.array([self._time_of(message)])
+        try:
+            T_map_camera = self.tree.look_up(self.map_frame, frame, now)[0]
+            image, notes = labels.read(message.data, T_map_camera)
+        except (CloudError, FrameError) as error:
+            self.notes.count(f"{message.topic}: {error}", f"{message.topic}: {getattr(error, 'kind', '')}")
+            return []
+        if not np.isfinite(T_map_camera).all():
+            notes = [f"no pose of {frame} in {self.map_frame} at the time of some images, which are left out"]
+        for note in notes:
+            self.notes.count(f"{message.topic}: {note}")
+        return [image] if np.isfinite(T_map_camera).all() else []
 
     def _time_of(self, message: Message) -> float:
         """Return the time [s] of a scan by the clock of the poses."""
@@ -128,7 +165,7 @@ class BagRecording:
     def _to_frame(self, message: Message, last: float | None) -> Frame | None:
         """Return a message's scan at its stamp; None, and counted, if it has no pose or is not asked for."""
         camera, period = self._cameras.get(message.topic), self._periods.get(message.topic)
-        scan = read_scan(message.data, camera, period)._replace(stamp=self._time_of(message))
+        scan = read_scan(message.data, camera, period, self._request.colors)._replace(stamp=self._time_of(message))
         for note in scan.notes:
             self.notes.count(f"{message.topic}: {note.text}", f"{message.topic}: {note.kind}")
         known = message.topic in self.clock_offsets
@@ -149,7 +186,8 @@ class BagRecording:
         if dt < 0:
             self.notes.count(f"{message.topic}: {_LATE}")
         points = self._see(scan)
-        return Frame(points, T_map_sensor, max(0.0, dt), message.topic, T_map_base, covariance, scan.stamp)
+        frame_dt = max(0.0, dt)
+        return Frame(points, T_map_sensor, frame_dt, message.topic, T_map_base, covariance, scan.stamp, scan.colors)
 
     def _see(self, scan: Scan) -> NDArray[np.float32]:
         """Return the points as seen at the stamp, in the sensor's frame or in that where the rays start."""

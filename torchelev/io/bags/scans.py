@@ -26,9 +26,12 @@ class Scan(NamedTuple):
     points: NDArray[np.float32]  #: (N, 3) [m]; NaN where there is no return
     times: NDArray[np.float64] | None  #: (N,) [s] of each point from the stamp; None: all at once
     notes: tuple[Note, ...] = ()  #: notes on data that are not used, or are interpreted differently from the message
+    colors: NDArray[np.float32] | None = None  #: (N, 3) from 0 to 1; None: none, or not asked for
 
 
-def read_scan(message: Any, camera: CameraSettings | Any = None, period: float | None = None) -> Scan:
+def read_scan(
+    message: Any, camera: CameraSettings | Any = None, period: float | None = None, colors: bool = False
+) -> Scan:
     """Return the points of a message.
 
     Args:
@@ -36,23 +39,24 @@ def read_scan(message: Any, camera: CameraSettings | Any = None, period: float |
             16UC1 [mm], 32FC1 [m], or a PNG of 16 bits or RVL: [mm], or 32FC1 quantised by compressedDepth.
         camera: the CameraInfo of a depth image, or all that is known about its topic.
         period: [s] between two messages of the topic; None: unknown.
+        colors: read the colours of the points, too, if they have any.
 
     Raises:
         CloudError: the message contradicts itself, or is of another kind.
     """
     stamp, frame = stamp_of(message.header), clean(message.header.frame_id)
-    cloud = _read(message, stamp, camera, period)
+    cloud = _read(message, stamp, camera, period, colors)
     T = getattr(message, "T_frame_points", None)  # of Foxglove's messages
     points = cloud.points if T is None else (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    return Scan(frame, stamp, points, cloud.times, cloud.notes)
+    return Scan(frame, stamp, points, cloud.times, cloud.notes, cloud.colors)
 
 
-def _read(message: Any, stamp: float, camera: CameraSettings | Any, period: float | None) -> Cloud:
+def _read(message: Any, stamp: float, camera: CameraSettings | Any, period: float | None, colors: bool) -> Cloud:
     if camera is not None:
         return read_depth_image(message, camera if isinstance(camera, CameraSettings) else CameraSettings(camera))
     if hasattr(message, "ranges"):
         return read_laser_scan(message, period)
-    return read_livox(message, stamp) if hasattr(message, "timebase") else read_points(message, stamp, period)
+    return read_livox(message, stamp) if hasattr(message, "timebase") else read_points(message, stamp, period, colors)
 
 
 def stamp_of(header: Any) -> float:

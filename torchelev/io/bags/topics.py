@@ -34,13 +34,17 @@ class BagRequest(NamedTuple):
     depth_axes: str = "optical"  #: axes of the frame of depth images, see `depth_to_points`
     odometry: Literal["kiss-icp"] | None = None  #: finds poses from the first topic's clouds; None: they are known
     imu: str | None = None  #: topic of Imu by which the map's z axis points up, with `odometry`; None: by the ground
+    colors: bool = False  #: read the colours of the clouds' points
+    semantic: str | None = None  #: topic of images of class labels
+    semantic_info: str | None = None  #: topic of its CameraInfo; None: the one beside it
+    classes: Sequence[str] = ()  #: names of the labels 0, 1, ...; (): as many as there are
 
 
 def choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> list[str]:
     """Return the requested topics, or the only one of clouds."""
     for names, kinds, option in ((request.clouds, CLOUDS, "--points"), (request.depths, IMAGES, "--depth")):
         for name in names:
-            kind = types[name].type if name in types else _absence(bag, name)
+            kind = types[name].type if name in types else absence(bag, name)
             if kind not in kinds:
                 have = name_topics([topic for topic in types.values() if topic.type in kinds])
                 raise RecordingError(bag.path, f"{option} {name} is {kind}", f"such topics are {have}")
@@ -74,8 +78,8 @@ def describe_unread(bag: Bag) -> str:
     return "; ".join(f"{topic.name} ({topic.num:,} of {topic.type}: {topic.problem})" for topic in bag.unread)
 
 
-def _absence(bag: Bag, name: str) -> str:
-    """Return why a topic is not among those that can be read."""
+def absence(bag: Bag, name: str) -> str:
+    """Return why a topic is not among those that can be read: it is not there, or of a type that is not known."""
     unread = next((topic for topic in bag.unread if topic.name == name), None)
     return "not in the bag" if unread is None else f"{unread.type}, not read: {unread.problem}"
 

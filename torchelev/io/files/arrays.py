@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
+from torchelev.io.point_colors import color_fields, to_colors
 from torchelev.io.point_times import TIME_FIELDS
 
 MAX_COLUMNS = 16  # numbers per point; wider arrays are images, or have one column per point
@@ -25,6 +26,7 @@ class CloudFile(NamedTuple):
     times: NDArray | None = None  #: (N,) as the file gives them; None: none
     time_name: str = ""  #: of their field
     others: NDArray | None = None  #: (N, C) columns without a name, one of which may be a time
+    colors: NDArray[np.float32] | None = None  #: (N, 3) from 0 to 1; None: none
 
 
 def load_npy(path: Path) -> NDArray:
@@ -82,7 +84,16 @@ def from_fields(path: Path, array: Any) -> CloudFile:
     points = np.stack([np.asarray(array[name]).ravel() for name in "xyz"], axis=-1)
     name = next((name for name in TIME_FIELDS if name in names and array.dtype[name].kind in _TIME_KINDS), None)
     times = None if name is None else _to_numbers(np.asarray(array[name]))
-    return CloudFile(points, times if times is not None and len(times) == len(points) else None, name or "")
+    times = times if times is not None and len(times) == len(points) else None
+    return CloudFile(points, times, name or "", colors=_colors(array))
+
+
+def _colors(array: Any) -> NDArray[np.float32] | None:
+    fields = color_fields(array.dtype.names)
+    try:
+        return to_colors([np.asarray(array[name]).ravel() for name in fields]) if fields else None
+    except ValueError:  # they may not be asked for
+        return None
 
 
 def _to_numbers(times: NDArray) -> NDArray:

@@ -22,6 +22,7 @@ from torchelev.io.folders.kitti import to_lidar
 from torchelev.io.folders.pairing import compute_steps, pair
 from torchelev.io.folders.scan_files import find_scans
 from torchelev.io.folders.within_scan import hold_still
+from torchelev.io.labels import LabelImage
 from torchelev.io.notes import Reasons
 from torchelev.io.poses import read_poses
 
@@ -38,6 +39,8 @@ class Frame(NamedTuple):
     T_map_base: NDArray[np.float64] | None = None  #: (4, 4); None: unknown
     pose_covariance: NDArray[np.float64] | None = None  #: (6, 6) of the sensor's pose, see `ElevationMap.update`
     stamp: float = 0.0  #: [s] of a bag's scan; 0 of a file
+    colors: NDArray[np.float32] | None = None  #: (N, 3) of the points, from 0 to 1; None: none
+    images: tuple[LabelImage, ...] = ()  #: taken after the scan and before the next one
 
 
 class Recording(Sequence[Frame]):
@@ -85,10 +88,12 @@ class Recording(Sequence[Frame]):
             part.notes = self.notes
             return part
         path, base = self.files[index], None if bases is None else bases[index]
-        return Frame(self._read_points(path, index), self.T_map_sensor[index], float(self.dt[index]), path.name, base)
+        points, colors = self._read_points(path, index)
+        dt = float(self.dt[index])
+        return Frame(points, self.T_map_sensor[index], dt, path.name, base, colors=colors)
 
-    def _read_points(self, path: Path, index: int) -> NDArray[np.float32]:
-        """Return a scan's points (N, 3) [m], as seen from its pose."""
+    def _read_points(self, path: Path, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return a scan's points (N, 3) [m], as seen from its pose, and their colours."""
         read, clock = self._read(path), self._clock
         cloud = read if isinstance(read, CloudFile) else CloudFile(read)
         if clock is None:
@@ -97,7 +102,7 @@ class Recording(Sequence[Frame]):
             points, notes = hold_still(cloud, clock.path, clock.stamps[index], clock.pose_times[index])
         for note in notes:
             self.notes.count(f"{path.name}: {note.text}", note.kind)
-        return points
+        return points, cloud.colors
 
     @property
     def middle(self) -> NDArray[np.float64]:

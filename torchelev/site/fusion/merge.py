@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -12,6 +13,7 @@ from torchelev.ops.parallel import map_in_order
 from torchelev.site.fusion.entries import read_entries, rise
 from torchelev.site.fusion.fuse import Entries, Heights, fuse
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
+from torchelev.site.fusion.shares import Change, forget_changed, fuse_change
 from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import LAYERS, Tile, Tiles
@@ -19,7 +21,7 @@ from torchelev.site.tiles import LAYERS, Tile, Tiles
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_BOUND, _TIME = LAYERS.index("upper_bound"), LAYERS.index("time")
+_ELEVATION, _BOUND, _TIME = (LAYERS.index(name) for name in ("elevation", "upper_bound", "time"))
 
 
 class MergeReport(NamedTuple):
@@ -41,19 +43,40 @@ class Merged(NamedTuple):
 
 
 def merge_windows(
-    tiles: Tiles, windows: Windows, alignment: Alignment, resolution: float, rate: float, cfg: SiteConfig
+    tiles: Tiles,
+    windows: Windows,
+    alignment: Alignment,
+    resolution: float,
+    rate: float,
+    cfg: SiteConfig,
+    changes: Mapping[str, Change] = MappingProxyType({}),
 ) -> Iterator[Merged]:
-    """Return the tiles that the windows touch after fusion, a group at a time; changes none in memory."""
-    groups = group_tiles(windows.known.corner, windows.is_new | windows.is_bounded)
+    """Return the tiles that the windows touch after fusion, a group at a time; changes none in memory.
+
+    Args:
+        tiles: of the site.
+        windows: of the robots.
+        alignment: how they lie in the site's frame.
+        resolution: [m].
+        rate: [m^2/s] at which variances grow.
+        cfg: settings.
+        changes: of the channels that the robots know.
+    """
+    touched = windows.is_new | windows.is_bounded
+    for change in changes.values():
+        touched = touched | change.is_new
+    groups = group_tiles(windows.known.corner, touched)
     tiles.reserve(sum(tile not in tiles for group in groups for tile in group.tiles))
 
     def fuse_group(group_and_values: tuple[Group, Tensor]) -> Merged:
         group, values = group_and_values
         pieces, layers = group.cut(), values.flatten(1)
+        before = layers[_ELEVATION].clone() if tiles.channels else layers[_ELEVATION]
         robot, cell, place = pieces.select(windows.is_new)
         entries = read_entries(windows, alignment, robot, cell, place, resolution)
         is_contradicted = fuse_entries(layers, entries, rate, cfg)
         lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
+        fuse_channels(layers, before, tiles, pieces, changes)
         contradictions = torch.bincount(robot[is_contradicted], minlength=len(alignment.offset))
         return Merged(pieces.tiles, values, contradictions)
 
@@ -67,6 +90,24 @@ def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cf
     for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
         layers[row] = value
     return fused.is_contradicted
+
+
+def fuse_channels(
+    layers: Float[Tensor, "L C"],
+    before: Float[Tensor, "C"],
+    tiles: Tiles,
+    pieces: Pieces,
+    changes: Mapping[str, Change],
+) -> None:
+    """Fuse what robots know of channels into the layers of tiles, in place; `before` is their elevation before [m]."""
+    after = layers[_ELEVATION]
+    for name, cfg in tiles.channels.configs.items():
+        first = tiles.layers.index(tiles.channels.sources(name)[0])
+        stored = layers[first : first + cfg.size + 1]
+        forget_changed(stored, before, after, cfg.tolerance)
+        if name in changes:
+            _, cell, place = pieces.select(changes[name].is_new)
+            fuse_change(stored, before, after, changes[name], cell, place, cfg)
 
 
 def _read_bounds(windows: Windows, alignment: Alignment, pieces: Pieces, resolution: float) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
     from torchelev.elevation_map import ElevationMap
+    from torchelev.site.fusion.shares import Share
 
 _NANOSECONDS = 1e-9
 BEFORE_ALL = -(10**18)  # [ns] earlier than anything on a map's clock
@@ -67,6 +70,7 @@ class Contribution(NamedTuple):
     elapsed: Int[Tensor, "B"]  #: [ns] of the maps' clocks
     num_resets: Int[Tensor, "B"]  #: of the maps until then
     keyframe: Int[Tensor, "B"]  #: id of that merge's keyframe; -1: none was kept
+    shares: Mapping[str, Share] = MappingProxyType({})  #: of the site's channels, by name
 
 
 def no_contribution(known: Known, num_resets: Int[Tensor, "B"]) -> Contribution:
@@ -127,7 +131,7 @@ def drop_reset(contribution: Contribution, num_resets: Int[Tensor, "B"], elapsed
     elapsed = torch.where(was_reset, BEFORE_ALL, contribution.elapsed)
     alignment = Alignment(offset, tilt, is_isolated)
     keyframe = torch.where(was_reset, -1, contribution.keyframe)
-    return Contribution(known, alignment, elapsed, num_resets.clone(), keyframe)
+    return Contribution(known, alignment, elapsed, num_resets.clone(), keyframe, contribution.shares)
 
 
 def _find_new(state: MapState, known: Known, contribution: Contribution | None) -> Bool[Tensor, "B H W"]:

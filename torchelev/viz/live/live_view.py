@@ -72,7 +72,7 @@ class LiveView:
         require(0 < max_share <= 1, "max_share", "must lie in (0, 1]", max_share, "use 0.05")
         require(max_rate > 0, "max_rate", "must be positive", max_rate, "use 15")
         self._emap, self._max_share, self._max_rate = emap, max_share, max_rate
-        self.page = Page("torchelev", emap.layers, emap.num_envs, host, port)
+        self.page = Page("torchelev", emap.layers, emap.num_envs, host, port, emap.cfg.channels)
         self._start = self._due = time.perf_counter()
         self._load = Load()
         self._arguments: tuple[Any, ...] = (None,) * 5  # of the last `show`
@@ -127,7 +127,10 @@ class LiveView:
         return take_snapshot(self._emap, T_map_base, T_map_sensor, points, scan=scan, plan=plan, **own)
 
     def _own_layers(self) -> tuple[str, ...]:
-        """The filter's layer that colours the map, if one does; others are not computed."""
+        """The layer of a filter, or those of a channel, that colour the map, if they do; others are not computed."""
+        channel = self._emap.cfg.channels.get(self.page.layer)
+        if channel is not None:
+            return channel.components(self.page.layer)
         return (self.page.layer,) if self.page.layer in self._emap.layers else ()
 
     def _draw(self) -> None:

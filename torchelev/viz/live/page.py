@@ -8,15 +8,26 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.channels.config import ChannelConfig
 from torchelev.errors import require
+from torchelev.viz.channels import choose_channels
 from torchelev.viz.live.camera import Camera
-from torchelev.viz.live.colors import Limits, choose_limits, colorize, describe, legend, shown_layers
+from torchelev.viz.live.colors import (
+    Limits,
+    channel_legend,
+    choose_limits,
+    colorize,
+    colorize_channel,
+    describe,
+    legend,
+    shown_layers,
+)
 from torchelev.viz.live.scene import Scene
 from torchelev.viz.live.snapshot import PARTS, Snapshot
 from torchelev.viz.live.surface import find_cell
@@ -34,6 +45,7 @@ class Page:
         num_envs: number of environments to choose from.
         host: "127.0.0.1" lets only this machine connect, "0.0.0.0" every machine that reaches it.
         port: of the page. If it is taken, the next free one is used.
+        channels: of the map; those of colours and classes whose components are among the layers can be chosen, too.
 
     Attributes:
         on_change: called, in a thread of the server, when the picture has to be drawn again.
@@ -50,6 +62,7 @@ class Page:
         num_envs: int = 1,
         host: str = "127.0.0.1",
         port: int = 8080,
+        channels: Mapping[str, ChannelConfig] | None = None,
     ) -> None:
         import viser
 
@@ -66,6 +79,7 @@ class Page:
         self._last: Snapshot | None = None
         self._limits: dict[str, Limits] = {}
         self._ray: tuple[NDArray, NDArray] | None = None
+        self._channels = choose_channels(channels or {}, layers)
         self._add_controls(layers, num_envs)
         self.server.scene.on_click()(self._point_at)
 
@@ -77,7 +91,7 @@ class Page:
 
     @property
     def layer(self) -> str:
-        """The layer that colours the surface."""
+        """The layer, or the channel, that colours the surface."""
         return self._layer.value
 
     @property
@@ -97,9 +111,9 @@ class Page:
         if num_envs > 1:
             self._env = gui.add_slider("robot", 0, num_envs - 1, 1, 0)
             self._env.on_update(lambda _: self._forget_robot())
-        names = tuple(shown_layers(dict.fromkeys(layers, np.zeros(0))))
+        names = (*shown_layers(dict.fromkeys(layers, np.zeros(0))), *self._channels)
         self._layer = gui.add_dropdown("colour", names, initial_value=names[0])
-        self._layer.on_update(lambda _: self.redraw())
+        self._layer.on_update(lambda _: self._recolor())
         self._legend = gui.add_html("")
         with gui.add_folder("show"):
             self._parts = {name: gui.add_checkbox(name, shown, visible=False) for name, shown in PARTS.items()}
@@ -107,6 +121,17 @@ class Page:
         for box in self._parts.values():
             box.on_update(lambda _: self.redraw())
         self._cell = gui.add_markdown(_CLICK_HINT)
+
+    def _recolor(self) -> None:
+        """Draw the last snapshot in other colours, and ask for another one if it lacks them."""
+        self.redraw()
+        if self._last is not None and not self._components() <= set(shown_layers(self._last.map.layers)):
+            self.on_change()
+
+    def _components(self) -> set[str]:
+        """Return the layers of which the colours are made."""
+        cfg = self._channels.get(self.layer)
+        return {self.layer} if cfg is None else set(cfg.components(self.layer))
 
     def _forget_robot(self) -> None:
         self._path.clear()
@@ -143,16 +168,25 @@ class Page:
 
     def _draw(self, snapshot: Snapshot) -> None:
         layers = shown_layers(snapshot.map.layers)
-        layer = self.layer if self.layer in layers else "elevation"  # a filter chosen after the snapshot was taken
-        values = layers[layer]
-        self._limits[layer] = limits = choose_limits(layer, values, self._limits.get(layer))
+        colors, explained = self._color(layers)
         parts = {name for name, box in self._parts.items() if box.value}
         with self.server.atomic():
             for name in snapshot.parts:
                 self._parts[name].visible = True
-            self._legend.content = legend(layer, limits)
-            self._scene.draw(snapshot, colorize(layer, values, limits), np.array(self._path), parts)
+            self._legend.content = explained
+            self._scene.draw(snapshot, colors, np.array(self._path), parts)
             self._cell.content = self._describe_cell(snapshot, layers)
+
+    def _color(self, layers: dict[str, NDArray]) -> tuple[NDArray[np.uint8], str]:
+        """Return the colours (H, W, 4) of the layer or channel that was chosen, and its legend."""
+        cfg = self._channels.get(self.layer)
+        if cfg is not None and self._components() <= set(layers):
+            parts = np.stack([layers[name] for name in cfg.components(self.layer)])
+            return colorize_channel(cfg, parts), channel_legend(self.layer, cfg, parts)
+        layer = self.layer if self.layer in layers else "elevation"  # a filter chosen after the snapshot was taken
+        values = layers[layer]
+        self._limits[layer] = limits = choose_limits(layer, values, self._limits.get(layer))
+        return colorize(layer, values, limits), legend(layer, limits)
 
     def _point_at(self, event: Any) -> None:
         self._ray = np.array(event.ray_origin) + self._scene.origin, np.array(event.ray_direction)

@@ -75,7 +75,7 @@ def take_snapshot(
         scan: (B, M, 2), such as `HeightScan.xy`, or (B, M, 3) [m] points that a policy reads, map frame. Without z
             they lie on the elevation, and are left out where that is unknown.
         plan: (P, 3) [m] planned path of this environment, map frame.
-        layers: names of filters' layers to show beside the map's own.
+        layers: names of layers of filters and channels to show beside the map's own.
         time: [s] since the start.
 
     Raises:

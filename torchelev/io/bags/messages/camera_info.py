@@ -26,7 +26,7 @@ class Lens(NamedTuple):
 
 
 def choose_lens(camera: Any, topic: str = "") -> tuple[Lens, Note | None]:
-    """Return how a depth image was projected: rectified, with the matrix of P, or as it came, with K and D.
+    """Return how an image was projected: rectified, with the matrix of P, or as it came, with K and D.
 
     Images are taken as rectified if their topic has "rect" in its name, or the lens has no distortion. Some drivers
     fill in only one of the matrices.
@@ -53,7 +53,7 @@ def choose_lens(camera: Any, topic: str = "") -> tuple[Lens, Note | None]:
     model = getattr(camera, "distortion_model", "")
     if _is_rectified(topic) or "K" not in given or model not in _MODELS or len(D) not in _NUM_COEFFICIENTS:
         text = f"{text}, which is not removed: {_why_not(topic, given, model, len(D))}"
-        return lens, Note(f"{text}; depth images are taken as rectified", "distortion")
+        return lens, Note(f"{text}; its images are taken as rectified", "distortion")
     note = Note(f"{text}, which is removed: without rect in the topic's name, images are not rectified", "distortion")
     return _lens(K)._replace(distortion=tuple(D.tolist()), is_fisheye=model in _FISHEYE), note
 

@@ -29,3 +29,4 @@ class Cloud(NamedTuple):
     points: NDArray[np.float32]  #: (N, 3) [m]; NaN where there is no return
     times: NDArray[np.float64] | None  #: (N,) [s] from the message's stamp; None: all at once
     notes: tuple[Note, ...] = ()  #: notes on data that are not used
+    colors: NDArray[np.float32] | None = None  #: (N, 3) from 0 to 1; None: none, or not asked for

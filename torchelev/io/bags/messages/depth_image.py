@@ -11,7 +11,7 @@ from torchelev.frames.axes import turn
 from torchelev.io.bags.messages.camera_info import choose_lens, pixel_rays
 from torchelev.io.bags.messages.cloud import Cloud, CloudError, Note
 from torchelev.io.bags.messages.depth_png import decode_depth
-from torchelev.io.bags.messages.raw import as_bytes
+from torchelev.io.bags.messages.raw import as_bytes, read_pixels
 
 _MILLIMETRES = 1e-3  # [m]
 _UNITS = {"16UC1": _MILLIMETRES, "mono16": _MILLIMETRES, "32FC1": 1.0}  # [m] of depth, by encoding
@@ -37,8 +37,10 @@ def read_depth_image(message: Any, settings: CameraSettings) -> Cloud:
     """
     is_compressed = hasattr(message, "format")
     scale = settings.scale
-    data = as_bytes(message.data)
-    depth = decode_depth(data.tobytes(), message.format, scale) if is_compressed else _decode(message, data, scale)
+    if is_compressed:
+        depth = decode_depth(as_bytes(message.data).tobytes(), message.format, scale)
+    else:
+        depth = _decode(message, scale)
     camera = settings.camera
     if (depth.shape[1], depth.shape[0]) != (camera.width, camera.height):
         actual, expected = f"{depth.shape[1]} x {depth.shape[0]}", f"{camera.width} x {camera.height}"
@@ -52,17 +54,11 @@ def read_depth_image(message: Any, settings: CameraSettings) -> Cloud:
     return Cloud(points, None, tuple(found for found in (note, doubt) if found is not None))
 
 
-def _decode(message: Any, data: NDArray[np.uint8], scale: float | None) -> NDArray[np.float32]:
+def _decode(message: Any, scale: float | None) -> NDArray[np.float32]:
     """Return an Image's depth (h, w) [m]."""
     if message.encoding not in _UNITS:
         raise CloudError(f"images of {message.encoding} hold no depth; 16UC1 and 32FC1 do")
-    kind = np.dtype((">" if message.is_bigendian else "<") + ("f4" if message.encoding == "32FC1" else "u2"))
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    if len(data) == height * width * kind.itemsize:  # drivers leave step 0, or as it was before a crop
-        step = width * kind.itemsize
-    if step < width * kind.itemsize or len(data) < step * (height - 1) + width * kind.itemsize:
-        raise CloudError(f"the image has {len(data)} bytes, too few for {height} rows of {step}", "too few bytes")
-    image = np.ndarray((height, width), kind, buffer=data, strides=(step, kind.itemsize))
+    image = read_pixels(message, "f4" if message.encoding == "32FC1" else "u2")
     return image.astype(np.float32) * np.float32(_UNITS[message.encoding] if scale is None else scale)
 
 

@@ -96,7 +96,7 @@ def _clean_frames(request: BagRequest) -> BagRequest:
 
 
 def _require_topics(bag: Bag, request: BagRequest, topics: Sequence[str]) -> None:
-    unknown = [topic for topic in request.clock_offsets if topic and topic not in topics]
+    unknown = [topic for topic in request.clock_offsets if topic and topic not in (*topics, request.semantic)]
     if unknown:
         reason = f"--clock-offset {unknown[0]}: is no topic of scans"
         raise RecordingError(bag.path, f"{reason}; these are {', '.join(topics)}")
