@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks import RESULTS
+from benchmarks.quality.em_cupy_channels import channels_table, evaluate_channels
 from benchmarks.speed.workload import BPEARL, Drive, full_config
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.app.results import markdown_table, write_json
@@ -153,7 +154,7 @@ def table(result: dict[str, Any]) -> str:
     head = [f"{kind}: {key.replace('_', ' ')}" for kind in ("one step", "run") for key in COLUMNS]
     own, usual = (f"{result['milliseconds'][name]:.1f}" for name in ("like_em_cupy", "default"))
     note = f"An update with {BPEARL:,} points: {own} ms, {usual} by default; one robot, {result['threads']} threads."
-    return f"{markdown_table(['scene', *head], rows)}\n\n{note}"
+    return f"{markdown_table(['scene', *head], rows)}\n\n{channels_table(result['channels'])}\n\n{note}"
 
 
 def main() -> None:
@@ -166,6 +167,7 @@ def main() -> None:
     if not names:
         parser.error(f"{arguments.folder}: must hold <scene>.inputs.npz, got none; give the folder of the recordings")
     result: dict[str, Any] = {"scenes": {name: evaluate(arguments.folder, name, arguments.weights) for name in names}}
+    result["channels"] = evaluate_channels(arguments.folder)
     result |= {"milliseconds": time_updates(), "threads": torch.get_num_threads()}
     write_json(RESULTS / "em_cupy.json", result)
     print(table(result))

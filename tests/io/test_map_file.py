@@ -275,7 +275,7 @@ def test_a_damaged_file_is_a_value_error_that_names_it(tmp_path, save, load):
         except ValueError as error:
             assert str(path) in str(error) and "\n" not in str(error)
             refused += 1
-    assert refused > 0.8 * len(damaged)
+    assert refused > 0.7 * len(damaged)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,8 @@ class ChannelConfig:
     """
 
     kind: str = "mean"  #: one of KINDS
-    names: tuple[str, ...] = ()  #: of the components; of classes, those of the classes
+    #: of the components; of classes, those of the classes; ("red", "green", "blue") makes a colour of any kind
+    names: tuple[str, ...] = ()
     size: int = 0  #: C, number of components; 0: that of `names`, 3 of a colour, else 1
     rate: float = 0.7  #: share of a new mean in "exponential" and "class_average"
     prior: float = 1.0  #: points that all classes have before the first, together
@@ -94,6 +95,11 @@ class ChannelConfig:
     def is_weighted(self) -> bool:
         """Whether points count by the variance of their heights."""
         return self.kind in ("mean", "color", "feature")
+
+    @property
+    def is_color(self) -> bool:
+        """Whether the components are red, green and blue, from 0 to 1: of "color", or by their names."""
+        return self.names == COLORS
 
     def components(self, name: str) -> tuple[str, ...]:
         """Return the layers of a channel of this name: itself, or `<name>.<component>` of each of several."""

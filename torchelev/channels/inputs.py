@@ -53,7 +53,7 @@ def check_features(
 def _check_values(
     where: str, value: Any, lead: tuple[int, ...], cfg: ChannelConfig, device: torch.device
 ) -> Float[Tensor, "B M C"]:
-    kinds = (*FLOATS, torch.uint8) if cfg.kind == "color" else FLOATS
+    kinds = (*FLOATS, torch.uint8) if cfg.is_color else FLOATS
     value = check_tensor(where, value, device, kinds)
     expected = (*lead, cfg.size)
     fits = tuple(value.shape) == expected or (cfg.size == 1 and tuple(value.shape) == lead)
@@ -67,7 +67,7 @@ def _check_values(
 
 def require_values(where: str, value: Float[Tensor, "... C"], cfg: ChannelConfig) -> None:
     """Refuse colours that are not from 0 to 1, and probabilities that do not sum to 1; NaN is no value."""
-    if cfg.kind == "color" and value.numel():
+    if cfg.is_color and value.numel():
         lowest, highest = (float(limit) for limit in value.aminmax())
         if not (lowest >= 0 and highest <= 1):  # NaN if any value is
             wrong = (value < 0) | (value > 1)

@@ -80,7 +80,7 @@ class Picture:
 def _check_image(
     image: Any, channels: dict[str, ChannelConfig], C: int, B: int, device: torch.device
 ) -> Float[Tensor, "B V C h w"]:
-    is_color = all(cfg.kind == "color" for cfg in channels.values())
+    is_color = all(cfg.is_color for cfg in channels.values())
     value = check_tensor("image", image, device, (*FLOATS, torch.uint8) if is_color else FLOATS)
     fits = value.ndim in (4, 5) and value.shape[0] == B and value.shape[-3] == C and min(value.shape) > 0
     rule, hint = f"expected ({B}, {C}, h, w) or ({B}, V, {C}, h, w)", f"give the components of {', '.join(channels)}"

@@ -68,7 +68,7 @@ def save_geotiff(
 
 def color_roles(channels: Mapping[str, ChannelConfig]) -> dict[str, str]:
     """Return which components of channels are Red, Green or Blue, by their names."""
-    colors = {name: cfg for name, cfg in channels.items() if cfg.kind == "color"}
+    colors = {name: cfg for name, cfg in channels.items() if cfg.is_color}
     return {
         part: role for name, cfg in colors.items() for part, role in zip(cfg.components(name), _COLORS, strict=True)
     }

@@ -145,7 +145,7 @@ def _flat(name: str, values: NDArray, emap: ElevationMap) -> NDArray:
         return values
     cfg = emap.cfg.channels[name]
     hint = f"give {', '.join(cfg.components(name))}"
-    require(cfg.kind == "color", "layers", "must have one value for each cell", f"{name!r} with {cfg.size}", hint)
+    require(cfg.is_color, "layers", "must have one value for each cell", f"{name!r} with {cfg.size}", hint)
     return pack_colors(values)
 
 

@@ -26,7 +26,7 @@ def choose_channels(channels: Mapping[str, ChannelConfig], layers: Collection[st
     return {
         name: cfg
         for name, cfg in channels.items()
-        if cfg.kind.startswith(("color", "class")) and set(cfg.components(name)) <= set(layers)
+        if (cfg.is_color or cfg.kind.startswith("class")) and set(cfg.components(name)) <= set(layers)
     }
 
 
@@ -50,7 +50,7 @@ def channel_colors(cfg: ChannelConfig, parts: NDArray) -> NDArray[np.float64]:
         cfg: of colours, or of classes, whose most probable one counts.
         parts: (C, H, W) its components.
     """
-    if cfg.kind == "color":
+    if cfg.is_color:
         return np.clip(np.moveaxis(parts, 0, -1), 0, 1)
     best = most_probable(parts)
     colors = class_colors(cfg.size)[np.nan_to_num(best).astype(np.int64)]

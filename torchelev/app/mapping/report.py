@@ -92,6 +92,6 @@ def _channel_panels(saved: SavedMap) -> Iterator[Panel]:
 
     for name, cfg in shown_channels(saved.config, saved.layers).items():
         parts = np.stack([saved.layers[part] for part in cfg.components(name)])
-        colors, is_color = channel_colors(cfg, parts), cfg.kind == "color"
+        colors, is_color = channel_colors(cfg, parts), cfg.is_color
         legend = {} if is_color else class_legend(cfg, parts)
         yield Panel(title=name if is_color else f"most probable {name}", values=colors, legend=legend)

@@ -93,7 +93,7 @@ class GridMapWriter:
 
 def _all_layers(emap: ElevationMap) -> tuple[str, ...]:
     """Return all layers, and the channels of colours, which RViz reads packed."""
-    return (*emap.layers, *(name for name, cfg in emap.cfg.channels.items() if cfg.kind == "color"))
+    return (*emap.layers, *(name for name, cfg in emap.cfg.channels.items() if cfg.is_color))
 
 
 def write_grid_map(

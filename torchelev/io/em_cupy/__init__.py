@@ -49,7 +49,8 @@ def load_config(
         plugins: plugin_config.yaml; the plugins become `cfg.filters`.
         sensor: file with the sensors and their channels, such as <robot>_sensor_parameter.yaml.
         channels: names of channels that sensors send, as `channel_info` does; those that a fusion names are known.
-        same_heights: compute heights, bounds and validity as elevation_mapping_cupy does; else as the paper.
+        same_heights: compute heights, bounds and validity as elevation_mapping_cupy does, and let all points of a cell
+            count for its channels; else as the paper, and those near its height.
 
     Raises:
         ValueError: a file cannot be read, holds a parameter or plugin that the package does not have, or a value that
@@ -65,7 +66,7 @@ def load_config(
     average_weight = given.get("average_weight", 0.5)
     is_share = isinstance(average_weight, int | float) and 0 <= average_weight < 1
     require(is_share, "average_weight", "must lie in [0, 1)", repr(average_weight), "give 0.5")
-    parsed, channel_notes = read_channels(fusions, tuple(channels), average_weight)
+    parsed, channel_notes = read_channels(fusions, tuple(channels), average_weight, same_heights)
     settings, notes = read_same_parameters(given) if same_heights else read_parameters(given)
     settings |= {"filters": [step.to_dict() for step in filters], "channels": parsed}
     return Converted(ElevationMapConfig.from_dict(settings), (*notes, *plugin_notes, *channel_notes))

@@ -6,10 +6,11 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from torchelev.channels.config import ChannelConfig
+from torchelev.channels.config import COLORS, ChannelConfig
 from torchelev.errors import require
 
 GROUPS = ("pointcloud_channel_fusions", "image_channel_fusions")
+ANY_HEIGHT = 1e6  # [m]
 
 
 class Fusion(NamedTuple):
@@ -17,10 +18,15 @@ class Fusion(NamedTuple):
 
     settings: dict[str, Any]  #: of the `ChannelConfig`
     note: str = ""  #: what differs
+    same: dict[str, Any] | None = None  #: settings that compute what that package does, where they are others
 
 
 FUSIONS: dict[str, Fusion] = {
-    "color": Fusion({"kind": "color"}, "is the mean over all updates here, that of the newest there"),
+    "color": Fusion(
+        {"kind": "color"},
+        "is the mean over all updates here, that of the newest there",
+        {"kind": "exponential", "rate": 1.0, "names": COLORS},
+    ),
     "average": Fusion({"kind": "exponential", "rate": 1.0}, "outliers do not count here; there they do in the sum"),
     "exponential": Fusion({"kind": "exponential", "rate": 0.7}),
     "class_average": Fusion({"kind": "exponential"}, "is one channel for each class"),
@@ -33,9 +39,12 @@ FUSIONS: dict[str, Fusion] = {
 
 
 def read_channels(
-    fusions: Mapping[str, Any], sent: tuple[str, ...], average_weight: float
+    fusions: Mapping[str, Any], sent: tuple[str, ...], average_weight: float, every_point: bool
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the channels: those that a fusion names, and those that sensors send, by the first rule that fits."""
+    """Return the channels: those that a fusion names, and those that sensors send, by the first rule that fits.
+
+    With `every_point`, points at any height above or below their cell count, as there.
+    """
     channels: dict[str, Any] = {}
     notes: list[str] = []
     for group in GROUPS:
@@ -47,8 +56,10 @@ def read_channels(
                 continue
             require(rule in FUSIONS, f"{group}.{name}", f"must be one of {', '.join(FUSIONS)}", rule, "correct it")
             kind = FUSIONS[rule]
-            settings = kind.settings | ({"rate": 1 - average_weight} if rule == "class_average" else {})
-            channels[name] = ChannelConfig(**settings)
+            settings = (every_point and kind.same or kind.settings) | (
+                {"rate": 1 - average_weight} if rule == "class_average" else {}
+            )
+            channels[name] = ChannelConfig(**settings | ({"tolerance": ANY_HEIGHT} if every_point else {}))
             if kind.note:
                 notes.append(f"channel {name}, {rule}: {kind.note}")
     return channels, notes

@@ -68,7 +68,7 @@ def colorize_channel(cfg: ChannelConfig, parts: NDArray) -> NDArray[np.uint8]:
 
 def channel_legend(name: str, cfg: ChannelConfig, parts: NDArray) -> str:
     """Return the name of a channel, and of classes those that are the most probable somewhere, as HTML."""
-    if cfg.kind == "color":
+    if cfg.is_color:
         return f'<div style="{_BOX}">{escape(name)}, as seen</div>'
     classes = class_legend(cfg, parts)
     rows = "".join(
