@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from torchelev.channels.config import KINDS, ChannelConfig
-from torchelev.channels.points import box_of
 from torchelev.channels.state import Channel, Ground
 from torchelev.grid import GridConfig
 from torchelev.kernels.cpu_build import call, load
 from torchelev.ops.transforms import can_compute_unseen
 from torchelev.stages.by_tensors import ByTensors
-from torchelev.stages.measure.stage import anchor_of
+from torchelev.stages.measure.config import BodyConfig
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ class _Channel(ctypes.Structure):
 
 
 _MAPS = (
-    *("points", "T_map_sensor", "variance", "own", "T_base_sensor", "box", "anchor", "dt", "drift"),
+    *("points", "T_map_sensor", "T_map_base", "variance", "own", "dt", "drift"),
     *("corner_now", "elevation", "validity", "corner", "height"),
 )
 
@@ -54,6 +53,8 @@ class _Update(ctypes.Structure):
         *((name, ctypes.c_int64) for name in "BSNHWK"),
         ("resolution", ctypes.c_double),
         *((name, ctypes.c_float) for name in ("noise_factor", "noise_floor", "min_distance", "max_distance")),
+        ("box", ctypes.c_float * 6),
+        ("has_box", ctypes.c_int32),
     )
 
 
@@ -84,16 +85,13 @@ def update_in_cpp(
     B = len(ground.corner)
     drift = None if dt is None else state.statistics.drift_correction
     given = {name: x.contiguous() for name, x in features.items()} if inputs is not None else {}
-    cloud: list[Tensor | None] = [None] * 7
+    cloud: list[Tensor | None] = [None] * 5
     S = N = 0
     if inputs is not None and given:
         S, N = inputs.points.shape[1:3]
         variance = None if inputs.variance is None else inputs.variance.float()
-        T_base_sensor, *corners = box_of(inputs, sensor) or (None,)
-        followed = inputs.T_map_sensor[:, 0] if inputs.T_map_base is None else inputs.T_map_base
-        anchor = anchor_of(torch.where(followed.isfinite(), followed, 0.0)[:, :3, 3], grid.resolution)
-        box = torch.tensor(corners) if corners else None
-        cloud = [inputs.points.float(), inputs.T_map_sensor.double(), variance, own, T_base_sensor, box, anchor]
+        base = None if inputs.T_map_base is None else inputs.T_map_base.double()
+        cloud = [inputs.points.float(), inputs.T_map_sensor.double(), base, variance, own]
     times = [torch.zeros(B) if dt is None else dt.float(), drift]
     maps = [state.corner, state.elevation, state.validity]
     read = [None if value is None else value.contiguous() for value in (*cloud, *times, *maps)]
@@ -103,7 +101,10 @@ def update_in_cpp(
     addresses = (None if value is None else value.data_ptr() for value in (*read, *ground))
     sizes = (B, S, N, grid.height, grid.width, len(channels))
     limits = (sensor.noise_factor, sensor.noise_floor, sensor.min_distance, sensor.max_distance)
-    update = _Update(*addresses, ctypes.addressof(structs), *sizes, grid.resolution, *limits)
+    box = sensor.body if isinstance(sensor.body, BodyConfig) else None
+    corners = (ctypes.c_float * 6)(*(() if box is None else (*box.lower, *box.upper)))
+    numbers = (*sizes, grid.resolution, *limits, corners, int(box is not None))
+    update = _Update(*addresses, ctypes.addressof(structs), *numbers)
     call(library.update_channels, ctypes.byref(update), torch.get_num_threads())
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from torchelev.channels.fuse import GroundPoints
 from torchelev.grid import GridConfig, locate
@@ -14,8 +13,6 @@ from torchelev.stages.measure.stage import measure
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-
     from torchelev.inputs.update_inputs import Inputs
     from torchelev.stages.measure.config import SensorConfig
 
@@ -40,19 +37,3 @@ def match_points(inputs: Inputs, state: MapState, grid: GridConfig, sensor: Sens
     noise = m.variance if m.noise is None else m.noise
     counts = m.casts & inside & validity
     return GroundPoints(slot.to(torch.int64), counts, (z - elevation).abs(), torch.where(counts, noise, 1.0))
-
-
-def box_of(
-    inputs: Inputs, sensor: SensorConfig
-) -> tuple[Float[Tensor, "B S 4 4"], tuple[float, ...], tuple[float, ...]] | None:
-    """Return T_base_sensor, and the corners [m] of the robot's box in the base frame; None without a box or a base."""
-    lower, upper = getattr(sensor.body, "lower", None), getattr(sensor.body, "upper", None)
-    if lower is None or upper is None or inputs.T_map_base is None:
-        return None
-    T_map_base, T_map_sensor = inputs.T_map_base.double()[:, None], inputs.T_map_sensor.double()
-    R = T_map_base[..., :3, :3].mT  # the inverse of a rotation
-    T_base_sensor = T_map_sensor.clone()
-    T_base_sensor[..., :3, :3] = R @ T_map_sensor[..., :3, :3]
-    difference = T_map_sensor[..., :3, 3] - T_map_base[..., :3, 3]  # before the rotation: far from the origin, too
-    T_base_sensor[..., :3, 3] = (R @ difference[..., None])[..., 0]
-    return T_base_sensor, lower, upper

@@ -2,6 +2,7 @@
 
 #include <cstring>
 #include <limits>
+#include <utility>
 #include <vector>
 
 #include "channels/kernel/equation.h"
@@ -10,7 +11,8 @@
 namespace {
 
 constexpr float NOT_KNOWN = std::numeric_limits<float>::quiet_NaN();
-constexpr int64_t AHEAD = 16;  // points ahead of which memory is fetched
+constexpr int64_t CACHE = 1 << 17;  // [bytes] of a range's sums
+constexpr int MOST = 64;            // ranges of cells
 constexpr int64_t BLOCK = 64;  // cells or points that are looked at together
 constexpr int64_t FAR = int64_t(1) << 22;  // [cells] whole numbers up to it fit a float
 constexpr float NEVER = std::numeric_limits<float>::infinity();
@@ -28,11 +30,9 @@ struct Channel {
 struct Update {
     const float* points;          // (B, S, N, 3) [m] sensor frame
     const double* T_map_sensor;   // (B, S, 4, 4)
+    const double* T_map_base;     // (B, 4, 4), or null
     const float* variance;        // (B, S, N) [m^2], or null
     const uint8_t* own;           // (B, S, N) points on the robot's links, or null
-    const double* T_base_sensor;  // (B, S, 4, 4), or null without a box
-    const float* box;             // (2, 3) [m] lower and upper corner of the robot's box, base frame, or null
-    const int64_t* anchor;        // (B, 2) cell that points count from
     const float *dt, *drift;      // (B) [s], (B) [m] or null
     const int64_t* corner_now;    // (B, 2)
     const float* elevation;       // (B, H, W) [m]
@@ -43,6 +43,8 @@ struct Update {
     int64_t B, S, N, H, W, K;
     double resolution;
     float noise_factor, noise_floor, min_distance, max_distance;  // of the sensor [m]
+    float box[6];                 // [m] lower and upper corner of the robot's box, base frame
+    int32_t has_box;
 };
 
 // Give cell (i, j) of H x W cells of C values what was at (i, j) + by, or `blank` if that lies outside.
@@ -62,48 +64,75 @@ void move(float* layer, int64_t H, int64_t W, int64_t C, const int64_t* by, floa
 
 // Memory of one thread.
 struct Scratch {
-    std::vector<int32_t> slot;             // cell of each point
-    std::vector<std::vector<int32_t>> points;  // over known cells: of each part of them, by the range of the cell
-    std::vector<int64_t> count;                // of the points of each list
-    std::vector<float> distance, weight;   // [m] from the cell's elevation; POINT / sigma^2
-    std::vector<float> rise;               // of each cell [m] since the last update, NaN where it is not known
-    std::vector<float> sum;                // of each cell: C values, and the total of the weights
+    std::vector<int32_t> slot;            // cell of each point, -1 if it lies over none that is known
+    std::vector<int32_t> order;           // the points by range of cells
+    std::vector<int64_t> place;           // in `order`, of each range of cells and part of the points
+    std::vector<float> distance, weight;  // [m] from the cell's elevation; POINT / sigma^2
+};
+
+// Where the points of an update count from, as in `measure`: the cell below the base, or below the first sensor.
+struct Origin {
+    int64_t anchor[2];
+    float base[3], to_base[9];  // [m] from the anchor's corner; rows of the inverse rotation
+    bool has_base, is_sound = true;
+
+    Origin(const Update& u, int64_t b) : base{}, to_base{}, has_base(u.T_map_base) {
+        const double* T = has_base ? u.T_map_base + 16 * b : u.T_map_sensor + 16 * b * u.S;
+        for (int n = 0; n < 12; n++) is_sound &= std::isfinite(T[n]);
+        for (int axis = 0; axis < 2; axis++)
+            anchor[axis] = is_sound ? int64_t(std::floor(T[4 * axis + 3] / u.resolution)) : 0;
+        for (int row = 0; is_sound && row < 3; row++) {
+            base[row] = relative(T, row, u.resolution);
+            for (int k = 0; k < 3; k++) to_base[3 * k + row] = float(T[4 * row + k]);
+        }
+    }
+    // A coordinate of a pose's position [m], of x and y from the anchor's corner.
+    float relative(const double* T, int row, double resolution) const {
+        return float(T[4 * row + 3] - (row < 2 ? double(anchor[row]) * resolution : 0));
+    }
 };
 
 // Where a sensor's points lie in the window, and how much they count.
 struct Frame {
     float R[9], t[3], first[2], resolution, H, W, noise_factor, noise_floor, nearest2, farthest2;
     int32_t width;
+    Origin origin;
 
-    Frame(const Update& u, int64_t b, const float* rotation, const float* origin)
+    Frame(const Update& u, int64_t b, const double* T, const Origin& origin)
         : resolution(float(u.resolution)), H(float(u.H)), W(float(u.W)), noise_factor(u.noise_factor),
           noise_floor(u.noise_floor), nearest2(u.min_distance * u.min_distance),
-          farthest2(u.max_distance * u.max_distance), width(int32_t(u.W)) {
-        std::copy(rotation, rotation + 9, R), std::copy(origin, origin + 3, t);
+          farthest2(u.max_distance * u.max_distance), width(int32_t(u.W)), origin(origin) {
+        for (int row = 0; row < 3; row++) {
+            for (int k = 0; k < 3; k++) R[3 * row + k] = float(T[4 * row + k]);
+            t[row] = origin.relative(T, row, u.resolution);
+        }
         for (int axis = 0; axis < 2; axis++)
-            first[axis] = float(std::clamp(u.anchor[2 * b + axis] - u.corner[2 * b + axis], -FAR, FAR));
+            first[axis] = float(std::clamp(origin.anchor[axis] - u.corner[2 * b + axis], -FAR, FAR));
     }
 
-    // Return whether a point lies in a box of the base frame, where the sensor is at `place`.
-    static bool is_inside(const float* turn, const float* place, const float* box, float x, float y, float z) {
+    // Find the place of a point [m], its cell, -1 out of the window, and POINT / sigma^2.
+    void place(float x, float y, float z, float& ax, float& ay, float& az, int32_t& cell, float& weight) const {
+        const float d2 = x * x + y * y + z * z;
+        ax = R[0] * x + R[1] * y + R[2] * z + t[0];
+        ay = R[3] * x + R[4] * y + R[5] * z + t[1];
+        az = R[6] * x + R[7] * y + R[8] * z + t[2];
+        // As `Window::slot`: a point on the border of two cells belongs to that whose height it measures.
+        const float i = std::floor(ax / resolution) + first[0], j = std::floor(ay / resolution) + first[1];
+        const bool inside = (d2 >= nearest2) & (d2 <= farthest2) & (d2 < NEVER) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
+        cell = inside ? int32_t(inside ? i : 0) * width + int32_t(inside ? j : 0) : -1;
+        weight = channels::POINT / (noise_factor * d2 + noise_floor);
+    }
+
+    // Return whether a place [m] lies in the robot's box.
+    bool is_inside(float x, float y, float z, const float* box) const {
+        x -= origin.base[0], y -= origin.base[1], z -= origin.base[2];
         bool inside = true;
         for (int axis = 0; axis < 3; axis++) {
-            const float c = turn[3 * axis] * x + turn[3 * axis + 1] * y + turn[3 * axis + 2] * z + place[axis];
+            const float* turn = origin.to_base + 3 * axis;
+            const float c = turn[0] * x + turn[1] * y + turn[2] * z;
             inside &= (c >= box[axis]) & (c <= box[3 + axis]);
         }
         return inside;
-    }
-
-    // Find the cell of a point, -1 out of the window, its height, and POINT / sigma^2.
-    void place(float x, float y, float z, int32_t& cell, float& height, float& weight) const {
-        const float d2 = x * x + y * y + z * z;
-        // As `Window::slot`: a point on the border of two cells belongs to that whose height it measures.
-        const float i = std::floor((R[0] * x + R[1] * y + R[2] * z + t[0]) / resolution) + first[0];
-        const float j = std::floor((R[3] * x + R[4] * y + R[5] * z + t[1]) / resolution) + first[1];
-        const bool inside = (d2 >= nearest2) & (d2 <= farthest2) & (d2 < NEVER) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
-        cell = inside ? int32_t(inside ? i : 0) * width + int32_t(inside ? j : 0) : -1;
-        height = R[6] * x + R[7] * y + R[8] * z + t[2];
-        weight = channels::POINT / (noise_factor * d2 + noise_floor);
     }
 };
 
@@ -128,6 +157,8 @@ class Map {
     Scratch& own;
     const int64_t cells;
     const Parts parts;
+    int shift = 0;       // of a cell's number to that of its range
+    int64_t ranges = 0;  // of cells
 
     void follow() {
         int64_t shift[2];
@@ -136,166 +167,196 @@ class Map {
             shift[axis] = std::clamp(now - u.corner[2 * b + axis], -largest, largest);
             u.corner[2 * b + axis] = now;
         }
-        const bool moves = shift[0] || shift[1];
-        float* height = u.height + b * cells;
-        if (moves) move(height, u.H, u.W, 1, shift, NOT_KNOWN);
-        const float* elevation = u.elevation + b * cells;
-        const uint8_t* known = u.validity + b * cells;
-        const float drift = u.drift ? u.drift[b] : 0;
-        own.rise.resize(cells);
+        if (shift[0] || shift[1]) move_layers(shift);
         parts(cells, [&](int64_t, int64_t begin, int64_t end) {
-            for (int64_t c = begin; c < end; c++) {
-                const float now = known[c] ? elevation[c] : NOT_KNOWN;
-                own.rise[c] = std::fabs(now - (height[c] + drift));
-                height[c] = now;
+            for (int64_t first = begin; first < end; first += BLOCK) {
+                const int64_t last = std::min(first + BLOCK, end);
+                float rise[BLOCK];
+                note_heights(first, last, rise);
+                for (int64_t k = 0; k < u.K; k++) keep(u.channels[k], first, last, rise);
             }
         });
-        for (int64_t k = 0; k < u.K; k++) {
-            const Channel& channel = u.channels[k];
-            if (moves) {
-                move(channel.values + b * cells * channel.C, u.H, u.W, channel.C, shift, 0);
-                move(channel.weight + b * cells, u.H, u.W, 1, shift, 0);
-                if (channel.age) move(channel.age + b * cells, u.H, u.W, 1, shift, 0);
-            }
-            parts(cells, [&](int64_t, int64_t begin, int64_t end) { keep(channel, begin, end); });
+    }
+
+    void move_layers(const int64_t* shift) {
+        for_each(int(3 * u.K + 1), parts.num_threads, [&](int n) {  // the largest first
+            const Channel& channel = u.channels[n % std::max<int64_t>(u.K, 1)];
+            if (n == 3 * u.K) move(u.height + b * cells, u.H, u.W, 1, shift, NOT_KNOWN);
+            else if (n < u.K) move(channel.values + b * cells * channel.C, u.H, u.W, channel.C, shift, 0);
+            else if (n < 2 * u.K) move(channel.weight + b * cells, u.H, u.W, 1, shift, 0);
+            else if (channel.age) move(channel.age + b * cells, u.H, u.W, 1, shift, 0);
+        });
+    }
+
+    // Note the elevations of a block of cells, and by how much they rose or fell, NaN where they are not known.
+    void note_heights(int64_t begin, int64_t end, float* __restrict rise) {
+        const float* __restrict elevation = u.elevation + b * cells + begin;
+        const uint8_t* __restrict known = u.validity + b * cells + begin;
+        float* __restrict height = u.height + b * cells + begin;
+        const float drift = u.drift ? u.drift[b] : 0;
+        for (int64_t n = 0; n < end - begin; n++) {
+            const float now = known[n] ? elevation[n] : NOT_KNOWN;
+            rise[n] = std::fabs(now - (height[n] + drift));
+            height[n] = now;
         }
     }
 
-    // Age the cells of a channel, and forget those whose ground is another one.
-    void keep(const Channel& channel, int64_t begin, int64_t end) {
-        const float dt = u.dt[b], share = channel.half_life < NEVER ? std::exp2(-dt / channel.half_life) : 1.0f;
-        float* values = channel.values + b * cells * channel.C;
-        float* weight = channel.weight + b * cells;
-        float* age = channel.age ? channel.age + b * cells : nullptr;
-        for (int64_t first = begin; first < end; first += BLOCK) {
-            const int64_t last = std::min(first + BLOCK, end);
-            int lost = 0;  // mostly 0: then the block is left as it is
-            for (int64_t c = first; c < last; c++) {
-                if (age) age[c] = weight[c] != 0 ? age[c] + dt : 0;
-                const bool stays = own.rise[c] <= channel.tolerance && !(age && age[c] > channel.max_age);
-                lost += !stays & (weight[c] != 0);
-            }
-            for (int64_t c = first; lost && c < last; c++) {
-                if (own.rise[c] <= channel.tolerance && !(age && age[c] > channel.max_age)) continue;
-                weight[c] = 0;
-                if (age) age[c] = 0;
-                std::fill(values + c * channel.C, values + (c + 1) * channel.C, 0.0f);
-            }
+    // Age the cells of a block of a channel, and forget those whose ground is another one.
+    void keep(const Channel& channel, int64_t begin, int64_t end, const float* __restrict rise) {
+        const float dt = u.dt[b], tolerance = channel.tolerance, max_age = channel.max_age;
+        const int64_t number = end - begin, first = b * cells + begin;
+        float* __restrict weight = channel.weight + first;
+        float* __restrict age = channel.age ? channel.age + first : nullptr;
+        for (int64_t n = 0; age && n < number; n++) age[n] = weight[n] != 0 ? age[n] + dt : 0;
+        auto is_lost = [&](int64_t n) { return !(rise[n] <= tolerance) | (age && age[n] > max_age); };
+        int lost = 0;  // mostly 0: then the block is left as it is
+        for (int64_t n = 0; !age && n < number; n++) lost |= !(rise[n] <= tolerance) & (weight[n] != 0);
+        for (int64_t n = 0; age && n < number; n++) lost |= is_lost(n) & (weight[n] != 0);
+        float* values = channel.values + first * channel.C;
+        for (int64_t n = 0; lost && n < number; n++) {
+            if (!is_lost(n)) continue;
+            weight[n] = 0;
+            if (age) age[n] = 0;
+            std::fill(values + n * channel.C, values + (n + 1) * channel.C, 0.0f);
         }
-        if (share == 1) return;
-        for (int64_t c = begin; c < end; c++) weight[c] *= share;
+        if (channel.half_life == NEVER) return;
+        const float share = std::exp2(-dt / channel.half_life);
+        for (int64_t n = 0; n < number; n++) weight[n] *= share;
         if (channel.kind == channels::CLASS)
-            for (int64_t n = begin * channel.C; n < end * channel.C; n++) values[n] *= share;
+            for (int64_t n = 0; n < number * channel.C; n++) values[n] *= share;
     }
 
+    // Find the cells of all points, and sort the points by ranges of cells whose sums fit the cache.
     void locate() {
         const int64_t M = u.S * u.N;
-        own.slot.resize(M), own.distance.resize(M), own.weight.resize(M);
-        own.points.resize(parts.number * parts.number);
-        own.count.assign(parts.number * parts.number, 0);
-        for (std::vector<int32_t>& list : own.points) list.resize(M);
-        for (int64_t s = 0; s < u.S; s++) {
-            const double* T = u.T_map_sensor + 16 * (b * u.S + s);
-            bool is_sound = true;
-            for (int n = 0; n < 12; n++) is_sound &= std::isfinite(T[n]);
-            float R[9], t[3];
-            for (int row = 0; row < 3; row++) {
-                const double corner = row < 2 ? double(u.anchor[2 * b + row]) * u.resolution : 0;
-                for (int k = 0; k < 3; k++) R[3 * row + k] = float(T[4 * row + k]);
-                t[row] = float(T[4 * row + 3] - corner);
-            }
-            if (!is_sound) continue;
-            parts(u.N, [&](int64_t part, int64_t begin, int64_t end) {
-                for (int64_t n = begin; n < end; n += BLOCK) find(s, part, n, std::min(n + BLOCK, end), R, t);
-            });
-        }
+        own.slot.resize(M), own.distance.resize(M), own.weight.resize(M), own.order.resize(M);
+        shift = shift_of_ranges();
+        ranges = ((cells - 1) >> shift) + 1;
+        own.place.assign((ranges + 1) * parts.number, 0);  // the last range is that of no cell
+        const Origin origin(u, b);
+        parts(M, [&](int64_t part, int64_t begin, int64_t end) {
+            for (int64_t s = u.N ? begin / u.N : u.S; s * u.N < end; s++)
+                find_all(origin, s, std::max(begin, s * u.N), std::min(end, (s + 1) * u.N));
+            int64_t number[MOST + 1] = {};  // of this thread alone: others would wait for its cache line
+            for (int64_t m = begin; m < end; m++) number[range_of(m)]++;
+            for (int64_t r = 0; r <= ranges; r++) own.place[r * parts.number + part] = number[r];
+        });
+        int64_t before = 0;
+        for (int64_t& place : own.place) before += std::exchange(place, before);
+        own.place.push_back(before);
+        parts(M, [&](int64_t part, int64_t begin, int64_t end) {
+            int64_t place[MOST + 1];
+            for (int64_t r = 0; r <= ranges; r++) place[r] = own.place[r * parts.number + part];
+            for (int64_t m = begin; m < end; m++) own.order[place[range_of(m)]++] = int32_t(m);
+        });
     }
 
-    // Find the cells of points `begin` to `end`, a part of those of sensor s, and how much they count.
-    void find(int64_t s, int64_t part, int64_t begin, int64_t end, const float* R, const float* t) {
-        const float* p = u.points + 3 * ((b * u.S + s) * u.N + begin);
-        const float* variance = u.variance ? u.variance + (b * u.S + s) * u.N + begin : nullptr;
-        const int64_t m = s * u.N + begin, number = end - begin;
-        float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, height[BLOCK], share[BLOCK];
+    int shift_of_ranges() const {
+        int64_t most = 1;
+        for (int64_t k = 0; k < u.K; k++)
+            if (u.channels[k].features) most = std::max(most, u.channels[k].C);
+        int shift = 6;
+        while (shift < 30 && ((most + 1) * int64_t(sizeof(float)) << (shift + 1) <= CACHE || cells >> shift >= MOST))
+            shift++;
+        return shift;
+    }
+
+    int64_t range_of(int64_t m) const { return own.slot[m] < 0 ? ranges : own.slot[m] >> shift; }
+
+    // Find the cells of points `begin` to `end`, of sensor s, and how much they count.
+    void find_all(const Origin& origin, int64_t s, int64_t begin, int64_t end) {
+        const double* T = u.T_map_sensor + 16 * (b * u.S + s);
+        bool is_sound = origin.is_sound;
+        for (int n = 0; n < 12; n++) is_sound &= std::isfinite(T[n]);
+        if (!is_sound) return std::fill(own.slot.begin() + begin, own.slot.begin() + end, -1);
+        const Frame frame(u, b, T, origin);
+        for (int64_t m = begin; m < end; m += BLOCK) find(m, std::min(m + BLOCK, end), frame);
+    }
+
+    // Find those of a block.
+    void find(int64_t begin, int64_t end, const Frame& given) {
+        const Frame frame = given;  // a copy that nothing else can change: the loops become vectors
+        const float* p = u.points + 3 * (b * u.S * u.N + begin);
+        const float* variance = u.variance ? u.variance + b * u.S * u.N + begin : nullptr;
+        const int64_t number = end - begin;
+        float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, ax[BLOCK], ay[BLOCK], az[BLOCK], share[BLOCK];
         int32_t cell[BLOCK];
         for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
-        const Frame frame(u, b, R, t);
-        for (int64_t n = 0; n < BLOCK; n++) frame.place(x[n], y[n], z[n], cell[n], height[n], share[n]);
+        for (int64_t n = 0; n < BLOCK; n++)
+            frame.place(x[n], y[n], z[n], ax[n], ay[n], az[n], cell[n], share[n]);
         for (int64_t n = 0; variance && n < number; n++) {
             const bool is_sound = variance[n] > 0 && variance[n] < NEVER;
             share[n] = channels::POINT / variance[n], cell[n] = is_sound ? cell[n] : -1;
         }
-        if (u.box) {
-            const double* T = u.T_base_sensor + 16 * (b * u.S + s);
-            float turn[9], place[3], box[6];
-            for (int row = 0; row < 3; row++) {
-                for (int k = 0; k < 3; k++) turn[3 * row + k] = float(T[4 * row + k]);
-                place[row] = float(T[4 * row + 3]);
-            }
-            std::copy(u.box, u.box + 6, box);
-            for (int64_t n = 0; n < BLOCK; n++)
-                cell[n] = Frame::is_inside(turn, place, box, x[n], y[n], z[n]) ? -1 : cell[n];
-        }
-        const uint8_t* is_own = u.own ? u.own + (b * u.S + s) * u.N + begin : nullptr;
+        for (int64_t n = 0; u.has_box && u.T_map_base && n < BLOCK; n++)
+            cell[n] = frame.is_inside(ax[n], ay[n], az[n], u.box) ? -1 : cell[n];
+        const uint8_t* is_own = u.own ? u.own + b * u.S * u.N + begin : nullptr;
         for (int64_t n = 0; is_own && n < number; n++) cell[n] = is_own[n] ? -1 : cell[n];
-        int32_t* slot = own.slot.data() + m;
-        float *distance = own.distance.data() + m, *weight = own.weight.data() + m;
+        int32_t* slot = own.slot.data() + begin;
+        float *distance = own.distance.data() + begin, *weight = own.weight.data() + begin;
         const float* elevation = u.elevation + b * cells;
         const uint8_t* known = u.validity + b * cells;
         for (int64_t n = 0; n < number; n++) {
             const int64_t c = std::max(cell[n], 0);
-            slot[n] = cell[n], weight[n] = share[n];
-            distance[n] = std::fabs(height[n] - elevation[c]);
-            const int64_t range = ((c + 1) * parts.number - 1) / cells;  // as `Parts` divides the cells
-            const int64_t list = part * parts.number + range;
-            own.points[list][own.count[list]] = int32_t(m + n);
-            own.count[list] += (cell[n] >= 0) & (known[c] != 0);
+            slot[n] = known[c] ? cell[n] : -1, weight[n] = share[n], distance[n] = std::fabs(az[n] - elevation[c]);
         }
     }
 
     void fuse(const Channel& channel) {
-        if (int64_t(own.sum.size()) < cells * (channel.C + 1)) own.sum.resize(cells * (channel.C + 1));
-        parts(cells, [&](int64_t range, int64_t begin, int64_t end) {
-            if (channel.C == 1) fuse_cells<1>(channel, range, begin, end);
-            else if (channel.C == 3) fuse_cells<3>(channel, range, begin, end);
-            else fuse_cells<0>(channel, range, begin, end);
+        for_each(int(ranges), parts.num_threads, [&](int range) {
+            if (channel.C == 1) fuse_cells<1>(channel, range);
+            else if (channel.C == 3) fuse_cells<3>(channel, range);
+            else fuse_cells<0>(channel, range);
         });
     }
 
-    // Fuse the points of cells `begin` to `end`, a range of them; SIZE is C, or 0 for any.
-    template <int SIZE> void fuse_cells(const Channel& channel, int64_t range, int64_t begin, int64_t end) {
-        const int64_t C = SIZE ? SIZE : channel.C, M = u.S * u.N, stride = C + 1;
-        const bool weighted = channels::is_weighted(channel.kind), is_maximum = channel.kind == channels::MAXIMUM;
-        float* const sums = own.sum.data();
-        std::fill(sums + begin * stride, sums + end * stride, 0.0f);
-        const float* const features = channel.features + b * M * C;
-        for (int64_t part = 0; part < parts.number; part++) {
-            const int32_t* points = own.points[part * parts.number + range].data();
-            const int64_t number = own.count[part * parts.number + range];
-            for (int64_t n = 0; n < number; n++) {
-                if (n + AHEAD < number) __builtin_prefetch(sums + own.slot[points[n + AHEAD]] * stride, 1);
-                const int64_t m = points[n];
-                const float* x = features + m * C;
-                float zero = 0;  // NaN where a value is not finite
-                for (int64_t k = 0; k < C; k++) zero += x[k] * 0;
-                const float w = weighted ? own.weight[m] : 1.0f;
-                if (!(own.distance[m] <= channel.tolerance) || zero != 0) continue;
-                float* sum = sums + own.slot[m] * stride;
-                for (int64_t k = 0; k < C; k++)
-                    sum[k] = !is_maximum ? sum[k] + w * x[k] : sum[C] > 0 ? std::max(sum[k], x[k]) : x[k];
-                sum[C] += w;
-            }
-        }
+    // Fuse the points of a range of cells; SIZE is C, or 0 for any.
+    template <int SIZE> void fuse_cells(const Channel& channel, int64_t range) {
+        const int64_t C = SIZE ? SIZE : channel.C, stride = C + 1;
+        const int64_t begin = range << shift, end = std::min(cells, (range + 1) << shift);
+        const int64_t first = own.place[range * parts.number], last = own.place[(range + 1) * parts.number];
+        if (first == last) return;
+        static thread_local std::vector<float> memory;  // kept, as is `Scratch`; zero between two calls
+        static thread_local std::vector<int32_t> hit;   // cells
+        memory.resize(std::max<size_t>(memory.size(), (end - begin) * stride));
+        hit.resize(std::max<size_t>(hit.size(), last - first + 1));
+        const int64_t number = add_points<SIZE>(channel, first, last, memory.data() - begin * stride, hit.data());
         float *values = channel.values + b * cells * C, *weight = channel.weight + b * cells;
-        for (int64_t c = begin; c < end; c++) {
-            const float* sum = sums + c * stride;
-            if (!(sum[C] > 0)) continue;
+        for (int64_t n = 0; n < number; n++) {
+            const int64_t c = hit[n];
+            float* sum = memory.data() + (c - begin) * stride;
+            if (!(sum[C] > 0)) continue;  // points that weigh nothing
             for (int64_t k = 0; k < C; k++)
                 values[c * C + k] =
                     channels::combine(channel.kind, values[c * C + k], weight[c], sum[k], sum[C], channel.rate);
             weight[c] += sum[C];
             if (channel.age) channel.age[b * cells + c] = 0;
+            std::fill(sum, sum + stride, 0.0f);
         }
+    }
+
+    // Add points, by their places in `order`, to the sums of their cells: C values, and the total of the weights, which
+    // are zero before. Note the cells, and return how many there are.
+    template <int SIZE>
+    int64_t add_points(const Channel& channel, int64_t first, int64_t last, float* sums, int32_t* hit) const {
+        const int64_t C = SIZE ? SIZE : channel.C;
+        const bool weighted = channels::is_weighted(channel.kind), is_maximum = channel.kind == channels::MAXIMUM;
+        const float* const features = channel.features + b * u.S * u.N * C;
+        int64_t number = 0;
+        for (int64_t n = first; n < last; n++) {
+            const int64_t m = own.order[n];
+            const float* x = features + m * C;
+            float zero = 0;  // NaN where a value is not finite
+            for (int64_t k = 0; k < C; k++) zero += x[k] * 0;
+            const float w = weighted ? own.weight[m] : 1.0f;
+            if (!(own.distance[m] <= channel.tolerance) || zero != 0) continue;
+            float* sum = sums + own.slot[m] * (C + 1);
+            hit[number] = own.slot[m], number += sum[C] == 0;
+            for (int64_t k = 0; k < C; k++)
+                sum[k] = !is_maximum ? sum[k] + w * x[k] : sum[C] > 0 ? std::max(sum[k], x[k]) : x[k];
+            sum[C] += w;
+        }
+        return number;
     }
 };
 
