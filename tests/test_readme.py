@@ -44,7 +44,7 @@ def test_writes_a_table_in_place_of_an_old_one():
 @pytest.mark.slow(10)
 def test_its_python_runs_from_the_first_block_to_the_last():
     blocks = [block for block in code_blocks(README.read_text()) if block.language == "python"]
-    assert len(blocks) >= 5
+    assert len(blocks) >= 3
     run_blocks(README, blocks)
 
 
