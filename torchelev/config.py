@@ -83,6 +83,9 @@ class ElevationMapConfig:
             self.completion.require_resolution(self.grid.resolution)
         if self.raycast is not None:
             self.raycast.require_grid(self.grid)
+            fits = self.raycast.steps is None or self.fusion.averaging is not None
+            rule, hint = "needs fusion.averaging, whose support it lowers", "give both, or neither"
+            require(fits, "cfg.raycast.steps", rule, "fusion.averaging = None", hint)
         if isinstance(self.traversability, TraversabilityConfig):
             self.traversability.require_grid(self.grid)
 

@@ -145,11 +145,9 @@ def only_by_tensors(cfg: ElevationMapConfig) -> str:
 @functools.lru_cache(maxsize=256)
 def register_stages(cfg: ElevationMapConfig) -> int:
     """Return the key of the C++ stages for a config; they are built when they first run. -1 if only tensors run it."""
-    return (
-        -1
-        if only_by_tensors(cfg)
-        else cpu_update.register(CpuUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig()))
-    )
+    if only_by_tensors(cfg):
+        return -1
+    return cpu_update.register(CpuUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig()))
 
 
 def write(stored: MapState, new: MapState) -> None:

@@ -250,6 +250,25 @@ def test_cpp_computes_what_tensors_define(monkeypatch):
                 torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("in_cpp", [True, False])
+def test_points_above_the_ramp_and_without_a_sound_variance_count_for_no_channel(in_cpp, monkeypatch):
+    if not in_cpp:
+        monkeypatch.setattr(module, "can_update", lambda *args: False)
+    emap = make(grass=ChannelConfig(tolerance=1e6), mean=ChannelConfig(tolerance=1e6))
+    points = torch.tensor([[[0.05, 0.05, -1.0], [0.05, 0.05, 0.5], [0.05, 0.05, -1.0]]])
+    variance = torch.tensor([[1e-4, 1e-4, 1e-39]])  # of which the last has no finite inverse
+    values = torch.tensor([[1.0, 5.0, 7.0]])
+    given = {"grass": values, "mean": values}
+    emap.update(points, pose(), pose(), dt=0.1, variance=variance, features=given)
+    assert at_cell(emap, "grass") == at_cell(emap, "mean") == pytest.approx(1.0)
+
+
+def test_a_channel_of_red_green_and_blue_is_a_colour_unless_these_are_classes():
+    names = ("red", "green", "blue")
+    assert ChannelConfig(kind="exponential", names=names).is_color and ChannelConfig(kind="color").is_color
+    assert not ChannelConfig(kind="class", names=names).is_color and not ChannelConfig(kind="feature", size=3).is_color
+
+
 def test_features_have_gradients_by_the_definition():
     from torchelev.channels.fuse import GroundPoints, accumulate, combine, read
     from torchelev.channels.state import blank_channel

@@ -45,9 +45,10 @@ def ramp(num_envs=1):
 
 def test_a_cell_takes_the_pixel_that_shows_its_centre():
     emap, T = make(uv=ChannelConfig(kind="feature", size=2, normalize=False)), look()
-    emap.paint(ramp(), K, T, "uv")
+    number = emap.paint(ramp(), K, T, "uv")
     uv = emap.layer("uv")[0]
     known = uv[0].isfinite()
+    assert number.tolist() == [int(known.sum())]
     assert 200 < known.sum() < known.numel() / 2
     centers = torch.cat([emap.cell_centers()[0], torch.zeros(60, 50, 1)], -1)[known].double()
     in_camera = (centers - T[0, :3, 3].double()) @ T[0, :3, :3].double()
@@ -180,7 +181,7 @@ def test_filters_of_a_channel_are_computed_anew():
 def test_a_camera_far_away_takes_no_time_and_sees_nothing():
     emap, T = make(grass=ChannelConfig()), look()
     T[:, 0, 3] = 1e8
-    emap.paint(torch.ones(1, 1, H, W), K, T, "grass")
+    assert emap.paint(torch.ones(1, 1, H, W), K, T, "grass").tolist() == [0]
     assert emap.layer("grass").isnan().all()
 
 

@@ -1,11 +1,13 @@
 """Configs of elevation_mapping_cupy: what is taken over, what a note says, and what is refused."""
 
+import numpy as np
 import pytest
 import torch
 
 from torchelev import ChannelConfig, ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.io.em_cupy import load_config
 from torchelev.io.em_cupy.parameters import NODE_PARAMETERS, PARAMETERS, SWITCHES
+from torchelev.traversability.paper_filter import SHAPES
 
 CORE = """
 resolution: 0.05
@@ -60,7 +62,7 @@ def test_a_note_says_what_differs(write):
         "sensor_noise_factor = 0.05: grows with the squared depth, and is compared as a standard deviation; the",
         "overlap_clear_range_xy = 4.0: is a side there, and a radius here: halved",
         "cleanup_step = 0.1: has no equal: one accepted ray removes a cell",
-        "map_frame is a setting of the node",
+        "map_frame: settings of the node",
     ):
         assert any(note.startswith(words) for note in notes), words
     assert not any(note.startswith(("resolution", "max_height_range")) for note in notes)
@@ -158,3 +160,78 @@ def test_every_rule_names_a_setting_that_exists():
                 group = group[part]
         assert rule.note or rule.convert, name
     assert not set(PARAMETERS) & set(NODE_PARAMETERS)
+
+
+# The mode that computes the same heights ------------------------------------------------------------------------------
+
+
+def test_same_heights_take_over_what_has_another_meaning_by_default(write):
+    cfg, notes = load_config(
+        write("core.yaml", CORE + "cleanup_step: 0.3\nmahalanobis_thresh: 1.5\n"), same_heights=True
+    )
+    assert cfg.sensor.depth.factor == 0.05 and cfg.raycast.steps.validity_per_ray == 0.3
+    assert cfg.fusion.averaging.gate_per_variance == 1.5 and cfg.overlap.square.side == 4.0
+    assert not any(note.startswith(("mahalanobis_thresh", "cleanup_step")) for note in notes)
+    assert any(note.startswith("weight_file: without") for note in notes)
+
+
+def test_weights_lie_beside_the_file_that_names_them(write, tmp_path):
+    path = write("core.yaml", CORE + "weight_file: weights.npz\n")
+    with pytest.raises(
+        ValueError, match=r"weight_file: must be a file, got .*weights.npz; give its path from the folder"
+    ):
+        load_config(path, same_heights=True)
+    np.savez(tmp_path / "weights.npz", **{name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()})
+    cfg, notes = load_config(path, same_heights=True)
+    assert cfg.surface.upper_bound.filter_weights == str(tmp_path / "weights.npz")
+    assert not any("weight_file" in note for note in notes)
+
+
+def test_switches_are_true_or_false(write):
+    for same_heights in (False, True):
+        for value in ("nope", "'false'", "0"):
+            with pytest.raises(ValueError, match="enable_drift_compensation: must be true or false"):
+                load_config(write("core.yaml", f"enable_drift_compensation: {value}"), same_heights=same_heights)
+        off = load_config(write("core.yaml", "enable_drift_compensation: false"), same_heights=same_heights).cfg
+        assert off.drift is None
+
+
+def test_files_in_the_wrong_order_are_refused(write):
+    core, plugins = write("core.yaml", CORE), write("plugins.yaml", PLUGINS)
+    with pytest.raises(ValueError, match=r"core, .*plugins.yaml: must hold parameters of the map, got min_filter"):
+        load_config(plugins)
+    with pytest.raises(ValueError, match=r"plugins, .*core.yaml: must hold plugins alone, got resolution"):
+        load_config(core, core)
+
+
+def test_plugins_may_have_names_of_their_own(write):
+    text = "low_1: {type: min_filter, enable: True, fill_nan: True, layer_name: low}"
+    cfg, notes = load_config(write("core.yaml", CORE), write("plugins.yaml", text))
+    assert [(step.layer, step.filter) for step in cfg.filters] == [("low", "em_cupy_min_filter")]
+    assert any("fill_nan has no equal" in note for note in notes)
+
+
+def test_without_rules_channels_have_those_of_the_package(write):
+    core = write("core.yaml", CORE)
+    cfg = load_config(core, channels=["rgb", "person"]).cfg
+    assert (cfg.channels["rgb"].kind, cfg.channels["person"].kind) == ("color", "exponential")
+    rules = write("sensor.yaml", "pointcloud_channel_fusions: {rgb: color}\nimage_channel_fusions: {rgb: color}")
+    notes = load_config(core, sensor=rules, channels=["person"]).notes
+    assert any(note.startswith("channel person: no rule of") for note in notes)
+
+
+def test_same_heights_count_every_point_for_the_newest_colour(write):
+    cfg, notes = load_config(write("core.yaml", CORE), sensor=write("sensor.yaml", SENSOR), same_heights=True)
+    rgb = cfg.channels["rgb"]
+    assert (rgb.kind, rgb.rate, rgb.is_color) == ("exponential", 1.0, True) and rgb.tolerance > 1e3
+    assert not any(note.startswith("channel rgb") for note in notes)
+
+
+def test_an_odd_number_of_cells_is_told(write):
+    notes = load_config(write("core.yaml", "resolution: 0.05\nmap_length: 8.05"), same_heights=True).notes
+    assert any("161 cells are an odd number" in note for note in notes)
+
+
+def test_a_substitution_of_a_launch_file_is_named(write):
+    with pytest.raises(ValueError, match="write what the launch file puts there"):
+        load_config(write("core.yaml", "resolution: $(arg resolution)"))

@@ -178,8 +178,8 @@ def test_nothing_waits_for_the_device():
     (dict(class_costs=3), TypeError, r"cost.class_costs: must be a dict, got int; give \{\"terrain\": \{"),
     (dict(class_costs={"terrain": 3}), TypeError, r"cost.class_costs\['terrain'\]: must be a dict, got int"),
     *((dict(class_costs={"terrain": {"mud": wrong}}), ValueError,
-       rf"cost.class_costs\['terrain'\]\['mud'\]: must be a positive number, or inf, got {wrong!r}")
-      for wrong in (-1.0, 0, math.nan, "high", True, None)),
+       rf"cost.class_costs\['terrain'\]\['mud'\]: must lie in \[0.001, 1000\], or be inf, got {wrong!r}")
+      for wrong in (-1.0, 0, 1e-50, 5000.0, math.nan, "high", True, None)),
     (dict(max_forbidden=1.0), ValueError, r"cost.max_forbidden: must lie in \[0, 1\), got 1.0"),
     (dict(max_forbidden=-0.1), ValueError, "cost.max_forbidden: must be at least 0"),
     (dict(unknown_class_cost=0), ValueError, "cost.unknown_class_cost: must be"),

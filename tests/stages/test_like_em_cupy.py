@@ -1,6 +1,7 @@
 """Maps that compute as elevation_mapping_cupy does."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests import em_cupy_reference as reference
-from torchelev import ElevationMap, ElevationMapConfig
+from torchelev import ChannelConfig, ElevationMap, ElevationMapConfig, FusionConfig
 from torchelev.stages.like_em_cupy import DEFAULTS
+from torchelev.traversability.paper_filter import SHAPES
 
 N, RESOLUTION = 16, 0.1
 SMALL = dict(resolution=RESOLUTION, map_length=N * RESOLUTION, min_valid_distance=0.2, overlap_clear_range_xy=0.8)
@@ -55,9 +57,9 @@ def update(emap, points, dt=0.2, moving=None, sensor=SENSOR):
 def test_computes_what_the_code_computes(changed, at_most_one):
     rng = np.random.default_rng(3)
     given = SMALL | changed
-    emap = ElevationMap(ElevationMapConfig.like_em_cupy(**given)).double()
+    cfg = ElevationMapConfig.like_em_cupy(**given)  # of which the rating is of no interest here
+    emap = ElevationMap(replace(cfg, drift=cfg.drift and replace(cfg.drift, min_traversability=0.0))).double()
     expected = reference.Map(N, RESOLUTION, (-N * RESOLUTION / 2,) * 2, DEFAULTS | given | {"traversability_inlier": 0})
-    emap.cfg.drift.__dict__["min_traversability"] = 0.0  # the rating is of no interest here
     cleared = bounded = outliers = corrected = 0
     for k in range(8):
         if k == 4:  # what stood there is gone
@@ -120,6 +122,78 @@ def test_normals_are_the_differences_of_the_dilated_upper_bound():
     assert gx[8, 8] == pytest.approx(1.0, abs=0.05)
     assert gy[8, 8] == pytest.approx(0.0, abs=1e-6)  # (8, 9) is unknown, and takes the height of the cell before it
     assert gx[4, 11] == pytest.approx(0.0, abs=1e-6) and int(emap.state.has_normal.sum()) == 3
+
+
+def test_cells_that_no_scan_founded_stay_until_rays_contradict_them():
+    emap = ElevationMap(ElevationMapConfig.like_em_cupy(**SMALL))
+    feet = torch.tensor([[[0.4, 0.4, 0.1], [0.4, -0.4, 0.1], [-0.4, 0.4, 0.1], [-0.4, -0.4, 0.1]]])
+    emap.initialize(feet)
+    known = int(emap.state.validity.sum())
+    update(emap, np.full((3, 3), np.nan))
+    assert known > 40 and int(emap.state.validity.sum()) == known
+    update(emap, np.array([[0.75, 0.0, -1.0], [0.76, 0.01, -1.0]]), dt=1.0)
+    assert 0 < known - int(emap.state.validity.sum()) < 20
+
+
+@pytest.mark.parametrize("drift", [True, False])
+def test_the_error_of_the_pose_counts_as_without_the_mode(drift):
+    """As by default, what the pose adds is no part of a new map's variance, but of the state."""
+    covariance = torch.diag(torch.tensor([0.0, 0.0, 0.04, 0.0, 0.0, 0.0]))[None]
+    variances = []
+    for given in (None, covariance):
+        emap = ElevationMap(ElevationMapConfig.like_em_cupy(**SMALL, enable_drift_compensation=drift))
+        T = torch.eye(4)[None]
+        T[:, 2, 3] = 0.7
+        emap.update(torch.tensor([[[0.05, 0.05, -0.7]]]), T, T, dt=0.1, pose_covariance=given)
+        variances.append(float(emap.state.variance[emap.state.validity]))
+    assert variances[0] == pytest.approx(variances[1], rel=1e-5)
+    assert float(emap.state.pose_covariance[0, 2, 2]) == pytest.approx(0.04)
+
+
+def test_several_sensors_are_fused_as_one():
+    rng = np.random.default_rng(2)
+    points = torch.from_numpy(scan(rng, 60, False) - SENSOR).float()
+    T = torch.eye(4)[None]
+    T[0, :3, 3] = torch.from_numpy(SENSOR)
+    one, two = (ElevationMap(ElevationMapConfig.like_em_cupy(**BUSY)) for _ in range(2))
+    one.update(points[None], T, T, dt=0.1)
+    two.update(points.view(1, 2, 30, 3), T[:, None].repeat(1, 2, 1, 1), T, dt=0.1)
+    torch.testing.assert_close(one.layer("elevation"), two.layer("elevation"), equal_nan=True)
+    torch.testing.assert_close(one.layer("upper_bound"), two.layer("upper_bound"), equal_nan=True)
+
+
+def test_rates_the_dilated_upper_bound_by_the_filter(tmp_path):
+    weights = {name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()}
+    weights["conv1.weight"][0, 0, 1, 1:] = -1, 1  # the difference to the next cell along y
+    weights["conv_final.weight"][0, 0] = 5
+    np.savez(tmp_path / "weights.npz", **weights)
+    cfg = ElevationMapConfig.like_em_cupy(weights=tmp_path / "weights.npz", **SMALL)
+    emap = ElevationMap(replace(cfg, raycast=None))
+    update(
+        emap, np.array([[x, y, 0.1 * (y > 0)] for x in np.arange(-0.75, 0.8, 0.1) for y in np.arange(-0.75, 0.8, 0.1)])
+    )
+    rating = emap.layer("traversability")[0]
+    torch.testing.assert_close(
+        rating[8, 4:11], torch.exp(-5 * torch.tensor([0, 0, 0, 0.1, 0, 0, 0])), atol=0.02, rtol=0
+    )
+    assert rating[:2].isnan().all() and rating[2:-2, 2:-2].isfinite().all()
+
+
+def test_channels_come_with_the_noise_of_the_depth_and_not_from_above_the_ramp():
+    cfg = ElevationMapConfig.like_em_cupy(**SMALL, ramped_height_range_c=-0.3)
+    emap = ElevationMap(replace(cfg, channels={"rgb": ChannelConfig(kind="color", tolerance=1e6)}))
+    T = torch.eye(4)[None]
+    T[:, 2, 3] = 0.7
+    points = torch.tensor([[[0.05, 0.05, -0.7], [0.05, 0.05, -0.1]]])  # ground, and a ceiling above it
+    emap.update(points, T, T, dt=0.1, features={"rgb": torch.tensor([[[1.0, 0, 0], [0, 0, 1.0]]])})
+    assert emap.layer("rgb")[0, :, 8, 8].tolist() == [1, 0, 0]
+    assert float(emap.channels.channel("rgb").weight[0, 8, 8]) == pytest.approx(1e-4 / (0.05 * 0.49), rel=1e-3)
+
+
+def test_rays_by_steps_need_the_averaged_fusion():
+    cfg = ElevationMapConfig.like_em_cupy(**SMALL)
+    with pytest.raises(ValueError, match=r"cfg.raycast.steps: needs fusion.averaging.*give both, or neither"):
+        replace(cfg, fusion=FusionConfig())
 
 
 def test_says_that_tensors_compute_it_and_why():

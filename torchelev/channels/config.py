@@ -55,7 +55,8 @@ class ChannelConfig:
         is_list = isinstance(self.names, list | tuple)
         require(is_list, "channel.names", "must be a list of names", repr(self.names), 'give ("grass", "stone")')
         object.__setattr__(self, "names", tuple(self.names))
-        require(self.kind in KINDS, "channel.kind", f"must be one of {', '.join(KINDS)}", repr(self.kind), "use mean")
+        kinds = f"must be one of {', '.join(KINDS)}"
+        require(self.kind in KINDS, "channel.kind", kinds, repr(self.kind), "see ChannelConfig")
         require(
             self.dtype in DTYPES, "channel.dtype", f"must be one of {', '.join(DTYPES)}", repr(self.dtype), "float32"
         )
@@ -99,7 +100,7 @@ class ChannelConfig:
     @property
     def is_color(self) -> bool:
         """Whether the components are red, green and blue, from 0 to 1: of "color", or by their names."""
-        return self.names == COLORS
+        return self.names == COLORS and not self.kind.startswith("class")
 
     def components(self, name: str) -> tuple[str, ...]:
         """Return the layers of a channel of this name: itself, or `<name>.<component>` of each of several."""

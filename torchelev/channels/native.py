@@ -15,7 +15,6 @@ from torchelev.channels.state import Channel, Ground
 from torchelev.grid import GridConfig
 from torchelev.kernels.cpu_build import call, load
 from torchelev.ops.transforms import can_compute_unseen
-from torchelev.stages.by_tensors import ByTensors
 from torchelev.stages.measure.config import BodyConfig
 from torchelev.state import MapState
 
@@ -54,13 +53,15 @@ class _Update(ctypes.Structure):
         ("resolution", ctypes.c_double),
         *((name, ctypes.c_float) for name in ("noise_factor", "noise_floor", "min_distance", "max_distance")),
         ("box", ctypes.c_float * 6),
+        ("ramp", ctypes.c_float * 4),
         ("has_box", ctypes.c_int32),
+        ("has_ramp", ctypes.c_int32),
     )
 
 
 def can_update(channels: Mapping[str, Channel], state: MapState, sensor: SensorConfig) -> bool:
     """Return whether `update_in_cpp` takes these: float32 on a CPU, with nothing to differentiate or to trace."""
-    if isinstance(sensor, ByTensors):
+    if sensor.depth is not None:
         return False
     tensors = (state.elevation, *(channel.values for channel in channels.values()))
     is_plain = all(value.dtype == torch.float32 and value.is_contiguous() for value in tensors)
@@ -103,7 +104,9 @@ def update_in_cpp(
     limits = (sensor.noise_factor, sensor.noise_floor, sensor.min_distance, sensor.max_distance)
     box = sensor.body if isinstance(sensor.body, BodyConfig) else None
     corners = (ctypes.c_float * 6)(*(() if box is None else (*box.lower, *box.upper)))
-    numbers = (*sizes, grid.resolution, *limits, corners, int(box is not None))
+    ramp = sensor.exclusion
+    slope = (ctypes.c_float * 4)(*(() if ramp is None else (ramp.slope, ramp.distance, ramp.offset, ramp.height)))
+    numbers = (*sizes, grid.resolution, *limits, corners, slope, int(box is not None), int(ramp is not None))
     update = _Update(*addresses, ctypes.addressof(structs), *numbers)
     call(library.update_channels, ctypes.byref(update), torch.get_num_threads())
 

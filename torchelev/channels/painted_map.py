@@ -14,10 +14,11 @@ from torchelev.channels.module import Channels
 from torchelev.channels.paint import Picture, fuse_view, look, require_mode, sample
 from torchelev.channels.views import can_paint, paint_in_cpp
 from torchelev.layers import Layer
+from torchelev.ops.masks import count
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     from torchelev.config import ElevationMapConfig
 
@@ -42,7 +43,7 @@ class PaintedMap:
         distortion: Sequence[float] | Float[Tensor, "*B D"] | None = None,
         mode: str = "bilinear",
         margin: float = 0.1,
-    ) -> None:
+    ) -> Int[Tensor, "B"]:
         """Fuse what cameras see of the ground into channels: each cell takes the pixel that shows its centre.
 
         A cell that the map hides takes none, nor one that is not known. Each camera counts as a point of a
@@ -51,13 +52,18 @@ class PaintedMap:
         Args:
             image: (B, C, h, w), or (B, V, C, h, w) of V cameras, NaN where a pixel says nothing. Colours are from 0 to
                 1, or uint8; probabilities of classes sum to 1.
-            K: intrinsics [pixels], (3, 3), (B, 3, 3) or (B, V, 3, 3); (0, 0) is the centre of the first pixel.
+            K: intrinsics [pixels], (3, 3), (B, 3, 3) or (B, V, 3, 3); (0, 0) is the centre of the first pixel. The
+                principal point must lie in the middle half of the image, along both sides.
             T_map_camera: optical frame (x right, y down, z forward) to map frame, (B, 4, 4) or (B, V, 4, 4).
             channels: name of the channel, or of several in the order of the image's C components.
             distortion: k1, k2, p1, p2 and, if there are more, k3, and k4, k5, k6, as OpenCV has them; (D,), (B, D) or
                 (B, V, D). None: pictures without distortion.
             mode: "bilinear" or "nearest"; use "nearest" for labels.
             margin: a cell is hidden if the line from the camera to it passes more than this below the elevation [m].
+
+        Returns:
+            How many cells a camera sees, int64. None of a known map means a wrong pose, such as axes of a sensor frame
+            (x forward) in place of the optical frame.
 
         Raises:
             KeyError: if there is no such channel. Nothing has changed then.
@@ -73,6 +79,7 @@ class PaintedMap:
                     paint_in_cpp(channel, part, view, mode, cfg)
                 else:
                     self.channels.write(name, fuse_view(channel, sample(part, view, mode), view, cfg))
+        return count(view.seen.any(1))
 
     def painted(
         self,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def match_points(inputs: Inputs, state: MapState, grid: GridConfig, sensor: SensorConfig) -> GroundPoints:
     """Find the cell of each point, and how far its height is from the cell's elevation after the update.
 
-    Left out are points that `measure` leaves out, but for those above the exclusion ramp.
+    Left out are points that `measure` leaves out.
 
     Args:
         inputs: of the update; M = S * N points.
@@ -35,5 +35,5 @@ def match_points(inputs: Inputs, state: MapState, grid: GridConfig, sensor: Sens
         layer.flatten(1).gather(1, slot.to(torch.int64)) for layer in (state.elevation, state.validity)
     )
     noise = m.variance if m.noise is None else m.noise
-    counts = m.casts & inside & validity
+    counts = m.used & inside & validity
     return GroundPoints(slot.to(torch.int64), counts, (z - elevation).abs(), torch.where(counts, noise, 1.0))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Costs = Mapping[str, Mapping[str, float]]
 
 _ARGUMENT = "cost.class_costs"
+MIN_FACTOR = 1e-3  # of a cost: sums of float32 costs would lose smaller ones
 _EXAMPLE = 'give {"terrain": {"mud": 3.0, "water": math.inf}}'
 
 
@@ -35,14 +36,16 @@ def parse_costs(costs: Any) -> dict[str, dict[str, float]]:
     """Return a copy of costs by channel and class.
 
     Raises:
-        TypeError, ValueError: if they are no mapping of mappings, or a factor is not positive; inf is allowed.
+        TypeError, ValueError: if they are no mapping of mappings, or a factor is out of range; inf is allowed.
     """
     _require_mapping(_ARGUMENT, costs)
     for channel, factors in costs.items():
         _require_mapping(f"{_ARGUMENT}[{channel!r}]", factors)
         for name, factor in factors.items():
-            is_factor = isinstance(factor, int | float) and not isinstance(factor, bool) and factor > 0
-            rule, hint = "must be a positive number, or inf", "give 1 for plain ground, inf to forbid the class"
+            is_number = isinstance(factor, int | float) and not isinstance(factor, bool)
+            is_factor = is_number and (MIN_FACTOR <= factor <= 1 / MIN_FACTOR or factor == math.inf)
+            rule = f"must lie in [{MIN_FACTOR:g}, {1 / MIN_FACTOR:g}], or be inf"
+            hint = "give 1 for plain ground, inf to forbid the class"
             require(is_factor, f"{_ARGUMENT}[{channel!r}][{name!r}]", rule, repr(factor), hint)
     return {channel: dict(factors) for channel, factors in costs.items()}
 

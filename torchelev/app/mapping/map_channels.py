@@ -41,7 +41,8 @@ def add_channels(config: ElevationMapConfig, wanted: Mapping[str, ChannelConfig]
     """
     for name, cfg in wanted.items():
         own = config.channels.get(name, cfg)
-        fits = own.kind.startswith(cfg.kind) and own.size >= cfg.size and cfg.names in ((), own.names)
+        is_kind = own.is_color if cfg.is_color else own.kind.startswith(cfg.kind)
+        fits = is_kind and own.size >= cfg.size and cfg.names in ((), own.names)
         rule = f"must be of kind {cfg.kind} and have {_parts(cfg)}, as {_OPTIONS[name]} brings them"
         require(fits, f"config.channels.{name}", rule, f"{own.kind} with {_parts(own)}", "correct it, or leave it out")
     return replace(config, channels={**wanted, **config.channels}) if wanted else config

@@ -6,46 +6,17 @@
 #include <vector>
 
 #include "channels/kernel/equation.h"
+#include "channels/kernel/places.h"
 #include "kernels/threads.h"
 
 namespace {
 
+using channels::Channel, channels::Frame, channels::INFINITE, channels::Origin, channels::TINY, channels::Update;
+
 constexpr float NOT_KNOWN = std::numeric_limits<float>::quiet_NaN();
 constexpr int64_t CACHE = 1 << 17;  // [bytes] of a range's sums
-constexpr int MOST = 64;            // ranges of cells
+constexpr int MAX_RANGES = 64;            // ranges of cells
 constexpr int64_t BLOCK = 64;  // cells or points that are looked at together
-constexpr int64_t FAR = int64_t(1) << 22;  // [cells] whole numbers up to it fit a float
-constexpr float NEVER = std::numeric_limits<float>::infinity();
-
-// `_Channel` of native.py.
-struct Channel {
-    float *values, *weight, *age;  // (B, H, W, C), (B, H, W), (B, H, W) or null
-    const float* features;         // (B, M, C), null if the update brings none
-    int64_t C;
-    int32_t kind;
-    float rate, half_life, max_age, tolerance;  // half_life: infinite for none
-};
-
-// `_Update` of native.py.
-struct Update {
-    const float* points;          // (B, S, N, 3) [m] sensor frame
-    const double* T_map_sensor;   // (B, S, 4, 4)
-    const double* T_map_base;     // (B, 4, 4), or null
-    const float* variance;        // (B, S, N) [m^2], or null
-    const uint8_t* own;           // (B, S, N) points on the robot's links, or null
-    const float *dt, *drift;      // (B) [s], (B) [m] or null
-    const int64_t* corner_now;    // (B, 2)
-    const float* elevation;       // (B, H, W) [m]
-    const uint8_t* validity;      // (B, H, W)
-    int64_t* corner;              // (B, 2)
-    float* height;                // (B, H, W) [m]
-    const Channel* channels;      // (K)
-    int64_t B, S, N, H, W, K;
-    double resolution;
-    float noise_factor, noise_floor, min_distance, max_distance;  // of the sensor [m]
-    float box[6];                 // [m] lower and upper corner of the robot's box, base frame
-    int32_t has_box;
-};
 
 // Give cell (i, j) of H x W cells of C values what was at (i, j) + by, or `blank` if that lies outside.
 void move(float* layer, int64_t H, int64_t W, int64_t C, const int64_t* by, float blank) {
@@ -68,72 +39,6 @@ struct Scratch {
     std::vector<int32_t> order;           // the points by range of cells
     std::vector<int64_t> place;           // in `order`, of each range of cells and part of the points
     std::vector<float> distance, weight;  // [m] from the cell's elevation; POINT / sigma^2
-};
-
-// Where the points of an update count from, as in `measure`: the cell below the base, or below the first sensor.
-struct Origin {
-    int64_t anchor[2];
-    float base[3], to_base[9];  // [m] from the anchor's corner; rows of the inverse rotation
-    bool has_base, is_sound = true;
-
-    Origin(const Update& u, int64_t b) : base{}, to_base{}, has_base(u.T_map_base) {
-        const double* T = has_base ? u.T_map_base + 16 * b : u.T_map_sensor + 16 * b * u.S;
-        for (int n = 0; n < 12; n++) is_sound &= std::isfinite(T[n]);
-        for (int axis = 0; axis < 2; axis++)
-            anchor[axis] = is_sound ? int64_t(std::floor(T[4 * axis + 3] / u.resolution)) : 0;
-        for (int row = 0; is_sound && row < 3; row++) {
-            base[row] = relative(T, row, u.resolution);
-            for (int k = 0; k < 3; k++) to_base[3 * k + row] = float(T[4 * row + k]);
-        }
-    }
-    // A coordinate of a pose's position [m], of x and y from the anchor's corner.
-    float relative(const double* T, int row, double resolution) const {
-        return float(T[4 * row + 3] - (row < 2 ? double(anchor[row]) * resolution : 0));
-    }
-};
-
-// Where a sensor's points lie in the window, and how much they count.
-struct Frame {
-    float R[9], t[3], first[2], resolution, H, W, noise_factor, noise_floor, nearest2, farthest2;
-    int32_t width;
-    Origin origin;
-
-    Frame(const Update& u, int64_t b, const double* T, const Origin& origin)
-        : resolution(float(u.resolution)), H(float(u.H)), W(float(u.W)), noise_factor(u.noise_factor),
-          noise_floor(u.noise_floor), nearest2(u.min_distance * u.min_distance),
-          farthest2(u.max_distance * u.max_distance), width(int32_t(u.W)), origin(origin) {
-        for (int row = 0; row < 3; row++) {
-            for (int k = 0; k < 3; k++) R[3 * row + k] = float(T[4 * row + k]);
-            t[row] = origin.relative(T, row, u.resolution);
-        }
-        for (int axis = 0; axis < 2; axis++)
-            first[axis] = float(std::clamp(origin.anchor[axis] - u.corner[2 * b + axis], -FAR, FAR));
-    }
-
-    // Find the place of a point [m], its cell, -1 out of the window, and POINT / sigma^2.
-    void place(float x, float y, float z, float& ax, float& ay, float& az, int32_t& cell, float& weight) const {
-        const float d2 = x * x + y * y + z * z;
-        ax = R[0] * x + R[1] * y + R[2] * z + t[0];
-        ay = R[3] * x + R[4] * y + R[5] * z + t[1];
-        az = R[6] * x + R[7] * y + R[8] * z + t[2];
-        // As `Window::slot`: a point on the border of two cells belongs to that whose height it measures.
-        const float i = std::floor(ax / resolution) + first[0], j = std::floor(ay / resolution) + first[1];
-        const bool inside = (d2 >= nearest2) & (d2 <= farthest2) & (d2 < NEVER) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
-        cell = inside ? int32_t(inside ? i : 0) * width + int32_t(inside ? j : 0) : -1;
-        weight = channels::POINT / (noise_factor * d2 + noise_floor);
-    }
-
-    // Return whether a place [m] lies in the robot's box.
-    bool is_inside(float x, float y, float z, const float* box) const {
-        x -= origin.base[0], y -= origin.base[1], z -= origin.base[2];
-        bool inside = true;
-        for (int axis = 0; axis < 3; axis++) {
-            const float* turn = origin.to_base + 3 * axis;
-            const float c = turn[0] * x + turn[1] * y + turn[2] * z;
-            inside &= (c >= box[axis]) & (c <= box[3 + axis]);
-        }
-        return inside;
-    }
 };
 
 class Map {
@@ -219,7 +124,7 @@ class Map {
             if (age) age[n] = 0;
             std::fill(values + n * channel.C, values + (n + 1) * channel.C, 0.0f);
         }
-        if (channel.half_life == NEVER) return;
+        if (channel.half_life == INFINITE) return;
         const float share = std::exp2(-dt / channel.half_life);
         for (int64_t n = 0; n < number; n++) weight[n] *= share;
         if (channel.kind == channels::CLASS)
@@ -237,7 +142,7 @@ class Map {
         parts(M, [&](int64_t part, int64_t begin, int64_t end) {
             for (int64_t s = u.N ? begin / u.N : u.S; s * u.N < end; s++)
                 find_all(origin, s, std::max(begin, s * u.N), std::min(end, (s + 1) * u.N));
-            int64_t number[MOST + 1] = {};  // of this thread alone: others would wait for its cache line
+            int64_t number[MAX_RANGES + 1] = {};  // of this thread alone: others would wait for its cache line
             for (int64_t m = begin; m < end; m++) number[range_of(m)]++;
             for (int64_t r = 0; r <= ranges; r++) own.place[r * parts.number + part] = number[r];
         });
@@ -245,18 +150,18 @@ class Map {
         for (int64_t& place : own.place) before += std::exchange(place, before);
         own.place.push_back(before);
         parts(M, [&](int64_t part, int64_t begin, int64_t end) {
-            int64_t place[MOST + 1];
+            int64_t place[MAX_RANGES + 1];
             for (int64_t r = 0; r <= ranges; r++) place[r] = own.place[r * parts.number + part];
             for (int64_t m = begin; m < end; m++) own.order[place[range_of(m)]++] = int32_t(m);
         });
     }
 
     int shift_of_ranges() const {
-        int64_t most = 1;
+        int64_t largest = 1;
         for (int64_t k = 0; k < u.K; k++)
-            if (u.channels[k].features) most = std::max(most, u.channels[k].C);
+            if (u.channels[k].features) largest = std::max(largest, u.channels[k].C);
         int shift = 6;
-        while (shift < 30 && ((most + 1) * int64_t(sizeof(float)) << (shift + 1) <= CACHE || cells >> shift >= MOST))
+        while (shift < 30 && ((largest + 1) * int64_t(sizeof(float)) << (shift + 1) <= CACHE || cells >> shift >= MAX_RANGES))
             shift++;
         return shift;
     }
@@ -285,11 +190,13 @@ class Map {
         for (int64_t n = 0; n < BLOCK; n++)
             frame.place(x[n], y[n], z[n], ax[n], ay[n], az[n], cell[n], share[n]);
         for (int64_t n = 0; variance && n < number; n++) {
-            const bool is_sound = variance[n] > 0 && variance[n] < NEVER;
+            const bool is_sound = variance[n] >= TINY && variance[n] < INFINITE;
             share[n] = channels::POINT / variance[n], cell[n] = is_sound ? cell[n] : -1;
         }
         for (int64_t n = 0; u.has_box && u.T_map_base && n < BLOCK; n++)
             cell[n] = frame.is_inside(ax[n], ay[n], az[n], u.box) ? -1 : cell[n];
+        for (int64_t n = 0; u.has_ramp && n < BLOCK; n++)
+            cell[n] = frame.is_above(ax[n], ay[n], az[n], u.ramp) ? -1 : cell[n];
         const uint8_t* is_own = u.own ? u.own + b * u.S * u.N + begin : nullptr;
         for (int64_t n = 0; is_own && n < number; n++) cell[n] = is_own[n] ? -1 : cell[n];
         int32_t* slot = own.slot.data() + begin;

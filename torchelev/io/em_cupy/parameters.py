@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from textwrap import shorten
 from typing import Any, NamedTuple
 
 from torchelev.errors import require
 from torchelev.stages.like_em_cupy import DEFAULTS, settings_like_em_cupy
 
-NODE = "is a setting of the node: see docs/howto/from_elevation_mapping.md"
 GONE = "has no equal"
 
 
@@ -57,7 +58,7 @@ PARAMETERS: dict[str, Rule] = {
     "drift_compensation_alpha": _taken("drift.gain"),
     "min_height_drift_cnt": Rule("drift.min_points", "", int),
     "drift_compensation_variance_inlier": _kept("drift.max_variance", "is halved, and is that of another variance"),
-    "drift_compensation_variance_inler": Rule("", "is misspelled there, and without effect"),
+    "drift_compensation_variance_inler": Rule("", "is misspelled there, and has no effect"),
     "traversability_inlier": _kept("drift.min_traversability", "is that of another rating"),
     "position_noise_thresh": Rule("", f"{GONE}: give update(moving=False) while the robot stands"),
     "orientation_noise_thresh": Rule("", f"{GONE}: give update(moving=False) while the robot stands"),
@@ -83,8 +84,8 @@ PARAMETERS: dict[str, Rule] = {
     "average_weight": Rule("", "becomes rate = 1 - average_weight of channels of class_average"),
     "cell_n": Rule("", "follows from resolution and map_length"),
     "data_type": Rule("", f"{GONE}: maps are float32, or of the dtype that emap.to gives"),
-    "min_filter_size": Rule("", "is without effect there"),
-    "min_filter_iteration": Rule("", "is without effect there"),
+    "min_filter_size": Rule("", "has no effect there"),
+    "min_filter_iteration": Rule("", "has no effect there"),
     "enable_normal": Rule("", f"{GONE}: normals are layers, computed with each update"),
     "enable_normal_color": Rule("", f"{GONE}: normals are layers"),
 }
@@ -111,12 +112,18 @@ NODE_PARAMETERS = frozenset(
 )
 
 
-def read_same_parameters(given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return the nested settings of a map that computes as elevation_mapping_cupy does, and the notes."""
+def read_same_parameters(given: Mapping[str, Any], folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Return the nested settings of a map that computes as elevation_mapping_cupy does, and the notes.
+
+    The file of weights is seen from `folder`.
+    """
     same = {name: value for name, value in given.items() if name in DEFAULTS}
-    same = {name: bool(value) if name in SWITCHES else value for name, value in same.items()}
-    path = given.get("weight_file")
-    weights = path if isinstance(path, str) and path.endswith(".npz") else None
+    same = {name: _switch(name, value) if name in SWITCHES else value for name, value in same.items()}
+    path = str(given.get("weight_file", ""))
+    weights = folder / path if path.endswith(".npz") else None
+    if weights is not None:
+        hint = "give its path from the folder of core_param.yaml"
+        require(weights.exists(), "weight_file", "must be a file", weights, hint)
     taken = {*DEFAULTS, *(["weight_file"] if weights else [])}
     _, notes = read_parameters({name: value for name, value in given.items() if name not in taken})
     if weights is None:
@@ -130,14 +137,12 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]
     settings: dict[str, Any] = {}
     known = (*PARAMETERS, *SWITCHES, *NODE_PARAMETERS)
     for name, value in given.items():
-        hint = "correct it, or remove it"
-        require(name in known, name, "is no parameter of elevation_mapping_cupy", repr(value), hint)
+        hint = "correct it, or remove it; sensors and channels are in <robot>_sensor_parameter.yaml"
+        require(name in known, name, "is no parameter of elevation_mapping_cupy", shorten(repr(value), 40), hint)
         if name in SWITCHES:
-            if not value:
+            if not _switch(name, value):
                 _set(settings, SWITCHES[name], None)
-        elif name in NODE_PARAMETERS:
-            notes.append(f"{name} {NODE}")
-        else:
+        elif name in PARAMETERS:
             rule = PARAMETERS[name]
             if rule.convert is not None:
                 _set(settings, rule.setting, _convert(name, value, rule))
@@ -145,13 +150,24 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]
                 notes.append(f"{name} = {value}: {rule.note}")
     if "grid" in settings:
         notes += _square(settings["grid"])
+    of_node = [name for name in given if name in NODE_PARAMETERS]
+    notes += (
+        [f"{', '.join(of_node)}: settings of the node, see docs/howto/from_elevation_mapping.md"] if of_node else []
+    )
     return settings, notes
+
+
+def _switch(name: str, value: Any) -> bool:
+    require(isinstance(value, bool), name, "must be true or false", repr(value), "write it without quotes")
+    return bool(value)
 
 
 def _convert(name: str, value: Any, rule: Rule) -> Any:
     assert rule.convert is not None
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    require(is_number, name, "must be a number", repr(value), "give a number without quotes")
+    is_substitution = isinstance(value, str) and value.startswith("$(")
+    hint = "write what the launch file puts there" if is_substitution else "give a number without quotes"
+    require(is_number, name, "must be a number", repr(value), hint)
     return rule.convert(value)
 
 
@@ -180,5 +196,9 @@ def _length_note(given: Mapping[str, Any]) -> list[str]:
     """Return a note if a map of these parameters is not whole cells long."""
     resolution, length = (given.get(name, DEFAULTS[name]) for name in ("resolution", "map_length"))
     cells = round(length / resolution)
-    changed = abs(cells * resolution - length) > 1e-6
-    return [f"map_length = {length}: became {cells * resolution:g} m, {cells} whole cells"] if changed else []
+    notes = []
+    if abs(cells * resolution - length) > 1e-6:
+        notes.append(f"map_length = {length}: became {cells * resolution:g} m, {cells} whole cells")
+    if cells % 2:
+        notes.append(f"map_length = {length}: {cells} cells are an odd number, and lie half a cell beside those there")
+    return notes

@@ -55,10 +55,11 @@ def read_plugins(plugins: Mapping[str, Any]) -> tuple[list[FilterConfig], list[s
     for name, value in plugins.items():
         is_group = isinstance(value, Mapping) and isinstance(value.get("extra_params") or {}, Mapping)
         require(is_group, name, "must be a group of settings", repr(value), "give layer_name and extra_params")
-        require(name in PLUGINS, name, f"must be a plugin: {', '.join(PLUGINS)}", name, "write it as a filter")
+        kind = str(value.get("type", name))
+        require(kind in PLUGINS, name, f"must be a plugin: {', '.join(PLUGINS)}", kind, "write it as a filter")
         if not value.get("enable", True):
             continue
-        plugin, layer, extra = PLUGINS[name], str(value.get("layer_name", name)), value.get("extra_params") or {}
+        plugin, layer, extra = PLUGINS[kind], str(value.get("layer_name", name)), value.get("extra_params") or {}
         if plugin.filter is not None:
             for setting in extra:
                 known = (*plugin.settings, *_WITHOUT_EFFECT)
@@ -70,4 +71,6 @@ def read_plugins(plugins: Mapping[str, Any]) -> tuple[list[FilterConfig], list[s
             filters.append(FilterConfig(layer=layer, filter=plugin.filter, inputs=source, settings=settings))
         if plugin.note:
             notes.append(f"plugin {name}, layer {layer}: {plugin.note}")
+        if value.get("fill_nan"):
+            notes.append(f"plugin {name}, layer {layer}: fill_nan {GONE}: unknown cells stay unknown")
     return filters, notes

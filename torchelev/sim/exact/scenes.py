@@ -84,6 +84,16 @@ class Scene:
         xy = xy.double()
         return self.height(xy[..., 0], xy[..., 1], t, below)
 
+    def ceiling(self, xy: Tensor, ground: Tensor, t: float = 0.0) -> Tensor:
+        """Return the lowest underside [m] of a box above `ground` (...,) [m] at xy (..., 2) [m]; inf without one."""
+        x, y = xy.double().unbind(-1)
+        lowest = torch.full_like(x, math.inf)
+        for box in self.boxes:
+            under = box.corners(t)[0][2]
+            if box.exists(t):
+                lowest = torch.where(box.covers(x, y, t) & (under > ground), lowest.clamp(max=under), lowest)
+        return lowest
+
     def is_covered(self, xy: Tensor, t: float = 0.0) -> Tensor:
         """Return which places xy (..., 2) [m] lie under or in a box that is not grounded (bar, ceiling, person)."""
         is_covered = torch.zeros(xy.shape[:-1], dtype=torch.bool)

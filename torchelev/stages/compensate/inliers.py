@@ -8,6 +8,7 @@ from torchelev.grid import GridConfig
 from torchelev.ops.masks import count
 from torchelev.stages.cells import cells_of
 from torchelev.stages.compensate.config import DriftConfig, InlierConfig
+from torchelev.stages.pose_error import share_pose_error
 from torchelev.state import MapState, Measurement, tally
 
 
@@ -18,12 +19,13 @@ def compensate_by_inliers(
     cfg: DriftConfig,
     inliers: InlierConfig,
     min_traversability: float,
+    max_variance: float,
 ) -> MapState:
     """Add a share of the mean height error to all elevations; upper bounds stay.
 
     h <- h + gain * mean(z - h) over the points of known cells with |z - h| < gate_per_variance * sigma_m^2,
     sigma_m^2 < max_variance, and a traversability above `min_traversability`, if that is positive. No correction if
-    there are fewer than `min_points`, or |mean| > max_drift.
+    there are fewer than `min_points`, or |mean| > max_drift. No variance grows beyond `max_variance` [m^2].
     """
     cells = cells_of(state, m, grid)
     suits = state.validity & (state.variance < cfg.max_variance)
@@ -39,4 +41,5 @@ def compensate_by_inliers(
         applies = applies & m.moving
     correction = torch.where(applies, cfg.gain * mean, 0.0)
     state = state._replace(elevation=state.elevation + correction[:, None, None] * state.validity)
+    state = share_pose_error(state, m, applies, max_variance)
     return tally(state, drift_points=number, drift_error=mean, drift_correction=correction)

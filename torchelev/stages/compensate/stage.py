@@ -40,7 +40,7 @@ def compensate(
     sensors of one, disagree. No variance grows beyond `max_variance` [m^2].
     """
     if cfg is not None and cfg.inliers is not None:
-        return compensate_by_inliers(state, m, grid, cfg, cfg.inliers, min_traversability)
+        return compensate_by_inliers(state, m, grid, cfg, cfg.inliers, min_traversability, max_variance)
     if m.origin.shape[1] > 1:
         state = tally(state, disagreement=compare_sensors(state, m, grid))
     if cfg is None:

@@ -12,6 +12,7 @@ from torchelev.ops.masks import count
 from torchelev.ops.scatter import lowest
 from torchelev.stages.cells import PointCells, cells_of
 from torchelev.stages.fusion.config import AveragingConfig
+from torchelev.stages.pose_error import relative_variance
 from torchelev.state import MapState, Measurement, tally
 
 if TYPE_CHECKING:
@@ -38,7 +39,9 @@ def average(state: MapState, m: Measurement, grid: GridConfig, cfg: AveragingCon
     validity that rays have left: 1 after a hit.
     """
     cells = cells_of(state, m, grid)
-    z, noise = m.points[..., 2], m.variance
+    z, of_pose = m.points[..., 2], relative_variance(state, m)
+    noise = m.variance if m.noise is None else m.noise
+    noise = noise if of_pose is None else noise + of_pose
     h, v = cells.take(state.elevation, torch.where(state.validity, state.variance, cfg.unknown_variance))
     points = _judge(z, h, v, cells, cfg)
     share = torch.where(points.accepted, points.variance / (points.variance + noise), 0.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 from typing import TYPE_CHECKING
 
@@ -21,21 +20,20 @@ if TYPE_CHECKING:
 
 
 @functools.lru_cache(maxsize=8)
-def filter_of(path: str) -> PaperFilter:
-    """Return the filter whose weights a file holds."""
-    return PaperFilter.from_npz(path).requires_grad_(False)
+def filter_of(path: str, device: torch.device) -> PaperFilter:
+    """Return the filter whose weights a file holds, read once."""
+    return PaperFilter.from_npz(path).requires_grad_(False).to(device)
 
 
 def require_filter(cfg: SurfaceConfig) -> None:
     """Refuse a file of weights that cannot be read."""
     if cfg.upper_bound is not None and cfg.upper_bound.filter_weights is not None:
-        filter_of(str(cfg.upper_bound.filter_weights))
+        filter_of(str(cfg.upper_bound.filter_weights), torch.device("cpu"))
 
 
 def rate_upper_bound(state: MapState, dilation: int, path: str) -> MapState:
     """Rate the dilated upper bound by the filter; cells that are known or bounded, but for a border of RIM - 1."""
-    net = copy.deepcopy(filter_of(path)).to(state.elevation.device)
-    rated = net(dilated(state, dilation, border=1))[:, 1:-1, 1:-1]
+    rated = filter_of(path, state.elevation.device)(dilated(state, dilation, border=1))[:, 1:-1, 1:-1]
     inner = F.pad(torch.ones_like(rated[:, 2 * RIM - 2 :, 2 * RIM - 2 :], dtype=torch.bool), [RIM - 1] * 4)
     known = (state.validity | state.bounded) & inner
     return state._replace(traversability=torch.where(known, rated, 0.0), rated=known)

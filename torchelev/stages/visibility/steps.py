@@ -64,7 +64,9 @@ def clear_by_steps(
     weight = steps.validity_per_ray * reach / rays.length.clamp(min=1e-6)
     passes = _follow(rays, weight, _read_cells(state, cfg), lattice_offset(state, m, grid), grid, cfg)
     lowest, removed, number = (layer.view(state.elevation.shape) for layer in passes)
-    left = state.support - removed
+    # Cells that no scan founded, as by `initialize`, have another support: they count as whole.
+    whole = (state.support < 0.5) | (state.support > 1)
+    left = torch.where(whole, 1.0, state.support) - removed
     gone = state.validity & (left < 0.5)
     validity = state.validity & ~gone
     bound = torch.where(state.bounded, torch.minimum(state.upper_bound, lowest), lowest)
@@ -115,7 +117,9 @@ def _follow(
 
 def _longest(length: Tensor, reach: float) -> float:
     """Return the length [m] of the longest ray, or what it is at most where the host would have to wait."""
-    return float(length.max()) if is_readable(length) and length.numel() else reach
+    if not length.numel():
+        return 0.0
+    return float(length.detach().max()) if is_readable(length) else reach
 
 
 def _add(
