@@ -60,6 +60,8 @@ def test_a_scan_reads_heights_then_the_cells_of_channels(emap, name, native, mon
     values, valid = scan(emap, T_MAP_BASE, *feet)
     assert values.dtype == torch.float32 and values.shape == valid.shape == (2, 6, scan.num_points)
     assert scan.shape_on(CFG) == (6, scan.num_points)
+    with pytest.raises(TypeError, match="cfg: must be an ElevationMapConfig, got ElevationMap; give emap.cfg"):
+        scan.shape_on(emap)
     heights, known = make(**settings)(emap, T_MAP_BASE, *feet)
     assert torch.equal(values[:, 0], heights) and torch.equal(valid[:, 0], known)
     rows, rows_known = expected_rows(emap, scan.xy(T_MAP_BASE, *feet), -2.0)

@@ -69,6 +69,8 @@ class ChannelConfig:
         are_names = all(isinstance(name, str) and name and "." not in name for name in names)
         require(are_names and len(set(names)) == len(names), "channel.names", "must be different words without dots",
                 names, "rename them")  # fmt: skip
+        is_vector = self.kind != "feature" or size > 1
+        require(is_vector, "channel.size", "must be two or more of a vector", size, 'give size=64, or kind="mean"')
         is_color, hint = self.kind != "color" or size == 3, "leave size and names out"
         require(is_color, "channel.size", "must be 3 of a colour", size, hint)
         has_classes = not self.kind.startswith("class") or size > 1

@@ -54,7 +54,10 @@ def _check_values(
     where: str, value: Any, lead: tuple[int, ...], cfg: ChannelConfig, device: torch.device
 ) -> Float[Tensor, "B M C"]:
     kinds = (*FLOATS, torch.uint8) if cfg.is_color else FLOATS
-    value = check_tensor(where, value, device, kinds)
+    labels = (
+        f"give probabilities, such as one_hot(labels, {cfg.size}).float()" if cfg.kind.startswith("class") else None
+    )
+    value = check_tensor(where, value, device, kinds, labels)
     expected = (*lead, cfg.size)
     fits = tuple(value.shape) == expected or (cfg.size == 1 and tuple(value.shape) == lead)
     require(fits, where, f"expected {expected}", tuple(value.shape), "give the values of each point")

@@ -31,6 +31,10 @@ def parse_channels(channels: Any, channel_fill: Any) -> tuple[str, ...]:
 
 def count_rows(channels: Sequence[str], cfg: ElevationMapConfig) -> int:
     """Return how many components channels have in maps of a config; KeyError if one is not there."""
+    hint = "give emap.cfg"
+    require(
+        isinstance(cfg, ElevationMapConfig), "cfg", "must be an ElevationMapConfig", type(cfg).__name__, hint, TypeError
+    )
     return len(expand_names(channels, cfg.channels, "channels"))
 
 
