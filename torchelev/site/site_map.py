@@ -83,8 +83,8 @@ class SiteMap(OpenedSite):
             each cell of the windows and merge, less what compression saves on disk. Holds from the first merge on; a
             site on disk that has keyframes continues to keep them.
         channels: keep these channels of the maps that are merged, as of `ElevationMapConfig(channels=...)`: 4 bytes for
-            each cell and component, and 4 for the weight. Settings of ageing are of no use. Holds from the first merge
-            on; a site on disk that has channels continues to keep them.
+            each cell and component, and 8 for the weight and since when it counts ("maximum": 4). Settings of ageing
+            are of no use. Holds from the first merge on; a site on disk that has channels continues to keep them.
 
     Attributes:
         resolution: [m].

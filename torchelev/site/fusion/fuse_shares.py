@@ -118,9 +118,8 @@ def _withdrawn(before: Share | None, known: Cells, since: Tensor, cell: Tensor, 
     """Return what cells still hold of what the same robots gave before; None: nothing."""
     if before is None:
         return None
-    merge = before.merge.flatten()[place]
-    is_forgotten = (since.index_select(0, cell) > merge) | (known.weight.index_select(0, cell) <= 0)
-    weight = torch.where((merge > 0) & ~is_forgotten, before.weight.flatten()[place], 0.0)
+    began = torch.where(known.weight > 0, since.nan_to_num(nan=1.0), torch.inf).index_select(0, cell)
+    weight = torch.where(before.merge.flatten()[place] >= began, before.weight.flatten()[place], 0.0)
     return Cells(before.values.flatten(0, 2)[place], weight)
 
 

@@ -103,7 +103,7 @@ def _compare(now: Share, before: Share, was_reset: Bool[Tensor, "B"], number: in
     # Evidence that only ages has not been measured again, and what was measured since is no older than the last merge.
     since = torch.where(was_reset, -torch.inf, before.now)[:, None, None]
     time = torch.where(has_values & (now.weight <= before.weight), before.time, torch.maximum(now.time, since))
-    taken = torch.where(is_new, float(number), torch.where(now.weight > 0, before.merge, 0.0))
+    taken = torch.where(is_new, float(number), before.merge)
     return Change(now._replace(time=time, merge=taken), before, is_new, number)
 
 
@@ -116,6 +116,4 @@ def _follow(share: Share, corner: Int[Tensor, "B 2"], was_reset: Bool[Tensor, "B
     inside = inside_i[:, :, None] & inside_j[:, None] & ~was_reset[:, None, None]
     chosen = robot[:, None, None], i.clamp(0, H - 1)[:, :, None], j.clamp(0, W - 1)[:, None]
     height, time, values, weight, merge = (layer[chosen] for layer in share[2:])
-    return Share(
-        corner, share.now, height, time, values, torch.where(inside, weight, 0.0), torch.where(inside, merge, 0.0)
-    )
+    return Share(corner, share.now, height, time, values, torch.where(inside, weight, 0.0), merge)
