@@ -100,6 +100,11 @@ class ChannelConfig:
         return self.kind in ("mean", "color", "feature")
 
     @property
+    def is_newest(self) -> bool:
+        """Whether new values replace old ones by and by, so that the newest counts most."""
+        return self.kind in ("exponential", "class_average")
+
+    @property
     def is_color(self) -> bool:
         """Whether the components are red, green and blue, from 0 to 1: of "color", or by their names."""
         return self.names == COLORS and not self.kind.startswith("class")

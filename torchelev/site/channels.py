@@ -21,18 +21,24 @@ if TYPE_CHECKING:
 
 
 class SiteChannels:
-    """The channels of a site, by name; each is stored as its components and their weight.
+    """The channels of a site, by name; each is stored as its components, their weight, and since when they hold.
 
     Args:
         channels: as of `ElevationMapConfig`, or from `attributes`.
         taken: layers that the site has already.
+        stored: layers of a folder that is there already, which may lack those of `since`; None: it is to have all.
 
     Raises:
         TypeError, ValueError: as of `ElevationMapConfig(channels=...)`.
     """
 
-    def __init__(self, channels: Mapping[str, Any] | None, taken: tuple[str, ...]) -> None:
+    def __init__(
+        self, channels: Mapping[str, Any] | None, taken: tuple[str, ...], stored: tuple[str, ...] | None = None
+    ) -> None:
         self.configs = parse_channels({} if channels is None else channels, taken)
+        layers = [layer for name in self.configs for layer in (*self.sources(name), self.since(name))]
+        #: The layers in the tiles.
+        self.stored = tuple(layer for layer in layers if layer and (stored is None or layer in stored))
 
     def __bool__(self) -> bool:
         """Return whether there are any."""
@@ -48,14 +54,20 @@ class SiteChannels:
         """The components of all channels, as they are read."""
         return tuple(layer for name, cfg in self.configs.items() for layer in cfg.components(name))
 
-    @property
-    def stored(self) -> tuple[str, ...]:
-        """The layers in the tiles: the components of each channel, followed by its weight."""
-        return tuple(layer for name in self.configs for layer in self.sources(name))
-
     def sources(self, channel: str) -> tuple[str, ...]:
-        """Return the layers in the tiles of a channel."""
+        """Return the layers in the tiles that a channel is read from: its components, followed by its weight."""
         return (*self.configs[channel].components(channel), f"{channel}/weight")
+
+    def since(self, channel: str) -> str | None:
+        """Return the layer in the tiles that says since when a cell holds what it does; None: of a maximum, nothing.
+
+        "exponential" and "class_average": the time at which the value was measured [s], by the site's clock. Others:
+        the number of the merge at which the cell's evidence began, which is exact up to 2^24 merges.
+        """
+        cfg = self.configs[channel]
+        if cfg.kind == "maximum":
+            return None
+        return f"{channel}/time" if cfg.is_newest else f"{channel}/merge"
 
     def channel_of(self, layer: str) -> str:
         """Return the channel of a component."""

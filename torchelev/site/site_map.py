@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import uuid
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -14,14 +12,14 @@ import torch
 from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
-from torchelev.errors import require, require_positive
+from torchelev.errors import require
 from torchelev.inputs import checks
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.channels import SiteChannels
 from torchelev.site.fusion.align import align
-from torchelev.site.fusion.merge import Merged, MergeReport, merge_windows
-from torchelev.site.fusion.shares import Change, find_changes, read_shares
+from torchelev.site.fusion.merge import MergeReport, merge_windows
+from torchelev.site.fusion.shares import Change, read_changes
 from torchelev.site.fusion.windows import (
     Alignment,
     Contribution,
@@ -34,14 +32,14 @@ from torchelev.site.fusion.windows import (
     snapshot,
 )
 from torchelev.site.initialize_from_site import add_filled, center_on, fill, move_contribution
-from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog, arrays_of, changed_arrays
+from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of, changed_arrays
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
-from torchelev.site.readable_site import ReadableSite
-from torchelev.site.shared.collective import gather_windows, open_shared, shared_transaction
+from torchelev.site.opened_site import OpenedSite
+from torchelev.site.shared.collective import gather_windows, open_shared
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import LAYERS, Tiles, locate
+from torchelev.site.tiles import LAYERS, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
 from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
@@ -54,7 +52,7 @@ if TYPE_CHECKING:
 _contributions: WeakKeyDictionary[ElevationMap, dict[str, Contribution]] = WeakKeyDictionary()
 
 
-class SiteMap(ReadableSite):
+class SiteMap(OpenedSite):
     """A world map that grows: the windows of many robots, in one frame.
 
     ```python
@@ -85,8 +83,8 @@ class SiteMap(ReadableSite):
             each cell of the windows and merge, less what compression saves on disk. Holds from the first merge on; a
             site on disk that has keyframes continues to keep them.
         channels: keep these channels of the maps that are merged, as of `ElevationMapConfig(channels=...)`: 4 bytes for
-            each cell and component, and 4 for the weight. Settings of ageing are of no use. Holds from the first merge
-            on; a site on disk that has channels continues to keep them.
+            each cell and component, and 8 for the weight and since when it counts ("maximum": 4). Settings of ageing
+            are of no use. Holds from the first merge on; a site on disk that has channels continues to keep them.
 
     Attributes:
         resolution: [m].
@@ -99,8 +97,6 @@ class SiteMap(ReadableSite):
             others than those of the site at `path`.
         ModuleNotFoundError: tensorstore is missing.
     """
-
-    _interrupted: BaseException | None
 
     def __init__(
         self,
@@ -120,84 +116,6 @@ class SiteMap(ReadableSite):
         self._begin(device, wanted)
         self._check_keyframes(keyframes, wanted)
         self._agree_on_id()
-
-    def _begin(self, device: torch.device | str, channels: SiteChannels | None = None) -> None:
-        """Start with what is stored, or with nothing."""
-        if self._store is not None:  # of a site without channels, there may be no such attribute
-            channels = SiteChannels(self._store.attributes.get("channels"), LAYERS)
-        self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels)
-        self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
-        self._epoch = self._time = self._opened = 0.0  # the last two count from the first
-        self._num_commits, self._interrupted = 0, None
-        self._read_attributes()
-
-    def _check_keyframes(self, wanted: bool, channels: SiteChannels) -> None:
-        """Raise ValueError unless the site can keep keyframes and channels as wanted."""
-        kept, hint = self._keyframes is not None, "begin another"
-        own = self._tiles.channels
-        try:
-            require(kept or not wanted, "keyframes", "must be kept from the first merge on", "a site without", hint)
-            hint = "merge in one process, or without keyframes"
-            require(not kept or self._ranks.size == 1, "keyframes, group", "exclude each other", "both", hint)
-            is_alone, hint = not (kept or self._ranks.size > 1), "keep one of them"
-            require(not own or is_alone, "channels, keyframes and group", "exclude each other", "several", hint)
-            rule, actual = "must be kept from the first merge on", ", ".join(channels.layers)
-            require(not channels or own.configs == channels.configs, "channels", rule, actual,
-                    f"leave them out: the site has {', '.join(own.layers) or 'none'}")  # fmt: skip
-        except ValueError:
-            self.close()
-            raise
-
-    def _set_up(self, resolution: float, path: str | Path | None, cfg: SiteConfig | None) -> dict[str, Any]:
-        """Take the settings, and return those that all ranks must share."""
-        require_positive(resolution=resolution)
-        self.resolution = float(resolution)
-        self.cfg = checks.given_or_default(SiteConfig, cfg)
-        settings = {f"cfg.{name}": value for name, value in asdict(self.cfg).items() if name != "cache_tiles"}
-        return {"resolution": self.resolution, "path": "in memory" if path is None else "on disk", **settings}
-
-    def _agree_on_id(self) -> None:
-        """Take the id of rank 0; raise ValueError if ranks have opened different sites."""
-        stored = None if self._store is None else self._store.attributes.get("id")
-        try:
-            plans = self._ranks.exchange("SiteMap", lambda: {"id": self._id, "same": {"path: id of the site": stored}})
-        except BaseException:
-            self.close()
-            raise
-        self._id = plans[0]["id"]
-
-    @classmethod
-    def open(
-        cls,
-        path: str | Path,
-        *,
-        read_only: bool = False,
-        cfg: SiteConfig | None = None,
-        device: torch.device | str = "cpu",
-    ) -> SiteMap:
-        """Open a site that is on disk.
-
-        Args:
-            path: its folder.
-            read_only: read beside a process that writes; `refresh` shows what it has written since.
-            cfg: how windows are aligned and fused.
-            device: that fuses.
-
-        Raises:
-            FileNotFoundError: there is nothing; ``SiteMap(resolution=..., path=...)`` makes a site.
-            ValueError: it is not a site, is damaged, or has a newer version.
-            OSError: another process writes to it.
-        """
-        from torchelev.site.storage.store import TileStore
-
-        site = cls.__new__(cls)
-        site._ranks = Ranks(None)
-        site._store = TileStore.open(path, read_only=read_only)
-        site.resolution = float(site._store.attributes["resolution"])
-        site.cfg = checks.given_or_default(SiteConfig, cfg)
-        site._keyframes = None
-        site._begin(device)
-        return site
 
     # Merging --------------------------------------------------------------------------------------------------------
 
@@ -258,9 +176,10 @@ class SiteMap(ReadableSite):
         alignment = Alignment(*(value[own] for value in all_aligned))
         new = self._record(windows, alignment, T_map_base, now)
         keyframes = torch.full_like(state.elapsed, -1) if new is None else new.ids
-        shares = read_shares(emap, windows, alignment, self._tiles.channels, self.resolution)
-        changes = find_changes(shares, contribution)
-        contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes)._replace(shares=shares)
+        number = self._num_commits + 1
+        changes = read_changes(emap, windows, alignment, self._tiles.channels, self.resolution, number)
+        shares = {name: change.now for name, change in changes.items()}
+        contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes, shares)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _contributions.setdefault(emap, {})[self._id] = contribution
         contradictions = self._fuse(all_windows, all_aligned, now, new, changes)[own]
@@ -308,13 +227,6 @@ class SiteMap(ReadableSite):
         self._tiles.channels.require_fit(emap)
         self._require_writable()
 
-    def _require_writable(self) -> None:
-        if self._store is not None:
-            hint = "open it again with SiteMap(resolution=..., path=...)"
-            require(not self._store.is_closed, "site", "must be open", "a site after close()", hint)
-            is_reader = self._store.is_read_only and self._ranks.rank == 0
-            require(not is_reader, "site", "must be open for writing", "a read-only site", "open it without read_only")
-
     def require_resolution(self, emap: ElevationMap) -> None:
         """Raise ValueError unless a map has the site's resolution."""
         actual, rule = emap.cfg.grid.resolution, f"must have the site's resolution, {self.resolution:g} m"
@@ -359,32 +271,6 @@ class SiteMap(ReadableSite):
         contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1)
         self._keyframes.append(new)
         return contradictions
-
-    def _write(
-        self, parts: Iterable[Merged], time: float, size: int, arrays: Arrays | None = None, merges: int = 0
-    ) -> Int[Tensor, "B"]:
-        """Write tiles and arrays, on disk first; return the sum of the contradictions."""
-        contradictions = torch.zeros(size, dtype=torch.int64, device=self._tiles.device)
-        attributes = self._attributes(time, merges)
-        try:
-            with shared_transaction(self._ranks, self._store, attributes, arrays) as write:
-                for part in parts:
-                    write(part.tiles, part.values.transpose(0, 1).cpu().numpy())
-                    self._tiles.write(part.tiles, part.values)
-                    contradictions += part.contradictions
-        except BaseException as error:
-            self._tiles.forget()
-            if self._store is None or self._store.attributes.get("num_commits") != attributes["num_commits"]:
-                raise
-            self._interrupted = error  # after the commit: raised once memory has followed
-        self._time, self._num_commits = time, attributes["num_commits"]
-        return contradictions
-
-    def _raise_interrupted(self) -> None:
-        """Raise what interrupted a merge that was committed."""
-        if self._interrupted is not None:
-            error, self._interrupted = self._interrupted, None
-            raise error
 
     # Keyframes ------------------------------------------------------------------------------------------------------
 
@@ -456,22 +342,6 @@ class SiteMap(ReadableSite):
         areas = self.windows(state.corner[ids], size[0], size[1], Remembered._fields) if len(ids) else {}
         unknown = torch.full(state.elevation.shape, torch.nan, device=chosen.device)
         return Remembered(*(unknown.index_copy(0, ids, areas[n]) if areas else unknown for n in Remembered._fields))
-
-    def _attributes(self, time: float, new_merges: int) -> dict[str, Any]:
-        own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}
-        own["num_commits"] = self._num_commits + 1
-        merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
-        own["channels"] = self._tiles.channels.attributes
-        return own | {"variance_rate": self._rate, "keyframe_merges": merges}
-
-    def _read_attributes(self) -> None:
-        if self._store is not None and "id" in self._store.attributes:
-            stored = self._store.attributes
-            self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
-            self._opened, self._num_commits = self._time, stored["num_commits"]
-            self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
-            merges = stored.get("keyframe_merges")
-            self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
 
 
 def _require_poses(emap: ElevationMap, T_map_base: Tensor | None) -> Tensor:

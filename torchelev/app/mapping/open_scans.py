@@ -52,19 +52,30 @@ def open_scans(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
 def _open_folder(request: MapRequest) -> tuple[Recording, MapOptions]:
     mount = None if request.extrinsics is None else read_transform(request.extrinsics)
     _check(request, mount)
-    options = MapOptions(
+    scans = _open_files(request)
+    if request.poses_of == "base" and mount is not None:
+        scans = scans.apply_mount(mount)
+    scans = scans.with_bases(base_poses(scans.T_map_sensor, mount, request.sensor_height))
+    if request.colour:
+        require_colors(scans)
+    if scans.note:
+        click.echo(f"warning: {scans.note}", err=True)
+    return scans, MapOptions(
         T_base_sensor=mount,
         sensor_height=request.sensor_height,
         fixed=request.fixed,
         channels=wanted_channels(request.colour),
     )
+
+
+def _open_files(request: MapRequest) -> Recording:
     layout = FileLayout(
         bin=request.bin_layout,
         quaternions=request.quaternions,
         time_unit=request.time_unit,
         pcd_frame=request.pcd_frame,
     )
-    scans = open_recording(
+    return open_recording(
         request.recording,
         request.poses,
         request.intrinsics,
@@ -73,14 +84,6 @@ def _open_folder(request: MapRequest) -> tuple[Recording, MapOptions]:
         request.depth_scale,
         request.depth_axes,
     )
-    if request.poses_of == "base" and mount is not None:
-        scans = scans.apply_mount(mount)
-    scans = scans.with_bases(base_poses(scans.T_map_sensor, mount, request.sensor_height))
-    if request.colour:
-        require_colors(scans)
-    if scans.note:
-        click.echo(f"warning: {scans.note}", err=True)
-    return scans, options
 
 
 def _check(request: MapRequest, mount: NDArray | None) -> None:

@@ -12,8 +12,9 @@ from torch import Tensor
 from torchelev.ops.parallel import map_in_order
 from torchelev.site.fusion.entries import read_entries, rise
 from torchelev.site.fusion.fuse import Entries, Heights, fuse
+from torchelev.site.fusion.fuse_shares import fuse_channels
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
-from torchelev.site.fusion.shares import Change, forget_changed, fuse_change
+from torchelev.site.fusion.shares import Change
 from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import LAYERS, Tile, Tiles
@@ -76,7 +77,7 @@ def merge_windows(
         entries = read_entries(windows, alignment, robot, cell, place, resolution)
         is_contradicted = fuse_entries(layers, entries, rate, cfg)
         lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
-        fuse_channels(layers, before, tiles, pieces, changes)
+        fuse_channels(layers, before, layers[_ELEVATION], tiles, pieces, changes)
         contradictions = torch.bincount(robot[is_contradicted], minlength=len(alignment.offset))
         return Merged(pieces.tiles, values, contradictions)
 
@@ -90,24 +91,6 @@ def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cf
     for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
         layers[row] = value
     return fused.is_contradicted
-
-
-def fuse_channels(
-    layers: Float[Tensor, "L C"],
-    before: Float[Tensor, "C"],
-    tiles: Tiles,
-    pieces: Pieces,
-    changes: Mapping[str, Change],
-) -> None:
-    """Fuse what robots know of channels into the layers of tiles, in place; `before` is their elevation before [m]."""
-    after = layers[_ELEVATION]
-    for name, cfg in tiles.channels.configs.items():
-        first = tiles.layers.index(tiles.channels.sources(name)[0])
-        stored = layers[first : first + cfg.size + 1]
-        forget_changed(stored, before, after, cfg.tolerance)
-        if name in changes:
-            _, cell, place = pieces.select(changes[name].is_new)
-            fuse_change(stored, before, after, changes[name], cell, place, cfg)
 
 
 def _read_bounds(windows: Windows, alignment: Alignment, pieces: Pieces, resolution: float) -> tuple[Tensor, Tensor]:

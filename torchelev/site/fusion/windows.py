@@ -160,8 +160,14 @@ def move_known(known: Known, corner: Int[Tensor, "B 2"]) -> Known:
 
 
 def snapshot(
-    emap: ElevationMap, windows: Windows, alignment: Alignment, elapsed: Int[Tensor, "B"], keyframe: Int[Tensor, "B"]
+    emap: ElevationMap,
+    windows: Windows,
+    alignment: Alignment,
+    elapsed: Int[Tensor, "B"],
+    keyframe: Int[Tensor, "B"],
+    shares: Mapping[str, Share] = MappingProxyType({}),
 ) -> Contribution:
-    """Return a map's contribution at a merge, as copies, with the ids of its keyframes and the maps' clocks."""
+    """Return a map's contribution at a merge, as copies, with its keyframes, the maps' clocks, and these shares."""
     known = Known(*(value.clone() for value in windows.known))
-    return Contribution(known, alignment, elapsed.clone(), emap.num_resets.to(elapsed.device, copy=True), keyframe)
+    num_resets = emap.num_resets.to(elapsed.device, copy=True)
+    return Contribution(known, alignment, elapsed.clone(), num_resets, keyframe, shares)

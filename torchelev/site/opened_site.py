@@ -1,0 +1,168 @@
+"""Opening a site, in memory or on disk, and writing to it: what `SiteMap` stands on."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchelev.errors import require, require_positive
+from torchelev.inputs import checks
+from torchelev.site.channels import SiteChannels
+from torchelev.site.fusion.merge import Merged
+from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog
+from torchelev.site.readable_site import ReadableSite
+from torchelev.site.shared.collective import shared_transaction
+from torchelev.site.shared.ranks import Ranks
+from torchelev.site.site_config import SiteConfig
+from torchelev.site.tiles import LAYERS, Tiles
+
+if TYPE_CHECKING:
+    from jaxtyping import Int
+    from torch import Tensor
+    from typing_extensions import Self
+
+
+class OpenedSite(ReadableSite):
+    """A site that has been opened: its settings, its attributes on disk, and its commits."""
+
+    cfg: SiteConfig
+    _ranks: Ranks
+    _keyframes: KeyframeLog | None
+    _id: str
+    _opened: float
+    _num_commits: int
+    _interrupted: BaseException | None
+
+    @classmethod
+    def open(
+        cls,
+        path: str | Path,
+        *,
+        read_only: bool = False,
+        cfg: SiteConfig | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Self:
+        """Open a site that is on disk.
+
+        Args:
+            path: its folder.
+            read_only: read beside a process that writes; `refresh` shows what it has written since.
+            cfg: how windows are aligned and fused.
+            device: that fuses.
+
+        Raises:
+            FileNotFoundError: there is nothing; ``SiteMap(resolution=..., path=...)`` makes a site.
+            ValueError: it is not a site, is damaged, or has a newer version.
+            OSError: another process writes to it.
+        """
+        from torchelev.site.storage.store import TileStore
+
+        site = cls.__new__(cls)
+        site._ranks = Ranks(None)
+        site._store = TileStore.open(path, read_only=read_only)
+        site.resolution = float(site._store.attributes["resolution"])
+        site.cfg = checks.given_or_default(SiteConfig, cfg)
+        site._keyframes = None
+        site._begin(device)
+        return site
+
+    def _begin(self, device: torch.device | str, channels: SiteChannels | None = None) -> None:
+        """Start with what is stored, or with nothing."""
+        if self._store is not None:  # of a site without channels, there may be no such attribute
+            channels = SiteChannels(self._store.attributes.get("channels"), LAYERS, self._store.layers)
+        self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels)
+        self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
+        self._epoch = self._time = self._opened = 0.0  # the last two count from the first
+        self._num_commits, self._interrupted = 0, None
+        self._read_attributes()
+
+    def _check_keyframes(self, wanted: bool, channels: SiteChannels) -> None:
+        """Raise ValueError unless the site can keep keyframes and channels as wanted."""
+        kept, hint = self._keyframes is not None, "begin another"
+        own = self._tiles.channels
+        try:
+            require(kept or not wanted, "keyframes", "must be kept from the first merge on", "a site without", hint)
+            hint = "merge in one process, or without keyframes"
+            require(not kept or self._ranks.size == 1, "keyframes, group", "exclude each other", "both", hint)
+            is_alone, hint = not (kept or self._ranks.size > 1), "keep one of them"
+            require(not own or is_alone, "channels, keyframes and group", "exclude each other", "several", hint)
+            rule, actual = "must be kept from the first merge on", ", ".join(channels.layers)
+            require(not channels or own.configs == channels.configs, "channels", rule, actual,
+                    f"leave them out: the site has {', '.join(own.layers) or 'none'}")  # fmt: skip
+        except ValueError:
+            self.close()
+            raise
+
+    def _set_up(self, resolution: float, path: str | Path | None, cfg: SiteConfig | None) -> dict[str, Any]:
+        """Take the settings, and return those that all ranks must share."""
+        require_positive(resolution=resolution)
+        self.resolution = float(resolution)
+        self.cfg = checks.given_or_default(SiteConfig, cfg)
+        settings = {f"cfg.{name}": value for name, value in asdict(self.cfg).items() if name != "cache_tiles"}
+        return {"resolution": self.resolution, "path": "in memory" if path is None else "on disk", **settings}
+
+    def _agree_on_id(self) -> None:
+        """Take the id of rank 0; raise ValueError if ranks have opened different sites."""
+        stored = None if self._store is None else self._store.attributes.get("id")
+        try:
+            plans = self._ranks.exchange("SiteMap", lambda: {"id": self._id, "same": {"path: id of the site": stored}})
+        except BaseException:
+            self.close()
+            raise
+        self._id = plans[0]["id"]
+
+    def _attributes(self, time: float, new_merges: int) -> dict[str, Any]:
+        own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}
+        own["num_commits"] = self._num_commits + 1
+        merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
+        own["channels"] = self._tiles.channels.attributes
+        return own | {"variance_rate": self._rate, "keyframe_merges": merges}
+
+    def _read_attributes(self) -> None:
+        if self._store is not None and "id" in self._store.attributes:
+            stored = self._store.attributes
+            self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
+            self._opened, self._num_commits = self._time, stored["num_commits"]
+            self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
+            merges = stored.get("keyframe_merges")
+            self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
+
+    # Writing --------------------------------------------------------------------------------------------------------
+
+    def _require_writable(self) -> None:
+        if self._store is not None:
+            hint = "open it again with SiteMap(resolution=..., path=...)"
+            require(not self._store.is_closed, "site", "must be open", "a site after close()", hint)
+            is_reader = self._store.is_read_only and self._ranks.rank == 0
+            require(not is_reader, "site", "must be open for writing", "a read-only site", "open it without read_only")
+
+    def _write(
+        self, parts: Iterable[Merged], time: float, size: int, arrays: Arrays | None = None, merges: int = 0
+    ) -> Int[Tensor, "B"]:
+        """Write tiles and arrays, on disk first; return the sum of the contradictions."""
+        contradictions = torch.zeros(size, dtype=torch.int64, device=self._tiles.device)
+        attributes = self._attributes(time, merges)
+        try:
+            with shared_transaction(self._ranks, self._store, attributes, arrays) as write:
+                for part in parts:
+                    write(part.tiles, part.values.transpose(0, 1).cpu().numpy())
+                    self._tiles.write(part.tiles, part.values)
+                    contradictions += part.contradictions
+        except BaseException as error:
+            self._tiles.forget()
+            if self._store is None or self._store.attributes.get("num_commits") != attributes["num_commits"]:
+                raise
+            self._interrupted = error  # after the commit: raised once memory has followed
+        self._time, self._num_commits = time, attributes["num_commits"]
+        return contradictions
+
+    def _raise_interrupted(self) -> None:
+        """Raise what interrupted a merge that was committed."""
+        if self._interrupted is not None:
+            error, self._interrupted = self._interrupted, None
+            raise error
