@@ -15,7 +15,7 @@ from docs.extensions.fields import comments
 from torchelev.channels.config import DTYPES, KINDS, ChannelConfig
 from torchelev.completion.config import WHEN
 from torchelev.config import ElevationMapConfig, setting_types
-from torchelev.config_files import SCHEMA_NAME, VERSION, VERSION_NAME, to_json
+from torchelev.files.config_files import SCHEMA_NAME, VERSION, VERSION_NAME, to_json
 from torchelev.kernels.registry import PACKAGE
 
 FILE = PACKAGE / "runtime" / "generated" / "map.schema.json"

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from torchelev.channels.config import ChannelConfigs, parse_channels
 from torchelev.completion.config import CompletionConfig
-from torchelev.config_files import from_json, read_settings, without_header, write_settings
 from torchelev.errors import require
+from torchelev.files.config_files import from_json, read_settings, without_header, write_settings
 from torchelev.grid import GridConfig
 from torchelev.layers import LAYERS
 from torchelev.stages.age.config import AgingConfig

@@ -17,7 +17,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from torchelev.errors import require
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 from training.resume import CHECKPOINT, deferred_interrupt
 
 

@@ -13,7 +13,7 @@ import click
 from tqdm import tqdm
 
 from torchelev.app.results import to_json
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 
 CHECKPOINT = "checkpoint.pt"
 

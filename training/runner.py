@@ -14,7 +14,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tqdm import tqdm
 
 from torchelev.errors import message, require
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 from training.resume import CHECKPOINT, deferred_interrupt
 
 _DEFAULTS = {"encoder": "cnn", "fill": "base"}  # of configurations and checkpoints that name none

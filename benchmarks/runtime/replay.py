@@ -17,9 +17,9 @@ from benchmarks.quality.accuracy.score import score
 from benchmarks.quality.features.comparison import FEATURES, examine
 from benchmarks.runtime.build import machine
 from torchelev import ElevationMap, HeightScan
-from torchelev.config_files import to_json
 from torchelev.errors import require
-from torchelev.map_buffers import name_tensors
+from torchelev.files.config_files import to_json
+from torchelev.maps.buffers import name_tensors
 from torchelev.runtime.library import CMap, build_library
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from docs.browser import Browser
 from torchelev.app.demo import DT, DemoWalk
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 from torchelev.viz.live import Page, Player, take_snapshot
 
 PICTURE = Path(__file__).parents[1] / "pictures" / "live_view.png"

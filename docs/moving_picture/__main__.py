@@ -14,7 +14,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from docs.moving_picture.film import frames, save_film
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 _STILL = 0.72  # of the film

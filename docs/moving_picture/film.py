@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from docs.moving_picture import batch
 from docs.moving_picture.stage import BACKGROUND, CMAP, LIMITS, Stage
 from docs.moving_picture.walk import Path, make_ground, walk
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 from torchelev.viz.style import ROBOT_COLOR, UNKNOWN_COLOR
 
 FRAMES_PER_SECOND = 15

@@ -15,9 +15,9 @@ from torchelev import (
     ElevationMapConfig,
     FilterConfig,
     GridConfig,
-    readable_map,
 )
 from torchelev.io.map_file import load_map, save_map
+from torchelev.maps import readable
 from torchelev.stages.complete import COMPLETED, complete_map
 
 SMOOTH = FilterConfig(layer="smooth", filter="box", inputs="completed")
@@ -34,13 +34,13 @@ def look(emap, seed=0, blind=()):
 @pytest.fixture
 def count(monkeypatch):
     """The list grows with every completion."""
-    calls, compute = [], readable_map.completed_layers
+    calls, compute = [], readable.completed_layers
 
     def counted(*args):
         calls.append(args)
         return compute(*args)
 
-    monkeypatch.setattr(readable_map, "completed_layers", counted)
+    monkeypatch.setattr(readable, "completed_layers", counted)
     return calls
 
 

@@ -10,7 +10,7 @@ from tests import reference
 from torchelev.completion.complete import CompletionInput, complete
 from torchelev.completion.net import VERSION, CompletionNet
 from torchelev.completion.surroundings import DIRECTIONS, NONE, count_steps
-from torchelev.weight_files import write_weights
+from torchelev.files.weight_files import write_weights
 
 RESOLUTION = 0.08
 

@@ -10,7 +10,7 @@ from tests.diagnosis.walks import CFG, DT
 from tests.helpers import pose
 from tests.runtime.test_maps import numpy, update
 from tests.stages.test_disagreement import GRID, clouds
-from torchelev.map_buffers import name_tensors
+from torchelev.maps.buffers import name_tensors
 from torchelev.runtime.library import CMap
 from torchelev.sim import DepthCamera, mount, walk
 from torchelev.sim.exact import scenes

@@ -14,7 +14,7 @@ from tests.helpers import pose, random_poses, seen_from, small_config
 from torchelev.errors import require
 from torchelev.kernels.registry import PACKAGE
 from torchelev.kernels.structs import members
-from torchelev.map_buffers import name_tensors
+from torchelev.maps.buffers import name_tensors
 from torchelev.pipeline import update_by_tensors
 from torchelev.runtime.library import STATISTICS, CMap, LibraryError
 from torchelev.stages.recenter.stage import recenter

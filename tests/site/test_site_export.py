@@ -10,8 +10,8 @@ import tifffile
 
 from tests.helpers import without
 from tests.site.helpers import fill, robots
+from torchelev.files.output_files import is_own_output
 from torchelev.io.export import load_npz
-from torchelev.output_files import is_own_output
 from torchelev.site import SiteMap
 
 

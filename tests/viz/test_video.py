@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from tests.helpers import without
-from torchelev.output_files import WriteError
+from torchelev.files.output_files import WriteError
 from torchelev.viz.map_frames import MapFrames
 from torchelev.viz.video import VideoWriter
 

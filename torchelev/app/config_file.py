@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchelev.config import ElevationMapConfig
-from torchelev.config_files import read_settings
+from torchelev.files.config_files import read_settings
 
 _RESOLUTION, _SIZE = 0.1, 20.0  # [m] defaults
 _MAX_CELLS = 16_000_000  # an update takes about 350 bytes of memory per cell

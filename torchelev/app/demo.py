@@ -20,8 +20,8 @@ from torchelev.app.demo_course import LANDMARKS, ROUTE, make_course
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.files.output_files import require_writable
 from torchelev.grid import GridConfig
-from torchelev.output_files import require_writable
 from torchelev.sim import DepthCamera, Scene, Trajectory, mount, outliers, range_noise, steps, walk
 
 if TYPE_CHECKING:

@@ -109,7 +109,7 @@ def _describe(start: Tensor, goal: tuple[float, float], path: PlannedPath, check
 
 def _require_picture(out: Path) -> None:
     """Refuse what no picture can be written to."""
-    from torchelev.output_files import require_writable
+    from torchelev.files.output_files import require_writable
     from torchelev.viz.style import require_picture
 
     require_picture(out)

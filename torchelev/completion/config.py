@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchelev.errors import require, require_positive
-from torchelev.weight_files import require_resolution
+from torchelev.files.weight_files import require_resolution
 
 WHEN = ("read", "update")
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torchelev.completion.complete import Completion, CompletionInput, complete
 from torchelev.completion.parameters import Weights, weight_shapes
 from torchelev.errors import require
+from torchelev.files.weight_files import WeightFormat, require_resolution, write_weights
 from torchelev.ops.transforms import require_reverse_mode
-from torchelev.weight_files import WeightFormat, require_resolution, write_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
+from torchelev.files.output_files import MARK, atomic_file
 from torchelev.io.map_file import WHOLE, as_array, load_map, map_arrays, read_npz, save_map
-from torchelev.output_files import MARK, atomic_file
 from torchelev.state import map_layers
 
 if TYPE_CHECKING:

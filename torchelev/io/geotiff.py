@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from torchelev.channels.config import ChannelConfig
 from torchelev.errors import require
+from torchelev.files.output_files import atomic_file
 from torchelev.io.export import take
-from torchelev.output_files import atomic_file
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap

@@ -17,9 +17,9 @@ from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.files.output_files import atomic_file
 from torchelev.inputs import checks
-from torchelev.map_buffers import name_tensors, state_of
-from torchelev.output_files import atomic_file
+from torchelev.maps.buffers import name_tensors, state_of
 from torchelev.pipeline import rate
 from torchelev.state import MapState
 from torchelev.traversability.net import TraversabilityNet

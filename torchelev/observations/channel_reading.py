@@ -13,7 +13,7 @@ from torchelev.channels.config import expand_names
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.layers import Layer, containing_cells
-from torchelev.readable_map import ReadableMap
+from torchelev.maps.readable import ReadableMap
 from torchelev.state import MapState
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from torch import Tensor
 from torchelev.errors import message, require
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer, sample_layers
+from torchelev.maps.readable import ReadableMap
 from torchelev.observations.ground import border_left_out, continue_ground
 from torchelev.ops.windows import padded, window_moments
-from torchelev.readable_map import ReadableMap
 from torchelev.state import MapState
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from torchelev.config_files import to_json
 from torchelev.errors import require
+from torchelev.files.config_files import to_json
 from torchelev.observations.scan_settings import ScanSettings
 
 # Noise belongs to training, reach to the map's window; the placement follows from the pattern.

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.config_files import to_json
 from torchelev.errors import require
+from torchelev.files.config_files import to_json
 from torchelev.ros2.engine import PathAnswer, SensorInput, Window
 from torchelev.ros2.settings import NodeSettings
 

@@ -11,8 +11,8 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from torchelev.config_files import read_settings
 from torchelev.errors import require, require_positive
+from torchelev.files.config_files import read_settings
 
 _KINDS = {str: "text", float: "a number", int: "a whole number", bool: "true or false"}
 _OF_ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")  # parameters that rclpy declares

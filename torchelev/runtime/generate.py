@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from torchelev.config import ElevationMapConfig, setting_types
-from torchelev.config_files import VERSION
 from torchelev.diagnosis import history, sensor_bias, surfaces
 from torchelev.diagnosis.causes import REASONS
 from torchelev.diagnosis.evidence import FAR, GATES, MIN_POINTS
+from torchelev.files.config_files import VERSION
 from torchelev.filters.inpainting import harmonic
 from torchelev.filters.registry import FILTERS, settings_of
 from torchelev.grid import MIN_RESOLUTION

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from torchelev.errors import message, require
+from torchelev.files.output_files import MARK, atomic_file, require_writable
 from torchelev.io.export import SavedMap, triangulate, write_npz, write_ply
 from torchelev.io.geotiff import check_epsg, color_roles, write_bands
-from torchelev.output_files import MARK, atomic_file, require_writable
 from torchelev.site.reading import sources_of
 from torchelev.site.tiles import TILE, Tiles
 

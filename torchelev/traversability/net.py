@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchelev.errors import require
+from torchelev.files.weight_files import write_weights
 from torchelev.robot import RobotConfig
 from torchelev.traversability.rate import rate
 from torchelev.traversability.rating import Rating
@@ -21,7 +22,6 @@ from torchelev.traversability.weight_file import (
     require_in_ranges,
     weight_shapes,
 )
-from torchelev.weight_files import write_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.files.weight_files import WeightFormat, is_within, require_resolution
 from torchelev.robot import RobotConfig
 from torchelev.traversability.features import NUM_FEATURES
-from torchelev.weight_files import WeightFormat, is_within, require_resolution
 
 if TYPE_CHECKING:
     from jaxtyping import Float

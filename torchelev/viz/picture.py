@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from torchelev.errors import require, require_count, require_positive
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 from torchelev.viz.plot import Panel, color_limits
 from torchelev.viz.style import HEIGHTS, UNKNOWN_COLOR, png_info
 

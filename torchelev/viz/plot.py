@@ -20,7 +20,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 from torchelev.viz.style import HEIGHTS, ROBOT_COLOR, UNKNOWN_COLOR, small_png, styled
 
 

@@ -25,7 +25,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from torchelev.errors import require
-from torchelev.output_files import MARK, atomic_file
+from torchelev.files.output_files import MARK, atomic_file
 
 UNKNOWN_COLOR = "#d9d9d9"  #: cells without a value
 HEIGHTS = "viridis"  #: colour map of heights [m]

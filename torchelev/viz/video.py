@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import GifImagePlugin, Image
 
 from torchelev.errors import require
-from torchelev.output_files import atomic_file, require_writable
+from torchelev.files.output_files import atomic_file, require_writable
 
 SUFFIXES = (".mp4", ".gif")
 

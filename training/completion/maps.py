@@ -20,8 +20,8 @@ from tqdm import tqdm
 from torchelev import ElevationMap
 from torchelev.completion.complete import CompletionInput
 from torchelev.errors import require, require_positive
+from torchelev.files.weight_files import RESOLUTIONS
 from torchelev.sim import HeightField
-from torchelev.weight_files import RESOLUTIONS
 from training.completion.yards import drive_and_look
 from training.fit import save_atomically
 from training.traversability.maps.mapping import DataConfig, Look, blank_map, tile_cell_centers, walk_and_look

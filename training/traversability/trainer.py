@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require, require_positive
+from torchelev.files.weight_files import RESOLUTIONS
 from torchelev.robot import RobotConfig
 from torchelev.traversability.net import TraversabilityNet
 from torchelev.traversability.weight_file import ratios
-from torchelev.weight_files import RESOLUTIONS
 from training.fit import Fit
 from training.traversability.maps.data import MappedTerrain
 from training.traversability.metrics import SAFE

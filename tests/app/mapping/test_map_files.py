@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from torchelev import output_files
+from torchelev.files import output_files
 from torchelev.io.export import load_npz
 
 

@@ -10,7 +10,7 @@ from torchelev.app.fleet.explore import cells_per_coarse_cell
 from torchelev.app.fleet.robots import CAMP_SPACING
 from torchelev.app.fleet.world import make_camp
 from torchelev.errors import require, require_count, require_positive, whole_cells
-from torchelev.output_files import require_writable
+from torchelev.files.output_files import require_writable
 
 _WINDOW = 8.0  # [m] side of each robot's map, about
 _MAX_ROBOTS, _MAX_SIZE = 256, 150.0

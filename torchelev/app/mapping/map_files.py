@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchelev.app.mapping.report import choose_panels
+from torchelev.files.output_files import require_writable
 from torchelev.io import MappingRun
-from torchelev.output_files import require_writable
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap

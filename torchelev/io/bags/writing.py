@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from torchelev.errors import require
+from torchelev.files.output_files import WriteError, require_writable
 from torchelev.io.bags.files.definitions import make_typestore
-from torchelev.output_files import WriteError, require_writable
 
 _STORAGE = {".mcap": "MCAP", ".db3": "SQLITE3", "": "MCAP"}
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchelev.config import ElevationMapConfig
-from torchelev.config_files import read_settings
 from torchelev.errors import require
+from torchelev.files.config_files import read_settings
 from torchelev.io.em_cupy.channels import GROUPS, read_channels
 from torchelev.io.em_cupy.parameters import NODE_PARAMETERS, PARAMETERS, SWITCHES, read_parameters, read_same_parameters
 from torchelev.io.em_cupy.plugins import PLUGINS, is_plugin, read_plugins

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 
 
 def write_tum(path: str | Path, stamps: NDArray[np.float64], rows: Iterable[Iterable[float]], comment: str) -> None:

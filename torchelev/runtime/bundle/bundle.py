@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
+from torchelev.files.output_files import atomic_file
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
-from torchelev.output_files import atomic_file
 from torchelev.runtime.bundle.groups import Group, from_json, shape_of
 from torchelev.runtime.bundle.recording import CONFIG, EPISODE, OBSERVATION, POLICY, VERSION
 

@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torchelev import config_files
 from torchelev.errors import require
+from torchelev.files import config_files
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import MapImage
 from torchelev.observations.scan_layout import scan_layout

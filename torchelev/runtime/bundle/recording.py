@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.files.output_files import atomic_file
 from torchelev.observations.height_scan import HeightScan
-from torchelev.output_files import atomic_file
 from torchelev.runtime.bundle import groups as observation_groups
 from torchelev.runtime.bundle.groups import Group
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchelev.errors import message, require
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 
 Net = TypeVar("Net", bound=nn.Module)
 RESOLUTIONS = (0.02, 0.1)  # [m] limits of the maps that networks are trained for

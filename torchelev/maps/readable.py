@@ -12,7 +12,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer
-from torchelev.map_buffers import MapBuffers
+from torchelev.maps.buffers import MapBuffers
 from torchelev.stages.complete import (
     COMPLETED,
     completed_layers,

@@ -14,8 +14,8 @@ import pytest
 from tests.helpers import mapped
 from torchelev import TraversabilityNet
 from torchelev.app.demo import run_demo
+from torchelev.files.output_files import WriteError, atomic_file, is_own_output, require_writable
 from torchelev.io.export import save_cloud, save_map, save_mesh, save_npz
-from torchelev.output_files import WriteError, atomic_file, is_own_output, require_writable
 from torchelev.viz.picture import save_image
 from torchelev.viz.plot import Panel, save_layers
 
@@ -37,7 +37,7 @@ def test_a_writer_that_fails_leaves_the_older_file(tmp_path):
     for name in WRITERS:
         (tmp_path / name).write_bytes(b"older")
     code = (
-        "import pathlib, resource, sys, pytest; sys.path.insert(0, 'tests')\n"
+        "import pathlib, resource, sys, pytest; sys.path.insert(0, 'tests/files')\n"
         "from test_output_files import WRITERS, WriteError\n"
         "import torch; torch.__version__ < '2.10' and __import__('torch._dynamo')  # writes files when it is imported\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"

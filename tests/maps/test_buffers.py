@@ -6,7 +6,7 @@ import torch
 
 from tests.helpers import differences, mapped, random_state, scan, small_map, snapshot
 from torchelev import FilterConfig
-from torchelev.map_buffers import name_tensors, state_of, without_shared_memory
+from torchelev.maps.buffers import name_tensors, state_of, without_shared_memory
 
 
 def test_tensors_by_name_are_the_buffers_and_make_the_state_again():

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from torchelev.errors import require
-from torchelev.output_files import atomic_file
+from torchelev.files.output_files import atomic_file
 
 VERSION_NAME, VERSION = "torchelev_config", 1  # of the format; files without it are of version 1
 SCHEMA_NAME = "$schema"  # by which editors find the file that describes the settings
