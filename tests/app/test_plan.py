@@ -6,8 +6,9 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig, TraversabilityConfig
+from torchelev import ChannelConfig, ElevationMap, ElevationMapConfig, GridConfig, TraversabilityConfig
 from torchelev.app.cli import main
+from torchelev.channels.state import Channel
 from torchelev.io.export import save_map, save_npz, take, write_npz
 from torchelev.pipeline import rate
 
@@ -41,6 +42,26 @@ def test_a_path_around_a_wall(tmp_path, save):
     assert code == 0 and text.startswith("path") and "every footprint along the path is safe" in text
     assert float(text.split(" m, ")[0].split()[-1]) > 2.3, "longer than the straight line"
     assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow(1)
+@pytest.mark.parametrize("robot", [(), ("--step-height", 0.2)])
+def test_a_path_around_a_class_that_is_forbidden(tmp_path, robot):
+    """Flat ground with water at x = 0 up to y = 0.5; a robot of its own keeps the map's channels."""
+    channels = {"semantic": ChannelConfig(kind="class", names=("grass", "water"))}
+    emap = world(height=0.0, channels=channels)
+    x, y = emap.cell_centers()[0].unbind(-1)
+    is_water = ((x > -0.2) & (x < 0.2) & (y < 0.5)).float()
+    emap.channels.write(
+        "semantic", Channel(torch.stack([1 - is_water, is_water], -1)[None] * 20, 20 * torch.ones(1, 40, 30), None)
+    )
+    save_map(tmp_path / "map.npz", emap)
+    lengths = []
+    for costs in ((), ("--class-cost", "semantic.water=inf")):
+        code, text = run(tmp_path / "map.npz", *ENDS, *robot, *costs)
+        assert code == 0 and text.startswith("path")
+        lengths.append(float(text.split(" m, ")[0].split()[-1]))
+    assert lengths[0] == pytest.approx(2.0, abs=0.05) and lengths[1] > 2.3
 
 
 @pytest.mark.slow(1)
@@ -89,6 +110,9 @@ def test_a_map_without_a_head_is_rated_for_the_default_robot(tmp_path):
     (("layers.npz", "--goal", 1, 0), "must be a whole map"),
     (("empty.npz", "--goal", 1, 0), "the map is empty"),
     (("map.npz",), "Missing option '--goal'"),
+    (("map.npz", "--goal", 1, 0, "--class-cost", "water=inf"), "CHANNEL.CLASS=FACTOR, got 'water=inf'"),
+    (("map.npz", "--goal", 1, 0, "--class-cost", "semantic.water=much"), "must be CHANNEL.CLASS=FACTOR"),
+    (("map.npz", "--goal", 1, 0, "--class-cost", "semantic.water=3"), "cost.class_costs"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(tmp_path, arguments, text):
     emap = world()

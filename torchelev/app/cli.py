@@ -203,6 +203,13 @@ def _robot_option(name: str, unit: str, text: str) -> Callable[[Callable[..., No
 @click.option("--goal", type=float, nargs=2, metavar="X Y", required=True, help="Where to go [m], map frame.")
 @click.option("--start", type=float, nargs=2, metavar="X Y", help="Where from [m].  [default: the map's centre]")
 @click.option("--out", type=click.Path(path_type=Path), metavar="PICTURE", help="Picture to write: .png or .svg.")
+@click.option(
+    "--class-cost",
+    "class_costs",
+    multiple=True,
+    metavar="CLASS=FACTOR",
+    help="What a metre on a class costs, such as semantic.mud=3, or semantic.water=inf to forbid it; repeat it.",
+)
 @_robot_option("step-height", "M", "Highest step of the robot [m].")
 @_robot_option("max-slope", "RAD", "Its steepest slope [rad].")
 @_robot_option("clearance", "M", "Height of its belly over its feet [m].")
@@ -213,13 +220,14 @@ def plan_command(
     goal: tuple[float, float],
     start: tuple[float, float] | None,
     out: Path | None,
+    class_costs: tuple[str, ...],
     **robot: float | None,
 ) -> None:
     """Run `torchelev plan`; its help text is `_PLAN_HELP`."""
     from torchelev.app.plan_command import run_plan
 
     given = {name: value for name, value in robot.items() if value is not None}
-    sys.exit(run_plan(map_file, goal, start, out, given))
+    sys.exit(run_plan(map_file, goal, start, out, given, class_costs))
 
 
 @main.command("filters", short_help="List the filters that a config can use.")

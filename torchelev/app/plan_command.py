@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from torchelev.app.user_error import EmptyMapError, user_errors
 from torchelev.elevation_map import ElevationMap
+from torchelev.errors import require
 from torchelev.io.export import load_map, take
 from torchelev.pipeline import rate
 from torchelev.planning.path_check import PathCheck, check_path
@@ -30,6 +32,7 @@ def run_plan(
     start: tuple[float, float] | None,
     out: Path | None,
     robot: dict[str, float],
+    class_costs: tuple[str, ...] = (),
 ) -> int:
     """Plan, check and report; bad input becomes a one-line click error.
 
@@ -39,6 +42,7 @@ def run_plan(
         start: x, y [m], map frame; None: the window's centre, where the robot was last.
         out: picture to write.
         robot: fields of `RobotConfig` that were given; without any, the map's own head rates the ground.
+        class_costs: what classes of the map's channels cost, "channel.class=factor" each.
 
     Returns:
         The exit code.
@@ -46,9 +50,14 @@ def run_plan(
     with user_errors():
         if out is not None:
             _require_picture(out)
+        costs = parse_class_costs(class_costs)
         emap = _load(map_file, robot)
         starts = emap.center[:, :2].double() if start is None else torch.tensor([start], dtype=torch.float64)
-        path, check = _plan(emap, starts, torch.tensor([goal], dtype=torch.float64), _robot_of(emap, robot))
+        goals = torch.tensor([goal], dtype=torch.float64)
+        try:
+            path, check = _plan(emap, starts, goals, _robot_of(emap, robot), costs)
+        except KeyError as error:  # a channel or a class that is not there
+            raise ValueError(error.args[0]) from error
         is_safe = bool(path.reached & check.safe)
         refused = None if is_safe else _refused_place(path, check)
         click.echo(_describe(starts, goal, path, check))
@@ -56,6 +65,23 @@ def run_plan(
             _draw(emap, path, goal, refused, out)
             click.echo(f"wrote {out}")
     return 0 if is_safe else NO_PATH
+
+
+def parse_class_costs(given: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Return the factors of "channel.class=factor" by channel and class.
+
+    Raises:
+        ValueError: a text has another form; the planner refuses factors out of range, and classes that are not there.
+    """
+    costs: dict[str, dict[str, float]] = {}
+    for text in given:
+        name, _, factor = text.partition("=")
+        channel, _, part = name.partition(".")
+        rule, hint = "must be CHANNEL.CLASS=FACTOR", "give semantic.mud=3, or semantic.water=inf"
+        with suppress(ValueError):
+            costs.setdefault(channel, {})[part] = float(factor)
+        require(bool(channel and part) and part in costs.get(channel, {}), "--class-cost", rule, repr(text), hint)
+    return costs
 
 
 def _load(map_file: Path, robot: dict[str, float]) -> ElevationMap:
@@ -71,6 +97,8 @@ def _load(map_file: Path, robot: dict[str, float]) -> ElevationMap:
     cfg = replace(emap.cfg, traversability=head)
     rated = ElevationMap(cfg, head=emap.head, completion_net=emap.completion_net).to(emap.elevation.dtype)
     rated.load_state(rate(emap.state, cfg, None if rated.head is None else rated.head.weights))
+    if rated.channels is not None and emap.channels is not None:
+        rated.channels.load_state_dict(emap.channels.state_dict())
     return rated
 
 
@@ -79,7 +107,9 @@ def _robot_of(emap: ElevationMap, robot: dict[str, float]) -> RobotConfig:
     return (head.robot if head is not None else None) or RobotConfig(**robot)
 
 
-def _plan(emap: ElevationMap, start: Tensor, goal: Tensor, robot: RobotConfig) -> tuple[PlannedPath, PathCheck]:
+def _plan(
+    emap: ElevationMap, start: Tensor, goal: Tensor, robot: RobotConfig, class_costs: dict[str, dict[str, float]]
+) -> tuple[PlannedPath, PathCheck]:
     """Plan for the robot's width or, where its footprint does not fit along the path, for all headings of its body.
 
     The learned head's ratings include the body, whose centre alone is checked.
@@ -91,7 +121,7 @@ def _plan(emap: ElevationMap, start: Tensor, goal: Tensor, robot: RobotConfig) -
     samples = math.ceil(2 + radius * math.pi / 2 / emap.cfg.grid.resolution)
     results = []
     for inflation in (width / 2, radius) if emap.head is None else (0.0,):
-        path = plan(emap, start, goal, TraversalCostConfig(inflation_radius=inflation))
+        path = plan(emap, start, goal, TraversalCostConfig(inflation_radius=inflation, class_costs=class_costs))
         results.append((path, check_path(emap, path.poses(), corners, samples=samples)))
         if results[-1][1].safe:
             return results[-1]

@@ -11,6 +11,7 @@ import numpy as np
 from torchelev.io import MappingRun
 
 if TYPE_CHECKING:
+    from torchelev.elevation_map import ElevationMap
     from torchelev.io.export import SavedMap
     from torchelev.viz.plot import Panel
 
@@ -31,9 +32,18 @@ def summarize(run: MappingRun, num_scans: int) -> list[str]:
         f"scans     {run.num_scans} of {num_scans}, {run.num_points:,} points",
         f"window    {size}, centred on ({x:.2f}, {y:.2f})",
         f"coverage  {coverage:.1f} % of the window's cells",
+        *_describe_channels(run.emap),
         f"points    {used:,} used ({used_percent:.1f} %); rejected: {reasons or 'none'}",
         f"time      {np.median(run.update_ms):.1f} ms per scan (median; slowest {max(run.update_ms):.1f} ms)",
     ]
+
+
+def _describe_channels(emap: ElevationMap) -> Iterator[str]:
+    """Yield for each channel in how many of the known cells it says something."""
+    known = emap.layer("validity")[0] > 0
+    for name in emap.cfg.channels if known.any() else ():
+        share = float(emap.read_channel(name)[1][0][known].float().mean())
+        yield f"channel   {name}: {100 * share:.1f} % of the known cells"
 
 
 def describe_emptiness(run: MappingRun) -> str | None:
